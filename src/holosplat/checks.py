@@ -1,0 +1,66 @@
+"""Bad input, said clearly: one exception type and the few checks every module shares.
+
+A message is one sentence (or two) that names the field, what it must be, what it is, and what to do.
+The command line prints it without a traceback and exits with a non-zero code.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+
+class InputError(ValueError):
+    """The user's input cannot be used; the message says which field, why, and what to do."""
+
+
+def require(condition: bool, message: str) -> None:
+    """Raise `InputError(message)` unless `condition` holds."""
+    if not condition:
+        raise InputError(message)
+
+
+def positive(field: str, value: Any, unit: str = "") -> float:
+    """`value` as a float, if it is a finite number above zero; `InputError` naming `field` otherwise."""
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not (math.isfinite(number) and number > 0):
+        raise InputError(f"{field} must be a positive number{_of(unit)}, but it is {value!r}; correct it.")
+    return number
+
+
+def in_range(field: str, value: float, low: float, high: float, unit: str = "") -> float:
+    """`value` as a float inside [low, high]; `InputError` otherwise (catches units mixed up)."""
+    number = positive(field, value, unit)
+    if not low <= number <= high:
+        raise InputError(
+            f"{field} must lie between {low:g} and {high:g}{_of(unit)}, but it is {number:g}; check its unit."
+        )
+    return number
+
+
+def finite(field: str, array: np.ndarray) -> np.ndarray:
+    """`array` unchanged, if every entry is finite; `InputError` naming `field` and the count otherwise."""
+    bad = int(array.size - np.count_nonzero(np.isfinite(array)))
+    if bad:
+        raise InputError(
+            f"{field} must hold finite numbers, but {bad} of {array.size} values are NaN or infinite; "
+            "repair or mask them first."
+        )
+    return array
+
+
+def shaped(field: str, array: np.ndarray, shape: tuple[int | None, ...]) -> np.ndarray:
+    """`array` unchanged, if its shape matches `shape` (None matches any length); `InputError` otherwise."""
+    if array.ndim != len(shape) or any(want is not None and want != got for want, got in zip(shape, array.shape)):
+        wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
+        raise InputError(f"{field} must have the shape {wanted}, but it has the shape {tuple(array.shape)}.")
+    return array
+
+
+def _of(unit: str) -> str:
+    return f" of {unit}" if unit else ""

@@ -1,0 +1,127 @@
+"""The spine: project → transmit → propagate → detect. Simulation and reconstruction both run it."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .checks import require
+from .optics.detector import bin_pixels, blur, gaussian_transfer, poisson
+from .optics.propagation import exit_wave_minus_one, fresnel_propagate, fresnel_reach_px, fresnel_transfer
+from .scan import Exposures, Scan, interleaved_split
+from .units import wavelength
+from .volume import Object
+
+GUARD_PX = 8
+"""Detector pixels of margin beyond the fringes' reach: room for the point-spread function and faint tails."""
+
+
+class Instrument:
+    """The wave optics of some exposures, made ready: line integrals in, frames out, differentiable.
+
+    The line integrals live on `views`: the detector's raster, padded by the fringes' reach so that nothing
+    wraps around, and `oversample` times finer than the detector.
+    """
+
+    def __init__(self, exposures: Exposures, oversample: int = 1, dtype: torch.dtype = torch.float32) -> None:
+        require(oversample >= 1, f"oversample must be at least 1, but it is {oversample}.")
+        self.exposures, self.oversample, self.dtype = exposures, int(oversample), dtype
+        self.margin = padding(exposures, self.oversample)
+        self.views = exposures.views.padded(self.margin).refined(self.oversample)
+        complex_dtype = torch.complex128 if dtype == torch.float64 else torch.complex64
+        distances, self._which = np.unique(exposures.distance, return_inverse=True)
+        self._transfer = fresnel_transfer(
+            self.views.shape, self.views.pixel_size, distances, exposures.energy_kev, complex_dtype
+        )
+        sigmas = exposures.psf_sigma_px * self.oversample
+        self._psf = gaussian_transfer(self.views.shape, sigmas, dtype) if np.any(sigmas > 0) else None
+
+    def image(self, B: Tensor, D: Tensor, index: np.ndarray | None = None) -> Tensor:
+        """Frames [V, H, W] from line integrals [V, H', W'] in metres on `self.views` (or its views `index`)."""
+        index = np.arange(len(self.views)) if index is None else index
+        scattered = exit_wave_minus_one(B, D, self.exposures.energy_kev)
+        wave = fresnel_propagate(scattered, self._transfer[self._which[index]])
+        intensity = (wave.real + 1) ** 2 + wave.imag**2
+        if self._psf is not None:
+            intensity = blur(intensity, self._psf[index])
+        (my, mx), s = self.margin, self.oversample
+        h, w = self.exposures.views.shape
+        return bin_pixels(intensity[:, my * s : (my + h) * s, mx * s : (mx + w) * s], s)
+
+    def measure(self, obj: Object, index: np.ndarray | None = None) -> Tensor:
+        """Frames [V, H, W] that `obj` would give in the exposures `index` (default: all)."""
+        index = np.arange(len(self.views)) if index is None else np.asarray(index)
+        times = self.exposures.time[index]
+        frames = torch.empty(0)
+        for time in np.unique(times):
+            at = np.flatnonzero(times == time)
+            part = self.image(*obj.at(float(time)).project(self.views[index[at]]), index[at])
+            if len(at) == len(index):
+                return part
+            frames = frames if len(frames) else part.new_empty((len(index), *part.shape[1:]))
+            frames[at] = part
+        return frames
+
+
+def padding(exposures: Exposures, oversample: int) -> tuple[int, int]:
+    """Margin (rows, columns) in detector pixels that the fringes need, such that FFT lengths are 5-smooth.
+
+    At most the field of view itself is added on each side; what would travel further is cut by the
+    propagator (see `fresnel_transfer`).
+    """
+    pitch = exposures.views.pixel_size
+    reach = max(fresnel_reach_px(pitch / oversample, z, exposures.energy_kev) for z in exposures.distance)
+    blur_px = math.ceil(4 * float(exposures.psf_sigma_px.max()))
+    margin = math.ceil(reach / oversample) + blur_px + GUARD_PX
+    return tuple(_smooth_margin(n, min(margin, n + GUARD_PX)) for n in exposures.views.shape)  # type: ignore[return-value]
+
+
+def _smooth_margin(length: int, margin: int) -> int:
+    while not _is_5_smooth(length + 2 * margin):
+        margin += 1
+    return margin
+
+
+def _is_5_smooth(n: int) -> bool:
+    for p in (2, 3, 5):
+        while n % p == 0:
+            n //= p
+    return n == 1
+
+
+def measure(obj: Object, exposures: Exposures, oversample: int = 1, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Frames [N, H, W] (relative intensity) that `obj` gives in `exposures`, on waves `oversample` times finer."""
+    return Instrument(exposures, oversample, dtype).measure(obj)
+
+
+def resolving_oversample(exposures: Exposures, samples_per_fringe: float, at_least: int) -> int:
+    """Samples per detector pixel that put `samples_per_fringe` samples on the first fringe's width √(λz)."""
+    fringe = math.sqrt(wavelength(exposures.energy_kev) * float(exposures.distance.min()))
+    return max(at_least, math.ceil(exposures.views.pixel_size * samples_per_fringe / fringe))
+
+
+def simulate(
+    obj: Object,
+    exposures: Exposures,
+    *,
+    photons_per_pixel: float | None = None,
+    seed: int = 0,
+    is_test: np.ndarray | None = None,
+    oversample: int | None = None,
+) -> Scan:
+    """A scan of `obj`: float64 waves on a fine raster, integrated over pixels, then photon noise if asked for.
+
+    is_test: [N] bool, default every fourth frame; oversample: samples per pixel, default from the fringe width.
+    """
+    fine = oversample or resolving_oversample(exposures, samples_per_fringe=4, at_least=4)
+    frames = np.empty((len(exposures), *exposures.views.shape))
+    for i in range(len(exposures)):  # one at a time: a fine padded raster is large
+        frames[i] = measure(obj, exposures[[i]], fine, torch.float64)[0].numpy()
+    if photons_per_pixel is not None:
+        frames = poisson(frames, photons_per_pixel, seed)
+    split = interleaved_split(len(exposures)) if is_test is None else is_test
+    made_by = {"simulated_with_oversample": str(fine), "photons_per_pixel": str(photons_per_pixel or "none"), "seed": str(seed)}
+    return Scan(frames.astype(np.float32), exposures, split, made_by)

@@ -1,0 +1,137 @@
+"""Where things are: views (poses and the detector's raster) and grids (a volume's raster).
+
+Frames, signs and pixel centres follow docs/conventions.md: `x_lab = R x_obj`, the beam runs along +z_lab,
+pixel `(i, j)` has its centre at `x = (j + ½ - W/2) p + sx`, `y = (i + ½ - H/2) p + sy`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .checks import InputError, finite, positive, require, shaped
+
+
+def rotation_y(angles_deg: np.ndarray | list[float]) -> np.ndarray:
+    """Rotation matrices [V, 3, 3] of tomographic angles [V] in degrees about y (docs/conventions.md)."""
+    theta = np.deg2rad(np.asarray(angles_deg, dtype=np.float64).reshape(-1))
+    c, s, o, i = np.cos(theta), np.sin(theta), np.zeros_like(theta), np.ones_like(theta)
+    return np.stack([np.stack([c, o, s], -1), np.stack([o, i, o], -1), np.stack([-s, o, c], -1)], -2)
+
+
+@dataclass(frozen=True)
+class Views:
+    """V parallel-beam views on one detector raster.
+
+    rotations: [V, 3, 3], `x_lab = R x_obj`; shifts: [V, 2] detector shifts `(sx, sy)` [m];
+    shape: `(H, W)` pixels; pixel_size: pitch `p` [m] of square pixels.
+    """
+
+    rotations: np.ndarray
+    shifts: np.ndarray
+    shape: tuple[int, int]
+    pixel_size: float
+
+    def __post_init__(self) -> None:
+        rotations = finite("view rotation", np.asarray(self.rotations, dtype=np.float64))
+        shaped("view rotation", rotations, (None, 3, 3))
+        gram = rotations @ rotations.transpose(0, 2, 1)
+        proper = np.allclose(gram, np.eye(3), atol=1e-6) and np.all(np.linalg.det(rotations) > 0)
+        require(bool(proper), "view rotation must hold proper rotation matrices (R Rᵀ = 1, det R = 1).")
+        shifts = finite("detector shift", np.asarray(self.shifts, dtype=np.float64))
+        shaped("detector shift", shifts, (len(rotations), 2))
+        if len(self.shape) != 2 or min(self.shape) < 1:
+            raise InputError(f"detector shape must be two positive counts (rows, columns), but it is {self.shape}.")
+        object.__setattr__(self, "rotations", rotations)
+        object.__setattr__(self, "shifts", shifts)
+        object.__setattr__(self, "shape", (int(self.shape[0]), int(self.shape[1])))
+        object.__setattr__(self, "pixel_size", positive("pixel size", self.pixel_size, "metres"))
+
+    @classmethod
+    def from_rotations(cls, rotations: np.ndarray, shape: tuple[int, int], pixel_size: float) -> Views:
+        """Views of any orientation without detector shifts: rotations [V, 3, 3], pixel_size [m]."""
+        return cls(rotations, np.zeros((len(rotations), 2)), shape, pixel_size)
+
+    @classmethod
+    def from_angles(cls, angles_deg: np.ndarray | list[float], shape: tuple[int, int], pixel_size: float) -> Views:
+        """Tomographic views: angles [V] in degrees about the y axis, pixel_size [m]."""
+        return cls.from_rotations(rotation_y(angles_deg), shape, pixel_size)
+
+    @classmethod
+    def evenly_spaced(cls, count: int, shape: tuple[int, int], pixel_size: float) -> Views:
+        """`count` tomographic views over [0°, 180°), pixel_size [m]."""
+        require(count >= 1, f"the number of views must be at least 1, but it is {count}.")
+        return cls.from_angles(np.arange(count) * (180.0 / count), shape, pixel_size)
+
+    def __len__(self) -> int:
+        return len(self.rotations)
+
+    def __getitem__(self, index: np.ndarray | list[int] | slice) -> Views:
+        return replace(self, rotations=self.rotations[index], shifts=self.shifts[index])
+
+    @property
+    def width(self) -> float:
+        """Width of the field of view [m]."""
+        return self.shape[1] * self.pixel_size
+
+    @property
+    def height(self) -> float:
+        """Height of the field of view [m]."""
+        return self.shape[0] * self.pixel_size
+
+    @property
+    def shares_axis(self) -> bool:
+        """Whether every view turns about the object's y axis only (one rotation axis, slices decouple)."""
+        y = np.array([0.0, 1.0, 0.0])
+        return bool(np.allclose(self.rotations[:, 1], y) and np.allclose(self.shifts[:, 1], self.shifts[:1, 1]))
+
+    def refined(self, factor: int) -> Views:
+        """The same field of view on a raster `factor` times finer."""
+        h, w = self.shape
+        return replace(self, shape=(h * factor, w * factor), pixel_size=self.pixel_size / factor)
+
+    def padded(self, margin: tuple[int, int]) -> Views:
+        """The raster grown by `margin = (rows, columns)` pixels on every side; centres of old pixels stay."""
+        (h, w), (my, mx) = self.shape, margin
+        return replace(self, shape=(h + 2 * my, w + 2 * mx))
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A volume's raster, indexed `[z, y, x]`.
+
+    shape: `(Z, Y, X)` voxels; voxel_size: `(dx, dy, dz)` [m]; origin: centre `(x, y, z)` [m] of voxel [0, 0, 0].
+    """
+
+    shape: tuple[int, int, int]
+    voxel_size: tuple[float, float, float]
+    origin: tuple[float, float, float]
+
+    def __post_init__(self) -> None:
+        if len(self.shape) != 3 or min(self.shape) < 1:
+            raise InputError(f"volume shape must be three positive counts (Z, Y, X), but it is {self.shape}.")
+        size = tuple(positive("voxel size", v, "metres") for v in self.voxel_size)
+        require(len(size) == 3, f"voxel size must be three lengths (dx, dy, dz), but it is {self.voxel_size}.")
+        require(len(self.origin) == 3, f"volume origin must be (x, y, z) in metres, but it is {self.origin}.")
+        object.__setattr__(self, "shape", tuple(int(n) for n in self.shape))
+        object.__setattr__(self, "voxel_size", size)
+        object.__setattr__(self, "origin", tuple(float(v) for v in self.origin))
+
+    @classmethod
+    def centred(cls, shape: tuple[int, int, int], voxel_size: float) -> Grid:
+        """A grid of cubic voxels of `voxel_size` [m], centred on the object frame's origin."""
+        z, y, x = shape
+        low = tuple(-0.5 * (n - 1) * voxel_size for n in (x, y, z))
+        return cls(shape, (voxel_size,) * 3, low)
+
+    @classmethod
+    def of_views(cls, views: Views, refine: float = 1) -> Grid:
+        """The views' field of view at pixel pitch (divided by `refine`): Z = X = W, Y = H."""
+        h, w = (round(n * refine) for n in views.shape)
+        return cls.centred((w, h, w), views.pixel_size / refine)
+
+    def axes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Voxel-centre coordinates `(x [X], y [Y], z [Z])` [m]."""
+        counts = self.shape[::-1]
+        return tuple(o + d * np.arange(n) for o, d, n in zip(self.origin, self.voxel_size, counts))  # type: ignore[return-value]

@@ -1,0 +1,262 @@
+"""Matter to refractive index: δ and β of formulas and mixtures, n = 1 - δ + iβ (docs/conventions.md).
+
+Atomic scattering factors are those of Chantler (1995, J. Phys. Chem. Ref. Data 24, 71; 2000, ibid. 29, 597),
+read through `xraydb`: δ = r_e λ² Σ n_j f1_j / 2π, β = r_e λ² Σ n_j f2_j / 2π. β is photoabsorption only:
+photons scattered out of the beam (a third of water's attenuation at 20 keV) are not in it.
+Densities are in g/cm³, the unit chemists and tables use; energies in keV.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import xraydb
+
+from .checks import InputError, in_range, require
+
+ENERGY_RANGE_KEV = (0.1, 400.0)
+"""Where Chantler's tables hold both f1 and f2 [keV]."""
+MAX_DENSITY_G_CM3 = 30.0
+"""Above osmium (22.6 g/cm³), the densest element: what is denser is a unit mixed up."""
+
+
+class DeltaBeta(NamedTuple):
+    """Refractive index n = 1 - delta + i·beta, dimensionless; of a difference, either may be negative."""
+
+    delta: float
+    beta: float
+
+    def against(self, medium: DeltaBeta) -> DeltaBeta:
+        """What an object in `medium` adds to it: `(δ - δ_medium, β - β_medium)`."""
+        return DeltaBeta(self.delta - medium.delta, self.beta - medium.beta)
+
+    @property
+    def ratio(self) -> float:
+        """δ/β; infinite (with δ's sign) for β = 0, negative where the two differ in sign, NaN for vacuum."""
+        if self.beta == 0:
+            return math.copysign(math.inf, self.delta) if self.delta else math.nan
+        return self.delta / self.beta
+
+
+def _density(name: str, value: Any) -> float:
+    field = f"density of {name}"
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise InputError(f"{field} must be a number of g/cm³, but it is {value!r}; correct it.")
+    return in_range(field, value, 1e-6, MAX_DENSITY_G_CM3, unit="g/cm³")
+
+
+def _preset_names() -> str:
+    return ", ".join(PRESETS)
+
+
+@lru_cache(maxsize=256)
+def _checked_formula(formula: str) -> str:
+    if isinstance(formula, str) and xraydb.validate_formula(formula):
+        atoms = xraydb.chemparse(formula)
+        if sum(atoms.values()) > 0 and max(xraydb.atomic_number(symbol) for symbol in atoms) <= 92:
+            return formula
+    raise InputError(
+        f"material {formula!r} must be a chemical formula of elements up to uranium, such as 'H2O' or 'SiO2' "
+        f"(mind the capitals), or one of {_preset_names()}."
+    )
+
+
+@lru_cache(maxsize=1024)
+def _per_density(formula: str, energy_kev: float) -> DeltaBeta:
+    """δ and β of `formula` at 1 g/cm³ (both are proportional to the density)."""
+    delta, beta, _ = xraydb.xray_delta_beta(formula, 1.0, 1e3 * energy_kev)
+    return DeltaBeta(float(delta), float(beta))
+
+
+@dataclass(frozen=True)
+class Compound:
+    """One chemical formula ("H2O", "CaMg(CO3)2") at a density [g/cm³]; `InputError` if either is wrong."""
+
+    formula: str
+    density_g_cm3: float
+
+    def __post_init__(self) -> None:
+        _checked_formula(self.formula)
+        object.__setattr__(self, "density_g_cm3", _density(self.formula, self.density_g_cm3))
+
+    def delta_beta(self, energy_kev: float) -> DeltaBeta:
+        """δ and β at `energy_kev` [keV, 0.1 to 400]; `InputError` outside."""
+        per_density = _per_density(
+            self.formula, in_range("energy", energy_kev, *ENERGY_RANGE_KEV, unit="keV")
+        )
+        return DeltaBeta(*(self.density_g_cm3 * value for value in per_density))
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Several substances by mass fraction, at the mixture's own density.
+
+    components: `((substance, mass fraction), …)`, a substance being a formula, a `Compound` or a `Mixture`
+    (whose own density does not count here); the fractions must be positive and add up to 1.
+    density_g_cm3: of the whole [g/cm³].
+    """
+
+    components: tuple[tuple[str | Compound | Mixture, float], ...]
+    density_g_cm3: float
+
+    def __post_init__(self) -> None:
+        try:
+            parts = tuple((part, float(fraction)) for part, fraction in self.components)
+        except (TypeError, ValueError):
+            raise InputError(
+                f"mixture components must be pairs (substance, mass fraction), not {self.components!r}."
+            ) from None
+        for part, fraction in parts:
+            require(0 < fraction <= 1, f"mass fraction of {part} must lie in (0, 1], but it is {fraction:g}.")
+        total = sum(fraction for _, fraction in parts)
+        require(
+            abs(total - 1) < 1e-6,
+            f"mass fractions of a mixture must add up to 1, but they add up to {total:.6g}.",
+        )
+        parts = tuple((Compound(part, 1.0) if isinstance(part, str) else part, f) for part, f in parts)
+        object.__setattr__(self, "components", parts)
+        object.__setattr__(self, "density_g_cm3", _density("the mixture", self.density_g_cm3))
+
+    def delta_beta(self, energy_kev: float) -> DeltaBeta:
+        """δ and β at `energy_kev` [keV, 0.1 to 400]: mass-weighted sums of δ/ρ and β/ρ times the density."""
+        delta = beta = 0.0
+        for part, fraction in self.components:
+            of_part = part.delta_beta(energy_kev)  # type: ignore[union-attr]  # formulas became Compounds above
+            delta += fraction * of_part.delta / part.density_g_cm3  # type: ignore[union-attr]
+            beta += fraction * of_part.beta / part.density_g_cm3  # type: ignore[union-attr]
+        return DeltaBeta(self.density_g_cm3 * delta, self.density_g_cm3 * beta)
+
+
+Material = Compound | Mixture
+
+
+def solution(solute: Compound, concentration_g_ml: float, solvent: Compound) -> Mixture:
+    """`concentration_g_ml` [g per mL of solution] of `solute` in `solvent`, their volumes adding up.
+
+    `InputError` when that concentration exceeds the solute's own density.
+    """
+    limit = solute.density_g_cm3
+    in_range("concentration", concentration_g_ml, 0.0, 0.999999 * limit, unit="g/mL")
+    density = concentration_g_ml + (1 - concentration_g_ml / limit) * solvent.density_g_cm3
+    fraction = concentration_g_ml / density
+    return Mixture(((solute, fraction), (solvent, 1 - fraction)), density)
+
+
+WATER = Compound("H2O", 0.9982)
+"""Water at 20 °C: 0.9982 g/cm³ (Tanaka et al. 2001, Metrologia 38, 301)."""
+
+HAEMOGLOBIN = Compound("C2952H4664N812O832S8Fe4", 1.335)
+"""Human haemoglobin tetramer, dry, at one over its partial specific volume in water, 0.749 mL/g
+(Svedberg & Pedersen 1940, The Ultracentrifuge): δ/β = 2.8e3 at 20 keV."""
+
+ALBUMIN = Compound("C2936H4624N786O889S41", 1.364)
+"""Human serum albumin, dry, at one over its partial specific volume 0.733 mL/g (Hunter 1966, J. Phys. Chem.
+70, 3285); stands for all plasma protein."""
+
+PLASMA = Mixture(((WATER, 0.922), (ALBUMIN, 0.070), ("NaCl", 0.006), ("NaHCO3", 0.002)), 1.025)
+"""Blood plasma by mass: 7 % protein, and the reference values of chloride (103 mmol/L) and bicarbonate
+(24 mmol/L) as sodium salts (Guyton & Hall, Textbook of Medical Physiology); 1.025 g/cm³ at 25 °C, between the
+measured 1.0310 at 4 °C and 1.0205 at 37 °C (Trudnowski & Rico 1974, Clin. Chem. 20, 615)."""
+
+RED_CELL = solution(HAEMOGLOBIN, 0.33, WATER)
+"""A red cell as a haemoglobin solution of 33 g/dL, the normal mean cell concentration (32 to 36 g/dL).
+
+Against `PLASMA` at 20 keV: Δδ = 2.8e-8 and Δβ = -1.5e-11, negative because plasma's salt absorbs more than
+water while haemoglobin absorbs as little. The cell's own ions are left out; its potassium alone (95 mmol per
+litre of cells) would add 1.9e-11 to β, so of Δβ only the smallness is certain, not the sign.
+"""
+
+PRESETS: dict[str, Material] = {
+    "water": WATER,
+    "haemoglobin": HAEMOGLOBIN,
+    "hemoglobin": HAEMOGLOBIN,
+    "albumin": ALBUMIN,
+    "plasma": PLASMA,
+    "red cell": RED_CELL,
+    "red_cell": RED_CELL,
+    "rbc": RED_CELL,
+}
+"""Names that `parse_material` knows, in lower case."""
+
+
+def parse_material(text: str, density_g_cm3: float | None = None) -> Material:
+    """The material that `text` names: a preset ("plasma", any case) or a formula ("SiO2"), with its density.
+
+    density_g_cm3: [g/cm³]; a preset keeps its own unless one is given, a formula needs one (`InputError`).
+    """
+    if not isinstance(text, str) or not text.strip():
+        raise InputError(
+            f"material must be a chemical formula or one of {_preset_names()}, but it is {text!r}."
+        )
+    name = text.strip()
+    preset = PRESETS.get(name.lower())
+    if preset is not None:
+        return preset if density_g_cm3 is None else replace(preset, density_g_cm3=density_g_cm3)
+    _checked_formula(name)
+    require(
+        density_g_cm3 is not None,
+        f"material {name!r} is a formula and needs its density in g/cm³; give it, or use {_preset_names()}.",
+    )
+    return Compound(name, density_g_cm3)  # type: ignore[arg-type]
+
+
+def read_material_table(path: str | Path) -> dict[str, Material]:
+    """Materials per mesh file, from a JSON or TOML file: {file-name pattern: material}, in the file's order.
+
+    A pattern is a shell glob ("rbc*.vtk"); a material is a preset's name, or a table with `formula` (or a
+    preset's name there) and, for a formula, `density` [g/cm³]. `InputError` names the pattern at fault.
+    """
+    table = _read_table(Path(path))
+    return {
+        pattern: _table_entry(f"{path}: material of {pattern!r}", entry) for pattern, entry in table.items()
+    }
+
+
+def material_of(name: str, table: Mapping[str, Material], default: Material | None = None) -> Material:
+    """The material of the first pattern in `table` that matches `name`, else `default`.
+
+    name: a mesh's file name, with or without its folder or suffix. `InputError` when there is neither.
+    """
+    candidates = {name, Path(name).name, Path(name).stem}
+    for pattern, material in table.items():
+        if any(fnmatchcase(candidate, pattern) for candidate in candidates):
+            return material
+    if default is None:
+        raise InputError(
+            f"mesh {name!r} matches no pattern of the material table ({', '.join(table)}); add one."
+        )
+    return default
+
+
+def _read_table(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+        table = tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text)
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(
+            f"{path} must be a readable JSON or TOML file, but reading it failed: {error}."
+        ) from None
+    except ValueError as error:  # both decoders' errors
+        raise InputError(f"{path} must be valid JSON (or TOML, named .toml), but {error}.") from None
+    if not isinstance(table, dict) or not table:
+        raise InputError(f'{path} must map mesh file names to materials, like {{"cell*.vtk": "red cell"}}.')
+    return table
+
+
+def _table_entry(field: str, entry: Any) -> Material:
+    if isinstance(entry, str):
+        entry = {"formula": entry}
+    if not isinstance(entry, dict) or "formula" not in entry or set(entry) - {"formula", "density"}:
+        raise InputError(f"{field} must be a preset's name or {{formula, density}}, but it is {entry!r}.")
+    try:
+        return parse_material(entry["formula"], entry.get("density"))
+    except InputError as error:
+        raise InputError(f"{field}: {error}") from None

@@ -1,0 +1,71 @@
+"""A triangle mesh, as specimens make it and projectors read it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from .checks import InputError, finite, shaped
+
+
+@dataclass(frozen=True)
+class TriangleMesh:
+    """vertices: [P, 3] float64 object-frame coordinates `(x, y, z)` [m]; faces: [F, 3] int64 vertex indices.
+
+    A closed mesh with outward normals (counter-clockwise seen from outside) encloses positive volume.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    name: str = "mesh"
+
+    def __post_init__(self) -> None:
+        vertices = np.ascontiguousarray(self.vertices, dtype=np.float64)
+        finite(f"{self.name}: vertex coordinates", shaped(f"{self.name}: vertices", vertices, (None, 3)))
+        faces = np.ascontiguousarray(self.faces, dtype=np.int64)
+        shaped(f"{self.name}: faces", faces, (None, 3))
+        if len(faces) == 0 or faces.min() < 0 or faces.max() >= len(vertices):
+            raise InputError(f"{self.name}: faces must name existing vertices, at least one face.")
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", faces)
+
+    @property
+    def volume(self) -> float:
+        """Signed enclosed volume [m³]: Σ a·(b × c)/6 (divergence theorem)."""
+        a, b, c = np.moveaxis((self.vertices - self.vertices.mean(0))[self.faces], 1, 0)
+        return float(np.einsum("fi,fi->", a, np.cross(b, c)) / 6)
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner `(x, y, z)` [m] of the bounding box."""
+        return self.vertices.min(0), self.vertices.max(0)
+
+    def merged(self, tolerance: float = 0.0) -> TriangleMesh:
+        """The mesh with vertices closer than `tolerance` [m] (0: equal ones) made one.
+
+        Triangles left with a repeated vertex are dropped; the order of the vertices that stay is kept.
+        """
+        if tolerance > 0:
+            pairs = cKDTree(self.vertices).query_pairs(tolerance, output_type="ndarray")
+            graph = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(self.vertices),) * 2)
+            _, group = connected_components(graph, directed=False)
+        else:
+            _, group = np.unique(self.vertices, axis=0, return_inverse=True)
+        _, first, group = np.unique(group.reshape(-1), return_index=True, return_inverse=True)
+        kept, index = np.unique(first[group.reshape(-1)], return_inverse=True)
+        faces = index.reshape(-1)[self.faces]
+        a, b, c = faces.T
+        faces = faces[(a != b) & (b != c) & (c != a)]
+        if len(faces) == 0:
+            raise InputError(
+                f"{self.name}: all triangles are degenerate (two corners coincide); check the mesh."
+            )
+        return replace(self, vertices=self.vertices[kept], faces=faces)
+
+    def transformed(self, rotation: np.ndarray, translation: np.ndarray) -> TriangleMesh:
+        """The mesh moved to `rotation @ vertex + translation` ([3, 3], [3] in metres)."""
+        return replace(self, vertices=self.vertices @ np.asarray(rotation).T + np.asarray(translation))

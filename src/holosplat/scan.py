@@ -1,0 +1,130 @@
+"""Everything measured: frames, one exposure per frame, and the split into training and test frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from .checks import finite, in_range, require, shaped
+from .geometry import Views
+
+ENERGY_RANGE_KEV = (0.1, 1000.0)
+PIXEL_RANGE_M = (1e-10, 1e-2)
+DISTANCE_RANGE_M = (1e-9, 1e4)
+
+
+@dataclass(frozen=True)
+class Exposures:
+    """How each of N frames was taken: poses and raster (`views`), and the physics of its beam and detector.
+
+    energy_kev: one photon energy [keV] for all frames; distance: [N] effective propagation distances [m];
+    psf_sigma_px: [N] standard deviations of the Gaussian point-spread function [detector pixels];
+    time: [N] seconds since the first frame.
+    """
+
+    views: Views
+    energy_kev: float
+    distance: np.ndarray
+    psf_sigma_px: np.ndarray
+    time: np.ndarray
+
+    def __post_init__(self) -> None:
+        count = len(self.views)
+        in_range("energy", self.energy_kev, *ENERGY_RANGE_KEV, unit="keV")
+        in_range("pixel size", self.views.pixel_size, *PIXEL_RANGE_M, unit="metres")
+        for name in ("distance", "psf_sigma_px", "time"):
+            array = np.broadcast_to(np.asarray(getattr(self, name), dtype=np.float64), (count,))
+            object.__setattr__(self, name, finite(name, array.copy()))
+        for z in self.distance:
+            in_range("propagation distance", z, *DISTANCE_RANGE_M, unit="metres")
+        require(bool(np.all(self.psf_sigma_px >= 0)), "psf_sigma_px must not be negative; correct it.")
+
+    @classmethod
+    def of(cls, views: Views, energy_kev: float, distance: float, psf_sigma_px: float = 0.0) -> Exposures:
+        """Exposures that share one distance [m] and one point-spread function, all at time 0."""
+        n = len(views)
+        return cls(views, energy_kev, np.full(n, distance), np.full(n, psf_sigma_px), np.zeros(n))
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def __getitem__(self, index: np.ndarray | list[int] | slice) -> Exposures:
+        return replace(
+            self,
+            views=self.views[index],
+            distance=self.distance[index],
+            psf_sigma_px=self.psf_sigma_px[index],
+            time=self.time[index],
+        )
+
+
+@dataclass(frozen=True)
+class Scan:
+    """Frames and how they were taken.
+
+    frames: [N, H, W] float32 intensity relative to the flat field; is_test: [N] bool, frames held out of the fit;
+    provenance: what made the scan, as flat text entries.
+    """
+
+    frames: np.ndarray
+    exposures: Exposures
+    is_test: np.ndarray
+    provenance: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        frames = np.ascontiguousarray(self.frames, dtype=np.float32)
+        shaped("frames", frames, (len(self.exposures), *self.exposures.views.shape))
+        is_test = shaped("split", np.asarray(self.is_test, dtype=bool), (len(frames),))
+        object.__setattr__(self, "frames", finite("frames", frames))
+        object.__setattr__(self, "is_test", is_test)
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, index: np.ndarray | list[int] | slice) -> Scan:
+        return replace(
+            self, frames=self.frames[index], exposures=self.exposures[index], is_test=self.is_test[index]
+        )
+
+    @property
+    def views(self) -> Views:
+        """The exposures' poses and raster."""
+        return self.exposures.views
+
+    def binned(self, factor: int) -> Scan:
+        """The scan on pixels `factor` times larger (means of `factor × factor`); odd rows and columns are cut evenly."""
+        if factor == 1:
+            return self
+        h, w = (n // factor for n in self.views.shape)
+        require(min(h, w) > 0, f"frames of {self.views.shape} pixels cannot be binned by {factor}.")
+        top, left = ((n - m * factor) // 2 for n, m in zip(self.views.shape, (h, w)))
+        cut = self.frames[:, top : top + h * factor, left : left + w * factor]
+        odd = np.array([self.views.shape[1] - w * factor - 2 * left, self.views.shape[0] - h * factor - 2 * top])
+        views = replace(
+            self.views,
+            shape=(h, w),
+            pixel_size=self.views.pixel_size * factor,
+            shifts=self.views.shifts - 0.5 * odd * self.views.pixel_size,
+        )
+        exposures = replace(self.exposures, views=views, psf_sigma_px=self.exposures.psf_sigma_px / factor)
+        return replace(self, frames=cut.reshape(len(self), h, factor, w, factor).mean((2, 4)), exposures=exposures)
+
+    def train(self) -> Scan:
+        """The training frames only; `InputError` when there are none."""
+        require(
+            not bool(self.is_test.all()),
+            "the scan has no training frame (every entry of /entry/split is 1); mark at least one frame 0.",
+        )
+        return self[np.flatnonzero(~self.is_test)]
+
+    def test(self) -> Scan:
+        """The held-out frames only (possibly none)."""
+        return self[np.flatnonzero(self.is_test)]
+
+
+def interleaved_split(count: int, every: int = 4) -> np.ndarray:
+    """[count] bool: True for each `every`-th frame (the last of every group), which is held out; 0 holds out none."""
+    if every <= 0:
+        return np.zeros(count, dtype=bool)
+    return np.arange(count) % every == every - 1

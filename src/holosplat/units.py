@@ -1,0 +1,49 @@
+"""Constants, and units as files name them. Inside, everything is SI; energies are in keV by name."""
+
+from __future__ import annotations
+
+import math
+
+from .checks import InputError, positive
+
+PLANCK_TIMES_C_KEV_M = 1.2398419843320026e-9
+"""h·c in keV·m (CODATA 2018, exact)."""
+
+LENGTH_UNITS = {
+    "m": 1.0,
+    "dm": 1e-1,
+    "cm": 1e-2,
+    "mm": 1e-3,
+    "um": 1e-6,
+    "µm": 1e-6,
+    "μm": 1e-6,
+    "micrometer": 1e-6,
+    "micron": 1e-6,
+    "nm": 1e-9,
+    "meter": 1.0,
+    "metre": 1.0,
+    "angstrom": 1e-10,
+    "Å": 1e-10,
+}
+ENERGY_UNITS = {"keV": 1.0, "kev": 1.0, "eV": 1e-3, "ev": 1e-3, "MeV": 1e3, "J": 1 / 1.602176634e-16}
+ANGLE_UNITS = {"deg": math.pi / 180, "degree": math.pi / 180, "degrees": math.pi / 180, "°": math.pi / 180, "rad": 1.0}
+TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "second": 1.0, "seconds": 1.0}
+
+
+def unit_factor(field: str, unit: str, table: dict[str, float]) -> float:
+    """The factor that brings `unit` to the table's base unit; `InputError` naming `field` if it is unknown."""
+    try:
+        return table[unit.strip()]
+    except KeyError:
+        known = ", ".join(table)
+        raise InputError(f"{field} has the unknown unit {unit!r}; use one of {known}.") from None
+
+
+def wavelength(energy_kev: float) -> float:
+    """Wavelength [m] of photons of `energy_kev` [keV]: λ = hc/E."""
+    return PLANCK_TIMES_C_KEV_M / positive("energy_kev", energy_kev, "keV")
+
+
+def wavenumber(energy_kev: float) -> float:
+    """Wavenumber k = 2π/λ [rad/m] of photons of `energy_kev` [keV]."""
+    return 2 * math.pi / wavelength(energy_kev)
