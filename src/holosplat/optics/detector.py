@@ -1,0 +1,40 @@
+"""From the wave's intensity to a frame: pixel integration, point-spread function, photon noise."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from ..checks import positive
+
+
+def bin_pixels(image: Tensor, factor: int) -> Tensor:
+    """[V, H·factor, W·factor] → [V, H, W]: the mean over each pixel's `factor × factor` samples."""
+    return image if factor == 1 else avg_pool2d(image[None], factor)[0]
+
+
+def gaussian_transfer(shape: tuple[int, int], sigma_px: np.ndarray, dtype: torch.dtype) -> Tensor:
+    """Fourier transform `exp(-2π²σ²f²)` of Gaussian point-spread functions, [V, H, W//2 + 1] (for `rfft2`).
+
+    sigma_px: [V] standard deviations in samples of the raster `shape`.
+    """
+    factor = -2 * math.pi**2 * np.asarray(sigma_px, dtype=np.float64).reshape(-1, 1) ** 2
+    rows = np.exp(factor * np.fft.fftfreq(shape[0]) ** 2)
+    columns = np.exp(factor * np.fft.rfftfreq(shape[1]) ** 2)
+    return torch.from_numpy(rows[:, :, None] * columns[:, None, :]).to(dtype)
+
+
+def blur(image: Tensor, transfer: Tensor) -> Tensor:
+    """`image` [V, H, W] blurred (periodically) by the point-spread functions whose `rfft2` is `transfer`."""
+    return torch.fft.irfft2(torch.fft.rfft2(image) * transfer, s=image.shape[-2:])
+
+
+def poisson(intensity: np.ndarray, photons_per_pixel: float, seed: int) -> np.ndarray:
+    """Relative intensity [N, H, W] with photon noise: Poisson counts of mean `I · photons_per_pixel`, divided by it."""
+    photons = positive("photons_per_pixel", photons_per_pixel)
+    counts = np.random.default_rng(seed).poisson(np.clip(intensity, 0, None) * photons)
+    return (counts / photons).astype(np.float32)
