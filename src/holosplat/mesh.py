@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from .checks import InputError, finite, shaped
 
@@ -50,7 +50,7 @@ class TriangleMesh:
         Triangles left with a repeated vertex are dropped; the order of the vertices that stay is kept.
         """
         if tolerance > 0:
-            pairs = cKDTree(self.vertices).query_pairs(tolerance, output_type="ndarray")
+            pairs = KDTree(self.vertices).query_pairs(tolerance, output_type="ndarray")
             graph = coo_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(self.vertices),) * 2)
             _, group = connected_components(graph, directed=False)
         else:

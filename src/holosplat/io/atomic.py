@@ -1,0 +1,32 @@
+"""Writing a file whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from ..checks import InputError, require
+
+
+@contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """A temporary path beside `path` (same suffix) to write to; it replaces `path` when the block ends well.
+
+    If the block raises, the temporary file goes and `path` stays as it was; a failure of the file system
+    itself (no such folder, no permission, disk full) becomes an `InputError`.
+    """
+    target = Path(os.path.realpath(path))  # of a link, what it points to is replaced
+    require(not target.is_dir(), f"{path} must be a file to write, but it is a folder; add a file name.")
+    folder = target.parent
+    require(folder.is_dir(), f"{path} must lie in an existing folder, but {folder} is none; create it.")
+    temporary = target.with_name(f".{target.stem[:64]}-{secrets.token_hex(4)}{target.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, target)
+    except OSError as error:
+        raise InputError(f"{path} must be writable, but writing it failed: {error}.") from error
+    finally:
+        temporary.unlink(missing_ok=True)

@@ -1,0 +1,96 @@
+"""HDF5 with clear messages: what the readers of scans and volumes share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from ..checks import InputError, require, shaped
+from ..units import unit_factor
+
+
+@contextmanager
+def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
+    """`path` opened for reading; `InputError` when it is missing, no HDF5 file, truncated or damaged."""
+    file = Path(path)
+    require(file.exists(), f"{path} must be an HDF5 file, but there is no such file; check the path.")
+    require(file.is_file(), f"{path} must be an HDF5 file, but it is a folder; name the file in it.")
+    try:
+        if not h5py.is_hdf5(file):
+            raise InputError(f"{path} must be an HDF5 file, but it does not start like one.")
+        with h5py.File(file, "r") as opened:
+            yield opened
+    except (OSError, RuntimeError, KeyError) as error:
+        raise InputError(
+            f"{path} must be a complete HDF5 file, but it is truncated, damaged or not readable: {error}."
+        ) from error
+
+
+@dataclass(frozen=True)
+class Fields:
+    """The datasets below one group of the file `path`; messages name the file and the dataset."""
+
+    path: Path
+    group: h5py.Group
+
+    def label(self, name: str) -> str:
+        """How messages call the dataset `name` (below the group)."""
+        return f"{self.path}: {self._below}/{name}"
+
+    @property
+    def _below(self) -> str:
+        return (self.group.name or "").rstrip("/")
+
+    def find(self, *names: str) -> str | None:
+        """The first of `names` that exists, or None."""
+        return next((name for name in names if name in self.group), None)
+
+    def need(self, *names: str) -> str:
+        """The first of `names` that exists; `InputError` when none does."""
+        found = self.find(*names)
+        if found is None:
+            others = "".join(f" (or {self._below}/{name})" for name in names[1:])
+            raise InputError(f"{self.label(names[0])}{others} must be there, but it is missing; add it.")
+        return found
+
+    def dataset(self, name: str) -> h5py.Dataset:
+        """The dataset `name`, if it is one and holds real numbers."""
+        found = self.group.get(name)
+        if not isinstance(found, h5py.Dataset):
+            raise InputError(f"{self.label(name)} must be a dataset, but it is a group or a broken link.")
+        if found.dtype.kind not in "iufb" or found.shape is None:
+            raise InputError(f"{self.label(name)} must hold numbers, but its type is {found.dtype}.")
+        return found
+
+    def numbers(self, name: str) -> np.ndarray:
+        """All of the dataset `name` as float64."""
+        return np.asarray(self.dataset(name)[()], dtype=np.float64)
+
+    def unit(self, name: str, table: dict[str, float], default: str) -> float:
+        """The factor of the dataset's `@units` to the base unit of `table`; `default` when it has none."""
+        text = attribute_text(self.dataset(name).attrs.get("units"))
+        return unit_factor(self.label(name), default if text is None else text, table)
+
+
+def attribute_text(value: Any) -> str | None:
+    """An attribute as text, whichever of HDF5's string types it has; None for None."""
+    if isinstance(value, np.ndarray):
+        value = value.reshape(-1)[0] if value.size == 1 else str(value)
+    if isinstance(value, bytes):
+        value = value.decode("utf-8", errors="replace")
+    return None if value is None else str(value)
+
+
+def attribute_numbers(label: str, value: Any, counts: tuple[int, ...]) -> np.ndarray:
+    """An attribute as float64 [n], n being one of `counts`; `InputError` otherwise."""
+    array = np.asarray(value)
+    if array.dtype.kind not in "iuf":
+        raise InputError(f"{label} must hold numbers, but it is {attribute_text(value)!r}.")
+    array = array.astype(np.float64).reshape(-1)
+    return array if array.size in counts else shaped(label, array, (counts[-1],))

@@ -1,0 +1,70 @@
+"""Volumes of δ and β from and to HDF5 (docs/conventions.md)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from ..checks import InputError, finite, in_range
+from ..geometry import Grid
+from ..volume import Volume
+from .atomic import atomic_path
+from .hdf5 import Fields, attribute_numbers, open_hdf5
+
+NAMES = ("delta", "beta")
+VOXEL_RANGE_M = (1e-10, 1e-2)
+
+
+def read_volume(path: str | Path) -> Volume:
+    """The volume of a file with /delta and /beta [Z, Y, X], and `voxel_size` and `origin` [m] as attributes.
+
+    The attributes may stand on the datasets, on the file's root, or both (then they must agree); voxel_size
+    is one number or three, `(dx, dy, dz)`. `InputError` names the file and the field at fault.
+    """
+    with open_hdf5(path) as file:
+        fields = Fields(Path(path), file)
+        arrays = [_array(fields, name) for name in NAMES]
+        if arrays[0].shape != arrays[1].shape:
+            raise InputError(
+                f"{path}: /delta and /beta must have the same shape, but they have {arrays[0].shape} and "
+                f"{arrays[1].shape}."
+            )
+        size = np.broadcast_to(_attribute(fields, "voxel_size", (1, 3)), (3,))
+        for number in size:
+            in_range(f"{path}: voxel_size", float(number), *VOXEL_RANGE_M, unit="metres")
+        origin = finite(f"{path}: origin", _attribute(fields, "origin", (3,)))
+    return Volume(arrays[0], arrays[1], Grid(arrays[0].shape, tuple(size), tuple(origin)))
+
+
+def write_volume(path: str | Path, volume: Volume) -> None:
+    """Write `volume` as /delta and /beta with their grid, replacing `path` only once all is written."""
+    grid = {"voxel_size": np.array(volume.grid.voxel_size), "origin": np.array(volume.grid.origin)}
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs.update(grid)
+        for name in NAMES:
+            file[name] = getattr(volume, name)
+            file[name].attrs.update(grid)
+
+
+def _array(fields: Fields, name: str) -> np.ndarray:
+    data = fields.dataset(fields.need(name))
+    if data.ndim != 3 or 0 in data.shape:
+        raise InputError(f"{fields.label(name)} must have the shape [Z, Y, X], but it has {data.shape}.")
+    return finite(fields.label(name), data[()].astype(np.float32))
+
+
+def _attribute(fields: Fields, name: str, counts: tuple[int, ...]) -> np.ndarray:
+    """The attribute `name` of the datasets and the root, wherever it stands."""
+    places = [fields.group, *(fields.group[dataset] for dataset in NAMES)]
+    label = f"{fields.path}: @{name}"
+    found = [attribute_numbers(label, place.attrs[name], counts) for place in places if name in place.attrs]
+    if not found:
+        raise InputError(
+            f"{label} (in metres, on /delta or the file's root) must be there, but it is missing."
+        )
+    if not all(np.allclose(value, found[0], rtol=1e-6, atol=1e-15, equal_nan=True) for value in found):
+        values = ", ".join(str(value.tolist()) for value in found)
+        raise InputError(f"{label} must be the same on the datasets and the root, but it is {values}.")
+    return found[0]

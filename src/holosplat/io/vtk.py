@@ -1,0 +1,240 @@
+"""Triangle meshes from and to VTK files: legacy and XML, POLYDATA and UNSTRUCTURED_GRID, one body a file.
+
+VTK's readers hand over what they could read of a damaged file and complain on stderr; here their complaints
+are collected and become one `InputError`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..checks import InputError, require
+from ..mesh import TriangleMesh
+from ..units import LENGTH_UNITS, unit_factor
+from .atomic import atomic_path
+from .vtk_guard import cells_fault, legacy_fault
+
+SUFFIXES = (".vtk", ".vtu", ".vtp")
+MERGE_TOLERANCE = 1e-6
+"""Vertices closer than this fraction of the mesh's diagonal are one vertex, written several times."""
+STRIP = 6
+FLAT_CELLS = (5, STRIP, 7, 9)
+"""VTK's numbers of flat cells whose corners run around the rim or along the strip: triangle to quad."""
+
+
+def read_meshes(paths: str | Path | Iterable[str | Path], length_unit: str) -> list[TriangleMesh]:
+    """One mesh [m] a file, named by its file name, with duplicate vertices merged and their order kept.
+
+    paths: a file, a folder (its .vtk, .vtu, .vtp files, cell2 before cell10), or several of either;
+    length_unit: of the files' coordinates ("um", "m", …), which VTK files do not record.
+    Strips, quads and polygons are cut into triangles; of solid cells the boundary is taken. `InputError`
+    names the file that is missing, damaged, truncated, no VTK file, or holds no triangles.
+    """
+    factor = unit_factor("length_unit", length_unit, LENGTH_UNITS)
+    several = [paths] if isinstance(paths, (str, Path)) else list(paths)
+    files = [file for path in several for file in _files(Path(path))]
+    require(len(files) > 0, "mesh files must be at least one, but the list of paths is empty.")
+    return [_read_mesh(file, factor) for file in files]
+
+
+def write_mesh(path: str | Path, mesh: TriangleMesh, length_unit: str = "um") -> None:
+    """Write `mesh` as legacy binary VTK polydata (version 4.2, which all readers take) in `length_unit`."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
+    from vtkmodules.vtkCommonCore import vtkPoints
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+    from vtkmodules.vtkIOLegacy import vtkPolyDataWriter
+
+    points, cells, data = vtkPoints(), vtkCellArray(), vtkPolyData()
+    scaled = mesh.vertices / unit_factor("length_unit", length_unit, LENGTH_UNITS)
+    points.SetData(numpy_to_vtk(np.ascontiguousarray(scaled), deep=True))
+    rows = np.concatenate([np.full((len(mesh.faces), 1), 3), mesh.faces], axis=1)
+    cells.ImportLegacyFormat(numpy_to_vtkIdTypeArray(np.ascontiguousarray(rows.reshape(-1)), deep=True))
+    data.SetPoints(points)
+    data.SetPolys(cells)
+    with atomic_path(path) as temporary, _quiet() as complaints:
+        writer = vtkPolyDataWriter()
+        writer.SetFileName(str(temporary))
+        writer.SetFileVersion(writer.VTK_LEGACY_READER_VERSION_4_2)
+        writer.SetFileTypeToBinary()
+        writer.SetHeader(f"{mesh.name[:200]} length_unit={length_unit}".replace("\n", " "))
+        writer.SetInputData(data)
+        if not writer.Write() or complaints():
+            raise InputError(f"{path} must be writable, but VTK could not write it: {complaints()}.")
+
+
+def _files(path: Path) -> list[Path]:
+    if path.is_dir():
+        found = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES]
+        require(len(found) > 0, f"{path} must hold mesh files ({', '.join(SUFFIXES)}), but it holds none.")
+        return sorted(found, key=_natural_order)
+    require(path.exists(), f"{path} must be a mesh file, but there is no such file; check the path.")
+    return [path]
+
+
+def _natural_order(file: Path) -> list[tuple[int, str]]:
+    """Numbers in names compare as numbers: cell2 comes before cell10."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", file.name)]
+
+
+def _read_mesh(path: Path, factor: float) -> TriangleMesh:
+    with _quiet() as complaints:
+        data = _read_data(path)
+        if complaints():
+            raise _damaged(path, complaints())
+        surface = _surface(path, data)
+        points, faces = _checked_points(path, surface), _triangles(surface)
+    if len(faces) == 0:
+        raise InputError(
+            f"{path} must hold triangles, strips or polygons, but its cells are points or lines."
+        )
+    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+    mesh = TriangleMesh(points * factor, faces, path.name).merged(MERGE_TOLERANCE * extent * factor)
+    if _ends_within_a_line(path) and not _is_closed(mesh.faces):
+        raise _damaged(path, "it ends in the middle of a line and its surface is not closed")
+    return mesh
+
+
+def _damaged(path: Path, reason: str) -> InputError:
+    return InputError(f"{path} must be a complete VTK file, but it is truncated or damaged: {reason}.")
+
+
+def _read_data(path: Path) -> Any:
+    """The data set that VTK reads from `path`, or `InputError` where it does not start like a VTK file."""
+    from vtkmodules.vtkIOLegacy import vtkGenericDataObjectReader
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLUnstructuredGridReader
+
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path} must be a readable file, but reading it failed: {error}.") from None
+    xml = re.search(rb"<VTKFile[^>]*?\btype\s*=\s*[\"'](\w+)[\"']", content[:4096])
+    kind = xml[1].decode() if xml else "legacy" if content.startswith(b"# vtk DataFile") else "none"
+    readers = {
+        "legacy": vtkGenericDataObjectReader,
+        "PolyData": vtkXMLPolyDataReader,
+        "UnstructuredGrid": vtkXMLUnstructuredGridReader,
+    }
+    if kind not in readers:
+        what = f"it holds {kind}" if xml else "it does not start like one" if content else "it is empty"
+        raise InputError(f"{path} must be a VTK file of PolyData or UnstructuredGrid, but {what}.")
+    if xml and b"</VTKFile>" not in content[-4096:]:  # VTK may fill in what is missing of appended data
+        raise _damaged(path, "its closing tag </VTKFile> is missing")
+    if fault := "" if xml else legacy_fault(content):
+        raise _damaged(path, fault)
+    reader = readers[kind]()
+    reader.SetFileName(str(path))
+    reader.Update()
+    return reader.GetOutput()
+
+
+def _surface(path: Path, data: Any) -> Any:
+    """`data` as vtkPolyData, points in their order; of solid cells the boundary."""
+    from vtkmodules.vtkFiltersGeometry import vtkGeometryFilter
+
+    if data is None or not data.IsA("vtkPointSet"):
+        kind = "nothing" if data is None else data.GetClassName()
+        raise InputError(f"{path} must hold a surface (PolyData or UnstructuredGrid), but it holds {kind}.")
+    count = data.GetNumberOfPoints()
+    if count == 0 or data.GetNumberOfCells() == 0:
+        raise _damaged(path, f"it holds {count} points and {data.GetNumberOfCells()} cells")
+    if not (data.IsA("vtkPolyData") or data.IsA("vtkUnstructuredGrid")):
+        kind = data.GetClassName()
+        raise InputError(f"{path} must hold PolyData or an UnstructuredGrid, but it holds {kind}.")
+    if fault := cells_fault(data):
+        raise _damaged(path, fault)
+    if data.IsA("vtkPolyData"):
+        return data
+    flat = _flat_cells(data)
+    if flat is not None:
+        return flat
+    boundary = vtkGeometryFilter()
+    boundary.SetInputData(data)
+    boundary.Update()
+    return boundary.GetOutput()
+
+
+def _flat_cells(grid: Any) -> Any | None:
+    """An unstructured grid's flat cells as vtkPolyData; None unless they are all strips, or none is."""
+    from vtkmodules.vtkCommonDataModel import vtkPolyData
+
+    kinds = set(_array(grid.GetDistinctCellTypesArray()).tolist())
+    if not kinds <= set(FLAT_CELLS) or (STRIP in kinds and len(kinds) > 1):
+        return None
+    surface = vtkPolyData()
+    surface.SetPoints(grid.GetPoints())
+    (surface.SetStrips if STRIP in kinds else surface.SetPolys)(grid.GetCells())
+    return surface
+
+
+def _checked_points(path: Path, surface: Any) -> np.ndarray:
+    """The surface's points [P, 3] in the file's unit, all finite."""
+    points = _array(surface.GetPoints().GetData()).astype(np.float64)
+    bad = int((~np.isfinite(points)).any(axis=1).sum())
+    require(bad == 0, f"{path}: point coordinates must be finite, but {bad} of {len(points)} points are not.")
+    return points
+
+
+def _triangles(surface: Any) -> np.ndarray:
+    """Triangles [F, 3] of a vtkPolyData's polygons and strips; its lines and loose points are left out."""
+    from vtkmodules.vtkFiltersCore import vtkTriangleFilter
+
+    cut = vtkTriangleFilter()
+    cut.PassLinesOff()
+    cut.PassVertsOff()
+    cut.SetInputData(surface)
+    cut.Update()
+    polygons = cut.GetOutput().GetPolys()
+    return _array(polygons.GetConnectivityArray()).reshape(-1, 3).astype(np.int64)
+
+
+def _array(vtk_array: Any) -> np.ndarray:
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    return vtk_to_numpy(vtk_array)
+
+
+def _ends_within_a_line(path: Path) -> bool:
+    """Whether a legacy ASCII file lacks its last line's end: its last number may be cut, unseen by VTK."""
+    with path.open("rb") as file:
+        head = file.read(1024).split(b"\n", 3)
+        file.seek(-1, 2)
+        last = file.read(1)
+    return len(head) > 2 and head[2].strip().upper() == b"ASCII" and not last.isspace()
+
+
+def _is_closed(faces: np.ndarray) -> bool:
+    sides = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    return bool((np.unique(sides, axis=0, return_counts=True)[1] == 2).all())
+
+
+@contextmanager
+def _quiet() -> Iterator[Callable[[], str]]:
+    """VTK's messages kept off stderr; yields a function that tells the first error so far ("" if none)."""
+    from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkStringOutputWindow
+
+    window, before = vtkStringOutputWindow(), vtkOutputWindow.GetInstance()
+    verbosity = vtkLogger.GetCurrentVerbosityCutoff()
+    vtkOutputWindow.SetInstance(window)
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_OFF)
+    try:
+        yield lambda: _first_error(window.GetOutput())
+    finally:
+        vtkLogger.SetStderrVerbosity(verbosity)
+        vtkOutputWindow.SetInstance(before)
+
+
+def _first_error(messages: str | bytes) -> str:
+    """The first error in VTK's output, which reads 'ERROR: In file, line n', then 'class (address): text'.
+
+    Reading past the end is a "Generic Warning"; plain warnings (a newer file version) do no harm.
+    """
+    if isinstance(messages, bytes):  # it quotes bytes of the file that are no text
+        messages = messages.decode(errors="replace")
+    found = re.search(r"(?:ERROR|Generic Warning): In [^\n]*\n(?:\w+ \(0x[0-9a-f]+\): )?([^\n]*)", messages)
+    return found.group(1).split(" for file:")[0].strip(" .!") if found else ""

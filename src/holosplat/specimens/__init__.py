@@ -1,0 +1,1 @@
+"""Truth objects: meshes made closed, and red blood cells by their published shape."""

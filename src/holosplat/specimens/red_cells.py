@@ -1,0 +1,287 @@
+"""Red blood cells by their published shape, deformed mildly and placed at random without overlap.
+
+The resting shape is that of Evans & Fung (1972, Microvasc. Res. 4, 335): thickness at radius r, with
+t = (r/R)², `D(r) = sqrt(1 - t) (C0 + C1 t + C2 t²)`, R = 3.91 µm, (C0, C1, C2) = (0.81, 7.83, -4.39) µm
+at 300 mosmol: volume 94 µm³, area 135 µm², thickness 0.81 µm in the middle and 2.58 µm at most. Written as
+the image of the unit sphere, `(X, Y, Z) -> (R X, R Y, Z (C0 + C1 t + C2 t²)/2)` with t = X² + Y², it is
+smooth at the rim, has a mesh without poles, and its inverse is an exact test of what is inside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..checks import InputError, finite, in_range, require, shaped
+from ..mesh import TriangleMesh
+
+RADIUS = 3.91e-6
+THICKNESS = (0.81e-6, 7.83e-6, -4.39e-6)
+DIAMETER = 2 * RADIUS
+"""Mean diameter of a resting human red cell, 7.82 µm; cells of another diameter are scaled as a whole."""
+MAX_DEFORM = 0.1
+TRIES = 2000
+COARSE_POINTS, FINE_LEVEL = 162, 4
+"""Overlap is tested on the vertices of a level-4 icosphere; the first 162 (its level 2) reject quickly."""
+
+
+@dataclass(frozen=True, eq=False)
+class RedCell:
+    """One cell: size, pose and bending. Bending and stretch keep the volume exactly (unit Jacobian).
+
+    diameter: of the undeformed cell [m]; rotation: [3, 3] and centre: [3] (metres), with
+    `x = rotation @ x_cell + centre` and the cell's axis along its own z; stretch: logarithm of the stretch
+    along the cell's x and of the shrinkage along its y; bend: [5] amplitudes, in radii, of the mid-plane's
+    bending (Zernike's bowl, two saddles, two trefoils, each of unit root mean square over the disc).
+    """
+
+    diameter: float = DIAMETER
+    rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
+    centre: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    stretch: float = 0.0
+    bend: np.ndarray = field(default_factory=lambda: np.zeros(5))
+
+    def __post_init__(self) -> None:
+        in_range("cell diameter", self.diameter, 1e-9, 1.0, unit="metres")
+        for name, shape in (("rotation", (3, 3)), ("centre", (3,)), ("bend", (5,))):
+            array = np.asarray(getattr(self, name), dtype=np.float64)
+            object.__setattr__(self, name, finite(f"cell {name}", shaped(f"cell {name}", array, shape)))
+
+    def surface(self, sphere: np.ndarray) -> np.ndarray:
+        """Object-frame points [..., 3] (metres) of the unit-sphere points `sphere` [..., 3]."""
+        x, y, z = np.moveaxis(sphere, -1, 0)
+        z = z * _half_thickness(x**2 + y**2)
+        x, y = x * np.exp(self.stretch), y * np.exp(-self.stretch)
+        bent = np.stack([x, y, z + _bending(x, y, self.bend)], axis=-1)
+        return 0.5 * self.diameter * bent @ self.rotation.T + self.centre
+
+    def level(self, points: np.ndarray) -> np.ndarray:
+        """Where `points` [..., 3] (metres) lie, [...]: below 1 inside, 1 on the surface, above 1 outside."""
+        local = (points - self.centre) @ self.rotation / (0.5 * self.diameter)
+        x, y, z = np.moveaxis(local, -1, 0)
+        z = z - _bending(x, y, self.bend)
+        x, y = x * np.exp(-self.stretch), y * np.exp(self.stretch)
+        t = x**2 + y**2
+        return np.sqrt(t + (z / _half_thickness(np.minimum(t, 1.0))) ** 2)
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        """Whether object-frame `points` [..., 3] (metres) lie inside the smooth cell: [...] bool."""
+        return self.level(points) < 1
+
+    def mesh(self, subdivisions: int = 3, name: str = "red cell") -> TriangleMesh:
+        """Closed mesh, wound outwards, of 10·4^s + 2 vertices (642 for s = 3) on the smooth surface."""
+        sphere, faces = icosphere(subdivisions)
+        return TriangleMesh(self.surface(sphere), faces, name)
+
+
+def evans_fung_cell(diameter: float = DIAMETER, subdivisions: int = 3) -> TriangleMesh:
+    """A resting red cell of `diameter` [m], its axis along z: a closed mesh of 10·4^s + 2 vertices."""
+    return RedCell(diameter).mesh(subdivisions)
+
+
+def random_cells(
+    count: int,
+    box: tuple[float, float, float],
+    seed: int | np.random.Generator = 0,
+    diameter: float = DIAMETER,
+    deform: float = 0.03,
+    margin: float | None = None,
+    shape: str = "cylinder",
+) -> list[TriangleMesh]:
+    """Meshes (642 vertices each, named cell00, cell01, …) of `place_cells`, which explains the arguments."""
+    cells = place_cells(count, box, seed, diameter, deform, margin, shape)
+    return [cell.mesh(name=f"cell{i:02d}") for i, cell in enumerate(cells)]
+
+
+def place_cells(
+    count: int,
+    box: tuple[float, float, float],
+    seed: int | np.random.Generator = 0,
+    diameter: float = DIAMETER,
+    deform: float = 0.03,
+    margin: float | None = None,
+    shape: str = "cylinder",
+) -> list[RedCell]:
+    """`count` cells, turned and placed uniformly at random in a channel about the origin, none touching.
+
+    box: the channel's extents `(x, y, z)` [m]; seed: makes the result reproducible; diameter: of a cell [m];
+    deform: typical root-mean-square bending, in diameters, from 0 (rigid) to 0.1; at 0.03 the area
+    grows by 1 % on average and 5 % at most; margin: clear distance [m] between cells and to the walls,
+    by default 2 % of the diameter; shape: "box", or "cylinder" about y of diameter min(x, z), which
+    every tomographic view sees whole. `InputError` when the cells do not fit, after `TRIES` random
+    tries for one cell.
+    """
+    margin = 0.02 * diameter if margin is None else margin
+    _check_channel(count, box, diameter, deform, margin, shape)
+    rng = np.random.default_rng(seed)
+    placed: list[_Placed] = []
+    for _ in range(count):
+        resting = _Placed.resting(diameter, margin, deform, rng)
+        for _ in range(TRIES):
+            turned = resting.moved(_random_rotation(rng), np.zeros(3))
+            centre = _random_centre(turned.points, box, margin, shape, rng)
+            if centre is None:
+                continue
+            candidate = turned.moved(np.eye(3), centre)
+            if not _overlaps_any(candidate, placed):
+                placed.append(candidate)
+                break
+        else:
+            raise InputError(
+                f"{count} red cells of {1e6 * diameter:.4g} µm must fit into the {shape} of "
+                f"{' x '.join(f'{1e6 * b:.4g}' for b in box)} µm, but only {len(placed)} found a place; "
+                "take fewer or smaller cells, a larger box or a smaller margin."
+            )
+    return [cell.cell for cell in placed]
+
+
+@lru_cache(maxsize=8)
+def icosphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices [10·4^s + 2, 3] on the unit sphere and faces [20·4^s, 3], wound outwards (read-only arrays).
+
+    The vertices of each coarser level come first. `InputError` unless `subdivisions` is in 0 … 7.
+    """
+    if not isinstance(subdivisions, (int, np.integer)) or not 0 <= subdivisions <= 7:
+        raise InputError(f"subdivisions must be a whole number from 0 to 7, but it is {subdivisions!r}.")
+    if subdivisions == 0:
+        vertices, faces = _icosahedron()
+    else:
+        coarse, triangles = icosphere(subdivisions - 1)
+        sides = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1), axis=-1)
+        edges, index = np.unique(sides.reshape(-1, 2), axis=0, return_inverse=True)
+        middles = coarse[edges].sum(1)
+        vertices = np.concatenate([coarse, middles / np.linalg.norm(middles, axis=1, keepdims=True)])
+        (a, b, c), (ab, bc, ca) = triangles.T, len(coarse) + index.reshape(-1, 3).T
+        faces = np.stack([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]], axis=0)
+        faces = faces.transpose(2, 0, 1).reshape(-1, 3)
+    vertices.flags.writeable = faces.flags.writeable = False
+    return vertices, faces
+
+
+def _icosahedron() -> tuple[np.ndarray, np.ndarray]:
+    """The 12 vertices (0, ±1, ±golden ratio) and cyclic, and the 20 faces, wound outwards."""
+    golden = (1 + 5**0.5) / 2
+    signs = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]]) * [1.0, golden]
+    flat = np.concatenate([np.zeros((4, 1)), signs], axis=1)
+    vertices = np.concatenate([np.roll(flat, shift, axis=1) for shift in range(3)])
+    triples = np.stack(np.meshgrid(*[np.arange(12)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    corners = vertices[triples]
+    sides = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
+    outward = np.linalg.det(corners) > 0
+    rotated = triples[:, 0] == triples.min(1)  # one of the three cyclic orders
+    faces = triples[np.isclose(sides, 2).all(1) & outward & rotated]
+    return vertices / np.linalg.norm(vertices[0]), faces
+
+
+def _half_thickness(t: np.ndarray) -> np.ndarray:
+    """(C0 + C1 t + C2 t²)/2 in radii: half the thickness of Evans & Fung without its root."""
+    c0, c1, c2 = (0.5 * c / RADIUS for c in THICKNESS)
+    return c0 + t * (c1 + t * c2)
+
+
+def _bending(x: np.ndarray, y: np.ndarray, bend: np.ndarray) -> np.ndarray:
+    """Height of the bent mid-plane at `(x, y)`, in radii: Zernike's Z4, Z5, Z6, Z9, Z10 in Noll's order."""
+    if not bend.any():
+        return np.zeros_like(x)
+    xx, yy = x * x, y * y
+    bowl = 3**0.5 * (2 * (xx + yy) - 1)
+    saddles = 6**0.5 * (bend[1] * 2 * x * y + bend[2] * (xx - yy))
+    trefoils = 8**0.5 * (bend[3] * (3 * xx - yy) * y + bend[4] * (xx - 3 * yy) * x)
+    return bend[0] * bowl + saddles + trefoils
+
+
+@dataclass(frozen=True, eq=False)
+class _Placed:
+    """A cell with the points that test it against others: on its surface, and a margin outside it."""
+
+    cell: RedCell
+    points: np.ndarray
+    outer: np.ndarray
+    reach: float
+
+    @classmethod
+    def resting(cls, diameter: float, margin: float, deform: float, rng: np.random.Generator) -> _Placed:
+        """A randomly deformed cell at the origin."""
+        weights = np.array([1, 1, 1, 0.5, 0.5]) / 3.5**0.5
+        bend = 2 * deform * weights * rng.standard_normal(5)
+        cell = RedCell(diameter, stretch=deform * rng.standard_normal(), bend=bend)
+        mesh = cell.mesh(FINE_LEVEL)
+        outer = mesh.vertices + margin * _vertex_normals(mesh)
+        reach = float(np.linalg.norm(np.concatenate([mesh.vertices, outer]), axis=1).max())
+        return cls(cell, mesh.vertices, outer, reach)
+
+    def moved(self, rotation: np.ndarray, translation: np.ndarray) -> _Placed:
+        """Turned about the origin, then shifted."""
+        cell = self.cell
+        cell = replace(cell, rotation=rotation @ cell.rotation, centre=rotation @ cell.centre + translation)
+        points, outer = (p @ rotation.T + translation for p in (self.points, self.outer))
+        return _Placed(cell, points, outer, self.reach)
+
+
+def _overlaps_any(candidate: _Placed, placed: list[_Placed]) -> bool:
+    """Whether `candidate` comes closer than the margin to any cell of `placed`.
+
+    Where two smooth bodies come closest they share the normal, so a point of one, moved the margin outwards,
+    lies inside the other if they are closer than that; level-4 vertices are 1/50 of a diameter apart.
+    """
+    if not placed:
+        return False
+    distance = np.linalg.norm([p.cell.centre - candidate.cell.centre for p in placed], axis=1)
+    near = [p for p, d in zip(placed, distance) if d < p.reach + candidate.reach]
+    for count in (COARSE_POINTS, None):
+        for other in near:
+            for a, b in ((candidate, other), (other, candidate)):
+                probes = np.concatenate([a.points[:count], a.outer[:count]])
+                if b.cell.contains(probes).any():
+                    return True
+    return False
+
+
+def _random_centre(
+    points: np.ndarray, box: tuple[float, float, float], margin: float, shape: str, rng: np.random.Generator
+) -> np.ndarray | None:
+    """A uniform random place [3] that keeps `points` [P, 3] inside the channel, or None (try again)."""
+    half = np.asarray(box, dtype=np.float64) / 2 - margin
+    if shape == "box":
+        low, high = -half - points.min(0), half - points.max(0)
+        return rng.uniform(low, high) if np.all(low <= high) else None
+    radius = min(half[0], half[2])
+    centre = rng.uniform([-radius, -half[1], -radius], [radius, half[1], radius]) if radius > 0 else None
+    if centre is None or half[1] <= 0:
+        return None
+    x, y, z = (points + centre).T
+    return centre if np.max(x**2 + z**2) <= radius**2 and np.max(np.abs(y)) <= half[1] else None
+
+
+def _random_rotation(rng: np.random.Generator) -> np.ndarray:
+    """A uniformly distributed rotation [3, 3] (a normalised 4D Gaussian is a uniform unit quaternion)."""
+    return Rotation.from_quat(rng.standard_normal(4)).as_matrix()
+
+
+def _vertex_normals(mesh: TriangleMesh) -> np.ndarray:
+    """Outward unit normals [P, 3], averaged over the triangles about each vertex by area."""
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    of_face = np.repeat(np.cross(b - a, c - a), 3, axis=0)
+    corner = mesh.faces.reshape(-1)
+    sums = [np.bincount(corner, weights=of_face[:, i], minlength=len(mesh.vertices)) for i in range(3)]
+    normals = np.stack(sums, axis=1)
+    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def _check_channel(
+    count: int, box: tuple[float, float, float], diameter: float, deform: float, margin: float, shape: str
+) -> None:
+    whole = isinstance(count, (int, np.integer)) and count >= 1
+    require(whole, f"the number of red cells must be a whole number of at least 1, but it is {count!r}.")
+    require(len(box) == 3, f"box must be three extents (x, y, z) in metres, but it is {box!r}.")
+    for axis, extent in zip("xyz", box):
+        in_range(f"box extent {axis}", extent, 1e-9, 10.0, unit="metres")
+    in_range("cell diameter", diameter, 1e-9, 1.0, unit="metres")
+    require(0 <= deform <= MAX_DEFORM, f"deform must lie between 0 and {MAX_DEFORM}, but it is {deform!r}.")
+    require(
+        0 <= margin < diameter, f"margin must lie between 0 and the cell diameter, but it is {margin!r} m."
+    )
+    require(shape in ("box", "cylinder"), f"shape must be 'box' or 'cylinder', but it is {shape!r}.")

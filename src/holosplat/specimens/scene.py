@@ -1,0 +1,73 @@
+"""A scene of closed triangle meshes, each filled with one material: the truth that simulations start from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from torch import Tensor
+
+from ..checks import require
+from ..geometry import Grid, Views
+from ..materials import DeltaBeta
+from ..mesh import TriangleMesh
+from ..projectors.mesh import mesh_line_integrals, voxelise_meshes
+from ..volume import Volume
+
+
+@dataclass(frozen=True)
+class MeshScene:
+    """Closed, outward-oriented meshes (see `specimens.repair.closed`) and the δ, β inside each of them."""
+
+    meshes: tuple[TriangleMesh, ...]
+    materials: tuple[DeltaBeta, ...]
+
+    @classmethod
+    def of_one_material(cls, meshes: Sequence[TriangleMesh], material: DeltaBeta) -> MeshScene:
+        """All meshes filled with the same δ, β."""
+        return cls(tuple(meshes), (material,) * len(meshes))
+
+    def __post_init__(self) -> None:
+        require(len(self.meshes) > 0, "a scene needs at least one mesh.")
+        require(len(self.meshes) == len(self.materials), "a scene needs one material for each mesh.")
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner `(x, y, z)` [m] of all meshes together."""
+        low, high = zip(*(mesh.bounds for mesh in self.meshes))
+        return np.min(low, axis=0), np.max(high, axis=0)
+
+    def moved(self, translation: np.ndarray) -> MeshScene:
+        """The scene shifted by `translation` (x, y, z) [m]."""
+        return MeshScene(tuple(m.transformed(np.eye(3), translation) for m in self.meshes), self.materials)
+
+    def at(self, time: float) -> MeshScene:
+        """The scene itself: it does not move."""
+        return self
+
+    def project(self, views: Views) -> tuple[Tensor, Tensor]:
+        """Line integrals (B, D) [V, H, W] in metres, float64, `2 × 2` rays a pixel."""
+        vertices, faces, values = self._soup()
+        delta, beta = mesh_line_integrals(vertices, faces, values, views)
+        return beta, delta
+
+    def voxelise(self, grid: Grid) -> Volume:
+        """δ and β averaged over voxels (partial occupancy at surfaces)."""
+        delta, beta = voxelise_meshes(*self._soup(), grid)
+        return Volume(delta, beta, grid)
+
+    def missing_field(self, views: Views) -> float:
+        """How far [m] the scene reaches beyond the detector in the worst view (0 or less: it fits)."""
+        vertices = np.concatenate([m.vertices for m in self.meshes])
+        lab = np.einsum("vij,pj->vpi", views.rotations, vertices)[..., :2] - views.shifts[:, None]
+        half = 0.5 * np.array([views.width, views.height])
+        return float((np.abs(lab) - half).max())
+
+    def _soup(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """All meshes as one: vertices [P, 3], faces [F, 3], and (δ, β) of each face's body [2, F]."""
+        offsets = np.cumsum([0] + [len(m.vertices) for m in self.meshes[:-1]])
+        faces = np.concatenate([m.faces + o for m, o in zip(self.meshes, offsets)])
+        counts = [len(m.faces) for m in self.meshes]
+        values = np.repeat(np.array(self.materials, dtype=np.float64).T, counts, axis=1)
+        return np.concatenate([m.vertices for m in self.meshes]), faces, values
