@@ -1,0 +1,114 @@
+"""The start of a reconstruction: one material's occupancy from a few holograms, on voxels.
+
+Paganin retrieval of each view, then total-variation tomography with the occupancy kept in [0, 1], then a few
+corrections that make the volume agree with the holograms themselves: single-view retrieval leaves errors at low
+frequencies that only consistency between views can mend.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate, pad
+
+from ..checks import require
+from ..forward import Instrument, resolving_oversample
+from ..geometry import Grid, Views
+from ..materials import DeltaBeta
+from ..optics.retrieval import invert_contrast, retrieve_thickness
+from ..projectors.voxels import projector_for
+from ..scan import Scan
+from .primal_dual import PrimalDual
+
+
+@dataclass(frozen=True)
+class HolographicTV:
+    """Options. weight: of total variation, in pixels of path length; iterations: primal–dual steps on the retrieved
+    thickness; corrections: rounds of agreement with the holograms, of `inner` steps each; refine: voxels along a
+    pixel's edge (0: as the first fringe needs); max_voxels: coarser voxels rather than more than this many;
+    upper: bound of the occupancy (0: none).
+    """
+
+    weight: float = 0.3
+    iterations: int = 100
+    corrections: int = 6
+    inner: int = 20
+    refine: int = 0
+    max_voxels: int = 20_000_000
+    upper: float = 1.0
+
+
+def holographic_tv(
+    scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Callable[[str, float], None]
+) -> tuple[Tensor, Grid]:
+    """Occupancy [Z, Y, X] of `material` (δ > 0, β of any sign) from the frames of `scan`, and its grid.
+
+    `on_progress(stage, fraction)` is called between pieces of work.
+    """
+    require(options.iterations > 0, f"iterations must be positive, but it is {options.iterations}.")
+    scan, refine = _working_resolution(scan, options)
+    exposures, pitch = scan.exposures, scan.views.pixel_size
+    frames = torch.from_numpy(scan.frames)
+    physics = (pitch, exposures.distance, exposures.energy_kev, material.delta, material.beta)
+    on_progress("phase retrieval", 0.0)
+    lines = retrieve_thickness(frames, *physics) / pitch
+
+    views = _in_pixels(scan.views)
+    grid = Grid.of_views(views)
+    upper = options.upper if options.upper > 0 else None
+    solver = PrimalDual(projector_for(grid, views), torch.zeros(grid.shape), options.weight, upper)
+    for done in range(0, options.iterations, 10):
+        on_progress("tomography", done / options.iterations)
+        solver.run(lines, min(10, options.iterations - done))
+    volume = solver.volume
+
+    if options.corrections > 0:
+        instrument = Instrument(exposures, refine)
+        fine_views, fine = views.refined(refine), Grid.of_views(views, refine)
+        start = interpolate(volume[None, None], size=fine.shape, mode="trilinear", align_corners=False)[0, 0]
+        solver = PrimalDual(projector_for(fine, fine_views), start, options.weight, upper, coupling=1 / refine**2)
+        for done in range(options.corrections):
+            on_progress("agreement with the holograms", done / options.corrections)
+            lines = solver.lines()
+            missing = frames - _image(instrument, lines * pitch, material)
+            change = invert_contrast(missing, *physics) / pitch
+            solver.run(lines + _refined(change, refine), options.inner)
+        volume, grid = solver.volume, fine
+    on_progress("done", 1.0)
+    return volume, _in_metres(grid, pitch)
+
+
+def _working_resolution(scan: Scan, options: HolographicTV) -> tuple[Scan, int]:
+    """The scan, binned if its voxels would be too many, and the voxels along a pixel's edge."""
+    refine = options.refine or resolving_oversample(scan.exposures, 1.5, at_least=1)
+    h, w = scan.views.shape
+    while refine > 1 and w * w * h * refine**3 > options.max_voxels:
+        refine -= 1
+    factor = 1
+    while w * w * h / factor**3 > options.max_voxels:
+        factor += 1
+    return scan.binned(factor), refine
+
+
+def _image(instrument: Instrument, lines: Tensor, material: DeltaBeta) -> Tensor:
+    """Frames from thickness [V, H, W] in metres on the unpadded raster (matter outside it counts as none)."""
+    (my, mx), s = instrument.margin, instrument.oversample
+    padded = pad(lines, (mx * s, mx * s, my * s, my * s))
+    return instrument.image(padded * material.beta, padded * material.delta)
+
+
+def _refined(images: Tensor, factor: int) -> Tensor:
+    return interpolate(images[None], scale_factor=factor, mode="bilinear", align_corners=False)[0]
+
+
+def _in_pixels(views: Views) -> Views:
+    """The same views with the pixel as the unit of length."""
+    return Views(views.rotations, views.shifts / views.pixel_size, views.shape, 1.0)
+
+
+def _in_metres(grid: Grid, pitch: float) -> Grid:
+    size, origin = ([v * pitch for v in values] for values in (grid.voxel_size, grid.origin))
+    return Grid(grid.shape, (size[0], size[1], size[2]), (origin[0], origin[1], origin[2]))

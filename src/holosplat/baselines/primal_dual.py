@@ -1,0 +1,109 @@
+"""Total-variation tomography with a box on the values, by a preconditioned primal–dual method."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from ..projectors import native
+
+
+class LinearProjector(Protocol):
+    """A linear map from volumes to line integrals, and its adjoint, on arrays in an order of its own choice."""
+
+    array_shape: tuple[int, int, int]
+
+    def project(self, array: Tensor) -> Tensor:
+        """Volume → line integrals."""
+        ...
+
+    def backproject(self, lines: Tensor) -> Tensor:
+        """The adjoint: line integrals → volume."""
+        ...
+
+    def volume_in(self, volume: Tensor) -> Tensor:
+        """[Z, Y, X] → the projector's order."""
+        ...
+
+    def volume_out(self, array: Tensor) -> Tensor:
+        """The projector's order → [Z, Y, X]."""
+        ...
+
+    def lines_in(self, images: Tensor) -> Tensor:
+        """[V, H, W] → the projector's order."""
+        ...
+
+    def lines_out(self, lines: Tensor) -> Tensor:
+        """The projector's order → [V, H, W]."""
+        ...
+
+
+class PrimalDual:
+    """`min_u ½‖A u - b‖² + λ Σ|∇u|` with `0 ≤ u ≤ upper`, warm-started from call to call; float32.
+
+    Chambolle & Pock (2011), algorithm 1, with the diagonal steps of Pock & Chambolle (2011), eq. 10 (α = 1).
+    `coupling` scales the gradient operator against the projector and changes only how fast it converges.
+    Lengths are in voxels or pixels, as the projector has them; `upper=None` bounds from below only.
+    """
+
+    def __init__(
+        self, projector: LinearProjector, start: Tensor, weight: float, upper: float | None, coupling: float = 1.0
+    ) -> None:
+        self.projector, self.coupling = projector, coupling
+        self.radius = weight / coupling
+        self.upper = float("inf") if upper is None else upper
+        self._array = projector.volume_in(start).float().contiguous().clone()
+        path = projector.project(torch.ones_like(self._array)).clamp_min(1e-3)
+        self._dual_step = 1 / path
+        self._primal_step = 1 / (projector.backproject(torch.ones_like(path)) + 6 * coupling)
+        self._extrapolated = self._array.clone()
+        self._residual_dual = torch.zeros_like(path)
+        self._gradient_dual = self._array.new_zeros(3, *self._array.shape)
+
+    @property
+    def volume(self) -> Tensor:
+        """The volume [Z, Y, X] as it is now."""
+        return self.projector.volume_out(self._array)
+
+    def lines(self) -> Tensor:
+        """Line integrals [V, H, W] of the volume as it is now."""
+        return self.projector.lines_out(self.projector.project(self._array))
+
+    def run(self, images: Tensor, iterations: int) -> None:
+        """`iterations` more steps towards the volume that explains the line integrals [V, H, W]."""
+        lines = self.projector.lines_in(images)
+        for _ in range(iterations):
+            difference = self.projector.project(self._extrapolated) - lines
+            self._residual_dual = (self._residual_dual + self._dual_step * difference) / (1 + self._dual_step)
+            # σ = 1 / (2 coupling) for the gradient's rows, so that σ · coupling = ½
+            tv_ascend(self._extrapolated, self._gradient_dual, 0.5, self.radius)
+            slope = self.projector.backproject(self._residual_dual)
+            tv_descend(
+                slope, self._primal_step, self._gradient_dual, self.coupling, self.upper, self._array, self._extrapolated
+            )
+
+
+def tv_ascend(u: Tensor, q: Tensor, step: float, radius: float) -> None:
+    """q [3, Z, Y, X] ← projection of `q + step ∇u` onto balls of `radius`; forward differences, in place."""
+    native.call("holosplat_tv_ascend", _grid(u), _pointer(u), _pointer(q), step, radius, torch.get_num_threads())
+
+
+def tv_descend(
+    slope: Tensor, tau: Tensor, q: Tensor, coupling: float, upper: float, u: Tensor, extrapolated: Tensor
+) -> None:
+    """u ← `clamp(u - tau (slope + coupling ∇ᵀq), 0, upper)`, extrapolated ← `2 u_new - u_old`, in place."""
+    arrays = [_pointer(a) for a in (slope, tau, q)]
+    moved = [_pointer(a) for a in (u, extrapolated)]
+    native.call("holosplat_tv_descend", _grid(u), *arrays, coupling, upper, *moved, torch.get_num_threads())
+
+
+def _grid(volume: Tensor) -> native.Grid:
+    return native.Grid(*volume.shape)
+
+
+def _pointer(array: Tensor) -> native.c_void_p:
+    assert array.dtype == torch.float32
+    assert array.is_contiguous()
+    return native.c_void_p(array.data_ptr())

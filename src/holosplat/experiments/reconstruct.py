@@ -1,0 +1,161 @@
+"""`reconstruct`: a scan in, a fitted cloud and its run folder out."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+
+from ..checks import require
+from ..fit.loop import Fit, Record, split_validation
+from ..representations import GaussianCloud
+from ..scan import Scan
+from .run_folder import RunFolder, environment, read_gaussians, read_json, scan_hash, write_gaussians, write_json
+from .settings import MaterialPrior, Settings
+from .start import starting_cloud
+
+CHECKPOINT_SECONDS = 20.0
+
+Progress = Callable[[str, float, Record], None]
+"""Called with (stage, fraction done of the stage, the last record of the fit or {})."""
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A fitted cloud, the wave sampling it was fitted with, and how long each stage took [s]."""
+
+    cloud: GaussianCloud
+    oversample: int
+    timing: dict[str, float]
+    finished: bool
+
+
+def reconstruct(
+    scan: Scan,
+    prior: MaterialPrior,
+    settings: Settings,
+    seed: int = 0,
+    *,
+    folder: RunFolder | None = None,
+    resume: bool = False,
+    on_progress: Progress = lambda stage, fraction, record: None,
+) -> Reconstruction:
+    """Fit Gaussians to the training frames of `scan`.
+
+    With a `folder`, everything is written there, and a later call with `resume=True` goes on from the last
+    checkpoint, with the same result as if nothing had happened. Ctrl-C (KeyboardInterrupt) ends the fit with
+    what it has reached (`finished` is False); during the start there is nothing yet, and it is passed on.
+    Errors: `InputError` for scans without training frames or matter, and for folders that do not fit.
+    """
+    train, _ = split_validation(scan.train(), settings.fit.schedule.validation_views)
+    checkpoint = _open_folder(folder, scan, prior, settings, seed, resume) if folder else None
+    timing: dict[str, float] = dict(checkpoint["timing"]) if checkpoint else {}
+    if checkpoint:
+        cloud = _cloud_of(checkpoint)
+    else:
+        began = time.perf_counter()
+        cloud = starting_cloud(train, prior, settings, seed, lambda stage, part: on_progress(stage, part, {}))
+        timing["start"] = time.perf_counter() - began
+    fit = Fit(scan, cloud, settings.fit, seed)
+    if checkpoint:
+        fit.load(checkpoint["fit"])
+    journal = _Journal(fit, timing, folder, on_progress)
+    try:
+        fit.run(journal.record)
+    except KeyboardInterrupt:
+        on_progress("interrupted", 1.0, {})
+    return journal.close()
+
+
+def load_reconstruction(folder: RunFolder) -> Reconstruction:
+    """What a run folder holds; `InputError` if it holds no reconstruction."""
+    folder.require_run()
+    summary = read_json(folder.summary)
+    timing = {name: float(value) for name, value in summary["timing_s"].items()}
+    return Reconstruction(
+        read_gaussians(folder.gaussians), int(summary["oversample"]), timing, bool(summary["finished"])
+    )
+
+
+class _Journal:
+    """Keeps the run folder up to date while a fit runs: metrics, checkpoints, and the result at the end."""
+
+    def __init__(self, fit: Fit, timing: dict[str, float], folder: RunFolder | None, on_progress: Progress) -> None:
+        self._fit, self._timing, self._folder, self._on_progress = fit, timing, folder, on_progress
+        self._pending: list[Record] = []
+        self._saved = time.perf_counter()
+        if folder is not None:
+            folder.start_metrics(fit.columns(), keep_until=fit.step)
+            self._save()
+
+    def record(self, record: Record) -> None:
+        """Take in one step's record."""
+        self._pending.append(record)
+        self._on_progress("fit", self._fit.step / self._fit.options.schedule.steps, record)
+        if time.perf_counter() - self._saved > CHECKPOINT_SECONDS:
+            self._save()
+
+    def close(self) -> Reconstruction:
+        """Save everything once more, with the result."""
+        self._timing["fit"] = self._fit.seconds
+        fit = self._fit
+        done = Reconstruction(fit.result(), fit.instrument.oversample, dict(self._timing), fit.finished)
+        if self._folder is not None:
+            self._save()
+            write_gaussians(self._folder.gaussians, done.cloud)
+            write_json(self._folder.summary, self._summary(done))
+        return done
+
+    def _summary(self, done: Reconstruction) -> dict[str, Any]:
+        fit, cloud = self._fit, done.cloud
+        (h, w), pitch = fit.train.views.shape, fit.train.views.pixel_size
+        return {
+            "finished": done.finished,
+            "steps": fit.step,
+            "stopped_early": fit.stopped_early,
+            "best_step": fit.best_step if fit.best_step else fit.step,
+            "gaussians": len(cloud),
+            "oversample": done.oversample,
+            "detector": {"rows": h, "columns": w, "pixel_size_m": pitch},
+            "energy_kev": fit.train.exposures.energy_kev,
+            "material": {"delta": cloud.delta, "beta": cloud.beta, "single": cloud.single_material},
+            "timing_s": done.timing,
+        }
+
+    def _save(self) -> None:
+        if self._folder is None:
+            return
+        self._folder.append_metrics(self._pending)
+        self._pending = []
+        cloud = self._fit.cloud
+        units = {"unit_length": cloud.unit_length, "delta": cloud.delta, "beta": cloud.beta}
+        self._folder.save_checkpoint({"fit": self._fit.state_dict(), "cloud": units, "timing": dict(self._timing)})
+        self._saved = time.perf_counter()
+
+
+def _cloud_of(checkpoint: dict[str, Any]) -> GaussianCloud:
+    parameters: list[torch.Tensor] = checkpoint["fit"]["trainable"]["parameters"]
+    return GaussianCloud(parameters, **checkpoint["cloud"])
+
+
+def _open_folder(
+    folder: RunFolder, scan: Scan, prior: MaterialPrior, settings: Settings, seed: int, resume: bool
+) -> dict[str, Any] | None:
+    """Prepare the folder; returns the checkpoint to resume from, if any."""
+    config = {"settings": asdict(settings), "prior": asdict(prior), "seed": seed, "scan_hash": scan_hash(scan)}
+    if not (resume and folder.config.is_file()):
+        folder.require_new()
+        folder.create()
+        write_json(folder.config, {**config, **environment()})
+        return None
+    old, same = folder.read_config(), json.loads(json.dumps(config))
+    for key, value in same.items():
+        require(
+            old.get(key) == value,
+            f"--resume needs the {key} that {folder.path} was started with; use the same options, or another --out.",
+        )
+    return folder.load_checkpoint()

@@ -1,0 +1,176 @@
+"""A run is a folder: config.json, metrics.csv, checkpoint.pt, gaussians.h5, summary.json, report.html."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import os
+import platform
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import torch
+
+from .. import __version__
+from ..checks import InputError, require
+from ..io.atomic import atomic_path
+from ..io.hdf5 import Fields, attribute_numbers, open_hdf5
+from ..representations.gaussians import PARAMETERS, GaussianCloud
+from ..scan import Scan
+
+FORMAT = "holosplat Gaussians 1"
+
+
+class RunFolder:
+    """The files of one reconstruction. Every file is replaced as a whole; metrics.csv only grows."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.config = self.path / "config.json"
+        self.metrics = self.path / "metrics.csv"
+        self.checkpoint = self.path / "checkpoint.pt"
+        self.gaussians = self.path / "gaussians.h5"
+        self.summary = self.path / "summary.json"
+        self.report = self.path / "report.html"
+        self._columns: list[str] = []
+
+    def require_new(self) -> None:
+        """`InputError` if something is there already."""
+        taken = self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir()))
+        require(not taken, f"--out must name a new or empty folder, but {self.path} holds files; choose another, or add --resume.")
+        parent = self.path.resolve().parent
+        require(parent.is_dir(), f"--out must lie in an existing folder, but {parent} is none; create it.")
+
+    def require_run(self) -> None:
+        """`InputError` unless the folder holds a reconstruction."""
+        require(self.path.is_dir(), f"the run folder {self.path} does not exist; check the path.")
+        found = self.config.is_file() and self.gaussians.is_file()
+        require(found, f"{self.path} must hold a reconstruction (config.json, gaussians.h5), but it does not.")
+
+    def create(self) -> None:
+        """Make the folder."""
+        self.path.mkdir(exist_ok=True)
+
+    def read_config(self) -> dict[str, Any]:
+        """What config.json holds."""
+        return read_json(self.config)
+
+    def start_metrics(self, columns: Iterable[str], keep_until: int = 0) -> None:
+        """Begin metrics.csv, or cut it back to the rows up to step `keep_until`."""
+        self._columns = list(columns)
+        rows = self.read_rows() if keep_until and self.metrics.exists() else []
+        with atomic_path(self.metrics) as temporary, temporary.open("w", newline="") as file:
+            writer = csv.DictWriter(file, self._columns, restval="", extrasaction="ignore")
+            writer.writeheader()
+            writer.writerows(row for row in rows if float(row["step"]) <= keep_until)
+
+    def append_metrics(self, records: list[dict[str, float]]) -> None:
+        """Add rows to metrics.csv."""
+        with self.metrics.open("a", newline="") as file:
+            writer = csv.DictWriter(file, self._columns, restval="", extrasaction="ignore")
+            writer.writerows({k: f"{v:.7g}" for k, v in record.items()} for record in records)
+
+    def read_rows(self) -> list[dict[str, str]]:
+        """The rows of metrics.csv as text."""
+        with self.metrics.open(newline="") as file:
+            return list(csv.DictReader(file))
+
+    def history(self) -> dict[str, np.ndarray]:
+        """The columns of metrics.csv as float64 (NaN where a row has no entry); empty if there is no file."""
+        rows = self.read_rows() if self.metrics.is_file() else []
+        names = rows[0].keys() if rows else ()
+        return {name: np.array([float(row[name] or "nan") for row in rows]) for name in names}
+
+    def save_checkpoint(self, state: dict[str, Any]) -> None:
+        """Replace checkpoint.pt."""
+        with atomic_path(self.checkpoint) as temporary:
+            torch.save(state, temporary)
+
+    def load_checkpoint(self) -> dict[str, Any] | None:
+        """The last checkpoint, or None; `InputError` if it cannot be read."""
+        if not self.checkpoint.is_file():
+            return None
+        try:
+            return torch.load(self.checkpoint, map_location="cpu", weights_only=True)
+        except Exception as error:  # torch raises many kinds for damaged files
+            raise InputError(f"{self.checkpoint} must be a checkpoint, but it is damaged; start anew without it.") from error
+
+
+def write_json(path: Path, values: dict[str, Any]) -> None:
+    """Write `values` as JSON, whole or not at all."""
+    text = json.dumps(values, indent=2, allow_nan=False)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text + "\n", encoding="utf-8")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON table; `InputError` if the file is missing or damaged."""
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} must be a readable JSON file, but it is not: {error}.") from error
+    require(isinstance(values, dict), f"{path} must hold a table, but it holds {type(values).__name__}.")
+    return values
+
+
+def write_gaussians(path: Path, cloud: GaussianCloud) -> None:
+    """Write a cloud: its parameters (float32, as the class documents them), `unit_length` [m], `delta` and `beta`."""
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs.update(
+            format=FORMAT, unit_length=cloud.unit_length, unit_length_units="m", delta=cloud.delta, beta=cloud.beta
+        )
+        for name, parameter in zip(PARAMETERS, cloud.parameters):
+            file[name] = parameter.detach().numpy()
+
+
+def read_gaussians(path: Path) -> GaussianCloud:
+    """The cloud that `write_gaussians` wrote; `InputError` if the file is damaged or no such file."""
+    with open_hdf5(path) as file:
+        fields = Fields(path, file)
+        arrays = [fields.numbers(fields.need(name)).astype(np.float32) for name in PARAMETERS]
+        unit, delta, beta = (
+            float(attribute_numbers(f"{path}: @{name}", file.attrs.get(name), (1,))[0])
+            for name in ("unit_length", "delta", "beta")
+        )
+    return GaussianCloud([torch.from_numpy(a) for a in arrays], unit, delta, beta)
+
+
+def scan_hash(scan: Scan) -> str:
+    """A short fingerprint (SHA-256) of the frames and how they were taken."""
+    digest = hashlib.sha256()
+    exposures = scan.exposures
+    parts = (scan.frames, scan.is_test, scan.views.rotations, scan.views.shifts, exposures.distance, exposures.psf_sigma_px)
+    for array in parts:
+        digest.update(np.ascontiguousarray(array).tobytes())
+    digest.update(repr((scan.views.pixel_size, exposures.energy_kev)).encode())
+    return digest.hexdigest()[:16]
+
+
+def environment() -> dict[str, dict[str, str]]:
+    """Versions and machine, for config.json."""
+    return {
+        "versions": {
+            "holosplat": __version__,
+            "python": platform.python_version(),
+            "torch": torch.__version__,
+            "numpy": np.__version__,
+        },
+        "machine": {
+            "system": platform.platform(),
+            "processor": _processor(),
+            "threads": f"{torch.get_num_threads()} of {os.cpu_count()} cores",
+            "device": "cpu",
+        },
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()

@@ -1,0 +1,124 @@
+"""What a reconstruction is asked to do: settings, presets, and the file `config.json`."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal, get_type_hints
+
+from ..baselines import HolographicTV
+from ..checks import InputError, require
+from ..fit.density import DensityControl
+from ..fit.loop import FitOptions
+from ..fit.objective import THESIS, Objective
+from ..fit.schedule import Schedule
+from ..materials import DeltaBeta
+
+
+@dataclass(frozen=True)
+class MaterialPrior:
+    """What is known of the matter: its δ and β (`known`), only their `ratio`, or nothing (`free`).
+
+    delta, beta: of the material against its medium (β of either sign); ratio: δ/β.
+    """
+
+    kind: Literal["known", "ratio", "free"] = "free"
+    delta: float = 0.0
+    beta: float = 0.0
+    ratio: float = 0.0
+
+    @classmethod
+    def known(cls, material: DeltaBeta) -> MaterialPrior:
+        """One material whose δ (above zero) and β are known."""
+        require(
+            material.delta > 0,
+            f"the material must have δ above its medium's, but the difference is {material.delta:.3g}; "
+            "exchange the two.",
+        )
+        return cls("known", material.delta, material.beta)
+
+    @classmethod
+    def of_ratio(cls, ratio: float) -> MaterialPrior:
+        """One material of unknown density, with δ/β known (negative where β lies below the medium's)."""
+        require(abs(ratio) >= 1 and abs(ratio) < 1e6, f"delta_beta must have a size between 1 and 1e6, but it is {ratio:g}.")
+        return cls("ratio", ratio=ratio)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything about a reconstruction but the scan, the material and the seed.
+
+    start: `phase` (phase retrieval, total-variation tomography, Gaussians where there is matter) or `random`;
+    spacing_px: distance between Gaussians at a phase start [pixels]; max_start: coarser rather than more than
+    this many; approximate_steps: steps in which they learn the starting volume; random_count: Gaussians of a
+    random start; volume, fit: options of the starting volume and of the fit.
+    """
+
+    start: Literal["phase", "random"] = "phase"
+    spacing_px: float = 1.0
+    max_start: int = 150_000
+    approximate_steps: int = 50
+    random_count: int = 8_000
+    volume: HolographicTV = field(default_factory=HolographicTV)
+    fit: FitOptions = field(default_factory=FitOptions)
+
+
+def presets() -> dict[str, Settings]:
+    """Named settings for `--preset`."""
+    default = Settings(
+        volume=HolographicTV(weight=0.3, iterations=60, corrections=6, inner=12),
+        fit=FitOptions(
+            Objective(l1=1.0, tv_volume=0.05, overfull=10.0),
+            Schedule(steps=200, rate_position=0.01, rate_scale=0.01, rate_rotation=0.01, rate_amplitude=0.01),
+        ),
+    )
+    return {
+        "default": default,
+        "fast": replace(
+            default,
+            approximate_steps=30,
+            volume=replace(default.volume, iterations=40, corrections=3, inner=10),
+            fit=replace(default.fit, schedule=replace(default.fit.schedule, steps=60)),
+        ),
+        "thesis": Settings(
+            start="random",
+            fit=FitOptions(
+                THESIS,
+                Schedule(
+                    steps=30_000,
+                    views_per_step=4,
+                    rate_position=0.02,
+                    rate_scale=5e-3,
+                    rate_rotation=1e-3,
+                    rate_amplitude=0.01,
+                    warmup_steps=1000,
+                    detach_worst=True,
+                    validation_views=1,
+                    validate_every=250,
+                ),
+                DensityControl(every=500, start=0.1, stop=0.5, max_count=250_000),
+            ),
+        ),
+    }
+
+
+def preset(name: str) -> Settings:
+    """The settings called `name`; `InputError` listing the names otherwise."""
+    table = presets()
+    if name not in table:
+        raise InputError(f"preset must be one of {', '.join(table)}, but it is {name!r}.")
+    return table[name]
+
+
+def from_plain(kind: type, values: Any, where: str = "config") -> Any:
+    """The dataclass `kind` from a nested dictionary; unknown and missing keys are an `InputError`."""
+    require(isinstance(values, dict), f"{where} must be a table of settings, but it is {values!r}.")
+    hints = get_type_hints(kind)
+    unknown, missing = set(values) - set(hints), set(hints) - set(values)
+    require(not unknown, f"{where} has the unknown settings {', '.join(sorted(unknown))}; remove them.")
+    require(not missing, f"{where} lacks the settings {', '.join(sorted(missing))}; add them.")
+    built = {
+        name: from_plain(hint, values[name], f"{where}.{name}") if dataclasses.is_dataclass(hint) else values[name]
+        for name, hint in hints.items()
+    }
+    return kind(**built)

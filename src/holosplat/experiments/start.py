@@ -1,0 +1,65 @@
+"""The cloud a fit starts from, and the material it is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from ..baselines import holographic_tv
+from ..baselines.material import estimate_delta, estimate_ratio
+from ..materials import WATER, DeltaBeta
+from ..optics.retrieval import retrieve_thickness
+from ..representations import GaussianCloud, approximate, cloud_from_volume, freed, random_cloud
+from ..scan import Scan
+from .settings import MaterialPrior, Settings
+
+Progress = Callable[[str, float], None]
+
+
+def starting_cloud(
+    scan: Scan, prior: MaterialPrior, settings: Settings, seed: int, on_progress: Progress
+) -> GaussianCloud:
+    """The cloud to start from, by the training frames `scan`: single-material, or with δ and β free if nothing is known."""
+    start = _random if settings.start == "random" else _from_phase_retrieval
+    return start(scan, prior, settings, seed, on_progress)
+
+
+def _from_phase_retrieval(
+    scan: Scan, prior: MaterialPrior, settings: Settings, seed: int, on_progress: Progress
+) -> GaussianCloud:
+    material = _material(scan, prior, on_progress)
+    volume, grid = holographic_tv(scan, material, settings.volume, on_progress)
+    pitch = scan.views.pixel_size
+    matter = float(volume.sum()) * grid.voxel_size[0] ** 3
+    spacing = max(settings.spacing_px * pitch, (2 * matter / settings.max_start) ** (1 / 3))
+    cloud = cloud_from_volume(volume, grid, material, spacing, pitch)
+    cloud = approximate(cloud, volume, grid, settings.approximate_steps, on_progress)
+    return freed(cloud) if prior.kind == "free" else cloud
+
+
+def _material(scan: Scan, prior: MaterialPrior, on_progress: Progress) -> DeltaBeta:
+    """δ and β of the material: as known, or as the holograms suggest."""
+    if prior.kind == "known":
+        return DeltaBeta(prior.delta, prior.beta)
+    ratio = prior.ratio if prior.kind == "ratio" else estimate_ratio(scan, on_progress)
+    delta = estimate_delta(scan, ratio, on_progress)
+    return DeltaBeta(delta, delta / ratio)
+
+
+def _random(scan: Scan, prior: MaterialPrior, settings: Settings, seed: int, on_progress: Progress) -> GaussianCloud:
+    """The thesis' start; amplitudes are in units of the known material, or else of water."""
+    on_progress("random start", 0.0)
+    material = WATER.delta_beta(scan.exposures.energy_kev)
+    if prior.kind == "known":
+        material = DeltaBeta(prior.delta, prior.beta)
+    elif prior.kind == "ratio":
+        material = DeltaBeta(material.delta, material.delta / prior.ratio)
+    frames, pitch = torch.from_numpy(scan.frames), scan.views.pixel_size
+    retrieved = retrieve_thickness(frames, pitch, scan.exposures.distance, scan.exposures.energy_kev, *material)
+    h, w = scan.views.shape
+    disc = np.pi / 4 * min(h, w) ** 2 / (h * w)
+    thickness = max(float(retrieved.mean()) / disc, 0.1 * pitch)
+    channels = 2 if prior.kind == "free" else 1
+    return random_cloud(settings.random_count, scan.views, material, channels, thickness, seed)

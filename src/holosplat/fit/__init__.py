@@ -1,0 +1,1 @@
+"""Fitting a trainable Object to a scan: objective, schedule, density control, loop, checkpoints."""

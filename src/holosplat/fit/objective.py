@@ -1,0 +1,135 @@
+"""The terms of the objective. Each is a small function; `Objective` holds their weights."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from torch import Tensor
+
+SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
+
+
+@dataclass(frozen=True)
+class Objective:
+    """Weights of the terms; a weight of zero leaves the term out.
+
+    Image terms compare predicted with measured frames, after the affine map that takes the training frames'
+    minimum and maximum to 0 and 1: `l1`, `l2_amplitude`, `ssim` (1 - SSIM), `tv_image`, `frc` (1 - FRCM, its
+    weight ramped linearly from 0 over the first `frc_ramp` of the steps). Object terms act on the Gaussians:
+    `anisotropy` on scales beyond `anisotropy_limit`, and, on the volume they add up to, `tv_volume`, and
+    `overfull`, the square of what exceeds an occupancy of one (single material only).
+    """
+
+    l1: float = 1.0
+    l2_amplitude: float = 0.0
+    ssim: float = 0.0
+    tv_image: float = 0.0
+    frc: float = 0.0
+    frc_ramp: float = 1.0
+    anisotropy: float = 0.0
+    anisotropy_limit: float = 10.0
+    tv_volume: float = 0.0
+    overfull: float = 0.0
+
+    @property
+    def uses_volume(self) -> bool:
+        """Whether a term needs the voxelised object."""
+        return self.tv_volume > 0 or self.overfull > 0
+
+
+THESIS = Objective(l1=0.75, ssim=0.20, tv_image=0.05, frc=0.05, frc_ramp=0.5)
+"""The thesis' composite loss: 0.75 L1 + 0.20 (1 - SSIM) + TV + ramped FRC."""
+
+
+def l1(predicted: Tensor, measured: Tensor) -> Tensor:
+    """Mean absolute difference of each view: [V, H, W] → [V]."""
+    return (predicted - measured).abs().mean(dim=(1, 2))
+
+
+def l2_amplitude(predicted: Tensor, measured: Tensor) -> Tensor:
+    """Mean squared difference of amplitudes √I of each view: [V, H, W] relative intensities → [V].
+
+    The variance-stabilised (Poisson) data term; see Godard et al. (2012), eq. 9.
+    """
+    difference = predicted.clamp_min(1e-12).sqrt() - measured.clamp_min(0).sqrt()
+    return difference.square().mean(dim=(1, 2))
+
+
+def one_minus_ssim(predicted: Tensor, measured: Tensor) -> Tensor:
+    """1 - SSIM of each view, [V, H, W] of data range 1 → [V] (Wang et al. 2004, eq. 13; 11 × 11, σ = 1.5)."""
+    rows, columns = (_window_matrix(n, predicted.dtype) for n in predicted.shape[1:])
+
+    def local_mean(image: Tensor) -> Tensor:
+        return rows @ image @ columns.T
+
+    mean_a, mean_b = local_mean(predicted), local_mean(measured)
+    var_a = local_mean(predicted * predicted) - mean_a**2
+    var_b = local_mean(measured * measured) - mean_b**2
+    covariance = local_mean(predicted * measured) - mean_a * mean_b
+    c1, c2 = 0.01**2, 0.03**2
+    numerator = (2 * mean_a * mean_b + c1) * (2 * covariance + c2)
+    return 1 - (numerator / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))).mean(dim=(1, 2))
+
+
+def tv_image(image: Tensor) -> Tensor:
+    """Anisotropic total variation of each view, mean over pixels: [V, H, W] → [V]."""
+    return image.diff(dim=1).abs().mean(dim=(1, 2)) + image.diff(dim=2).abs().mean(dim=(1, 2))
+
+
+def one_minus_frcm(predicted: Tensor, measured: Tensor) -> Tensor:
+    """1 - FRCM of each view, [V, H, W] → [V]; FRCM = Σ r·FRC(r)/Σ r over rings 1 … Nyquist."""
+    ring, count = _rings(predicted.shape[1], predicted.shape[2])
+    spectra = [torch.fft.fft2(f - f.mean(dim=(1, 2), keepdim=True)).flatten(1) for f in (predicted, measured)]
+
+    def ring_sum(values: Tensor) -> Tensor:
+        return values.new_zeros(len(values), count + 1).index_add(1, ring, values)[:, 1:]
+
+    cross = ring_sum((spectra[0] * spectra[1].conj()).real)
+    power = ring_sum(spectra[0].abs().square()) * ring_sum(spectra[1].abs().square())
+    weight = torch.arange(1, count + 1, dtype=predicted.dtype)
+    return 1 - (cross / power.clamp_min(1e-20).sqrt() * weight).sum(1) / weight.sum()
+
+
+def anisotropy(log_scales: Tensor, limit: float) -> Tensor:
+    """Mean excess of log(longest/shortest axis) over log(limit): [N, 3] → scalar (Xie et al. 2024, eq. 9)."""
+    if len(log_scales) == 0:
+        return log_scales.sum()
+    spread = log_scales.amax(dim=1) - log_scales.amin(dim=1)
+    return (spread - torch.log(torch.tensor(limit))).clamp_min(0).mean()
+
+
+def tv_volume(density: Tensor, smoothing: float = 0.02) -> Tensor:
+    """Isotropic total variation of [C, Z, Y, X], mean over voxels, smoothed at `smoothing` (Rudin et al. 1992)."""
+    core = density[:, :-1, :-1, :-1]
+    square = (density[:, 1:, :-1, :-1] - core).square()
+    square = square + (density[:, :-1, 1:, :-1] - core).square()
+    square = square + (density[:, :-1, :-1, 1:] - core).square()
+    return ((square + smoothing**2).sqrt() - smoothing).mean()
+
+
+def overfull(density: Tensor) -> Tensor:
+    """Mean square of what exceeds an occupancy of one, [1, Z, Y, X] → scalar."""
+    return (density - 1).clamp_min(0).square().mean()
+
+
+@lru_cache(maxsize=8)
+def _window_matrix(n: int, dtype: torch.dtype) -> Tensor:
+    """[n - 10, n]: the Gaussian window as a banded matrix, windows wholly inside only (small n: the whole)."""
+    width = min(SSIM_WINDOW, n)
+    weights = torch.exp(-0.5 * ((torch.arange(width) - (width - 1) / 2) / SSIM_SIGMA) ** 2)
+    matrix = torch.zeros(n - width + 1, n, dtype=torch.float64)
+    for i in range(len(matrix)):
+        matrix[i, i : i + width] = (weights / weights.sum()).double()
+    return matrix.to(dtype)
+
+
+@lru_cache(maxsize=8)
+def _rings(h: int, w: int) -> tuple[Tensor, int]:
+    """Ring index of each Fourier sample (0: the mean and beyond Nyquist), and the number of rings."""
+    shortest = min(h, w)  # a ring is one frequency step of the shorter side wide, as in metrics.correlation
+    fy, fx = torch.fft.fftfreq(h) * shortest, torch.fft.fftfreq(w) * shortest
+    ring = torch.round(torch.sqrt(fy[:, None] ** 2 + fx[None] ** 2)).long().flatten()
+    count = shortest // 2
+    return torch.where(ring <= count, ring, 0), count

@@ -1,0 +1,132 @@
+"""Anisotropic 3D Gaussians that add up: one density of a known material, or free δ and β."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize, softplus
+
+from ..checks import require
+from ..geometry import Grid, Views
+from ..projectors.splat import splat, voxelise
+from ..volume import Volume
+
+PARAMETERS = ("centres", "log_scales", "quaternions", "raw_amplitudes")
+"""The trainable tensors, in the order of `GaussianCloud.parameters`."""
+
+
+class GaussianCloud:
+    """N Gaussians; `n(x) - 1` is the sum of `a exp(-½ (x-c)ᵀ Σ⁻¹ (x-c))`, `Σ = R(q) diag(s²) R(q)ᵀ`.
+
+    Parameters are float32 tensors in units of `unit_length` [m], the scan's pixel size, so that they are of
+    order one (a 100 nm Gaussian in metres would underflow):
+    centres [N, 3] `(x, y, z)`; log_scales [N, 3], natural logarithms of the standard deviations;
+    quaternions [N, 4] `(w, x, y, z)`, normalised on use; raw_amplitudes [N, C], peak values through softplus.
+
+    With C = 1 the amplitude is an *occupancy*, the density of one material: δ = a·delta, β = a·beta (β may be
+    negative). With C = 2 it is `(δ/delta, β/beta)`, both free and non-negative, in the units `delta`, `beta`.
+    """
+
+    def __init__(self, parameters: Iterable[Tensor], unit_length: float, delta: float, beta: float) -> None:
+        self.centres, self.log_scales, self.quaternions, self.raw_amplitudes = parameters
+        self.unit_length, self.delta, self.beta = float(unit_length), float(delta), float(beta)
+        n = len(self.centres)
+        shapes = [tuple(p.shape) for p in self.parameters]
+        fits = shapes[:3] == [(n, 3), (n, 3), (n, 4)] and shapes[3] in ((n, 1), (n, 2))
+        require(fits, f"a Gaussian cloud needs shapes (N, 3), (N, 3), (N, 4), (N, 1 or 2), but got {shapes}.")
+        self.backend = "cpu"
+
+    def __len__(self) -> int:
+        return len(self.centres)
+
+    @property
+    def parameters(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The four trainable tensors, in the order of `PARAMETERS`."""
+        return self.centres, self.log_scales, self.quaternions, self.raw_amplitudes
+
+    @property
+    def single_material(self) -> bool:
+        """Whether one density carries both δ and β."""
+        return self.raw_amplitudes.shape[1] == 1
+
+    @property
+    def scales(self) -> Tensor:
+        """Standard deviations [N, 3] in units of `unit_length`."""
+        return torch.exp(self.log_scales)
+
+    @property
+    def amplitudes(self) -> Tensor:
+        """Peak values [N, C] in units of the material's δ (and β)."""
+        return softplus(self.raw_amplitudes)
+
+    def replaced(self, parameters: Iterable[Tensor]) -> GaussianCloud:
+        """A cloud of other parameters in the same units."""
+        cloud = GaussianCloud(parameters, self.unit_length, self.delta, self.beta)
+        cloud.backend = self.backend
+        return cloud
+
+    def detached(self) -> GaussianCloud:
+        """A copy that carries no gradients."""
+        return self.replaced(p.detach().clone() for p in self.parameters)
+
+    def at(self, time: float) -> GaussianCloud:
+        """The cloud itself: it does not move."""
+        return self
+
+    def thickness(self, views: Views) -> Tensor:
+        """Line integrals [V, C, H, W] of the amplitudes, in units of `unit_length`."""
+        scale = self.unit_length / views.pixel_size
+        return splat(
+            self.centres * scale,
+            self.scales * scale,
+            self.quaternions,
+            self.amplitudes / scale,
+            views.rotations,
+            views.shifts / views.pixel_size,
+            views.shape,
+            backend=self.backend,
+        )
+
+    def project(self, views: Views) -> tuple[Tensor, Tensor]:
+        """Line integrals (B, D), each [V, H, W] in metres, differentiable in the parameters."""
+        lines = self.thickness(views) * self.unit_length
+        return lines[:, -1] * self.beta, lines[:, 0] * self.delta
+
+    def density(self, grid: Grid) -> Tensor:
+        """Amplitudes [C, Z, Y, X] on `grid` (cubic voxels), averaged over voxels; differentiable."""
+        pitch = grid.voxel_size[0]
+        require(np.allclose(grid.voxel_size, pitch), "Gaussians are voxelised on cubic voxels only.")
+        scale = self.unit_length / pitch
+        middle = np.array(grid.origin) / pitch + 0.5 * (np.array(grid.shape[::-1]) - 1)
+        offset = torch.as_tensor(middle, dtype=self.centres.dtype)
+        return voxelise(
+            self.centres * scale - offset,
+            self.scales * scale,
+            self.quaternions,
+            self.amplitudes,
+            grid.shape,
+            backend=self.backend,
+        )
+
+    def voxelise(self, grid: Grid) -> Volume:
+        """δ and β on `grid`."""
+        with torch.no_grad():
+            density = self.density(grid).numpy()
+        return Volume(density[0] * self.delta, density[-1] * self.beta, grid)
+
+    def masses(self) -> Tensor:
+        """Integrals [N, C] of each Gaussian, in units of `unit_length³` × amplitude: `a (2π)^{3/2} s₁s₂s₃`."""
+        return self.amplitudes * (2 * np.pi) ** 1.5 * self.scales.prod(dim=1, keepdim=True)
+
+
+def raw_of(amplitudes: Tensor) -> Tensor:
+    """The raw amplitudes whose softplus is `amplitudes` (> 0)."""
+    return amplitudes + torch.log(-torch.expm1(-amplitudes.clamp_min(1e-6)))
+
+
+def unit_quaternions(quaternions: Tensor) -> Tensor:
+    """Quaternions [N, 4] of length one."""
+    return normalize(quaternions, dim=1)

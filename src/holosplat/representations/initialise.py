@@ -1,0 +1,115 @@
+"""Where Gaussians start: on a volume that a classical reconstruction gave, or at random."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool3d, pad
+
+from ..checks import require
+from ..geometry import Grid, Views
+from .gaussians import GaussianCloud, raw_of
+
+SMALLEST = 1e-3
+"""Smallest starting amplitude: softplus needs some slope to start from."""
+
+
+APPROXIMATION_RATES = (0.02, 0.02, 0.02, 0.05)
+"""Adam's first rates of centres, log-scales, quaternions and amplitudes while a cloud learns a volume."""
+
+
+def cloud_from_volume(
+    occupancy: Tensor, grid: Grid, material: tuple[float, float], spacing: float, unit_length: float
+) -> GaussianCloud:
+    """A single-material cloud that approximates `occupancy` [Z, Y, X] on `grid`: one Gaussian a filled block.
+
+    Blocks have an edge of about `spacing` [m] (a whole number of voxels). Each block that holds more than 5 % of
+    matter becomes one isotropic Gaussian at its centre of mass, with its mass, and with half a block as standard
+    deviation, so that full blocks add up to a flat density (ripple below 2 %).
+    material: (δ, β) of an occupancy of one; unit_length [m]: the cloud's unit, the pixel size.
+    """
+    voxel = grid.voxel_size[0]
+    edge = max(1, round(spacing / voxel))
+    mass, centre = _block_moments(occupancy.float().clamp_min(0), edge)
+    filled = torch.nonzero(mass > 0.05)
+    require(len(filled) > 0, "the start found no matter in the holograms; check material, energy and distance.")
+    mass, centre = mass[tuple(filled.T)], centre[(slice(None), *filled.T)].T
+    position = centre * voxel + torch.tensor(grid.origin, dtype=torch.float32)
+    sigma = 0.5 * edge * voxel
+    peak = mass * (edge * voxel) ** 3 / ((2 * np.pi) ** 1.5 * sigma**3)
+    log_scales = torch.full((len(mass), 3), float(np.log(sigma / unit_length)))
+    return GaussianCloud(
+        (position / unit_length, log_scales, _identity(len(mass)), raw_of(peak.clamp_min(SMALLEST))[:, None]),
+        unit_length,
+        *material,
+    )
+
+
+def approximate(
+    cloud: GaussianCloud, occupancy: Tensor, grid: Grid, steps: int, on_progress: Callable[[str, float], None]
+) -> GaussianCloud:
+    """The cloud after `steps` of Adam towards `occupancy` [Z, Y, X] on `grid`, by mean squared difference.
+
+    It starts a hologram fit where the classical reconstruction ended. `on_progress(stage, fraction)`.
+    """
+    leaves = [p.detach().clone().requires_grad_() for p in cloud.parameters]
+    cloud = cloud.replaced(leaves)
+    optimiser = torch.optim.Adam([{"params": [leaf]} for leaf in leaves], lr=0.0, eps=1e-12, fused=True)
+    power = float(occupancy.square().sum())
+    for step in range(steps):
+        on_progress("Gaussians for the volume", step / steps)
+        loss = (cloud.density(grid)[0] - occupancy).square().sum() / power
+        loss.backward()
+        for group, rate in zip(optimiser.param_groups, APPROXIMATION_RATES):
+            group["lr"] = rate * 0.1 ** (step / steps)
+        optimiser.step()
+        optimiser.zero_grad(set_to_none=True)
+    return cloud.detached()
+
+
+def random_cloud(
+    count: int, views: Views, material: tuple[float, float], channels: int, thickness: float, seed: int
+) -> GaussianCloud:
+    """`count` Gaussians, uniform in the ball that every view sees, as the thesis starts.
+
+    Their size is the mean distance between neighbours and their summed mass that of a slab of `thickness` [m]
+    of material over the ball's cross-section. material: (δ, β) of amplitude one; channels: 1 or 2.
+    """
+    require(count > 0, f"the number of Gaussians must be positive, but it is {count}.")
+    generator = torch.Generator().manual_seed(seed)
+    radius = 0.5 * min(views.shape)
+    direction = torch.randn(count, 3, generator=generator)
+    distance = radius * torch.rand(count, 1, generator=generator) ** (1 / 3)
+    centres = distance * direction / direction.norm(dim=1, keepdim=True)
+    sigma = 0.5 * radius * (4.19 / count) ** (1 / 3)
+    mass = np.pi * radius**2 * thickness / views.pixel_size / count
+    peak = torch.full((count, channels), mass / ((2 * np.pi) ** 1.5 * sigma**3))
+    log_scales = torch.full((count, 3), float(np.log(sigma)))
+    return GaussianCloud((centres, log_scales, _identity(count), raw_of(peak)), views.pixel_size, *material)
+
+
+def freed(cloud: GaussianCloud) -> GaussianCloud:
+    """The same single-material cloud with δ and β free: its amplitude in both channels."""
+    centres, log_scales, quaternions, raw = (p.detach().clone() for p in cloud.parameters)
+    return cloud.replaced((centres, log_scales, quaternions, raw[:, :1].repeat(1, 2)))
+
+
+def _block_moments(occupancy: Tensor, edge: int) -> tuple[Tensor, Tensor]:
+    """Mean occupancy [z, y, x] of blocks of `edge³` voxels, and their centres of mass [3, z, y, x] as (x, y, z)."""
+    missing = [(-n) % edge for n in occupancy.shape]
+    full = pad(occupancy, (0, missing[2], 0, missing[1], 0, missing[0]))
+
+    def mean(values: Tensor) -> Tensor:
+        return avg_pool3d(values[None, None], edge)[0, 0]
+
+    mass = mean(full)
+    axes = torch.meshgrid(*(torch.arange(n, dtype=torch.float32) for n in full.shape), indexing="ij")
+    centre = torch.stack([mean(full * axis) / mass.clamp_min(1e-9) for axis in axes[::-1]])
+    return mass, centre
+
+
+def _identity(count: int) -> Tensor:
+    return torch.tensor([1.0, 0.0, 0.0, 0.0]).repeat(count, 1)
