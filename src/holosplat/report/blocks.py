@@ -1,0 +1,193 @@
+"""The figures of the page with their captions; where data is absent, a sentence says so instead."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ..metrics import VolumeScores
+from ..units import wavenumber
+from .content import ReportContent
+from .curves import correlation_figure, histogram_figure, history_figure
+from .figures import (
+    evenly_chosen,
+    grey_limits,
+    held_out_figure,
+    projections_figure,
+    residual_limit,
+    richest_planes,
+    scene_figure,
+    slices_figure,
+)
+from .style import WIDTH, data_uri, format_length, scientific
+
+MOST_VIEWS = 4
+
+
+@dataclass(frozen=True)
+class Block:
+    """One figure of the page: image is a `data:` URI, drawn `width` per cent of the page wide.
+
+    Without an image, `caption` says why there is none.
+    """
+
+    heading: str
+    caption: str
+    title: str = ""
+    image: str | None = None
+    width: int = 100
+    number: int | None = None
+
+
+def make_blocks(content: ReportContent) -> list[Block]:
+    """All figures of the page, in order and numbered from 1."""
+    makers = (_scene, _held_out, _projections, _slices, _correlation, _history, _histograms)
+    blocks, number = [], 0
+    for block in (make(content) for make in makers):
+        number += block.image is not None
+        blocks.append(replace(block, number=number) if block.image is not None else block)
+    return blocks
+
+
+def _drawn(heading: str, caption: str, title: str, figure: Figure, kind: str) -> Block:
+    width = round(100 * float(figure.get_figwidth()) / WIDTH)
+    return Block(heading, caption.strip(), title, data_uri(figure, kind), width)
+
+
+def _scene(content: ReportContent) -> Block:
+    heading, material = "Scene and reconstruction", content.surface_material()
+    if material is None:
+        return Block(
+            heading, "The reconstruction holds no matter (its δ is zero everywhere), so no surface is drawn."
+        )
+    grid = content.reconstruction.grid
+    figure = scene_figure(content.reconstruction, content.truth, material)
+    size = "\u00a0×\u00a0".join(f"{n * d * 1e6:.3g}" for n, d in zip(grid.shape[::-1], grid.voxel_size))
+    text = (
+        f"Surfaces where δ = {scientific(0.5 * material)}, half of the material's, seen from above. "
+        f"The box is the volume, {size}\u00a0µm (x\u00a0×\u00a0y\u00a0×\u00a0z). "
+    )
+    if content.truth is None:
+        text += "a, from the first side; b, turned by 90° about the vertical axis. The truth is not known."
+    else:
+        voxel = format_length(max(grid.voxel_size))
+        text += (
+            "a, truth; b, reconstruction; c, the reconstruction coloured by distance from the true surface "
+            f"along its own normals: red outside, blue inside of it; colours end at one voxel, {voxel}."
+        )
+    return _drawn(heading, text, "The scene and its reconstruction.", figure, "png")
+
+
+def _held_out(content: ReportContent) -> Block:
+    heading, views = "Held-out views", content.held_out
+    if views is None:
+        return Block(heading, "No view was held out of the fit, so no prediction could be tested.")
+    figure = held_out_figure(views, content.pixel_size, MOST_VIEWS)
+    count, chosen = len(views.labels), evenly_chosen(len(views.labels), MOST_VIEWS)
+    which = f"{len(chosen)} of {count}" if len(chosen) < count else f"all {count}" if count > 1 else "the one"
+    low, high = grey_limits(views)
+    error = float(np.sqrt(np.mean(np.square(np.subtract(views.predicted, views.measured, dtype=np.float64)))))
+    text = (
+        "Measured intensity, its prediction from the reconstruction, and their difference, for "
+        f"{which} held-out view{'s' * (count > 1)}. "
+        f"Measured and predicted share the grey scale {low:.3f} to {high:.3f}, the 0.2 and 99.8 percentiles; "
+        f"measured values run from {views.measured.min():.3f} to {views.measured.max():.3f}. "
+        f"Colours of differences end at ±{residual_limit(views):.2g}; their root mean square is {error:.2g}. "
+        f"Scores use the range of the training frames, {views.scores.data_range[0]:.3f} to "
+        f"{views.scores.data_range[1]:.3f}."
+    )
+    return _drawn(heading, text, "Prediction of held-out views.", figure, "png")
+
+
+def _projections(content: ReportContent) -> Block:
+    heading, maps = "Projected phase and absorption", content.projections
+    if maps is None:
+        return Block(heading, "No line integrals of the reconstruction were given.")
+    figure = projections_figure(maps, content.energy_kev, content.pixel_size)
+    text = (
+        f"Phase φ = −kD with D = ∫δ dz, and absorption 2kB with B = ∫β dz, at {content.energy_kev:g} keV, "
+        f"{' and '.join(maps.labels[:2])}. "
+    )
+    phase = -wavenumber(content.energy_kev) * np.asarray(maps.dephasing[:2])
+    text += f"The reconstruction's phase runs from {phase.min():.3g} to {phase.max():.3g} rad. ".replace(
+        "-", "−"
+    )
+    if maps.true_dephasing is None:
+        text += "The truth is not known."
+    else:
+        text += "Truth and reconstruction share one colour scale; differences are reconstruction − truth."
+    return _drawn(heading, text, "Line integrals through the object.", figure, "png")
+
+
+def _slices(content: ReportContent) -> Block:
+    truth, delta = content.truth, content.reconstruction.delta
+    planes = richest_planes(content.reconstruction if truth is None else truth)
+    figure = slices_figure(content.reconstruction, truth, planes)
+    low, high = scientific(float(delta.min())), scientific(float(delta.max()))
+    text = (
+        "δ in the three orthogonal planes that hold most matter. "
+        f"Over the whole volume the reconstruction's δ runs from {low} to {high}"
+    )
+    if truth is None:
+        text += ". The truth is not known."
+    else:
+        low, high = scientific(float(truth.delta.min())), scientific(float(truth.delta.max()))
+        text += (
+            f", the truth's from {low} to {high}. "
+            "Truth and reconstruction share one colour scale; differences are reconstruction − truth."
+        )
+    return _drawn("Slices", text, "Slices of δ.", figure, "png")
+
+
+def _correlation(content: ReportContent) -> Block:
+    heading, images = "Resolution", None if content.held_out is None else content.held_out.scores
+    if images is None and content.volume_scores is None:
+        return Block(
+            heading, "Without a held-out view or a truth there is nothing to correlate the result with."
+        )
+    figure = correlation_figure(images, content.volume_scores, content.pixel_size)
+    text = ""
+    if images is not None:
+        text += "Fourier ring correlation of predicted with measured held-out views. "
+    if content.volume_scores is not None:
+        crossings = _resolutions(content.volume_scores)
+        text += f"Fourier shell correlation of the reconstructed with the true δ, {crossings}. "
+    text += (
+        "The upper scale is the full period. Both thresholds were made for two halves of one data set "
+        "(van Heel & Schatz 2005; Rosenthal & Henderson 2003); against a noise-free truth they are lenient."
+    )
+    return _drawn(heading, text, "Correlation in Fourier space.", figure, "svg")
+
+
+def _resolutions(scores: VolumeScores) -> str:
+    def said(length: float | None) -> str:
+        if length is None:
+            return f"not before the sampling limit ({format_length(2 * scores.pitch)})"
+        return "from the first shell on" if np.isinf(length) else f"at {format_length(length)}"
+
+    return f"below ½-bit {said(scores.resolution_half_bit)} and below 0.143 {said(scores.resolution_fixed)}"
+
+
+def _history(content: ReportContent) -> Block:
+    heading, figure = "Course of the fit", history_figure(content.history)
+    if figure is None:
+        return Block(heading, "No course of the fit was recorded.")
+    text = "Recorded while fitting, over optimisation steps; the loss and its terms on a logarithmic scale."
+    return _drawn(heading, text, "Course of the fit.", figure, "svg")
+
+
+def _histograms(content: ReportContent) -> Block:
+    heading, material = "Quantitative values", content.surface_material()
+    if material is None:
+        return Block(heading, "The reconstruction holds no matter, so there are no values to show.")
+    figure, outside = histogram_figure(content.reconstruction, content.truth, material)
+    text = f"The material's δ is {scientific(material)}; matter is what exceeds half of it. "
+    if outside is None:
+        text += "β is zero in all matter, so δ\u2060/\u2060β is not defined. "
+    else:
+        text += f"{100 * outside:.1f} % of the mass lies outside of the range drawn for δ\u2060/\u2060β. "
+        if content.truth is not None:
+            text += "The truth's δ\u2060/\u2060β is the ratio of its mean δ to its mean β. "
+    return _drawn(heading, text, "Distribution of δ\u2060/\u2060β and of δ.", figure, "svg")

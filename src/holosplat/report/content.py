@@ -1,0 +1,136 @@
+"""Everything a report shows, as data."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..checks import InputError, positive, require, shaped
+from ..geometry import Views
+from ..metrics import ImageScores, VolumeScores, require_same_grid, robust_material_delta
+from ..volume import Volume
+
+
+@dataclass(frozen=True)
+class HeldOutViews:
+    """Frames that the fit never saw, and what the reconstruction predicts for them.
+
+    measured, predicted: [T, H, W] relative intensity; labels: T texts, from `view_labels`; scores: of these
+    frames.
+    """
+
+    measured: np.ndarray
+    predicted: np.ndarray
+    labels: tuple[str, ...]
+    scores: ImageScores
+
+    def __post_init__(self) -> None:
+        measured = shaped("measured frames", np.asarray(self.measured), (None, None, None))
+        shaped("predicted frames", np.asarray(self.predicted), measured.shape)
+        if not (len(measured) == len(self.labels) == len(self.scores) > 0):
+            raise InputError(
+                f"held-out views need one label and one score a frame, but there are {len(measured)} frames, "
+                f"{len(self.labels)} labels and {len(self.scores)} scores."
+            )
+
+
+@dataclass(frozen=True)
+class ProjectedMaps:
+    """Line integrals of the reconstruction, and of the truth where it is known, for a few views.
+
+    absorption, dephasing: B = ∫β dz and D = ∫δ dz, [V, H, W] [m]; true_absorption, true_dephasing: likewise
+    or None; labels: V texts, from `view_labels`.
+    """
+
+    absorption: np.ndarray
+    dephasing: np.ndarray
+    labels: tuple[str, ...]
+    true_absorption: np.ndarray | None = None
+    true_dephasing: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        shape = shaped("projected δ", np.asarray(self.dephasing), (None, None, None)).shape
+        shaped("projected β", np.asarray(self.absorption), shape)
+        require(len(self.labels) == shape[0], "projected maps need one label a view; correct the labels.")
+        require(
+            (self.true_absorption is None) == (self.true_dephasing is None),
+            "give both true projections, of β and of δ, or neither.",
+        )
+        if self.true_absorption is not None and self.true_dephasing is not None:
+            shaped("true projected β", np.asarray(self.true_absorption), shape)
+            shaped("true projected δ", np.asarray(self.true_dephasing), shape)
+
+
+@dataclass(frozen=True)
+class ReportContent:
+    """Everything the page shows; whatever is left out is said to be absent, in words.
+
+    - title: what was reconstructed; summary: a sentence or two on the experiment, plain text
+    - reconstruction, truth: volumes on one grid
+    - energy_kev [keV]; pixel_size: of the frames [m]
+    - held_out: test views; projections: line integrals of a few views; volume_scores: against the truth
+    - material_delta: the material's δ, for surfaces and masks; None: the robust maximum of the truth, or else
+      of the reconstruction
+    - history: columns of metrics.csv, each [S]: step, seconds, loss, the loss' terms, count, val_ssim …
+    - seconds: time of the reconstruction [s]
+    - settings: the resolved configuration, nested or flat
+    - versions, machine, timing: tables of names and values; input_hash: of the scan
+    """
+
+    title: str
+    reconstruction: Volume
+    energy_kev: float
+    pixel_size: float
+    summary: str = ""
+    truth: Volume | None = None
+    held_out: HeldOutViews | None = None
+    projections: ProjectedMaps | None = None
+    volume_scores: VolumeScores | None = None
+    material_delta: float | None = None
+    history: Mapping[str, np.ndarray] = field(default_factory=dict)
+    seconds: float | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    versions: Mapping[str, Any] = field(default_factory=dict)
+    machine: Mapping[str, Any] = field(default_factory=dict)
+    timing: Mapping[str, Any] = field(default_factory=dict)
+    input_hash: str = ""
+
+    def __post_init__(self) -> None:
+        positive("energy", self.energy_kev, "keV")
+        positive("pixel size", self.pixel_size, "metres")
+        if self.truth is not None:
+            require_same_grid(self.reconstruction.grid, self.truth.grid)
+        lengths = {name: len(column) for name, column in self.history.items()}
+        require(len(set(lengths.values())) <= 1, f"history columns must have one length, but have {lengths}.")
+
+    def surface_material(self) -> float | None:
+        """The material's δ for surfaces and masks; None when there is no matter at all."""
+        if self.material_delta is not None:
+            return self.material_delta
+        if self.volume_scores is not None:
+            return self.volume_scores.material_delta
+        volume = self.truth if self.truth is not None else self.reconstruction
+        return robust_material_delta(volume) if np.any(volume.delta) else None
+
+
+def view_labels(views: Views) -> tuple[str, ...]:
+    """A label for each view: "θ = 15.0°" where all turn about the y axis, else "view k" (counted from 1)."""
+    if not views.shares_axis:
+        return tuple(f"view {k + 1}" for k in range(len(views)))
+    angles = np.degrees(np.arctan2(views.rotations[:, 0, 2], views.rotations[:, 0, 0])) % 360.0
+    return tuple(f"θ = {0.0 if math.isclose(angle, 360.0, abs_tol=0.05) else angle:.1f}°" for angle in angles)
+
+
+def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+    """Nested settings as dotted names and texts: {"fit": {"steps": 3}} → {"fit.steps": "3"}."""
+    flat: dict[str, str] = {}
+    for name, value in settings.items():
+        if isinstance(value, Mapping):
+            flat |= flatten(value, f"{prefix}{name}.")
+        else:
+            flat[f"{prefix}{name}"] = f"{value:.6g}" if isinstance(value, float) else str(value)
+    return flat

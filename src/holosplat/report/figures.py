@@ -1,0 +1,363 @@
+"""The pictures: surfaces, held-out views, projections, slices, banner. Each function returns a figure."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize, to_rgb
+from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
+
+from ..geometry import Grid
+from ..metrics import robust_material_delta
+from ..units import wavenumber
+from ..volume import Volume
+from .content import HeldOutViews, ProjectedMaps
+from .style import (
+    BETA_MAP,
+    DELTA_MAP,
+    HOLOGRAM_MAP,
+    INK,
+    RECONSTRUCTION,
+    SIGNED_MAP,
+    TRUE_SURFACE,
+    WIDTH,
+    PanelGrid,
+    colour_bar,
+    decimal_scale,
+    from_dark,
+    image_panel,
+    length_unit,
+    letter,
+    new_figure,
+    scale_bar,
+    styled,
+)
+from .surface import Deviation, SurfaceImage, box_edges, camera, render_surface
+
+PLANES = (("xy", 0, ("x", "y")), ("xz", 1, ("x", "z")), ("zy", 2, ("z", "y")))
+"""Orthogonal planes: name, the axis of [Z, Y, X] that is fixed, and what runs along columns and rows."""
+
+
+@styled
+def scene_figure(reconstruction: Volume, truth: Volume | None, material: float) -> Figure:
+    """Surfaces at half of the `material`'s δ: truth, reconstruction, and its distance from the truth.
+
+    Without truth: the reconstruction seen from two sides, a quarter turn apart.
+    """
+    found, turned = (reconstruction, to_rgb(RECONSTRUCTION)), camera(120.0)
+    if truth is None:
+        shown = [(*found, camera(), "Reconstruction"), (*found, turned, "Turned by 90°")]
+        panels = PanelGrid(1, [1.0, 1.0], [1.12, 1.12], (), 0.8 * WIDTH)
+    else:
+        paint = _deviation(truth, 0.5 * material)
+        shown = [
+            (truth, to_rgb(TRUE_SURFACE), camera(), "Truth"),
+            (*found, camera(), "Reconstruction"),
+            (reconstruction, paint, camera(), "Distance from the true surface"),
+        ]
+        panels = PanelGrid(1, [1.0] * 3, [1.12] * 3, ())
+    for i, (volume, colour, rotation, title) in enumerate(shown):
+        axes = panels.axes[0][i]
+        picture = render_surface(volume.delta, volume.grid, 0.5 * material, rotation, 512, colour)
+        _surface_panel(axes, picture, volume.grid)
+        letter(axes, i, title)
+    if truth is not None:
+        _deviation_bar(panels.figure, panels.axes[0][2], max(truth.grid.voxel_size))
+    return panels.figure
+
+
+def _deviation_bar(figure: Figure, axes: Axes, limit: float) -> None:
+    unit, factor = length_unit(limit)
+    end = limit * factor
+    inset = axes.inset_axes((0.53, 0.028, 0.40, 0.024))
+    scale = ScalarMappable(Normalize(-end, end), SIGNED_MAP)
+    bar = figure.colorbar(scale, cax=inset, orientation="horizontal", ticks=[-end, 0, end])
+    bar.outline.set_linewidth(0.4)  # type: ignore[operator]
+    inset.xaxis.set_ticks_position("top")
+    inset.set_xticklabels([f"−{end:.3g}", "0", f"{end:.3g} {unit}"])
+    inset.tick_params(length=2, width=0.4, pad=1.5)
+
+
+def _deviation(truth: Volume, level: float) -> Deviation:
+    """Colours by distance from the true surface, blue inside and red outside of it, up to one voxel."""
+    colours = matplotlib.colormaps[SIGNED_MAP]
+    return Deviation(truth.delta, level, max(truth.grid.voxel_size), lambda d: colours(0.5 + 0.5 * d)[:, :3])
+
+
+def _surface_panel(axes: Axes, shown: SurfaceImage, grid: Grid, close: bool = False) -> None:
+    """The picture in its box; `close`: without the box, and no wider than the matter needs."""
+    half = 0.5 * shown.width
+    axes.imshow(
+        shown.rgba, extent=(-half, half, half, -half), zorder=2, interpolation="antialiased", aspect="auto"
+    )
+    axes.set_axis_off()
+    if close:
+        _come_close(axes, shown)
+    else:
+        for points in box_edges(grid, shown.rotation):
+            axes.plot(points[:, 0], points[:, 1], lw=0.5, color=INK, alpha=0.4, zorder=1)
+        axes.set(xlim=(-half, half), ylim=(1.24 * half, -half))  # room for the scale bar below the box
+    left, right = axes.get_xlim()
+    scale_bar(axes, right - left, INK, 0.03)
+
+
+def _come_close(axes: Axes, shown: SurfaceImage) -> None:
+    rows, columns = np.nonzero(shown.rgba[..., 3])
+    if not rows.size:
+        return
+    box = axes.get_window_extent()
+    ratio = box.width / box.height
+    x, y = (0.5 * (i.min() + i.max() + 1) * shown.pixel_size - 0.5 * shown.width for i in (columns, rows))
+    half = 0.53 * max(np.ptp(columns) / ratio, np.ptp(rows)) * shown.pixel_size
+    axes.set(xlim=(x - half * ratio, x + half * ratio), ylim=(y + half, y - half))
+
+
+@styled
+def held_out_figure(views: HeldOutViews, pixel_size: float, most: int = 4) -> Figure:
+    """Measured, predicted and residual intensity of up to `most` test views; pixel_size [m]."""
+    chosen = evenly_chosen(len(views.labels), most)
+    low, high = grey_limits(views)
+    limit = residual_limit(views)
+    scale, power = decimal_scale(limit)
+    height, width = views.measured.shape[1:]
+    panels = PanelGrid(len(chosen), [width] * 3, [height] * 3, (1, 2))
+    pitch = (pixel_size, pixel_size)
+    for row, k in enumerate(chosen):
+        axes = panels.axes[row]
+        grey = image_panel(axes[0], views.measured[k], pitch, HOLOGRAM_MAP, (low, high))
+        image_panel(axes[1], views.predicted[k], pitch, HOLOGRAM_MAP, (low, high))
+        residual = (views.predicted[k] - views.measured[k]) / scale
+        signed = image_panel(axes[2], residual, pitch, SIGNED_MAP, (-limit / scale, limit / scale))
+        scores = f"SSIM {views.scores.ssim[k]:.3f}, FRCM {views.scores.frcm[k]:.3f}"
+        for i, title in enumerate(
+            (f"Measured, {views.labels[k]}", f"Predicted ({scores})", "Predicted − measured")
+        ):
+            letter(axes[i], 3 * row + i, title)
+        scale_bar(axes[0], width * pixel_size)
+    panels.bar(grey, 1, (0, len(chosen) - 1), "intensity relative to the flat field", "both")
+    panels.bar(
+        signed, 2, (0, len(chosen) - 1), f"difference of intensity{f' ({power})' if power else ''}", "both"
+    )
+    return panels.figure
+
+
+def evenly_chosen(count: int, most: int) -> list[int]:
+    """At most `most` of `count` indices, evenly spread, the first and the last among them."""
+    return sorted({round(i) for i in np.linspace(0, count - 1, min(count, most))})
+
+
+def grey_limits(views: HeldOutViews) -> tuple[float, float]:
+    """The grey scale of holograms: the 0.2 and 99.8 percentiles of the measured test frames."""
+    low, high = np.percentile(views.measured, [0.2, 99.8])
+    return (float(low), float(high)) if high > low else (float(low) - 0.5, float(low) + 0.5)
+
+
+def residual_limit(views: HeldOutViews) -> float:
+    """The residuals' colour limit: the 99.8 percentile of their magnitude."""
+    return float(np.percentile(np.abs(views.predicted - views.measured), 99.8)) or 1.0
+
+
+@styled
+def projections_figure(maps: ProjectedMaps, energy_kev: float, pixel_size: float) -> Figure:
+    """Phase φ = -kD [rad] and absorption 2kB of one or two views; truth and difference too where it is known.
+
+    energy_kev [keV]; pixel_size [m].
+    """
+    k, views = wavenumber(energy_kev), min(len(maps.labels), 2)
+    height, width = maps.dephasing.shape[1:]
+    pairs = [(phase, i) for i in range(views) for phase in (True, False)]
+    if maps.true_dephasing is None or maps.true_absorption is None:
+        panels = PanelGrid(views, [width] * 2, [height] * 2, (0, 1), 0.8 * WIDTH)
+        for index, (phase, i) in enumerate(pairs):
+            found = -k * maps.dephasing[i] if phase else 2 * k * maps.absorption[i]
+            _projected(panels, divmod(index, 2), [found], phase, maps.labels[i], pixel_size)
+        return panels.figure
+    panels = PanelGrid(2 * views, [width] * 3, [height] * 3, (1, 2))
+    for row, (phase, i) in enumerate(pairs):
+        factor, true, found = (
+            (-k, maps.true_dephasing, maps.dephasing)
+            if phase
+            else (2 * k, maps.true_absorption, maps.absorption)
+        )
+        shown = [factor * np.asarray(true[i]), factor * np.asarray(found[i])]
+        _projected(panels, (row, 0), shown, phase, maps.labels[i], pixel_size)
+    return panels.figure
+
+
+def _projected(
+    panels: PanelGrid,
+    place: tuple[int, int],
+    shown: list[np.ndarray],
+    phase: bool,
+    view: str,
+    pixel_size: float,
+) -> None:
+    """One quantity of one view from `place` on: [found], or [true, found] on one scale and the difference."""
+    row, column = place
+    colours = DELTA_MAP if phase else BETA_MAP
+    axes = panels.axes[row][column:]
+    name, unit = ("phase φ", " (rad)") if phase else ("absorption 2kB", "")
+    scale, power = (1.0, "") if phase else decimal_scale(max(float(np.abs(i).max()) for i in shown))
+    unit = f" ({power})" if power else unit
+    pitch, limits = (pixel_size, pixel_size), value_limits([image / scale for image in shown])
+    for panel, image in zip(axes, shown):
+        drawn = image_panel(panel, image / scale, pitch, from_dark(colours, limits), limits)
+    panels.bar(drawn, column + len(shown) - 1, (row, row), name + unit)
+    scale_bar(axes[0], shown[0].shape[1] * pixel_size)
+    title = name[0].upper() + name[1:]
+    titles = (
+        [f"{title}, {view}"]
+        if len(shown) == 1
+        else [f"{title}, truth, {view}", "Reconstruction", "Difference"]
+    )
+    for i, text in enumerate(titles):
+        letter(axes[i], row * len(panels.axes[row]) + column + i, text)
+    if len(shown) == 2:
+        difference = (shown[1] - shown[0]) / scale
+        limit = float(np.percentile(np.abs(difference), 99.8)) or 1.0
+        signed = image_panel(axes[2], difference, pitch, SIGNED_MAP, (-limit, limit))
+        panels.bar(signed, 2, (row, row), "difference" + unit, "both")
+
+
+def value_limits(images: list[np.ndarray]) -> tuple[float, float]:
+    """A colour range that holds all images and zero, so that empty space has the map's end colour."""
+    low, high = min(float(i.min()) for i in images), max(float(i.max()) for i in images)
+    low, high = min(low, 0.0), max(high, 0.0)
+    return (low, high) if high > low else (low, low + 1.0)
+
+
+@styled
+def slices_figure(reconstruction: Volume, truth: Volume | None, positions: tuple[int, int, int]) -> Figure:
+    """δ in three orthogonal planes at voxel `positions` (z, y, x): truth, reconstruction and difference."""
+    volumes = (
+        [("Reconstruction", reconstruction.delta)]
+        if truth is None
+        else [
+            ("Truth", truth.delta),
+            ("Reconstruction", reconstruction.delta),
+        ]
+    )
+    scale, power = decimal_scale(max(float(np.abs(v).max()) for _, v in volumes))
+    limits = value_limits([v / scale for _, v in volumes])
+    colours = from_dark(DELTA_MAP, limits)
+    widths, heights = _plane_sizes(reconstruction.grid)
+    panels = PanelGrid(1 if truth is None else 3, widths, heights, (2,))
+    for row, (name, values) in enumerate(volumes):
+        drawn = _slice_row(panels.axes[row], values / scale, reconstruction.grid, positions, colours, limits)
+        _slice_titles(panels.axes[row], 3 * row, name, reconstruction.grid, positions)
+    label = f"δ ({power})" if power else "δ"
+    panels.bar(drawn, 2, (0, len(volumes) - 1), label)
+    if truth is not None:
+        difference = (reconstruction.delta - truth.delta) / scale
+        limit = float(np.percentile(np.abs(difference), 99.9)) or 1.0
+        drawn = _slice_row(panels.axes[2], difference, truth.grid, positions, SIGNED_MAP, (-limit, limit))
+        _slice_titles(panels.axes[2], 6, "Difference", truth.grid, positions)
+        panels.bar(drawn, 2, (2, 2), f"difference of {label}", "both")
+    return panels.figure
+
+
+def richest_planes(volume: Volume) -> tuple[int, int, int]:
+    """Voxel positions (z, y, x) of the planes with the most matter (largest Σ|δ|)."""
+    mass = np.abs(volume.delta)
+    z, y, x = (int(np.argmax(mass.sum(axis=axes, dtype=np.float64))) for axes in ((1, 2), (0, 2), (0, 1)))
+    return z, y, x
+
+
+def _slice(values: np.ndarray, axis: int, index: int) -> np.ndarray:
+    plane = np.take(values, index, axis=axis)
+    return plane.T if axis == 2 else plane  # [Z, Y] is shown with z along columns and y down
+
+
+def _plane_sizes(grid: Grid) -> tuple[list[float], list[float]]:
+    x, y, z = (n * d for n, d in zip(grid.shape[::-1], grid.voxel_size))
+    return [x, x, z], [y, z, y]
+
+
+def _slice_row(
+    axes: list[Axes],
+    values: np.ndarray,
+    grid: Grid,
+    positions: tuple[int, int, int],
+    colours: str,
+    limits: tuple[float, float],
+) -> AxesImage:
+    edge = dict(zip("xyz", grid.voxel_size))
+    widths, _ = _plane_sizes(grid)
+    for panel, (_, axis, (across, down)), width in zip(axes, PLANES, widths):
+        plane = _slice(values, axis, positions[axis])
+        drawn = image_panel(panel, plane, (edge[across], edge[down]), colours, limits)
+        scale_bar(panel, width, "white" if colours != SIGNED_MAP else INK)
+    return drawn
+
+
+def _slice_titles(
+    axes: list[Axes], first: int, name: str, grid: Grid, positions: tuple[int, int, int]
+) -> None:
+    centres = grid.axes()[::-1]
+    unit, factor = length_unit(max(n * d for n, d in zip(grid.shape[::-1], grid.voxel_size)))
+    for i, (panel, (plane, axis, _)) in enumerate(zip(axes, PLANES)):
+        where = centres[axis][positions[axis]] * factor
+        fixed = "zyx"[axis]
+        letter(panel, first + i, f"{name}, {plane} at {fixed} = {where:.1f} {unit}".replace("-", "−"))
+
+
+@styled
+def hero_figure(
+    hologram: np.ndarray,
+    pixel_size: float,
+    reconstruction: Volume,
+    truth: Volume | None = None,
+    material: float | None = None,
+) -> Figure:
+    """The banner, 1600 × 500 pixels: a hologram [H, W] of `pixel_size` [m], the surface, and slices of δ.
+
+    material: the material's δ, whose half is the surface; None: its robust value. The slices are the xy and
+    xz planes that hold most matter: the truth above, the reconstruction below.
+    """
+    figure, grid = new_figure(10.0, 3.125, "none"), reconstruction.grid
+    material = robust_material_delta(truth or reconstruction) if material is None else material
+
+    def place(left: float, bottom: float, width: float, height: float) -> Axes:  # [inches]
+        return figure.add_axes((left / 10.0, bottom / 3.125, width / 10.0, height / 3.125))
+
+    first, second = place(0.05, 0.05, 2.8, 2.8), place(2.95, 0.05, 3.5, 2.8)
+    low, high = np.percentile(hologram, [0.2, 99.8])
+    image_panel(first, hologram, (pixel_size, pixel_size), HOLOGRAM_MAP, (float(low), float(high)))
+    scale_bar(first, hologram.shape[1] * pixel_size)
+    letter(first, 0, "Hologram")
+    picture = render_surface(
+        reconstruction.delta, grid, 0.5 * material, camera(), 800, to_rgb(RECONSTRUCTION)
+    )
+    _surface_panel(second, picture, grid, close=True)
+    letter(second, 1, "Reconstruction")
+    drawn = _banner_slices(place, reconstruction, truth, material)
+    _, power = decimal_scale(material)
+    colour_bar(figure, drawn, place(9.47, 0.12, 0.085, 2.66), f"δ ({power})" if power else "δ")
+    return figure
+
+
+def _banner_slices(
+    place: Callable[[float, float, float, float], Axes],
+    reconstruction: Volume,
+    truth: Volume | None,
+    material: float,
+) -> AxesImage:
+    grid, planes = reconstruction.grid, richest_planes(truth or reconstruction)
+    scale, _ = decimal_scale(material)
+    limits = value_limits([v.delta / scale for v in (reconstruction, truth) if v is not None])
+    if truth is None:
+        panels = [place(6.6, 0.05, 2.8, 2.8)]
+        letter(panels[0], 2, "Slice of δ")
+        return _slice_row(
+            panels, reconstruction.delta / scale, grid, planes, from_dark(DELTA_MAP, limits), limits
+        )
+    for i, (name, volume) in enumerate((("truth", truth), ("reconstruction", reconstruction))):
+        panels = [place(left, 1.56 - 1.51 * i, 1.29, 1.29) for left in (6.72, 8.11)]
+        drawn = _slice_row(panels, volume.delta / scale, grid, planes, from_dark(DELTA_MAP, limits), limits)
+        letter(panels[0], 2 + i, f"Slices of δ, {name}")
+    return drawn

@@ -1,0 +1,239 @@
+"""Shaded isosurfaces without a graphics card: orthographic first-hit ray marching in numpy.
+
+The camera follows the frames of docs/conventions.md: it is a view, `x_lab = R x_obj`, that looks along the
+beam (+z_lab), with columns to the right and rows down. A surface seen with a hologram's rotation overlays it.
+
+Empty space is crossed with the distance to the nearest voxel of matter (Hart 1996, sphere tracing); close to
+matter the ray advances by half a voxel, and the hit is bisected on the trilinear field. Everything is
+deterministic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise, product
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
+
+from ..checks import require, shaped
+from ..geometry import Grid, rotation_y
+
+STEP = 0.5  # voxels a ray advances near matter
+KEY_LIGHT, FILL_LIGHT = (-0.55, -0.70, -0.60), (0.80, 0.10, -0.55)  # directions to the lights, lab frame
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """Colours a surface by its distance from a true one, measured along its own normals.
+
+    true_values: [Z, Y, X] on the same grid, its surface at `level`; limit: distances beyond ± `limit` [m]
+    saturate; colours: distance / limit in [-1, 1] [N] → RGB [N, 3], positive where the surface lies outside
+    of the true one.
+    """
+
+    true_values: np.ndarray
+    level: float
+    limit: float
+    colours: Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class SurfaceImage:
+    """rgba: [S, S, 4] float32 in [0, 1], straight alpha; pixel_size: [m]; rotation: the camera, [3, 3]."""
+
+    rgba: np.ndarray
+    pixel_size: float
+    rotation: np.ndarray
+
+    @property
+    def width(self) -> float:
+        """Width of the square picture [m]."""
+        return self.rgba.shape[1] * self.pixel_size
+
+
+@dataclass(frozen=True)
+class _Field:
+    """The padded volume in units of the level; a point has the index `offset + per_metre * (x, y, z)`."""
+
+    values: np.ndarray
+    offset: np.ndarray
+    per_metre: np.ndarray
+    voxel: float
+
+    def at(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Trilinear samples of `values` [Z, Y, X] at object points [3, N] (x, y, z) [m]; 0 outside."""
+        index = self.offset[:, None] + self.per_metre[:, None] * points
+        return map_coordinates(values, index[::-1], order=1, mode="constant", cval=0.0, prefilter=False)
+
+
+def camera(azimuth_deg: float = 30.0, elevation_deg: float = 25.0) -> np.ndarray:
+    """Camera rotation [3, 3]: turn the object about y by `azimuth_deg`, look down by `elevation_deg`."""
+    c, s = np.cos(np.deg2rad(elevation_deg)), np.sin(np.deg2rad(elevation_deg))
+    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]]) @ rotation_y([azimuth_deg])[0]
+
+
+def render_surface(
+    values: np.ndarray,
+    grid: Grid,
+    level: float,
+    rotation: np.ndarray | None = None,
+    size: int = 512,
+    colour: tuple[float, float, float] | Deviation = (0.75, 0.36, 0.25),
+) -> SurfaceImage:
+    """The shaded surface where `values` [Z, Y, X] cross `level`, `size` × `size` pixels of 2 × 2 rays each.
+
+    level: in the unit of `values`, may be negative (then matter is below it); rotation: the camera [3, 3],
+    default `camera()`; colour: RGB in [0, 1], or `Deviation`. The picture holds the whole grid; the ground is
+    transparent. Raises `InputError` when the level is zero or shapes do not match.
+    """
+    require(level != 0 and np.isfinite(level), f"the surface level must be a number but 0; it is {level!r}.")
+    shaped("surface values", values, grid.shape)
+    rotation = camera() if rotation is None else np.asarray(rotation, dtype=np.float64)
+    field = _field(np.asarray(values, dtype=np.float32) / np.float32(level), grid)
+    half = np.abs(_corners(grid) @ rotation.T)[:, :2].max() * 1.02
+    pixel = 2 * half / (2 * size)
+    offsets = (np.arange(2 * size) + 0.5) * pixel - half
+    x, y = (axis.ravel() for axis in np.meshgrid(offsets, offsets))
+    found, depth = _first_hits(field, rotation, x, y, _centre(grid))
+    rgba = np.zeros((4 * size * size, 4), dtype=np.float32)
+    if found.size:
+        lab = np.stack([x[found], y[found], depth])
+        points = rotation.T @ lab + _centre(grid)[:, None]
+        rgba[found, :3] = _shade(field, points, lab[2] / half, rotation, colour)
+        rgba[found, 3] = 1.0
+    premultiplied = rgba.reshape(size, 2, size, 2, 4).mean(axis=(1, 3))
+    return SurfaceImage(_straight(premultiplied), 2 * pixel, rotation)
+
+
+def _straight(premultiplied: np.ndarray) -> np.ndarray:
+    """Straight alpha whose transparent pixels take the colour around them, so that rims stay clean."""
+    spread = gaussian_filter(premultiplied, (1.5, 1.5, 0), truncate=3.0)
+    alpha, around = premultiplied[..., 3:], spread[..., 3:]
+    inside = premultiplied[..., :3] / np.maximum(alpha, 1e-6)
+    colour = np.where(alpha > 0, inside, spread[..., :3] / np.maximum(around, 1e-6))
+    return np.clip(np.concatenate([colour, alpha], axis=-1), 0, 1)
+
+
+def box_edges(grid: Grid, rotation: np.ndarray) -> list[np.ndarray]:
+    """The grid's edges but the nearest corner's, which would hide matter: points [2, 2] of (x, y) [m]."""
+    corners = _corners(grid) @ np.asarray(rotation).T
+    nearest = int(np.argmin(corners[:, 2]))
+    pairs = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b) in (1, 2, 4)]
+    return [corners[[a, b], :2] for a, b in pairs if nearest not in (a, b)]
+
+
+def _corners(grid: Grid) -> np.ndarray:
+    """[8, 3] the grid's corners (x, y, z) [m] about its centre."""
+    half = 0.5 * np.asarray(grid.shape[::-1]) * np.asarray(grid.voxel_size)
+    return np.array(list(product((-1, 1), repeat=3))) * half
+
+
+def _centre(grid: Grid) -> np.ndarray:
+    steps = np.asarray(grid.voxel_size) * (np.asarray(grid.shape[::-1]) - 1)
+    return np.asarray(grid.origin) + 0.5 * steps
+
+
+def _field(values: np.ndarray, grid: Grid) -> _Field:
+    padded = np.pad(values, 1)  # closes surfaces that the grid's faces cut
+    per_metre = 1.0 / np.asarray(grid.voxel_size)
+    return _Field(padded, 1.0 - np.asarray(grid.origin) * per_metre, per_metre, min(grid.voxel_size))
+
+
+def _first_hits(
+    field: _Field, rotation: np.ndarray, x: np.ndarray, y: np.ndarray, centre: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the rays through (x, y) [m] that meet matter, and the depths [m] of their first hits."""
+    matter = field.values > 1.0
+    if not matter.any():
+        return np.empty(0, dtype=np.intp), np.empty(0)
+    distance = np.asarray(distance_transform_edt(~matter))  # in voxels; a cell with matter lies within √3
+    start = rotation.T[:, :2] @ np.stack([x, y]) + centre[:, None]
+    along = rotation.T[:, 2]
+    enter, leave = _box_span(field, start, along)
+    active = np.flatnonzero(enter < leave)
+    depth = enter.copy()
+    hits = []
+    while active.size:
+        points = start[:, active] + along[:, None] * depth[active]
+        index = np.rint(field.offset[:, None] + field.per_metre[:, None] * points).astype(np.intp)
+        gap = distance[tuple(np.clip(i, 0, n - 1) for i, n in zip(index[::-1], distance.shape))]
+        advance = np.where(gap > 3.2, gap - 2.6, STEP)  # 2.6 = √3 (a cell) + √3/2 (rounding to the voxel)
+        near = np.flatnonzero(gap <= 3.2)
+        inside = np.zeros(active.size, dtype=bool)
+        inside[near] = field.at(field.values, points[:, near]) > 1.0
+        hits.append(active[inside])
+        depth[active[~inside]] += advance[~inside] * field.voxel
+        active = active[~inside]
+        active = active[depth[active] < leave[active]]
+    found = np.sort(np.concatenate(hits))
+    return found, _bisect(field, start[:, found], along, depth[found])
+
+
+def _bisect(field: _Field, start: np.ndarray, along: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    low, high = depth - STEP * field.voxel, depth.copy()
+    for _ in range(6):
+        middle = 0.5 * (low + high)
+        inside = field.at(field.values, start + along[:, None] * middle) > 1.0
+        high, low = np.where(inside, middle, high), np.where(inside, low, middle)
+    return high
+
+
+def _box_span(field: _Field, start: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Depths [m] at which rays enter and leave the padded volume (slab method, Kay & Kajiya 1986)."""
+    low = (0.0 - field.offset) / field.per_metre
+    high = (np.asarray(field.values.shape[::-1]) - 1.0 - field.offset) / field.per_metre
+    slope = np.where(np.abs(along) < 1e-12, 1e-12, along)[:, None]
+    a, b = (low[:, None] - start) / slope, (high[:, None] - start) / slope
+    return np.minimum(a, b).max(axis=0), np.maximum(a, b).min(axis=0)
+
+
+def _shade(
+    field: _Field,
+    points: np.ndarray,
+    depth: np.ndarray,
+    rotation: np.ndarray,
+    colour: tuple[float, float, float] | Deviation,
+) -> np.ndarray:
+    """RGB [N, 3] at object points [3, N]: two lights, ambient occlusion, a dark rim, a depth cue to white."""
+    smooth = gaussian_filter(np.clip(field.values, 0, 2), 1.0)
+    gradient = np.stack([field.at(np.gradient(smooth, axis=axis), points) for axis in (2, 1, 0)])
+    normal = -rotation @ (gradient * field.per_metre[:, None])
+    normal /= np.maximum(np.linalg.norm(normal, axis=0), 1e-30)
+    facing = np.clip(-normal[2], 0, 1)
+    crowd = gaussian_filter(np.clip(field.values - 0.5, 0, 1), 5.0)
+    beside = points + (rotation.T @ normal) * (5.0 * field.voxel)
+    open_sky = np.clip(1.25 - 1.6 * field.at(crowd, beside), 0.35, 1.0)
+    key, fill = (np.clip(_unit(light) @ normal, 0, 1) for light in (KEY_LIGHT, FILL_LIGHT))
+    halfway = np.clip(_unit(np.add(_unit(KEY_LIGHT), (0, 0, -1))) @ normal, 0, 1)
+    light = (0.36 + 0.16 * fill) * open_sky + 0.62 * key * (0.4 + 0.6 * open_sky)
+    light *= 1.0 - 0.45 * (1.0 - facing) ** 3
+    if isinstance(colour, Deviation):
+        base = colour.colours(_signed_distance(field, points, rotation.T @ normal, colour) / colour.limit)
+    else:
+        base = np.asarray(colour, dtype=np.float64)[None, :]
+    shaded = base * light[:, None] + 0.10 * (halfway**30)[:, None]
+    haze = np.clip(0.16 * (depth + 1.0), 0, 0.32)[:, None]
+    return np.clip(shaded * (1 - haze) + haze, 0, 1)
+
+
+def _signed_distance(field: _Field, points: np.ndarray, normal: np.ndarray, against: Deviation) -> np.ndarray:
+    """Distance [N] [m] of points [3, N] outside (+) or inside (-) the true surface, along `normal` [3, N]."""
+    offsets = np.linspace(-against.limit, against.limit, 17)
+    true = np.pad(against.true_values / np.float32(against.level), 1)
+    samples = np.stack([field.at(true, points + offset * normal) for offset in offsets]) - 1.0
+    distance = np.where(samples[len(offsets) // 2] > 0, -against.limit, against.limit)
+    nearest = np.full(distance.shape, np.inf)
+    for (low, high), (a, b) in zip(pairwise(offsets), pairwise(samples)):
+        crosses = (a > 0) != (b > 0)
+        crossing = low + (high - low) * a / np.where(crosses, a - b, 1.0)
+        better = crosses & (np.abs(crossing) < nearest)
+        nearest = np.where(better, np.abs(crossing), nearest)
+        distance = np.where(better, -crossing, distance)
+    return distance
+
+
+def _unit(vector: tuple[float, float, float] | np.ndarray) -> np.ndarray:
+    array = np.asarray(vector, dtype=np.float64)
+    return array / np.linalg.norm(array)

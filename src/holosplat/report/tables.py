@@ -1,0 +1,148 @@
+"""The numbers of the page: the verdict, the key figures, and the tables."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from .content import ReportContent, flatten
+from .style import format_length, scientific
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table: caption, column heads (may be empty), and rows of texts whose first one names the row."""
+
+    caption: str
+    rows: list[tuple[str, ...]]
+    head: tuple[str, ...] = ()
+
+
+def verdict(content: ReportContent) -> str:
+    """The result in one sentence, with the numbers that carry it."""
+    parts = []
+    if content.held_out is not None:
+        mean, count = content.held_out.scores.mean, len(content.held_out.labels)
+        views = "one held-out view" if count == 1 else f"{count} held-out views"
+        parts.append(
+            f"predicts {views} with a mean SSIM of {mean['ssim']:.3f} and FRCM of {mean['frcm']:.3f}"
+        )
+    if content.volume_scores is not None:
+        scores = content.volume_scores
+        size = percent(abs(scores.delta_deviation)).lstrip("+")
+        side = "above" if scores.delta_deviation > 0 else "below"
+        parts.append(
+            f"overlaps the truth with a Dice coefficient of {scores.dice:.3f}, "
+            f"its mean δ {size} {side} the true one"
+        )
+    if not parts:
+        return (
+            "No view was held out and no truth is known: this page shows the reconstruction without a score."
+        )
+    return f"The reconstruction {' and '.join(parts)}."
+
+
+def key_figures(content: ReportContent) -> list[tuple[str, str, str]]:
+    """Name, value and explanation of the numbers at the head of the page."""
+    figures = []
+    if content.held_out is not None:
+        mean = content.held_out.scores.mean
+        figures += [
+            ("SSIM", f"{mean['ssim']:.3f}", "held-out views"),
+            ("FRCM", f"{mean['frcm']:.3f}", "held-out views"),
+            ("PSNR", f"{scientific(mean['psnr'], 3)} dB", "held-out views"),
+            ("L1", scientific(mean["l1"], 2), "held-out views"),
+        ]
+    if content.volume_scores is not None:
+        figures += [
+            ("Dice", f"{content.volume_scores.dice:.3f}", "at half of the δ"),
+            ("Mean δ", percent(content.volume_scores.delta_deviation), "against the truth"),
+        ]
+    if content.seconds is not None:
+        figures.append(("Time", duration(content.seconds), "of the reconstruction"))
+    return figures
+
+
+def score_tables(content: ReportContent) -> list[Table]:
+    """The scores of the volume and of each held-out view, as far as there are any."""
+    return [table for table in (_volume_table(content), _views_table(content)) if table is not None]
+
+
+def record_tables(content: ReportContent) -> list[Table]:
+    """What makes the run repeatable: input, settings, versions, machine and timing."""
+    shape, edges = content.reconstruction.grid.shape[::-1], content.reconstruction.grid.voxel_size
+    data = [
+        ("photon energy", f"{content.energy_kev:g} keV"),
+        ("pixel size", format_length(content.pixel_size, 4)),
+        ("voxels (x × y × z)", " × ".join(str(n) for n in shape)),
+        (
+            "voxel size",
+            " × ".join(format_length(d, 4) for d in (edges if len(set(edges)) > 1 else edges[:1])),
+        ),
+        ("input hash", content.input_hash or "not recorded"),
+    ]
+    named = {"Timing": content.timing, "Machine": content.machine, "Versions": content.versions}
+    named["Settings"] = content.settings
+    tables = [Table("Input", data)]
+    tables += [Table(name, list(flatten(entries).items())) for name, entries in named.items() if entries]
+    return tables
+
+
+def _volume_table(content: ReportContent) -> Table | None:
+    scores = content.volume_scores
+    if scores is None:
+        return None
+    sampling = 2 * scores.pitch
+
+    def resolved(length: float | None) -> str:
+        if length is None:
+            return f"≤ {format_length(sampling)} (sampling limit)"
+        return "not resolved" if length == float("inf") else format_length(length)
+
+    rows = [
+        ("mean δ in the matter", scientific(scores.mean_delta), scientific(scores.true_mean_delta)),
+        ("mean β in the matter", scientific(scores.mean_beta), scientific(scores.true_mean_beta)),
+        ("mean δ / mean β", scientific(scores.ratio, 4), scientific(scores.true_ratio, 4)),
+        ("relative error of δ", scientific(scores.relative_error_delta), ""),
+        ("relative error of β", scientific(scores.relative_error_beta), ""),
+        ("Dice coefficient", f"{scores.dice:.4f}", ""),
+        ("resolution, ½-bit", resolved(scores.resolution_half_bit), ""),
+        ("resolution, FSC 0.143", resolved(scores.resolution_fixed), ""),
+    ]
+    deviations = [scores.delta_deviation, scores.beta_deviation, scores.ratio_deviation]
+    last = [percent(d) for d in deviations] + [""] * (len(rows) - 3)
+    head = ("volume", "found", "truth", "deviation")
+    return Table("Volume against the truth", [(*row, end) for row, end in zip(rows, last)], head)
+
+
+def _views_table(content: ReportContent) -> Table | None:
+    if content.held_out is None:
+        return None
+    s, labels = content.held_out.scores, content.held_out.labels
+    mean = s.mean
+    rows = [
+        (label, f"{s.ssim[i]:.4f}", f"{s.frcm[i]:.4f}", f"{s.psnr[i]:.2f}", f"{s.l1[i]:.4f}")
+        for i, label in enumerate(labels)
+    ]
+    means = (f"{mean['ssim']:.4f}", f"{mean['frcm']:.4f}", f"{mean['psnr']:.2f}", f"{mean['l1']:.4f}")
+    head = ("view", "SSIM", "FRCM", "PSNR (dB)", "L1")
+    return Table("Held-out views", [*rows, ("mean", *means)], head)
+
+
+def percent(value: float | None) -> str:
+    """A relative deviation in per cent with its sign: -0.0123 → "−1.2 %"; None → "–"."""
+    if value is None:
+        return "–"
+    digits = 2 if abs(value) < 0.00995 else 1
+    return f"{100 * value:+.{digits}f} %".replace("-", "−")
+
+
+def duration(seconds: float) -> str:
+    """A time for people: 54.2 → "54 s", 3700 → "1 h 02 min"."""
+    if seconds < 9.95:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    if whole < 120:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"

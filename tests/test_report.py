@@ -1,0 +1,350 @@
+"""The report: self-contained, well formed, complete with and without data, and honest surfaces."""
+
+import base64
+import math
+import re
+from html.parser import HTMLParser
+
+import matplotlib
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_laplace
+
+from holosplat.checks import InputError
+from holosplat.geometry import Grid, Views
+from holosplat.metrics import image_scores, intensity_range, volume_scores
+from holosplat.report import (
+    HeldOutViews,
+    ProjectedMaps,
+    ReportContent,
+    hero_figure,
+    render_page,
+    render_surface,
+    view_labels,
+    write_report,
+)
+from holosplat.report.content import flatten
+from holosplat.report.curves import histogram_figure
+from holosplat.report.figures import richest_planes, scene_figure, slices_figure
+from holosplat.report.style import data_uri, format_length, scientific
+from holosplat.report.surface import Deviation, camera
+from holosplat.report.tables import duration, percent
+from holosplat.volume import Volume
+
+DELTA, PITCH = 4e-7, 1e-7
+
+
+def ball(grid, radius, centre=(0.0, 0.0, 0.0)):
+    """Fill factor [Z, Y, X] of a ball, smooth over two voxels."""
+    x, y, z = (axis - c for axis, c in zip(grid.axes(), centre))
+    distance = np.sqrt(x[None, None] ** 2 + y[None, :, None] ** 2 + z[:, None, None] ** 2)
+    return np.clip(0.5 + 0.5 * (radius - distance) / max(grid.voxel_size), 0, 1)
+
+
+def scene(shape=(24, 20, 28)):
+    grid = Grid.centred(shape, PITCH)
+    fill = np.maximum(ball(grid, 5e-7, (4e-7, 0, 1e-7)), ball(grid, 4e-7, (-5e-7, 2e-7, -3e-7)))
+    truth = Volume(DELTA * fill, DELTA / 500 * fill, grid)
+    rng = np.random.default_rng(0)
+    noisy = fill * 0.97 + 0.02 * rng.standard_normal(grid.shape)
+    return truth, Volume(DELTA * noisy, DELTA / 480 * noisy, grid)
+
+
+def content(**changes):
+    """A full report of a small scene; `changes` replace fields."""
+    truth, found = scene()
+    views = Views.from_angles([10.0, 80.0], (20, 28), PITCH)
+    dephasing = [np.stack([v.delta.sum(axis=0)] * 2) * PITCH for v in (found, truth)]
+    absorption = [np.stack([v.beta.sum(axis=0)] * 2) * PITCH for v in (found, truth)]
+    predicted, measured = (
+        1 + 2e10 * np.stack([gaussian_laplace(d, 1.5) for d in maps]) for maps in dephasing
+    )
+    scores = image_scores(predicted, measured, intensity_range(measured))
+    labels = view_labels(views)
+    steps = np.arange(0, 100, 10)
+    fields = {
+        "title": "Two balls & a <test>",
+        "reconstruction": found,
+        "truth": truth,
+        "energy_kev": 11.0,
+        "pixel_size": PITCH,
+        "held_out": HeldOutViews(measured, predicted, labels, scores),
+        "projections": ProjectedMaps(absorption[0], dephasing[0], labels, absorption[1], dephasing[1]),
+        "volume_scores": volume_scores(found, truth),
+        "history": {
+            "step": steps,
+            "loss": np.exp(-steps / 30),
+            "data": 0.5 * np.exp(-steps / 30),
+            "count": 10 + steps,
+            "val_ssim": np.where(steps % 20 == 0, steps / 100, np.nan),
+        },
+        "seconds": 61.0,
+        "settings": {"fit": {"steps": 100, "rate": 1e-3}, "seed": 0},
+        "versions": {"holosplat": "0"},
+        "input_hash": "abc123",
+    }
+    return ReportContent(**(fields | changes))
+
+
+BARE = {"truth": None, "held_out": None, "projections": None, "volume_scores": None, "history": {}}
+VOID = {"area", "base", "br", "col", "embed", "hr", "img", "input", "link", "meta", "source", "track", "wbr"}
+
+
+class Page(HTMLParser):
+    """Checks that tags are nested, and collects what the page refers to."""
+
+    def __init__(self, text):
+        super().__init__(convert_charrefs=True)
+        self.open, self.sources, self.words = [], [], []
+        self.feed(text)
+        self.close()
+        assert not self.open
+
+    def handle_starttag(self, tag, attributes):
+        names = [name for name, _ in attributes]
+        assert len(names) == len(set(names))
+        self.sources += [
+            value for name, value in attributes if name in ("src", "href", "srcset", "data", "poster")
+        ]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open[-1:] != ["style"]:
+            self.words.append(data)
+
+    @property
+    def text(self):
+        return " ".join(" ".join(self.words).split())
+
+
+@pytest.fixture(scope="module")
+def full_page():
+    return render_page(content())
+
+
+@pytest.fixture(scope="module")
+def bare_page():
+    return render_page(content(**BARE))
+
+
+# --- the page ---
+
+
+def test_full_report_holds_every_figure_and_nothing_external(full_page):
+    page = Page(full_page)
+    assert len(page.sources) == 7
+    assert all(source.startswith("data:image/") for source in page.sources)
+    assert "http" not in re.sub(r'"data:[^"]*"', "", full_page)
+    assert "@import" not in full_page
+    assert "url(" not in full_page
+    assert "<script" not in full_page
+    assert [f"Figure {k} |" in page.text for k in range(1, 9)] == [True] * 7 + [False]
+    for words in (
+        "SSIM",
+        "FRCM",
+        "PSNR",
+        "Dice",
+        "fit.steps",
+        "abc123",
+        "θ = 10.0°",
+        "1.00e-3",
+        "Two balls & a <test>",
+    ):
+        assert words.replace("1.00e-3", "0.001") in page.text
+
+
+def test_images_are_decodable_and_svg_loads_nothing(full_page):
+    for source in Page(full_page).sources:
+        kind, data = source.split(";base64,")
+        raw = base64.b64decode(data)
+        if kind.endswith("png"):
+            assert raw.startswith(b"\x89PNG")
+        else:
+            links = re.findall(r'(?:href|src)="([^"]*)"', raw.decode())
+            assert all(link.startswith("#") for link in links)
+
+
+def test_bare_report_says_what_is_absent(bare_page):
+    page = Page(bare_page)
+    assert len(page.sources) == 3  # scene, slices, histograms
+    for words in (
+        "No view was held out and no truth is known",
+        "no prediction could be tested",
+        "No line integrals",
+        "nothing to correlate",
+        "No course of the fit",
+        "neither a held-out view nor a truth",
+    ):
+        assert words in page.text
+
+
+@pytest.mark.parametrize(
+    ("changes", "figures"),
+    [
+        ({"held_out": None, "projections": None}, 5),
+        ({"truth": None, "volume_scores": None}, 7),
+        ({"truth": None, "volume_scores": None, "projections": None, "history": {"step": np.arange(3.0)}}, 5),
+    ],
+)
+def test_any_part_may_be_absent(changes, figures):
+    if changes.get("truth", 1) is None and "projections" not in changes:
+        maps = content().projections
+        changes = changes | {"projections": ProjectedMaps(maps.absorption, maps.dephasing, maps.labels)}
+    assert len(Page(render_page(content(**changes))).sources) == figures
+
+
+def test_empty_reconstruction_and_no_beta_are_reported():
+    truth, found = scene()
+    zero = np.zeros_like(found.delta)
+    empty = content(**BARE, reconstruction=Volume(zero, zero, found.grid))
+    text = Page(render_page(empty)).text
+    assert "no surface is drawn" in text
+    assert "there are no values to show" in text
+    plain = Volume(found.delta, zero, found.grid)
+    known = Volume(truth.delta, zero, truth.grid)
+    pure = content(reconstruction=plain, truth=known, volume_scores=volume_scores(plain, known))
+    assert "β is zero in all matter" in Page(render_page(pure)).text
+
+
+def test_negative_contrast_is_drawn():
+    truth, found = (Volume(-v.delta, v.beta, v.grid) for v in scene())
+    _, outside = histogram_figure(found, truth, -DELTA)
+    assert outside is not None
+    assert outside < 0.05
+    for figure in (scene_figure(found, truth, -DELTA), slices_figure(found, truth, richest_planes(truth))):
+        picture = data_uri(figure, "png")
+        assert len(picture) > 20_000
+
+
+def test_equal_content_gives_equal_pages_and_leaves_matplotlib_alone(bare_page):
+    before = dict(matplotlib.rcParams)
+    assert render_page(content(**BARE)) == bare_page
+    assert dict(matplotlib.rcParams) == before
+
+
+def test_report_is_written_atomically(tmp_path, monkeypatch):
+    monkeypatch.setattr("holosplat.report.page.render_page", lambda _: "<html></html>")
+    path = tmp_path / "report.html"
+    assert write_report(content(**BARE), path) == path
+    assert path.read_text() == "<html></html>"
+    monkeypatch.setattr("holosplat.report.page.os.replace", lambda *_: (_ for _ in ()).throw(OSError("full")))
+    with pytest.raises(OSError, match="full"):
+        write_report(content(**BARE), path)
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_mismatched_content_is_refused():
+    truth, _ = scene((20, 20, 20))
+    with pytest.raises(InputError, match="one grid"):
+        content(truth=truth)
+    with pytest.raises(InputError, match="one length"):
+        content(history={"step": np.arange(3), "loss": np.arange(4)})
+    held = content().held_out
+    with pytest.raises(InputError, match="one label"):
+        HeldOutViews(held.measured, held.predicted, held.labels[:1], held.scores)
+    maps = content().projections
+    with pytest.raises(InputError, match="or neither"):
+        ProjectedMaps(maps.absorption, maps.dephasing, maps.labels, true_dephasing=maps.dephasing)
+
+
+def test_banner_has_its_size():
+    truth, found = scene()
+    figure = hero_figure(content().held_out.measured[0], PITCH, found, truth)
+    assert tuple(figure.get_size_inches() * figure.dpi) == pytest.approx((1600, 500))
+
+
+# --- words and numbers ---
+
+
+def test_labels_numbers_and_settings_read_well():
+    assert view_labels(Views.from_angles([0.0, 15.0, 359.99], (4, 4), PITCH)) == (
+        "θ = 0.0°",
+        "θ = 15.0°",
+        "θ = 0.0°",
+    )
+    assert view_labels(Views.from_rotations(camera()[None], (4, 4), PITCH)) == ("view 1",)
+    assert flatten({"a": {"b": 1, "c": {"d": 0.5}}, "e": (1, 2)}) == {
+        "a.b": "1",
+        "a.c.d": "0.5",
+        "e": "(1, 2)",
+    }
+    assert scientific(4.123e-7).replace("\u00a0", " ") == "4.12 × 10⁻⁷"
+    assert scientific(-9.999e-7, 2).replace("\u00a0", " ") == "−1.0 × 10⁻⁶"
+    assert scientific(None) == "–"
+    assert scientific(math.inf) == "∞"
+    assert scientific(1300.2, 4) == "1,300"
+    assert format_length(4.2e-7).replace("\u00a0", " ") == "420 nm"
+    assert format_length(9.999e-7).replace("\u00a0", " ") == "1 µm"
+    assert percent(-0.0123) == "−1.2 %"
+    assert percent(None) == "–"
+    assert [duration(t) for t in (1.25, 54.2, 600, 3700)] == ["1.2 s", "54 s", "10 min 00 s", "1 h 01 min"]
+
+
+# --- surfaces ---
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_silhouette_of_a_ball_is_a_disc(sign):
+    grid, radius = Grid.centred((48, 56, 44), PITCH), 1.5e-6
+    shown = render_surface(sign * DELTA * ball(grid, radius), grid, sign * 0.5 * DELTA, size=160)
+    area = shown.rgba[..., 3].sum() * shown.pixel_size**2
+    assert area == pytest.approx(math.pi * radius**2, rel=0.02)
+    assert np.all((shown.rgba >= 0) & (shown.rgba <= 1))
+
+
+def test_surfaces_are_deterministic_and_lit_from_above():
+    grid = Grid.centred((40, 40, 40), PITCH)
+    values = ball(grid, 1.2e-6)
+    first, second = (render_surface(values, grid, 0.5, size=96) for _ in range(2))
+    assert np.array_equal(first.rgba, second.rgba)
+    brightness = first.rgba[..., :3].mean(axis=-1) * (first.rgba[..., 3] > 0.99)
+    assert brightness[:48].sum() > 1.2 * brightness[48:].sum()
+
+
+def test_camera_agrees_with_a_hologram_of_the_same_rotation():
+    """A ball at (x, y, z) appears where the view's rotation puts it: columns to the right, rows down."""
+    grid, centre = Grid.centred((64, 64, 64), PITCH), np.array([1.0e-6, -1.2e-6, 0.5e-6])
+    rotation = camera(40.0, 20.0)
+    shown = render_surface(ball(grid, 6e-7, centre), grid, 0.5, rotation, size=128)
+    rows, columns = np.nonzero(shown.rgba[..., 3] > 0.5)
+    found = (np.array([columns.mean(), rows.mean()]) + 0.5) * shown.pixel_size - 0.5 * shown.width
+    assert found == pytest.approx((rotation @ centre)[:2], abs=0.5 * PITCH)
+
+
+def test_nearer_matter_hides_what_lies_behind():
+    grid = Grid.centred((48, 32, 32), PITCH)
+    near, far = (ball(grid, 6e-7, (0, 0, z)) for z in (-1.4e-6, 1.4e-6))
+    both = render_surface(np.maximum(near, far), grid, 0.5, np.eye(3), size=96)
+    alone = render_surface(near, grid, 0.5, np.eye(3), size=96)
+    assert np.abs(both.rgba[..., 3] - alone.rgba[..., 3]).max() < 0.3
+    inner = alone.rgba[..., 3] > 0.99
+    assert np.abs(both.rgba - alone.rgba)[inner].max() < 0.1
+
+
+def test_thin_long_voxels_and_empty_volumes():
+    grid = Grid((30, 60, 60), (1e-7, 1e-7, 2e-7), (-2.95e-6, -2.95e-6, -2.9e-6))
+    radius = 1.6e-6
+    shown = render_surface(ball(grid, radius), grid, 0.5, camera(60.0, 10.0), size=128)
+    assert shown.rgba[..., 3].sum() * shown.pixel_size**2 == pytest.approx(math.pi * radius**2, rel=0.03)
+    assert not render_surface(np.zeros(grid.shape), grid, 0.5, size=32).rgba[..., 3].any()
+    with pytest.raises(InputError, match="surface level"):
+        render_surface(np.zeros(grid.shape), grid, 0.0)
+
+
+def test_deviation_measures_the_distance_between_surfaces():
+    grid, seen = Grid.centred((40, 40, 40), PITCH), []
+
+    def remember(distance):
+        seen.append(distance)
+        return np.ones((len(distance), 3))
+
+    for grown in (0.4 * PITCH, -0.4 * PITCH, 5 * PITCH):
+        paint = Deviation(ball(grid, 1.2e-6), 0.5, PITCH, remember)
+        render_surface(ball(grid, 1.2e-6 + grown), grid, 0.5, size=64, colour=paint)
+    assert np.median(seen[0]) == pytest.approx(0.4, abs=0.06)
+    assert np.median(seen[1]) == pytest.approx(-0.4, abs=0.06)
+    assert np.all(seen[2] == 1.0)
