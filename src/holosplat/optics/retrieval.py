@@ -28,7 +28,7 @@ def retrieve_thickness(
     require(delta > 0, f"phase retrieval needs a material with δ > 0, but δ is {delta:g}.")
     if beta < WEAKEST_ABSORPTION * delta:
         return invert_contrast(frames - 1, pitch, distance, energy_kev, delta, beta)
-    padded, crop = _continued(frames, pitch, distance, energy_kev, delta, beta)
+    padded, crop = _continued(frames, pitch, distance, energy_kev, delta, beta, "replicate")
     f2 = _squared_frequency(padded.shape, pitch)
     lam_z = wavelength(energy_kev) * np.asarray(distance, dtype=np.float64)[:, None, None]
     low_pass = torch.from_numpy(1 / (1 + np.pi * lam_z * (delta / beta) * f2))
@@ -44,8 +44,9 @@ def invert_contrast(
     The linear response of a thin object is `F[I - 1] = -H F[T]`, `H = 2k (β cos χ + δ sin χ)`, `χ = πλz f²`
     (Cloetens et al. 1999, eq. 3, for φ and absorption of one material). It is inverted as `H / (H² + α²)` with
     α small up to the first maximum (χ = π/2) and a third of the peak response beyond, where zeros follow.
+    Beyond the frame the contrast is taken as zero: a residual continued by its edge values would be blown up.
     """
-    padded, crop = _continued(contrast, pitch, distance, energy_kev, delta, beta)
+    padded, crop = _continued(contrast, pitch, distance, energy_kev, delta, beta, "constant")
     lam_z = wavelength(energy_kev) * np.asarray(distance, dtype=np.float64)[:, None, None]
     chi = np.pi * lam_z * _squared_frequency(padded.shape, pitch)
     k2 = 2 * wavenumber(energy_kev)
@@ -59,14 +60,14 @@ def invert_contrast(
 
 
 def _continued(
-    frames: Tensor, pitch: float, distance: np.ndarray, energy_kev: float, delta: float, beta: float
+    frames: Tensor, pitch: float, distance: np.ndarray, energy_kev: float, delta: float, beta: float, mode: str
 ) -> tuple[Tensor, tuple[slice, slice, slice]]:
-    """Frames in float64 with edge values continued by twice the filter's length, and the slices that undo it."""
+    """Frames in float64, continued by twice the filter's length (torch's padding `mode`), and the slices that undo it."""
     absorption = max(abs(beta), WEAKEST_ABSORPTION * delta)
     reach = math.sqrt(wavelength(energy_kev) * float(np.max(distance)) * delta / absorption / math.pi)
     h, w = frames.shape[-2:]
     my, mx = (min(n - 1, math.ceil(2 * reach / pitch)) for n in (h, w))
-    padded = pad(frames[None].double(), (mx, mx, my, my), mode="replicate")[0]
+    padded = pad(frames[None].double(), (mx, mx, my, my), mode=mode)[0]
     return padded, (slice(None), slice(my, my + h), slice(mx, mx + w))
 
 

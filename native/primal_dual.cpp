@@ -1,0 +1,80 @@
+// The two passes over the voxels of a primal-dual iteration with total variation (Chambolle & Pock 2011).
+// Fused, because the iteration is bound by memory: each array is read once and written once a pass.
+
+#include <algorithm>
+#include <cmath>
+
+#include "abi.hpp"
+#include "threads.hpp"
+
+namespace {
+
+// One row of the gradient's dual variable: q += step * forward difference, then onto the ball of `radius`.
+// `down` and `side` are the neighbouring rows along the two slower axes, null at the border (difference 0).
+void ascend_row(int64_t n, const float* u, const float* down, const float* side, float* q0, float* q1, float* q2,
+                float step, float radius) {
+  if (!down) down = u;
+  if (!side) side = u;
+  const auto ascend = [&](int64_t i, float along) {
+    const float a = q0[i] + step * (down[i] - u[i]);
+    const float b = q1[i] + step * (side[i] - u[i]);
+    const float c = q2[i] + step * along;
+    const float scale = radius / std::max(radius, std::sqrt(a * a + b * b + c * c));
+    q0[i] = a * scale;
+    q1[i] = b * scale;
+    q2[i] = c * scale;
+  };
+  for (int64_t i = 0; i + 1 < n; ++i) ascend(i, u[i + 1] - u[i]);
+  ascend(n - 1, 0.0f);
+}
+
+struct Step {
+  float coupling, upper;
+};
+
+// One row of the primal variable: u - tau (slope + coupling * adjoint gradient of q), clamped to [0, upper],
+// and its extrapolation 2 new - old. `above` and `before` are the neighbouring rows of q0 and q1, null at the border.
+void descend_row(int64_t n, const float* slope, const float* tau, const float* q0, const float* above, const float* q1,
+                 const float* before, const float* q2, const Step& step, float* u, float* extrapolated) {
+  const auto descend = [&](int64_t i, float last) {
+    const float inflow = (above ? above[i] : 0.0f) + (before ? before[i] : 0.0f) + last;
+    const float divergence = inflow - q0[i] - q1[i] - q2[i];
+    const float moved = u[i] - tau[i] * (slope[i] + step.coupling * divergence);
+    const float fresh = std::min(std::max(moved, 0.0f), step.upper);
+    extrapolated[i] = 2 * fresh - u[i];
+    u[i] = fresh;
+  };
+  descend(0, 0.0f);
+  for (int64_t i = 1; i < n; ++i) descend(i, q2[i - 1]);
+}
+
+}  // namespace
+
+int64_t holosplat_tv_ascend(const HoloGrid* grid, const float* u, float* q, double step, double radius,
+                            int64_t threads) {
+  return holo::guarded([&] {
+    const int64_t ny = grid->height, nx = grid->width, plane = ny * nx, all = grid->depth * plane;
+    holo::parallel(grid->depth, threads, [&](int64_t z) {
+      for (int64_t y = 0; y < ny; ++y) {
+        const int64_t at = z * plane + y * nx;
+        ascend_row(nx, u + at, z + 1 < grid->depth ? u + at + plane : nullptr, y + 1 < ny ? u + at + nx : nullptr,
+                   q + at, q + all + at, q + 2 * all + at, static_cast<float>(step), static_cast<float>(radius));
+      }
+    });
+  });
+}
+
+int64_t holosplat_tv_descend(const HoloGrid* grid, const float* slope, const float* tau, const float* q,
+                             double coupling, double upper, float* u, float* extrapolated, int64_t threads) {
+  return holo::guarded([&] {
+    const int64_t ny = grid->height, nx = grid->width, plane = ny * nx, all = grid->depth * plane;
+    const Step step{static_cast<float>(coupling), static_cast<float>(upper)};
+    holo::parallel(grid->depth, threads, [&](int64_t z) {
+      for (int64_t y = 0; y < ny; ++y) {
+        const int64_t at = z * plane + y * nx;
+        descend_row(nx, slope + at, tau + at, q + at, z > 0 ? q + at - plane : nullptr, q + all + at,
+                    y > 0 ? q + all + at - nx : nullptr, q + 2 * all + at, step, u + at, extrapolated + at);
+      }
+    });
+  });
+}

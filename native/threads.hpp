@@ -1,0 +1,64 @@
+// Running numbered tasks on a few threads.
+#pragma once
+
+#include <algorithm>
+#include <atomic>
+#include <cstdint>
+#include <exception>
+#include <system_error>
+#include <thread>
+#include <vector>
+
+namespace holo {
+
+// Calls `work(task)` for task = 0 … tasks - 1 on up to `threads` threads, the caller's among them.
+// Which thread does which task is left to chance: a task must write only what no other task writes.
+// Threads sleep when they are done; a busy wait would steal time from whoever shares the cores.
+// An exception in any task ends the others soon and is thrown again here.
+template <class Work>
+void parallel(int64_t tasks, int64_t threads, const Work& work) {
+  std::atomic<int64_t> next{0};
+  std::atomic<bool> failed{false};
+  std::exception_ptr failure;
+  const auto loop = [&] {
+    try {
+      for (int64_t task = next++; task < tasks; task = next++) work(task);
+    } catch (...) {
+      next = tasks;
+      if (!failed.exchange(true)) failure = std::current_exception();
+    }
+  };
+  std::vector<std::thread> helpers;
+  helpers.reserve(static_cast<size_t>(std::max<int64_t>(0, threads)));
+  try {
+    for (int64_t k = 1; k < std::min(tasks, threads); ++k) helpers.emplace_back(loop);
+  } catch (const std::system_error&) {
+    // No more threads to be had: those that started do it all.
+  }
+  loop();
+  for (auto& helper : helpers) helper.join();
+  if (failure) std::rethrow_exception(failure);
+}
+
+// As `parallel`, over the numbers 0 … count - 1 in runs [first, last) of at most `longest`: short enough to keep all
+// threads busy to the end, long enough to share what a run's numbers have in common.
+template <class Work>
+void parallel_runs(int64_t count, int64_t longest, int64_t threads, const Work& work) {
+  const int64_t length = std::clamp<int64_t>(count / (8 * threads), 1, longest);
+  parallel((count + length - 1) / length, threads, [&](int64_t run) {
+    work(run * length, std::min(count, (run + 1) * length));
+  });
+}
+
+// Runs `work` for a C caller, to whom no exception may pass: 0, or 1 if it failed (only memory can run out).
+template <class Work>
+int64_t guarded(const Work& work) {
+  try {
+    work();
+    return 0;
+  } catch (...) {
+    return 1;
+  }
+}
+
+}  // namespace holo

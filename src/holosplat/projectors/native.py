@@ -1,0 +1,164 @@
+"""The compiled kernels: finds the shared library for this machine's instruction set, calls it through ctypes.
+
+`native/abi.hpp` describes the functions; the structures here mirror it. ctypes releases the interpreter lock
+during a call. The environment variable `HOLOSPLAT_ISA` (sse2, avx2, avx512) forces one build, for tests.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.metadata
+import os
+import platform
+import sys
+from ctypes import POINTER, c_double, c_int64, c_void_p
+from functools import cache
+from pathlib import Path
+
+ABI = 1
+ISAS = ("sse2", "avx2", "avx512")
+"""Builds for x86-64, slowest first. Other processors have one build, `generic`."""
+
+
+class Cloud(ctypes.Structure):
+    """N Gaussians: counts and pointers to float32 arrays."""
+
+    _fields_ = [
+        ("count", c_int64),
+        ("channels", c_int64),
+        ("centres", c_void_p),
+        ("scales", c_void_p),
+        ("quaternions", c_void_p),
+        ("amplitudes", c_void_p),
+    ]
+
+
+class Gradients(ctypes.Structure):
+    """Where the gradients of a cloud's four arrays go."""
+
+    _fields_ = [(name, c_void_p) for name in ("centres", "scales", "quaternions", "amplitudes")]
+
+
+class Views(ctypes.Structure):
+    """V views on one raster: counts and pointers to float64 arrays."""
+
+    _fields_ = [
+        ("count", c_int64),
+        ("height", c_int64),
+        ("width", c_int64),
+        ("rotations", c_void_p),
+        ("shifts", c_void_p),
+    ]
+
+
+class Grid(ctypes.Structure):
+    """Counts of voxels along z, y, x."""
+
+    _fields_ = [("depth", c_int64), ("height", c_int64), ("width", c_int64)]
+
+
+class Options(ctypes.Structure):
+    """Cutoff in standard deviations, variance added [px²], number of threads."""
+
+    _fields_ = [("cutoff", c_double), ("variance", c_double), ("threads", c_int64)]
+
+
+_FUNCTIONS = {
+    "holosplat_abi": (),
+    "holosplat_best_isa": (),
+    "holosplat_splat": (POINTER(Cloud), POINTER(Views), POINTER(Options), c_void_p),
+    "holosplat_splat_backward": (
+        *(POINTER(t) for t in (Cloud, Views, Options)),
+        c_void_p,
+        POINTER(Gradients),
+    ),
+    "holosplat_voxelise": (POINTER(Cloud), POINTER(Grid), POINTER(Options), c_void_p),
+    "holosplat_voxelise_backward": (
+        *(POINTER(t) for t in (Cloud, Grid, Options)),
+        c_void_p,
+        POINTER(Gradients),
+    ),
+    "holosplat_tv_ascend": (POINTER(Grid), c_void_p, c_void_p, c_double, c_double, c_int64),
+    "holosplat_tv_descend": (POINTER(Grid), *(c_void_p,) * 3, c_double, c_double, *(c_void_p,) * 2, c_int64),
+}
+
+
+def call(function: str, *arguments: ctypes.Structure | c_void_p | c_int64 | float) -> None:
+    """Call a kernel by name with structures (passed by reference) and pointers.
+
+    Errors: `RuntimeError` if the library is missing, `MemoryError` if memory ran out.
+    """
+    passed = [ctypes.byref(a) if isinstance(a, ctypes.Structure) else a for a in arguments]
+    if getattr(_library(os.environ.get("HOLOSPLAT_ISA", "")), function)(*passed):
+        raise MemoryError(f"{function} ran out of memory; use fewer Gaussians or a smaller raster.")
+
+
+def available_isas() -> tuple[str, ...]:
+    """The builds that are installed and that this machine can run, slowest first."""
+    folder = _folder()
+    if not _is_x86():
+        return ("generic",)
+    best = _open(folder, ISAS[0]).holosplat_best_isa()
+    return tuple(isa for isa in ISAS[: best + 1] if _path(folder, isa).exists())
+
+
+@cache
+def _library(forced: str) -> ctypes.CDLL:
+    """The library for `forced`, or the fastest one that this machine runs if that is empty."""
+    choices = available_isas()
+    if forced and forced not in choices:
+        raise RuntimeError(
+            f"HOLOSPLAT_ISA must be one of {', '.join(choices)} here, but it is {forced!r}; unset it."
+        )
+    return _open(_folder(), forced or choices[-1])
+
+
+def _open(folder: Path, isa: str) -> ctypes.CDLL:
+    """One build, if it was compiled from the same interface as this file."""
+    path = _path(folder, isa)
+    try:
+        library = ctypes.CDLL(str(path))
+        for name, types in _FUNCTIONS.items():
+            function = getattr(library, name)
+            function.argtypes, function.restype = types, c_int64
+    except (OSError, AttributeError) as error:
+        raise RuntimeError(f"The compiled kernels at {path} cannot be used ({error}). {_ADVICE}") from error
+    if library.holosplat_abi() != ABI:
+        raise RuntimeError(f"The compiled kernels at {path} are of another version. {_ADVICE}")
+    return library
+
+
+_ADVICE = (
+    "Reinstall holosplat where a C++ compiler (GCC or clang) is installed (in a checkout: pip install -e .), "
+    "or ask for backend='reference', which is slow but needs none."
+)
+
+
+@cache
+def _folder() -> Path:
+    """The folder `holosplat/_native` that holds the libraries, in a normal or an editable install."""
+    searched = _candidates()
+    for folder in searched:
+        if _path(folder, ISAS[0] if _is_x86() else "generic").exists():
+            return folder
+    places = ", ".join(str(folder) for folder in searched)
+    raise RuntimeError(f"The compiled kernels of holosplat are not installed (looked in {places}). {_ADVICE}")
+
+
+def _candidates() -> list[Path]:
+    """Beside the package; or, in an editable install, in site-packages, where the metadata is."""
+    folders = [Path(__file__).resolve().parents[1] / "_native"]
+    try:
+        located = importlib.metadata.distribution("holosplat").locate_file("holosplat/_native")
+        folders.append(Path(str(located)))
+    except importlib.metadata.PackageNotFoundError:
+        pass
+    return folders
+
+
+def _path(folder: Path, isa: str) -> Path:
+    return folder / f"holosplat_{isa}{'.dll' if sys.platform == 'win32' else '.so'}"
+
+
+def _is_x86() -> bool:
+    return platform.machine().lower() in ("x86_64", "amd64")
