@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -15,6 +16,8 @@ from .scan import Exposures, Scan, interleaved_split
 from .units import wavelength
 from .volume import Object
 
+SIMULATED_FRINGE_SAMPLES = 8
+"""Samples on the first fringe in simulations: frames are then right to 0.5 % of their contrast."""
 GUARD_PX = 8
 """Detector pixels of margin beyond the fringes' reach: room for the point-spread function and faint tails."""
 
@@ -111,17 +114,24 @@ def simulate(
     seed: int = 0,
     is_test: np.ndarray | None = None,
     oversample: int | None = None,
+    on_progress: Callable[[float], None] = lambda fraction: None,
 ) -> Scan:
     """A scan of `obj`: float64 waves on a fine raster, integrated over pixels, then photon noise if asked for.
 
-    is_test: [N] bool, default every fourth frame; oversample: samples per pixel, default from the fringe width.
+    is_test: [N] bool, default every fourth frame; oversample: samples per pixel, default from the fringe width;
+    `on_progress(fraction)` is called after each view.
     """
-    fine = oversample or resolving_oversample(exposures, samples_per_fringe=4, at_least=4)
+    fine = oversample or resolving_oversample(exposures, SIMULATED_FRINGE_SAMPLES, at_least=4)
     frames = np.empty((len(exposures), *exposures.views.shape))
     for i in range(len(exposures)):  # one at a time: a fine padded raster is large
         frames[i] = measure(obj, exposures[[i]], fine, torch.float64)[0].numpy()
+        on_progress((i + 1) / len(exposures))
     if photons_per_pixel is not None:
         frames = poisson(frames, photons_per_pixel, seed)
     split = interleaved_split(len(exposures)) if is_test is None else is_test
-    made_by = {"simulated_with_oversample": str(fine), "photons_per_pixel": str(photons_per_pixel or "none"), "seed": str(seed)}
+    made_by = {
+        "simulated_with_oversample": str(fine),
+        "photons_per_pixel": str(photons_per_pixel or "none"),
+        "seed": str(seed),
+    }
     return Scan(frames.astype(np.float32), exposures, split, made_by)

@@ -135,3 +135,8 @@ class Grid:
         """Voxel-centre coordinates `(x [X], y [Y], z [Z])` [m]."""
         counts = self.shape[::-1]
         return tuple(o + d * np.arange(n) for o, d, n in zip(self.origin, self.voxel_size, counts))  # type: ignore[return-value]
+
+    def block(self, start: tuple[int, int, int], shape: tuple[int, int, int]) -> Grid:
+        """The part of `shape` voxels whose first one is voxel `start` (z, y, x) of this grid."""
+        origin = [o + d * i for o, d, i in zip(self.origin, self.voxel_size, start[::-1])]
+        return Grid(shape, self.voxel_size, (origin[0], origin[1], origin[2]))

@@ -89,9 +89,7 @@ class Compound:
 
     def delta_beta(self, energy_kev: float) -> DeltaBeta:
         """δ and β at `energy_kev` [keV, 0.1 to 400]; `InputError` outside."""
-        per_density = _per_density(
-            self.formula, in_range("energy", energy_kev, *ENERGY_RANGE_KEV, unit="keV")
-        )
+        per_density = _per_density(self.formula, in_range("energy", energy_kev, *ENERGY_RANGE_KEV, unit="keV"))
         return DeltaBeta(*(self.density_g_cm3 * value for value in per_density))
 
 
@@ -193,9 +191,7 @@ def parse_material(text: str, density_g_cm3: float | None = None) -> Material:
     density_g_cm3: [g/cm³]; a preset keeps its own unless one is given, a formula needs one (`InputError`).
     """
     if not isinstance(text, str) or not text.strip():
-        raise InputError(
-            f"material must be a chemical formula or one of {_preset_names()}, but it is {text!r}."
-        )
+        raise InputError(f"material must be a chemical formula or one of {_preset_names()}, but it is {text!r}.")
     name = text.strip()
     preset = PRESETS.get(name.lower())
     if preset is not None:
@@ -215,9 +211,7 @@ def read_material_table(path: str | Path) -> dict[str, Material]:
     preset's name there) and, for a formula, `density` [g/cm³]. `InputError` names the pattern at fault.
     """
     table = _read_table(Path(path))
-    return {
-        pattern: _table_entry(f"{path}: material of {pattern!r}", entry) for pattern, entry in table.items()
-    }
+    return {pattern: _table_entry(f"{path}: material of {pattern!r}", entry) for pattern, entry in table.items()}
 
 
 def material_of(name: str, table: Mapping[str, Material], default: Material | None = None) -> Material:
@@ -230,9 +224,7 @@ def material_of(name: str, table: Mapping[str, Material], default: Material | No
         if any(fnmatchcase(candidate, pattern) for candidate in candidates):
             return material
     if default is None:
-        raise InputError(
-            f"mesh {name!r} matches no pattern of the material table ({', '.join(table)}); add one."
-        )
+        raise InputError(f"mesh {name!r} matches no pattern of the material table ({', '.join(table)}); add one.")
     return default
 
 
@@ -241,9 +233,7 @@ def _read_table(path: Path) -> dict[str, Any]:
         text = path.read_text(encoding="utf-8")
         table = tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text)
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"{path} must be a readable JSON or TOML file, but reading it failed: {error}."
-        ) from None
+        raise InputError(f"{path} must be a readable JSON or TOML file, but reading it failed: {error}.") from None
     except ValueError as error:  # both decoders' errors
         raise InputError(f"{path} must be valid JSON (or TOML, named .toml), but {error}.") from None
     if not isinstance(table, dict) or not table:

@@ -61,9 +61,7 @@ class TriangleMesh:
         a, b, c = faces.T
         faces = faces[(a != b) & (b != c) & (c != a)]
         if len(faces) == 0:
-            raise InputError(
-                f"{self.name}: all triangles are degenerate (two corners coincide); check the mesh."
-            )
+            raise InputError(f"{self.name}: all triangles are degenerate (two corners coincide); check the mesh.")
         return replace(self, vertices=self.vertices[kept], faces=faces)
 
     def transformed(self, rotation: np.ndarray, translation: np.ndarray) -> TriangleMesh:

@@ -83,9 +83,7 @@ class Scan:
         return len(self.frames)
 
     def __getitem__(self, index: np.ndarray | list[int] | slice) -> Scan:
-        return replace(
-            self, frames=self.frames[index], exposures=self.exposures[index], is_test=self.is_test[index]
-        )
+        return replace(self, frames=self.frames[index], exposures=self.exposures[index], is_test=self.is_test[index])
 
     @property
     def views(self) -> Views:
@@ -93,7 +91,7 @@ class Scan:
         return self.exposures.views
 
     def binned(self, factor: int) -> Scan:
-        """The scan on pixels `factor` times larger (means of `factor × factor`); odd rows and columns are cut evenly."""
+        """The scan on pixels `factor` times larger (means of `factor × factor`); odd rows and columns are cut."""
         if factor == 1:
             return self
         h, w = (n // factor for n in self.views.shape)

@@ -26,7 +26,13 @@ LENGTH_UNITS = {
     "Å": 1e-10,
 }
 ENERGY_UNITS = {"keV": 1.0, "kev": 1.0, "eV": 1e-3, "ev": 1e-3, "MeV": 1e3, "J": 1 / 1.602176634e-16}
-ANGLE_UNITS = {"deg": math.pi / 180, "degree": math.pi / 180, "degrees": math.pi / 180, "°": math.pi / 180, "rad": 1.0}
+ANGLE_UNITS = {
+    "deg": math.pi / 180,
+    "degree": math.pi / 180,
+    "degrees": math.pi / 180,
+    "°": math.pi / 180,
+    "rad": 1.0,
+}
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "second": 1.0, "seconds": 1.0}
 
 

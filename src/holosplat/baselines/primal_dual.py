@@ -49,7 +49,12 @@ class PrimalDual:
     """
 
     def __init__(
-        self, projector: LinearProjector, start: Tensor, weight: float, upper: float | None, coupling: float = 1.0
+        self,
+        projector: LinearProjector,
+        start: Tensor,
+        weight: float,
+        upper: float | None,
+        coupling: float = 1.0,
     ) -> None:
         self.projector, self.coupling = projector, coupling
         self.radius = weight / coupling
@@ -81,7 +86,13 @@ class PrimalDual:
             tv_ascend(self._extrapolated, self._gradient_dual, 0.5, self.radius)
             slope = self.projector.backproject(self._residual_dual)
             tv_descend(
-                slope, self._primal_step, self._gradient_dual, self.coupling, self.upper, self._array, self._extrapolated
+                slope,
+                self._primal_step,
+                self._gradient_dual,
+                self.coupling,
+                self.upper,
+                self._array,
+                self._extrapolated,
             )
 
 

@@ -14,7 +14,15 @@ from ..checks import require
 from ..fit.loop import Fit, Record, split_validation
 from ..representations import GaussianCloud
 from ..scan import Scan
-from .run_folder import RunFolder, environment, read_gaussians, read_json, scan_hash, write_gaussians, write_json
+from .run_folder import (
+    RunFolder,
+    environment,
+    read_gaussians,
+    read_json,
+    scan_hash,
+    write_gaussians,
+    write_json,
+)
 from .settings import MaterialPrior, Settings
 from .start import starting_cloud
 
@@ -146,7 +154,12 @@ def _open_folder(
     folder: RunFolder, scan: Scan, prior: MaterialPrior, settings: Settings, seed: int, resume: bool
 ) -> dict[str, Any] | None:
     """Prepare the folder; returns the checkpoint to resume from, if any."""
-    config = {"settings": asdict(settings), "prior": asdict(prior), "seed": seed, "scan_hash": scan_hash(scan)}
+    config = {
+        "settings": asdict(settings),
+        "prior": asdict(prior),
+        "seed": seed,
+        "scan_hash": scan_hash(scan),
+    }
     if not (resume and folder.config.is_file()):
         folder.require_new()
         folder.create()

@@ -1,4 +1,4 @@
-"""A run is a folder: config.json, metrics.csv, checkpoint.pt, gaussians.h5, summary.json, report.html."""
+"""A run is a folder: config.json, metrics.csv, checkpoint.pt, gaussians.h5, summary.json, source.json, report.html."""
 
 from __future__ import annotations
 
@@ -35,13 +35,17 @@ class RunFolder:
         self.checkpoint = self.path / "checkpoint.pt"
         self.gaussians = self.path / "gaussians.h5"
         self.summary = self.path / "summary.json"
+        self.source = self.path / "source.json"
         self.report = self.path / "report.html"
         self._columns: list[str] = []
 
     def require_new(self) -> None:
         """`InputError` if something is there already."""
         taken = self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir()))
-        require(not taken, f"--out must name a new or empty folder, but {self.path} holds files; choose another, or add --resume.")
+        require(
+            not taken,
+            f"--out must name a new or empty folder, but {self.path} holds files; choose another, or add --resume.",
+        )
         parent = self.path.resolve().parent
         require(parent.is_dir(), f"--out must lie in an existing folder, but {parent} is none; create it.")
 
@@ -97,7 +101,9 @@ class RunFolder:
         try:
             return torch.load(self.checkpoint, map_location="cpu", weights_only=True)
         except Exception as error:  # torch raises many kinds for damaged files
-            raise InputError(f"{self.checkpoint} must be a checkpoint, but it is damaged; start anew without it.") from error
+            raise InputError(
+                f"{self.checkpoint} must be a checkpoint, but it is damaged; start anew without it."
+            ) from error
 
 
 def write_json(path: Path, values: dict[str, Any]) -> None:
@@ -121,7 +127,11 @@ def write_gaussians(path: Path, cloud: GaussianCloud) -> None:
     """Write a cloud: its parameters (float32, as the class documents them), `unit_length` [m], `delta` and `beta`."""
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         file.attrs.update(
-            format=FORMAT, unit_length=cloud.unit_length, unit_length_units="m", delta=cloud.delta, beta=cloud.beta
+            format=FORMAT,
+            unit_length=cloud.unit_length,
+            unit_length_units="m",
+            delta=cloud.delta,
+            beta=cloud.beta,
         )
         for name, parameter in zip(PARAMETERS, cloud.parameters):
             file[name] = parameter.detach().numpy()
@@ -143,7 +153,14 @@ def scan_hash(scan: Scan) -> str:
     """A short fingerprint (SHA-256) of the frames and how they were taken."""
     digest = hashlib.sha256()
     exposures = scan.exposures
-    parts = (scan.frames, scan.is_test, scan.views.rotations, scan.views.shifts, exposures.distance, exposures.psf_sigma_px)
+    parts = (
+        scan.frames,
+        scan.is_test,
+        scan.views.rotations,
+        scan.views.shifts,
+        exposures.distance,
+        exposures.psf_sigma_px,
+    )
     for array in parts:
         digest.update(np.ascontiguousarray(array).tobytes())
     digest.update(repr((scan.views.pixel_size, exposures.energy_kev)).encode())

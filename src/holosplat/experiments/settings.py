@@ -40,7 +40,10 @@ class MaterialPrior:
     @classmethod
     def of_ratio(cls, ratio: float) -> MaterialPrior:
         """One material of unknown density, with δ/β known (negative where β lies below the medium's)."""
-        require(abs(ratio) >= 1 and abs(ratio) < 1e6, f"delta_beta must have a size between 1 and 1e6, but it is {ratio:g}.")
+        require(
+            abs(ratio) >= 1 and abs(ratio) < 1e6,
+            f"delta_beta must have a size between 1 and 1e6, but it is {ratio:g}.",
+        )
         return cls("ratio", ratio=ratio)
 
 

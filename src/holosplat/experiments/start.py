@@ -21,7 +21,7 @@ Progress = Callable[[str, float], None]
 def starting_cloud(
     scan: Scan, prior: MaterialPrior, settings: Settings, seed: int, on_progress: Progress
 ) -> GaussianCloud:
-    """The cloud to start from, by the training frames `scan`: single-material, or with δ and β free if nothing is known."""
+    """The cloud to start from, by the training frames `scan`; δ and β are free if nothing is known of the matter."""
     start = _random if settings.start == "random" else _from_phase_retrieval
     return start(scan, prior, settings, seed, on_progress)
 

@@ -56,7 +56,11 @@ class GradientRecord:
 
 
 def control_density(
-    trainable: Trainable, record: GradientRecord, views: Views, options: DensityControl, generator: torch.Generator
+    trainable: Trainable,
+    record: GradientRecord,
+    views: Views,
+    options: DensityControl,
+    generator: torch.Generator,
 ) -> tuple[int, int]:
     """One event: clone or split where the position gradient is largest, then prune; returns (added, removed)."""
     before = len(trainable.cloud)

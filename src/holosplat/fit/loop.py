@@ -96,9 +96,7 @@ class Fit:
         self.gradients.add(_gradient(self.cloud.centres))
         self.trainable.step(schedule.rates(self.step))
         if self.options.density.due(self.step, schedule.steps):
-            control_density(
-                self.trainable, self.gradients, self.train.views, self.options.density, self._generator
-            )
+            control_density(self.trainable, self.gradients, self.train.views, self.options.density, self._generator)
         self.step += 1
         record["count"] = len(self.cloud)
         if self._judge is not None and (self.step % schedule.validate_every == 0 or self.step == schedule.steps):
@@ -117,7 +115,7 @@ class Fit:
 
     def _gradients(self, index: np.ndarray) -> Record:
         """Back-propagate the objective of the views `index`; returns its terms."""
-        weights, schedule = self.options.objective, self.options.schedule
+        schedule = self.options.schedule
         predicted = self.instrument.measure(self.cloud, index)
         parts = self._image_terms(predicted, self._measured[torch.from_numpy(index)])
         per_view = sum(weight * value for weight, value in parts.values())
@@ -211,7 +209,10 @@ class Fit:
 
 def split_validation(train: Scan, count: int) -> tuple[Scan, Scan]:
     """Training frames without, and only, `count` evenly spread validation frames; `InputError` if none is left."""
-    require(count < len(train), f"validation_views must leave a training frame: {count} of {len(train)} are asked for.")
+    require(
+        count < len(train),
+        f"validation_views must leave a training frame: {count} of {len(train)} are asked for.",
+    )
     chosen = np.zeros(len(train), dtype=bool)
     if count > 0:
         chosen[np.round((np.arange(count) + 0.5) * len(train) / count).astype(int) % len(train)] = True

@@ -108,9 +108,7 @@ def _frame_kinds(fields: Fields) -> np.ndarray:
             f"but it holds {wrong:g}."
         )
     if not (kinds == PROJECTION).any():
-        raise InputError(
-            f"{fields.label(IMAGE_KEY)} must mark at least one projection (0), but it marks none."
-        )
+        raise InputError(f"{fields.label(IMAGE_KEY)} must mark at least one projection (0), but it marks none.")
     return kinds.astype(int)
 
 
@@ -119,9 +117,7 @@ def _corrected_frames(fields: Fields, kinds: np.ndarray) -> np.ndarray:
     data = fields.dataset(DATA)
     flat, dark = _mean_frame(data, kinds == FLAT), _mean_frame(data, kinds == DARK)
     if flat is None and dark is not None:
-        raise InputError(
-            f"{fields.label(IMAGE_KEY)} must mark flats (1) beside the dark ones (2), but it marks none."
-        )
+        raise InputError(f"{fields.label(IMAGE_KEY)} must mark flats (1) beside the dark ones (2), but it marks none.")
     offset = np.zeros(data.shape[1:]) if dark is None else dark
     gain = np.ones(data.shape[1:]) if flat is None else flat - offset
     dead = int((~(gain > 0)).sum())
@@ -240,9 +236,7 @@ def _distances(fields: Fields, kinds: np.ndarray) -> np.ndarray:
 def _split(fields: Fields, kinds: np.ndarray) -> np.ndarray:
     split = _optional(fields, kinds, SPLIT, PIXEL_UNITS, "")
     wrong = split[~np.isin(split, (0, 1))]
-    require(
-        len(wrong) == 0, f"{fields.label(SPLIT)} must hold 0 (train) or 1 (test), but it holds {wrong[:1]}."
-    )
+    require(len(wrong) == 0, f"{fields.label(SPLIT)} must hold 0 (train) or 1 (test), but it holds {wrong[:1]}.")
     return split == 1
 
 

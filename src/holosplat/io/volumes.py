@@ -61,9 +61,7 @@ def _attribute(fields: Fields, name: str, counts: tuple[int, ...]) -> np.ndarray
     label = f"{fields.path}: @{name}"
     found = [attribute_numbers(label, place.attrs[name], counts) for place in places if name in place.attrs]
     if not found:
-        raise InputError(
-            f"{label} (in metres, on /delta or the file's root) must be there, but it is missing."
-        )
+        raise InputError(f"{label} (in metres, on /delta or the file's root) must be there, but it is missing.")
     if not all(np.allclose(value, found[0], rtol=1e-6, atol=1e-15, equal_nan=True) for value in found):
         values = ", ".join(str(value.tolist()) for value in found)
         raise InputError(f"{label} must be the same on the datasets and the root, but it is {values}.")

@@ -90,9 +90,7 @@ def _read_mesh(path: Path, factor: float) -> TriangleMesh:
         surface = _surface(path, data)
         points, faces = _checked_points(path, surface), _triangles(surface)
     if len(faces) == 0:
-        raise InputError(
-            f"{path} must hold triangles, strips or polygons, but its cells are points or lines."
-        )
+        raise InputError(f"{path} must hold triangles, strips or polygons, but its cells are points or lines.")
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     mesh = TriangleMesh(points * factor, faces, path.name).merged(MERGE_TOLERANCE * extent * factor)
     if _ends_within_a_line(path) and not _is_closed(mesh.faces):

@@ -27,9 +27,7 @@ def legacy_fault(file: bytes) -> str:
     """What is wrong with how a legacy file's cells are counted."""
     lines = file[:1024].split(b"\n", 3)
     binary = len(lines) > 2 and lines[2].strip().upper() == b"BINARY"
-    version = re.match(
-        rb".{22}[ \t]*(\d+)\.\d+", file
-    )  # VTK too takes what it cannot read for an old version
+    version = re.match(rb".{22}[ \t]*(\d+)\.\d+", file)  # VTK too takes what it cannot read for an old version
     modern = version is not None and int(version[1]) >= 5
     for section in SECTION.finditer(file):
         name = section[1].decode().upper()
@@ -54,9 +52,7 @@ def cells_fault(data: Any) -> str:
 
     points = data.GetNumberOfPoints()
     grid = data.IsA("vtkUnstructuredGrid")
-    arrays = (
-        [data.GetCells()] if grid else [data.GetVerts(), data.GetLines(), data.GetPolys(), data.GetStrips()]
-    )
+    arrays = [data.GetCells()] if grid else [data.GetVerts(), data.GetLines(), data.GetPolys(), data.GetStrips()]
     for cells in (cells for cells in arrays if cells.GetNumberOfCells()):
         corners = vtk_to_numpy(cells.GetConnectivityArray())
         if len(corners) and (corners.min() < 0 or corners.max() >= points):

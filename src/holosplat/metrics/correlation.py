@@ -71,9 +71,7 @@ def half_bit_threshold(counts: np.ndarray) -> np.ndarray:
     return (snr + cross + root) / (snr + 1.0 + cross)
 
 
-def resolution(
-    frequency: np.ndarray, curve: np.ndarray, threshold: float | np.ndarray, pitch: float
-) -> float | None:
+def resolution(frequency: np.ndarray, curve: np.ndarray, threshold: float | np.ndarray, pitch: float) -> float | None:
     """Full-period resolution [m] `pitch / f` where `curve` first falls below `threshold`.
 
     frequency: [R] [cycles/pixel]; curve: [R]; threshold: one number or [R]; pitch: [m] per pixel. The
@@ -129,9 +127,7 @@ def _correlate(
     return np.arange(1, count + 1) / float(sides.min()), curve
 
 
-def _rings(
-    shape: tuple[int, ...], spacing: Sequence[float] | np.ndarray | None
-) -> tuple[np.ndarray, np.ndarray, int]:
+def _rings(shape: tuple[int, ...], spacing: Sequence[float] | np.ndarray | None) -> tuple[np.ndarray, np.ndarray, int]:
     """Ring index and Hermitian weight of each sample of a real transform, and the number of the last ring."""
     steps = np.ones(len(shape)) if spacing is None else np.asarray(spacing, dtype=np.float64)
     if len(steps) != len(shape) or not np.all(steps > 0):

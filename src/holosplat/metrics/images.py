@@ -113,9 +113,7 @@ def structural_similarity(image_a: np.ndarray, image_b: np.ndarray) -> float:
     """
     a, b = np.asarray(image_a, dtype=np.float64), np.asarray(image_b, dtype=np.float64)
     if a.ndim != 2 or a.shape != b.shape or min(a.shape) < SSIM_WINDOW:
-        raise InputError(
-            f"SSIM needs two images of one shape, at least 11 × 11, but got {a.shape} and {b.shape}."
-        )
+        raise InputError(f"SSIM needs two images of one shape, at least 11 × 11, but got {a.shape} and {b.shape}.")
     mean_a, mean_b = _window(a), _window(b)
     var_a, var_b = _window(a * a) - mean_a**2, _window(b * b) - mean_b**2
     covariance = _window(a * b) - mean_a * mean_b

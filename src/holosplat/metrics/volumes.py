@@ -79,9 +79,7 @@ def volume_scores(reconstruction: Volume, truth: Volume, material_delta: float |
     """
     require_same_grid(reconstruction.grid, truth.grid)
     material = robust_material_delta(truth) if material_delta is None else float(material_delta)
-    require(
-        material != 0 and np.isfinite(material), f"material δ must be a number but 0; it is {material!r}."
-    )
+    require(material != 0 and np.isfinite(material), f"material δ must be a number but 0; it is {material!r}.")
     found, true = reconstruction.delta / material > 0.5, truth.delta / material > 0.5
     require(
         bool(true.any()),

@@ -60,9 +60,15 @@ def invert_contrast(
 
 
 def _continued(
-    frames: Tensor, pitch: float, distance: np.ndarray, energy_kev: float, delta: float, beta: float, mode: str
+    frames: Tensor,
+    pitch: float,
+    distance: np.ndarray,
+    energy_kev: float,
+    delta: float,
+    beta: float,
+    mode: str,
 ) -> tuple[Tensor, tuple[slice, slice, slice]]:
-    """Frames in float64, continued by twice the filter's length (torch's padding `mode`), and the slices that undo it."""
+    """Frames in float64, continued by twice the filter's length (torch's `mode`), and the slices that undo it."""
     absorption = max(abs(beta), WEAKEST_ABSORPTION * delta)
     reach = math.sqrt(wavelength(energy_kev) * float(np.max(distance)) * delta / absorption / math.pi)
     h, w = frames.shape[-2:]

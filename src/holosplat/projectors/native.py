@@ -107,9 +107,7 @@ def _library(forced: str) -> ctypes.CDLL:
     """The library for `forced`, or the fastest one that this machine runs if that is empty."""
     choices = available_isas()
     if forced and forced not in choices:
-        raise RuntimeError(
-            f"HOLOSPLAT_ISA must be one of {', '.join(choices)} here, but it is {forced!r}; unset it."
-        )
+        raise RuntimeError(f"HOLOSPLAT_ISA must be one of {', '.join(choices)} here, but it is {forced!r}; unset it.")
     return _open(_folder(), forced or choices[-1])
 
 

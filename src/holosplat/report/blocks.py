@@ -59,9 +59,7 @@ def _drawn(heading: str, caption: str, title: str, figure: Figure, kind: str) ->
 def _scene(content: ReportContent) -> Block:
     heading, material = "Scene and reconstruction", content.surface_material()
     if material is None:
-        return Block(
-            heading, "The reconstruction holds no matter (its δ is zero everywhere), so no surface is drawn."
-        )
+        return Block(heading, "The reconstruction holds no matter (its δ is zero everywhere), so no surface is drawn.")
     grid = content.reconstruction.grid
     figure = scene_figure(content.reconstruction, content.truth, material)
     size = "\u00a0×\u00a0".join(f"{n * d * 1e6:.3g}" for n, d in zip(grid.shape[::-1], grid.voxel_size))
@@ -111,9 +109,7 @@ def _projections(content: ReportContent) -> Block:
         f"{' and '.join(maps.labels[:2])}. "
     )
     phase = -wavenumber(content.energy_kev) * np.asarray(maps.dephasing[:2])
-    text += f"The reconstruction's phase runs from {phase.min():.3g} to {phase.max():.3g} rad. ".replace(
-        "-", "−"
-    )
+    text += f"The reconstruction's phase runs from {phase.min():.3g} to {phase.max():.3g} rad. ".replace("-", "−")
     if maps.true_dephasing is None:
         text += "The truth is not known."
     else:
@@ -144,9 +140,7 @@ def _slices(content: ReportContent) -> Block:
 def _correlation(content: ReportContent) -> Block:
     heading, images = "Resolution", None if content.held_out is None else content.held_out.scores
     if images is None and content.volume_scores is None:
-        return Block(
-            heading, "Without a held-out view or a truth there is nothing to correlate the result with."
-        )
+        return Block(heading, "Without a held-out view or a truth there is nothing to correlate the result with.")
     figure = correlation_figure(images, content.volume_scores, content.pixel_size)
     text = ""
     if images is not None:

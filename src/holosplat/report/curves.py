@@ -80,9 +80,7 @@ def _threshold(
     axes.plot(frequency, threshold, color=colour, lw=0.8, ls=dashes, label=name + said)
     if crossed:
         at = 1e-6 / float(length or np.inf)
-        axes.plot(
-            [at], [np.interp(at, frequency, threshold)], "o", ms=3.2, color=colour, zorder=5, clip_on=False
-        )
+        axes.plot([at], [np.interp(at, frequency, threshold)], "o", ms=3.2, color=colour, zorder=5, clip_on=False)
 
 
 def _correlation_axes(axes: Axes, frequency: np.ndarray, label: str, least: float) -> None:
@@ -175,9 +173,7 @@ def _course(axes: Axes, step: np.ndarray, columns: Mapping[str, np.ndarray], sca
 
 
 @styled
-def histogram_figure(
-    reconstruction: Volume, truth: Volume | None, material: float
-) -> tuple[Figure, float | None]:
+def histogram_figure(reconstruction: Volume, truth: Volume | None, material: float) -> tuple[Figure, float | None]:
     """Histograms of δ/β over the matter, weighted by δ, and of δ over all voxels.
 
     Matter is where δ exceeds half of the `material`'s. Returns the figure and the part of the mass whose δ/β
@@ -246,9 +242,7 @@ def _delta_panel(axes: Axes, reconstruction: Volume, truth: Volume | None, mater
         filled = "stepfilled" if name == "truth" else "step"
         alpha = 0.35 if name == "truth" else 1.0
         axes.hist(values, edges, color=colour, histtype=filled, alpha=alpha, lw=1.0, label=name)
-    axes.axvline(
-        0.5 * material / scale, color=FAINT, lw=0.8, ls=(0, (1, 1.5)), label="half of the material's δ"
-    )
+    axes.axvline(0.5 * material / scale, color=FAINT, lw=0.8, ls=(0, (1, 1.5)), label="half of the material's δ")
     axes.set_yscale("log")
     axes.set(xlabel=f"δ ({power})" if power else "δ", ylabel="voxels per bin", xlim=(edges[0], edges[-1]))
     axes.legend(loc="upper right")

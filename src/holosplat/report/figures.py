@@ -92,9 +92,7 @@ def _deviation(truth: Volume, level: float) -> Deviation:
 def _surface_panel(axes: Axes, shown: SurfaceImage, grid: Grid, close: bool = False) -> None:
     """The picture in its box; `close`: without the box, and no wider than the matter needs."""
     half = 0.5 * shown.width
-    axes.imshow(
-        shown.rgba, extent=(-half, half, half, -half), zorder=2, interpolation="antialiased", aspect="auto"
-    )
+    axes.imshow(shown.rgba, extent=(-half, half, half, -half), zorder=2, interpolation="antialiased", aspect="auto")
     axes.set_axis_off()
     if close:
         _come_close(axes, shown)
@@ -134,15 +132,11 @@ def held_out_figure(views: HeldOutViews, pixel_size: float, most: int = 4) -> Fi
         residual = (views.predicted[k] - views.measured[k]) / scale
         signed = image_panel(axes[2], residual, pitch, SIGNED_MAP, (-limit / scale, limit / scale))
         scores = f"SSIM {views.scores.ssim[k]:.3f}, FRCM {views.scores.frcm[k]:.3f}"
-        for i, title in enumerate(
-            (f"Measured, {views.labels[k]}", f"Predicted ({scores})", "Predicted − measured")
-        ):
+        for i, title in enumerate((f"Measured, {views.labels[k]}", f"Predicted ({scores})", "Predicted − measured")):
             letter(axes[i], 3 * row + i, title)
         scale_bar(axes[0], width * pixel_size)
     panels.bar(grey, 1, (0, len(chosen) - 1), "intensity relative to the flat field", "both")
-    panels.bar(
-        signed, 2, (0, len(chosen) - 1), f"difference of intensity{f' ({power})' if power else ''}", "both"
-    )
+    panels.bar(signed, 2, (0, len(chosen) - 1), f"difference of intensity{f' ({power})' if power else ''}", "both")
     return panels.figure
 
 
@@ -180,9 +174,7 @@ def projections_figure(maps: ProjectedMaps, energy_kev: float, pixel_size: float
     panels = PanelGrid(2 * views, [width] * 3, [height] * 3, (1, 2))
     for row, (phase, i) in enumerate(pairs):
         factor, true, found = (
-            (-k, maps.true_dephasing, maps.dephasing)
-            if phase
-            else (2 * k, maps.true_absorption, maps.absorption)
+            (-k, maps.true_dephasing, maps.dephasing) if phase else (2 * k, maps.true_absorption, maps.absorption)
         )
         shown = [factor * np.asarray(true[i]), factor * np.asarray(found[i])]
         _projected(panels, (row, 0), shown, phase, maps.labels[i], pixel_size)
@@ -210,11 +202,7 @@ def _projected(
     panels.bar(drawn, column + len(shown) - 1, (row, row), name + unit)
     scale_bar(axes[0], shown[0].shape[1] * pixel_size)
     title = name[0].upper() + name[1:]
-    titles = (
-        [f"{title}, {view}"]
-        if len(shown) == 1
-        else [f"{title}, truth, {view}", "Reconstruction", "Difference"]
-    )
+    titles = [f"{title}, {view}"] if len(shown) == 1 else [f"{title}, truth, {view}", "Reconstruction", "Difference"]
     for i, text in enumerate(titles):
         letter(axes[i], row * len(panels.axes[row]) + column + i, text)
     if len(shown) == 2:
@@ -295,9 +283,7 @@ def _slice_row(
     return drawn
 
 
-def _slice_titles(
-    axes: list[Axes], first: int, name: str, grid: Grid, positions: tuple[int, int, int]
-) -> None:
+def _slice_titles(axes: list[Axes], first: int, name: str, grid: Grid, positions: tuple[int, int, int]) -> None:
     centres = grid.axes()[::-1]
     unit, factor = length_unit(max(n * d for n, d in zip(grid.shape[::-1], grid.voxel_size)))
     for i, (panel, (plane, axis, _)) in enumerate(zip(axes, PLANES)):
@@ -330,9 +316,7 @@ def hero_figure(
     image_panel(first, hologram, (pixel_size, pixel_size), HOLOGRAM_MAP, (float(low), float(high)))
     scale_bar(first, hologram.shape[1] * pixel_size)
     letter(first, 0, "Hologram")
-    picture = render_surface(
-        reconstruction.delta, grid, 0.5 * material, camera(), 800, to_rgb(RECONSTRUCTION)
-    )
+    picture = render_surface(reconstruction.delta, grid, 0.5 * material, camera(), 800, to_rgb(RECONSTRUCTION))
     _surface_panel(second, picture, grid, close=True)
     letter(second, 1, "Reconstruction")
     drawn = _banner_slices(place, reconstruction, truth, material)
@@ -353,9 +337,7 @@ def _banner_slices(
     if truth is None:
         panels = [place(6.6, 0.05, 2.8, 2.8)]
         letter(panels[0], 2, "Slice of δ")
-        return _slice_row(
-            panels, reconstruction.delta / scale, grid, planes, from_dark(DELTA_MAP, limits), limits
-        )
+        return _slice_row(panels, reconstruction.delta / scale, grid, planes, from_dark(DELTA_MAP, limits), limits)
     for i, (name, volume) in enumerate((("truth", truth), ("reconstruction", reconstruction))):
         panels = [place(left, 1.56 - 1.51 * i, 1.29, 1.29) for left in (6.72, 8.11)]
         drawn = _slice_row(panels, volume.delta / scale, grid, planes, from_dark(DELTA_MAP, limits), limits)

@@ -223,9 +223,7 @@ class PanelGrid:
         box = (left / figure_width, bottom / self._height, width / figure_width, height / self._height)
         return self.figure.add_axes(box)
 
-    def bar(
-        self, drawn: AxesImage, column: int, rows: tuple[int, int], label: str, extend: str = "neither"
-    ) -> None:
+    def bar(self, drawn: AxesImage, column: int, rows: tuple[int, int], label: str, extend: str = "neither") -> None:
         """A colour bar with `label` in the slot right of `column`, along rows `first … last`."""
         last = min(rows[1], rows[0] + 1)  # two rows are long enough
         top = self._height - rows[0] * self._pitch - self.TITLE
@@ -235,9 +233,7 @@ class PanelGrid:
         colour_bar(self.figure, drawn, axes, label, extend)
 
 
-def colour_bar(
-    figure: Figure, drawn: ScalarMappable, axes: Axes, label: str, extend: str = "neither"
-) -> None:
+def colour_bar(figure: Figure, drawn: ScalarMappable, axes: Axes, label: str, extend: str = "neither") -> None:
     """A colour bar with `label` that fills `axes`."""
     height = axes.get_position().height * figure.get_figheight()  # [inches]
     bar = figure.colorbar(drawn, cax=axes, extend=extend, extendfrac=0.09 / height)
@@ -273,10 +269,6 @@ def scientific(value: float | None, digits: int = 3) -> str:
     if math.isinf(value):
         return "∞" if value > 0 else "−∞"
     if value == 0 or 1e-3 <= abs(value) < 1e5:
-        return (
-            f"{value:.{digits}g}".replace("-", "−")
-            if abs(value) < 1000
-            else f"{value:,.0f}".replace("-", "−")
-        )
+        return f"{value:.{digits}g}".replace("-", "−") if abs(value) < 1000 else f"{value:,.0f}".replace("-", "−")
     mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
     return f"{mantissa.replace('-', '−')}\u00a0×\u00a010{superscript(int(exponent))}"

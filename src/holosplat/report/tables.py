@@ -23,21 +23,16 @@ def verdict(content: ReportContent) -> str:
     if content.held_out is not None:
         mean, count = content.held_out.scores.mean, len(content.held_out.labels)
         views = "one held-out view" if count == 1 else f"{count} held-out views"
-        parts.append(
-            f"predicts {views} with a mean SSIM of {mean['ssim']:.3f} and FRCM of {mean['frcm']:.3f}"
-        )
+        parts.append(f"predicts {views} with a mean SSIM of {mean['ssim']:.3f} and FRCM of {mean['frcm']:.3f}")
     if content.volume_scores is not None:
         scores = content.volume_scores
         size = percent(abs(scores.delta_deviation)).lstrip("+")
         side = "above" if scores.delta_deviation > 0 else "below"
         parts.append(
-            f"overlaps the truth with a Dice coefficient of {scores.dice:.3f}, "
-            f"its mean δ {size} {side} the true one"
+            f"overlaps the truth with a Dice coefficient of {scores.dice:.3f}, its mean δ {size} {side} the true one"
         )
     if not parts:
-        return (
-            "No view was held out and no truth is known: this page shows the reconstruction without a score."
-        )
+        return "No view was held out and no truth is known: this page shows the reconstruction without a score."
     return f"The reconstruction {' and '.join(parts)}."
 
 

@@ -281,7 +281,5 @@ def _check_channel(
         in_range(f"box extent {axis}", extent, 1e-9, 10.0, unit="metres")
     in_range("cell diameter", diameter, 1e-9, 1.0, unit="metres")
     require(0 <= deform <= MAX_DEFORM, f"deform must lie between 0 and {MAX_DEFORM}, but it is {deform!r}.")
-    require(
-        0 <= margin < diameter, f"margin must lie between 0 and the cell diameter, but it is {margin!r} m."
-    )
+    require(0 <= margin < diameter, f"margin must lie between 0 and the cell diameter, but it is {margin!r} m.")
     require(shape in ("box", "cylinder"), f"shape must be 'box' or 'cylinder', but it is {shape!r}.")

@@ -59,7 +59,7 @@ def occupancy(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray, grid:
 def ray_hits(
     points: np.ndarray, faces: np.ndarray, shape: tuple[int, int]
 ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]]:
-    """Batches of hits `(ray, z, sign, face)`: flat lattice index, depth, +1 where the ray leaves and -1 where it enters.
+    """Batches of hits `(ray, z, sign, face)`: flat lattice index, depth, +1 where the ray leaves, -1 where it enters.
 
     points: [P, 3] as (column, row, depth), the first two in lattice units; shape: lattice (rows, columns).
     """

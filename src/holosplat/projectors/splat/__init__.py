@@ -95,9 +95,7 @@ def _of(table: dict[str, Callable[..., Tensor]], backend: str) -> Callable[..., 
     return table[backend]
 
 
-def _check_cloud(
-    backend: str, centres: Tensor, scales: Tensor, quaternions: Tensor, amplitudes: Tensor
-) -> None:
+def _check_cloud(backend: str, centres: Tensor, scales: Tensor, quaternions: Tensor, amplitudes: Tensor) -> None:
     """`InputError` unless the four arrays describe a cloud the backend can draw."""
     cloud = {"centres": centres, "scales": scales, "quaternions": quaternions, "amplitudes": amplitudes}
     for name, array in cloud.items():
@@ -130,8 +128,7 @@ def _check_type(backend: str, name: str, array: Tensor, centres: Tensor) -> None
     alike = array.dtype == centres.dtype and array.device == centres.device
     require(
         alike,
-        f"{name} must have the type and device of centres, {centres.dtype} on {centres.device}, "
-        f"but they are {held}.",
+        f"{name} must have the type and device of centres, {centres.dtype} on {centres.device}, but they are {held}.",
     )
     if backend == "cpu":
         require(
@@ -163,7 +160,5 @@ def _counts(shape: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _check_spread(cutoff: float, name: str, variance: float) -> None:
-    require(
-        0 < cutoff <= 10, f"cutoff must be above 0 and at most 10 standard deviations, but it is {cutoff}."
-    )
+    require(0 < cutoff <= 10, f"cutoff must be above 0 and at most 10 standard deviations, but it is {cutoff}.")
     require(0 <= variance < math.inf, f"{name} must be a variance of zero or more, but it is {variance}.")

@@ -71,9 +71,7 @@ class _Splat(torch.autograd.Function):
         arrays = ctx.saved_tensors
         out = [torch.empty_like(a) for a in arrays]
         views, gradient = _views(ctx.poses, ctx.shape), gradient.contiguous()
-        native.call(
-            "holosplat_splat_backward", _cloud(arrays), views, ctx.options, _at(gradient), _gradients(out)
-        )
+        native.call("holosplat_splat_backward", _cloud(arrays), views, ctx.options, _at(gradient), _gradients(out))
         return *out, None, None, None
 
 
@@ -101,9 +99,7 @@ class _Voxelise(torch.autograd.Function):
         arrays = ctx.saved_tensors
         out = [torch.empty_like(a) for a in arrays]
         grid, gradient = native.Grid(*ctx.shape), gradient.contiguous()
-        native.call(
-            "holosplat_voxelise_backward", _cloud(arrays), grid, ctx.options, _at(gradient), _gradients(out)
-        )
+        native.call("holosplat_voxelise_backward", _cloud(arrays), grid, ctx.options, _at(gradient), _gradients(out))
         return *out, None, None
 
 

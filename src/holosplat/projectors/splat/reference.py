@@ -98,9 +98,7 @@ def _boxes(
     return low.long(), high.long()
 
 
-def _draw(
-    mean: Tensor, covariance: Tensor, peak: Tensor, low: Tensor, high: Tensor, shape: tuple[int, ...]
-) -> Tensor:
+def _draw(mean: Tensor, covariance: Tensor, peak: Tensor, low: Tensor, high: Tensor, shape: tuple[int, ...]) -> Tensor:
     """The sum [C, *shape] of Gaussians of peak [N, C] on their boxes, by a list of (Gaussian, pixel)."""
     extent = (high - low + 1).clamp(min=0)
     pairs = extent.prod(1)

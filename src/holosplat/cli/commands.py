@@ -1,0 +1,246 @@
+"""Each command is a thin layer over the Python API: it reads files, calls one act, writes files, and prints."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import OmitArgPrefixes, Positional, arg
+
+from ..checks import InputError, require
+from ..experiments.demo import DETECTOR, write_demo_meshes
+from ..experiments.evaluate import Evaluation
+from ..experiments.evaluate import evaluate as score
+from ..experiments.evaluate import render as predict
+from ..experiments.reconstruct import load_reconstruction
+from ..experiments.reconstruct import reconstruct as fit
+from ..experiments.run_folder import RunFolder, read_json, write_json
+from ..experiments.settings import preset
+from ..experiments.simulate import read_scene
+from ..forward import simulate as image_scene
+from ..geometry import Grid
+from ..io.nxtomo import read_scan, write_scan
+from ..io.volumes import read_volume, write_volume
+from ..report.run import report_run
+from ..scan import Scan
+from .options import BeamlineOptions, MaterialOptions, MeshOptions, NoiseOptions, PriorOptions
+from .progress import ProgressBar
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+
+
+def simulate(
+    meshes: Positional[tuple[Path, ...]],
+    beamline: BeamlineOptions,
+    out: Path,
+    files: MeshOptions = MeshOptions(),
+    filling: MaterialOptions = MaterialOptions(),
+    noise: NoiseOptions = NoiseOptions(),
+    truth: Path | None = None,
+) -> None:
+    """Simulate the holograms of closed triangle meshes.
+
+    Args:
+        meshes: VTK files (.vtk, .vtu, .vtp), one a cell; x, y, z are the object frame's, y is the rotation axis.
+        out: Scan file to write (NXtomo).
+        truth: Also write the true volume here.
+    """
+    require(len(meshes) > 0, "simulate needs at least one mesh file.")
+    exposures = beamline.exposures()
+    materials = filling.filling()
+    scene = read_scene(meshes, materials, beamline.energy_kev, length_unit=files.length_unit, origin=files.origin)
+    missing = scene.missing_field(exposures.views)
+    if missing > 0:
+        _say(
+            f"warning: the scene reaches {1e6 * missing:.3g} µm ({missing / beamline.pixel_size:.3g} pixels) beyond "
+            "the detector in at least one view; enlarge --detector, or move --origin."
+        )
+    split = beamline.split(len(exposures))
+    with ProgressBar() as bar:
+        scan = image_scene(
+            scene,
+            exposures,
+            photons_per_pixel=noise.photons_per_pixel,
+            seed=noise.seed,
+            is_test=split,
+            on_progress=lambda fraction: bar.show("simulating views", fraction, {}),
+        )
+    of_scene = {
+        "meshes": str(len(meshes)),
+        "material": filling.material,
+        "medium": filling.medium or "vacuum",
+    }
+    write_scan(out, replace(scan, provenance={**scan.provenance, **of_scene}))
+    rows, columns = beamline.detector
+    _say(f"wrote {out}: {len(scan)} frames of {rows} × {columns} pixels, {int(split.sum())} of them held out")
+    if truth is not None:
+        write_volume(truth, scene.voxelise(Grid.of_views(exposures.views)))
+        _say(f"wrote {truth}: the true volume")
+
+
+def reconstruct(
+    scan: Positional[Path],
+    out: Path,
+    matter: PriorOptions = PriorOptions(),
+    preset_name: Annotated[str, arg(name="preset")] = "default",
+    seed: int = 0,
+    resume: bool = False,
+) -> None:
+    """Reconstruct a scan as Gaussians; the run folder holds the result and its report.
+
+    Args:
+        scan: Scan file (NXtomo).
+        out: Run folder to make.
+        preset_name: Named settings: default, fast, thesis.
+        seed: Seed of everything random.
+        resume: Go on with an interrupted run.
+    """
+    settings = preset(preset_name)
+    measured = read_scan(scan)
+    prior = matter.prior(measured.exposures.energy_kev)
+    folder = RunFolder(out)
+    with ProgressBar() as bar:
+        result = fit(measured, prior, settings, seed, folder=folder, resume=resume, on_progress=bar.show)
+    write_json(folder.source, {"scan": str(scan.resolve())})
+    evaluation = score(result, measured, None)
+    report = report_run(folder, result, measured, evaluation, None)
+    _print_scores(evaluation)
+    _say(f"{sum(result.timing.values()):.1f} s, {len(result.cloud)} Gaussians; report: {report}")
+    if not result.finished:
+        _say(f"interrupted, but {out} is usable; go on with --resume")
+        raise SystemExit(INTERRUPTED)
+
+
+def render(run: Positional[Path], scan: Path, out: Path, split: Literal["test", "train", "all"] = "test") -> None:
+    """Predict the frames of a scan from a run.
+
+    Args:
+        run: Run folder.
+        scan: Scan file whose poses and optics are rendered.
+        out: Scan file to write: the predicted frames, in the scan's order.
+        split: Which frames.
+    """
+    result, wanted = load_reconstruction(RunFolder(run)), read_scan(scan)
+    chosen = {"test": wanted.test, "train": wanted.train, "all": lambda: wanted}[split]()
+    require(len(chosen) > 0, f"{scan} has no {split} frames to render; choose another --split.")
+    frames = predict(result, chosen.exposures)
+    write_scan(out, Scan(frames, chosen.exposures, chosen.is_test, {"rendered_from": run.name}))
+    _say(f"wrote {out}: {len(frames)} predicted frames")
+
+
+def export(
+    run: Positional[Path],
+    volume: Path,
+    shape: tuple[int, int, int] | None = None,
+    voxel_size: float | None = None,
+) -> None:
+    """Write δ and β of a run as a volume file.
+
+    Args:
+        run: Run folder.
+        volume: Volume file to write (HDF5).
+        shape: Voxels along z, y, x (default: the scan's field of view, Z = X = W, Y = H).
+        voxel_size: Edge of a voxel [m] (default: the pixel size).
+    """
+    folder = RunFolder(run)
+    result = load_reconstruction(folder)
+    detector = read_json(folder.summary)["detector"]
+    rows, columns = int(detector["rows"]), int(detector["columns"])
+    grid = Grid.centred(shape or (columns, rows, columns), voxel_size or float(detector["pixel_size_m"]))
+    write_volume(volume, result.cloud.voxelise(grid))
+    _say(f"wrote {volume}: {' × '.join(map(str, grid.shape))} voxels of {1e6 * grid.voxel_size[0]:.4g} µm")
+
+
+def evaluate(
+    run: Positional[Path],
+    scan: Path | None = None,
+    truth: Path | None = None,
+    as_json: Annotated[bool, arg(name="json")] = False,
+) -> None:
+    """Score a run on held-out frames and against the true volume, and bring its report up to date.
+
+    Args:
+        run: Run folder.
+        scan: Scan file (default: the one that was reconstructed).
+        truth: Volume file of the truth.
+        as_json: Print JSON instead of a table.
+    """
+    folder = RunFolder(run)
+    result = load_reconstruction(folder)
+    measured, true_volume = read_scan(scan or _source(folder)), read_volume(truth) if truth else None
+    evaluation = score(result, measured, true_volume)
+    if as_json:
+        print(json.dumps(evaluation.as_dict(), indent=2, allow_nan=False))
+    else:
+        _print_scores(evaluation)
+    report = report_run(folder, result, measured, evaluation, true_volume)
+    _say(f"report: {report}")
+
+
+def demo(out: Path = Path("demo")) -> None:
+    """Run the whole chain on generated red cells: simulate, reconstruct, evaluate, report.
+
+    Args:
+        out: Folder to make.
+    """
+    RunFolder(out).require_new()
+    meshes, scan, truth, run = out / "meshes", out / "scan.nxs", out / "truth.h5", out / "run"
+    meshes.mkdir(parents=True)
+    paths = write_demo_meshes(meshes)
+    _say(f"wrote {len(paths)} generated red cells to {meshes}")
+    detector = "--detector {} {}".format(*DETECTOR)
+    _say(
+        f"\n$ holosplat simulate {meshes}/*.vtk {detector} --views 16 --psf-sigma-px 0.05 --out {scan} --truth {truth}"
+    )
+    simulate(tuple(paths), BeamlineOptions(DETECTOR, psf_sigma_px=0.05, views=16), scan, truth=truth)
+    _say(f"\n$ holosplat reconstruct {scan} --material haemoglobin --out {run}")
+    reconstruct(scan, run, PriorOptions("haemoglobin"))
+    _say(f"\n$ holosplat evaluate {run} --truth {truth}")
+    evaluate(run, truth=truth)
+
+
+def _source(folder: RunFolder) -> Path:
+    path = Path(str(read_json(folder.source).get("scan", "")))
+    require(path.is_file(), f"the scan {path} of this run is no longer there; name it with --scan.")
+    return path
+
+
+def _print_scores(evaluation: Evaluation) -> None:
+    for line in evaluation.lines():
+        print(line)
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)
+
+
+COMMANDS = {
+    "simulate": simulate,
+    "reconstruct": reconstruct,
+    "render": render,
+    "export": export,
+    "evaluate": evaluate,
+    "demo": demo,
+}
+
+
+def main() -> None:
+    """Run a command; bad input prints one sentence and exits with 2, Ctrl-C exits with 130."""
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            COMMANDS,
+            prog="holosplat",
+            description="Quantitative 3D maps from a handful of X-ray phase-contrast images.",
+            config=(OmitArgPrefixes,),
+        )
+    except InputError as error:
+        _say(f"holosplat: {error}")
+        raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        _say("holosplat: interrupted")
+        raise SystemExit(INTERRUPTED) from None

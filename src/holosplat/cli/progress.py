@@ -1,0 +1,47 @@
+"""The progress bar of the command line."""
+
+from __future__ import annotations
+
+import sys
+from types import TracebackType
+
+from tqdm import tqdm
+
+
+class ProgressBar:
+    """One bar for one stage after another, on standard error."""
+
+    def __init__(self) -> None:
+        self._bar: tqdm | None = None
+        self._stage = ""
+
+    def __enter__(self) -> ProgressBar:
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._close()
+
+    def show(self, stage: str, fraction: float, record: dict[str, float]) -> None:
+        """Stage `stage` is done to `fraction`; the fit's last `record` adds loss, count and steps a second."""
+        if stage != self._stage:
+            self._close()
+            self._stage = stage
+            self._bar = tqdm(total=1.0, desc=stage, bar_format=_FORMAT, file=sys.stderr, mininterval=0.2)
+        assert self._bar is not None
+        if record:
+            self._bar.set_postfix_str(_described(record), refresh=False)
+        self._bar.update(max(0.0, min(1.0, fraction) - self._bar.n))
+
+    def _close(self) -> None:
+        if self._bar is not None:
+            self._bar.update(max(0.0, 1.0 - self._bar.n) if sys.exc_info()[0] is None else 0.0)
+            self._bar.close()
+        self._bar = None
+
+
+_FORMAT = "{desc:28s} {percentage:3.0f}%|{bar:24}| {elapsed}{postfix}"
+
+
+def _described(record: dict[str, float]) -> str:
+    speed = record["step"] / record["seconds"] if record["seconds"] > 0 else 0.0
+    return f"loss {record['loss']:.3e}, {record['count']:.0f} Gaussians, {speed:.1f} steps/s"

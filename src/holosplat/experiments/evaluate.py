@@ -1,0 +1,117 @@
+"""`evaluate`: a reconstruction against held-out frames and the true volume."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..forward import Instrument
+from ..metrics import ImageScores, VolumeScores, image_scores, intensity_range, volume_scores
+from ..representations import GaussianCloud
+from ..scan import Exposures, Scan
+from ..volume import Volume
+from .reconstruct import Reconstruction
+
+
+@dataclass(frozen=True)
+class MaterialFound:
+    """What the cloud says about the matter: mass-weighted medians of δ and of δ/β over its Gaussians."""
+
+    delta: float
+    ratio: float
+    single_material: bool
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Scores on held-out and training frames, against the truth, and the material found; None: nothing to compare."""
+
+    test: ImageScores | None
+    train: ImageScores | None
+    volume: VolumeScores | None
+    material: MaterialFound
+    predicted: np.ndarray | None = None
+    """Predictions [T, H, W] of the held-out frames."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """The numbers, ready for JSON."""
+        parts = {"test": self.test, "train": self.train, "volume": self.volume}
+        scores: dict[str, Any] = {name: part.as_dict() if part else None for name, part in parts.items()}
+        found = self.material
+        ratio = found.ratio if np.isfinite(found.ratio) else None
+        material = {"delta": found.delta, "ratio": ratio, "single_material": found.single_material}
+        return {**self.headline(), **scores, "material": material}
+
+    def headline(self) -> dict[str, float]:
+        """The few numbers that matter: means over held-out frames, and the volume's."""
+        numbers = dict(self.test.mean) if self.test else {}
+        if self.volume:
+            names = ("dice", "relative_error_delta", "mean_delta", "true_mean_delta")
+            numbers |= {name: float(getattr(self.volume, name)) for name in names}
+        return numbers
+
+    def lines(self) -> list[str]:
+        """The numbers as a few lines of text."""
+        lines = []
+        for name, scores in (("held-out frames", self.test), ("training frames", self.train)):
+            if scores:
+                m = scores.mean
+                lines.append(
+                    f"{name}: SSIM {m['ssim']:.4f}, FRCM {m['frcm']:.4f}, PSNR {m['psnr']:.1f} dB, L1 {m['l1']:.5f}"
+                )
+        if self.volume:
+            v = self.volume
+            lines.append(
+                f"volume: Dice {v.dice:.4f}, relative error of δ {v.relative_error_delta:.4f}, mean δ inside "
+                f"{v.mean_delta:.3e} (true {v.true_mean_delta:.3e}, {100 * v.delta_deviation:+.1f} %)"
+            )
+        kind = "given" if self.material.single_material else "found"
+        lines.append(f"material: δ {self.material.delta:.3e}, δ/β {self.material.ratio:.0f} ({kind})")
+        return lines
+
+
+def render(reconstruction: Reconstruction, exposures: Exposures) -> np.ndarray:
+    """Frames [N, H, W] float32 that the reconstruction predicts, one exposure at a time to bound memory."""
+    frames = np.empty((len(exposures), *exposures.views.shape), dtype=np.float32)
+    with torch.no_grad():
+        for i in range(len(exposures)):
+            frames[i] = Instrument(exposures[[i]], reconstruction.oversample).measure(reconstruction.cloud)[0].numpy()
+    return frames
+
+
+def evaluate(reconstruction: Reconstruction, scan: Scan | None, truth: Volume | None) -> Evaluation:
+    """Scores of `reconstruction`: on the frames of `scan`, and against `truth` on the truth's own grid.
+
+    The data range is that of the scan's training frames.
+    """
+    test = train = predicted = None
+    if scan is not None:
+        data_range = intensity_range(scan.train().frames)
+        train = image_scores(render(reconstruction, scan.train().exposures), scan.train().frames, data_range)
+        if len(scan.test()):
+            predicted = render(reconstruction, scan.test().exposures)
+            test = image_scores(predicted, scan.test().frames, data_range)
+    volume = None
+    if truth is not None:
+        volume = volume_scores(reconstruction.cloud.voxelise(truth.grid), truth)
+    return Evaluation(test, train, volume, material_found(reconstruction.cloud), predicted)
+
+
+def material_found(cloud: GaussianCloud) -> MaterialFound:
+    """Mass-weighted medians over the cloud's Gaussians; the given values for a single material."""
+    if cloud.single_material:
+        ratio = cloud.delta / cloud.beta if cloud.beta else float("inf")
+        return MaterialFound(cloud.delta, ratio, True)
+    mass = cloud.masses().detach().double().numpy()
+    density = cloud.amplitudes.detach().double().numpy()
+    ratio = density[:, 0] * cloud.delta / np.maximum(density[:, 1] * cloud.beta, 1e-30)
+    return MaterialFound(_median(density[:, 0] * cloud.delta, mass[:, 0]), _median(ratio, mass[:, 0]), False)
+
+
+def _median(values: np.ndarray, weights: np.ndarray) -> float:
+    order = np.argsort(values)
+    cumulative = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(cumulative, 0.5 * cumulative[-1])])

@@ -1,0 +1,102 @@
+"""The report of a run folder: collects what the page shows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ..experiments.evaluate import Evaluation
+from ..experiments.reconstruct import Reconstruction
+from ..experiments.run_folder import RunFolder
+from ..geometry import Grid, Views
+from ..projectors.voxels import voxel_line_integrals
+from ..scan import Scan
+from ..volume import Volume
+from .content import HeldOutViews, ProjectedMaps, ReportContent, view_labels
+from .page import write_report
+
+LARGEST_VOLUME = 160
+"""Voxels along an edge of the volume that a report draws where no truth fixes its grid."""
+
+
+def report_run(
+    folder: RunFolder,
+    reconstruction: Reconstruction,
+    scan: Scan,
+    evaluation: Evaluation,
+    truth: Volume | None,
+) -> Path:
+    """Write `report.html` of a run; returns its path."""
+    config = folder.read_config()
+    cloud = reconstruction.cloud
+    grid = truth.grid if truth is not None else _drawn_grid(scan.views)
+    held_out = None
+    if evaluation.test is not None and evaluation.predicted is not None:
+        test = scan.test()
+        held_out = HeldOutViews(test.frames, evaluation.predicted, view_labels(test.views), evaluation.test)
+    content = ReportContent(
+        title=_title(config),
+        summary=_summary(reconstruction, scan),
+        reconstruction=cloud.voxelise(grid),
+        truth=truth,
+        energy_kev=scan.exposures.energy_kev,
+        pixel_size=scan.views.pixel_size,
+        held_out=held_out,
+        projections=_projections(reconstruction, scan.views, truth),
+        volume_scores=evaluation.volume,
+        material_delta=cloud.delta if cloud.single_material else None,
+        history=folder.history(),
+        seconds=sum(reconstruction.timing.values()),
+        settings={"seed": config["seed"], "prior": config["prior"], **config["settings"]},
+        versions=config["versions"],
+        machine=config["machine"],
+        timing={stage: f"{seconds:.1f} s" for stage, seconds in reconstruction.timing.items()},
+        input_hash=config["scan_hash"],
+    )
+    return write_report(content, folder.report)
+
+
+def _title(config: Mapping[str, Any]) -> str:
+    kinds = {
+        "known": "one known material",
+        "ratio": "one material of known δ/β",
+        "free": "δ and β free",
+    }
+    return f"Gaussian reconstruction, {kinds[config['prior']['kind']]}"
+
+
+def _summary(reconstruction: Reconstruction, scan: Scan) -> str:
+    exposures, views = scan.exposures, scan.views
+    h, w = views.shape
+    low, high = 100 * exposures.distance.min(), 100 * exposures.distance.max()
+    distance = f"{low:.4g} cm" if low == high else f"{low:.4g} to {high:.4g} cm"
+    state = "" if reconstruction.finished else " The fit was interrupted before its end."
+    return (
+        f"{len(scan.train())} training and {len(scan.test())} held-out frames of {h} × {w} pixels of "
+        f"{1e6 * views.pixel_size:.4g} µm, {exposures.energy_kev:g} keV, {distance} behind the sample; "
+        f"{len(reconstruction.cloud)} Gaussians.{state}"
+    )
+
+
+def _drawn_grid(views: Views) -> Grid:
+    return Grid.of_views(views, min(1.0, LARGEST_VOLUME / max(views.shape)))
+
+
+def _projections(reconstruction: Reconstruction, views: Views, truth: Volume | None) -> ProjectedMaps:
+    """B and D of the first view and the one most at right angles to it, through the truth's voxels where known."""
+    first, other = 0, int(abs(views.rotations[:, 2] @ views.rotations[0, 2]).argmin())
+    chosen = views[[first, other] if other != first else [first]]
+    with torch.no_grad():
+        absorption, dephasing = (line.numpy() for line in reconstruction.cloud.project(chosen))
+        if truth is None:
+            return ProjectedMaps(absorption, dephasing, view_labels(chosen))
+        true_absorption, true_dephasing = (line.numpy() for line in _project_volume(truth, chosen))
+    return ProjectedMaps(absorption, dephasing, view_labels(chosen), true_absorption, true_dephasing)
+
+
+def _project_volume(truth: Volume, views: Views) -> torch.Tensor:
+    values = torch.from_numpy(truth.beta), torch.from_numpy(truth.delta)
+    return voxel_line_integrals(torch.stack(values), truth.grid, views, step=0.5)
