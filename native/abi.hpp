@@ -64,3 +64,7 @@ HOLO_EXPORT int64_t holosplat_tv_ascend(const HoloGrid*, const float* u, float* 
 // u <- clamp(u - tau (slope + coupling * adjoint_gradient(q)), 0, upper); extrapolated <- 2 u_new - u_old
 HOLO_EXPORT int64_t holosplat_tv_descend(const HoloGrid*, const float* slope, const float* tau, const float* q,
                                          double coupling, double upper, float* u, float* extrapolated, int64_t threads);
+// value <- sum over voxels with three forward neighbours of sqrt(|gradient(u)|^2 + smoothing^2) - smoothing;
+// gradient [Z, Y, X] <- its derivative
+HOLO_EXPORT int64_t holosplat_tv_smooth(const HoloGrid*, const float* u, double smoothing, float* gradient,
+                                        double* value, int64_t threads);

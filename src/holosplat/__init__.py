@@ -1,3 +1,93 @@
-"""holosplat: quantitative 3D maps from a handful of X-ray phase-contrast images."""
+"""holosplat: quantitative 3D maps from a handful of X-ray phase-contrast images.
+
+The names below are the public interface; each is imported from its module when it is first used, so that
+`import holosplat` costs nothing.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+_WHERE = {
+    "checks": ("InputError",),
+    "geometry": ("Grid", "Views"),
+    "scan": ("Exposures", "Scan", "interleaved_split"),
+    "volume": ("Object", "Volume"),
+    "mesh": ("TriangleMesh",),
+    "materials": ("HAEMOGLOBIN", "PLASMA", "RED_CELL", "WATER", "Compound", "DeltaBeta", "Mixture", "parse_material"),
+    "forward": ("Instrument", "measure", "simulate"),
+    "specimens.scene": ("MeshScene",),
+    "specimens.red_cells": ("evans_fung_cell", "random_cells"),
+    "specimens.repair": ("closed",),
+    "representations.gaussians": ("GaussianCloud",),
+    "io.nxtomo": ("read_scan", "write_scan"),
+    "io.volumes": ("read_volume", "write_volume"),
+    "io.vtk": ("read_meshes", "write_mesh"),
+    "experiments.settings": ("MaterialPrior", "Settings", "preset"),
+    "experiments.simulate": ("Filling", "read_scene"),
+    "experiments.run_folder": ("RunFolder",),
+    "experiments.reconstruct": ("Reconstruction", "load_reconstruction", "reconstruct"),
+    "experiments.evaluate": ("Evaluation", "evaluate", "render"),
+}
+_MODULE_OF = {name: module for module, names in _WHERE.items() for name in names}
+
+__all__ = sorted(_MODULE_OF)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f".{_MODULE_OF[name]}", __name__), name)
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__all__]
+
+
+if TYPE_CHECKING:
+    from .checks import InputError as InputError
+    from .experiments.evaluate import Evaluation as Evaluation
+    from .experiments.evaluate import evaluate as evaluate
+    from .experiments.evaluate import render as render
+    from .experiments.reconstruct import Reconstruction as Reconstruction
+    from .experiments.reconstruct import load_reconstruction as load_reconstruction
+    from .experiments.reconstruct import reconstruct as reconstruct
+    from .experiments.run_folder import RunFolder as RunFolder
+    from .experiments.settings import MaterialPrior as MaterialPrior
+    from .experiments.settings import Settings as Settings
+    from .experiments.settings import preset as preset
+    from .experiments.simulate import Filling as Filling
+    from .experiments.simulate import read_scene as read_scene
+    from .forward import Instrument as Instrument
+    from .forward import measure as measure
+    from .forward import simulate as simulate
+    from .geometry import Grid as Grid
+    from .geometry import Views as Views
+    from .io.nxtomo import read_scan as read_scan
+    from .io.nxtomo import write_scan as write_scan
+    from .io.volumes import read_volume as read_volume
+    from .io.volumes import write_volume as write_volume
+    from .io.vtk import read_meshes as read_meshes
+    from .io.vtk import write_mesh as write_mesh
+    from .materials import HAEMOGLOBIN as HAEMOGLOBIN
+    from .materials import PLASMA as PLASMA
+    from .materials import RED_CELL as RED_CELL
+    from .materials import WATER as WATER
+    from .materials import Compound as Compound
+    from .materials import DeltaBeta as DeltaBeta
+    from .materials import Mixture as Mixture
+    from .materials import parse_material as parse_material
+    from .mesh import TriangleMesh as TriangleMesh
+    from .representations.gaussians import GaussianCloud as GaussianCloud
+    from .scan import Exposures as Exposures
+    from .scan import Scan as Scan
+    from .scan import interleaved_split as interleaved_split
+    from .specimens.red_cells import evans_fung_cell as evans_fung_cell
+    from .specimens.red_cells import random_cells as random_cells
+    from .specimens.repair import closed as closed
+    from .specimens.scene import MeshScene as MeshScene
+    from .volume import Object as Object
+    from .volume import Volume as Volume

@@ -1,5 +1,11 @@
 """The command line: `holosplat simulate | reconstruct | render | export | evaluate | demo`."""
 
+import os
+
+# Threads that spin at every barrier triple the time of a step when somebody else needs a core (docs/design/kernels.md).
+# It must be said before torch loads its OpenMP; whoever sets the variable keeps the choice.
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
 from .commands import main
 
 __all__ = ["main"]

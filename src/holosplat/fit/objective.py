@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import torch
 from torch import Tensor
+
+from ..projectors import native
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
 
@@ -101,12 +105,45 @@ def anisotropy(log_scales: Tensor, limit: float) -> Tensor:
 
 
 def tv_volume(density: Tensor, smoothing: float = 0.02) -> Tensor:
-    """Isotropic total variation of [C, Z, Y, X], mean over voxels, smoothed at `smoothing` (Rudin et al. 1992)."""
+    """Isotropic total variation of [C, Z, Y, X], mean over voxels, smoothed at `smoothing` (Rudin et al. 1992).
+
+    `sqrt(|∇u|² + s²) - s` with forward differences, over the voxels that have all three neighbours. Float32 runs
+    a fused kernel, any other type `tv_volume_reference`, which defines it.
+    """
+    if density.dtype != torch.float32:
+        return tv_volume_reference(density, smoothing)
+    return torch.stack([_FusedTV.apply(channel, smoothing) for channel in density]).mean()
+
+
+def tv_volume_reference(density: Tensor, smoothing: float) -> Tensor:
+    """The plain form of `tv_volume`, any float type."""
     core = density[:, :-1, :-1, :-1]
     square = (density[:, 1:, :-1, :-1] - core).square()
     square = square + (density[:, :-1, 1:, :-1] - core).square()
     square = square + (density[:, :-1, :-1, 1:] - core).square()
     return ((square + smoothing**2).sqrt() - smoothing).mean()
+
+
+class _FusedTV(torch.autograd.Function):
+    """Value and gradient of one channel's total variation in one pass of the compiled kernel."""
+
+    @staticmethod
+    def forward(ctx: Any, density: Tensor, smoothing: float) -> Tensor:
+        volume = density.detach().contiguous()
+        gradient, value = torch.empty_like(volume), torch.zeros(1, dtype=torch.float64)
+        pointers = [native.c_void_p(array.data_ptr()) for array in (volume, gradient, value)]
+        threads = torch.get_num_threads()
+        native.call(
+            "holosplat_tv_smooth", native.Grid(*volume.shape), pointers[0], smoothing, pointers[1], pointers[2], threads
+        )
+        voxels = math.prod(n - 1 for n in volume.shape)
+        ctx.save_for_backward(gradient.div_(voxels))
+        return (value[0] / voxels).to(density.dtype)
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
+        (gradient,) = ctx.saved_tensors
+        return gradient * upstream[0], None
 
 
 def overfull(density: Tensor) -> Tensor:

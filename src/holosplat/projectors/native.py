@@ -78,6 +78,7 @@ _FUNCTIONS = {
         c_void_p,
         POINTER(Gradients),
     ),
+    "holosplat_tv_smooth": (POINTER(Grid), c_void_p, c_double, c_void_p, c_void_p, c_int64),
     "holosplat_tv_ascend": (POINTER(Grid), c_void_p, c_void_p, c_double, c_double, c_int64),
     "holosplat_tv_descend": (POINTER(Grid), *(c_void_p,) * 3, c_double, c_double, *(c_void_p,) * 2, c_int64),
 }
