@@ -37,6 +37,12 @@ struct HoloGrid {
   int64_t depth, height, width;  // Z, Y, X
 };
 
+struct HoloLattice {
+  int64_t depth, height, width;  // Z, Y, X
+  double origin[3];              // x, y, z of voxel [0, 0, 0]
+  double pitch;                  // voxel edge
+};
+
 struct HoloOptions {
   double cutoff;    // half-width of a Gaussian's box in standard deviations
   double variance;  // added to the covariance: what a pixel or voxel does
@@ -68,3 +74,10 @@ HOLO_EXPORT int64_t holosplat_tv_descend(const HoloGrid*, const float* slope, co
 // gradient [Z, Y, X] <- its derivative
 HOLO_EXPORT int64_t holosplat_tv_smooth(const HoloGrid*, const float* u, double smoothing, float* gradient,
                                         double* value, int64_t threads);
+
+// Sums of voxels along the beam as bilinear hats, image [V, H, W] from volume [Z, Y, X], and the exact adjoint.
+// Voxels whose four pixels do not all lie on the detector are left out.
+HOLO_EXPORT int64_t holosplat_lattice_project(const HoloLattice*, const HoloViews*, const float* volume, float* image,
+                                              int64_t threads);
+HOLO_EXPORT int64_t holosplat_lattice_backproject(const HoloLattice*, const HoloViews*, const float* image,
+                                                  float* volume, int64_t threads);

@@ -57,6 +57,18 @@ class Grid(ctypes.Structure):
     _fields_ = [("depth", c_int64), ("height", c_int64), ("width", c_int64)]
 
 
+class Lattice(ctypes.Structure):
+    """Counts of voxels along z, y, x; x, y, z of the first voxel's centre; voxel edge."""
+
+    _fields_ = [
+        ("depth", c_int64),
+        ("height", c_int64),
+        ("width", c_int64),
+        ("origin", c_double * 3),
+        ("pitch", c_double),
+    ]
+
+
 class Options(ctypes.Structure):
     """Cutoff in standard deviations, variance added [px²], number of threads."""
 
@@ -78,6 +90,8 @@ _FUNCTIONS = {
         c_void_p,
         POINTER(Gradients),
     ),
+    "holosplat_lattice_project": (POINTER(Lattice), POINTER(Views), c_void_p, c_void_p, c_int64),
+    "holosplat_lattice_backproject": (POINTER(Lattice), POINTER(Views), c_void_p, c_void_p, c_int64),
     "holosplat_tv_smooth": (POINTER(Grid), c_void_p, c_double, c_void_p, c_void_p, c_int64),
     "holosplat_tv_ascend": (POINTER(Grid), c_void_p, c_void_p, c_double, c_double, c_int64),
     "holosplat_tv_descend": (POINTER(Grid), *(c_void_p,) * 3, c_double, c_double, *(c_void_p,) * 2, c_int64),

@@ -207,7 +207,7 @@ def _ratio_panel(axes: Axes, ratios: list[tuple[np.ndarray, np.ndarray]]) -> flo
     if len(ratios) > 1 and ratios[1][0].size:
         true = float(ratios[1][1].sum() / np.sum(ratios[1][1] / ratios[1][0]))
         low, high = min(low, true), max(high, true)
-    margin = 0.06 * (high - low) or 0.05 * abs(middle) or 1.0
+    margin = max(0.06 * (high - low), 0.05 * abs(middle))  # one material: a line, not its rounding
     low, high = low - margin, high + margin
     weights, bins = mass / mass.sum() * 100, np.linspace(low, high, 60).tolist()
     axes.hist(

@@ -53,6 +53,7 @@ def occupancy(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray, grid:
             out[c] += np.bincount(slot + ny * nx, weight * (depth - k), out.shape[1])
             out[c] += np.bincount(slot, weight * (1 - depth + k), out.shape[1])
     filled = out.reshape(-1, nz + 1, ny, nx)[:, ::-1].cumsum(axis=1)[:, ::-1]
+    filled[np.abs(filled) < 1e-12 * np.abs(values).max()] = 0  # what the sums leave of a zero
     return filled[:, 1:] / rays**2
 
 
