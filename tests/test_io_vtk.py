@@ -111,9 +111,7 @@ def test_strips_of_polydata_and_grids(sample):
 def test_quads_and_polygons_are_cut_into_triangles(sample):
     cube = [(x, y, z) for z in (0, 2) for y in (0, 2) for x in (0, 2)]
     quads = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
-    grid = dataset(
-        vtkUnstructuredGrid, [(QUAD, q) for q in quads[:3]] + [(POLYGON, q) for q in quads[3:]], cube
-    )
+    grid = dataset(vtkUnstructuredGrid, [(QUAD, q) for q in quads[:3]] + [(POLYGON, q) for q in quads[3:]], cube)
     for data in (dataset(vtkPolyData, quads, cube), grid):
         (mesh,) = read_meshes([sample(data)], "um")
         assert len(mesh.faces) == 12
@@ -133,9 +131,7 @@ def test_boundary_of_solid_cells(sample):
 
 def test_duplicate_vertices_become_one_and_order_is_kept(tmp_path):
     mesh = evans_fung_cell(subdivisions=1)
-    torn = TriangleMesh(
-        mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3)
-    )
+    torn = TriangleMesh(mesh.vertices[mesh.faces].reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3))
     write_mesh(tmp_path / "torn.vtk", torn)
     (read,) = read_meshes(tmp_path / "torn.vtk", "um")
     assert len(read.vertices) == 42

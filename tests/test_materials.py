@@ -91,9 +91,7 @@ def test_mixture_weights_by_mass_and_ignores_its_parts_densities():
 def test_solution_adds_volumes():
     mixed = solution(HAEMOGLOBIN, 0.33, WATER)
     assert mixed.density_g_cm3 == near(0.33 + (1 - 0.33 / 1.335) * 0.9982)
-    by_volume = (
-        0.33 / 1.335 * HAEMOGLOBIN.delta_beta(20).delta + (1 - 0.33 / 1.335) * WATER.delta_beta(20).delta
-    )
+    by_volume = 0.33 / 1.335 * HAEMOGLOBIN.delta_beta(20).delta + (1 - 0.33 / 1.335) * WATER.delta_beta(20).delta
     assert mixed.delta_beta(20).delta == near(by_volume)
 
 

@@ -38,9 +38,7 @@ def images(shape, seed=0, noise=0.1):
 def sphere(grid, radius, centre=(0.0, 0.0, 0.0), delta=4e-7, ratio=500.0):
     x, y, z = grid.axes()
     distance = np.sqrt(
-        (x[None, None] - centre[0]) ** 2
-        + (y[None, :, None] - centre[1]) ** 2
-        + (z[:, None, None] - centre[2]) ** 2
+        (x[None, None] - centre[0]) ** 2 + (y[None, :, None] - centre[1]) ** 2 + (z[:, None, None] - centre[2]) ** 2
     )
     fill = np.clip(0.5 + (radius - distance) / grid.voxel_size[0], 0, 1)
     return Volume(delta * fill, delta / ratio * fill, grid)
@@ -59,9 +57,7 @@ def test_ssim_psnr_l1_agree_with_scikit_image(shape):
         a, b, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1.0
     )
     assert scores.ssim[0] == pytest.approx(ssim, abs=1e-12)
-    assert scores.psnr[0] == pytest.approx(
-        skimage.metrics.peak_signal_noise_ratio(a, b, data_range=1.0), abs=1e-10
-    )
+    assert scores.psnr[0] == pytest.approx(skimage.metrics.peak_signal_noise_ratio(a, b, data_range=1.0), abs=1e-10)
     assert scores.l1[0] == pytest.approx(np.abs(a - b).mean(), abs=1e-15)
 
 

@@ -56,9 +56,7 @@ def content(**changes):
     views = Views.from_angles([10.0, 80.0], (20, 28), PITCH)
     dephasing = [np.stack([v.delta.sum(axis=0)] * 2) * PITCH for v in (found, truth)]
     absorption = [np.stack([v.beta.sum(axis=0)] * 2) * PITCH for v in (found, truth)]
-    predicted, measured = (
-        1 + 2e10 * np.stack([gaussian_laplace(d, 1.5) for d in maps]) for maps in dephasing
-    )
+    predicted, measured = (1 + 2e10 * np.stack([gaussian_laplace(d, 1.5) for d in maps]) for maps in dephasing)
     scores = image_scores(predicted, measured, intensity_range(measured))
     labels = view_labels(views)
     steps = np.arange(0, 100, 10)
@@ -103,9 +101,7 @@ class Page(HTMLParser):
     def handle_starttag(self, tag, attributes):
         names = [name for name, _ in attributes]
         assert len(names) == len(set(names))
-        self.sources += [
-            value for name, value in attributes if name in ("src", "href", "srcset", "data", "poster")
-        ]
+        self.sources += [value for name, value in attributes if name in ("src", "href", "srcset", "data", "poster")]
         if tag not in VOID:
             self.open.append(tag)
 

@@ -203,9 +203,7 @@ def test_deform_is_the_typical_bending_in_diameters():
 def test_rotations_are_uniform():
     rng = np.random.default_rng(0)
     rotations = np.stack([_random_rotation(rng) for _ in range(4000)])
-    assert rotations @ rotations.transpose(0, 2, 1) == near(
-        np.broadcast_to(np.eye(3), (4000, 3, 3)), abs=1e-12
-    )
+    assert rotations @ rotations.transpose(0, 2, 1) == near(np.broadcast_to(np.eye(3), (4000, 3, 3)), abs=1e-12)
     assert np.abs(rotations.mean(0)).max() < 0.04
     assert (rotations**2).mean(0) == near(np.full((3, 3), 1 / 3), abs=0.03)
 

@@ -136,9 +136,7 @@ def test_arrays_need_not_be_contiguous():
     centres, scales, quaternions, amplitudes = cloud("ordinary", 2)
     views = (poses(2)[0].mT.contiguous().mT, poses(2)[1])
     image = splat(centres.T.contiguous().T, scales, quaternions, amplitudes[:, 1:], *views, DETECTOR)
-    assert torch.equal(
-        image, splat(centres, scales, quaternions, amplitudes[:, 1:].clone(), *poses(2), DETECTOR)
-    )
+    assert torch.equal(image, splat(centres, scales, quaternions, amplitudes[:, 1:].clone(), *poses(2), DETECTOR))
 
 
 @DRAWS
@@ -174,9 +172,7 @@ def test_bitwise_the_same_for_every_number_of_threads(views):
 
     def everything(threads: int) -> list[Tensor]:
         torch.set_num_threads(threads)
-        image, gradients = value_and_gradients(
-            lambda *a: splat(*a, *poses(views), (61, 50)), arrays, torch.float32
-        )
+        image, gradients = value_and_gradients(lambda *a: splat(*a, *poses(views), (61, 50)), arrays, torch.float32)
         volume, more = value_and_gradients(lambda *a: voxelise(*a, VOLUME), arrays, torch.float32)
         return [image, *gradients, volume, *more]
 
@@ -223,9 +219,7 @@ def test_line_integrals_by_quadrature(smallest, tolerance):
     expected = []
     for rotation, shift in zip(rotations.numpy(), shifts.numpy()):
         lab = np.stack(
-            np.broadcast_arrays(
-                x[None, :, None, :, None] + shift[0], y[:, None, :, None, None] + shift[1], z
-            ),
+            np.broadcast_arrays(x[None, :, None, :, None] + shift[0], y[:, None, :, None, None] + shift[1], z),
             -1,
         )  # [H, W, node, node, z, 3]
         values = gaussian_at(lab @ rotation, arrays).sum(-1) * 0.25
@@ -250,9 +244,7 @@ def test_voxel_means_by_quadrature():
 
 @pytest.mark.parametrize("draw", ["splat", "voxelise"])
 def test_reference_gradients_by_finite_differences(draw):
-    arrays = [a.double().requires_grad_() for a in few(0.7)[:3]] + [
-        cloud("small", 2, 4)[3].double().requires_grad_()
-    ]
+    arrays = [a.double().requires_grad_() for a in few(0.7)[:3]] + [cloud("small", 2, 4)[3].double().requires_grad_()]
 
     def function(*a: Tensor) -> Tensor:
         if draw == "splat":
