@@ -1,0 +1,40 @@
+# holosplat: `make demo` and `make test` set everything up by themselves. `make help` lists the targets.
+# Needs Python >= 3.11 with its venv module, GCC or clang, and make (Debian: python3-venv g++ make).
+
+PYTHON ?= python3
+VENV := .venv
+STAMP := $(VENV)/.installed
+NATIVE := $(wildcard native/*.cpp native/*.hpp native/CMakeLists.txt)
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help setup demo test check clean
+
+help: ## list the targets
+	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
+
+setup: $(STAMP) ## make .venv, install the pinned dependencies, compile the kernels
+
+# Done again only when the dependencies or the C++ sources change: the Python sources are used where they lie.
+$(STAMP): pyproject.toml constraints.txt $(NATIVE)
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+		{ echo "holosplat needs Python 3.11 or newer: make PYTHON=/path/to/python3.11 ..."; exit 1; }
+	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
+	$(VENV)/bin/python -m pip install -c constraints.txt -e ".[dev]"
+	touch $@
+
+demo: setup ## simulate, reconstruct and report a small specimen into demo/
+	rm -rf demo
+	$(VENV)/bin/holosplat demo --out demo
+
+test: setup ## run the tests
+	$(VENV)/bin/python -m pytest
+
+check: setup ## lint, formatting and types
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/pyright
+
+clean: ## remove everything that was made here
+	rm -rf $(VENV) build dist demo .pytest_cache .ruff_cache
+	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +
