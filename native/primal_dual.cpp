@@ -19,7 +19,8 @@ void ascend_row(int64_t n, const float* u, const float* down, const float* side,
     const float a = q0[i] + step * (down[i] - u[i]);
     const float b = q1[i] + step * (side[i] - u[i]);
     const float c = q2[i] + step * along;
-    const float scale = radius / std::max(radius, std::sqrt(a * a + b * b + c * c));
+    // The tiny number keeps 0 / 0 away where there is no total variation at all.
+    const float scale = radius / std::max(std::max(radius, std::sqrt(a * a + b * b + c * c)), 1e-30f);
     q0[i] = a * scale;
     q1[i] = b * scale;
     q2[i] = c * scale;

@@ -17,7 +17,8 @@ from .units import wavelength
 from .volume import Object
 
 SIMULATED_FRINGE_SAMPLES = 8
-"""Samples on the first fringe in simulations: frames are then right to 0.5 % of their contrast."""
+"""Samples on the first fringe in simulations: frames of rounded bodies are then right to 0.5 % of their contrast
+(rms); faces exactly along the beam, where the phase jumps, converge more slowly (a few per cent)."""
 GUARD_PX = 8
 """Detector pixels of margin beyond the fringes' reach: room for the point-spread function and faint tails."""
 

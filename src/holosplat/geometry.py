@@ -122,8 +122,8 @@ class Grid:
     def centred(cls, shape: tuple[int, int, int], voxel_size: float) -> Grid:
         """A grid of cubic voxels of `voxel_size` [m], centred on the object frame's origin."""
         z, y, x = shape
-        low = tuple(-0.5 * (n - 1) * voxel_size for n in (x, y, z))
-        return cls(shape, (voxel_size,) * 3, low)
+        low_x, low_y, low_z = (-0.5 * (n - 1) * voxel_size for n in (x, y, z))
+        return cls(shape, (voxel_size, voxel_size, voxel_size), (low_x, low_y, low_z))
 
     @classmethod
     def of_views(cls, views: Views, refine: float = 1) -> Grid:

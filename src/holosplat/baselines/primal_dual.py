@@ -15,27 +15,27 @@ class LinearProjector(Protocol):
 
     array_shape: tuple[int, int, int]
 
-    def project(self, array: Tensor) -> Tensor:
+    def project(self, array: Tensor, /) -> Tensor:
         """Volume → line integrals."""
         ...
 
-    def backproject(self, lines: Tensor) -> Tensor:
+    def backproject(self, lines: Tensor, /) -> Tensor:
         """The adjoint: line integrals → volume."""
         ...
 
-    def volume_in(self, volume: Tensor) -> Tensor:
+    def volume_in(self, volume: Tensor, /) -> Tensor:
         """[Z, Y, X] → the projector's order."""
         ...
 
-    def volume_out(self, array: Tensor) -> Tensor:
+    def volume_out(self, array: Tensor, /) -> Tensor:
         """The projector's order → [Z, Y, X]."""
         ...
 
-    def lines_in(self, images: Tensor) -> Tensor:
+    def lines_in(self, images: Tensor, /) -> Tensor:
         """[V, H, W] → the projector's order."""
         ...
 
-    def lines_out(self, lines: Tensor) -> Tensor:
+    def lines_out(self, lines: Tensor, /) -> Tensor:
         """The projector's order → [V, H, W]."""
         ...
 
@@ -104,7 +104,10 @@ def tv_ascend(u: Tensor, q: Tensor, step: float, radius: float) -> None:
 def tv_descend(
     slope: Tensor, tau: Tensor, q: Tensor, coupling: float, upper: float, u: Tensor, extrapolated: Tensor
 ) -> None:
-    """u ← `clamp(u - tau (slope + coupling ∇ᵀq), 0, upper)`, extrapolated ← `2 u_new - u_old`, in place."""
+    """u ← `clamp(u - tau (slope + coupling ∇ᵀq), 0, upper)`, extrapolated ← `2 u_new - u_old`, in place.
+
+    q must be zero where a forward difference would leave the volume, as `tv_ascend` keeps it.
+    """
     arrays = [_pointer(a) for a in (slope, tau, q)]
     moved = [_pointer(a) for a in (u, extrapolated)]
     native.call("holosplat_tv_descend", _grid(u), *arrays, coupling, upper, *moved, torch.get_num_threads())

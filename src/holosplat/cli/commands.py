@@ -18,11 +18,12 @@ from ..experiments.evaluate import evaluate as score
 from ..experiments.evaluate import render as predict
 from ..experiments.reconstruct import load_reconstruction
 from ..experiments.reconstruct import reconstruct as fit
-from ..experiments.run_folder import RunFolder, read_json, write_json
-from ..experiments.settings import preset
+from ..experiments.run_folder import RunFolder
+from ..experiments.settings import preset, read_settings
 from ..experiments.simulate import read_scene
 from ..forward import simulate as image_scene
 from ..geometry import Grid
+from ..io.json import read_json, write_json
 from ..io.nxtomo import read_scan, write_scan
 from ..io.volumes import read_volume, write_volume
 from ..report.run import report_run
@@ -88,6 +89,7 @@ def reconstruct(
     out: Path,
     matter: PriorOptions = PriorOptions(),
     preset_name: Annotated[str, arg(name="preset")] = "default",
+    config: Path | None = None,
     seed: int = 0,
     resume: bool = False,
 ) -> None:
@@ -97,10 +99,11 @@ def reconstruct(
         scan: Scan file (NXtomo).
         out: Run folder to make.
         preset_name: Named settings: default, fast, thesis.
+        config: Or: a JSON file of settings, such as the config.json of another run.
         seed: Seed of everything random.
         resume: Go on with an interrupted run.
     """
-    settings = preset(preset_name)
+    settings = read_settings(config) if config else preset(preset_name)
     measured = read_scan(scan)
     prior = matter.prior(measured.exposures.energy_kev)
     folder = RunFolder(out)

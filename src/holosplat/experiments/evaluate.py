@@ -9,16 +9,20 @@ import numpy as np
 import torch
 
 from ..forward import Instrument
+from ..geometry import Grid
 from ..metrics import ImageScores, VolumeScores, image_scores, intensity_range, volume_scores
 from ..representations import GaussianCloud
 from ..scan import Exposures, Scan
 from ..volume import Volume
 from .reconstruct import Reconstruction
 
+MOST_VOXELS = 8_000_000
+"""Voxels of the volume on which the material is read off, at most."""
+
 
 @dataclass(frozen=True)
 class MaterialFound:
-    """What the cloud says about the matter: mass-weighted medians of δ and of δ/β over its Gaussians."""
+    """What the cloud says about the matter: mass-weighted medians of δ over its volume, and of δ/β in the matter."""
 
     delta: float
     ratio: float
@@ -101,17 +105,30 @@ def evaluate(reconstruction: Reconstruction, scan: Scan | None, truth: Volume | 
 
 
 def material_found(cloud: GaussianCloud) -> MaterialFound:
-    """Mass-weighted medians over the cloud's Gaussians; the given values for a single material."""
+    """What the cloud, where δ and β are free, says about the matter; the given values for a single material."""
     if cloud.single_material:
         ratio = cloud.delta / cloud.beta if cloud.beta else float("inf")
         return MaterialFound(cloud.delta, ratio, True)
-    mass = cloud.masses().detach().double().numpy()
-    density = cloud.amplitudes.detach().double().numpy()
-    ratio = density[:, 0] * cloud.delta / np.maximum(density[:, 1] * cloud.beta, 1e-30)
-    return MaterialFound(_median(density[:, 0] * cloud.delta, mass[:, 0]), _median(ratio, mass[:, 0]), False)
+    volume = cloud.voxelise(_enclosing_grid(cloud))
+    delta, beta = volume.delta.ravel().astype(np.float64), volume.beta.ravel().astype(np.float64)
+    level = _weighted_median(delta, delta)
+    matter = delta > 0.5 * level
+    ratio = _weighted_median(delta[matter] / np.maximum(beta[matter], 1e-30), delta[matter])
+    return MaterialFound(level, ratio, False)
 
 
-def _median(values: np.ndarray, weights: np.ndarray) -> float:
+def _enclosing_grid(cloud: GaussianCloud) -> Grid:
+    """A grid around all centres, of the cloud's unit as voxel, or coarser where that would be too many."""
+    centres = cloud.centres.detach().double().numpy()
+    low, high = centres.min(0) - 2, centres.max(0) + 2
+    pitch = max(1.0, float((np.prod(high - low) / MOST_VOXELS) ** (1 / 3)))
+    x, y, z = (int(n) for n in np.ceil((high - low) / pitch))
+    origin = (0.5 * (low + high) - 0.5 * (np.array([x, y, z]) - 1) * pitch) * cloud.unit_length
+    edge = pitch * cloud.unit_length
+    return Grid((z, y, x), (edge, edge, edge), (origin[0], origin[1], origin[2]))
+
+
+def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
     order = np.argsort(values)
     cumulative = np.cumsum(weights[order])
     return float(values[order][np.searchsorted(cumulative, 0.5 * cumulative[-1])])

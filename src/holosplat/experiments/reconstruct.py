@@ -12,17 +12,10 @@ import torch
 
 from ..checks import require
 from ..fit.loop import Fit, Record, split_validation
+from ..io.json import read_json, write_json
 from ..representations import GaussianCloud
 from ..scan import Scan
-from .run_folder import (
-    RunFolder,
-    environment,
-    read_gaussians,
-    read_json,
-    scan_hash,
-    write_gaussians,
-    write_json,
-)
+from .run_folder import RunFolder, environment, read_gaussians, scan_hash, write_gaussians
 from .settings import MaterialPrior, Settings
 from .start import starting_cloud
 

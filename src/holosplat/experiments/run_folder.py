@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import json
 import os
 import platform
 from collections.abc import Iterable
@@ -19,6 +18,7 @@ from .. import __version__
 from ..checks import InputError, require
 from ..io.atomic import atomic_path
 from ..io.hdf5 import Fields, attribute_numbers, open_hdf5
+from ..io.json import read_json
 from ..representations.gaussians import PARAMETERS, GaussianCloud
 from ..scan import Scan
 
@@ -104,23 +104,6 @@ class RunFolder:
             raise InputError(
                 f"{self.checkpoint} must be a checkpoint, but it is damaged; start anew without it."
             ) from error
-
-
-def write_json(path: Path, values: dict[str, Any]) -> None:
-    """Write `values` as JSON, whole or not at all."""
-    text = json.dumps(values, indent=2, allow_nan=False)
-    with atomic_path(path) as temporary:
-        temporary.write_text(text + "\n", encoding="utf-8")
-
-
-def read_json(path: Path) -> dict[str, Any]:
-    """A JSON table; `InputError` if the file is missing or damaged."""
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} must be a readable JSON file, but it is not: {error}.") from error
-    require(isinstance(values, dict), f"{path} must hold a table, but it holds {type(values).__name__}.")
-    return values
 
 
 def write_gaussians(path: Path, cloud: GaussianCloud) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, get_type_hints
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from ..baselines import HolographicTV
 from ..checks import InputError, require
@@ -12,6 +13,7 @@ from ..fit.density import DensityControl
 from ..fit.loop import FitOptions
 from ..fit.objective import THESIS, Objective
 from ..fit.schedule import Schedule
+from ..io.json import read_json
 from ..materials import DeltaBeta
 
 
@@ -113,15 +115,30 @@ def preset(name: str) -> Settings:
     return table[name]
 
 
-def from_plain(kind: type, values: Any, where: str = "config") -> Any:
-    """The dataclass `kind` from a nested dictionary; unknown and missing keys are an `InputError`."""
+def read_settings(path: Path) -> Settings:
+    """Settings from a JSON file: those of a run (its config.json), or such a table alone; checked field by field."""
+    values = read_json(path)
+    return from_plain(Settings, values.get("settings", values), "settings")
+
+
+def from_plain(kind: Any, values: Any, where: str) -> Any:
+    """The dataclass `kind` from a nested dictionary; unknown, missing and ill-typed entries are an `InputError`."""
     require(isinstance(values, dict), f"{where} must be a table of settings, but it is {values!r}.")
     hints = get_type_hints(kind)
     unknown, missing = set(values) - set(hints), set(hints) - set(values)
-    require(not unknown, f"{where} has the unknown settings {', '.join(sorted(unknown))}; remove them.")
-    require(not missing, f"{where} lacks the settings {', '.join(sorted(missing))}; add them.")
-    built = {
-        name: from_plain(hint, values[name], f"{where}.{name}") if dataclasses.is_dataclass(hint) else values[name]
-        for name, hint in hints.items()
-    }
-    return kind(**built)
+    require(not unknown, f"{where} has the unknown entries {', '.join(sorted(unknown))}; remove them.")
+    require(not missing, f"{where} lacks the entries {', '.join(sorted(missing))}; add them.")
+    return kind(**{name: _checked(hint, values[name], f"{where}.{name}") for name, hint in hints.items()})
+
+
+def _checked(hint: Any, value: Any, where: str) -> Any:
+    if dataclasses.is_dataclass(hint):
+        return from_plain(hint, value, where)
+    if get_origin(hint) is Literal:
+        choices = get_args(hint)
+        require(value in choices, f"{where} must be one of {', '.join(choices)}, but it is {value!r}.")
+        return value
+    kinds = {float: (int, float), int: (int,), bool: (bool,), str: (str,)}[hint]
+    good = isinstance(value, kinds) and (hint is bool or not isinstance(value, bool))
+    require(good, f"{where} must be of the type {hint.__name__}, but it is {value!r}.")
+    return hint(value)

@@ -2,10 +2,10 @@
 
 from ...geometry import Grid, Views
 from .lattice import LatticeProjector
-from .raycast import RayProjector, voxel_line_integrals
+from .raycast import voxel_line_integrals
 from .slices import SliceProjector, rows_match
 
-__all__ = ["LatticeProjector", "RayProjector", "SliceProjector", "projector_for", "voxel_line_integrals"]
+__all__ = ["LatticeProjector", "SliceProjector", "projector_for", "voxel_line_integrals"]
 
 
 def projector_for(grid: Grid, views: Views) -> SliceProjector | LatticeProjector:

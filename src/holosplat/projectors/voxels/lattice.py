@@ -15,7 +15,8 @@ class LatticeProjector:
     """Each voxel casts a bilinear hat of its mass on the detector; forward and exact adjoint, compiled, float32.
 
     The hat's variance, 1/6 px², is that of a pixel-sized cube's shadow (1/12) seen by a pixel (1/12), so voxels
-    should be about as large as the raster's pixels. Arrays are volumes [Z, Y, X] and images [V, H, W]; grids
+    should be about as large as the raster's pixels. Single pixels carry a ripple of a few per cent where the
+    lattice and the raster beat; their means do not. Arrays are volumes [Z, Y, X] and images [V, H, W]; grids
     of cubic voxels. Voxels at the very rim of the detector, with a pixel of their hat outside, are left out.
     """
 

@@ -11,39 +11,6 @@ from ...checks import require
 from ...geometry import Grid, Views
 
 
-class RayProjector:
-    """The ray caster as a linear map with its exact adjoint (by differentiation); any poses, slow."""
-
-    def __init__(self, grid: Grid, views: Views, step: float = 1.0) -> None:
-        self.grid, self.views, self.step = grid, views, step
-        self.array_shape = grid.shape
-
-    def project(self, volume: Tensor) -> Tensor:
-        """Line integrals [V, H, W] in metres × value of `volume` [Z, Y, X]."""
-        return voxel_line_integrals(volume[None], self.grid, self.views, step=self.step)[0]
-
-    def backproject(self, images: Tensor) -> Tensor:
-        """The adjoint of `project`: [V, H, W] → [Z, Y, X]."""
-        total = torch.zeros(self.grid.shape, dtype=images.dtype)
-        for v in range(len(self.views)):  # view by view: the samples of one are already many
-            volume = torch.zeros(self.grid.shape, dtype=images.dtype, requires_grad=True)
-            line = _cast(volume[None], self.grid, self.views, v, self.step)[0]
-            total += torch.autograd.grad(line, volume, images[v])[0]
-        return total
-
-    def volume_in(self, volume: Tensor) -> Tensor:
-        """The volume as it is: this projector's order is [Z, Y, X]."""
-        return volume
-
-    volume_out = volume_in
-
-    def lines_in(self, images: Tensor) -> Tensor:
-        """The images as they are: this projector's order is [V, H, W]."""
-        return images
-
-    lines_out = lines_in
-
-
 def voxel_line_integrals(values: Tensor, grid: Grid, views: Views, *, step: float = 0.5, rays: int = 1) -> Tensor:
     """Line integrals [C, V, H, W] in metres × value of `values` [C, Z, Y, X] on `grid`; differentiable in `values`.
 

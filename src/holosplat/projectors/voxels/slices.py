@@ -82,7 +82,7 @@ def slice_matrix(grid: Grid, views: Views) -> scipy.sparse.csr_matrix:
             data.append(share[keep] * (dx * dz / p))
         entries = (np.concatenate(data), (np.concatenate(rows), np.concatenate(columns)))
         blocks.append(scipy.sparse.csr_matrix(entries, shape=(w, centre.size)))
-    return scipy.sparse.vstack(blocks, format="csr")
+    return scipy.sparse.csr_matrix(scipy.sparse.vstack(blocks))
 
 
 def _trapezoid_integral(t: np.ndarray, wide: float, narrow: float) -> np.ndarray:

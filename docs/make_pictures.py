@@ -1,0 +1,26 @@
+"""The pictures of README and docs, after `holosplat demo --out demo`: `python docs/make_pictures.py demo`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import holosplat as hs
+from holosplat.report import hero_figure
+
+
+def main(demo: Path) -> None:
+    """Draw docs/images/hero.png from the folder that `holosplat demo` made."""
+    scan, truth = hs.read_scan(demo / "scan.nxs"), hs.read_volume(demo / "truth.h5")
+    cloud = hs.load_reconstruction(hs.RunFolder(demo / "run")).cloud
+    held_out = scan.test()
+    figure = hero_figure(
+        held_out.frames[0], scan.views.pixel_size, cloud.voxelise(truth.grid), truth=truth, material=cloud.delta
+    )
+    images = Path(__file__).parent / "images"
+    images.mkdir(exist_ok=True)
+    figure.savefig(images / "hero.png", dpi=160)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
