@@ -1,9 +1,10 @@
 """The main job, measured: simulate, reconstruct, judge, on scenes that no setting was chosen on.
 
-    python benchmarks/main_job.py --json                      # 24 generated cells, seeds 101, 102, 103
-    python benchmarks/main_job.py --case snapshot --meshes DIR/rbc*_049.vtk --json
+    python benchmarks/main_job.py --json                                  # 24 generated cells, seeds 101, 102, 103
+    python benchmarks/main_job.py --cases ratio free poses noise plasma   # harder ones
+    python benchmarks/main_job.py --cases snapshot --meshes DIR/rbc*_049.vtk
 
-Settings were chosen on other scenes (seeds below 100). Prints one JSON object; without --json a Markdown table.
+Settings were chosen on other scenes (seeds below 100). Prints one JSON object, or a Markdown table.
 """
 
 from __future__ import annotations
@@ -13,41 +14,84 @@ import json
 import os
 import subprocess
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-import numpy as np
+from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from holosplat.experiments.run_folder import environment
 
+HAEMOGLOBIN = hs.HAEMOGLOBIN.delta_beta(20.0)
 
-def generated_cells(seed: int) -> tuple[hs.MeshScene, hs.Exposures]:
+
+@dataclass(frozen=True)
+class Case:
+    """A scene, how it is measured, and what the reconstruction is told of its material."""
+
+    scene: hs.MeshScene
+    exposures: hs.Exposures
+    prior: hs.MaterialPrior
+    photons: float | None = None
+
+
+def cells(seed: int, prior: hs.MaterialPrior | None = None, photons: float | None = None) -> Case:
     """24 cells of 20 px diameter, 128 × 128 px of 3.2 µm, 20 keV, 10 cm, 16 views, PSF 0.05 px, haemoglobin."""
     pixel = 3.2e-6
-    cells = hs.random_cells(24, (128 * pixel,) * 3, seed, 20 * pixel)
-    views = hs.Views.evenly_spaced(16, (128, 128), pixel)
-    scene = hs.MeshScene.of_one_material(cells, hs.HAEMOGLOBIN.delta_beta(20.0))
-    return scene, hs.Exposures.of(views, 20.0, 0.1, 0.05)
+    meshes = hs.random_cells(24, (128 * pixel,) * 3, seed, 20 * pixel)
+    exposures = hs.Exposures.of(hs.Views.evenly_spaced(16, (128, 128), pixel), 20.0, 0.1, 0.05)
+    known = hs.MaterialPrior.known(HAEMOGLOBIN)
+    return Case(hs.MeshScene.of_one_material(meshes, HAEMOGLOBIN), exposures, prior or known, photons)
 
 
-def snapshot(meshes: list[Path]) -> tuple[hs.MeshScene, hs.Exposures]:
+def poses(seed: int) -> Case:
+    """The same from 10 random orientations (8 for the fit), no two axes alike."""
+    case = cells(seed)
+    rotations = Rotation.random(10, rng=seed).as_matrix()
+    views = hs.Views.from_rotations(rotations, (128, 128), 3.2e-6)
+    return Case(case.scene, hs.Exposures.of(views, 20.0, 0.1, 0.05), case.prior)
+
+
+def plasma(seed: int) -> Case:
+    """40 red cells in plasma, 96 × 96 px of 1 µm, 10 keV, 50 cm, 16 views, 1e5 photons a pixel; Δβ is negative."""
+    contrast = hs.RED_CELL.delta_beta(10.0).against(hs.PLASMA.delta_beta(10.0))
+    scene = hs.MeshScene.of_one_material(hs.random_cells(40, (96e-6,) * 3, seed, 7.8e-6), contrast)
+    exposures = hs.Exposures.of(hs.Views.evenly_spaced(16, (96, 96), 1e-6), 10.0, 0.5)
+    return Case(scene, exposures, hs.MaterialPrior.known(contrast), 1e5)
+
+
+def snapshot(meshes: list[Path]) -> Case:
     """A snapshot of cells in µm, 128 × 192 px of 0.5 µm, 20 keV, 10 cm, 16 views, haemoglobin."""
     scene = hs.read_scene(sorted(meshes), hs.Filling(), 20.0)
-    return scene, hs.Exposures.of(hs.Views.evenly_spaced(16, (128, 192), 0.5e-6), 20.0, 0.1)
+    exposures = hs.Exposures.of(hs.Views.evenly_spaced(16, (128, 192), 0.5e-6), 20.0, 0.1)
+    return Case(scene, exposures, hs.MaterialPrior.known(HAEMOGLOBIN))
 
 
-def run(scene: hs.MeshScene, exposures: hs.Exposures, preset: str, seed: int) -> dict[str, Any]:
-    """Simulate, reconstruct and score one scene."""
-    scan, truth = hs.simulate(scene, exposures), scene.voxelise(hs.Grid.of_views(exposures.views))
+CASES: dict[str, Callable[[int], Case]] = {
+    "cells": cells,
+    "ratio": lambda seed: cells(seed, hs.MaterialPrior.of_ratio(HAEMOGLOBIN.ratio)),
+    "free": lambda seed: cells(seed, hs.MaterialPrior()),
+    "noise": lambda seed: cells(seed, photons=2000.0),
+    "poses": poses,
+    "plasma": plasma,
+}
+
+
+def run(case: Case, preset: str, seed: int) -> dict[str, Any]:
+    """Simulate, reconstruct and score one case."""
+    scan = hs.simulate(case.scene, case.exposures, photons_per_pixel=case.photons, seed=seed)
+    truth = case.scene.voxelise(hs.Grid.of_views(case.exposures.views))
     began = time.perf_counter()
-    result = hs.reconstruct(scan, hs.MaterialPrior.known(scene.materials[0]), hs.preset(preset), seed)
+    result = hs.reconstruct(scan, case.prior, hs.preset(preset), seed)
     seconds = time.perf_counter() - began
     scores = hs.evaluate(result, scan, truth)
     assert scores.train is not None
     return {
+        "seed": seed,
         "preset": preset,
         "seconds": seconds,
         **{f"{stage}_seconds": value for stage, value in result.timing.items()},
@@ -55,6 +99,7 @@ def run(scene: hs.MeshScene, exposures: hs.Exposures, preset: str, seed: int) ->
         **scores.headline(),
         "train_ssim": scores.train.mean["ssim"],
         "train_frcm": scores.train.mean["frcm"],
+        "material": scores.as_dict()["material"],
     }
 
 
@@ -67,33 +112,37 @@ def commit() -> str:
 def main() -> None:
     """Run the cases and print their table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--case", choices=("cells", "snapshot"), default="cells")
+    parser.add_argument("--cases", nargs="+", choices=(*CASES, "snapshot"), default=["cells"])
     parser.add_argument("--meshes", type=Path, nargs="*", default=[])
-    parser.add_argument("--seeds", type=int, nargs="*", default=[101, 102, 103])
-    parser.add_argument("--presets", nargs="*", default=["default"])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[101, 102, 103])
+    parser.add_argument("--preset", default="default")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     rows = []
-    for preset in options.presets:
-        if options.case == "snapshot":
-            rows.append({"scene": "snapshot", **run(*snapshot(options.meshes), preset, 0)})
-        else:
-            rows += [{"scene": f"seed {s}", **run(*generated_cells(s), preset, s)} for s in options.seeds]
-    report = {"commit": commit(), **environment(), "case": options.case, "rows": rows}
-    print(json.dumps(report, indent=2) if options.json else table(rows))
+    for name in options.cases:
+        for seed in [0] if name == "snapshot" else options.seeds:
+            case = snapshot(options.meshes) if name == "snapshot" else CASES[name](seed)
+            rows.append({"case": name, **run(case, options.preset, seed)})
+    report = {"commit": commit(), **environment(), "rows": rows}
+    print(json.dumps(report, indent=2) if options.json else table(report))
 
 
-def table(rows: list[dict[str, Any]]) -> str:
-    """The rows as Markdown."""
-    names = ("ssim", "frcm", "psnr", "dice", "relative_error_delta", "seconds", "gaussians")
-    head = "| scene | preset | SSIM | FRCM | PSNR / dB | Dice | mean δ | error of δ | time / s | Gaussians |"
+def table(report: dict[str, Any]) -> str:
+    """The rows as Markdown, and where they were measured."""
+    head = "| case, seed | SSIM | FRCM | PSNR / dB | Dice | mean δ | error of δ | δ/β | Gaussians | time / s |"
     lines = [head, "|" + " --- |" * 10]
-    for row in rows:
+    for row in report["rows"]:
         deviation = 100 * (row["mean_delta"] / row["true_mean_delta"] - 1)
-        cells = [f"{row[n]:.4g}" if np.isfinite(row[n]) else "∞" for n in names]
-        cells.insert(4, f"{deviation:+.1f} %")
-        lines.append(f"| {row['scene']} | {row['preset']} | " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        found = row["material"]
+        ratio = f"{found['ratio']:.0f}" + ("" if found["single_material"] else " (found)")
+        lines.append(
+            f"| {row['case']}, {row['seed']} | {row['ssim']:.3f} | {row['frcm']:.3f} | {row['psnr']:.1f} "
+            f"| {row['dice']:.3f} | {deviation:+.1f} % | {row['relative_error_delta']:.3f} | {ratio} "
+            f"| {row['gaussians']} | {row['seconds']:.0f} |"
+        )
+    machine = report["machine"]
+    measured = f"{machine['processor']}, {machine['threads']}, torch {report['versions']['torch']}"
+    return "\n".join([*lines, "", f"Measured on {measured}; commit {report['commit']}."])
 
 
 if __name__ == "__main__":
