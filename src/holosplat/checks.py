@@ -37,9 +37,8 @@ def in_range(field: str, value: float, low: float, high: float, unit: str = "") 
     """`value` as a float inside [low, high]; `InputError` otherwise (catches units mixed up)."""
     number = positive(field, value, unit)
     if not low <= number <= high:
-        raise InputError(
-            f"{field} must lie between {low:g} and {high:g}{_of(unit)}, but it is {number:g}; check its unit."
-        )
+        limits = f"{low:g} and {high:g} {unit}".rstrip()
+        raise InputError(f"{field} must lie between {limits}, but it is {number:g}; check its unit.")
     return number
 
 

@@ -18,6 +18,7 @@ from ..representations.gaussians import GaussianCloud
 from ..scan import Scan
 from . import objective as terms
 from .density import DensityControl, GradientRecord, control_density
+from .interrupt import interrupts_held
 from .objective import Objective
 from .schedule import Schedule
 from .trainable import Trainable
@@ -84,11 +85,13 @@ class Fit:
     def run(self, on_record: Callable[[Record], None], until: int | None = None) -> None:
         """Advance to the end (or to step `until`); `on_record` receives one record a step."""
         end = min(until or self.options.schedule.steps, self.options.schedule.steps)
-        while self.step < end and not self.stopped_early:
-            started = time.perf_counter()
-            record = self._advance()
-            self.seconds += time.perf_counter() - started
-            on_record({"step": self.step, "seconds": self.seconds, **record})
+        with interrupts_held() as release:
+            while self.step < end and not self.stopped_early:
+                started = time.perf_counter()
+                record = self._advance()
+                self.seconds += time.perf_counter() - started
+                on_record({"step": self.step, "seconds": self.seconds, **record})
+                release()
 
     def _advance(self) -> Record:
         schedule = self.options.schedule
