@@ -28,7 +28,7 @@ Shadow shadow_of(const HoloLattice& lattice, const HoloViews& views, int64_t v) 
 }
 
 // Voxels of the row (z, y) whose four pixels all lie on the detector, where the loop needs no further check:
-// [first, last) is found by solving both linear inequalities; voxels at the rim are left out.
+// [first, last) is found by solving both linear inequalities, give or take a millionth of a pixel.
 struct Span {
   int64_t first, last;
   double column, row;  // of voxel 0
@@ -36,7 +36,7 @@ struct Span {
 
 void narrow(double start, double step, double limit, double& low, double& high) {
   if (std::abs(step) < 1e-12) {
-    if (start < 0 || start > limit) high = low;
+    if (start < 0 || start > limit) high = low - 1;  // empty
     return;
   }
   const double a = -start / step, b = (limit - start) / step;
@@ -47,11 +47,11 @@ void narrow(double start, double step, double limit, double& low, double& high) 
 Span span_of(const Shadow& s, const HoloLattice& lattice, const HoloViews& views, int64_t z, int64_t y) {
   const double column = s.column.start + z * s.column.dz + y * s.column.dy;
   const double row = s.row.start + z * s.row.dz + y * s.row.dy;
-  const double rim = 1e-6;
+  const double slack = 1e-6;
   double low = 0.0, high = static_cast<double>(lattice.width) - 1;
-  narrow(column - rim, s.column.dx, static_cast<double>(views.width) - 1 - 2 * rim, low, high);
-  narrow(row - rim, s.row.dx, static_cast<double>(views.height) - 1 - 2 * rim, low, high);
-  if (!(high >= low)) return {0, 0, column, row};
+  narrow(column + slack, s.column.dx, static_cast<double>(views.width) - 1 + 2 * slack, low, high);
+  narrow(row + slack, s.row.dx, static_cast<double>(views.height) - 1 + 2 * slack, low, high);
+  if (!(high >= low) || views.width < 2 || views.height < 2) return {0, 0, column, row};
   return {static_cast<int64_t>(std::ceil(low)), static_cast<int64_t>(std::floor(high)) + 1, column, row};
 }
 
@@ -72,7 +72,8 @@ int64_t holosplat_lattice_project(const HoloLattice* lattice, const HoloViews* v
           for (int64_t x = span.first; x < span.last; ++x) {
             if (values[x] == 0.0f) continue;
             const double column = span.column + x * s.column.dx, row = span.row + x * s.row.dx;
-            const int64_t j = static_cast<int64_t>(column), i = static_cast<int64_t>(row);
+            const int64_t j = std::min(static_cast<int64_t>(column), views->width - 2);
+            const int64_t i = std::min(static_cast<int64_t>(row), views->height - 2);
             const float a = static_cast<float>(column - j), b = static_cast<float>(row - i);
             float* at = out + i * w + j;
             const float lower = values[x] * b, upper = values[x] - lower;
@@ -101,7 +102,8 @@ int64_t holosplat_lattice_backproject(const HoloLattice* lattice, const HoloView
           float* values = slice + y * lattice->width;
           for (int64_t x = span.first; x < span.last; ++x) {
             const double column = span.column + x * s.column.dx, row = span.row + x * s.row.dx;
-            const int64_t j = static_cast<int64_t>(column), i = static_cast<int64_t>(row);
+            const int64_t j = std::min(static_cast<int64_t>(column), views->width - 2);
+            const int64_t i = std::min(static_cast<int64_t>(row), views->height - 2);
             const float a = static_cast<float>(column - j), b = static_cast<float>(row - i);
             const float* at = in + i * w + j;
             values[x] += (1 - b) * ((1 - a) * at[0] + a * at[1]) + b * ((1 - a) * at[w] + a * at[w + 1]);

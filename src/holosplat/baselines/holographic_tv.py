@@ -23,6 +23,12 @@ from ..projectors.voxels import projector_for
 from ..scan import Scan
 from .primal_dual import PrimalDual
 
+SETTLING = 2
+"""Rounds of agreement after which misfits are compared."""
+
+Progress = Callable[[str, float], None]
+"""Called with (stage, fraction done of it)."""
+
 
 @dataclass(frozen=True)
 class HolographicTV:
@@ -42,7 +48,7 @@ class HolographicTV:
 
 
 def holographic_tv(
-    scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Callable[[str, float], None]
+    scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress
 ) -> tuple[Tensor, Grid]:
     """Occupancy [Z, Y, X] of `material` (δ > 0, β of any sign) from the frames of `scan`, and its grid.
 
@@ -66,19 +72,38 @@ def holographic_tv(
     volume = solver.volume
 
     if options.corrections > 0:
-        instrument = Instrument(exposures, refine)
-        fine_views, fine = views.refined(refine), Grid.of_views(views, refine)
-        start = interpolate(volume[None, None], size=fine.shape, mode="trilinear", align_corners=False)[0, 0]
-        solver = PrimalDual(projector_for(fine, fine_views), start, options.weight, upper, coupling=1 / refine**2)
-        for done in range(options.corrections):
-            on_progress("agreement with the holograms", done / options.corrections)
-            lines = solver.lines()
-            missing = frames - _image(instrument, lines * pitch, material)
-            change = invert_contrast(missing, *physics) / pitch
-            solver.run(lines + _refined(change, refine), options.inner)
-        volume, grid = solver.volume, fine
+        volume, grid = _agree(scan, material, volume, options, refine, on_progress)
     on_progress("done", 1.0)
     return volume, _in_metres(grid, pitch)
+
+
+def _agree(
+    scan: Scan, material: DeltaBeta, volume: Tensor, options: HolographicTV, refine: int, on_progress: Progress
+) -> tuple[Tensor, Grid]:
+    """The volume after rounds of agreement with the holograms, on voxels `refine` times finer than pixels.
+
+    Each round runs the wave optics on the volume's projection, inverts what is missing from the frames, and
+    gives the corrected projection to a few primal–dual steps. The round that agrees best is returned, for the
+    iteration may diverge; the first ones, in which the solver finds its dual variables, do not count.
+    """
+    frames, pitch, views = torch.from_numpy(scan.frames), scan.views.pixel_size, _in_pixels(scan.views)
+    physics = (pitch, scan.exposures.distance, scan.exposures.energy_kev, material.delta, material.beta)
+    instrument, grid = Instrument(scan.exposures, refine), Grid.of_views(views, refine)
+    projector = projector_for(grid, views.refined(refine))
+    start = interpolate(volume[None, None], size=grid.shape, mode="trilinear", align_corners=False)[0, 0]
+    solver = PrimalDual(projector, start, options.weight, options.upper or None, coupling=1 / refine**2)
+    best, least = start, float("inf")
+    for done in range(options.corrections + 1):
+        on_progress("agreement with the holograms", done / options.corrections)
+        lines = solver.lines()
+        missing = frames - _image(instrument, lines * pitch, material)
+        misfit = float(missing.square().sum())
+        if misfit < least or done <= SETTLING:
+            best, least = solver.volume.clone(), misfit
+        if done < options.corrections:
+            change = invert_contrast(missing, *physics) / pitch
+            solver.run(lines + _refined(change, refine), options.inner)
+    return best, grid
 
 
 def _working_resolution(scan: Scan, options: HolographicTV) -> tuple[Scan, int]:

@@ -84,7 +84,7 @@ class Fit:
 
     def run(self, on_record: Callable[[Record], None], until: int | None = None) -> None:
         """Advance to the end (or to step `until`); `on_record` receives one record a step."""
-        end = min(until or self.options.schedule.steps, self.options.schedule.steps)
+        end = self.options.schedule.steps if until is None else min(until, self.options.schedule.steps)
         with interrupts_held() as release:
             while self.step < end and not self.stopped_early:
                 started = time.perf_counter()
@@ -111,10 +111,12 @@ class Fit:
         count = self.options.schedule.views_per_step
         if count <= 0 or count >= len(self.train):
             return np.arange(len(self.train))
-        while len(self._order) < count:
-            self._order += torch.randperm(len(self.train), generator=self._generator).tolist()
+        if len(self._order) < count:  # those left over from the last round come first, and not again in this step
+            fresh: list[int] = torch.randperm(len(self.train), generator=self._generator).tolist()
+            left = set(self._order)
+            self._order += [v for v in fresh if v not in left] + [v for v in fresh if v in left]
         drawn, self._order = self._order[:count], self._order[count:]
-        return np.array(sorted(set(drawn)))
+        return np.array(sorted(drawn))
 
     def _gradients(self, index: np.ndarray) -> Record:
         """Back-propagate the objective of the views `index`; returns its terms."""
@@ -218,7 +220,7 @@ def split_validation(train: Scan, count: int) -> tuple[Scan, Scan]:
     )
     chosen = np.zeros(len(train), dtype=bool)
     if count > 0:
-        chosen[np.round((np.arange(count) + 0.5) * len(train) / count).astype(int) % len(train)] = True
+        chosen[((np.arange(count) + 0.5) * len(train) / count).astype(int)] = True
     return train[np.flatnonzero(~chosen)], train[np.flatnonzero(chosen)]
 
 

@@ -50,9 +50,13 @@ class Trainable:
 
     def state_dict(self) -> dict[str, Any]:
         """Parameters and optimiser state, as `load` takes them."""
-        moments = [dict(self.optimiser.state.get(p, {})) for p in self.cloud.parameters]
+        moments = [_copied(self.optimiser.state.get(p, {})) for p in self.cloud.parameters]
         return {"parameters": [p.detach().clone() for p in self.cloud.parameters], "moments": moments}
 
     def load(self, state: dict[str, Any]) -> None:
         """Go back to a saved state (of any number of Gaussians)."""
-        self._adopt(self.cloud.replaced(state["parameters"]), [m for m in state["moments"] if m])
+        self._adopt(self.cloud.replaced(state["parameters"]), [_copied(m) for m in state["moments"] if m])
+
+
+def _copied(moments: dict[str, Any]) -> dict[str, Any]:
+    return {name: value.clone() for name, value in moments.items()}

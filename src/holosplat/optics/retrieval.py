@@ -16,6 +16,10 @@ WEAKEST_ABSORPTION = 1e-4
 """|β|/δ assumed at least: it sets the lowest frequencies that retrieval trusts."""
 
 
+FEEBLE_FLOOR = 1e-3
+"""α/(2kδ) of the inversion where absorption is no help: frequencies below χ = 0.001 are damped."""
+
+
 def retrieve_thickness(
     frames: Tensor, pitch: float, distance: np.ndarray, energy_kev: float, delta: float, beta: float
 ) -> Tensor:
@@ -52,8 +56,8 @@ def invert_contrast(
     k2 = 2 * wavenumber(energy_kev)
     response = k2 * (beta * np.cos(chi) + delta * np.sin(chi))
     floor = k2 * np.where(chi < 0.5 * np.pi, WEAKEST_ABSORPTION * delta, 0.3 * delta)
-    if beta < 0:  # the response changes sign at low frequencies
-        floor = np.maximum(floor, np.where(chi < 0.5 * np.pi, k2 * abs(beta), 0))
+    if beta < WEAKEST_ABSORPTION * delta:  # the lowest frequencies say next to nothing, or change their sign
+        floor = np.maximum(floor, k2 * max(abs(beta), FEEBLE_FLOOR * delta))
     inverse = torch.from_numpy(-response / (response**2 + floor**2))
     solved = torch.fft.irfft2(torch.fft.rfft2(padded) * inverse, s=padded.shape[-2:])
     return solved[crop].to(contrast.dtype)

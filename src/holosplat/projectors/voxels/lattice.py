@@ -74,8 +74,9 @@ def lattice_reference(volume: Tensor, grid: Grid, views: Views) -> Tensor:
     for rotation, shift in zip(views.rotations, views.shifts / pixel):
         lab = torch.as_tensor(rotation, dtype=volume.dtype)[:2] @ points
         column, row = lab[0] - shift[0] + 0.5 * w - 0.5, lab[1] - shift[1] + 0.5 * h - 0.5
-        j, i = column.floor().long(), row.floor().long()
-        kept = (j >= 0) & (j < w - 1) & (i >= 0) & (i < h - 1)
+        slack = 1e-6
+        kept = (column >= -slack) & (column <= w - 1 + slack) & (row >= -slack) & (row <= h - 1 + slack)
+        j, i = column.floor().long().clamp(0, w - 2), row.floor().long().clamp(0, h - 2)
         a, b, value = (column - j)[kept], (row - i)[kept], volume.reshape(-1)[kept]
         at = (i * w + j)[kept]
         image = torch.zeros(h * w, dtype=volume.dtype)
