@@ -29,19 +29,28 @@ def estimate_ratio(scan: Scan, on_progress: Progress) -> float:
 
     A wrong ratio leaves halos of positive or negative matter around everything, in every view alike, which
     lower the level of the matter itself. So of 11 ratios, the one whose non-negative tomography has the highest
-    `plateau` is taken, and refined by a parabola on a logarithmic scale. Good to a factor of about two; photon
-    noise pulls it down.
+    `plateau` is taken (the first such peak, from low ratios on), and refined by a parabola on a logarithmic
+    scale. Good to a factor of about two; photon noise pulls it down.
     """
     coarse = scan.binned(max(1, round(scan.views.shape[1] / WORKING_WIDTH)))
     levels = np.empty(len(RATIOS))
     for i, ratio in enumerate(RATIOS):
         on_progress("estimate of delta/beta", i / len(RATIOS))
         levels[i] = plateau(_trial_volume(coarse, ratio))
-    best = int(np.clip(np.argmax(levels), 1, len(RATIOS) - 2))
+    best = _first_peak(levels)
     left, middle, right = levels[best - 1 : best + 2]
     curvature = left - 2 * middle + right
     offset = float(np.clip(0.5 * (left - right) / curvature, -1, 1)) if curvature < 0 else 0.0
     return float(RATIOS[best] * (RATIOS[1] / RATIOS[0]) ** offset)
+
+
+def _first_peak(levels: np.ndarray) -> int:
+    """Index of the first local maximum (not an end); beyond it, ratios so high that retrieval barely filters.
+
+    There, whatever noise and fringes are left pass for matter and the level rises again.
+    """
+    inner = np.flatnonzero((levels[1:-1] > levels[:-2]) & (levels[1:-1] >= levels[2:])) + 1
+    return int(inner[0]) if len(inner) else int(np.clip(np.argmax(levels), 1, len(levels) - 2))
 
 
 def estimate_delta(scan: Scan, ratio: float, on_progress: Progress) -> float:

@@ -1,0 +1,372 @@
+"""Classical reconstructions: the primal–dual solver, holographic tomography, binned scans, material estimates."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from holosplat.baselines import HolographicTV, PrimalDual, holographic_tv
+from holosplat.baselines.material import estimate_delta, estimate_ratio, plateau
+from holosplat.checks import InputError
+from holosplat.forward import measure, simulate
+from holosplat.geometry import Grid, Views, rotation_y
+from holosplat.materials import HAEMOGLOBIN, PLASMA, RED_CELL, DeltaBeta
+from holosplat.mesh import TriangleMesh
+from holosplat.metrics import dice
+from holosplat.projectors.voxels import LatticeProjector, SliceProjector, projector_for, voxel_line_integrals
+from holosplat.projectors.voxels.lattice import lattice_reference
+from holosplat.representations import GaussianCloud
+from holosplat.representations.gaussians import raw_of
+from holosplat.scan import Exposures, Scan
+from holosplat.specimens.red_cells import icosphere, random_cells
+from holosplat.specimens.scene import MeshScene
+
+PIXEL = 3.2e-6
+SHAPE = (36, 40)
+CELL = HAEMOGLOBIN.delta_beta(20)
+IN_PLASMA = RED_CELL.delta_beta(20).against(PLASMA.delta_beta(20))
+
+
+def quiet(stage: str, fraction: float) -> None:
+    """No progress to show."""
+
+
+# --- the solver ---------------------------------------------------------------------------------------------
+
+SIDE, ANGLES = 24, 15
+DISCS = ((-3.0, 2.0, 6.0), (6.0, -5.0, 3.0))
+"""x, z and radius of each disc [pixels]; the phantom is the same in all slices."""
+
+
+def disc_views() -> Views:
+    return Views.evenly_spaced(ANGLES, (3, SIDE), 1.0)
+
+
+def disc_lines() -> torch.Tensor:
+    """Exact line integrals [V, 3, SIDE] of the discs: chords, averaged over each pixel's width."""
+    fine = (np.arange(SIDE * 32) + 0.5) / 32 - SIDE / 2
+    lines = np.zeros((ANGLES, fine.size))
+    for v, rotation in enumerate(disc_views().rotations):
+        for x, z, radius in DISCS:
+            middle = (rotation @ [x, 0, z])[0]
+            lines[v] += 2 * np.sqrt(np.clip(radius**2 - (fine - middle) ** 2, 0, None))
+    return torch.from_numpy(lines.reshape(ANGLES, 1, SIDE, 32).mean(3)).float().repeat(1, 3, 1)
+
+
+def disc_truth() -> torch.Tensor:
+    """Occupancy [SIDE, 3, SIDE] of the discs, averaged over voxels."""
+    fine = (np.arange(SIDE * 16) + 0.5) / 16 - SIDE / 2
+    inside = np.zeros((fine.size, fine.size))
+    for x, z, radius in DISCS:
+        inside += (fine[None] - x) ** 2 + (fine[:, None] - z) ** 2 < radius**2
+    return torch.from_numpy(inside.reshape(SIDE, 16, SIDE, 16).mean((1, 3))).float()[:, None].repeat(1, 3, 1)
+
+
+def a_solver(weight: float = 0.1, upper: float | None = 1.0, **options) -> PrimalDual:
+    grid = Grid.centred((SIDE, 3, SIDE), 1.0)
+    return PrimalDual(SliceProjector(grid, disc_views()), torch.zeros(grid.shape), weight, upper, **options)
+
+
+def objective(volume: torch.Tensor, lines: torch.Tensor, weight: float) -> float:
+    """½‖A u - b‖² + λ Σ|∇u|, with forward differences."""
+    u = volume.double().numpy()
+    projected = SliceProjector(Grid.centred((SIDE, 3, SIDE), 1.0), disc_views())
+    misfit = projected.lines_out(projected.project(projected.volume_in(volume))).double() - lines.double()
+    steps = [np.diff(u, axis=i, append=np.take(u, [-1], axis=i)) for i in range(3)]
+    return 0.5 * float(misfit.square().sum()) + weight * float(np.sqrt(sum(s**2 for s in steps)).sum())
+
+
+def test_discs_are_found_from_exact_projections():
+    solver, truth = a_solver(), disc_truth()
+    solver.run(disc_lines(), 150)
+    assert solver.volume.shape == truth.shape
+    assert float((solver.volume - truth).norm() / truth.norm()) < 0.12
+    assert dice(solver.volume.numpy() > 0.5, truth.numpy() > 0.5) > 0.97
+    error = solver.lines() - disc_lines()
+    assert float(error.norm() / disc_lines().norm()) < 0.02
+
+
+def test_the_box_is_kept():
+    """Also at every moment on the way, and with measurements that ask for more."""
+    solver = a_solver()
+    for _ in range(5):
+        solver.run(2 * disc_lines() - 1, 8)
+        assert float(solver.volume.min()) >= 0
+        assert float(solver.volume.max()) <= 1
+    assert float(solver.volume.max()) == 1
+
+
+def test_without_an_upper_bound_values_are_non_negative_only():
+    solver = a_solver(upper=None)
+    solver.run(3 * disc_lines() - 0.5, 80)
+    assert float(solver.volume.min()) == 0
+    assert float(solver.volume.max()) > 2.5
+
+
+def test_the_solution_minimises_the_objective():
+    """No worse than the truth, nor than the solution moved towards the truth, smoothed, scaled, or disturbed."""
+    weight, lines, noise = 0.4, disc_lines(), torch.Generator().manual_seed(0)
+    lines = lines + 0.5 * torch.randn(lines.shape, generator=noise)
+    solver = a_solver(weight)
+    solver.run(lines, 600)
+    best = objective(solver.volume, lines, weight)
+    assert best < objective(disc_truth(), lines, weight)
+    others = [solver.volume.lerp(disc_truth(), 0.1), 0.99 * solver.volume, torch.ones_like(solver.volume)]
+    others += [(solver.volume + 0.02 * torch.randn(solver.volume.shape, generator=noise)).clamp(0, 1)]
+    others += [solver.volume.lerp(solver.volume.roll(1, axis), 0.05) for axis in (0, 1, 2)]
+    assert all(objective(other, lines, weight) > best for other in others)
+
+
+def test_coupling_changes_the_way_but_not_the_end():
+    lines, ends = disc_lines(), []
+    for coupling in (1.0, 0.25):
+        solver = a_solver(0.3, coupling=coupling)
+        solver.run(lines, 400)
+        ends.append(objective(solver.volume, lines, 0.3))
+    assert ends[1] == pytest.approx(ends[0], rel=2e-3)
+
+
+def test_total_variation_suppresses_noise():
+    lines = disc_lines()
+    lines = lines + torch.randn(lines.shape, generator=torch.Generator().manual_seed(1))
+    errors = []
+    for weight in (0.0, 0.6):
+        solver = a_solver(weight)
+        solver.run(lines, 150)
+        errors.append(float((solver.volume - disc_truth()).norm() / disc_truth().norm()))
+    assert errors[1] < 0.7 * errors[0]
+
+
+def test_a_solver_is_warm():
+    """It goes on where it was, and starts where it is told to."""
+    whole, parts, lines = a_solver(), a_solver(), disc_lines()
+    whole.run(lines, 20)
+    parts.run(lines, 12)
+    parts.run(lines, 8)
+    assert torch.equal(whole.volume, parts.volume)
+    started = PrimalDual(whole.projector, disc_truth(), 0.1, 1.0)
+    assert torch.equal(started.volume, disc_truth())
+    wanted = SliceProjector(Grid.centred((SIDE, 3, SIDE), 1.0), disc_views())
+    assert torch.equal(started.lines(), wanted.lines_out(wanted.project(wanted.volume_in(disc_truth()))))
+
+
+# --- holographic tomography ---------------------------------------------------------------------------------
+
+
+def cells(material: DeltaBeta) -> MeshScene:
+    """Four red cells in the field."""
+    box = (SHAPE[1] * PIXEL, SHAPE[0] * PIXEL, SHAPE[1] * PIXEL)
+    return MeshScene.of_one_material(random_cells(4, box, 2, 13 * PIXEL), material)
+
+
+def balls(material: DeltaBeta) -> MeshScene:
+    """Two balls, for small fields."""
+    vertices, faces = icosphere(3)
+    places = (([-4, 2, 3], 4.0), ([4, -3, -2], 4.5))
+    meshes = [TriangleMesh(PIXEL * (radius * vertices + np.array(centre)), faces) for centre, radius in places]
+    return MeshScene.of_one_material(meshes, material)
+
+
+def scan_of(scene: MeshScene, views: Views) -> Scan:
+    return simulate(scene, Exposures.of(views, 20.0, 0.1), is_test=np.zeros(len(views), dtype=bool))
+
+
+@pytest.fixture(scope="module")
+def cell_scan() -> Scan:
+    return scan_of(cells(CELL), Views.evenly_spaced(8, SHAPE, PIXEL))
+
+
+@pytest.fixture(scope="module")
+def plasma_scan() -> Scan:
+    return scan_of(cells(IN_PLASMA), Views.evenly_spaced(8, SHAPE, PIXEL))
+
+
+def overlap(volume: torch.Tensor, grid: Grid, scene: MeshScene) -> float:
+    """Dice of the occupancy with the scene's own voxels."""
+    truth = scene.voxelise(grid).delta / scene.materials[0].delta
+    return dice(volume.numpy() > 0.5, truth > 0.5)
+
+
+USUAL = HolographicTV(weight=0.3, iterations=60, corrections=4, inner=12)
+
+
+def test_cells_are_found_from_eight_views(cell_scan):
+    volume, grid = holographic_tv(cell_scan, CELL, USUAL, quiet)
+    assert overlap(volume, grid, cells(CELL)) > 0.94
+    assert 0 <= float(volume.min()) < float(volume.max()) <= 1
+    views, refine = cell_scan.views, grid.shape[1] // SHAPE[0]
+    assert grid.shape == (40 * refine, 36 * refine, 40 * refine)
+    assert grid.voxel_size == pytest.approx((PIXEL / refine,) * 3)
+    assert grid.origin == pytest.approx(Grid.of_views(views, refine).origin)
+
+
+@pytest.mark.parametrize("corrections", [4, 6, 12])
+def test_cells_in_plasma_are_found_though_they_absorb_less(plasma_scan, corrections):
+    """Δβ < 0: there is no δ/β; more corrections must not undo what fewer found."""
+    options = replace(USUAL, corrections=corrections)
+    volume, grid = holographic_tv(plasma_scan, IN_PLASMA, options, quiet)
+    assert overlap(volume, grid, cells(IN_PLASMA)) > 0.93
+
+
+def test_balls_are_found_from_views_of_any_orientation():
+    """Views that share no axis (and shifted detectors) go through the lattice projector."""
+    rotations = Rotation.random(6, random_state=3).as_matrix()
+    shifts = PIXEL * np.random.default_rng(0).uniform(-1, 1, (6, 2))
+    views = Views(rotations, shifts, (20, 24), PIXEL)
+    scene = balls(CELL)
+    assert scene.missing_field(views) < 0
+    assert isinstance(projector_for(Grid.of_views(views), views), LatticeProjector)
+    options = HolographicTV(iterations=30, corrections=2, inner=8, refine=1)
+    volume, grid = holographic_tv(scan_of(scene, views), CELL, options, quiet)
+    assert overlap(volume, grid, scene) > 0.93
+
+
+def test_views_about_one_axis_may_have_shifted_detectors():
+    shifts = PIXEL * np.stack([np.linspace(-3, 3, 7), np.zeros(7)], axis=1)
+    views = Views(rotation_y(np.arange(7) * 180 / 7), shifts, (20, 24), PIXEL)
+    scene = balls(CELL)
+    assert isinstance(projector_for(Grid.of_views(views), views), SliceProjector)
+    volume, grid = holographic_tv(scan_of(scene, views), CELL, USUAL, quiet)
+    assert overlap(volume, grid, scene) > 0.93
+
+
+def test_views_about_one_axis_may_be_shifted_along_it_by_part_of_a_pixel():
+    """Rows that do not match (as after binning an odd number of them) go through the lattice projector."""
+    views = Views(rotation_y(10 + np.arange(7) * 180 / 7), np.tile([0, 0.5 * PIXEL], (7, 1)), (20, 24), PIXEL)
+    grid, scene = Grid.of_views(views), balls(CELL)
+    projector = projector_for(grid, views)
+    assert isinstance(projector, LatticeProjector)
+    full = torch.rand(grid.shape, generator=torch.Generator().manual_seed(0))
+    lines, wanted = projector.project(full), lattice_reference(full, grid, views)
+    np.testing.assert_allclose(lines, wanted, rtol=0, atol=1e-5 * float(wanted.max()))
+    volume, grid = holographic_tv(scan_of(scene, views), CELL, USUAL, quiet)
+    assert overlap(volume, grid, scene) > 0.93
+
+
+class Voxels:
+    """A volume of one material as an Object."""
+
+    def __init__(self, volume: torch.Tensor, grid: Grid, material: DeltaBeta) -> None:
+        self.volume, self.grid, self.material = volume, grid, material
+
+    def at(self, time: float) -> Voxels:
+        return self
+
+    def project(self, views: Views) -> tuple[torch.Tensor, torch.Tensor]:
+        lines = voxel_line_integrals(self.volume[None], self.grid, views)[0]
+        return lines * self.material.beta, lines * self.material.delta
+
+
+@pytest.mark.parametrize("material", [CELL, IN_PLASMA], ids=["in vacuum", "in plasma"])
+def test_corrections_bring_the_volume_in_agreement_with_the_holograms(request, material):
+    scan = request.getfixturevalue("cell_scan" if material is CELL else "plasma_scan")
+    errors, dices = [], []
+    for corrections in (0, 4):
+        volume, grid = holographic_tv(scan, material, replace(USUAL, corrections=corrections), quiet)
+        predicted = measure(Voxels(volume, grid, material), scan.exposures, 2).numpy()
+        errors.append(float(np.abs(predicted - scan.frames).mean() / np.abs(scan.frames - 1).mean()))
+        dices.append(overlap(volume, grid, cells(material)))
+    assert errors[1] < 0.7 * errors[0]
+    assert errors[1] < 0.4
+    assert dices[1] > dices[0] + 0.05
+
+
+def test_too_many_voxels_become_larger_ones(cell_scan):
+    for most, shape in ((60_000, (40, 36, 40)), (30_000, (20, 18, 20)), (5_000, (13, 12, 13))):
+        options = replace(USUAL, max_voxels=most, corrections=1)
+        volume, grid = holographic_tv(cell_scan, CELL, options, quiet)
+        assert volume.shape == shape == grid.shape
+        assert volume.numel() <= most
+        factor = 40 // shape[0]
+        assert grid.voxel_size == pytest.approx((factor * PIXEL,) * 3)
+        assert overlap(volume, grid, cells(CELL)) > (0.9, 0.8, 0.7)[factor - 1]
+
+
+def test_progress_is_told_stage_by_stage(cell_scan):
+    told: list[tuple[str, float]] = []
+    holographic_tv(cell_scan, CELL, replace(USUAL, iterations=25), lambda *step: told.append(step))
+    stages = list(dict.fromkeys(stage for stage, _ in told))
+    assert stages == ["phase retrieval", "tomography", "agreement with the holograms", "done"]
+    assert all(0 <= fraction <= 1 for _, fraction in told)
+    assert [fraction for stage, fraction in told if stage == "tomography"] == [0, 0.4, 0.8]
+
+
+def test_iterations_are_counted(cell_scan):
+    """Whole tens and what remains of them."""
+    some, more, same = (
+        holographic_tv(cell_scan, CELL, replace(USUAL, iterations=n, corrections=0), quiet)[0] for n in (5, 10, 5)
+    )
+    assert torch.equal(some, same)
+    assert not torch.equal(some, more)
+
+
+def test_no_iterations_are_refused(cell_scan):
+    with pytest.raises(InputError, match="iterations"):
+        holographic_tv(cell_scan, CELL, HolographicTV(iterations=0), quiet)
+
+
+# --- binned scans -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("factor", [2, 3])
+@pytest.mark.parametrize("shape", [(36, 42), (37, 41), (38, 43), (41, 37)])
+def test_binned_pixels_are_where_they_say(shape, factor):
+    """A known Gaussian: its lines, binned, are its lines on the binned scan's own views."""
+    centre, sigma = torch.tensor([[3.3, -2.2, 1.4]]), torch.full((1, 3), np.log(4.0))
+    one = GaussianCloud(
+        (centre, sigma, torch.tensor([[1.0, 0, 0, 0]]), raw_of(torch.tensor([[0.7]]))), PIXEL, 1e-6, 1e-9
+    )
+    shifts = PIXEL * np.array([[0, 0], [1.3, -0.6], [-0.4, 2.1]])
+    views = Views(rotation_y([0, 40, 110]), shifts, shape, PIXEL)
+    frames = one.project(views)[1].numpy() / 1e-6
+    exposures = Exposures.of(views, 20.0, 0.1, 0.6)
+    small = Scan(frames, exposures, np.array([False, True, False]), {"from": "here"}).binned(factor)
+    assert small.frames.shape[1:] == small.views.shape == (shape[0] // factor, shape[1] // factor)
+    assert small.views.pixel_size == pytest.approx(factor * PIXEL)
+    wanted = one.project(small.views)[1].numpy() / 1e-6
+    np.testing.assert_allclose(small.frames, wanted, rtol=0, atol=0.01 * wanted.max())
+    np.testing.assert_allclose(small.exposures.psf_sigma_px, 0.6 / factor)
+    np.testing.assert_array_equal(small.exposures.distance, exposures.distance)
+    assert (small.is_test.tolist(), small.provenance) == ([False, True, False], {"from": "here"})
+
+
+def test_binning_by_one_changes_nothing_and_by_too_much_is_refused(cell_scan):
+    assert cell_scan.binned(1) is cell_scan
+    with pytest.raises(InputError, match="binned by 37"):
+        cell_scan.binned(37)
+
+
+# --- what the holograms say about the material --------------------------------------------------------------
+
+
+def test_the_ratio_of_haemoglobin_is_found(cell_scan):
+    fractions: list[float] = []
+    found = estimate_ratio(cell_scan, lambda stage, fraction: fractions.append(fraction))
+    assert CELL.ratio / 2.5 < found < 2.5 * CELL.ratio
+    assert fractions == sorted(fractions)
+    assert 0 <= fractions[0] < fractions[-1] < 1
+
+
+def test_the_ratio_is_that_of_the_matter_not_a_habit():
+    """Matter that absorbs ten times as much gives a ratio several times lower."""
+    dark = DeltaBeta(CELL.delta, 10 * CELL.beta)
+    found = estimate_ratio(scan_of(cells(dark), Views.evenly_spaced(8, SHAPE, PIXEL)), quiet)
+    assert dark.ratio / 2.5 < found < 2.5 * dark.ratio
+
+
+def test_delta_is_found_where_the_ratio_is_known(cell_scan):
+    assert estimate_delta(cell_scan, CELL.ratio, quiet) == pytest.approx(CELL.delta, rel=0.15)
+
+
+def test_the_plateau_is_the_mass_weighted_median():
+    """Half of the matter lies at or below it; empty and negative voxels do not count."""
+    assert plateau(torch.tensor([[[0.0, 1.0, 2.0, 3.0, -9.0]]])) == 2  # masses 1, 2, 3: half of 6 is reached at 2
+    assert plateau(torch.tensor([[[0.1] * 5 + [1.0] * 4 + [7.0]]])) == 7  # 0.5 + 4 < 7
+    assert plateau(torch.tensor([[[1.0] * 9 + [11.0]]])) == 11  # 9 < 20 / 2
+    assert plateau(torch.tensor([[[0.1] * 5 + [1.0] * 4 + [3.0]]])) == 1
+    with pytest.raises(InputError, match="no matter"):
+        plateau(torch.zeros(2, 2, 2))
