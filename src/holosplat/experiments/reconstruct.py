@@ -53,7 +53,7 @@ def reconstruct(
     Errors: `InputError` for scans without training frames or matter, and for folders that do not fit.
     """
     train, _ = split_validation(scan.train(), settings.fit.schedule.validation_views)
-    checkpoint = _open_folder(folder, scan, prior, settings, seed, resume) if folder else None
+    checkpoint = _resumed(folder, scan, prior, settings, seed, resume) if folder else None
     timing: dict[str, float] = dict(checkpoint["timing"]) if checkpoint else {}
     if checkpoint:
         cloud = _cloud_of(checkpoint)
@@ -64,6 +64,8 @@ def reconstruct(
     fit = Fit(scan, cloud, settings.fit, seed)
     if checkpoint:
         fit.load(checkpoint["fit"])
+    elif folder:
+        _begin(folder, scan, prior, settings, seed)
     journal = _Journal(fit, timing, folder, on_progress)
     try:
         fit.run(journal.record)
@@ -143,25 +145,27 @@ def _cloud_of(checkpoint: dict[str, Any]) -> GaussianCloud:
     return GaussianCloud(parameters, **checkpoint["cloud"])
 
 
-def _open_folder(
+def _resumed(
     folder: RunFolder, scan: Scan, prior: MaterialPrior, settings: Settings, seed: int, resume: bool
 ) -> dict[str, Any] | None:
-    """Prepare the folder; returns the checkpoint to resume from, if any."""
-    config = {
-        "settings": asdict(settings),
-        "prior": asdict(prior),
-        "seed": seed,
-        "scan_hash": scan_hash(scan),
-    }
+    """The checkpoint to go on from, or None for a new run; writes nothing."""
     if not (resume and folder.config.is_file()):
         folder.require_new()
-        folder.create()
-        write_json(folder.config, {**config, **environment()})
         return None
-    old, same = folder.read_config(), json.loads(json.dumps(config))
+    old, same = folder.read_config(), json.loads(json.dumps(_config(scan, prior, settings, seed)))
     for key, value in same.items():
         require(
             old.get(key) == value,
             f"--resume needs the {key} that {folder.path} was started with; use the same options, or another --out.",
         )
     return folder.load_checkpoint()
+
+
+def _begin(folder: RunFolder, scan: Scan, prior: MaterialPrior, settings: Settings, seed: int) -> None:
+    """Make the folder, once there is something to put in it."""
+    folder.create()
+    write_json(folder.config, {**_config(scan, prior, settings, seed), **environment()})
+
+
+def _config(scan: Scan, prior: MaterialPrior, settings: Settings, seed: int) -> dict[str, Any]:
+    return {"settings": asdict(settings), "prior": asdict(prior), "seed": seed, "scan_hash": scan_hash(scan)}

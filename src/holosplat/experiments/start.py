@@ -32,9 +32,7 @@ def _from_phase_retrieval(
     material = _material(scan, prior, on_progress)
     volume, grid = holographic_tv(scan, material, settings.volume, on_progress)
     pitch = scan.views.pixel_size
-    matter = float(volume.sum()) * grid.voxel_size[0] ** 3
-    spacing = max(settings.spacing_px * pitch, (2 * matter / settings.max_start) ** (1 / 3))
-    cloud = cloud_from_volume(volume, grid, material, spacing, pitch)
+    cloud = cloud_from_volume(volume, grid, material, settings.spacing_px * pitch, pitch, settings.max_start)
     cloud = approximate(cloud, volume, grid, settings.approximate_steps, on_progress)
     return freed(cloud) if prior.kind == "free" else cloud
 

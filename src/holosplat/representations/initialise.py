@@ -17,16 +17,25 @@ SMALLEST = 1e-3
 """Smallest starting amplitude: softplus needs some slope to start from."""
 
 
+FILLED = 0.05
+"""Share of matter from which on a block becomes a Gaussian."""
+
 APPROXIMATION_RATES = (0.02, 0.02, 0.02, 0.05)
 """Adam's first rates of centres, log-scales, quaternions and amplitudes while a cloud learns a volume."""
 
 
 def cloud_from_volume(
-    occupancy: Tensor, grid: Grid, material: tuple[float, float], spacing: float, unit_length: float
+    occupancy: Tensor,
+    grid: Grid,
+    material: tuple[float, float],
+    spacing: float,
+    unit_length: float,
+    max_count: int = 1_000_000,
 ) -> GaussianCloud:
     """A single-material cloud that approximates `occupancy` [Z, Y, X] on `grid`: one Gaussian a filled block.
 
-    Blocks have an edge of about `spacing` [m] (a whole number of voxels). Each block that holds more than 5 % of
+    Blocks have an edge of about `spacing` [m] (a whole number of voxels), or more, so that there are at most
+    `max_count`. Each block that holds more than 5 % of
     matter becomes one isotropic Gaussian at its centre of mass, with its mass, and with half a block as standard
     deviation, so that full blocks add up to a flat density (ripple below 2 %).
     material: (δ, β) of an occupancy of one; unit_length [m]: the cloud's unit, the pixel size.
@@ -34,7 +43,10 @@ def cloud_from_volume(
     voxel = grid.voxel_size[0]
     edge = max(1, round(spacing / voxel))
     mass, centre = _block_moments(occupancy.float().clamp_min(0), edge)
-    filled = torch.nonzero(mass > 0.05)
+    while int((mass > FILLED).sum()) > max_count:
+        edge += 1
+        mass, centre = _block_moments(occupancy.float().clamp_min(0), edge)
+    filled = torch.nonzero(mass > FILLED)
     require(len(filled) > 0, "the start found no matter in the holograms; check material, energy and distance.")
     mass, centre = mass[tuple(filled.T)], centre[(slice(None), *filled.T)].T
     position = centre * voxel + torch.tensor(grid.origin, dtype=torch.float32)
