@@ -166,7 +166,7 @@ def _window_matrix(n: int, dtype: torch.dtype) -> Tensor:
 def _rings(h: int, w: int) -> tuple[Tensor, int]:
     """Ring index of each Fourier sample (0: the mean and beyond Nyquist), and the number of rings."""
     shortest = min(h, w)  # a ring is one frequency step of the shorter side wide, as in metrics.correlation
-    fy, fx = torch.fft.fftfreq(h) * shortest, torch.fft.fftfreq(w) * shortest
-    ring = torch.round(torch.sqrt(fy[:, None] ** 2 + fx[None] ** 2)).long().flatten()
+    fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) * shortest for n in (h, w))
+    ring = torch.floor(torch.sqrt(fy[:, None] ** 2 + fx[None] ** 2) + (0.5 + 1e-9)).long().flatten()
     count = shortest // 2
     return torch.where(ring <= count, ring, 0), count
