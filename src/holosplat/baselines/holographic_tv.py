@@ -7,6 +7,7 @@ frequencies that only consistency between views can mend.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -88,7 +89,9 @@ def _agree(
     """
     frames, pitch, views = torch.from_numpy(scan.frames), scan.views.pixel_size, _in_pixels(scan.views)
     physics = (pitch, scan.exposures.distance, scan.exposures.energy_kev, material.delta, material.beta)
-    instrument, grid = Instrument(scan.exposures, refine), Grid.of_views(views, refine)
+    grid = Grid.of_views(views, refine)
+    finer = math.ceil(resolving_oversample(scan.exposures, 1.5, at_least=1) / refine)
+    instrument = Instrument(scan.exposures, refine * finer)
     projector = projector_for(grid, views.refined(refine))
     start = interpolate(volume[None, None], size=grid.shape, mode="trilinear", align_corners=False)[0, 0]
     solver = PrimalDual(projector, start, options.weight, options.upper or None, coupling=1 / refine**2)
@@ -96,7 +99,7 @@ def _agree(
     for done in range(options.corrections + 1):
         on_progress("agreement with the holograms", done / options.corrections)
         lines = solver.lines()
-        missing = frames - _image(instrument, lines * pitch, material)
+        missing = frames - _image(instrument, _refined(lines, finer) * pitch, material)
         misfit = float(missing.square().sum())
         if misfit < least or done <= SETTLING:
             best, least = solver.volume.clone(), misfit
@@ -126,6 +129,8 @@ def _image(instrument: Instrument, lines: Tensor, material: DeltaBeta) -> Tensor
 
 
 def _refined(images: Tensor, factor: int) -> Tensor:
+    if factor == 1:
+        return images
     return interpolate(images[None], scale_factor=factor, mode="bilinear", align_corners=False)[0]
 
 
