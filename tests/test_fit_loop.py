@@ -6,6 +6,7 @@ import copy
 import io
 from collections import Counter
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 import pytest
@@ -188,7 +189,7 @@ def test_views_are_drawn_without_replacement_and_equally_often(scan, monkeypatch
     drawn = batches(fit_of(scan, steps=24, views_per_step=per_step), monkeypatch)
     epoch = 6 // per_step
     for start in range(0, 24, epoch):
-        assert sorted(sum(drawn[start : start + epoch], [])) == list(range(6))
+        assert sorted(chain.from_iterable(drawn[start : start + epoch])) == list(range(6))
     assert len({tuple(batch) for batch in drawn[::epoch]}) > 1  # the order is another in every round
 
 
@@ -197,7 +198,7 @@ def test_a_number_of_views_that_does_not_divide_draws_as_evenly(scan, monkeypatc
     """Every step has as many different views as asked for, and after whole rounds all were used equally often."""
     drawn = batches(fit_of(scan, steps=24, views_per_step=per_step), monkeypatch)
     assert [len(set(batch)) for batch in drawn] == [per_step] * 24
-    assert set(Counter(sum(drawn, [])).values()) == {24 * per_step // 6}
+    assert set(Counter(chain.from_iterable(drawn)).values()) == {24 * per_step // 6}
 
 
 # --- rates, warm-up, detached views -------------------------------------------------------------------------

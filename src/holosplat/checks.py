@@ -29,7 +29,8 @@ def positive(field: str, value: Any, unit: str = "") -> float:
     except (TypeError, ValueError):
         number = math.nan
     if not (math.isfinite(number) and number > 0):
-        raise InputError(f"{field} must be a positive number{_of(unit)}, but it is {value!r}; correct it.")
+        shown = f"{number:g}" if isinstance(value, (int, float)) else repr(value)
+        raise InputError(f"{field} must be a positive number{_of(unit)}, but it is {shown}; correct it.")
     return number
 
 

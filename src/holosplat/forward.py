@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .checks import require
+from .checks import in_range, require
 from .optics.detector import bin_pixels, blur, gaussian_transfer, poisson
 from .optics.propagation import exit_wave_minus_one, fresnel_propagate, fresnel_reach_px, fresnel_transfer
 from .scan import Exposures, Scan, interleaved_split
@@ -19,6 +19,7 @@ from .volume import Object
 SIMULATED_FRINGE_SAMPLES = 8
 """Samples on the first fringe in simulations: frames of rounded bodies are then right to 0.5 % of their contrast
 (rms); faces exactly along the beam, where the phase jumps, converge more slowly (a few per cent)."""
+PHOTON_RANGE = (1e-3, 1e15)
 GUARD_PX = 8
 """Detector pixels of margin beyond the fringes' reach: room for the point-spread function and faint tails."""
 
@@ -122,6 +123,9 @@ def simulate(
     is_test: [N] bool, default every fourth frame; oversample: samples per pixel, default from the fringe width;
     `on_progress(fraction)` is called after each view.
     """
+    if photons_per_pixel is not None:
+        in_range("photons_per_pixel", photons_per_pixel, *PHOTON_RANGE)
+    require(seed >= 0, f"seed must be 0 or more, but it is {seed}.")
     fine = oversample or resolving_oversample(exposures, SIMULATED_FRINGE_SAMPLES, at_least=4)
     frames = np.empty((len(exposures), *exposures.views.shape))
     for i in range(len(exposures)):  # one at a time: a fine padded raster is large

@@ -15,7 +15,10 @@ from .checks import InputError, finite, positive, require, shaped
 
 def rotation_y(angles_deg: np.ndarray | list[float]) -> np.ndarray:
     """Rotation matrices [V, 3, 3] of tomographic angles [V] in degrees about y (docs/conventions.md)."""
-    theta = np.deg2rad(np.asarray(angles_deg, dtype=np.float64).reshape(-1))
+    angles = np.asarray(angles_deg, dtype=np.float64).reshape(-1)
+    for angle in angles[~np.isfinite(angles)]:
+        raise InputError(f"every angle must be a finite number of degrees, but one is {angle:g}; correct it.")
+    theta = np.deg2rad(angles)
     c, s, o, i = np.cos(theta), np.sin(theta), np.zeros_like(theta), np.ones_like(theta)
     return np.stack([np.stack([c, o, s], -1), np.stack([o, i, o], -1), np.stack([-s, o, c], -1)], -2)
 

@@ -35,9 +35,11 @@ class Exposures:
         in_range("pixel size", self.views.pixel_size, *PIXEL_RANGE_M, unit="metres")
         for name in ("distance", "psf_sigma_px", "time"):
             array = np.broadcast_to(np.asarray(getattr(self, name), dtype=np.float64), (count,))
-            object.__setattr__(self, name, finite(name, array.copy()))
+            object.__setattr__(self, name, array.copy())
         for z in self.distance:
-            in_range("propagation distance", z, *DISTANCE_RANGE_M, unit="metres")
+            in_range("propagation distance", float(z), *DISTANCE_RANGE_M, unit="metres")
+        finite("psf_sigma_px", self.psf_sigma_px)
+        finite("time", self.time)
         require(bool(np.all(self.psf_sigma_px >= 0)), "psf_sigma_px must not be negative; correct it.")
 
     @classmethod

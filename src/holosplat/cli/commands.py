@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from ..checks import InputError, require
+from ..checks import InputError, in_range, require
 from ..experiments.demo import DETECTOR, write_demo_meshes
 from ..experiments.evaluate import Evaluation
 from ..experiments.evaluate import evaluate as score
@@ -23,14 +24,17 @@ from ..experiments.settings import preset, read_settings
 from ..experiments.simulate import read_scene
 from ..forward import simulate as image_scene
 from ..geometry import Grid
+from ..io.atomic import require_writable
 from ..io.json import read_json, write_json
 from ..io.nxtomo import read_scan, write_scan
 from ..io.volumes import read_volume, write_volume
 from ..report.run import report_run
-from ..scan import Scan
+from ..scan import PIXEL_RANGE_M, Scan
 from .options import BeamlineOptions, MaterialOptions, MeshOptions, NoiseOptions, PriorOptions
 from .progress import ProgressBar
 
+MOST_VOXELS = 2**31
+"""The largest volume that `export` writes: 16 GB for δ and β."""
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 
@@ -52,7 +56,10 @@ def simulate(
         truth: Also write the true volume here.
     """
     require(len(meshes) > 0, "simulate needs at least one mesh file.")
+    for path in (out, truth) if truth else (out,):
+        require_writable(path)
     exposures = beamline.exposures()
+    split = beamline.split(len(exposures))
     materials = filling.filling()
     scene = read_scene(meshes, materials, beamline.energy_kev, length_unit=files.length_unit, origin=files.origin)
     missing = scene.missing_field(exposures.views)
@@ -61,7 +68,6 @@ def simulate(
             f"warning: the scene reaches {1e6 * missing:.3g} µm ({missing / beamline.pixel_size:.3g} pixels) beyond "
             "the detector in at least one view; enlarge --detector, or move --origin."
         )
-    split = beamline.split(len(exposures))
     with ProgressBar() as bar:
         scan = image_scene(
             scene,
@@ -88,7 +94,7 @@ def reconstruct(
     scan: Positional[Path],
     out: Path,
     matter: PriorOptions = PriorOptions(),
-    preset_name: Annotated[str, arg(name="preset")] = "default",
+    preset_name: Annotated[str | None, arg(name="preset")] = None,
     config: Path | None = None,
     seed: int = 0,
     resume: bool = False,
@@ -98,12 +104,14 @@ def reconstruct(
     Args:
         scan: Scan file (NXtomo).
         out: Run folder to make.
-        preset_name: Named settings: default, fast, thesis.
+        preset_name: Named settings: default (what you get without), fast, thesis.
         config: Or: a JSON file of settings, such as the config.json of another run.
         seed: Seed of everything random.
         resume: Go on with an interrupted run.
     """
-    settings = read_settings(config) if config else preset(preset_name)
+    require(config is None or preset_name is None, "give --config or --preset, not both.")
+    settings = read_settings(config) if config else preset(preset_name or "default")
+    require(seed >= 0, f"--seed must be 0 or more, but it is {seed}.")
     measured = read_scan(scan)
     prior = matter.prior(measured.exposures.energy_kev)
     folder = RunFolder(out)
@@ -128,6 +136,7 @@ def render(run: Positional[Path], scan: Path, out: Path, split: Literal["test", 
         out: Scan file to write: the predicted frames, in the scan's order.
         split: Which frames.
     """
+    require_writable(out)
     result, wanted = load_reconstruction(RunFolder(run)), read_scan(scan)
     chosen = {"test": wanted.test, "train": wanted.train, "all": lambda: wanted}[split]()
     require(len(chosen) > 0, f"{scan} has no {split} frames to render; choose another --split.")
@@ -150,11 +159,15 @@ def export(
         shape: Voxels along z, y, x (default: the scan's field of view, Z = X = W, Y = H).
         voxel_size: Edge of a voxel [m] (default: the pixel size).
     """
+    require_writable(volume)
     folder = RunFolder(run)
     result = load_reconstruction(folder)
     detector = read_json(folder.summary)["detector"]
     rows, columns = int(detector["rows"]), int(detector["columns"])
-    grid = Grid.centred(shape or (columns, rows, columns), voxel_size or float(detector["pixel_size_m"]))
+    edge = float(detector["pixel_size_m"]) if voxel_size is None else voxel_size
+    grid = Grid.centred(shape or (columns, rows, columns), in_range("voxel size", edge, *PIXEL_RANGE_M, unit="metres"))
+    count = math.prod(grid.shape)
+    require(count <= MOST_VOXELS, f"shape must have at most {MOST_VOXELS:.0e} voxels, but it has {count:.0e}.")
     write_volume(volume, result.cloud.voxelise(grid))
     _say(f"wrote {volume}: {' × '.join(map(str, grid.shape))} voxels of {1e6 * grid.voxel_size[0]:.4g} µm")
 
@@ -208,6 +221,7 @@ def demo(out: Path = Path("demo")) -> None:
 
 
 def _source(folder: RunFolder) -> Path:
+    require(folder.source.is_file(), f"{folder.path} does not say which scan it is of; name it with --scan.")
     path = Path(str(read_json(folder.source).get("scan", "")))
     require(path.is_file(), f"the scan {path} of this run is no longer there; name it with --scan.")
     return path

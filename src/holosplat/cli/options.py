@@ -79,6 +79,8 @@ class BeamlineOptions:
 
     def split(self, count: int) -> np.ndarray:
         """[count] bool: the frames that are held out."""
+        every = self.test_every
+        require(every == 0 or every > 1, f"--test-every must be 0 (hold out none) or at least 2, but it is {every}.")
         return interleaved_split(count, self.test_every)
 
 
@@ -111,6 +113,8 @@ class PriorOptions:
         """The prior at `energy_kev` [keV]."""
         require(self.material is None or self.delta_beta is None, "give --material or --delta-beta, not both.")
         if self.delta_beta is not None:
+            alone = self.density is None and self.medium is None and self.medium_density is None
+            require(alone, "--density and --medium go with --material, not with --delta-beta.")
             return MaterialPrior.of_ratio(self.delta_beta)
         if self.material is None:
             stray = self.density is not None or self.medium is not None or self.medium_density is not None

@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from ..checks import require
+from ..checks import InputError, require
 from ..fit.loop import Fit, Record, split_validation
 from ..io.json import read_json, write_json
 from ..representations import GaussianCloud
@@ -20,6 +20,14 @@ from .settings import MaterialPrior, Settings
 from .start import starting_cloud
 
 CHECKPOINT_SECONDS = 20.0
+
+RESUMED_WITH = {
+    "scan_hash": "scan file",
+    "settings": "settings (--preset, --config)",
+    "prior": "material (--material, --delta-beta)",
+    "seed": "seed (--seed)",
+}
+"""What must not change between the parts of a run, as messages call it."""
 
 Progress = Callable[[str, float, Record], None]
 """Called with (stage, fraction done of the stage, the last record of the fit or {})."""
@@ -78,10 +86,14 @@ def load_reconstruction(folder: RunFolder) -> Reconstruction:
     """What a run folder holds; `InputError` if it holds no reconstruction."""
     folder.require_run()
     summary = read_json(folder.summary)
-    timing = {name: float(value) for name, value in summary["timing_s"].items()}
-    return Reconstruction(
-        read_gaussians(folder.gaussians), int(summary["oversample"]), timing, bool(summary["finished"])
-    )
+    try:
+        timing = {name: float(value) for name, value in summary["timing_s"].items()}
+        oversample, finished = int(summary["oversample"]), bool(summary["finished"])
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(
+            f"{folder.summary} must be what reconstruct wrote, but it lacks or garbles {error}."
+        ) from error
+    return Reconstruction(read_gaussians(folder.gaussians), oversample, timing, finished)
 
 
 class _Journal:
@@ -150,13 +162,13 @@ def _resumed(
 ) -> dict[str, Any] | None:
     """The checkpoint to go on from, or None for a new run; writes nothing."""
     if not (resume and folder.config.is_file()):
-        folder.require_new()
+        folder.require_new(advise_resume=not resume)
         return None
     old, same = folder.read_config(), json.loads(json.dumps(_config(scan, prior, settings, seed)))
-    for key, value in same.items():
+    for key, name in RESUMED_WITH.items():
         require(
-            old.get(key) == value,
-            f"--resume needs the {key} that {folder.path} was started with; use the same options, or another --out.",
+            old.get(key) == same[key],
+            f"--resume needs the {name} that {folder.path} was started with; use the same, or another --out.",
         )
     return folder.load_checkpoint()
 

@@ -39,13 +39,11 @@ class RunFolder:
         self.report = self.path / "report.html"
         self._columns: list[str] = []
 
-    def require_new(self) -> None:
-        """`InputError` if something is there already."""
+    def require_new(self, advise_resume: bool = False) -> None:
+        """`InputError` if something is there already; the message may point to --resume."""
         taken = self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir()))
-        require(
-            not taken,
-            f"--out must name a new or empty folder, but {self.path} holds files; choose another, or add --resume.",
-        )
+        way_out = "choose another, or add --resume" if advise_resume else "choose another"
+        require(not taken, f"--out must name a new or empty folder, but {self.path} holds files; {way_out}.")
         parent = self.path.resolve().parent
         require(parent.is_dir(), f"--out must lie in an existing folder, but {parent} is none; create it.")
 

@@ -44,6 +44,8 @@ def read_scene(
     origin: the point (x, y, z), in the files' coordinates and unit, that lies on the rotation axis at the
     centre of the field of view (default: the centre of the common bounding box).
     """
+    if origin is not None:
+        require(bool(np.all(np.isfinite(origin))), f"origin must be three finite numbers, but it is {origin}.")
     meshes = [closed(mesh, length_unit) for mesh in read_meshes(paths, length_unit)]
     scene = MeshScene(tuple(meshes), tuple(filling.of(mesh.name, energy_kev) for mesh in meshes))
     low, high = scene.bounds

@@ -11,6 +11,13 @@ from pathlib import Path
 from ..checks import InputError, require
 
 
+def require_writable(path: str | Path) -> None:
+    """`InputError` unless `path` is a place for a file: in an existing folder, and no folder itself."""
+    require(not Path(path).is_dir(), f"{path} must be a file to write, but it is a folder; add a file name.")
+    folder = Path(os.path.realpath(path)).parent
+    require(folder.is_dir(), f"{path} must lie in an existing folder, but {folder} is none; create it.")
+
+
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """A temporary path beside `path` (same suffix) to write to; it replaces `path` when the block ends well.
@@ -19,9 +26,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
     itself (no such folder, no permission, disk full) becomes an `InputError`.
     """
     target = Path(os.path.realpath(path))  # of a link, what it points to is replaced
-    require(not target.is_dir(), f"{path} must be a file to write, but it is a folder; add a file name.")
-    folder = target.parent
-    require(folder.is_dir(), f"{path} must lie in an existing folder, but {folder} is none; create it.")
+    require_writable(path)
     temporary = target.with_name(f".{target.stem[:64]}-{secrets.token_hex(4)}{target.suffix}")
     try:
         yield temporary
