@@ -105,7 +105,8 @@ def run(case: Case, preset: str, seed: int) -> dict[str, Any]:
 
 def commit() -> str:
     """The commit that is measured, with a mark if the tree was changed."""
-    shown = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True, check=False)
+    command = ["git", "describe", "--always", "--dirty"]
+    shown = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parent)
     return shown.stdout.strip() or "unknown"
 
 
@@ -118,6 +119,8 @@ def main() -> None:
     parser.add_argument("--preset", default="default")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
+    if "snapshot" in options.cases and not options.meshes:
+        parser.error("the case snapshot needs --meshes")
     rows = []
     for name in options.cases:
         for seed in [0] if name == "snapshot" else options.seeds:

@@ -236,7 +236,12 @@ def test_views_about_one_axis_may_have_shifted_detectors():
 
 def test_views_about_one_axis_may_be_shifted_along_it_by_part_of_a_pixel():
     """Rows that do not match (as after binning an odd number of them) go through the lattice projector."""
-    views = Views(rotation_y(10 + np.arange(7) * 180 / 7), np.tile([0, 0.5 * PIXEL], (7, 1)), (20, 24), PIXEL)
+    views = Views(
+        rotation_y(10 + np.arange(7) * 180 / 7),
+        PIXEL * np.stack([np.zeros(7), np.linspace(-0.5, 0.5, 7)], axis=1),
+        (20, 24),
+        PIXEL,
+    )
     grid, scene = Grid.of_views(views), balls(CELL)
     projector = projector_for(grid, views)
     assert isinstance(projector, LatticeProjector)

@@ -407,9 +407,12 @@ def test_float32_frames_agree_with_float64():
 
 
 def test_oversample_from_the_fringe_width():
-    """The first fringe is √(λz) wide; the shortest distance decides."""
+    """The first fringe is √(λz) wide; the shortest distance decides, up to a bound."""
     taken = exposures(distance=np.array([at(4.1), at(1 / 8.9)]), count=2)  # fringes of 2.02 and 0.335 pixels
-    assert resolving_oversample(taken, 4.0, 1) == 12
+    assert resolving_oversample(taken, 2.6, 1) == 8
+    assert resolving_oversample(taken, 2.0, 1) == 6
+    assert resolving_oversample(taken, 4.0, 1) == 8  # not 12
+    assert resolving_oversample(taken, 5.0, 1) == 10  # not 15
     assert resolving_oversample(taken[[0]], 4.0, 1) == 2
     assert resolving_oversample(taken[[0]], 4.0, 5) == 5
 

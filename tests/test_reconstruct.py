@@ -487,7 +487,7 @@ def a_result() -> Reconstruction:
     """Two wide Gaussians far apart."""
     centres, log_scales = torch.tensor([[-12.0, 0, 0], [12.0, 0, 0]]), torch.full((2, 3), math.log(3))
     quaternions, raw = torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1), raw_of(torch.full((2, 1), 0.8))
-    return Reconstruction(GaussianCloud((centres, log_scales, quaternions, raw), PIXEL, *CELL), 2, {}, True)
+    return Reconstruction(GaussianCloud((centres, log_scales, quaternions, raw), PIXEL, *CELL), 20.0, 2, {}, True)
 
 
 def test_rendered_frames_are_measured_ones(scan):

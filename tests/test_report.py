@@ -227,8 +227,8 @@ def test_report_is_written_atomically(tmp_path, monkeypatch):
     path = tmp_path / "report.html"
     assert write_report(content(**BARE), path) == path
     assert path.read_text() == "<html></html>"
-    monkeypatch.setattr("holosplat.report.page.os.replace", lambda *_: (_ for _ in ()).throw(OSError("full")))
-    with pytest.raises(OSError, match="full"):
+    monkeypatch.setattr("holosplat.io.atomic.os.replace", lambda *_: (_ for _ in ()).throw(OSError("full")))
+    with pytest.raises(InputError, match="full"):
         write_report(content(**BARE), path)
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
 

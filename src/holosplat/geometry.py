@@ -130,9 +130,17 @@ class Grid:
 
     @classmethod
     def of_views(cls, views: Views, refine: float = 1) -> Grid:
-        """The views' field of view at pixel pitch (divided by `refine`): Z = X = W, Y = H."""
+        """The views' field of view at pixel pitch (divided by `refine`): Z = X = W, Y = H.
+
+        It is centred where the (shifted) detectors look: at the point nearest to all their axes.
+        """
         h, w = (round(n * refine) for n in views.shape)
-        return cls.centred((w, h, w), views.pixel_size / refine)
+        grid = cls.centred((w, h, w), views.pixel_size / refine)
+        centre = np.linalg.lstsq(views.rotations[:, :2].reshape(-1, 3), views.shifts.reshape(-1), rcond=1e-6)[0]
+        if np.abs(centre).max() < 1e-6 * views.pixel_size:
+            return grid
+        x, y, z = (float(o + c) for o, c in zip(grid.origin, centre))
+        return replace(grid, origin=(x, y, z))
 
     def axes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Voxel-centre coordinates `(x [X], y [Y], z [Z])` [m]."""

@@ -44,8 +44,14 @@ class HolographicTV:
     corrections: int = 6
     inner: int = 20
     refine: int = 0
-    max_voxels: int = 20_000_000
+    max_voxels: int = 70_000_000
     upper: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("iterations", "max_voxels"):
+            require(getattr(self, name) >= 1, f"{name} must be at least 1, but it is {getattr(self, name)}.")
+        for name in ("weight", "corrections", "inner", "refine", "upper"):
+            require(getattr(self, name) >= 0, f"{name} must not be negative, but it is {getattr(self, name)}.")
 
 
 def holographic_tv(
@@ -55,7 +61,6 @@ def holographic_tv(
 
     `on_progress(stage, fraction)` is called between pieces of work.
     """
-    require(options.iterations > 0, f"iterations must be positive, but it is {options.iterations}.")
     scan, refine = _working_resolution(scan, options)
     exposures, pitch = scan.exposures, scan.views.pixel_size
     frames = torch.from_numpy(scan.frames)

@@ -19,7 +19,7 @@ from ..experiments.evaluate import evaluate as score
 from ..experiments.evaluate import render as predict
 from ..experiments.reconstruct import load_reconstruction
 from ..experiments.reconstruct import reconstruct as fit
-from ..experiments.run_folder import RunFolder
+from ..experiments.run_folder import RunFolder, scan_hash
 from ..experiments.settings import preset, read_settings
 from ..experiments.simulate import read_scene
 from ..forward import simulate as image_scene
@@ -77,11 +77,8 @@ def simulate(
             is_test=split,
             on_progress=lambda fraction: bar.show("simulating views", fraction, {}),
         )
-    of_scene = {
-        "meshes": str(len(meshes)),
-        "material": filling.material,
-        "medium": filling.medium or "vacuum",
-    }
+    found = sorted({f"delta {m.delta:.6g}, beta {m.beta:.6g}" for m in scene.materials})
+    of_scene = {"meshes": str(len(meshes)), "materials": "; ".join(found), "medium": filling.medium or "vacuum"}
     write_scan(out, replace(scan, provenance={**scan.provenance, **of_scene}))
     rows, columns = beamline.detector
     _say(f"wrote {out}: {len(scan)} frames of {rows} × {columns} pixels, {int(split.sum())} of them held out")
@@ -178,7 +175,7 @@ def evaluate(
     truth: Path | None = None,
     as_json: Annotated[bool, arg(name="json")] = False,
 ) -> None:
-    """Score a run on held-out frames and against the true volume, and bring its report up to date.
+    """Score a run on held-out frames and against the true volume, which then joins its report.
 
     Args:
         run: Run folder.
@@ -194,8 +191,10 @@ def evaluate(
         print(json.dumps(evaluation.as_dict(), indent=2, allow_nan=False))
     else:
         _print_scores(evaluation)
-    report = report_run(folder, result, measured, evaluation, true_volume)
-    _say(f"report: {report}")
+    if scan_hash(measured) != folder.read_config().get("scan_hash"):
+        _say("this is not the scan that was reconstructed, its frames may have been fitted; report unchanged")
+    elif true_volume is not None or not folder.report.exists():
+        _say(f"report: {report_run(folder, result, measured, evaluation, true_volume)}")
 
 
 def demo(out: Path = Path("demo")) -> None:

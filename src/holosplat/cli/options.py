@@ -28,8 +28,8 @@ class MeshOptions:
 class MaterialOptions:
     """What fills the meshes."""
 
-    material: str = "haemoglobin"
-    """Formula, or a preset (haemoglobin, red cell, water, plasma)."""
+    material: str | None = None
+    """Formula, or a preset (haemoglobin, red cell, water, plasma); without --materials, haemoglobin."""
     density: float | None = None
     """Its density [g/cm³]; a preset has its own."""
     medium: str | None = None
@@ -42,10 +42,13 @@ class MaterialOptions:
     def filling(self) -> Filling:
         """The materials that the options name."""
         require(self.medium is not None or self.medium_density is None, "--medium-density needs --medium.")
+        table = read_material_table(self.materials) if self.materials else {}
+        named = self.material or (None if table else "haemoglobin")
+        require(named is not None or self.density is None, "--density needs --material.")
         return Filling(
-            parse_material(self.material, self.density),
+            parse_material(named, self.density) if named else None,
             parse_material(self.medium, self.medium_density) if self.medium is not None else None,
-            read_material_table(self.materials) if self.materials else {},
+            table,
         )
 
 

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..checks import require
 from ..forward import Instrument
 from ..geometry import Grid
 from ..metrics import ImageScores, VolumeScores, image_scores, intensity_range, volume_scores
+from ..metrics.images import json_number
 from ..representations import GaussianCloud
 from ..scan import Exposures, Scan
 from ..volume import Volume
@@ -47,7 +49,7 @@ class Evaluation:
         found = self.material
         ratio = found.ratio if np.isfinite(found.ratio) else None
         material = {"delta": found.delta, "ratio": ratio, "single_material": found.single_material}
-        return {**self.headline(), **scores, "material": material}
+        return {**{k: json_number(v) for k, v in self.headline().items()}, **scores, "material": material}
 
     def headline(self) -> dict[str, float]:
         """The few numbers that matter: means over held-out frames, and the volume's."""
@@ -79,6 +81,11 @@ class Evaluation:
 
 def render(reconstruction: Reconstruction, exposures: Exposures) -> np.ndarray:
     """Frames [N, H, W] float32 that the reconstruction predicts, one exposure at a time to bound memory."""
+    energy = reconstruction.energy_kev
+    require(
+        abs(exposures.energy_kev / energy - 1) < 1e-3,
+        f"the run's δ and β are those at {energy:g} keV, but the scan's energy is {exposures.energy_kev:g} keV.",
+    )
     frames = np.empty((len(exposures), *exposures.views.shape), dtype=np.float32)
     with torch.no_grad():
         for i in range(len(exposures)):

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
 import torch
 
 from ..checks import InputError, require
@@ -20,6 +21,10 @@ from .settings import MaterialPrior, Settings
 from .start import starting_cloud
 
 CHECKPOINT_SECONDS = 20.0
+SMALLEST_FRAME = 11
+"""The window of SSIM."""
+FLAT_LEVELS = (0.2, 5.0)
+"""Between these lies the median of frames that are relative to the flat field."""
 
 RESUMED_WITH = {
     "scan_hash": "scan file",
@@ -35,9 +40,10 @@ Progress = Callable[[str, float, Record], None]
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """A fitted cloud, the wave sampling it was fitted with, and how long each stage took [s]."""
+    """A fitted cloud, the energy [keV] and wave sampling it was fitted at, and how long each stage took [s]."""
 
     cloud: GaussianCloud
+    energy_kev: float
     oversample: int
     timing: dict[str, float]
     finished: bool
@@ -60,6 +66,7 @@ def reconstruct(
     what it has reached (`finished` is False); during the start there is nothing yet, and it is passed on.
     Errors: `InputError` for scans without training frames or matter, and for folders that do not fit.
     """
+    _check_frames(scan.train())
     train, _ = split_validation(scan.train(), settings.fit.schedule.validation_views)
     checkpoint = _resumed(folder, scan, prior, settings, seed, resume) if folder else None
     timing: dict[str, float] = dict(checkpoint["timing"]) if checkpoint else {}
@@ -82,18 +89,33 @@ def reconstruct(
     return journal.close()
 
 
+def _check_frames(train: Scan) -> None:
+    h, w = train.views.shape
+    require(
+        min(h, w) >= SMALLEST_FRAME,
+        f"frames must have at least {SMALLEST_FRAME} rows and columns, but they have {h} × {w} pixels.",
+    )
+    level = float(np.median(train.frames))
+    require(
+        FLAT_LEVELS[0] < level < FLAT_LEVELS[1],
+        f"frames must be relative to the flat field (about 1 beside the sample), but their median is {level:.4g}; "
+        "add flats (image_key 1) to the scan, or divide by them.",
+    )
+
+
 def load_reconstruction(folder: RunFolder) -> Reconstruction:
     """What a run folder holds; `InputError` if it holds no reconstruction."""
     folder.require_run()
     summary = read_json(folder.summary)
     try:
         timing = {name: float(value) for name, value in summary["timing_s"].items()}
-        oversample, finished = int(summary["oversample"]), bool(summary["finished"])
+        energy, oversample = float(summary["energy_kev"]), int(summary["oversample"])
+        finished = bool(summary["finished"])
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(
             f"{folder.summary} must be what reconstruct wrote, but it lacks or garbles {error}."
         ) from error
-    return Reconstruction(read_gaussians(folder.gaussians), oversample, timing, finished)
+    return Reconstruction(read_gaussians(folder.gaussians), energy, oversample, timing, finished)
 
 
 class _Journal:
@@ -118,7 +140,8 @@ class _Journal:
         """Save everything once more, with the result."""
         self._timing["fit"] = self._fit.seconds
         fit = self._fit
-        done = Reconstruction(fit.result(), fit.instrument.oversample, dict(self._timing), fit.finished)
+        energy, oversample = fit.train.exposures.energy_kev, fit.instrument.oversample
+        done = Reconstruction(fit.result(), energy, oversample, dict(self._timing), fit.finished)
         if self._folder is not None:
             self._save()
             write_gaussians(self._folder.gaussians, done.cloud)

@@ -51,7 +51,8 @@ class RunFolder:
         """`InputError` unless the folder holds a reconstruction."""
         require(self.path.is_dir(), f"the run folder {self.path} does not exist; check the path.")
         found = self.config.is_file() and self.gaussians.is_file()
-        require(found, f"{self.path} must hold a reconstruction (config.json, gaussians.h5), but it does not.")
+        hint = "; it was cut off, finish it with reconstruct --resume" if self.checkpoint.is_file() else ""
+        require(found, f"{self.path} must hold a reconstruction (config.json, gaussians.h5), but it does not{hint}.")
 
     def create(self) -> None:
         """Make the folder."""
@@ -141,6 +142,7 @@ def scan_hash(scan: Scan) -> str:
         scan.views.shifts,
         exposures.distance,
         exposures.psf_sigma_px,
+        exposures.time,
     )
     for array in parts:
         digest.update(np.ascontiguousarray(array).tobytes())

@@ -67,6 +67,12 @@ class Settings:
     volume: HolographicTV = field(default_factory=HolographicTV)
     fit: FitOptions = field(default_factory=FitOptions)
 
+    def __post_init__(self) -> None:
+        require(self.spacing_px > 0, f"spacing_px must be positive, but it is {self.spacing_px}.")
+        for name in ("max_start", "random_count"):
+            require(getattr(self, name) >= 1, f"{name} must be at least 1, but it is {getattr(self, name)}.")
+        require(self.approximate_steps >= 0, f"approximate_steps must not be negative: {self.approximate_steps}.")
+
 
 def presets() -> dict[str, Settings]:
     """Named settings for `--preset`."""

@@ -19,9 +19,12 @@ from ..units import LENGTH_UNITS, unit_factor
 
 @dataclass(frozen=True)
 class Filling:
-    """What fills the meshes: `material`, unless a file-name pattern of `table` matches, and what surrounds them."""
+    """What fills the meshes: `material`, unless a file-name pattern of `table` matches, and what surrounds them.
 
-    material: Material = HAEMOGLOBIN
+    With `material=None` every mesh must match a pattern.
+    """
+
+    material: Material | None = HAEMOGLOBIN
     medium: Material | None = None
     table: dict[str, Material] = field(default_factory=dict)
 

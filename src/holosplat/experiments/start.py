@@ -11,7 +11,7 @@ from ..baselines import holographic_tv
 from ..baselines.material import estimate_delta, estimate_ratio
 from ..materials import WATER, DeltaBeta
 from ..optics.retrieval import retrieve_thickness
-from ..representations import GaussianCloud, approximate, cloud_from_volume, freed, random_cloud
+from ..representations import GaussianCloud, approximate, at_pitch, cloud_from_volume, freed, random_cloud
 from ..scan import Scan
 from .settings import MaterialPrior, Settings
 
@@ -32,7 +32,8 @@ def _from_phase_retrieval(
     material = _material(scan, prior, on_progress)
     volume, grid = holographic_tv(scan, material, settings.volume, on_progress)
     pitch = scan.views.pixel_size
-    cloud = cloud_from_volume(volume, grid, material, settings.spacing_px * pitch, pitch, settings.max_start)
+    whole = at_pitch(volume, grid, pitch)
+    cloud = cloud_from_volume(*whole, material, settings.spacing_px * pitch, pitch, settings.max_start)
     cloud = approximate(cloud, volume, grid, settings.approximate_steps, on_progress)
     return freed(cloud) if prior.kind == "free" else cloud
 

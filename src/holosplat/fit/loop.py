@@ -45,7 +45,7 @@ class Fit:
     def __init__(self, scan: Scan, cloud: GaussianCloud, options: FitOptions, seed: int = 0) -> None:
         self.options, self.seed = options, seed
         self.train, self.validation = split_validation(scan.train(), options.schedule.validation_views)
-        oversample = options.schedule.oversample or resolving_oversample(scan.exposures, 1.5, at_least=1)
+        oversample = options.schedule.oversample or resolving_oversample(self.train.exposures, 1.5, at_least=1)
         self.instrument = Instrument(self.train.exposures, oversample)
         self._judge = Instrument(self.validation.exposures, oversample) if len(self.validation) else None
         self._low, self._high = float(self.train.frames.min()), float(self.train.frames.max())

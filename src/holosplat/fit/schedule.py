@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ..checks import require
+
 
 @dataclass(frozen=True)
 class Schedule:
@@ -36,6 +38,14 @@ class Schedule:
     validation_views: int = 0
     validate_every: int = 25
     patience: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("volume_every", "validate_every"):
+            require(getattr(self, name) >= 1, f"{name} must be at least 1, but it is {getattr(self, name)}.")
+        for name in ("steps", "views_per_step", "warmup_steps", "oversample", "validation_views", "patience"):
+            require(getattr(self, name) >= 0, f"{name} must not be negative, but it is {getattr(self, name)}.")
+        require(self.volume_edge >= 2, f"volume_edge must be at least 2, but it is {self.volume_edge}.")
+        require(0 < self.decay <= 1, f"decay must lie in (0, 1], but it is {self.decay}.")
 
     def rates(self, step: int) -> tuple[float, float, float, float]:
         """Learning rates of centres, log-scales, quaternions and amplitudes at `step`."""

@@ -2,35 +2,26 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from importlib import resources
 from pathlib import Path
 
 import jinja2
 
+from ..io.atomic import atomic_path
 from .blocks import make_blocks
 from .content import ReportContent
 from .tables import key_figures, record_tables, score_tables, verdict
 
 
-def write_report(content: ReportContent, path: str | os.PathLike[str]) -> Path:
+def write_report(content: ReportContent, path: str | Path) -> Path:
     """Write `content` as one self-contained HTML file at `path`, atomically: no reader ever sees half of it.
 
-    Returns the path. Raises `OSError` when the folder does not exist or cannot be written.
+    Returns the path. Raises `InputError` when it cannot be written.
     """
-    target = Path(path)
     page = render_page(content)
-    descriptor, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
-    try:
-        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-            file.write(page)
-        os.chmod(name, 0o644)  # a temporary file is private; a report is to be shared
-        os.replace(name, target)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
-    return target
+    with atomic_path(path) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+    return Path(path)
 
 
 def render_page(content: ReportContent) -> str:

@@ -1,6 +1,6 @@
 """Trainable Objects, and how they are initialised."""
 
 from .gaussians import GaussianCloud
-from .initialise import approximate, cloud_from_volume, freed, random_cloud
+from .initialise import approximate, at_pitch, cloud_from_volume, freed, random_cloud
 
-__all__ = ["GaussianCloud", "approximate", "cloud_from_volume", "freed", "random_cloud"]
+__all__ = ["GaussianCloud", "approximate", "at_pitch", "cloud_from_volume", "freed", "random_cloud"]

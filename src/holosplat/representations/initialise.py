@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool3d, pad
+from torch.nn.functional import avg_pool3d, interpolate, pad
 
 from ..checks import require
 from ..geometry import Grid, Views
@@ -58,6 +58,17 @@ def cloud_from_volume(
         unit_length,
         *material,
     )
+
+
+def at_pitch(volume: Tensor, grid: Grid, pitch: float) -> tuple[Tensor, Grid]:
+    """The volume [Z, Y, X] interpolated to voxels of `pitch` [m] if its own are coarser (a whole number of times)."""
+    factor = round(grid.voxel_size[0] / pitch)
+    if factor <= 1:
+        return volume, grid
+    shape = (grid.shape[0] * factor, grid.shape[1] * factor, grid.shape[2] * factor)
+    fine = interpolate(volume[None, None], size=shape, mode="trilinear", align_corners=False)[0, 0]
+    x, y, z = (o - 0.5 * (factor - 1) * pitch for o in grid.origin)
+    return fine, Grid(shape, (pitch, pitch, pitch), (x, y, z))
 
 
 def approximate(
