@@ -395,6 +395,17 @@ def test_scores_are_those_of_the_python_api(shop):
     assert table.out.splitlines() == wanted.lines()
 
 
+def test_another_scan_is_scored_but_does_not_enter_the_report(shop, tmp_path):
+    """Its held-out frames may be some that were fitted: a line says so."""
+    scan = read_scan(shop.scan)
+    write_scan(tmp_path / "other.nxs", replace(scan, is_test=~scan.is_test))
+    before = (shop.run / "report.html").read_bytes()
+    outcome = worked(holosplat("evaluate", shop.run, "--scan", tmp_path / "other.nxs", "--truth", shop.truth))
+    assert "held-out frames: SSIM" in outcome.out
+    assert "not the scan" in outcome.err
+    assert (shop.run / "report.html").read_bytes() == before
+
+
 def test_a_run_finds_its_scan_or_asks_for_it(shop, tmp_path):
     """From any folder; and where the scan was moved away, it can be named."""
     scan, run = Path(shutil.copy(shop.scan, tmp_path)), tmp_path / "run"

@@ -155,6 +155,21 @@ def test_a_scan_without_training_frames_is_refused(scan, tmp_path):
     assert not folder.path.exists()
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda s: s.binned(4), "11 rows and columns"),
+        (lambda s: replace(s, frames=3000 * s.frames), "flat field"),
+        (lambda s: replace(s, frames=s.frames - 1), "flat field"),
+    ],
+    ids=["small", "counts", "contrast"],
+)
+def test_frames_that_cannot_be_fitted_are_refused(scan, tmp_path, change, message):
+    with pytest.raises(InputError, match=message):
+        reconstruct(change(scan), KNOWN, SMALL, folder=RunFolder(tmp_path / "run"))
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("settings", [SMALL, RANDOM], ids=["phase", "random"])
 def test_an_empty_field_is_refused_and_leaves_no_folder(scan, tmp_path, settings):
     empty, folder = replace(scan, frames=np.ones_like(scan.frames)), RunFolder(tmp_path / "run")
@@ -275,6 +290,13 @@ def test_settings_go_round_through_config_json(whole):
         ),
         (lambda s: s.update(start="guess"), r"settings\.start must be one of phase, random"),
         (lambda s: s.update(volume=4), r"settings\.volume must be a table"),
+        (lambda s: s["fit"]["schedule"].update(steps=-1), "steps must not be negative"),
+        (lambda s: s["fit"]["schedule"].update(decay=0.0), "decay"),
+        (lambda s: s["fit"]["schedule"].update(volume_edge=1), "volume_edge"),
+        (lambda s: s["volume"].update(iterations=0), "iterations"),
+        (lambda s: s["volume"].update(weight=-0.1), "weight"),
+        (lambda s: s.update(spacing_px=0), "spacing_px"),
+        (lambda s: s.update(random_count=0), "random_count"),
     ],
 )
 def test_settings_that_are_none_are_refused(tmp_path, change, message):
@@ -494,6 +516,12 @@ def test_rendered_frames_are_measured_ones(scan):
     result = a_result()
     wanted = measure(result.cloud, scan.exposures, 2).detach().numpy()
     np.testing.assert_allclose(render(result, scan.exposures), wanted, rtol=0, atol=1e-5)
+
+
+def test_frames_of_another_energy_are_not_rendered(scan):
+    """δ and β belong to one energy."""
+    with pytest.raises(InputError, match=r"20 keV.*25 keV"):
+        render(a_result(), replace(scan.exposures, energy_kev=25.0))
 
 
 def test_scores_are_taken_on_the_right_frames_and_grid(scan, truth):

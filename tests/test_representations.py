@@ -13,7 +13,7 @@ from torch.nn.functional import avg_pool2d, softplus
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views, rotation_y
 from holosplat.projectors.voxels import voxel_line_integrals
-from holosplat.representations import GaussianCloud, approximate, cloud_from_volume, freed, random_cloud
+from holosplat.representations import GaussianCloud, approximate, at_pitch, cloud_from_volume, freed, random_cloud
 from holosplat.representations.gaussians import PARAMETERS, raw_of
 from holosplat.volume import Object
 
@@ -296,6 +296,25 @@ def test_nearly_empty_blocks_are_left_out_and_negative_matter_counts_as_none():
     assert len(cloud) == 1
     assert float(cloud.masses()) == pytest.approx(7, rel=1e-5)
     np.testing.assert_allclose(cloud.centres, [[4 / 7 - 3.5, 4 / 7 - 3.5, 3 / 7 - 3.5]], atol=1e-5)
+
+
+def test_a_coarse_volume_is_refined_where_it_is():
+    """Onto voxels of the pitch, with its mass and its place; a volume that is fine enough stays as it is."""
+    coarse, body = Grid((9, 8, 7), (3 * PIXEL,) * 3, (-2e-6, 4e-6, 1e-5)), torch.zeros(9, 8, 7)
+    body[3:6, 2:5, 2:6] = 1.0
+    volume, grid = at_pitch(body, coarse, PIXEL)
+    assert volume.shape == grid.shape == (27, 24, 21)
+    np.testing.assert_allclose(grid.voxel_size, PIXEL)
+    for a, b in zip(coarse.axes(), grid.axes()):
+        assert a.mean() == pytest.approx(b.mean(), abs=1e-12)
+    assert float(volume.sum()) == pytest.approx(27 * float(body.sum()), rel=1e-3)
+    for dimension, axes in enumerate(zip(coarse.axes()[::-1], grid.axes()[::-1])):
+        others = tuple({0, 1, 2} - {dimension})
+        found = [(torch.from_numpy(a) * v.sum(others)).sum() / v.sum() for a, v in zip(axes, (body, volume))]
+        assert float(found[0]) == pytest.approx(float(found[1]), abs=1e-3 * PIXEL)
+    same, unchanged = at_pitch(body, coarse, 4 * PIXEL)
+    assert same is body
+    assert unchanged is coarse
 
 
 def test_an_empty_volume_is_refused():

@@ -79,7 +79,6 @@ def holographic_tv(
 
     if options.corrections > 0:
         volume, grid = _agree(scan, material, volume, options, refine, on_progress)
-    on_progress("done", 1.0)
     return volume, _in_metres(grid, pitch)
 
 

@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
+from .. import __version__
 from ..checks import InputError, in_range, require
 from ..experiments.demo import DETECTOR, write_demo_meshes
 from ..experiments.evaluate import Evaluation
@@ -247,6 +248,9 @@ COMMANDS = {
 
 def main() -> None:
     """Run a command; bad input prints one sentence and exits with 2, Ctrl-C exits with 130."""
+    if sys.argv[1:] == ["--version"]:
+        print(f"holosplat {__version__}")
+        return
     try:
         tyro.extras.subcommand_cli_from_dict(
             COMMANDS,

@@ -43,7 +43,7 @@ class RunFolder:
         """`InputError` if something is there already; the message may point to --resume."""
         taken = self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir()))
         way_out = "choose another, or add --resume" if advise_resume else "choose another"
-        require(not taken, f"--out must name a new or empty folder, but {self.path} holds files; {way_out}.")
+        require(not taken, f"the run folder (--out) must be new or empty, but {self.path} holds files; {way_out}.")
         parent = self.path.resolve().parent
         require(parent.is_dir(), f"--out must lie in an existing folder, but {parent} is none; create it.")
 

@@ -35,4 +35,4 @@ def interrupts_held() -> Iterator[Callable[[], None]]:
     try:
         yield release
     finally:
-        signal.signal(signal.SIGINT, previous)
+        signal.signal(signal.SIGINT, signal.default_int_handler if previous is None else previous)

@@ -184,7 +184,7 @@ class Fit:
         if score < self.best_score:
             self.best_score, self.best_step, self._best = score, self.step, self.cloud.detached()
         schedule = self.options.schedule
-        overdue = self.step - self.best_step > schedule.patience * schedule.validate_every
+        overdue = self.step - self.best_step >= schedule.patience * schedule.validate_every
         self.stopped_early = schedule.patience > 0 and overdue
         return {"val_l1": float(terms.l1(a, b).mean()), "val_ssim": ssim, "val_frcm": frcm}
 

@@ -37,7 +37,7 @@ def cloud_from_volume(
     Blocks have an edge of about `spacing` [m] (a whole number of voxels), or more, so that there are at most
     `max_count`. Each block that holds more than 5 % of
     matter becomes one isotropic Gaussian at its centre of mass, with its mass, and with half a block as standard
-    deviation, so that full blocks add up to a flat density (ripple below 2 %).
+    deviation, so that full blocks add up to a flat density (rms ripple below 2 %).
     material: (δ, β) of an occupancy of one; unit_length [m]: the cloud's unit, the pixel size.
     """
     voxel = grid.voxel_size[0]
