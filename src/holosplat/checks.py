@@ -43,6 +43,14 @@ def in_range(field: str, value: float, low: float, high: float, unit: str = "") 
     return number
 
 
+def at_least(options: object, low: float, *names: str) -> None:
+    """`InputError` naming the first of the fields `names` of `options` that is below `low`."""
+    for name in names:
+        value = getattr(options, name)
+        wanted = "must not be negative" if low == 0 else f"must be at least {low:g}"
+        require(value >= low, f"{name} {wanted}, but it is {value}.")
+
+
 def finite(field: str, array: np.ndarray) -> np.ndarray:
     """`array` unchanged, if every entry is finite; `InputError` naming `field` and the count otherwise."""
     bad = int(array.size - np.count_nonzero(np.isfinite(array)))

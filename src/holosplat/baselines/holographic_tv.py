@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
-from ..checks import require
+from ..checks import at_least
 from ..forward import Instrument, resolving_oversample
 from ..geometry import Grid, Views
 from ..materials import DeltaBeta
@@ -48,10 +48,8 @@ class HolographicTV:
     upper: float = 1.0
 
     def __post_init__(self) -> None:
-        for name in ("iterations", "max_voxels"):
-            require(getattr(self, name) >= 1, f"{name} must be at least 1, but it is {getattr(self, name)}.")
-        for name in ("weight", "corrections", "inner", "refine", "upper"):
-            require(getattr(self, name) >= 0, f"{name} must not be negative, but it is {getattr(self, name)}.")
+        at_least(self, 0, "weight", "corrections", "inner", "refine", "upper")
+        at_least(self, 1, "iterations", "max_voxels")
 
 
 def holographic_tv(

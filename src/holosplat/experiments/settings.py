@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from ..baselines import HolographicTV
-from ..checks import InputError, require
+from ..checks import InputError, at_least, require
 from ..fit.density import DensityControl
 from ..fit.loop import FitOptions
 from ..fit.objective import THESIS, Objective
@@ -69,9 +69,8 @@ class Settings:
 
     def __post_init__(self) -> None:
         require(self.spacing_px > 0, f"spacing_px must be positive, but it is {self.spacing_px}.")
-        for name in ("max_start", "random_count"):
-            require(getattr(self, name) >= 1, f"{name} must be at least 1, but it is {getattr(self, name)}.")
-        require(self.approximate_steps >= 0, f"approximate_steps must not be negative: {self.approximate_steps}.")
+        at_least(self, 0, "approximate_steps")
+        at_least(self, 1, "max_start", "random_count")
 
 
 def presets() -> dict[str, Settings]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..checks import require
+from ..checks import at_least, require
 
 
 @dataclass(frozen=True)
@@ -40,11 +40,9 @@ class Schedule:
     patience: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("volume_every", "validate_every"):
-            require(getattr(self, name) >= 1, f"{name} must be at least 1, but it is {getattr(self, name)}.")
-        for name in ("steps", "views_per_step", "warmup_steps", "oversample", "validation_views", "patience"):
-            require(getattr(self, name) >= 0, f"{name} must not be negative, but it is {getattr(self, name)}.")
-        require(self.volume_edge >= 2, f"volume_edge must be at least 2, but it is {self.volume_edge}.")
+        at_least(self, 0, "steps", "views_per_step", "warmup_steps", "oversample", "validation_views", "patience")
+        at_least(self, 1, "volume_every", "validate_every")
+        at_least(self, 2, "volume_edge")
         require(0 < self.decay <= 1, f"decay must lie in (0, 1], but it is {self.decay}.")
 
     def rates(self, step: int) -> tuple[float, float, float, float]:
