@@ -20,7 +20,7 @@ Files = dict[str, str]
 """Path below src/holosplat → source text."""
 
 TIERS = (
-    ("units", "checks", "geometry", "scan", "volume", "mesh"),
+    ("units", "checks", "native", "geometry", "scan", "volume", "mesh"),
     ("materials", "optics", "metrics", "projectors"),
     ("specimens", "representations", "forward", "io"),
     ("fit", "baselines"),
@@ -32,9 +32,9 @@ TIERS = (
 SAME_TIER = dict.fromkeys(TIERS[0], TIERS[0]) | {"cli": ("report", "viewer")}
 """Rooms of their own tier that a room may import (the nouns among themselves: without cycles)."""
 
-BACKENDS = ("projectors/*/cpu.py", "projectors/*/gpu.py", "projectors/*/reference.py")
+BACKENDS = ("*/cpu.py", "*/cuda.py", "*/reference.py")
 BACKEND_IMPORTS = {"projectors/mesh/reference.py": ("geometry",)}
-"""What a backend file may import of ours, beside its own folder and `projectors.native`."""
+"""What a backend file may import of ours, beside its own folder and `native`."""
 
 HEAVY: dict[str, tuple[str, ...]] = {
     "vtk": (),
@@ -163,13 +163,13 @@ def no_cycles(files: Files) -> list[str]:
 
 
 def backends_stand_alone(files: Files) -> list[str]:
-    """A backend file imports its own folder, `projectors.native`, and what `BACKEND_IMPORTS` adds."""
+    """A backend file imports its own folder, `native`, and what `BACKEND_IMPORTS` adds."""
     complaints = []
     for path in files:
         if not any(fnmatch(path, pattern) for pattern in BACKENDS):
             continue
         for target, name, _ in _imports(files, path):
-            own = target.startswith(path.rsplit("/", 1)[0] + "/") or target == "projectors/native.py"
+            own = target.startswith(path.rsplit("/", 1)[0] + "/") or target == "native.py"
             if target and not own and _room(target) not in BACKEND_IMPORTS.get(path, ()):
                 complaints.append(f"{path} imports {name}")
     return complaints
@@ -247,9 +247,9 @@ GOOD: Files = {
     "optics/__init__.py": '"""Waves."""\nfrom .wave import y\n',
     "optics/wave.py": '"""A wave."""\nfrom ..units import x\n\n\ndef _draw():\n    import matplotlib\n',
     "projectors/__init__.py": '"""Lines."""\n',
-    "projectors/native.py": '"""Kernels."""\n',
+    "native.py": '"""Kernels."""\n',
     "projectors/mesh/__init__.py": '"""Meshes."""\nfrom . import reference\nfrom ...geometry import Views\n',
-    "projectors/mesh/reference.py": '"""Twin."""\nfrom .. import native\nfrom ...geometry import Views\n',
+    "projectors/mesh/reference.py": '"""Twin."""\nfrom ... import native\nfrom ...geometry import Views\n',
     "io/__init__.py": '"""Files."""\nfrom .. import __version__\nfrom ..optics import y\n',
     "report/__init__.py": '"""Pages."""\nimport matplotlib.pyplot\n',
     "cli.py": '"""Commands."""\nimport tyro\nfrom . import report\nfrom holosplat.optics.wave import y\n',
@@ -265,7 +265,7 @@ BAD: tuple[tuple[Callable[[Files], list[str]], str, str], ...] = (
     (imports_run_downwards, "units.py", "from . import optics\n"),
     (imports_run_downwards, "units.py", "import holosplat.optics.wave\n"),
     (imports_run_downwards, "units.py", "from holosplat import cli\n"),
-    (imports_run_downwards, "optics/wave.py", "from ..projectors import native\n"),
+    (imports_run_downwards, "optics/wave.py", "from ..projectors import mesh\n"),
     (imports_run_downwards, "optics/wave.py", "def late():\n    from .. import io\n"),
     (imports_run_downwards, "report/__init__.py", "from ..cli import main\n"),
     (imports_run_downwards, "io/more.py", "from .. import other\n"),

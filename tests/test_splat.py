@@ -10,9 +10,9 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from holosplat import native
 from holosplat.checks import InputError
 from holosplat.geometry import rotation_y
-from holosplat.projectors import native
 from holosplat.projectors.splat import BACKENDS, splat, voxelise
 
 NAMES = ("centres", "scales", "quaternions", "amplitudes")

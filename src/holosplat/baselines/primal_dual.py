@@ -7,7 +7,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from ..projectors import native
+from .. import native
 
 
 class LinearProjector(Protocol):

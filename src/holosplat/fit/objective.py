@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..projectors import native
+from .. import native
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from ...checks import require
 from ...geometry import Grid, Views
-from .. import native
+from ... import native
 
 
 class LatticeProjector:

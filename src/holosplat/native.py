@@ -160,7 +160,7 @@ def _folder() -> Path:
 
 def _candidates() -> list[Path]:
     """Beside the package; or, in an editable install, in site-packages, where the metadata is."""
-    folders = [Path(__file__).resolve().parents[1] / "_native"]
+    folders = [Path(__file__).resolve().parent / "_native"]
     try:
         located = importlib.metadata.distribution("holosplat").locate_file("holosplat/_native")
         folders.append(Path(str(located)))
