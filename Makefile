@@ -4,11 +4,12 @@
 PYTHON ?= python3
 VENV := .venv
 STAMP := $(VENV)/.installed
-NATIVE := $(wildcard native/*.cpp native/*.hpp native/CMakeLists.txt)
+NATIVE := $(wildcard native/*.cpp native/*.hpp native/*.cmake native/CMakeLists.txt)
+TOOLS := build/tools
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test check clean
+.PHONY: help setup demo test check wheel wheels clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -34,6 +35,19 @@ check: setup ## lint, formatting and types
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/pyright
+
+wheel: $(TOOLS)/bin/cibuildwheel ## make a wheel for this machine, into dist/
+	$(TOOLS)/bin/python -m pip wheel . --no-deps --wheel-dir dist
+
+# From the source archive, which goes into the container without .venv and its gigabytes.
+wheels: $(TOOLS)/bin/cibuildwheel ## make the wheels of a release, into dist/ (on Linux: needs Docker, running)
+	rm -f dist/*.tar.gz
+	$(TOOLS)/bin/python -m build --sdist --outdir dist .
+	$(TOOLS)/bin/cibuildwheel --output-dir dist dist/*.tar.gz
+
+$(TOOLS)/bin/cibuildwheel:
+	$(PYTHON) -m venv $(TOOLS)
+	$(TOOLS)/bin/python -m pip install build "cibuildwheel>=3.1"
 
 clean: ## remove everything that was made here
 	rm -rf $(VENV) build dist demo .pytest_cache .ruff_cache
