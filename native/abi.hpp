@@ -37,6 +37,32 @@ struct HoloGrid {
   int64_t depth, height, width;  // Z, Y, X
 };
 
+struct HoloRaster {
+  int64_t count, channels, height, width;  // V, C (1 or 2), H, W
+};
+
+struct HoloDetector {  // frames of `rows` x `columns` pixels, each of factor x factor samples of V rasters
+  int64_t count, height, width;
+  int64_t rows, columns, margin_y, margin_x, factor;  // margins in samples
+  int64_t lanes;  // real images in a complex one: 1, or 2 (view 2k as real part, 2k + 1 as imaginary part)
+};
+
+struct HoloTarget {  // measured frames, compared after the affine map that takes `low` to 0 and `low + span` to 1
+  int64_t count, height, width;  // V, H, W; H and W at least 11, the width of the window of local moments
+  const float* frames;           // [V, H, W]
+  const float* statistics;       // [V, 2, H - 10, W - 10] local mean and variance of the mapped frames
+  double low, span;
+};
+
+struct HoloAdam {  // up to 4 arrays under optimisation
+  int64_t count;
+  int64_t lengths[4];
+  float* parameters[4];
+  const float* gradients[4];
+  float* first[4];   // running means of the gradient
+  float* second[4];  // and of its square
+};
+
 struct HoloLattice {
   int64_t depth, height, width;  // Z, Y, X
   double origin[3];              // x, y, z of voxel [0, 0, 0]
@@ -81,3 +107,40 @@ HOLO_EXPORT int64_t holosplat_lattice_project(const HoloLattice*, const HoloView
                                               int64_t threads);
 HOLO_EXPORT int64_t holosplat_lattice_backproject(const HoloLattice*, const HoloViews*, const float* image,
                                                   float* volume, int64_t threads);
+
+// Wave optics, between the Fourier transforms that the caller does. Complex arrays are float pairs (re, im).
+// wave [V, H, W] <- exp(-loss - i phase) - 1 with phase = sum over channels of refraction[c][0] lines[c], and loss of
+// refraction[c][1]; refraction [C, 2], lines [V, C, H, W]
+HOLO_EXPORT int64_t holosplat_exit_wave(const HoloRaster*, const double* refraction, const float* lines, float* wave,
+                                        int64_t threads);
+HOLO_EXPORT int64_t holosplat_exit_wave_backward(const HoloRaster*, const double* refraction, const float* lines,
+                                                 const float* wave_gradient, float* lines_gradient, int64_t threads);
+// spectrum [V, H, W] <- scale spectrum rows[v, y] columns[v, x], or times the conjugate; rows [V, H], columns [V, W]
+HOLO_EXPORT int64_t holosplat_transfer(const HoloRaster*, const float* rows, const float* columns, double scale,
+                                       int64_t conjugate, float* spectrum, int64_t threads);
+// frames [V, rows, columns] <- mean of |1 + wave|^2 over each pixel's samples; backward: wave <- gradient, in place
+HOLO_EXPORT int64_t holosplat_intensity(const HoloDetector*, const float* wave, float* frames, int64_t threads);
+HOLO_EXPORT int64_t holosplat_intensity_backward(const HoloDetector*, const float* frame_gradient, float* wave,
+                                                 int64_t threads);
+// The same in two steps, for a blur in between: images [V / lanes, H, W] (complex) <- |1 + wave|^2 - 1, and
+// frames <- 1 + their mean over each pixel's samples
+HOLO_EXPORT int64_t holosplat_contrast(const HoloDetector*, const float* wave, float* images, int64_t threads);
+HOLO_EXPORT int64_t holosplat_contrast_backward(const HoloDetector*, const float* images, float* wave,
+                                                int64_t threads);
+HOLO_EXPORT int64_t holosplat_bin(const HoloDetector*, const float* images, float* frames, int64_t threads);
+HOLO_EXPORT int64_t holosplat_bin_backward(const HoloDetector*, const float* frame_gradient, float* images,
+                                           int64_t threads);
+
+// The local moments of frames under the Gaussian window of SSIM; target.statistics is not read.
+HOLO_EXPORT int64_t holosplat_fidelity_statistics(const HoloTarget*, float* statistics, int64_t threads);
+// values [V, 2] <- mean absolute difference, and 1 - mean SSIM, of predicted [V, H, W] and the target;
+// gradient [V, H, W] <- derivative of the latter, unless it is null
+HOLO_EXPORT int64_t holosplat_fidelity(const HoloTarget*, const float* predicted, double* values, float* gradient,
+                                       int64_t threads);
+// out <- upstream[v, 0] derivative of the mean absolute difference + upstream[v, 1] gradient; upstream [V, 2]
+HOLO_EXPORT int64_t holosplat_fidelity_backward(const HoloTarget*, const float* predicted, const float* upstream,
+                                                const float* gradient, float* out, int64_t threads);
+
+// One step of Adam: first += 0.1 (g - first); second += 0.001 (g^2 - second);
+// parameter -= factors[k] first / (sqrt(second) + factors[count])
+HOLO_EXPORT int64_t holosplat_adam(const HoloAdam*, const float* factors, int64_t threads);

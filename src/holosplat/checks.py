@@ -16,6 +16,10 @@ class InputError(ValueError):
     """The user's input cannot be used; the message says which field, why, and what to do."""
 
 
+class MissingError(InputError, RuntimeError):
+    """Something that has to be installed is not; the message says what, and the ways out."""
+
+
 def require(condition: bool, message: str) -> None:
     """Raise `InputError(message)` unless `condition` holds."""
     if not condition:

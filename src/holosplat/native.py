@@ -15,7 +15,9 @@ from ctypes import POINTER, c_double, c_int64, c_void_p
 from functools import cache
 from pathlib import Path
 
-ABI = 2
+from .checks import MissingError
+
+ABI = 3
 ISAS = ("sse2", "avx2", "avx512")
 """Builds for x86-64, slowest first. Other processors have one build, `generic`."""
 
@@ -69,6 +71,45 @@ class Lattice(ctypes.Structure):
     ]
 
 
+class Raster(ctypes.Structure):
+    """Counts of views, channels, rows, columns."""
+
+    _fields_ = [(name, c_int64) for name in ("count", "channels", "height", "width")]
+
+
+class Detector(ctypes.Structure):
+    """Rasters [V, H, W], the frames of rows × columns pixels in them, and how images lie in complex ones."""
+
+    _fields_ = [
+        (name, c_int64)
+        for name in ("count", "height", "width", "rows", "columns", "margin_y", "margin_x", "factor", "lanes")
+    ]
+
+
+class Target(ctypes.Structure):
+    """Measured frames: counts, pointers to frames and their local moments, and the map to [0, 1]."""
+
+    _fields_ = [
+        ("count", c_int64),
+        ("height", c_int64),
+        ("width", c_int64),
+        ("frames", c_void_p),
+        ("statistics", c_void_p),
+        ("low", c_double),
+        ("span", c_double),
+    ]
+
+
+class Adam(ctypes.Structure):
+    """Up to four arrays under optimisation: how many, their lengths, and pointers to float32 arrays."""
+
+    _fields_ = [
+        ("count", c_int64),
+        ("lengths", c_int64 * 4),
+        *((name, c_void_p * 4) for name in ("parameters", "gradients", "first", "second")),
+    ]
+
+
 class Options(ctypes.Structure):
     """Cutoff in standard deviations, variance added [px²], number of threads."""
 
@@ -92,6 +133,18 @@ _FUNCTIONS = {
     ),
     "holosplat_lattice_project": (POINTER(Lattice), POINTER(Views), c_void_p, c_void_p, c_int64),
     "holosplat_lattice_backproject": (POINTER(Lattice), POINTER(Views), c_void_p, c_void_p, c_int64),
+    "holosplat_exit_wave": (POINTER(Raster), *(c_void_p,) * 3, c_int64),
+    "holosplat_exit_wave_backward": (POINTER(Raster), *(c_void_p,) * 4, c_int64),
+    "holosplat_transfer": (POINTER(Raster), *(c_void_p,) * 2, c_double, c_int64, c_void_p, c_int64),
+    **{
+        f"holosplat_{name}": (POINTER(Detector), *(c_void_p,) * 2, c_int64)
+        for step in ("intensity", "contrast", "bin")
+        for name in (step, f"{step}_backward")
+    },
+    "holosplat_fidelity_statistics": (POINTER(Target), c_void_p, c_int64),
+    "holosplat_fidelity": (POINTER(Target), *(c_void_p,) * 3, c_int64),
+    "holosplat_fidelity_backward": (POINTER(Target), *(c_void_p,) * 4, c_int64),
+    "holosplat_adam": (POINTER(Adam), c_void_p, c_int64),
     "holosplat_tv_smooth": (POINTER(Grid), c_void_p, c_double, c_void_p, c_void_p, c_int64),
     "holosplat_tv_ascend": (POINTER(Grid), c_void_p, c_void_p, c_double, c_double, c_int64),
     "holosplat_tv_descend": (POINTER(Grid), *(c_void_p,) * 3, c_double, c_double, *(c_void_p,) * 2, c_int64),
@@ -101,7 +154,7 @@ _FUNCTIONS = {
 def call(function: str, *arguments: ctypes.Structure | c_void_p | c_int64 | float) -> None:
     """Call a kernel by name with structures (passed by reference) and pointers.
 
-    Errors: `RuntimeError` if the library is missing, `MemoryError` if memory ran out.
+    Errors: `MissingError` if the library is missing, `MemoryError` if memory ran out.
     """
     passed = [ctypes.byref(a) if isinstance(a, ctypes.Structure) else a for a in arguments]
     if getattr(_library(os.environ.get("HOLOSPLAT_ISA", "")), function)(*passed):
@@ -117,12 +170,17 @@ def available_isas() -> tuple[str, ...]:
     return tuple(isa for isa in ISAS[: best + 1] if _path(folder, isa).exists())
 
 
+def used_isa() -> str:
+    """The build that is in use here."""
+    return os.environ.get("HOLOSPLAT_ISA", "") or available_isas()[-1]
+
+
 @cache
 def _library(forced: str) -> ctypes.CDLL:
     """The library for `forced`, or the fastest one that this machine runs if that is empty."""
     choices = available_isas()
     if forced and forced not in choices:
-        raise RuntimeError(f"HOLOSPLAT_ISA must be one of {', '.join(choices)} here, but it is {forced!r}; unset it.")
+        raise MissingError(f"HOLOSPLAT_ISA must be one of {', '.join(choices)} here, but it is {forced!r}; unset it.")
     return _open(_folder(), forced or choices[-1])
 
 
@@ -135,15 +193,15 @@ def _open(folder: Path, isa: str) -> ctypes.CDLL:
             function = getattr(library, name)
             function.argtypes, function.restype = types, c_int64
     except (OSError, AttributeError) as error:
-        raise RuntimeError(f"The compiled kernels at {path} cannot be used ({error}). {_ADVICE}") from error
+        raise MissingError(f"The compiled kernels at {path} cannot be used ({error}). {_ADVICE}") from error
     if library.holosplat_abi() != ABI:
-        raise RuntimeError(f"The compiled kernels at {path} are of another version. {_ADVICE}")
+        raise MissingError(f"The compiled kernels at {path} are of another version. {_ADVICE}")
     return library
 
 
 _ADVICE = (
-    "Reinstall holosplat where a C++ compiler (GCC or clang) is installed (in a checkout: pip install -e .), "
-    "or ask for backend='reference', which is slow but needs none."
+    "Either install a C++ compiler (GCC or clang) and then holosplat again (in its sources: pip install .), "
+    "or ask by name for backend='reference', which is slow but needs none."
 )
 
 
@@ -154,8 +212,11 @@ def _folder() -> Path:
     for folder in searched:
         if _path(folder, ISAS[0] if _is_x86() else "generic").exists():
             return folder
-    places = ", ".join(str(folder) for folder in searched)
-    raise RuntimeError(f"The compiled kernels of holosplat are not installed (looked in {places}). {_ADVICE}")
+    places = ", ".join(str(folder) for folder in dict.fromkeys(searched))
+    raise MissingError(
+        f"The compiled kernels of holosplat are not installed (looked in {places}): "
+        f"an install with HOLOSPLAT_KERNELS=OFF leaves them out. {_ADVICE}"
+    )
 
 
 def _candidates() -> list[Path]:

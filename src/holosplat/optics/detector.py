@@ -18,14 +18,19 @@ def bin_pixels(image: Tensor, factor: int) -> Tensor:
 
 
 def gaussian_transfer(shape: tuple[int, int], sigma_px: np.ndarray, dtype: torch.dtype) -> Tensor:
-    """Fourier transform `exp(-2π²σ²f²)` of Gaussian point-spread functions, [V, H, W//2 + 1] (for `rfft2`).
+    """Fourier transform of Gaussian point-spread functions, [V, H, W//2 + 1] (for `rfft2`); see `gaussian_factors`."""
+    rows, columns = gaussian_factors(shape, sigma_px, torch.float64)
+    return (rows[:, :, None] * columns[:, None, : shape[1] // 2 + 1]).to(dtype)
+
+
+def gaussian_factors(shape: tuple[int, int], sigma_px: np.ndarray, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """The factors `exp(-2π²σ²fy²)` [V, H] and `exp(-2π²σ²fx²)` [V, W] of Gaussian point-spread functions' transforms.
 
     sigma_px: [V] standard deviations in samples of the raster `shape`.
     """
     factor = -2 * math.pi**2 * np.asarray(sigma_px, dtype=np.float64).reshape(-1, 1) ** 2
-    rows = np.exp(factor * np.fft.fftfreq(shape[0]) ** 2)
-    columns = np.exp(factor * np.fft.rfftfreq(shape[1]) ** 2)
-    return torch.from_numpy(rows[:, :, None] * columns[:, None, :]).to(dtype)
+    rows, columns = (torch.from_numpy(np.exp(factor * np.fft.fftfreq(n) ** 2)).to(dtype) for n in shape)
+    return rows, columns
 
 
 def blur(image: Tensor, transfer: Tensor) -> Tensor:

@@ -18,9 +18,13 @@ def exit_wave_minus_one(B: Tensor, D: Tensor, energy_kev: float) -> Tensor:
     `expm1(-kB) cos φ - 2 sin²(φ/2)`, which keeps float32's digits for weak objects.
     """
     k = wavenumber(energy_kev)
-    loss, phase = -k * B, k * D
-    amplitude = torch.exp(loss)
-    real = torch.expm1(loss) - 2 * amplitude * torch.sin(0.5 * phase) ** 2
+    return exit_wave_of(k * B, k * D)
+
+
+def exit_wave_of(loss: Tensor, phase: Tensor) -> Tensor:
+    """`exp(-loss - i phase) - 1` of a loss of amplitude and a delay of phase, real [..., H, W], dimensionless."""
+    amplitude = torch.exp(-loss)
+    real = torch.expm1(-loss) - 2 * amplitude * torch.sin(0.5 * phase) ** 2
     return torch.complex(real, -amplitude * torch.sin(phase))
 
 
@@ -32,20 +36,28 @@ def exit_wave(B: Tensor, D: Tensor, energy_kev: float) -> Tensor:
 def fresnel_transfer(
     shape: tuple[int, int], pitch: float, distance: np.ndarray, energy_kev: float, dtype: torch.dtype
 ) -> Tensor:
-    """Fresnel transfer functions `exp(-iπλz(fx² + fy²))`, complex [V, H, W], for distances [V] in metres.
+    """Fresnel transfer functions `exp(-iπλz(fx² + fy²))`, complex [V, H, W]; see `fresnel_factors`."""
+    rows, columns = fresnel_factors(shape, pitch, distance, energy_kev, torch.complex128)
+    return (rows[:, :, None] * columns[:, None]).to(dtype)
 
-    Goodman (2005), *Introduction to Fourier Optics*, eq. 4-20, without the constant `exp(ikz)`; `pitch` [m].
-    The phase is built in float64 whatever `dtype` (complex64 or complex128) is asked for. Frequencies that
-    would travel further than half the raster (`|λ z f| > N p / 2`) are cut, since they could only alias
-    (Matsushima & Shimobaba 2009, eq. 13); a raster padded by `fresnel_reach_px` loses none.
+
+def fresnel_factors(
+    shape: tuple[int, int], pitch: float, distance: np.ndarray, energy_kev: float, dtype: torch.dtype
+) -> tuple[Tensor, Tensor]:
+    """The factors `exp(-iπλz fy²)` [V, H] and `exp(-iπλz fx²)` [V, W] of the transfer functions, complex.
+
+    Goodman (2005), *Introduction to Fourier Optics*, eq. 4-20, without the constant `exp(ikz)`; distances [V] and
+    `pitch` in metres. The phase is built in float64 whatever `dtype` (complex64 or complex128) is asked for.
+    Frequencies that would travel further than half the raster (`|λ z f| > N p / 2`) are cut, since they could only
+    alias (Matsushima & Shimobaba 2009, eq. 13); a raster padded by `fresnel_reach_px` loses none.
     """
     lam_z = wavelength(energy_kev) * np.asarray(distance, dtype=np.float64).reshape(-1, 1)
-    axes = []
+    factors = []
     for n in shape:
         f = np.fft.fftfreq(n, pitch)
         kept = np.abs(lam_z * f) <= 0.5 * n * pitch * (1 + 1e-9)
-        axes.append(np.exp(-1j * np.pi * lam_z * f**2) * kept)
-    return torch.from_numpy(axes[0][:, :, None] * axes[1][:, None, :]).to(dtype)
+        factors.append(torch.from_numpy(np.exp(-1j * np.pi * lam_z * f**2) * kept).to(dtype))
+    return factors[0], factors[1]
 
 
 def fresnel_propagate(wave: Tensor, transfer: Tensor) -> Tensor:

@@ -1,0 +1,116 @@
+"""Which implementation runs an operation: names, what each needs, and which operations it has.
+
+A backend is named once, where a fit starts; nothing falls back to another by itself. `auto` means `cuda` where a GPU
+can be used and `cpu` otherwise, never `reference`.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+from importlib import import_module
+from types import ModuleType
+
+import torch
+
+from . import native
+from .checks import InputError
+
+NAMES = ("auto", "cpu", "cuda", "reference")
+"""What one may ask for."""
+
+DESCRIPTIONS = {
+    "cpu": "compiled C++ kernels, float32, SSE2 to AVX-512",
+    "cuda": "Triton kernels on an NVIDIA GPU, float32",
+    "reference": "plain torch, float32 or float64, slow: the specification of the others",
+}
+
+SUPPORT: dict[str, tuple[str, str, dict[str, str]]] = {
+    "line integrals of Gaussians": ("projectors.splat", "splat", {}),
+    "Gaussians on voxels": ("projectors.splat", "voxelise", {}),
+    "wave optics": ("optics.hologram", "hologram", {"cpu": "C++, scipy's FFT", "cuda": "Triton, torch's FFT"}),
+    "L1 and SSIM of frames": ("fit.fidelity", "l1_and_ssim", {}),
+    "statistics of the measured frames": ("fit.fidelity", "statistics", {}),
+    "Adam": ("fit.adam", "step", {}),
+    "total variation of a volume": ("fit.total_variation", "total_variation", {"cuda": "plain torch"}),
+}
+"""Every operation that has several implementations: its package, its function, and remarks on single backends."""
+
+_KIND = {"cpu": "C++", "cuda": "Triton", "reference": "plain torch"}
+
+
+def implementation(package: str, backend: str) -> ModuleType:
+    """The module of `package` (a full name) that holds the functions of a resolved `backend`."""
+    if backend not in DESCRIPTIONS:
+        raise InputError(f"backend must be one of {', '.join(DESCRIPTIONS)} here, but it is {backend!r}.")
+    return import_module(f".{backend}", package)
+
+
+def support_table() -> list[list[str]]:
+    """The one support table: a row per operation, with how each of cpu, cuda, reference does it."""
+    return [
+        [operation, *(remarks.get(backend, kind) for backend, kind in _KIND.items())]
+        for operation, (_, _, remarks) in SUPPORT.items()
+    ]
+
+
+def resolve(name: str) -> str:
+    """The backend that `name` stands for here: `cpu`, `cuda` or `reference`.
+
+    Errors: `InputError` if the name is unknown, or what it needs is missing (with the reasons of both `cuda` and
+    `cpu`, since one of them is what a user then wants).
+    """
+    if name not in NAMES:
+        raise InputError(f"backend must be one of {', '.join(NAMES)}, but it is {name!r}.")
+    reasons = {backend: missing(backend) for backend in ("cuda", "cpu")}
+    if name == "reference" or (name in reasons and not reasons[name]):
+        return name
+    if name == "auto" and not reasons["cuda"] and not interpreted():
+        return "cuda"
+    if name == "auto" and not reasons["cpu"]:
+        return "cpu"
+    state = "; ".join(f"{backend}: {reason or 'can be used'}" for backend, reason in reasons.items())
+    raise InputError(
+        f"backend {name!r} cannot be used here. {state}. Mend one of them, or ask for backend 'reference', "
+        "which is slow but needs neither."
+    )
+
+
+def missing(backend: str) -> str:
+    """Why `backend` cannot be used here, as part of a sentence; empty if it can."""
+    if backend == "cpu":
+        try:
+            native.available_isas()
+        except RuntimeError as error:
+            return str(error).rstrip(".")
+    if backend == "cuda":
+        return _missing_cuda()
+    return ""
+
+
+def _missing_cuda() -> str:
+    if importlib.util.find_spec("triton") is None:
+        return "triton is not installed (pip install 'holosplat[gpu]')"
+    if interpreted() or torch.cuda.is_available():
+        return ""
+    if torch.version.cuda is None:
+        return f"this build of torch ({torch.__version__}) has no CUDA (install one that has)"
+    return "torch sees no CUDA device (check the driver with nvidia-smi)"
+
+
+def interpreted() -> bool:
+    """Whether Triton kernels run in Triton's interpreter, on the CPU: for tests, very slow (`TRITON_INTERPRET=1`)."""
+    return os.environ.get("TRITON_INTERPRET", "0") == "1"
+
+
+def device(backend: str) -> torch.device:
+    """Where the arrays of a resolved backend live."""
+    on_gpu = backend == "cuda" and not interpreted()
+    return torch.device("cuda" if on_gpu else "cpu")
+
+
+def device_name(backend: str) -> str:
+    """The device in words, for the record of a run."""
+    if backend == "cuda":
+        return "Triton's interpreter" if interpreted() else torch.cuda.get_device_name()
+    return f"CPU, {torch.get_num_threads()} threads" + (f", {native.used_isa()}" if backend == "cpu" else "")

@@ -1,0 +1,226 @@
+"""Adam over a few arrays at once: the compiled kernel, the plain form, and torch's own, step for step."""
+
+from __future__ import annotations
+
+import io
+from itertools import chain
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from holosplat import native
+from holosplat.checks import InputError
+from holosplat.fit import adam
+from holosplat.fit.trainable import Trainable
+from holosplat.representations.gaussians import GaussianCloud
+
+RATES = (0.02, 0.01, 0.003, 0.05)
+EPSILON = 1e-12
+TOLERANCE = 1e-5
+"""Of where the parameters went, over how far."""
+
+State = list[list[Tensor]]
+"""Parameters, first and second moments."""
+
+
+def a_start(lengths: tuple[int, ...] = (301, 17, 40000, 1), dtype: torch.dtype = torch.float32) -> State:
+    """Arrays of odd lengths (one longer than a thread's share), without history."""
+    generator = torch.Generator().manual_seed(0)
+    parameters = [0.1 * torch.randn(n, generator=generator).to(dtype) for n in lengths]
+    return [parameters, *([torch.zeros_like(p) for p in parameters] for _ in range(2))]
+
+
+def gradients_at(parameters: list[Tensor], step: int) -> list[Tensor]:
+    """Noisy gradients of a bowl, of magnitudes from 1e-9 to 1e3; some are zero throughout."""
+    generator = torch.Generator().manual_seed(step)
+    found = []
+    for p in parameters:
+        scale = 10 ** torch.linspace(-9, 3, len(p))
+        noisy = scale * (p.detach() + torch.randn(len(p), generator=generator))
+        found.append((noisy * (torch.arange(len(p)) % 7 != 3)).to(p.dtype))
+    return found
+
+
+def walked(backend: str, steps: int = 50, dtype: torch.dtype = torch.float32) -> State:
+    """Where `steps` steps lead, rates falling."""
+    state = a_start(dtype=dtype)
+    for count in range(1, steps + 1):
+        factors = adam.factors([rate * 0.98**count for rate in RATES], count, EPSILON)
+        adam.step(state[0], gradients_at(state[0], count), *state[1:], factors, backend)
+    return state
+
+
+def walked_by_torch(steps: int = 50, dtype: torch.dtype = torch.float32) -> list[Tensor]:
+    leaves = [p.clone().requires_grad_() for p in a_start(dtype=dtype)[0]]
+    optimiser = torch.optim.Adam([{"params": [leaf]} for leaf in leaves], lr=0.0, eps=EPSILON, fused=True)
+    for count in range(1, steps + 1):
+        for leaf, gradient, group, rate in zip(leaves, gradients_at(leaves, count), optimiser.param_groups, RATES):
+            leaf.grad, group["lr"] = gradient, rate * 0.98**count
+        optimiser.step()
+    return [leaf.detach() for leaf in leaves]
+
+
+def error(found: list[Tensor], true: list[Tensor]) -> float:
+    """Largest difference over the longest way, of the worst array."""
+    starts = a_start(dtype=true[0].dtype)[0]
+    return max(float((a - b).abs().max() / (b - start).abs().max()) for a, b, start in zip(found, true, starts))
+
+
+@pytest.mark.parametrize("isa", native.available_isas())
+def test_the_way_is_that_of_torch(isa, monkeypatch):
+    monkeypatch.setenv("HOLOSPLAT_ISA", isa)
+    found = walked("cpu")
+    assert error(found[0], walked_by_torch()) < TOLERANCE
+    exact = walked("reference", dtype=torch.float64)
+    for array, true in zip(chain(*found), chain(*exact)):
+        np.testing.assert_allclose(array, true, rtol=1e-4, atol=TOLERANCE * float(true.abs().max()))
+
+
+def test_the_plain_form_is_that_of_torch():
+    assert error(walked("reference", dtype=torch.float64)[0], walked_by_torch(dtype=torch.float64)) < 1e-6
+
+
+@pytest.mark.parametrize("index", range(len(RATES) + 1))
+def test_the_tolerance_sees_a_biased_factor(index, monkeypatch):
+    true, exact = walked_by_torch(), adam.factors
+    bias = torch.ones(len(RATES) + 1)
+    bias[index] = 1.001 if index < len(RATES) else 1e9  # nothing sees what is added to divisors a million times larger
+    monkeypatch.setattr(adam, "factors", lambda *args: exact(*args) * bias)
+    assert error(walked("cpu")[0], true) > TOLERANCE
+
+
+def test_the_first_step_is_as_long_as_the_rate_and_no_gradient_is_no_step():
+    parameters, first, second = a_start()
+    before = [p.clone() for p in parameters]
+    gradients = gradients_at(parameters, 0)
+    adam.step(parameters, gradients, first, second, adam.factors(RATES, 1, EPSILON))
+    for new, old, gradient, rate in zip(parameters, before, gradients, RATES):
+        np.testing.assert_allclose(new - old, -rate * gradient / (gradient.abs() + EPSILON), rtol=2e-3, atol=1e-6)
+
+
+def test_threads_change_nothing():
+    before, results = torch.get_num_threads(), []
+    try:
+        for threads in (1, 2, 7):
+            torch.set_num_threads(threads)
+            results.append(list(chain(*walked("cpu", steps=3))))
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other))
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_arrays_of_any_number_and_order(backend):
+    """Matrices, gradients in another memory order, empty arrays, and none at all."""
+    generator = torch.Generator().manual_seed(1)
+    parameters = [torch.randn(5, 3, generator=generator), torch.zeros(0, 4)]
+    gradients = [torch.randn(3, 5, generator=generator).T, torch.zeros(0, 4)]
+    moments = [[torch.zeros_like(p) for p in parameters] for _ in range(2)]
+    wanted = parameters[0] - 0.1 * gradients[0].sign()
+    adam.step(parameters, gradients, *moments, adam.factors([0.1, 0.2], 1, EPSILON), backend)
+    np.testing.assert_allclose(parameters[0], wanted, rtol=1e-5)
+    adam.step([], [], [], [], adam.factors([], 1, EPSILON), backend)
+
+
+def test_arrays_that_do_not_fit_together_are_refused():
+    arrays, factors = [[torch.zeros(3, 4)] for _ in range(4)], adam.factors([0.1], 1, EPSILON)
+    for wrong, message in (
+        ([*arrays[:3], [torch.zeros(3, 5)]], "shape"),
+        ([*arrays[:3], []], "one of each"),
+        ([a * 5 for a in arrays], "up to 4"),
+        ([[torch.zeros(4, 3).T], *arrays[1:]], "contiguous"),
+        ([[torch.zeros(3, 4).double()] for _ in range(4)], "float32"),
+    ):
+        with pytest.raises(InputError, match=message):
+            adam.step(*wrong, factors)
+    with pytest.raises(InputError, match="backend"):
+        adam.step(*arrays, factors, "tpu")
+
+
+# --- a cloud under optimisation -----------------------------------------------------------------------------
+
+
+def a_trainable(count: int = 12) -> Trainable:
+    generator = torch.Generator().manual_seed(2)
+    parameters = [torch.randn(count, width, generator=generator) for width in (3, 3, 4, 1)]
+    return Trainable(GaussianCloud(parameters, 1e-6, 1e-7, 1e-9))
+
+
+def advance(trainable: Trainable, steps: int, start: int = 0) -> None:
+    for count in range(start, start + steps):
+        generator = torch.Generator().manual_seed(count)
+        for p in trainable.cloud.parameters:
+            p.grad = torch.randn(p.shape, generator=generator)
+        trainable.step(RATES)
+
+
+def same(a: Trainable, b: Trainable) -> bool:
+    return all(torch.equal(p, q) for p, q in zip(a.cloud.parameters, b.cloud.parameters))
+
+
+def test_a_checkpoint_of_torchs_adam_goes_on():
+    """States saved when torch's optimiser moved the parameters: names, types and all."""
+    whole = a_trainable()
+    leaves = [p.detach().clone().requires_grad_() for p in whole.cloud.parameters]
+    optimiser = torch.optim.Adam([{"params": [p], "lr": rate} for p, rate in zip(leaves, RATES)], eps=1e-12, fused=True)
+    for count in range(5):
+        generator = torch.Generator().manual_seed(count)
+        for p in leaves:
+            p.grad = torch.randn(p.shape, generator=generator)
+        optimiser.step()
+    state = {"parameters": [p.detach() for p in leaves], "moments": [optimiser.state[p] for p in leaves]}
+    advance(whole, 5)
+    mine = whole.state_dict()["moments"]
+    for a, b in zip(mine, state["moments"]):
+        assert {name: (v.shape, v.dtype) for name, v in a.items()} == {n: (v.shape, v.dtype) for n, v in b.items()}
+    resumed = a_trainable(3)
+    resumed.load(state)
+    advance(resumed, 5, start=5)
+    advance(whole, 5, start=5)
+    for p, q in zip(resumed.cloud.parameters, whole.cloud.parameters):
+        np.testing.assert_allclose(p.detach(), q.detach(), atol=1e-6)
+
+
+@pytest.mark.parametrize("stop", [0, 1, 4])
+def test_a_saved_state_goes_on_bit_for_bit(stop):
+    whole, first, second = a_trainable(), a_trainable(), a_trainable(5)
+    advance(whole, 7)
+    advance(first, stop)
+    buffer = io.BytesIO()
+    torch.save(first.state_dict(), buffer)
+    buffer.seek(0)
+    second.load(torch.load(buffer, weights_only=True))
+    for trainable in (first, second):
+        advance(trainable, 7 - stop, start=stop)
+        assert same(trainable, whole)
+        assert [float(m["step"]) for m in trainable.state_dict()["moments"]] == [7] * 4
+
+
+def test_a_parameter_without_gradient_stays_and_keeps_its_moments():
+    trainable = a_trainable()
+    advance(trainable, 2)
+    before, saved = trainable.cloud.detached(), trainable.state_dict()["moments"]
+    trainable.cloud.quaternions.grad = torch.ones(12, 4)
+    trainable.step(RATES)
+    moved = [not torch.equal(p, q) for p, q in zip(trainable.cloud.parameters, before.parameters)]
+    assert moved == [False, False, True, False]
+    after = trainable.state_dict()["moments"]
+    assert [not torch.equal(a["exp_avg"], b["exp_avg"]) for a, b in zip(after, saved)] == moved
+    assert all(p.grad is None for p in trainable.cloud.parameters)
+    advance(trainable, 1)
+    assert all(bool(torch.isfinite(p).all()) for p in trainable.cloud.parameters)
+
+
+def test_two_halves_are_a_step():
+    """What is prepared before the gradients exist is used after."""
+    whole, halves = a_trainable(), a_trainable()
+    advance(whole, 3)
+    for count in range(3):
+        halves.prepare(RATES)
+        generator = torch.Generator().manual_seed(count)
+        for p in halves.cloud.parameters:
+            p.grad = torch.randn(p.shape, generator=generator)
+        halves.apply()
+    assert same(whole, halves)
