@@ -20,7 +20,7 @@ Files = dict[str, str]
 """Path below src/holosplat → source text."""
 
 TIERS = (
-    ("units", "checks", "native", "geometry", "scan", "volume", "mesh"),
+    ("units", "checks", "native", "backends", "geometry", "scan", "volume", "mesh"),
     ("materials", "optics", "metrics", "projectors"),
     ("specimens", "representations", "forward", "io"),
     ("fit", "baselines"),
@@ -33,7 +33,7 @@ SAME_TIER = dict.fromkeys(TIERS[0], TIERS[0]) | {"cli": ("report", "viewer")}
 """Rooms of their own tier that a room may import (the nouns among themselves: without cycles)."""
 
 BACKENDS = ("*/cpu.py", "*/cuda.py", "*/reference.py")
-BACKEND_IMPORTS = {"projectors/mesh/reference.py": ("geometry",)}
+BACKEND_IMPORTS = {"projectors/mesh/reference.py": ("geometry",), "optics/hologram/reference.py": ("optics",)}
 """What a backend file may import of ours, beside its own folder and `native`."""
 
 HEAVY: dict[str, tuple[str, ...]] = {

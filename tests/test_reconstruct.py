@@ -395,7 +395,7 @@ def test_an_interrupted_run_is_usable_and_goes_on_as_if_nothing_had_happened(req
     assert done.timing["fit"] > half.timing["fit"]
 
 
-@pytest.mark.parametrize("where", [(Instrument, "measure"), (Trainable, "step")], ids=["before", "after the step"])
+@pytest.mark.parametrize("where", [(Instrument, "frames"), (Trainable, "apply")], ids=["before", "after the step"])
 def test_ctrl_c_in_the_middle_of_a_step_does_no_harm(scan, random_whole, tmp_path, monkeypatch, where):
     """The signal comes at any time; what is saved must be the state between two steps."""
     folder, calls = RunFolder(tmp_path / "run"), []

@@ -9,12 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .backends import device, resolve
 from .checks import in_range, require
-from .optics.detector import bin_pixels, blur, gaussian_transfer, poisson
-from .optics.propagation import exit_wave_minus_one, fresnel_propagate, fresnel_reach_px, fresnel_transfer
+from .optics.detector import poisson
+from .optics.hologram import hologram, optical_path
+from .optics.propagation import fresnel_reach_px
 from .scan import Exposures, Scan, interleaved_split
-from .units import wavelength
-from .volume import Object
+from .units import wavelength, wavenumber
+from .volume import LineIntegrals, Object
 
 SIMULATED_FRINGE_SAMPLES = 8
 """Samples on the first fringe in simulations: frames of rounded bodies are then right to 0.5 % of their contrast
@@ -30,12 +32,21 @@ class Instrument:
     """The wave optics of some exposures, made ready: line integrals in, frames out, differentiable.
 
     The line integrals live on `views`: the detector's raster, padded by the fringes' reach so that nothing
-    wraps around, and `oversample` times finer than the detector.
+    wraps around, and `oversample` times finer than the detector. `backend`: `cpu`, `cuda`, `reference` or
+    `auto` (see `backends`); float64 (`dtype`) is what only `reference` computes in, and stands for it.
     """
 
-    def __init__(self, exposures: Exposures, oversample: int = 1, dtype: torch.dtype = torch.float32) -> None:
+    def __init__(
+        self,
+        exposures: Exposures,
+        oversample: int = 1,
+        dtype: torch.dtype = torch.float32,
+        backend: str = "cpu",
+    ) -> None:
         require(oversample >= 1, f"oversample must be at least 1, but it is {oversample}.")
         self.exposures, self.oversample, self.dtype = exposures, int(oversample), dtype
+        self.backend = resolve("reference" if dtype == torch.float64 else backend)
+        self.device = device(self.backend)
         self.margin = padding(exposures, self.oversample)
         self.views = exposures.views.padded(self.margin).refined(self.oversample)
         rows, columns = self.views.shape
@@ -44,25 +55,27 @@ class Instrument:
             f"the waves of {len(self.views)} views would need {rows} × {columns} samples each, more than memory holds; "
             "use fewer or smaller frames.",
         )
-        complex_dtype = torch.complex128 if dtype == torch.float64 else torch.complex64
-        distances, self._which = np.unique(exposures.distance, return_inverse=True)
-        self._transfer = fresnel_transfer(
-            self.views.shape, self.views.pixel_size, distances, exposures.energy_kev, complex_dtype
-        )
-        sigmas = exposures.psf_sigma_px * self.oversample
-        self._psf = gaussian_transfer(self.views.shape, sigmas, dtype) if np.any(sigmas > 0) else None
+        my, mx = (m * self.oversample for m in self.margin)
+        self.path = optical_path(
+            self.views.shape,
+            self.views.pixel_size,
+            exposures.energy_kev,
+            exposures.distance,
+            exposures.psf_sigma_px * self.oversample,
+            (exposures.views.shape, (my, mx), self.oversample),
+            dtype,
+        ).to(self.device)
+
+    def frames(self, lines: LineIntegrals, index: np.ndarray | Tensor | None = None) -> Tensor:
+        """Frames [V, H, W] from line integrals on `self.views` (or its views `index`), in the instrument's type."""
+        k = wavenumber(self.exposures.energy_kev)
+        refraction = [(k * delta, k * beta) for delta, beta in lines.materials]
+        path = self.path if index is None else self.path[torch.as_tensor(index, device=self.device)]
+        return hologram(lines.channels.to(self.device, self.dtype), refraction, path, self.backend)
 
     def image(self, B: Tensor, D: Tensor, index: np.ndarray | None = None) -> Tensor:
-        """Frames [V, H, W] from line integrals [V, H', W'] in metres on `self.views` (or its views `index`)."""
-        index = np.arange(len(self.views)) if index is None else index
-        scattered = exit_wave_minus_one(B, D, self.exposures.energy_kev)
-        wave = fresnel_propagate(scattered, self._transfer[self._which[index]])
-        intensity = (wave.real + 1) ** 2 + wave.imag**2
-        if self._psf is not None:
-            intensity = blur(intensity, self._psf[index])
-        (my, mx), s = self.margin, self.oversample
-        h, w = self.exposures.views.shape
-        return bin_pixels(intensity[:, my * s : (my + h) * s, mx * s : (mx + w) * s], s)
+        """Frames [V, H, W] from line integrals B, D [V, H', W'] in metres on `self.views` (or its views `index`)."""
+        return self.frames(LineIntegrals.of(B, D), index)
 
     def measure(self, obj: Object, index: np.ndarray | None = None) -> Tensor:
         """Frames [V, H, W] that `obj` would give in the exposures `index` (default: all)."""
@@ -71,7 +84,9 @@ class Instrument:
         frames = torch.empty(0)
         for time in np.unique(times):
             at = np.flatnonzero(times == time)
-            part = self.image(*obj.at(float(time)).project(self.views[index[at]]), index[at])
+            lines = obj.at(float(time)).project(self.views[index[at]])
+            lines = lines if isinstance(lines, LineIntegrals) else LineIntegrals.of(*lines)
+            part = self.frames(lines, index[at])
             if len(at) == len(index):
                 return part
             frames = frames if len(frames) else part.new_empty((len(index), *part.shape[1:]))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 
 from .checks import InputError, finite, positive, require, shaped
 
@@ -101,6 +102,31 @@ class Views:
 
 
 @dataclass(frozen=True)
+class Poses:
+    """V views made ready for kernels: tensors that stay on a device, picked by index without waiting for it.
+
+    rotations: [V, 3, 3] float64; shifts: [V, 2] float64, detector shifts `(sx, sy)` [m]; shape: `(H, W)` pixels;
+    pixel_size [m].
+    """
+
+    rotations: torch.Tensor
+    shifts: torch.Tensor
+    shape: tuple[int, int]
+    pixel_size: float
+
+    @classmethod
+    def of(cls, views: Views, device: torch.device | str = "cpu") -> Poses:
+        """The poses of `views` on `device`."""
+        arrays = (np.ascontiguousarray(a) for a in (views.rotations, views.shifts))
+        rotations, shifts = (torch.from_numpy(a).to(device) for a in arrays)
+        return cls(rotations, shifts, views.shape, views.pixel_size)
+
+    def __getitem__(self, index: torch.Tensor) -> Poses:
+        """The poses `index` [K], an integer tensor on the same device."""
+        return replace(self, rotations=self.rotations.index_select(0, index), shifts=self.shifts.index_select(0, index))
+
+
+@dataclass(frozen=True)
 class Grid:
     """A volume's raster, indexed `[z, y, x]`.
 
@@ -146,6 +172,11 @@ class Grid:
         """Voxel-centre coordinates `(x [X], y [Y], z [Z])` [m]."""
         counts = self.shape[::-1]
         return tuple(o + d * np.arange(n) for o, d, n in zip(self.origin, self.voxel_size, counts))  # type: ignore[return-value]
+
+    @property
+    def centre(self) -> np.ndarray:
+        """The middle `(x, y, z)` [m] of the grid."""
+        return np.array(self.origin) + 0.5 * np.array(self.voxel_size) * (np.array(self.shape[::-1]) - 1)
 
     def block(self, start: tuple[int, int, int], shape: tuple[int, int, int]) -> Grid:
         """The part of `shape` voxels whose first one is voxel `start` (z, y, x) of this grid."""

@@ -26,6 +26,31 @@ class Volume:
             object.__setattr__(self, name, finite(name, shaped(name, array, self.grid.shape)))
 
 
+@dataclass(frozen=True)
+class LineIntegrals:
+    """Line integrals along the beam by channels of matter; unpacks to `(B, D)`, of β and δ, each [V, H, W] in metres.
+
+    channels: [V, C, H, W], C = 1 or 2; materials: for each channel, the (δ, β) [m] that a unit of it integrates to,
+    so that `D = Σ δ_c T_c` and `B = Σ β_c T_c`.
+    """
+
+    channels: torch.Tensor
+    materials: tuple[tuple[float, float], ...]
+
+    @classmethod
+    def of(cls, B: torch.Tensor, D: torch.Tensor) -> LineIntegrals:
+        """From the integrals of β and δ themselves, each [V, H, W] in metres."""
+        return cls(torch.stack((D, B), dim=1), ((1.0, 0.0), (0.0, 1.0)))
+
+    def __getitem__(self, index: int) -> torch.Tensor:
+        """0: B, 1: D."""
+        if not 0 <= index < 2:
+            raise IndexError(index)
+        factors = [material[1 - index] for material in self.materials]
+        total = sum(f * channel for f, channel in zip(factors, self.channels.unbind(1)) if f != 0)
+        return total if isinstance(total, torch.Tensor) else torch.zeros_like(self.channels[:, 0])
+
+
 @runtime_checkable
 class Object(Protocol):
     """Anything made of matter: mesh scenes, voxel volumes, Gaussian clouds, and whatever moves."""
@@ -34,8 +59,8 @@ class Object(Protocol):
         """The object as it is at `time` [s]; a static one returns itself."""
         ...
 
-    def project(self, views: Views) -> tuple[torch.Tensor, torch.Tensor]:
-        """Line integrals `(B, D)` of β and δ along the beam, each [V, H, W] in metres."""
+    def project(self, views: Views) -> LineIntegrals | tuple[torch.Tensor, torch.Tensor]:
+        """Line integrals `(B, D)` of β and δ along the beam, each [V, H, W] in metres, or what unpacks to them."""
         ...
 
     def voxelise(self, grid: Grid) -> Volume:

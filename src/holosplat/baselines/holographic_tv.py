@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -22,6 +23,7 @@ from ..materials import DeltaBeta
 from ..optics.retrieval import invert_contrast, retrieve_thickness
 from ..projectors.voxels import projector_for
 from ..scan import Scan
+from ..volume import LineIntegrals
 from .primal_dual import PrimalDual
 
 SETTLING = 2
@@ -36,7 +38,7 @@ class HolographicTV:
     """Options. weight: of total variation, in pixels of path length; iterations: primal–dual steps on the retrieved
     thickness; corrections: rounds of agreement with the holograms, of `inner` steps each; refine: voxels along a
     pixel's edge (0: as the first fringe needs); max_voxels: coarser voxels rather than more than this many;
-    upper: bound of the occupancy (0: none).
+    upper: bound of the occupancy (0: none); backend: `cpu`, or `reference` (plain torch, slow).
     """
 
     weight: float = 0.3
@@ -46,6 +48,7 @@ class HolographicTV:
     refine: int = 0
     max_voxels: int = 70_000_000
     upper: float = 1.0
+    backend: Literal["cpu", "reference"] = "cpu"
 
     def __post_init__(self) -> None:
         at_least(self, 0, "weight", "corrections", "inner", "refine", "upper")
@@ -68,8 +71,9 @@ def holographic_tv(
 
     views = _in_pixels(scan.views)
     grid = Grid.of_views(views)
-    upper = options.upper if options.upper > 0 else None
-    solver = PrimalDual(projector_for(grid, views), torch.zeros(grid.shape), options.weight, upper)
+    upper = options.upper or None
+    projector = projector_for(grid, views, options.backend)
+    solver = PrimalDual(projector, torch.zeros(grid.shape), options.weight, upper, backend=options.backend)
     for done in range(0, options.iterations, 10):
         on_progress("tomography", done / options.iterations)
         solver.run(lines, min(10, options.iterations - done))
@@ -93,15 +97,16 @@ def _agree(
     physics = (pitch, scan.exposures.distance, scan.exposures.energy_kev, material.delta, material.beta)
     grid = Grid.of_views(views, refine)
     finer = math.ceil(resolving_oversample(scan.exposures, 1.5, at_least=1) / refine)
-    instrument = Instrument(scan.exposures, refine * finer)
-    projector = projector_for(grid, views.refined(refine))
+    instrument = Instrument(scan.exposures, refine * finer, backend=options.backend)
+    projector = projector_for(grid, views.refined(refine), options.backend)
     start = interpolate(volume[None, None], size=grid.shape, mode="trilinear", align_corners=False)[0, 0]
-    solver = PrimalDual(projector, start, options.weight, options.upper or None, coupling=1 / refine**2)
+    upper = options.upper or None
+    solver = PrimalDual(projector, start, options.weight, upper, 1 / refine**2, options.backend)
     best, least = start, float("inf")
     for done in range(options.corrections + 1):
         on_progress("agreement with the holograms", done / options.corrections)
         lines = solver.lines()
-        missing = frames - _image(instrument, _refined(lines, finer) * pitch, material)
+        missing = frames - _image(instrument, _refined(lines, finer) * pitch, material).detach()
         misfit = float(missing.square().sum())
         if misfit < least or done <= SETTLING:
             best, least = solver.volume.clone(), misfit
@@ -127,7 +132,7 @@ def _image(instrument: Instrument, lines: Tensor, material: DeltaBeta) -> Tensor
     """Frames from thickness [V, H, W] in metres on the unpadded raster (matter outside it counts as none)."""
     (my, mx), s = instrument.margin, instrument.oversample
     padded = pad(lines, (mx * s, mx * s, my * s, my * s))
-    return instrument.image(padded * material.beta, padded * material.delta)
+    return instrument.frames(LineIntegrals(padded[:, None], ((material.delta, material.beta),)))
 
 
 def _refined(images: Tensor, factor: int) -> Tensor:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import torch
@@ -22,9 +22,10 @@ WORKING_WIDTH = 64
 """Frames are binned to about this width for estimates; the ratio acts on the lowest frequencies only."""
 
 Progress = Callable[[str, float], None]
+Backend = Literal["cpu", "reference"]
 
 
-def estimate_ratio(scan: Scan, on_progress: Progress) -> float:
+def estimate_ratio(scan: Scan, on_progress: Progress, backend: Backend = "cpu") -> float:
     """A coarse δ/β of the matter in `scan`: the one that gives the most compact volume.
 
     A wrong ratio leaves halos of positive or negative matter around everything, in every view alike, which
@@ -36,7 +37,7 @@ def estimate_ratio(scan: Scan, on_progress: Progress) -> float:
     levels = np.empty(len(RATIOS))
     for i, ratio in enumerate(RATIOS):
         on_progress("estimate of delta/beta", i / len(RATIOS))
-        levels[i] = plateau(_trial_volume(coarse, ratio))
+        levels[i] = plateau(_trial_volume(coarse, ratio, backend))
     best = _first_peak(levels)
     left, middle, right = levels[best - 1 : best + 2]
     curvature = left - 2 * middle + right
@@ -53,11 +54,11 @@ def _first_peak(levels: np.ndarray) -> int:
     return int(inner[0]) if len(inner) else int(np.clip(np.argmax(levels), 1, len(levels) - 2))
 
 
-def estimate_delta(scan: Scan, ratio: float, on_progress: Progress) -> float:
+def estimate_delta(scan: Scan, ratio: float, on_progress: Progress, backend: Backend = "cpu") -> float:
     """δ of the one material in `scan` whose δ/β is `ratio`: the plateau of a non-negative tomography."""
     on_progress("estimate of delta", 0.0)
     coarse = scan.binned(max(1, round(scan.views.shape[1] / (2 * WORKING_WIDTH))))
-    return plateau(_trial_volume(coarse, ratio)) * TRIAL_DELTA
+    return plateau(_trial_volume(coarse, ratio, backend)) * TRIAL_DELTA
 
 
 def plateau(occupancy: Tensor) -> float:
@@ -68,7 +69,7 @@ def plateau(occupancy: Tensor) -> float:
     return float(values[int(torch.searchsorted(mass, 0.5 * mass[-1]))])
 
 
-def _trial_volume(scan: Scan, ratio: float) -> Tensor:
-    options = replace(HolographicTV(), weight=0.1, iterations=40, corrections=0, upper=0.0)
+def _trial_volume(scan: Scan, ratio: float, backend: Backend) -> Tensor:
+    options = HolographicTV(weight=0.1, iterations=40, corrections=0, upper=0.0, backend=backend)
     material = DeltaBeta(TRIAL_DELTA, TRIAL_DELTA / ratio)
     return holographic_tv(scan, material, options, lambda stage, fraction: None)[0]

@@ -7,7 +7,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from .. import native
+from ..backends import implementation
 
 
 class LinearProjector(Protocol):
@@ -55,7 +55,9 @@ class PrimalDual:
         weight: float,
         upper: float | None,
         coupling: float = 1.0,
+        backend: str = "cpu",
     ) -> None:
+        self._steps = implementation(f"{__package__}.tv_steps", backend)
         self.projector, self.coupling = projector, coupling
         self.radius = weight / coupling
         self.upper = float("inf") if upper is None else upper
@@ -83,9 +85,9 @@ class PrimalDual:
             difference = self.projector.project(self._extrapolated) - lines
             self._residual_dual = (self._residual_dual + self._dual_step * difference) / (1 + self._dual_step)
             # σ = 1 / (2 coupling) for the gradient's rows, so that σ · coupling = ½
-            tv_ascend(self._extrapolated, self._gradient_dual, 0.5, self.radius)
+            self._steps.ascend(self._extrapolated, self._gradient_dual, 0.5, self.radius)
             slope = self.projector.backproject(self._residual_dual)
-            tv_descend(
+            self._steps.descend(
                 slope,
                 self._primal_step,
                 self._gradient_dual,
@@ -94,30 +96,3 @@ class PrimalDual:
                 self._array,
                 self._extrapolated,
             )
-
-
-def tv_ascend(u: Tensor, q: Tensor, step: float, radius: float) -> None:
-    """q [3, Z, Y, X] ← projection of `q + step ∇u` onto balls of `radius`; forward differences, in place."""
-    native.call("holosplat_tv_ascend", _grid(u), _pointer(u), _pointer(q), step, radius, torch.get_num_threads())
-
-
-def tv_descend(
-    slope: Tensor, tau: Tensor, q: Tensor, coupling: float, upper: float, u: Tensor, extrapolated: Tensor
-) -> None:
-    """u ← `clamp(u - tau (slope + coupling ∇ᵀq), 0, upper)`, extrapolated ← `2 u_new - u_old`, in place.
-
-    q must be zero where a forward difference would leave the volume, as `tv_ascend` keeps it.
-    """
-    arrays = [_pointer(a) for a in (slope, tau, q)]
-    moved = [_pointer(a) for a in (u, extrapolated)]
-    native.call("holosplat_tv_descend", _grid(u), *arrays, coupling, upper, *moved, torch.get_num_threads())
-
-
-def _grid(volume: Tensor) -> native.Grid:
-    return native.Grid(*volume.shape)
-
-
-def _pointer(array: Tensor) -> native.c_void_p:
-    assert array.dtype == torch.float32
-    assert array.is_contiguous()
-    return native.c_void_p(array.data_ptr())

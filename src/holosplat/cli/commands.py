@@ -13,6 +13,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
 from .. import __version__
+from ..backends import DESCRIPTIONS, device_name, missing, resolve, support_table
 from ..checks import InputError, in_range, require
 from ..experiments.demo import DETECTOR, write_demo_meshes
 from ..experiments.evaluate import Evaluation
@@ -96,6 +97,7 @@ def reconstruct(
     config: Path | None = None,
     seed: int = 0,
     resume: bool = False,
+    backend: Literal["auto", "cpu", "cuda", "reference"] | None = None,
 ) -> None:
     """Reconstruct a scan as Gaussians; the run folder holds the result and its report.
 
@@ -106,9 +108,13 @@ def reconstruct(
         config: Or: a JSON file of settings, such as the config.json of another run.
         seed: Seed of everything random.
         resume: Go on with an interrupted run.
+        backend: What computes the fit (default: as the settings say, auto); `holosplat backends` lists them.
     """
     require(config is None or preset_name is None, "give --config or --preset, not both.")
     settings = read_settings(config) if config else preset(preset_name or "default")
+    if backend:
+        settings = replace(settings, fit=replace(settings.fit, backend=backend))
+    resolve(settings.fit.backend)  # before the start, which takes its time
     require(seed >= 0, f"--seed must be 0 or more, but it is {seed}.")
     measured = read_scan(scan)
     prior = matter.prior(measured.exposures.energy_kev)
@@ -220,6 +226,24 @@ def demo(out: Path = Path("demo")) -> None:
     evaluate(run, truth=truth)
 
 
+def backends() -> None:
+    """Say which backends can be used here, and what each of them offers."""
+    for name, description in DESCRIPTIONS.items():
+        reason = missing(name)
+        state = f"not usable here: {reason}" if reason else f"usable ({device_name(name)})"
+        print(f"{name:10} {description}; {state}")
+    print(f"auto       {_auto()}\n")
+    for operation, *kinds in [["", *DESCRIPTIONS], *support_table()]:
+        print(f"{operation:36}" + "".join(f"{kind:22}" for kind in kinds).rstrip())
+
+
+def _auto() -> str:
+    try:
+        return f"would take {resolve('auto')}"
+    except InputError:
+        return "finds neither cpu nor cuda"
+
+
 def _source(folder: RunFolder) -> Path:
     require(folder.source.is_file(), f"{folder.path} does not say which scan it is of; name it with --scan.")
     path = Path(str(read_json(folder.source).get("scan", "")))
@@ -243,6 +267,7 @@ COMMANDS = {
     "export": export,
     "evaluate": evaluate,
     "demo": demo,
+    "backends": backends,
 }
 
 

@@ -86,10 +86,12 @@ def render(reconstruction: Reconstruction, exposures: Exposures) -> np.ndarray:
         abs(exposures.energy_kev / energy - 1) < 1e-3,
         f"the run's δ and β are those at {energy:g} keV, but the scan's energy is {exposures.energy_kev:g} keV.",
     )
+    cloud = reconstruction.cloud
     frames = np.empty((len(exposures), *exposures.views.shape), dtype=np.float32)
     with torch.no_grad():
         for i in range(len(exposures)):
-            frames[i] = Instrument(exposures[[i]], reconstruction.oversample).measure(reconstruction.cloud)[0].numpy()
+            instrument = Instrument(exposures[[i]], reconstruction.oversample, backend=cloud.backend)
+            frames[i] = instrument.measure(cloud)[0].cpu().numpy()
     return frames
 
 

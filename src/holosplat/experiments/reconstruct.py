@@ -80,7 +80,7 @@ def reconstruct(
     if checkpoint:
         fit.load(checkpoint["fit"])
     elif folder:
-        _begin(folder, scan, prior, settings, seed)
+        _begin(folder, _config(scan, prior, settings, seed) | environment(fit.backend))
     journal = _Journal(fit, timing, folder, on_progress)
     try:
         fit.run(journal.record)
@@ -115,7 +115,9 @@ def load_reconstruction(folder: RunFolder) -> Reconstruction:
         raise InputError(
             f"{folder.summary} must be what reconstruct wrote, but it lacks or garbles {error}."
         ) from error
-    return Reconstruction(read_gaussians(folder.gaussians), energy, oversample, timing, finished)
+    plain = folder.read_config().get("settings", {}).get("fit", {}).get("backend") == "reference"
+    cloud = read_gaussians(folder.gaussians).on("reference" if plain else "cpu")
+    return Reconstruction(cloud, energy, oversample, timing, finished)
 
 
 class _Journal:
@@ -133,7 +135,8 @@ class _Journal:
         """Take in one step's record."""
         self._pending.append(record)
         self._on_progress("fit", self._fit.step / self._fit.options.schedule.steps, record)
-        if time.perf_counter() - self._saved > CHECKPOINT_SECONDS:
+        up_to_date = record["step"] == self._fit.step  # on a GPU, records come late and in batches
+        if up_to_date and time.perf_counter() - self._saved > CHECKPOINT_SECONDS:
             self._save()
 
     def close(self) -> Reconstruction:
@@ -196,10 +199,10 @@ def _resumed(
     return folder.load_checkpoint()
 
 
-def _begin(folder: RunFolder, scan: Scan, prior: MaterialPrior, settings: Settings, seed: int) -> None:
+def _begin(folder: RunFolder, config: dict[str, Any]) -> None:
     """Make the folder, once there is something to put in it."""
     folder.create()
-    write_json(folder.config, {**_config(scan, prior, settings, seed), **environment()})
+    write_json(folder.config, config)
 
 
 def _config(scan: Scan, prior: MaterialPrior, settings: Settings, seed: int) -> dict[str, Any]:

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from .. import __version__
+from ..backends import device_name
 from ..checks import InputError, require
 from ..io.atomic import atomic_path
 from ..io.hdf5 import Fields, attribute_numbers, open_hdf5
@@ -150,8 +151,8 @@ def scan_hash(scan: Scan) -> str:
     return digest.hexdigest()[:16]
 
 
-def environment() -> dict[str, dict[str, str]]:
-    """Versions and machine, for config.json."""
+def environment(backend: str) -> dict[str, dict[str, str]]:
+    """Versions and machine, for config.json; `backend` is the one that fits."""
     return {
         "versions": {
             "holosplat": __version__,
@@ -163,7 +164,8 @@ def environment() -> dict[str, dict[str, str]]:
             "system": platform.platform(),
             "processor": _processor(),
             "threads": f"{torch.get_num_threads()} of {os.cpu_count()} cores",
-            "device": "cpu",
+            "backend": backend,
+            "device": device_name(backend),
         },
     }
 

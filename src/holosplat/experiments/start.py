@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
 
 from ..baselines import holographic_tv
-from ..baselines.material import estimate_delta, estimate_ratio
+from ..baselines.material import Backend, estimate_delta, estimate_ratio
 from ..materials import WATER, DeltaBeta
 from ..optics.retrieval import retrieve_thickness
 from ..representations import GaussianCloud, approximate, at_pitch, cloud_from_volume, freed, random_cloud
@@ -29,21 +30,22 @@ def starting_cloud(
 def _from_phase_retrieval(
     scan: Scan, prior: MaterialPrior, settings: Settings, seed: int, on_progress: Progress
 ) -> GaussianCloud:
-    material = _material(scan, prior, on_progress)
-    volume, grid = holographic_tv(scan, material, settings.volume, on_progress)
+    backend = "reference" if settings.fit.backend == "reference" else "cpu"  # the start has no kernels for GPUs
+    material = _material(scan, prior, on_progress, backend)
+    volume, grid = holographic_tv(scan, material, replace(settings.volume, backend=backend), on_progress)
     pitch = scan.views.pixel_size
     whole = at_pitch(volume, grid, pitch)
-    cloud = cloud_from_volume(*whole, material, settings.spacing_px * pitch, pitch, settings.max_start)
+    cloud = cloud_from_volume(*whole, material, settings.spacing_px * pitch, pitch, settings.max_start).on(backend)
     cloud = approximate(cloud, volume, grid, settings.approximate_steps, on_progress)
     return freed(cloud) if prior.kind == "free" else cloud
 
 
-def _material(scan: Scan, prior: MaterialPrior, on_progress: Progress) -> DeltaBeta:
+def _material(scan: Scan, prior: MaterialPrior, on_progress: Progress, backend: Backend) -> DeltaBeta:
     """δ and β of the material: as known, or as the holograms suggest."""
     if prior.kind == "known":
         return DeltaBeta(prior.delta, prior.beta)
-    ratio = prior.ratio if prior.kind == "ratio" else estimate_ratio(scan, on_progress)
-    delta = estimate_delta(scan, ratio, on_progress)
+    ratio = prior.ratio if prior.kind == "ratio" else estimate_ratio(scan, on_progress, backend)
+    delta = estimate_delta(scan, ratio, on_progress, backend)
     return DeltaBeta(delta, delta / ratio)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -48,7 +49,7 @@ class GradientRecord:
     def add(self, gradient: Tensor) -> None:
         """Take in the position gradients [N, 3] of one step."""
         size = gradient.norm(dim=1)
-        self.total = size.clone() if self.total is None else self.total + size
+        self.total = size if self.total is None else self.total.add_(size)
 
     def clear(self) -> None:
         """Forget everything."""
@@ -81,7 +82,7 @@ def _grow(trainable: Trainable, record: GradientRecord, options: DensityControl,
     chosen = torch.topk(record.total, count).indices.sort().values
     large = cloud.scales.detach()[chosen].amax(dim=1) > options.split_scale_px
     clones, splits = chosen[~large], chosen[large]
-    keep = torch.ones(len(cloud), dtype=torch.bool)
+    keep = torch.ones(len(cloud), dtype=torch.bool, device=chosen.device)
     keep[chosen] = False
     children = [_pair(cloud, clones, generator, shrink=1.0), _pair(cloud, splits, generator, shrink=1.6)]
     trainable.resize(torch.nonzero(keep)[:, 0], tuple(torch.cat(parts) for parts in zip(*children)))
@@ -94,12 +95,12 @@ def _pair(
     """Two children of each Gaussian of `index`, that share its mass, half a deviation to either side of it."""
     centres, log_scales, quaternions, _ = (p.detach()[index] for p in cloud.parameters)
     scales = torch.exp(log_scales)
-    axis = torch.randn(centres.shape, generator=generator)
+    axis = torch.randn(centres.shape, generator=generator).to(centres.device)
     offset = rotate(quaternions, 0.5 * scales * axis / axis.norm(dim=1, keepdim=True).clamp_min(1e-6))
     amplitude = cloud.amplitudes.detach()[index] * 0.5 * shrink**3
     children = (
         torch.cat([centres + offset, centres - offset]),
-        torch.cat([log_scales, log_scales]) - torch.log(torch.tensor(shrink)),
+        torch.cat([log_scales, log_scales]) - math.log(shrink),
         torch.cat([quaternions, quaternions]),
         torch.cat([raw_of(amplitude)] * 2),
     )
@@ -127,8 +128,9 @@ def doomed(cloud: GaussianCloud, views: Views, options: DensityControl) -> Tenso
 
 def outside(cloud: GaussianCloud, views: Views) -> Tensor:
     """[N] bool: Gaussians whose centre no view has on its detector."""
-    rotations = torch.as_tensor(views.rotations, dtype=torch.float32)
-    shifts = torch.as_tensor(views.shifts / cloud.unit_length, dtype=torch.float32)
+    held = {"dtype": torch.float32, "device": cloud.centres.device}
+    rotations = torch.as_tensor(views.rotations, **held)
+    shifts = torch.as_tensor(views.shifts / cloud.unit_length, **held)
     lab = torch.einsum("vij,nj->vni", rotations[:, :2], cloud.centres.detach()) - shifts[:, None]
-    half = torch.tensor([views.width, views.height]) / (2 * cloud.unit_length)
+    half = torch.tensor([views.width, views.height], **held) / (2 * cloud.unit_length)
     return ~(lab.abs() <= half).all(dim=2).any(dim=0)

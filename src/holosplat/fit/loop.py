@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -11,20 +12,23 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import require
+from ..backends import resolve
+from ..checks import InputError, require
 from ..forward import Instrument, resolving_oversample
 from ..geometry import Grid
 from ..representations.gaussians import GaussianCloud
 from ..scan import Scan
 from . import objective as terms
+from .capture import CapturedStep
 from .density import DensityControl, GradientRecord, control_density
 from .interrupt import interrupts_held
+from .misfit import IMAGE_TERMS, OBJECT_TERMS, Draw, Misfit
 from .objective import Objective
 from .schedule import Schedule
 from .trainable import Trainable
 
-IMAGE_TERMS = ("l1", "l2_amplitude", "ssim", "tv_image", "frc")
-OBJECT_TERMS = ("anisotropy", "tv_volume", "overfull")
+UNREAD_STEPS = 20
+"""Steps on a GPU between looks at their values, each of which waits for it."""
 
 Record = dict[str, float]
 """One row of metrics.csv."""
@@ -32,33 +36,41 @@ Record = dict[str, float]
 
 @dataclass(frozen=True)
 class FitOptions:
-    """What is minimised, how, and where Gaussians come and go."""
+    """What is minimised, how, where Gaussians come and go, and which backend does it (see `backends`)."""
 
     objective: Objective = field(default_factory=Objective)
     schedule: Schedule = field(default_factory=Schedule)
     density: DensityControl = field(default_factory=DensityControl)
+    backend: str = "auto"
 
 
 class Fit:
-    """A fit in progress. `run` advances it; `state_dict` and `load` make it resumable, bit for bit."""
+    """A fit in progress. `run` advances it; `state_dict` and `load` make it resumable (on a CPU bit for bit)."""
 
     def __init__(self, scan: Scan, cloud: GaussianCloud, options: FitOptions, seed: int = 0) -> None:
         self.options, self.seed = options, seed
-        self.train, self.validation = split_validation(scan.train(), options.schedule.validation_views)
-        oversample = options.schedule.oversample or resolving_oversample(self.train.exposures, 1.5, at_least=1)
-        self.instrument = Instrument(self.train.exposures, oversample)
-        self._judge = Instrument(self.validation.exposures, oversample) if len(self.validation) else None
-        self._low, self._high = float(self.train.frames.min()), float(self.train.frames.max())
-        require(self._high > self._low, "all training frames are constant, so there is nothing to fit.")
-        self._measured = torch.from_numpy(self.train.frames)
+        self.backend = resolve(options.backend)
+        schedule = options.schedule
+        self.train, self.validation = split_validation(scan.train(), schedule.validation_views)
+        oversample = schedule.oversample or resolving_oversample(self.train.exposures, 1.5, at_least=1)
+        self.instrument = Instrument(self.train.exposures, oversample, backend=self.backend)
+        self._judge = self._instrument_of(self.validation) if len(self.validation) else None
+        require(np.ptp(self.train.frames) > 0, "all training frames are constant, so there is nothing to fit.")
         self._grid = Grid.of_views(scan.views)
-        self.trainable = Trainable(cloud)
+        block = self._grid.block((0, 0, 0), self._block_shape())
+        self._misfit = Misfit(self.train, self.instrument, options.objective, schedule.detach_worst, block)
+        self.trainable = Trainable(cloud.on(self.backend), self.backend)
         self.gradients = GradientRecord()
         self.step, self.seconds = 0, 0.0
+        self._unread: list[tuple[Record, list[str], Tensor]] = []
+        self._capture = CapturedStep(self._work) if self.instrument.device.type == "cuda" else None
         self._generator = torch.Generator().manual_seed(seed)
         self._order: list[int] = []
-        self.best_score, self.best_step, self._best = float("inf"), 0, cloud.detached()
+        self.best_score, self.best_step, self._best = float("inf"), 0, self.cloud.detached()
         self.stopped_early = False
+
+    def _instrument_of(self, scan: Scan) -> Instrument:
+        return Instrument(scan.exposures, self.instrument.oversample, backend=self.backend)
 
     @property
     def cloud(self) -> GaussianCloud:
@@ -71,8 +83,9 @@ class Fit:
         return self.stopped_early or self.step >= self.options.schedule.steps
 
     def result(self) -> GaussianCloud:
-        """The best cloud by the validation views, or the last one where there are none."""
-        return self._best if self._judge is not None and self.best_step > 0 else self.cloud.detached()
+        """The best cloud by the validation views, or the last one where there are none; in main memory."""
+        best = self._best if self._judge is not None and self.best_step > 0 else self.cloud.detached()
+        return best.on("cpu" if self.backend == "cuda" else self.backend)
 
     def columns(self) -> list[str]:
         """Names of everything that a record may hold, in the order of metrics.csv."""
@@ -83,28 +96,81 @@ class Fit:
         return ["step", "seconds", "loss", *used, "count", *judged]
 
     def run(self, on_record: Callable[[Record], None], until: int | None = None) -> None:
-        """Advance to the end (or to step `until`); `on_record` receives one record a step."""
+        """Advance to the end (or to step `until`); `on_record` receives one record a step, on a GPU in batches."""
         end = self.options.schedule.steps if until is None else min(until, self.options.schedule.steps)
-        with interrupts_held() as release:
-            while self.step < end and not self.stopped_early:
-                started = time.perf_counter()
-                record = self._advance()
-                self.seconds += time.perf_counter() - started
-                on_record({"step": self.step, "seconds": self.seconds, **record})
-                release()
+        try:
+            with interrupts_held() as release:
+                while self.step < end and not self.stopped_early:
+                    started = time.perf_counter()
+                    self._advance()
+                    if self._capture is None or len(self._unread) >= UNREAD_STEPS:
+                        self._deliver(on_record, started)
+                    else:
+                        self.seconds += time.perf_counter() - started
+                    release()
+        finally:
+            self._deliver(on_record, time.perf_counter())
 
-    def _advance(self) -> Record:
-        schedule = self.options.schedule
-        record = self._gradients(self._draw_views())
-        self.gradients.add(_gradient(self.cloud.centres))
-        self.trainable.step(schedule.rates(self.step))
-        if self.options.density.due(self.step, schedule.steps):
-            control_density(self.trainable, self.gradients, self.train.views, self.options.density, self._generator)
+    def _deliver(self, on_record: Callable[[Record], None], started: float) -> None:
+        """Read the steps that were not read yet, count the time since `started`, and hand out their records."""
+        records = self._read()
+        self.seconds += time.perf_counter() - started
+        for record in records:
+            on_record({"seconds": self.seconds, **record})
+
+    def _advance(self) -> None:
+        schedule, density = self.options.schedule, self.options.density
+        draw = self._draw()
+        self.trainable.prepare(schedule.rates(self.step))
+        values = self._work(draw) if self._capture is None else self._capture(draw)
+        if density.due(self.step, schedule.steps):
+            control_density(self.trainable, self.gradients, self.train.views, density, self._generator)
+            if self._capture is not None:
+                self._capture.forget()
         self.step += 1
-        record["count"] = len(self.cloud)
+        record: Record = {"step": self.step, "count": len(self.cloud)}
         if self._judge is not None and (self.step % schedule.validate_every == 0 or self.step == schedule.steps):
             record |= self._validate()
-        return record
+        self._unread.append((record, self._misfit.names(self.cloud, draw), values))
+
+    def _work(self, draw: Draw) -> Tensor:
+        """One step on the device: gradients, what density control wants of them, Adam. Waits for nothing."""
+        loss, values = self._misfit(self.cloud, draw)
+        loss.backward()
+        if self.options.density.every > 0:
+            self.gradients.add(_gradient(self.cloud.centres))
+        self.trainable.apply()
+        sound = torch.stack([p.detach().sum() for p in self.cloud.parameters]).sum()[None]
+        return torch.cat([values, sound])
+
+    def _read(self) -> list[Record]:
+        """The records of all steps that were not read yet; `InputError` if the fit has diverged."""
+        records = []
+        unread, self._unread = self._unread, []
+        for record, names, values in unread:
+            *numbers, sound = values.tolist()
+            if not math.isfinite(sound + numbers[0]):
+                raise InputError(
+                    f"the fit diverged at step {record['step']:.0f}: its parameters are no longer finite; "
+                    "lower the rates of the schedule (rate_position, rate_scale, rate_rotation, rate_amplitude)."
+                )
+            records.append({**record, **dict(zip(names, numbers))})
+        return records
+
+    def _draw(self) -> Draw:
+        """What the next step looks at, by the schedule and the generator."""
+        schedule, w, on = self.options.schedule, self.options.objective, self.instrument.device
+        views = self._draw_views()
+        whole = len(views) == len(self.train)
+        volume = schedule.volume_every if w.uses_volume and self.step % schedule.volume_every == 0 else 0
+        middle = self._volume_block().centre if volume else np.zeros(3)
+        ramp = min(1.0, self.step / max(1.0, w.frc_ramp * schedule.steps))
+        return Draw(
+            None if whole else torch.from_numpy(views).to(on),
+            torch.from_numpy(middle).to(on),
+            torch.tensor(ramp).to(on),
+            volume,
+        )
 
     def _draw_views(self) -> np.ndarray:
         """The views of this step: all, or the next ones of a shuffled order without replacement."""
@@ -118,67 +184,24 @@ class Fit:
         drawn, self._order = self._order[:count], self._order[count:]
         return np.array(sorted(drawn))
 
-    def _gradients(self, index: np.ndarray) -> Record:
-        """Back-propagate the objective of the views `index`; returns its terms."""
-        schedule = self.options.schedule
-        predicted = self.instrument.measure(self.cloud, index)
-        parts = self._image_terms(predicted, self._measured[torch.from_numpy(index)])
-        per_view = sum(weight * value for weight, value in parts.values())
-        assert isinstance(per_view, Tensor)
-        if schedule.detach_worst and len(index) > 1:
-            per_view = torch.where(per_view > per_view.detach().median(), per_view.detach(), per_view)
-        loss = per_view.mean()
-        record = {name: float(value.detach().mean()) for name, (_, value) in parts.items()}
-        for name, weight, value in self._object_terms():
-            loss = loss + weight * value
-            record[name] = float(value.detach())
-        loss.backward()
-        return {"loss": float(loss.detach()), **record}
-
-    def _image_terms(self, predicted: Tensor, measured: Tensor) -> dict[str, tuple[float, Tensor]]:
-        """Weight and value [V] of every image term in use."""
-        w = self.options.objective
-        span = self._high - self._low
-        a, b = (predicted - self._low) / span, (measured - self._low) / span
-        ramp = min(1.0, self.step / max(1.0, w.frc_ramp * self.options.schedule.steps))
-        table: list[tuple[str, float, Callable[[], Tensor]]] = [
-            ("l1", w.l1, lambda: terms.l1(a, b)),
-            ("l2_amplitude", w.l2_amplitude, lambda: terms.l2_amplitude(predicted, measured)),
-            ("ssim", w.ssim, lambda: terms.one_minus_ssim(a, b)),
-            ("tv_image", w.tv_image, lambda: terms.tv_image(a)),
-            ("frc", w.frc * ramp, lambda: terms.one_minus_frcm(a, b)),
-        ]
-        return {name: (weight, value()) for name, weight, value in table if weight > 0}
-
-    def _object_terms(self) -> list[tuple[str, float, Tensor]]:
-        """Name, weight and value of every term on the Gaussians in use at this step."""
-        w, every = self.options.objective, self.options.schedule.volume_every
-        found = []
-        if w.anisotropy > 0:
-            found.append(("anisotropy", w.anisotropy, terms.anisotropy(self.cloud.log_scales, w.anisotropy_limit)))
-        if w.uses_volume and self.step % every == 0:
-            density = self.cloud.density(self._volume_block())
-            if w.tv_volume > 0:
-                found.append(("tv_volume", w.tv_volume * every, terms.tv_volume(density)))
-            if w.overfull > 0 and self.cloud.single_material:
-                found.append(("overfull", w.overfull * every, terms.overfull(density)))
-        return found
-
     def _volume_block(self) -> Grid:
         """Where this step looks at the volume: all of it, or a random block where it is large."""
-        edge = self.options.schedule.volume_edge
-        shape = tuple(min(n, edge) for n in self._grid.shape)
+        shape = self._block_shape()
         free = [n - m for n, m in zip(self._grid.shape, shape)]
         start = [int(torch.randint(f + 1, (1,), generator=self._generator)) for f in free]
-        return self._grid.block((start[0], start[1], start[2]), (shape[0], shape[1], shape[2]))
+        return self._grid.block((start[0], start[1], start[2]), shape)
+
+    def _block_shape(self) -> tuple[int, int, int]:
+        z, y, x = (min(n, self.options.schedule.volume_edge) for n in self._grid.shape)
+        return z, y, x
 
     def _validate(self) -> Record:
         """Look at the validation views; keeps the best cloud, and stops the fit when patience is over."""
         assert self._judge is not None
         with torch.no_grad():
-            predicted = self._judge.measure(self.cloud)
-        span = self._high - self._low
-        a, b = (predicted - self._low) / span, (torch.from_numpy(self.validation.frames) - self._low) / span
+            predicted = self._judge.measure(self.cloud).cpu()
+        frames, low, span = torch.from_numpy(self.validation.frames), self._misfit.low, self._misfit.span
+        a, b = (predicted - low) / span, (frames - low) / span
         ssim, frcm = (1 - float(term(a, b).mean()) for term in (terms.one_minus_ssim, terms.one_minus_frcm))
         score = 1 - 0.5 * (ssim + frcm)  # not L1, which prefers a blurred object to one with its fringes misplaced
         if score < self.best_score:
@@ -192,24 +215,27 @@ class Fit:
         """Everything that `load` needs to go on as if nothing had happened."""
         return {
             "trainable": self.trainable.state_dict(),
-            "gradients": self.gradients.total,
+            "gradients": None if self.gradients.total is None else self.gradients.total.cpu().clone(),
             "step": self.step,
             "seconds": self.seconds,
             "generator": self._generator.get_state(),
             "order": self._order,
-            "best": (self.best_score, self.best_step, [p.clone() for p in self._best.parameters]),
+            "best": (self.best_score, self.best_step, [p.cpu().clone() for p in self._best.parameters]),
             "stopped_early": self.stopped_early,
         }
 
     def load(self, state: dict[str, Any]) -> None:
         """Go back to a saved state."""
         self.trainable.load(state["trainable"])
-        self.gradients.total = state["gradients"]
+        total = state["gradients"]
+        self.gradients.total = None if total is None else total.to(self.instrument.device).clone()
         self.step, self.seconds, self.stopped_early = state["step"], state["seconds"], state["stopped_early"]
         self._generator.set_state(state["generator"])
         self._order = list(state["order"])
         self.best_score, self.best_step, parameters = state["best"]
-        self._best = self._best.replaced(parameters)
+        self._best = self._best.replaced(p.to(self.instrument.device) for p in parameters)
+        if self._capture is not None:
+            self._capture.forget()
 
 
 def split_validation(train: Scan, count: int) -> tuple[Scan, Scan]:

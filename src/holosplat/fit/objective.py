@@ -5,14 +5,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from .. import native
-
-SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
+from .fidelity import reference as plain
 
 
 @dataclass(frozen=True)
@@ -63,18 +60,7 @@ def l2_amplitude(predicted: Tensor, measured: Tensor) -> Tensor:
 
 def one_minus_ssim(predicted: Tensor, measured: Tensor) -> Tensor:
     """1 - SSIM of each view, [V, H, W] of data range 1 → [V] (Wang et al. 2004, eq. 13; 11 × 11, σ = 1.5)."""
-    rows, columns = (_window_matrix(n, predicted.dtype) for n in predicted.shape[1:])
-
-    def local_mean(image: Tensor) -> Tensor:
-        return rows @ image @ columns.T
-
-    mean_a, mean_b = local_mean(predicted), local_mean(measured)
-    var_a = local_mean(predicted * predicted) - mean_a**2
-    var_b = local_mean(measured * measured) - mean_b**2
-    covariance = local_mean(predicted * measured) - mean_a * mean_b
-    c1, c2 = 0.01**2, 0.03**2
-    numerator = (2 * mean_a * mean_b + c1) * (2 * covariance + c2)
-    return 1 - (numerator / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))).mean(dim=(1, 2))
+    return plain.one_minus_ssim(predicted, measured, plain.statistics(measured, 0.0, 1.0))
 
 
 def tv_image(image: Tensor) -> Tensor:
@@ -84,7 +70,7 @@ def tv_image(image: Tensor) -> Tensor:
 
 def one_minus_frcm(predicted: Tensor, measured: Tensor) -> Tensor:
     """1 - FRCM of each view, [V, H, W] → [V]; FRCM = Σ r·FRC(r)/Σ r over rings 1 … Nyquist."""
-    ring, count = _rings(predicted.shape[1], predicted.shape[2])
+    ring, count = _rings(predicted.shape[1], predicted.shape[2], predicted.device)
     spectra = [torch.fft.fft2(f - f.mean(dim=(1, 2), keepdim=True)).flatten(1) for f in (predicted, measured)]
 
     def ring_sum(values: Tensor) -> Tensor:
@@ -92,7 +78,7 @@ def one_minus_frcm(predicted: Tensor, measured: Tensor) -> Tensor:
 
     cross = ring_sum((spectra[0] * spectra[1].conj()).real)
     power = ring_sum(spectra[0].abs().square()) * ring_sum(spectra[1].abs().square())
-    weight = torch.arange(1, count + 1, dtype=predicted.dtype)
+    weight = torch.arange(1, count + 1, dtype=predicted.dtype, device=predicted.device)
     return 1 - (cross / power.clamp_min(1e-20).sqrt() * weight).sum(1) / weight.sum()
 
 
@@ -101,49 +87,7 @@ def anisotropy(log_scales: Tensor, limit: float) -> Tensor:
     if len(log_scales) == 0:
         return log_scales.sum()
     spread = log_scales.amax(dim=1) - log_scales.amin(dim=1)
-    return (spread - torch.log(torch.tensor(limit))).clamp_min(0).mean()
-
-
-def tv_volume(density: Tensor, smoothing: float = 0.02) -> Tensor:
-    """Isotropic total variation of [C, Z, Y, X], mean over voxels, smoothed at `smoothing` (Rudin et al. 1992).
-
-    `sqrt(|∇u|² + s²) - s` with forward differences, over the voxels that have all three neighbours. Float32 runs
-    a fused kernel, any other type `tv_volume_reference`, which defines it.
-    """
-    if density.dtype != torch.float32:
-        return tv_volume_reference(density, smoothing)
-    return torch.stack([_FusedTV.apply(channel, smoothing) for channel in density]).mean()
-
-
-def tv_volume_reference(density: Tensor, smoothing: float) -> Tensor:
-    """The plain form of `tv_volume`, any float type."""
-    core = density[:, :-1, :-1, :-1]
-    square = (density[:, 1:, :-1, :-1] - core).square()
-    square = square + (density[:, :-1, 1:, :-1] - core).square()
-    square = square + (density[:, :-1, :-1, 1:] - core).square()
-    return ((square + smoothing**2).sqrt() - smoothing).mean()
-
-
-class _FusedTV(torch.autograd.Function):
-    """Value and gradient of one channel's total variation in one pass of the compiled kernel."""
-
-    @staticmethod
-    def forward(ctx: Any, density: Tensor, smoothing: float) -> Tensor:
-        volume = density.detach().contiguous()
-        gradient, value = torch.empty_like(volume), torch.zeros(1, dtype=torch.float64)
-        pointers = [native.c_void_p(array.data_ptr()) for array in (volume, gradient, value)]
-        threads = torch.get_num_threads()
-        native.call(
-            "holosplat_tv_smooth", native.Grid(*volume.shape), pointers[0], smoothing, pointers[1], pointers[2], threads
-        )
-        voxels = math.prod(n - 1 for n in volume.shape)
-        ctx.save_for_backward(gradient.div_(voxels))
-        return (value[0] / voxels).to(density.dtype)
-
-    @staticmethod
-    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
-        (gradient,) = ctx.saved_tensors
-        return gradient * upstream[0], None
+    return (spread - math.log(limit)).clamp_min(0).mean()
 
 
 def overfull(density: Tensor) -> Tensor:
@@ -152,21 +96,10 @@ def overfull(density: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=8)
-def _window_matrix(n: int, dtype: torch.dtype) -> Tensor:
-    """[n - 10, n]: the Gaussian window as a banded matrix, windows wholly inside only (small n: the whole)."""
-    width = min(SSIM_WINDOW, n)
-    weights = torch.exp(-0.5 * ((torch.arange(width) - (width - 1) / 2) / SSIM_SIGMA) ** 2)
-    matrix = torch.zeros(n - width + 1, n, dtype=torch.float64)
-    for i in range(len(matrix)):
-        matrix[i, i : i + width] = (weights / weights.sum()).double()
-    return matrix.to(dtype)
-
-
-@lru_cache(maxsize=8)
-def _rings(h: int, w: int) -> tuple[Tensor, int]:
+def _rings(h: int, w: int, device: torch.device) -> tuple[Tensor, int]:
     """Ring index of each Fourier sample (0: the mean and beyond Nyquist), and the number of rings."""
     shortest = min(h, w)  # a ring is one frequency step of the shorter side wide, as in metrics.correlation
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) * shortest for n in (h, w))
     ring = torch.floor(torch.sqrt(fy[:, None] ** 2 + fx[None] ** 2) + (0.5 + 1e-9)).long().flatten()
     count = shortest // 2
-    return torch.where(ring <= count, ring, 0), count
+    return torch.where(ring <= count, ring, 0).to(device), count

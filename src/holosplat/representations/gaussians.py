@@ -9,10 +9,11 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize, softplus
 
+from ..backends import device
 from ..checks import require
-from ..geometry import Grid, Views
+from ..geometry import Grid, Poses, Views
 from ..projectors.splat import splat, voxelise
-from ..volume import Volume
+from ..volume import LineIntegrals, Volume
 
 PARAMETERS = ("centres", "log_scales", "quaternions", "raw_amplitudes")
 """The trainable tensors, in the order of `GaussianCloud.parameters`."""
@@ -72,49 +73,67 @@ class GaussianCloud:
         """A copy that carries no gradients."""
         return self.replaced(p.detach().clone() for p in self.parameters)
 
+    def on(self, backend: str) -> GaussianCloud:
+        """The cloud for another backend (resolved: `cpu`, `cuda`, `reference`), on that backend's device."""
+        cloud = self.replaced(p.to(device(backend)) for p in self.parameters)
+        cloud.backend = backend
+        return cloud
+
     def at(self, time: float) -> GaussianCloud:
         """The cloud itself: it does not move."""
         return self
 
-    def thickness(self, views: Views) -> Tensor:
-        """Line integrals [V, C, H, W] of the amplitudes, in units of `unit_length`."""
-        scale = self.unit_length / views.pixel_size
+    def thickness(self, views: Views | Poses) -> Tensor:
+        """Line integrals [V, C, H, W] of the amplitudes, in units of `unit_length`.
+
+        Views are checked, Poses (on the cloud's device) are taken as they are, without waiting for a GPU.
+        """
+        poses = Poses.of(views, self.centres.device) if isinstance(views, Views) else views
+        scale = self.unit_length / poses.pixel_size
         return splat(
-            self.centres * scale,
-            self.scales * scale,
-            self.quaternions,
-            self.amplitudes / scale,
-            views.rotations,
-            views.shifts / views.pixel_size,
-            views.shape,
+            *self._scaled(scale),
+            amplitudes=self.amplitudes if scale == 1 else self.amplitudes / scale,
+            rotations=poses.rotations,
+            shifts=poses.shifts / poses.pixel_size,
+            shape=poses.shape,
             backend=self.backend,
+            checked=not isinstance(views, Views),
         )
 
-    def project(self, views: Views) -> tuple[Tensor, Tensor]:
-        """Line integrals (B, D), each [V, H, W] in metres, differentiable in the parameters."""
-        lines = self.thickness(views) * self.unit_length
-        return lines[:, -1] * self.beta, lines[:, 0] * self.delta
+    def project(self, views: Views | Poses) -> LineIntegrals:
+        """Line integrals (B, D), differentiable in the parameters."""
+        delta, beta = self.delta * self.unit_length, self.beta * self.unit_length
+        materials = ((delta, beta),) if self.single_material else ((delta, 0.0), (0.0, beta))
+        return LineIntegrals(self.thickness(views), materials)
 
     def density(self, grid: Grid) -> Tensor:
         """Amplitudes [C, Z, Y, X] on `grid` (cubic voxels), averaged over voxels; differentiable."""
         pitch = grid.voxel_size[0]
         require(np.allclose(grid.voxel_size, pitch), "Gaussians are voxelised on cubic voxels only.")
+        middle = torch.as_tensor(grid.centre, dtype=torch.float64, device=self.centres.device)
+        return self.density_around(middle, grid.shape, pitch, checked=False)
+
+    def density_around(self, middle: Tensor, shape: tuple[int, int, int], pitch: float, checked: bool = True) -> Tensor:
+        """As `density`, on `shape` voxels of `pitch` [m] around `middle` [3] `(x, y, z)` [m], float64, on the device.
+
+        By default the cloud's values are taken as they are, without waiting for a GPU.
+        """
         scale = self.unit_length / pitch
-        middle = np.array(grid.origin) / pitch + 0.5 * (np.array(grid.shape[::-1]) - 1)
-        offset = torch.as_tensor(middle, dtype=self.centres.dtype)
-        return voxelise(
-            self.centres * scale - offset,
-            self.scales * scale,
-            self.quaternions,
-            self.amplitudes,
-            grid.shape,
-            backend=self.backend,
-        )
+        centres, scales, quaternions = self._scaled(scale)
+        offset = (middle / pitch).to(centres.dtype)
+        arrays = (centres - offset, scales, quaternions, self.amplitudes)
+        return voxelise(*arrays, shape, backend=self.backend, checked=checked)
+
+    def _scaled(self, scale: float) -> tuple[Tensor, Tensor, Tensor]:
+        """Centres, scales and quaternions in pixels of which `unit_length` holds `scale`."""
+        if scale == 1:
+            return self.centres, self.scales, self.quaternions
+        return self.centres * scale, self.scales * scale, self.quaternions
 
     def voxelise(self, grid: Grid) -> Volume:
         """δ and β on `grid`."""
         with torch.no_grad():
-            density = self.density(grid).numpy()
+            density = self.density(grid).cpu().numpy()
         return Volume(density[0] * self.delta, density[-1] * self.beta, grid)
 
     def masses(self) -> Tensor:

@@ -8,25 +8,23 @@ A cloud of N Gaussians has, with every length in PIXELS (someone else scales fro
 - amplitudes [N, C], C = 1 or 2: signed peak values `a` of the Gaussian `a exp(-½ (x-c)ᵀ Σ⁻¹ (x-c))`, whose
   covariance is `Σ = R_q diag(s²) R_qᵀ`.
 
-Backends: `cpu` (C++, float32) and `reference` (plain torch, any float type and device, slow), which is the
-specification of the other. Both give gradients of the four arrays above, and of nothing else.
+Backends: `cpu` (C++, float32), `cuda` (Triton, float32, tensors on the GPU) and `reference` (plain torch, any float
+type and device, slow), which is the specification of the others. All give gradients of the four arrays above, and of
+nothing else.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ...backends import implementation, interpreted
 from ...checks import InputError, finite, require, shaped
-from . import cpu, reference
 
-BACKENDS = ("cpu", "reference")
-_SPLAT: dict[str, Callable[..., Tensor]] = {"cpu": cpu.splat, "reference": reference.splat}
-_VOXELISE: dict[str, Callable[..., Tensor]] = {"cpu": cpu.voxelise, "reference": reference.voxelise}
+BACKENDS = ("cpu", "cuda", "reference")
 
 
 def splat(
@@ -41,6 +39,7 @@ def splat(
     backend: str = "cpu",
     cutoff: float = 4.0,
     pixel_variance: float = 1 / 12,
+    checked: bool = False,
 ) -> Tensor:
     """Line integrals [V, C, H, W] of a Gaussian cloud along the beam (amplitude × pixels), for V views.
 
@@ -52,16 +51,19 @@ def splat(
     for integration over its area (within 0.3 % for σ ≥ 1 px). The sum over pixels is the mass within 0.3 %
     for σ ≥ 0.5 px; thinner Gaussians keep it only on average over positions in the pixel (±7 % at 0.3 px).
     Each Gaussian adds to the pixels of the rectangle that holds its `cutoff`-σ ellipse, and to no other.
-    Errors: `InputError` for input of the wrong shape, type or range; `RuntimeError` if the `cpu` backend's
-    library is missing.
+    `checked`: the caller vouches for types, shapes and values (rotations and shifts being float64 tensors on the
+    cloud's device); for inner loops, where a look at the values would wait for a GPU.
+    Errors: `InputError` for input of the wrong shape, type or range; `RuntimeError` if the backend's library is
+    missing.
     """
-    project = _of(_SPLAT, backend)
-    _check_cloud(backend, centres, scales, quaternions, amplitudes)
-    _check_raster("detector shape", shape, "two positive counts (rows, columns)", 2)
-    _check_spread(cutoff, "pixel_variance", pixel_variance)
-    rotations, shifts = _check_views(rotations, shifts)
+    run = implementation(__name__, backend).splat
     cloud = (centres, scales, quaternions, amplitudes)
-    return project(*cloud, rotations, shifts, _counts(shape), float(cutoff), float(pixel_variance))
+    if not checked:
+        _check_cloud(backend, *cloud)
+        _check_raster("detector shape", shape, "two positive counts (rows, columns)", 2)
+        _check_spread(cutoff, "pixel_variance", pixel_variance)
+        rotations, shifts = (array.to(centres.device) for array in _check_views(rotations, shifts))
+    return run(*cloud, rotations, shifts, _counts(shape), float(cutoff), float(pixel_variance))
 
 
 def voxelise(
@@ -74,25 +76,22 @@ def voxelise(
     backend: str = "cpu",
     cutoff: float = 4.0,
     voxel_variance: float = 1 / 12,
+    checked: bool = False,
 ) -> Tensor:
     """A Gaussian cloud on a voxel raster, [C, Z, Y, X]: nearly its mean over each voxel.
 
     The cloud is described at the top of this module, with the voxel pitch as the pixel. Voxel `[z, y, x]` of
     `shape = (Z, Y, X)` has its centre at `(x + ½ - X/2, y + ½ - Y/2, z + ½ - Z/2)`. `voxel_variance` [voxel²]
     is added to the covariance as `pixel_variance` is in `splat`, with the mass conserved. Each Gaussian adds
-    to the voxels of the cuboid that holds its `cutoff`-σ ellipsoid. Errors: as `splat`.
+    to the voxels of the cuboid that holds its `cutoff`-σ ellipsoid. `checked` and errors: as `splat`.
     """
-    fill = _of(_VOXELISE, backend)
-    _check_cloud(backend, centres, scales, quaternions, amplitudes)
-    _check_raster("volume shape", shape, "three positive counts (Z, Y, X)", 3)
-    _check_spread(cutoff, "voxel_variance", voxel_variance)
+    run = implementation(__name__, backend).voxelise
     cloud = (centres, scales, quaternions, amplitudes)
-    return fill(*cloud, _counts(shape), float(cutoff), float(voxel_variance))
-
-
-def _of(table: dict[str, Callable[..., Tensor]], backend: str) -> Callable[..., Tensor]:
-    require(backend in table, f"backend must be one of {', '.join(BACKENDS)}, but it is {backend!r}.")
-    return table[backend]
+    if not checked:
+        _check_cloud(backend, *cloud)
+        _check_raster("volume shape", shape, "three positive counts (Z, Y, X)", 3)
+        _check_spread(cutoff, "voxel_variance", voxel_variance)
+    return run(*cloud, _counts(shape), float(cutoff), float(voxel_variance))
 
 
 def _check_cloud(backend: str, centres: Tensor, scales: Tensor, quaternions: Tensor, amplitudes: Tensor) -> None:
@@ -130,10 +129,11 @@ def _check_type(backend: str, name: str, array: Tensor, centres: Tensor) -> None
         alike,
         f"{name} must have the type and device of centres, {centres.dtype} on {centres.device}, but they are {held}.",
     )
-    if backend == "cpu":
+    if backend != "reference":
+        place = "cuda" if backend == "cuda" and not interpreted() else "cpu"
         require(
-            array.dtype == torch.float32 and array.device.type == "cpu",
-            f"{name} must be float32 on the CPU for the cpu backend, but they are {held}; "
+            array.dtype == torch.float32 and array.device.type == place,
+            f"{name} must be float32 on {place} for the {backend} backend, but they are {held}; "
             "convert them, or ask for backend='reference'.",
         )
 

@@ -8,8 +8,11 @@ from .slices import SliceProjector, rows_match
 __all__ = ["LatticeProjector", "SliceProjector", "projector_for", "voxel_line_integrals"]
 
 
-def projector_for(grid: Grid, views: Views) -> SliceProjector | LatticeProjector:
-    """The fastest linear projector that fits: slice matrices for views about y with matching rows, else the lattice."""
+def projector_for(grid: Grid, views: Views, backend: str = "cpu") -> SliceProjector | LatticeProjector:
+    """The fastest linear projector that fits: slice matrices for views about y with matching rows, else the lattice.
+
+    backend: `cpu` or `reference`, for the lattice; slice matrices are torch's.
+    """
     if views.shares_axis and rows_match(grid, views):
         return SliceProjector(grid, views)
-    return LatticeProjector(grid, views)
+    return LatticeProjector(grid, views, backend)

@@ -6,13 +6,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ... import native
 from ...checks import require
 from ...geometry import Grid, Views
-from ... import native
 
 
 class LatticeProjector:
-    """Each voxel casts a bilinear hat of its mass on the detector; forward and exact adjoint, compiled, float32.
+    """Each voxel casts a bilinear hat of its mass on the detector; forward and exact adjoint, float32.
+
+    Backends: `cpu` (compiled) and `reference` (`lattice_reference`, and its adjoint by autograd).
 
     The hat's variance, 1/6 px², is that of a pixel-sized cube's shadow (1/12) seen by a pixel (1/12), so voxels
     should be about as large as the raster's pixels. Single pixels carry a ripple of a few per cent where the
@@ -20,9 +22,9 @@ class LatticeProjector:
     of cubic voxels. Voxels at the very rim of the detector, with a pixel of their hat outside, are left out.
     """
 
-    def __init__(self, grid: Grid, views: Views) -> None:
+    def __init__(self, grid: Grid, views: Views, backend: str = "cpu") -> None:
         require(np.allclose(grid.voxel_size, grid.voxel_size[0]), "the lattice projector needs cubic voxels.")
-        self.grid, self.views = grid, views
+        self.grid, self.views, self.backend = grid, views, backend
         self.array_shape = grid.shape
         pixel = views.pixel_size
         self._rotations = np.ascontiguousarray(views.rotations)
@@ -36,12 +38,17 @@ class LatticeProjector:
 
     def project(self, array: Tensor) -> Tensor:
         """Line integrals [V, H, W] in metres × value of `array` [Z, Y, X]."""
+        if self.backend == "reference":
+            return lattice_reference(array, self.grid, self.views)
         images = torch.empty(len(self.views), *self.views.shape)
         self._call("holosplat_lattice_project", array, images)
         return images.mul_(self._mass)
 
     def backproject(self, lines: Tensor) -> Tensor:
         """The adjoint of `project`: [V, H, W] → [Z, Y, X]."""
+        if self.backend == "reference":
+            anything = torch.zeros(self.grid.shape, requires_grad=True)
+            return torch.autograd.grad(lattice_reference(anything, self.grid, self.views), anything, lines)[0]
         volume = torch.empty(self.grid.shape)
         self._call("holosplat_lattice_backproject", lines, volume)
         return volume.mul_(self._mass)

@@ -1,0 +1,1 @@
+"""The two half-steps of primal–dual total variation on a volume, in place. Backends: `cpu` (C++), `reference`."""

@@ -1,0 +1,110 @@
+"""The objective as a function of the cloud: what one step of a fit differentiates."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ..forward import Instrument
+from ..geometry import Grid, Poses
+from ..representations.gaussians import GaussianCloud
+from ..scan import Scan
+from . import objective as terms
+from .fidelity import Target, l1_and_ssim
+from .objective import Objective
+from .total_variation import total_variation
+
+IMAGE_TERMS = ("l1", "l2_amplitude", "ssim", "tv_image", "frc")
+OBJECT_TERMS = ("anisotropy", "tv_volume", "overfull")
+
+
+@dataclass(frozen=True)
+class Draw:
+    """What one step looks at. The tensors live on the fit's device, where a captured step reads them again.
+
+    index: views [V] int64, or None for all of them in order; middle: centre [3] `(x, y, z)` [m] of the block of volume,
+    float64; ramp: share [] of the weight of the `frc` term; volume: weight of the terms on the volume, 0 where this
+    step does not look at it.
+    """
+
+    index: Tensor | None
+    middle: Tensor
+    ramp: Tensor
+    volume: int
+
+
+class Misfit:
+    """The objective of a scan's frames on one device: `(cloud, draw)` in, loss and single terms out.
+
+    Nothing in a call waits for the device, or depends on values that are not tensors there, but `draw.volume`.
+    """
+
+    def __init__(
+        self, train: Scan, instrument: Instrument, objective: Objective, detach_worst: bool, block: Grid
+    ) -> None:
+        """`train`: the frames to fit; `block`: a grid of the shape and pitch at which the volume is looked at."""
+        self.objective, self.instrument, self._detach_worst = objective, instrument, detach_worst
+        self.low, high = float(train.frames.min()), float(train.frames.max())
+        self.span = high - self.low
+        self._poses = Poses.of(instrument.views, instrument.device)
+        frames = torch.from_numpy(train.frames).to(instrument.device)
+        self._target = Target(frames, self.low, self.span, instrument.backend)
+        self._block = (block.shape, block.voxel_size[0])
+
+    def names(self, cloud: GaussianCloud, draw: Draw) -> list[str]:
+        """What the values of a call with these arguments are called."""
+        w = self.objective
+        image = [name for name in IMAGE_TERMS if getattr(w, name) > 0]
+        shape = ["anisotropy"] if w.anisotropy > 0 else []
+        used = {"tv_volume": w.tv_volume > 0, "overfull": w.overfull > 0 and cloud.single_material}
+        return ["loss", *image, *shape, *(name for name in used if used[name] and draw.volume)]
+
+    def __call__(self, cloud: GaussianCloud, draw: Draw) -> tuple[Tensor, Tensor]:
+        """The loss, and the values [K] of `names(cloud, draw)`, detached."""
+        poses = self._poses if draw.index is None else self._poses[draw.index]
+        predicted = self.instrument.frames(cloud.project(poses), draw.index)
+        parts = self._image_terms(predicted, draw)
+        per_view = sum(weight * value for weight, value in parts.values())
+        assert isinstance(per_view, Tensor)
+        if self._detach_worst and len(per_view) > 1:
+            per_view = torch.where(per_view > per_view.detach().median(), per_view.detach(), per_view)
+        loss = per_view.mean()
+        values = [value.detach().mean() for _, value in parts.values()]
+        for weight, value in self._object_terms(cloud, draw):
+            loss = loss + weight * value
+            values.append(value.detach())
+        return loss, torch.stack([loss.detach(), *values])
+
+    def _image_terms(self, predicted: Tensor, draw: Draw) -> dict[str, tuple[float | Tensor, Tensor]]:
+        """Weight and value [V] of every image term in use."""
+        w, target = self.objective, self._target if draw.index is None else self._target[draw.index]
+        if w.ssim > 0:
+            difference, dissimilarity = l1_and_ssim(predicted, target)
+        else:  # statistics of frames are not needed
+            difference, dissimilarity = terms.l1(predicted, target.frames) / self.span, predicted
+        a, b = ((f - self.low) / self.span if w.tv_image + w.frc > 0 else f for f in (predicted, target.frames))
+        table: list[tuple[str, float, Callable[[], Tensor]]] = [
+            ("l1", w.l1, lambda: difference),
+            ("l2_amplitude", w.l2_amplitude, lambda: terms.l2_amplitude(predicted, target.frames)),
+            ("ssim", w.ssim, lambda: dissimilarity),
+            ("tv_image", w.tv_image, lambda: terms.tv_image(a)),
+            ("frc", w.frc, lambda: terms.one_minus_frcm(a, b)),
+        ]
+        ramps = {"frc": draw.ramp}
+        return {name: (weight * ramps.get(name, 1.0), value()) for name, weight, value in table if weight > 0}
+
+    def _object_terms(self, cloud: GaussianCloud, draw: Draw) -> list[tuple[float, Tensor]]:
+        """Weight and value of every term on the Gaussians in use at this step."""
+        w, found = self.objective, []
+        if w.anisotropy > 0:
+            found.append((w.anisotropy, terms.anisotropy(cloud.log_scales, w.anisotropy_limit)))
+        if draw.volume:
+            density = cloud.density_around(draw.middle, *self._block)
+            if w.tv_volume > 0:
+                found.append((w.tv_volume * draw.volume, total_variation(density, backend=cloud.backend)))
+            if w.overfull > 0 and cloud.single_material:
+                found.append((w.overfull * draw.volume, terms.overfull(density)))
+        return found

@@ -1,0 +1,100 @@
+"""The backend switch: what a name stands for, what is said when something is missing, and that the table is true."""
+
+from __future__ import annotations
+
+import importlib
+
+import pytest
+import torch
+
+from holosplat import backends, native
+from holosplat.backends import DESCRIPTIONS, NAMES, SUPPORT, missing, resolve, support_table
+from holosplat.checks import InputError, MissingError
+
+GONE = "a reason"
+
+
+def lack(monkeypatch, *names: str) -> None:
+    """Make the named backends unusable."""
+    monkeypatch.setattr(backends, "missing", lambda name: GONE if name in names else "")
+
+
+@pytest.mark.parametrize(
+    ("lacking", "wanted"), [((), "cuda"), (("cuda",), "cpu"), (("cpu",), "cuda")], ids=["both", "no GPU", "no kernels"]
+)
+def test_auto_prefers_a_gpu_and_never_takes_the_plain_path(monkeypatch, lacking, wanted):
+    lack(monkeypatch, *lacking)
+    monkeypatch.setenv("TRITON_INTERPRET", "0")
+    assert resolve("auto") == wanted
+
+
+def test_auto_never_takes_the_interpreter(monkeypatch):
+    lack(monkeypatch)
+    monkeypatch.setenv("TRITON_INTERPRET", "1")
+    assert resolve("auto") == "cpu"
+    assert resolve("cuda") == "cuda"
+    lack(monkeypatch, "cpu")
+    with pytest.raises(InputError, match="cannot be used"):
+        resolve("auto")
+
+
+@pytest.mark.parametrize("name", ["auto", "cpu", "cuda"])
+def test_what_is_missing_is_said_of_both_with_the_way_out(monkeypatch, name):
+    monkeypatch.setattr(backends, "missing", lambda which: {"cpu": "no library", "cuda": "no device"}.get(which, ""))
+    with pytest.raises(InputError, match=rf"'{name}'.*cuda: no device; cpu: no library.*'reference'"):
+        resolve(name)
+    assert resolve("reference") == "reference"
+
+
+def test_a_missing_backend_is_never_replaced(monkeypatch):
+    lack(monkeypatch, "cuda")
+    with pytest.raises(InputError, match=f"cuda: {GONE}; cpu: can be used"):
+        resolve("cuda")
+
+
+def test_unknown_names_are_refused():
+    with pytest.raises(InputError, match="must be one of auto, cpu, cuda, reference, but it is 'gpu'"):
+        resolve("gpu")
+    with pytest.raises(InputError, match="backend must be one of"):
+        backends.implementation("holosplat.fit.adam", "auto")
+
+
+def test_the_kernels_reason_is_the_loaders(monkeypatch):
+    def absent() -> tuple[str, ...]:
+        raise MissingError("The kernels are gone.")
+
+    monkeypatch.setattr(native, "available_isas", absent)
+    assert missing("cpu") == "The kernels are gone"
+
+
+def test_the_gpus_reasons(monkeypatch):
+    monkeypatch.setenv("TRITON_INTERPRET", "0")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr(torch.version, "cuda", None)
+    found = importlib.util.find_spec("triton")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object())
+    assert "has no CUDA" in missing("cuda")
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    assert "no CUDA device" in missing("cuda")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    assert missing("cuda") == ""
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert "triton is not installed" in missing("cuda")
+    assert found is None or hasattr(found, "name")
+
+
+@pytest.mark.parametrize("operation", SUPPORT)
+@pytest.mark.parametrize("backend", DESCRIPTIONS)
+def test_the_table_says_what_there_is(operation, backend):
+    package, function, _ = SUPPORT[operation]
+    if backend == "cuda":
+        pytest.importorskip("triton")
+    assert callable(getattr(backends.implementation(f"holosplat.{package}", backend), function))
+
+
+def test_the_table_has_every_folder_of_backends():
+    source = native.Path(backends.__file__).parent
+    folders = {p.parent.relative_to(source).as_posix().replace("/", ".") for p in source.rglob("cuda.py")}
+    assert folders == {package for package, _, _ in SUPPORT.values()}
+    assert [row[0] for row in support_table()] == list(SUPPORT)
+    assert set(NAMES) == {"auto", *DESCRIPTIONS}
