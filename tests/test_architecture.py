@@ -51,6 +51,7 @@ MOST_LINES = 400
 MOST_ARGUMENTS = 7
 MANY_ARGUMENTS = {
     "projectors/splat/cpu.py:splat": "all arguments of the package's splat, checked, by position",
+    "projectors/splat/cuda.py:splat": "all arguments of the package's splat, checked, by position",
     "projectors/splat/reference.py:splat": "all arguments of the package's splat, checked, by position",
 }
 """Public functions with more arguments by position, each with its reason."""

@@ -248,7 +248,7 @@ def test_a_run_folder_holds_what_was_done(scan, whole):
     assert config["prior"] == {"kind": "known", "delta": CELL.delta, "beta": CELL.beta, "ratio": 0.0}
     assert config["scan_hash"] == scan_hash(scan)
     assert {"holosplat", "python", "torch", "numpy"} <= set(config["versions"])
-    assert config["machine"]["device"] == "cpu"
+    assert config["machine"]["backend"] == "cpu"
     summary = json.loads(whole.summary.read_text())
     assert summary["finished"] is True
     assert (summary["steps"], summary["best_step"]) == (STEPS, STEPS)

@@ -22,7 +22,6 @@ from ..experiments.evaluate import render as predict
 from ..experiments.reconstruct import load_reconstruction
 from ..experiments.reconstruct import reconstruct as fit
 from ..experiments.run_folder import RunFolder, scan_hash
-from ..experiments.settings import preset, read_settings
 from ..experiments.simulate import read_scene
 from ..forward import simulate as image_scene
 from ..geometry import Grid
@@ -32,7 +31,7 @@ from ..io.nxtomo import read_scan, write_scan
 from ..io.volumes import read_volume, write_volume
 from ..report.run import report_run
 from ..scan import PIXEL_RANGE_M, Scan
-from .options import BeamlineOptions, MaterialOptions, MeshOptions, NoiseOptions, PriorOptions
+from .options import BeamlineOptions, MaterialOptions, MeshOptions, NoiseOptions, PriorOptions, SettingsOptions
 from .progress import ProgressBar
 
 MOST_VOXELS = 2**31
@@ -93,28 +92,19 @@ def reconstruct(
     scan: Positional[Path],
     out: Path,
     matter: PriorOptions = PriorOptions(),
-    preset_name: Annotated[str | None, arg(name="preset")] = None,
-    config: Path | None = None,
+    how: SettingsOptions = SettingsOptions(),
     seed: int = 0,
     resume: bool = False,
-    backend: Literal["auto", "cpu", "cuda", "reference"] | None = None,
 ) -> None:
     """Reconstruct a scan as Gaussians; the run folder holds the result and its report.
 
     Args:
         scan: Scan file (NXtomo).
         out: Run folder to make.
-        preset_name: Named settings: default (what you get without), fast, thesis.
-        config: Or: a JSON file of settings, such as the config.json of another run.
         seed: Seed of everything random.
         resume: Go on with an interrupted run.
-        backend: What computes the fit (default: as the settings say, auto); `holosplat backends` lists them.
     """
-    require(config is None or preset_name is None, "give --config or --preset, not both.")
-    settings = read_settings(config) if config else preset(preset_name or "default")
-    if backend:
-        settings = replace(settings, fit=replace(settings.fit, backend=backend))
-    resolve(settings.fit.backend)  # before the start, which takes its time
+    settings = how.settings()
     require(seed >= 0, f"--seed must be 0 or more, but it is {seed}.")
     measured = read_scan(scan)
     prior = matter.prior(measured.exposures.energy_kev)

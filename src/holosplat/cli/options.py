@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
+from ..backends import resolve
 from ..checks import require
-from ..experiments.settings import MaterialPrior
+from ..experiments.settings import MaterialPrior, Settings, preset, read_settings
 from ..experiments.simulate import Filling, poses
 from ..materials import parse_material, read_material_table
 from ..scan import Exposures, interleaved_split
@@ -95,6 +97,27 @@ class NoiseOptions:
     """Mean photons a pixel for Poisson noise; none means noise-free."""
     seed: int = 0
     """Seed of the noise."""
+
+
+@dataclass(frozen=True)
+class SettingsOptions:
+    """How the reconstruction proceeds."""
+
+    preset: str | None = None
+    """Named settings: default (what you get without), fast, thesis."""
+    config: Path | None = None
+    """Or: a JSON file of settings, such as the config.json of another run."""
+    backend: Literal["auto", "cpu", "cuda", "reference"] | None = None
+    """What computes the fit (default: as the settings say, auto); `holosplat backends` lists what there is."""
+
+    def settings(self) -> Settings:
+        """The settings that the options name; `InputError` if their backend cannot be used here."""
+        require(self.config is None or self.preset is None, "give --config or --preset, not both.")
+        chosen = read_settings(self.config) if self.config else preset(self.preset or "default")
+        if self.backend:
+            chosen = replace(chosen, fit=replace(chosen.fit, backend=self.backend))
+        resolve(chosen.fit.backend)  # before the start, which takes its time
+        return chosen
 
 
 @dataclass(frozen=True)

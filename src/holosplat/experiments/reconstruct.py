@@ -191,6 +191,8 @@ def _resumed(
         folder.require_new(advise_resume=not resume)
         return None
     old, same = folder.read_config(), json.loads(json.dumps(_config(scan, prior, settings, seed)))
+    for config in (old, same):  # another machine may go on with a run
+        config.get("settings", {}).get("fit", {}).pop("backend", None)
     for key, name in RESUMED_WITH.items():
         require(
             old.get(key) == same[key],

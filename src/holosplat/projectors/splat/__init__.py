@@ -24,8 +24,6 @@ from torch import Tensor
 from ...backends import implementation, interpreted
 from ...checks import InputError, finite, require, shaped
 
-BACKENDS = ("cpu", "cuda", "reference")
-
 
 def splat(
     centres: Tensor,
