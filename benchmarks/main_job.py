@@ -126,7 +126,7 @@ def main() -> None:
         for seed in [0] if name == "snapshot" else options.seeds:
             case = snapshot(options.meshes) if name == "snapshot" else CASES[name](seed)
             rows.append({"case": name, **run(case, options.preset, seed)})
-    report = {"commit": commit(), **environment(), "rows": rows}
+    report = {"commit": commit(), **environment("cpu"), "rows": rows}
     print(json.dumps(report, indent=2) if options.json else table(report))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 from pathlib import Path
 
@@ -9,6 +10,53 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # threads that spin starve 
 
 import pytest
 import torch
+
+TRITON = importlib.util.find_spec("triton") is not None
+GPU = TRITON and torch.cuda.is_available()
+KERNELS = ("projectors.splat", "optics.hologram", "fit.fidelity", "fit.adam")
+"""Packages with Triton kernels."""
+
+
+def _bind_kernels_to_the_interpreter() -> None:
+    """Import Triton and all kernels such that they run in Triton's interpreter, on tensors in main memory.
+
+    Triton decides so when a kernel is defined, by an environment variable. It is taken away again: only tests that
+    ask for the fixture `gpu` shall see it, no other test and no subprocess.
+    """
+    os.environ["TRITON_INTERPRET"] = "1"
+    try:
+        for package in KERNELS:
+            importlib.import_module(f"holosplat.{package}.cuda")
+    finally:
+        del os.environ["TRITON_INTERPRET"]
+
+
+if TRITON and not GPU:
+    _bind_kernels_to_the_interpreter()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests marked `gpu` need one."""
+    for item in items:
+        if not GPU and item.get_closest_marker("gpu"):
+            item.add_marker(pytest.mark.skip(reason="there is no GPU here"))
+
+
+@pytest.fixture
+def gpu(monkeypatch: pytest.MonkeyPatch) -> torch.device:
+    """Where Triton's kernels run: on the GPU or, without one, in Triton's interpreter on the CPU."""
+    if not TRITON:
+        pytest.skip("triton is not installed")
+    if not GPU:
+        monkeypatch.setenv("TRITON_INTERPRET", "1")
+    return torch.device("cuda" if GPU else "cpu")
+
+
+@pytest.fixture(autouse=True)
+def _on_the_cpu(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The backend `auto` means the CPU in tests that do not ask for a GPU: their results are the same everywhere."""
+    if GPU and "gpu" not in request.fixturenames:
+        monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -98,3 +98,9 @@ def test_the_table_has_every_folder_of_backends():
     assert folders == {package for package, _, _ in SUPPORT.values()}
     assert [row[0] for row in support_table()] == list(SUPPORT)
     assert set(NAMES) == {"auto", *DESCRIPTIONS}
+
+
+def test_the_documented_table_is_the_table():
+    page = (native.Path(__file__).resolve().parents[1] / "docs/backends.md").read_text(encoding="utf-8")
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in page.splitlines() if line[:1] == "|"]
+    assert [row for row in rows if row in support_table()] == support_table()

@@ -1,0 +1,172 @@
+"""The GPU's splat, measured: pairs per second, forward and backward, and its errors.
+
+    python benchmarks/gpu.py --json
+
+A pair is a Gaussian and a pixel inside its integer box. 244 000 and 30 000 Gaussians with scales of 1 to 4 px, two
+channels, four views of 512 × 512 px, cut at three standard deviations; times are medians of CUDA events around
+single calls. Errors are largest differences over largest values, against the float64 reference on a part of the cloud
+that it can hold. Needs a CUDA GPU and triton.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import statistics
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+CUTOFF, VARIANCE = 3.0, 1 / 12
+CHANNELS = 2
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """One case: Gaussians, views, pixels along a side, repetitions, and Gaussians of the comparison."""
+
+    count: int
+    views: int = 4
+    side: int = 512
+    repeats: int = 30
+    compared: int = 2000
+
+
+CASES = (Sizes(244_000), Sizes(30_000))
+
+
+def cloud(sizes: Sizes, device: str) -> tuple[list[Tensor], tuple[Tensor, Tensor]]:
+    """Random Gaussians over the field of view, and random views, all on the device."""
+    r = torch.Generator().manual_seed(0)
+    centres = (torch.rand(sizes.count, 3, generator=r) - 0.5) * sizes.side
+    scales = 1 + 3 * torch.rand(sizes.count, 3, generator=r)
+    others = [torch.randn(sizes.count, width, generator=r) for width in (4, CHANNELS)]
+    rotations = torch.from_numpy(Rotation.random(sizes.views, rng=0).as_matrix())
+    poses = (rotations, torch.zeros(sizes.views, 2, dtype=torch.float64))
+    return [a.to(device) for a in (centres, scales, *others)], (poses[0].to(device), poses[1].to(device))
+
+
+def draw(arrays: list[Tensor], poses: tuple[Tensor, Tensor], sizes: Sizes, backend: str) -> Tensor:
+    """The splat of one case."""
+    from holosplat.projectors.splat import splat
+
+    options = {"cutoff": CUTOFF, "pixel_variance": VARIANCE, "checked": True}
+    return splat(*arrays, *poses, (sizes.side, sizes.side), backend=backend, **options)
+
+
+def pairs(arrays: list[Tensor], poses: tuple[Tensor, Tensor], sizes: Sizes) -> int:
+    """Gaussians × pixels in their boxes, over all views."""
+    from holosplat.projectors.splat import reference
+
+    centres, scales, quaternions = (a.double() for a in arrays[:3])
+    total = 0
+    for rotation, shift in zip(*poses):
+        projected = reference._projected(centres, scales, quaternions, rotation, shift)
+        low, high = reference._boxes(*projected, (sizes.side, sizes.side), CUTOFF, VARIANCE)
+        total += int((high - low + 1).clamp(min=0).prod(1).sum())
+    return total
+
+
+def seconds(call: Callable[[], Any], repeats: int) -> float:
+    """Median time of a call on the GPU, after three to warm up."""
+    for _ in range(3):
+        call()
+    events = [(torch.cuda.Event(enable_timing=True), torch.cuda.Event(enable_timing=True)) for _ in range(repeats)]
+    torch.cuda.synchronize()
+    for start, stop in events:
+        start.record()
+        call()
+        stop.record()
+    torch.cuda.synchronize()
+    return statistics.median(start.elapsed_time(stop) for start, stop in events) * 1e-3
+
+
+def errors(arrays: list[Tensor], poses: tuple[Tensor, Tensor], sizes: Sizes) -> dict[str, float]:
+    """Largest difference over largest value of the image and of each gradient, for the first Gaussians."""
+    found = {}
+    for backend, dtype in (("cuda", torch.float32), ("reference", torch.float64)):
+        leaves = [a[: sizes.compared].to(dtype).requires_grad_() for a in arrays]
+        image = draw(leaves, poses, sizes, backend)
+        weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+        found[backend] = (image.detach(), *torch.autograd.grad(image, leaves, weights.to(image)))
+    names = ("image", "centres", "scales", "quaternions", "amplitudes")
+    return {
+        name: float((value.double() - true).abs().max() / true.abs().max())
+        for name, value, true in zip(names, found["cuda"], found["reference"])
+    }
+
+
+def measure(sizes: Sizes, device: str, time: Callable[[Callable[[], Any], int], float] = seconds) -> dict[str, Any]:
+    """Everything about one case."""
+    arrays, poses = cloud(sizes, device)
+    leaves = [a.requires_grad_() for a in arrays]
+    work = pairs([a.detach() for a in leaves], poses, sizes)
+    with torch.no_grad():
+        forward = time(lambda: draw(leaves, poses, sizes, "cuda"), sizes.repeats)
+    image = draw(leaves, poses, sizes, "cuda")
+    weights = torch.randn_like(image)
+    backward = time(lambda: torch.autograd.grad(image, leaves, weights, retain_graph=True), sizes.repeats)
+    return {
+        "gaussians": sizes.count,
+        "views": sizes.views,
+        "pixels": [sizes.side, sizes.side],
+        "channels": CHANNELS,
+        "cutoff": CUTOFF,
+        "pairs": work,
+        "forward_ms": forward * 1e3,
+        "backward_ms": backward * 1e3,
+        "forward_pairs_per_s": work / forward,
+        "backward_pairs_per_s": work / backward,
+        "errors": errors([a.detach() for a in leaves], poses, sizes),
+    }
+
+
+def origin() -> dict[str, str]:
+    """Device, versions and commit."""
+    import triton
+
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    return {
+        "device": torch.cuda.get_device_name() if torch.cuda.is_available() else "none",
+        "torch": torch.__version__,
+        "triton": triton.__version__,
+        "numpy": np.__version__,
+        "commit": done.stdout.strip() or "unknown",
+    }
+
+
+def main() -> None:
+    """Measure all cases and print them."""
+    parser = argparse.ArgumentParser(description="Speed and errors of the GPU's splat.")
+    parser.add_argument("--json", action="store_true", help="print one JSON object instead of a Markdown table")
+    options = parser.parse_args()
+    if importlib.util.find_spec("triton") is None:
+        sys.exit("This benchmark needs triton, which is not installed (pip install 'holosplat[gpu]').")
+    if not torch.cuda.is_available():
+        sys.exit("This benchmark needs a CUDA GPU, and torch sees none.")
+    cases = [measure(sizes, "cuda") for sizes in CASES]
+    report = {**origin(), "cases": cases}
+    if options.json:
+        print(json.dumps(report, indent=2))
+        return
+    print(" · ".join(f"{name} {value}" for name, value in origin().items()), end="\n\n")
+    print("| Gaussians | pairs | forward ms | pairs/s | backward ms | pairs/s | largest error |")
+    print("| --- | --- | --- | --- | --- | --- | --- |")
+    for c in cases:
+        rates = [f"{c['forward_ms']:.3g} | {c['forward_pairs_per_s']:.3g}",
+                 f"{c['backward_ms']:.3g} | {c['backward_pairs_per_s']:.3g}"]  # fmt: skip
+        print(f"| {c['gaussians']} | {c['pairs']} | {' | '.join(rates)} | {max(c['errors'].values()):.1e} |")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,229 @@
+"""A whole step of the fit, measured against the same step in eager torch, side by side in one run.
+
+    python benchmarks/step.py --json            # two threads; needs quiet cores to mean anything
+    python benchmarks/step.py --backend cuda    # where there is a GPU (no comparison, no memory of the host)
+
+The step: splat, exit wave, Fresnel, intensity, point-spread function, 0.8 L1 + 0.2 (1 - SSIM), backward, Adam, on four
+views of two-channel Gaussians with standard deviations of 1 to 4 px (cutoff 4 standard deviations), PSF 0.5 px,
+20 keV, 10 cm, 0.5 µm pixels.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+import numpy as np
+import torch
+
+import holosplat as hs
+from holosplat.backends import device_name, resolve
+from holosplat.experiments.run_folder import environment
+from holosplat.fit.fidelity import Target, l1_and_ssim
+from holosplat.fit.loop import Fit, FitOptions
+from holosplat.fit.objective import Objective
+from holosplat.fit.schedule import Schedule
+from holosplat.geometry import Poses
+from holosplat.representations.gaussians import raw_of
+from holosplat.volume import LineIntegrals
+
+SEED, VIEWS, PIXEL = 0, 4, 0.5e-6
+SIZES = {"256": (8_000, 256), "512": (30_000, 512), "512_244k": (244_000, 512)}
+RATES = (1e-3, 1e-3, 1e-3, 1e-3)
+
+
+def workload(count: int, size: int) -> tuple[hs.Scan, hs.GaussianCloud]:
+    """A cloud that fills the field of view, and frames of the same cloud with other amplitudes."""
+    generator = torch.Generator().manual_seed(SEED)
+    centres = (torch.rand(count, 3, generator=generator) - 0.5) * size
+    log_scales = torch.log(1 + 3 * torch.rand(count, 3, generator=generator))
+    quaternions = torch.randn(count, 4, generator=generator)
+    share = 4.0 * size**2 / count / 100  # about 1 rad through all of it, whatever the number of Gaussians
+    amplitudes = share * (0.2 + torch.rand(count, 2, generator=generator))
+    delta = 1.5e-7
+    cloud = hs.GaussianCloud((centres, log_scales, quaternions, raw_of(amplitudes)), PIXEL, delta, delta / 1000)
+    other = cloud.replaced((centres, log_scales, quaternions, raw_of(amplitudes.flip(0))))
+    exposures = hs.Exposures.of(hs.Views.evenly_spaced(VIEWS, (size, size), PIXEL), 20.0, 0.1, 0.5)
+    with torch.no_grad():
+        frames = hs.measure(other.on(resolve("auto")), exposures).cpu().numpy()
+    return hs.Scan(frames, exposures, np.zeros(VIEWS, dtype=bool), {}), cloud
+
+
+def fit_of(scan: hs.Scan, cloud: hs.GaussianCloud, backend: str) -> Fit:
+    """The project's own loop, with the objective and the rates of this benchmark."""
+    position, scale, rotation, amplitude = RATES
+    schedule = Schedule(
+        steps=10_000,
+        rate_position=position,
+        rate_scale=scale,
+        rate_rotation=rotation,
+        rate_amplitude=amplitude,
+        oversample=1,
+        decay=1.0,
+    )
+    return Fit(scan, cloud, FitOptions(Objective(l1=0.8, ssim=0.2), schedule, backend=backend))
+
+
+def stepper(fit: Fit) -> Callable[[], float]:
+    """A function that takes one step and returns its loss."""
+    seen: list[float] = []
+
+    def step() -> float:
+        fit.run(lambda record: seen.append(record["loss"]), until=fit.step + 1)
+        return seen[-1]
+
+    return step
+
+
+def milliseconds(step: Callable[[], float], count: int) -> list[float]:
+    """Times of `count` steps [ms]."""
+    times = []
+    for _ in range(count):
+        started = time.perf_counter()
+        step()
+        times.append(1e3 * (time.perf_counter() - started))
+    return times
+
+
+def compare(size: str, rounds: int) -> dict[str, float]:
+    """Steps of ours and of eager torch in turns: best and median times [ms], their ratio, and both losses."""
+    from eager_step import EagerStep
+
+    scan, cloud = workload(*SIZES[size])
+    ours, eager = stepper(fit_of(scan, cloud, "cpu")), EagerStep(scan, cloud, RATES).step
+    first = {"loss_ours": ours(), "loss_eager": eager()}
+    fast, slow = [], []
+    for _ in range(rounds):
+        fast += milliseconds(ours, 10)
+        slow += milliseconds(eager, 2)
+        print(f"{size}: {min(fast):.1f} ms, eager {min(slow):.0f} ms", file=sys.stderr)
+    return {
+        f"step_ms_{size}": min(fast),
+        f"step_ms_{size}_median": float(np.median(fast)),
+        f"eager_ms_{size}": min(slow),
+        f"step_ratio_{size}": min(slow) / min(fast),
+        **{f"{name}_{size}": value for name, value in first.items()},
+    }
+
+
+def on_gpu() -> dict[str, float]:
+    """Steps on a GPU [ms], replayed from a captured graph; each batch of steps ends with a look at the values."""
+    found = {}
+    for size in ("256", "512", "512_244k"):
+        fit = fit_of(*workload(*SIZES[size]), "cuda")
+        fit.run(lambda record: None, until=40)
+        torch.cuda.synchronize()
+        started = time.perf_counter()
+        fit.run(lambda record: None, until=240)
+        torch.cuda.synchronize()
+        found[f"step_ms_{size}"] = 1e3 * (time.perf_counter() - started) / 200
+    return found
+
+
+def parts(size: str, repeat: int = 10) -> dict[str, float]:
+    """Best times [ms] of the parts of a step, one after the other."""
+    scan, cloud = workload(*SIZES[size])
+    fit = fit_of(scan, cloud, "cpu")
+    cloud, poses = fit.cloud, Poses.of(fit.instrument.views)
+    times: dict[str, list[float]] = {}
+
+    def timed(name: str, act: Callable[..., Any], *arguments: Any) -> Any:
+        started = time.perf_counter()
+        result = act(*arguments)
+        times.setdefault(name, []).append(1e3 * (time.perf_counter() - started))
+        return result
+
+    low, span = float(scan.frames.min()), float(np.ptp(scan.frames))
+    target = Target(torch.from_numpy(scan.frames), low, span, "cpu")
+    for _ in range(repeat):
+        lines = timed("splat", cloud.project, poses)
+        held = LineIntegrals(lines.channels.detach().requires_grad_(), lines.materials)
+        frames = timed("optics", fit.instrument.frames, held)
+        shown = frames.detach().requires_grad_()
+        l1, ssim = timed("l1_ssim", l1_and_ssim, shown, target)
+        timed("l1_ssim_backward", (0.8 * l1 + 0.2 * ssim).mean().backward)
+        timed("optics_backward", frames.backward, shown.grad)
+        timed("splat_backward", lines.channels.backward, held.channels.grad)
+        timed("adam", fit.trainable.step, RATES)
+    return {f"part_ms_{size}_{name}": min(values) for name, values in times.items()}
+
+
+def memory(size: str) -> dict[str, float]:
+    """Peak memory of steps beyond what is there before and stays after them [MB], and page faults a step."""
+    fit = fit_of(*workload(*SIZES[size]), "cpu")
+    before = _status("VmRSS")
+    with open("/proc/self/clear_refs", "w") as reset:
+        reset.write("5")  # the peak counts from here
+    step = stepper(fit)
+    step()
+    peak = _status("VmHWM")
+    kept = sum(p.numel() * p.element_size() for p in fit.cloud.parameters) / 1e6
+    faults = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    milliseconds(step, 10)
+    faults = resource.getrusage(resource.RUSAGE_SELF).ru_minflt - faults
+    outputs = kept + scan_megabytes(fit)  # gradients, and the predicted frames
+    return {f"memory_mb_{size}": max(peak, _status("VmHWM")) - before - outputs, f"page_faults_{size}": faults / 10}
+
+
+def scan_megabytes(fit: Fit) -> float:
+    """Size of the training frames [MB]."""
+    return fit.train.frames.nbytes / 1e6
+
+
+def _status(name: str) -> float:
+    with open("/proc/self/status") as lines:
+        return next(float(line.split()[1]) for line in lines if line.startswith(name)) * 1024 / 1e6
+
+
+def in_a_fresh_process(size: str) -> dict[str, float]:
+    """`memory`, where nothing else has used memory before."""
+    done = subprocess.run([sys.executable, __file__, "--memory", size], capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+def commit() -> str:
+    """The commit this was run on, marked if the tree had changes."""
+    found = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True)
+    return found.stdout.strip() or "unknown"
+
+
+def main() -> None:
+    """Read the arguments, measure, print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--backend", default="cpu", choices=("cpu", "cuda"))
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=4)
+    parser.add_argument("--memory", choices=SIZES, help=argparse.SUPPRESS)
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    if options.memory:
+        print(json.dumps(memory(options.memory)))
+        return
+    backend = resolve(options.backend)
+    found: dict[str, Any] = {"device": device_name(backend), "seed": SEED, "commit": commit(), **environment(backend)}
+    if backend == "cuda":
+        found |= on_gpu()
+    else:
+        for size in ("512", "256"):
+            found |= compare(size, options.rounds) | parts(size)
+        found["step_ratio"] = found["step_ratio_512"]
+        found |= in_a_fresh_process("512_244k")
+    if options.json:
+        print(json.dumps(found, indent=2))
+    else:
+        for name, value in found.items():
+            print(f"{name:32} {value:.4g}" if isinstance(value, float) else f"{name:32} {value}")
+
+
+if __name__ == "__main__":
+    main()
