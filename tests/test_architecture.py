@@ -309,7 +309,7 @@ def test_the_rule_refuses_a_bad_house(rule, path, text):
 
 @pytest.mark.parametrize("everything", [False, True], ids=["holosplat", "all but the readers"])
 def test_imports_are_light(everything, files):
-    """No package of `HEAVY` is loaded by `import holosplat`, nor by any room below the last tier; triton only by name."""
+    """No package of `HEAVY` is loaded by `import holosplat`, nor by any room below the last tier; triton neither."""
     low = [p for p in files if everything and _room(p) not in (*TIERS[-1], "")]
     low = [p for p in low if not fnmatch(p, "*/cuda.py") and not fnmatch(p, "*/triton_*.py")]
     modules = ["holosplat", *("holosplat." + p.removesuffix(".py").replace("/", ".") for p in low)]
