@@ -1,100 +1,108 @@
-// Patches by the batch. Most are narrow, a vector or two wide and a few rows high. The exponentials that start their
-// recurrences, and the sums over lanes at the end, are done for a whole batch at a time, in loops without surprises:
-// a processor that has mispredicted the end of each patch's rows would otherwise wait for each in turn.
+// Patches by the batch. The exponentials that start their recurrences are done for a whole batch at a time, in loops
+// without surprises: a processor that has mispredicted the end of each patch's rows would otherwise wait for each.
 #pragma once
 
 #include "needle.hpp"
 
 namespace holo {
 
-constexpr int kBatch = 16;   // jobs
-constexpr int kNarrow = 16;  // columns
-// Half a vector is enough for most, and crosses fewer cache lines.
-constexpr int kHalf = kWidest > 4 ? kWidest / 2 : kWidest;
+constexpr int kBatch = 16;
 
+// Jobs to do on rasters of one kind.
 template <int C>
-HOLO_INLINE bool is_narrow(const Job<C>& job) {
-  return !job.patch.needle && job.patch.x1 - job.patch.x0 < kNarrow;
+struct Batch {
+  Strides strides;
+  int count = 0;
+  Job<C> jobs[kBatch];
+  Crest crests[kBatch];
+};
+
+// The ladders of the first group of each patch, in one loop over their vectors.
+template <int C>
+HOLO_INLINE void fill_first(const Batch<C>& batch, Ladders* ladders) {
+  constexpr int kVectors = kGroup / kWidest;
+  struct {
+    int job, from;
+  } vectors[kBatch * kVectors + 1];
+  int count = 0;
+  for (int k = 0; k < batch.count; ++k)
+    for (int v = 0; v < kVectors; ++v) {
+      vectors[count] = {k, v * kWidest};
+      count += v * kWidest <= batch.jobs[k].patch.end;
+    }
+  for (int v = 0; v < count; ++v) {
+    const Job<C>& job = batch.jobs[vectors[v].job];
+    ladders[vectors[v].job].fill(job.patch, job.start, 0, vectors[v].from);
+  }
 }
 
-struct alignas(64) Ladders {
-  float value[kBatch][kNarrow], step[kBatch][kNarrow];
+// The ladders of a later group of a wide patch.
+template <int C>
+void fill_next(const Job<C>& job, int column, Ladders& ladders) {
+  for (int from = 0; from < kGroup; from += kWidest) ladders.fill(job.patch, job.start, column, from);
+}
 
-  template <int C>
-  HOLO_INLINE void fill(const Job<C>* jobs, int count) {
-    for (int k = 0; k < count; ++k) {
-      if (!is_narrow(jobs[k])) continue;
-      const Patch& p = jobs[k].patch;
-      const int row = anchor(p, jobs[k].first);
-      for (int column = 0; column <= p.x1 - p.x0; column += kWidest) {
-        const Ladder<kWidest> at = ladder<kWidest>(p, column, row);
-        store<kWidest>(value[k] + column, at.value);
-        store<kWidest>(step[k] + column, at.step);
+// Adds the jobs' patches to their rasters, in order. Their columns should count from multiples of kUnit: a store that
+// straddles 32 bytes takes twice as long as one that does not.
+template <int C>
+void draw(const Batch<C>& batch) {
+  const Strides strides = batch.strides;
+  Ladders ladders[kBatch];
+  fill_first(batch, ladders);
+  for (int k = 0; k < batch.count; ++k) {
+    const Job<C>& job = batch.jobs[k];
+    if (batch.crests[k].needle) {
+      draw_needle(job, strides, batch.crests[k]);
+      continue;
+    }
+    for (int column = 0; column <= job.patch.end; column += kGroup) {
+      if (column > 0) fill_next(job, column, ladders[k]);
+      switch ((job.patch.end - column) / kUnit) {
+        case 0: draw_columns<kUnit, 1>(job, strides, column, ladders[k]); break;
+        case 1: draw_columns<kWidest, 2 * kUnit / kWidest>(job, strides, column, ladders[k]); break;
+        case 2: draw_columns<kUnit, 3>(job, strides, column, ladders[k]); break;
+        default: draw_columns<kWidest, kGroup / kWidest>(job, strides, column, ladders[k]);
       }
     }
   }
-
-  template <int W>
-  HOLO_INLINE Ladder<W> get(int k, int column) const {
-    return {load<W>(value[k] + column), load<W>(step[k] + column)};
-  }
-};
-
-// Adds the jobs' patches to their rasters, in order.
-template <int C>
-void draw(const Job<C>* jobs, int count) {
-  Ladders ladders;
-  ladders.fill(jobs, count);
-  for (int k = 0; k < count; ++k) {
-    const Patch& p = jobs[k].patch;
-    if (p.needle) {
-      draw_needle(jobs[k]);
-    } else if (kHalf < kWidest && p.x1 - p.x0 < kHalf) {
-      draw_columns<kHalf>(jobs[k], 0, ladders.get<kHalf>(k, 0));
-    } else if (p.x1 - p.x0 < kNarrow) {
-      for (int column = 0; column <= p.x1 - p.x0; column += kWidest)
-        draw_columns<kWidest>(jobs[k], column, ladders.get<kWidest>(k, column));
-    } else {
-      const int row = anchor(p, jobs[k].first);
-      for (int column = 0; column <= p.x1 - p.x0; column += kWidest)
-        draw_columns<kWidest>(jobs[k], column, ladder<kWidest>(p, column, row));
-    }
-  }
 }
 
+// Gathers up to kGroup columns.
 template <int C>
-void gather_wide(const Job<C>& job, float* moments) {
-  constexpr int W = kWidest;
-  const Patch& p = job.patch;
-  const int row = anchor(p, job.first);
-  Floats<W> sums[kMoments] = {};
-  for (int column = 0; column <= p.x1 - p.x0; column += W)
-    gather_columns<W>(job, column, ladder<W>(p, column, row)).add_to(sums, job.peak, offsets<W>(p, column));
-  sum_each<W>(sums, moments);
+HOLO_INLINE void gather_group(const Job<C>& job, const Strides& strides, int column, const Ladders& ladders,
+                              float* moments) {
+  const int more = (job.patch.end - column) / kUnit;
+  if constexpr (kWidest == 16) {
+    switch (more) {
+      case 0: return gather_columns<kUnit, 1>(job, strides, column, ladders, 0, moments);
+      case 1: return gather_columns<kWidest, 1>(job, strides, column, ladders, 0, moments);
+      case 2: return gather_columns<kUnit, 3>(job, strides, column, ladders, 0, moments);
+      default: return gather_columns<kWidest, 2>(job, strides, column, ladders, 0, moments);
+    }
+  } else {
+    for (int n = 0; n <= std::min(more, 3); ++n)
+      gather_columns<kWidest, 1>(job, strides, column, ladders, n * kWidest, moments);
+  }
 }
 
 // The moments [count][kMoments] of the rasters (which hold a gradient) under the jobs' patches.
 template <int C>
-void gather(const Job<C>* jobs, int count, float (*moments)[kMoments]) {
-  constexpr int W = kWidest, kVectors = kNarrow / W;
-  Ladders ladders;
-  ladders.fill(jobs, count);
-  ColumnSums<W, C> sums[kBatch][kVectors];
-  for (int k = 0; k < count; ++k) {
-    if (!is_narrow(jobs[k])) continue;
-    for (int j = 0; j <= (jobs[k].patch.x1 - jobs[k].patch.x0) / W; ++j)
-      sums[k][j] = gather_columns<W>(jobs[k], j * W, ladders.get<W>(k, j * W));
-  }
-  for (int k = 0; k < count; ++k) {
-    const Patch& p = jobs[k].patch;
-    if (!is_narrow(jobs[k])) continue;
-    Floats<W> all[kMoments] = {};
-    for (int j = 0; j <= (p.x1 - p.x0) / W; ++j) sums[k][j].add_to(all, jobs[k].peak, offsets<W>(p, j * W));
-    sum_each<W>(all, moments[k]);
-  }
-  for (int k = 0; k < count; ++k) {
-    if (is_narrow(jobs[k])) continue;
-    (jobs[k].patch.needle ? gather_needle<C> : gather_wide<C>)(jobs[k], moments[k]);
+void gather(const Batch<C>& batch, float (*moments)[kMoments]) {
+  const Strides strides = batch.strides;
+  Ladders ladders[kBatch];
+  fill_first(batch, ladders);
+  for (int k = 0; k < batch.count; ++k) {
+    const Job<C>& job = batch.jobs[k];
+    std::fill_n(moments[k], int(kMoments), 0.0f);
+    if (batch.crests[k].needle) {
+      gather_needle(job, strides, batch.crests[k], moments[k]);
+      continue;
+    }
+    for (int column = 0; column <= job.patch.end; column += kGroup) {
+      if (column > 0) fill_next(job, column, ladders[k]);
+      gather_group(job, strides, column, ladders[k], moments[k]);
+    }
+    moments[k][END] = job.patch.dy + static_cast<float>(job.last + 1 - job.patch.y);
   }
 }
 

@@ -41,9 +41,20 @@ struct alignas(64) Parameters {
   double length[kBlock];
 };
 
-inline void read(const HoloCloud& cloud, int64_t first, Parameters& p) {
+// Fetches what a later block reads (or writes), whose Gaussians may lie anywhere in the arrays.
+template <bool kWrite, class Arrays>
+inline void prefetch(const Arrays& arrays, int64_t channels, const int64_t* order, int used) {
+  for (int k = 0; k < used; ++k) {
+    __builtin_prefetch(arrays.centres + 3 * order[k], kWrite);
+    __builtin_prefetch(arrays.scales + 3 * order[k], kWrite);
+    __builtin_prefetch(arrays.quaternions + 4 * order[k], kWrite);
+    __builtin_prefetch(arrays.amplitudes + channels * order[k], kWrite);
+  }
+}
+
+inline void read(const HoloCloud& cloud, const int64_t* order, int used, Parameters& p) {
   for (int k = 0; k < kBlock; ++k) {
-    const int64_t n = std::min(first + k, cloud.count - 1);
+    const int64_t n = order[std::min(k, used - 1)];
     for (int d = 0; d < 3; ++d) p.scale[d][k] = cloud.scales[3 * n + d];
     for (int d = 0; d < 4; ++d) p.unit[d][k] = cloud.quaternions[4 * n + d];
   }
@@ -62,11 +73,14 @@ inline void rotation_of(double w, double x, double y, double z, double r[9]) {
   r[6] = 2 * (x * z - w * y), r[7] = 2 * (y * z + w * x), r[8] = 1 - 2 * (x * x + y * y);
 }
 
-inline void load_block(const HoloCloud& cloud, int64_t first, Block& block) {
+inline void load_block(const HoloCloud& cloud, const int64_t* order, int64_t first, Block& block) {
   Parameters p;
-  read(cloud, first, p);
+  block.used = static_cast<int>(std::min<int64_t>(kBlock, cloud.count - first));
+  read(cloud, order + first, block.used, p);
+  const int64_t next = std::min(first + kBlock, cloud.count);
+  prefetch<false>(cloud, cloud.channels, order + next, static_cast<int>(std::min<int64_t>(kBlock, cloud.count - next)));
   for (int k = 0; k < kBlock; ++k) {
-    const int64_t n = std::min(first + k, cloud.count - 1);
+    const int64_t n = order[first + std::min(k, block.used - 1)];
     for (int d = 0; d < 3; ++d) block.centre[d][k] = cloud.centres[3 * n + d];
     for (int c = 0; c < cloud.channels; ++c) block.amplitude[c][k] = cloud.amplitudes[cloud.channels * n + c];
   }
@@ -83,7 +97,6 @@ inline void load_block(const HoloCloud& cloud, int64_t first, Block& block) {
     block.covariance[ZZ][k] = r[6] * r[6] * v0 + r[7] * r[7] * v1 + r[8] * r[8] * v2;
     block.root[k] = s0 * s1 * s2;
   }
-  block.used = static_cast<int>(std::min<int64_t>(kBlock, cloud.count - first));
 }
 
 // ∂L/∂(w, x, y, z) of a unit quaternion, from G = ∂L/∂R.
@@ -121,14 +134,19 @@ inline void chain(const Parameters& p, const BlockGradient& g, double scale[3][k
   }
 }
 
-inline void write_gradient(const HoloCloud& cloud, int64_t first, const BlockGradient& g, const HoloGradients& out) {
+inline void write_gradient(const HoloCloud& cloud, const int64_t* order, int64_t first, const BlockGradient& g,
+                           const HoloGradients& out) {
   alignas(64) double scale[3][kBlock], quaternion[4][kBlock];
   Parameters p;
-  read(cloud, first, p);
-  chain(p, g, scale, quaternion);
   const int used = static_cast<int>(std::min<int64_t>(kBlock, cloud.count - first));
+  read(cloud, order + first, used, p);
+  const int64_t next = std::min(first + kBlock, cloud.count);
+  const int more = static_cast<int>(std::min<int64_t>(kBlock, cloud.count - next));
+  prefetch<true>(out, cloud.channels, order + next, more);
+  prefetch<false>(cloud, cloud.channels, order + next, more);
+  chain(p, g, scale, quaternion);
   for (int k = 0; k < used; ++k) {
-    const int64_t n = first + k;
+    const int64_t n = order[first + k];
     for (int d = 0; d < 3; ++d) out.centres[3 * n + d] = static_cast<float>(g.centre[d][k]);
     for (int d = 0; d < 3; ++d) out.scales[3 * n + d] = static_cast<float>(scale[d][k]);
     for (int d = 0; d < 4; ++d) out.quaternions[4 * n + d] = static_cast<float>(quaternion[d][k]);

@@ -1,12 +1,13 @@
 // Line integrals of a Gaussian cloud in parallel beams, and their gradients.
 //
-// Forward: a task is a band of rows of one view; it adds every Gaussian in index order, so no two tasks share a pixel
-// and no result depends on the number of threads. Backward: a task is a run of Gaussians; each gathers its moments
-// from all views in order, so nothing is shared either.
+// Forward: a task is a band of rows of one view; it adds every Gaussian in one order (order.hpp), so no two tasks share
+// a pixel and no result depends on the number of threads. Backward: a task is a run of Gaussians; each gathers its
+// moments from all views in order, so nothing is shared either.
 
 #include <numeric>
 #include <vector>
 
+#include "order.hpp"
 #include "outline.hpp"
 #include "threads.hpp"
 
@@ -15,6 +16,7 @@ namespace {
 
 constexpr double kSqrtTwoPi = 2.5066282746310002;
 constexpr int64_t kRunBlocks = 64;  // 1024 Gaussians gather from one view before the next: it stays in the cache
+constexpr int kTurned = 1;        // most scans turn about y
 
 struct View {
   double across[3], down[3];  // the first two rows of R
@@ -45,20 +47,21 @@ struct Form {
       : xx(p[0] * q[0]), xy(p[0] * q[1] + p[1] * q[0]), xz(p[0] * q[2] + p[2] * q[0]), yy(p[1] * q[1]),
         yz(p[1] * q[2] + p[2] * q[1]), zz(p[2] * q[2]) {}
   HOLO_INLINE double of(const Block& g, int k) const {
-    return xx * g.covariance[XX][k] + xy * g.covariance[XY][k] + xz * g.covariance[XZ][k] +
-           yy * g.covariance[YY][k] + yz * g.covariance[YZ][k] + zz * g.covariance[ZZ][k];
+    const double x = fused(xx, g.covariance[XX][k], fused(xy, g.covariance[XY][k], xz * g.covariance[XZ][k]));
+    return fused(yy, g.covariance[YY][k], fused(yz, g.covariance[YZ][k], fused(zz, g.covariance[ZZ][k], x)));
   }
 };
 
-void project(const Block& __restrict g, const View& view, const HoloOptions& options, Projection& __restrict out) {
+void project(const Block& __restrict g, const View& view, const HoloOptions& options, int align,
+             Projection& __restrict out) {
   Spread& s = out.spread;
   const View v = view;  // copies: the loop's stores cannot change them
   const double cutoff = options.cutoff, variance = options.variance;
   const Form across(v.across, v.across), mixed(v.across, v.down), down(v.down, v.down);
   for (int k = 0; k < kBlock; ++k) {
     const double x = g.centre[0][k], y = g.centre[1][k], z = g.centre[2][k];
-    s.u[k] = v.across[0] * x + v.across[1] * y + v.across[2] * z + v.shift_x;
-    s.v[k] = v.down[0] * x + v.down[1] * y + v.down[2] * z + v.shift_y;
+    s.u[k] = fused(v.across[0], x, fused(v.across[1], y, fused(v.across[2], z, v.shift_x)));
+    s.v[k] = fused(v.down[0], x, fused(v.down[1], y, fused(v.down[2], z, v.shift_y)));
     const double xx = across.of(g, k) + variance, yy = down.of(g, k) + variance;
     const double inverse = invert(xx, mixed.of(g, k), yy, k, s);
     s.reach_x[k] = cutoff * std::sqrt(xx);
@@ -67,36 +70,41 @@ void project(const Block& __restrict g, const View& view, const HoloOptions& opt
     // Mass (2π)^{3/2} s₁s₂s₃ over the 2D Gaussian's 2π sqrt(det Σ₂').
     out.weight[k] = kSqrtTwoPi * g.root[k] * std::sqrt(inverse);
   }
-  outline(s, v.width, v.height, out.outline);
+  outline(s, v.width, v.height, align, out.outline);
 }
 
 // The patches of a block that touch rows first … last of a raster, and which Gaussians they are.
 template <int C>
-struct Jobs {
-  Job<C> jobs[kBlock];
+struct Patches {
+  Batch<C> batch;
   int gaussian[kBlock];
-  int count;
 
   void list(const Block& g, const Projection& projection, int first, int last, const Raster& raster) {
     const Outline& o = projection.outline;
-    count = 0;
+    batch.strides = raster.strides;
+    int count = 0;
     for (int k = 0; k < g.used; ++k) {
-      Job<C>& job = jobs[count];
-      job.first = std::max(o.top[k], first), job.last = std::min(o.bottom[k], last);
-      if (job.first > job.last || o.x0[k] > o.x1[k]) continue;
-      job.patch = patch_of(projection.spread, o, k);
+      Job<C>& job = batch.jobs[count];
+      const int from = std::max(o.top[k], first), to = std::min(o.bottom[k], last);
       for (int c = 0; c < C; ++c) job.peak[c] = static_cast<float>(projection.weight[k]) * g.amplitude[c][k];
-      job.raster = raster;
+      if (from > to || o.begin[k] > o.end[k] || !all_finite<C>(job.peak)) continue;
+      job.patch = patch_of(o, k);
+      set_rows(o, k, from, to, job);
+      job.raster = raster.data;
+      batch.crests[count].needle = o.needle[k];
+      if (o.needle[k]) batch.crests[count] = crest_of(projection.spread, o, k);
       gaussian[count++] = k;
     }
+    batch.count = count;
   }
 };
 
 std::unique_ptr<Block[]> load_cloud(const HoloCloud& cloud, int64_t threads) {
+  const auto order = drawing_order(cloud, kTurned, threads);
   const int64_t count = blocks(cloud.count);
   std::unique_ptr<Block[]> all(new Block[count]);  // a vector would be zeroed first, by one thread
   parallel_runs(count, kRunBlocks, threads, [&](int64_t first, int64_t last) {
-    for (int64_t b = first; b < last; ++b) load_block(cloud, b * kBlock, all[b]);
+    for (int64_t b = first; b < last; ++b) load_block(cloud, order.get(), b * kBlock, all[b]);
   });
   return all;
 }
@@ -109,22 +117,23 @@ void splat(const HoloCloud& cloud, const HoloViews& views, const HoloOptions& op
   const int64_t bands = std::min(views.height, options.threads / std::gcd(views.count, options.threads));
   const int64_t rows = (views.height + bands - 1) / bands, stride = row_stride(views.width, C);
   const int64_t plane = views.height * views.width;
-  parallel(views.count * bands, options.threads, [&](int64_t task) {
+  std::vector<Buffer> rasters(static_cast<size_t>(std::max<int64_t>(1, options.threads)));
+  parallel(views.count * bands, options.threads, [&](int64_t task, int64_t thread) {
     const View view = view_of(views, task / bands);
     const int64_t first = task % bands * rows, height = std::min(rows, views.height - first);
     if (height <= 0) return;
-    const auto memory = buffer(height * C * stride);
-    std::fill_n(memory.get(), height * C * stride, 0.0f);
-    const Raster raster{memory.get() - first * C * stride, C * stride, stride};
+    Buffer& memory = rasters[thread];
+    if (!memory.get()) memory = zeros(rows * C * stride);
+    const Raster raster{memory.get() - first * C * stride, {C * stride, stride}};
     Projection projection;
-    Jobs<C> jobs;
+    Patches<C> patches;
     for (int64_t b = 0; b < blocks(cloud.count); ++b) {
-      project(all[b], view, options, projection);
-      jobs.list(all[b], projection, static_cast<int>(first), static_cast<int>(first + height - 1), raster);
-      draw(jobs.jobs, jobs.count);
+      project(all[b], view, options, kUnit, projection);
+      patches.list(all[b], projection, static_cast<int>(first), static_cast<int>(first + height - 1), raster);
+      draw(patches.batch);
     }
     float* to = image + task / bands * C * plane + first * views.width;
-    crop_rows({memory.get(), C * stride, stride}, C, height, views.width, to, plane);
+    take_rows({memory.get(), {C * stride, stride}}, C, height, views.width, to, plane);
   });
 }
 
@@ -142,13 +151,17 @@ void pull_back(const Block& __restrict g, const View& view, const Projection& __
     const double weight = projection.weight[k];
     // With one channel the moments lack the amplitude and the weight.
     const double scale = C == 1 ? weight * g.amplitude[0][k] : 1.0;
-    double all = weight * (double(g.amplitude[0][k]) * m[FIRST]);
-    if (C == 2) all += weight * (double(g.amplitude[1][k]) * m[SECOND]);
+    // As single numbers, as in the moments, from which a multiple of this is subtracted.
+    const float peak = static_cast<float>(weight);
+    double all = C == 1 ? scale * m[FIRST] : double(peak * g.amplitude[0][k]) * m[FIRST];
+    if (C == 2) all += double(peak * g.amplitude[1][k]) * m[SECOND];
     const double slope = s.slope[k], lean = projection.outline.needle[k] ? 0.0 : slope;
-    const double d = scale * m[DOWN], d2 = scale * m[DOWN2];
-    const double t = scale * m[ACROSS] - lean * d;
-    const double td = scale * m[ACROSS_DOWN] - lean * d2;
-    const double t2 = scale * m[ACROSS2] - lean * (scale * m[ACROSS_DOWN] + td);
+    const double end = m[END], x = scale * m[ACROSS];
+    const double d = end * all - scale * m[UP], d2 = end * (end * all - 2 * scale * m[UP]) + scale * m[UP2];
+    const double xd = end * x - scale * m[ACROSS_UP];
+    const double t = x - lean * d;
+    const double td = xd - lean * d2;
+    const double t2 = scale * m[ACROSS2] - lean * (xd + td);
     // p_x = across t, p_y = down d - slope p_x.
     const double ix = s.across[k], iy = s.down[k];
     const double px = t * ix, py = d * iy - slope * px;
@@ -172,12 +185,12 @@ template <int C>
 void gather_block(const Block& g, const View& view, const HoloOptions& options, const Raster& raster,
                   BlockGradient& out) {
   Projection projection;
-  Jobs<C> jobs;
-  project(g, view, options, projection);
-  jobs.list(g, projection, 0, view.height - 1, raster);
+  Patches<C> patches;
+  project(g, view, options, 1, projection);
+  patches.list(g, projection, 0, view.height - 1, raster);
   alignas(64) float found[kBlock][kMoments], moments[kBlock][kMoments] = {};
-  gather(jobs.jobs, jobs.count, found);
-  for (int k = 0; k < jobs.count; ++k) std::copy_n(found[k], kMoments, moments[jobs.gaussian[k]]);
+  gather(patches.batch, found);
+  for (int k = 0; k < patches.batch.count; ++k) std::copy_n(found[k], kMoments, moments[patches.gaussian[k]]);
   pull_back<C>(g, view, projection, moments, out);
 }
 
@@ -185,9 +198,10 @@ template <int C>
 void splat_backward(const HoloCloud& cloud, const HoloViews& views, const HoloOptions& options, const float* gradient,
                     const HoloGradients& out) {
   const int64_t stride = row_stride(views.width, C), plane = views.height * views.width;
-  const auto memory = buffer(views.count * views.height * C * stride);
+  const auto order = drawing_order(cloud, kTurned, options.threads);
+  const Buffer memory(views.count * views.height * C * stride);
   const auto raster_of = [&](int64_t v) {
-    return Raster{memory.get() + v * views.height * C * stride, C * stride, stride};
+    return Raster{memory.get() + v * views.height * C * stride, {C * stride, stride}};
   };
   parallel(views.count, options.threads, [&](int64_t v) {
     pad_rows(gradient + v * C * plane, plane, C, views.height, views.width, raster_of(v));
@@ -196,12 +210,12 @@ void splat_backward(const HoloCloud& cloud, const HoloViews& views, const HoloOp
     const int64_t size = last - first;
     std::vector<Block> all(size);
     std::vector<BlockGradient> gradients(size, BlockGradient{});
-    for (int64_t b = 0; b < size; ++b) load_block(cloud, (first + b) * kBlock, all[b]);
+    for (int64_t b = 0; b < size; ++b) load_block(cloud, order.get(), (first + b) * kBlock, all[b]);
     for (int64_t v = 0; v < views.count; ++v) {
       const View view = view_of(views, v);
       for (int64_t b = 0; b < size; ++b) gather_block<C>(all[b], view, options, raster_of(v), gradients[b]);
     }
-    for (int64_t b = 0; b < size; ++b) write_gradient(cloud, (first + b) * kBlock, gradients[b], out);
+    for (int64_t b = 0; b < size; ++b) write_gradient(cloud, order.get(), (first + b) * kBlock, gradients[b], out);
   });
 }
 

@@ -7,11 +7,13 @@
 #include <exception>
 #include <system_error>
 #include <thread>
+#include <type_traits>
 #include <vector>
 
 namespace holo {
 
-// Calls `work(task)` for task = 0 … tasks - 1 on up to `threads` threads, the caller's among them.
+// Calls `work(task)` for task = 0 … tasks - 1 on up to `threads` threads, the caller's among them; or
+// `work(task, thread)` if it takes the number of the thread, 0 … threads - 1, for memory that its tasks use in turn.
 // Which thread does which task is left to chance: a task must write only what no other task writes.
 // Threads sleep when they are done; a busy wait would steal time from whoever shares the cores.
 // An exception in any task ends the others soon and is thrown again here.
@@ -20,9 +22,15 @@ void parallel(int64_t tasks, int64_t threads, const Work& work) {
   std::atomic<int64_t> next{0};
   std::atomic<bool> failed{false};
   std::exception_ptr failure;
-  const auto loop = [&] {
+  const auto loop = [&](int64_t thread) {
     try {
-      for (int64_t task = next++; task < tasks; task = next++) work(task);
+      for (int64_t task = next++; task < tasks; task = next++) {
+        if constexpr (std::is_invocable_v<Work, int64_t, int64_t>) {
+          work(task, thread);
+        } else {
+          work(task);
+        }
+      }
     } catch (...) {
       next = tasks;
       if (!failed.exchange(true)) failure = std::current_exception();
@@ -31,11 +39,11 @@ void parallel(int64_t tasks, int64_t threads, const Work& work) {
   std::vector<std::thread> helpers;
   helpers.reserve(static_cast<size_t>(std::max<int64_t>(0, threads)));
   try {
-    for (int64_t k = 1; k < std::min(tasks, threads); ++k) helpers.emplace_back(loop);
+    for (int64_t k = 1; k < std::min(tasks, threads); ++k) helpers.emplace_back(loop, k);
   } catch (const std::system_error&) {
     // No more threads to be had: those that started do it all.
   }
-  loop();
+  loop(0);
   for (auto& helper : helpers) helper.join();
   if (failure) std::rethrow_exception(failure);
 }

@@ -3,11 +3,12 @@
 // A slice through a 3D Gaussian at constant z is a 2D Gaussian: the conditional one, whose mean moves along a line
 // with z and whose covariance does not change. So each slice is a patch, as in the splat.
 //
-// Forward: a task is a slab of slices and adds, in index order, the Gaussians that reach it. Backward: a task is a run
-// of Gaussians. No two tasks write the same number, and nothing depends on the number of threads.
+// Forward: a task is a slab of slices and adds, in one order (order.hpp), the Gaussians that reach it. Backward: a task
+// is a run of Gaussians. No two tasks write the same number, and nothing depends on the number of threads.
 
 #include <vector>
 
+#include "order.hpp"
 #include "outline.hpp"
 #include "threads.hpp"
 
@@ -15,35 +16,34 @@ namespace holo {
 namespace {
 
 constexpr int64_t kRunBlocks = 32;
+constexpr int kSlowest = 2;  // axis of a volume in memory
 constexpr int64_t kSlab = 8;  // slices at most: a slab of a common volume stays in the second-level cache
 
 // The conditional Gaussian of one Gaussian's slices, on the raster.
 struct Slices {
-  Patch patch;             // at dz = 0, faint = 0
-  double w;                // mean along z in voxel indices
-  double lean_x, lean_y;   // how the mean of a slice moves with dz: Σxz / Σzz, Σyz / Σzz
-  float upright;           // faintness of a slice is upright dz²
-  float weight;            // sqrt(det Σ / det Σ')
-  int top, bottom;         // rows, cut to the raster
-  int front, back;         // slices, cut to the raster; empty if the box is
+  Patch patch;            // at dz = 0, faint = 0
+  Crest crest;
+  double w;               // mean along z in voxel indices
+  double lean_x, lean_y;  // how the mean of a slice moves with dz: Σxz / Σzz, Σyz / Σzz
+  float upright;          // faintness of a slice is upright dz²
+  float peak[2];          // amplitudes times sqrt(det Σ / det Σ')
+  int top, bottom;        // rows, cut to the raster
+  int front, back;        // slices, cut to the raster; empty if the box is
 
-  // Moves a job with this patch to slice z of a raster whose slices are `size` apart.
+  // Adds slice z of a raster whose slices are `size` apart to a batch.
   template <int C>
-  HOLO_INLINE void move(Job<C>& job, int z, int64_t size) const {
-    Patch& p = job.patch;
-    job.raster.data += z * size;
+  HOLO_INLINE void add_slice(int z, int64_t size, float* raster, Batch<C>& batch) const {
+    Job<C>& job = batch.jobs[batch.count];
     const double dz = z - w, du = lean_x * dz, dv = lean_y * dz;
-    p.dx -= static_cast<float>(du), p.dy -= static_cast<float>(dv);
-    p.u += du, p.v += dv;
-    p.faint = upright * static_cast<float>(dz) * static_cast<float>(dz);
-  }
-
-  template <int C>
-  HOLO_INLINE Job<C> job(const float* amplitude, const Raster& raster) const {
-    Job<C> job;
-    job.patch = patch, job.first = top, job.last = bottom, job.raster = raster;
-    for (int c = 0; c < C; ++c) job.peak[c] = weight * amplitude[c];
-    return job;
+    job.patch = patch;
+    job.patch.dx -= static_cast<float>(du), job.patch.dy -= static_cast<float>(dv);
+    job.patch.faint = upright * static_cast<float>(dz) * static_cast<float>(dz);
+    job.first = top, job.last = bottom;
+    job.start = anchor_at(job.patch, anchor(patch, top));
+    for (int c = 0; c < C; ++c) job.peak[c] = peak[c];
+    job.raster = raster + z * size;
+    Crest& moved = batch.crests[batch.count++] = crest;
+    moved.u += du, moved.v += dv;
   }
 };
 
@@ -54,7 +54,7 @@ struct alignas(64) Cut {
   double w[kBlock], zz[kBlock], lean_x[kBlock], lean_y[kBlock], weight[kBlock], reach_z[kBlock];
 };
 
-void cut(const Block& g, const HoloGrid& grid, const HoloOptions& options, Cut& out) {
+void cut(const Block& g, const HoloGrid& grid, const HoloOptions& options, int align, Cut& out) {
   Spread& s = out.spread;
   for (int k = 0; k < kBlock; ++k) {
     const double xx = g.covariance[XX][k] + options.variance, yy = g.covariance[YY][k] + options.variance;
@@ -74,41 +74,44 @@ void cut(const Block& g, const HoloGrid& grid, const HoloOptions& options, Cut& 
     const double far_y = s.reach_y[k] + std::fabs(out.lean_y[k]) * out.reach_z[k];
     s.corner[k] = corner_exponent(s, k, far_x, far_y) + 0.5 * options.cutoff * options.cutoff;
   }
-  outline(s, static_cast<int>(grid.width), static_cast<int>(grid.height), out.outline);
+  outline(s, static_cast<int>(grid.width), static_cast<int>(grid.height), align, out.outline);
 }
 
-Slices slices_of(const Cut& cut, const HoloGrid& grid, int k) {
+template <int C>
+Slices slices_of(const Block& g, const Cut& cut, const HoloGrid& grid, int k) {
   Slices s;
   const Outline& o = cut.outline;
-  s.patch = patch_of(cut.spread, o, k);
+  s.patch = patch_of(o, k), s.crest = crest_of(cut.spread, o, k);
   s.w = cut.w[k], s.lean_x = cut.lean_x[k], s.lean_y = cut.lean_y[k];
-  s.upright = static_cast<float>(kHalfLog2E / cut.zz[k]);
-  s.weight = static_cast<float>(cut.weight[k]);
+  s.upright = static_cast<float>(-kHalfLog2E / cut.zz[k]);
+  for (int c = 0; c < C; ++c) s.peak[c] = static_cast<float>(cut.weight[k]) * g.amplitude[c][k];
   s.top = o.top[k], s.bottom = o.bottom[k];
   const double depth = static_cast<double>(grid.depth);
   s.front = ceil_int(within(s.w - cut.reach_z[k], 0, depth));
   s.back = floor_int(within(s.w + cut.reach_z[k], -1, depth - 1));
-  if (s.top > s.bottom || o.x0[k] > o.x1[k]) s.front = 0, s.back = -1;
+  if (s.top > s.bottom || o.begin[k] > o.end[k] || !all_finite<C>(s.peak)) s.front = 0, s.back = -1;
   return s;
 }
 
-// Every Gaussian's slices, and for each slab the Gaussians that reach it, in index order.
+// The slices of every Gaussian in drawing order, and for each slab the places in it of those that reach the slab.
 struct Plan {
   std::unique_ptr<Slices[]> slices;
   int64_t thickness;  // slices of a slab
   std::vector<std::vector<int64_t>> slabs;
 };
 
+template <int C>
 Plan plan(const HoloCloud& cloud, const HoloGrid& grid, const HoloOptions& options) {
   Plan plan;
+  const auto order = drawing_order(cloud, kSlowest, options.threads);
   plan.slices.reset(new Slices[cloud.count]);
   parallel_runs(blocks(cloud.count), kRunBlocks, options.threads, [&](int64_t begin, int64_t end) {
     Block block;
     Cut cuts;
     for (int64_t b = begin; b < end; ++b) {
-      load_block(cloud, b * kBlock, block);
-      cut(block, grid, options, cuts);
-      for (int k = 0; k < block.used; ++k) plan.slices[b * kBlock + k] = slices_of(cuts, grid, k);
+      load_block(cloud, order.get(), b * kBlock, block);
+      cut(block, grid, options, kUnit, cuts);
+      for (int k = 0; k < block.used; ++k) plan.slices[b * kBlock + k] = slices_of<C>(block, cuts, grid, k);
     }
   });
   plan.thickness = std::clamp<int64_t>(grid.depth / (4 * options.threads), 1, kSlab);
@@ -124,29 +127,27 @@ Plan plan(const HoloCloud& cloud, const HoloGrid& grid, const HoloOptions& optio
 
 template <int C>
 void voxelise(const HoloCloud& cloud, const HoloGrid& grid, const HoloOptions& options, float* volume) {
-  const Plan todo = plan(cloud, grid, options);
+  const Plan todo = plan<C>(cloud, grid, options);
   const int64_t stride = row_stride(grid.width, C), plane = grid.height * grid.width;
   const int64_t slice_size = grid.height * C * stride;
-  parallel(static_cast<int64_t>(todo.slabs.size()), options.threads, [&](int64_t slab) {
+  std::vector<Buffer> rasters(static_cast<size_t>(std::max<int64_t>(1, options.threads)));
+  parallel(static_cast<int64_t>(todo.slabs.size()), options.threads, [&](int64_t slab, int64_t thread) {
     const int64_t first = slab * todo.thickness, depth = std::min(todo.thickness, grid.depth - first);
-    const auto memory = buffer(depth * slice_size);
-    std::fill_n(memory.get(), depth * slice_size, 0.0f);
-    const Raster raster{memory.get() - first * slice_size, C * stride, stride};
-    Job<C> jobs[kBatch];
-    int count = 0;
-    for (const int64_t n : todo.slabs[slab]) {
-      const Slices& s = todo.slices[n];
-      const Job<C> job = s.template job<C>(cloud.amplitudes + C * n, raster);
+    Buffer& memory = rasters[thread];
+    if (!memory.get()) memory = zeros(todo.thickness * slice_size);
+    Batch<C> batch;
+    batch.strides = {C * stride, stride};
+    for (const int64_t place : todo.slabs[slab]) {
+      const Slices& s = todo.slices[place];
       const int64_t to = std::min<int64_t>(s.back, first + depth - 1);
       for (int64_t z = std::max<int64_t>(s.front, first); z <= to; ++z) {
-        jobs[count] = job;
-        s.move(jobs[count], static_cast<int>(z), slice_size);
-        if (++count == kBatch) draw(jobs, kBatch), count = 0;
+        s.add_slice(static_cast<int>(z), slice_size, memory.get() - first * slice_size, batch);
+        if (batch.count == kBatch) draw(batch), batch.count = 0;
       }
     }
-    draw(jobs, count);
+    draw(batch);
     for (int64_t z = 0; z < depth; ++z)
-      crop_rows({memory.get() + z * slice_size, C * stride, stride}, C, grid.height, grid.width,
+      take_rows({memory.get() + z * slice_size, batch.strides}, C, grid.height, grid.width,
                 volume + (first + z) * plane, grid.depth * plane);
   });
 }
@@ -158,23 +159,27 @@ struct Moments {
 };
 
 template <int C>
-Moments gather_slices(const Slices& s, const Job<C>& job, int64_t slice_size) {
+Moments gather_slices(const Slices& s, const Raster& raster, int64_t slice_size) {
   Moments sum{};
-  const double lean = s.patch.needle ? 0.0 : s.patch.slope;
-  Job<C> jobs[kBatch];
-  float moments[kBatch][kMoments];
+  const double lean = s.crest.needle ? 0.0 : s.crest.slope;
+  Batch<C> batch;
+  batch.strides = raster.strides;
+  alignas(64) float moments[kBatch][kMoments];
   for (int front = s.front; front <= s.back; front += kBatch) {
     const int count = std::min(kBatch, s.back - front + 1);
-    for (int k = 0; k < count; ++k) jobs[k] = job, s.move(jobs[k], front + k, slice_size);
-    gather(jobs, count, moments);
+    batch.count = 0;
+    for (int k = 0; k < count; ++k) s.add_slice(front + k, slice_size, raster.data, batch);
+    gather(batch, moments);
     for (int k = 0; k < count; ++k) {
       const float* m = moments[k];
-      const double all = C == 1 ? m[FIRST] : double(job.peak[0]) * m[FIRST] + double(job.peak[C - 1]) * m[SECOND];
-      const double z = front + k - s.w, t = m[ACROSS] - lean * m[DOWN], td = m[ACROSS_DOWN] - lean * m[DOWN2];
+      const double all = C == 1 ? m[FIRST] : double(s.peak[0]) * m[FIRST] + double(s.peak[1]) * m[SECOND];
+      const double end = m[END], d = end * all - m[UP], dd = end * (end * all - 2.0 * m[UP]) + m[UP2];
+      const double xd = end * m[ACROSS] - m[ACROSS_UP];
+      const double z = front + k - s.w, t = m[ACROSS] - lean * d, td = xd - lean * dd;
       sum.first += m[FIRST], sum.second += m[SECOND];
-      sum.t += t, sum.d += m[DOWN], sum.z += z * all;
-      sum.tt += m[ACROSS2] - lean * (m[ACROSS_DOWN] + td), sum.td += td, sum.dd += m[DOWN2];
-      sum.tz += z * t, sum.dz += z * m[DOWN], sum.zz += z * z * all;
+      sum.t += t, sum.d += d, sum.z += z * all;
+      sum.tt += m[ACROSS2] - lean * (xd + td), sum.td += td, sum.dd += dd;
+      sum.tz += z * t, sum.dz += z * d, sum.zz += z * z * all;
     }
   }
   return sum;
@@ -212,25 +217,25 @@ void voxelise_backward(const HoloCloud& cloud, const HoloGrid& grid, const HoloO
                        const HoloGradients& out) {
   const int64_t stride = row_stride(grid.width, C), plane = grid.height * grid.width;
   const int64_t slice_size = grid.height * C * stride;
-  const auto memory = buffer(grid.depth * slice_size);
+  const Buffer memory(grid.depth * slice_size);
   parallel(grid.depth, options.threads, [&](int64_t z) {
     pad_rows(gradient + z * plane, grid.depth * plane, C, grid.height, grid.width,
-             {memory.get() + z * slice_size, C * stride, stride});
+             {memory.get() + z * slice_size, {C * stride, stride}});
   });
-  const Raster raster{memory.get(), C * stride, stride};
+  const Raster raster{memory.get(), {C * stride, stride}};
+  const auto order = drawing_order(cloud, kSlowest, options.threads);
   parallel_runs(blocks(cloud.count), kRunBlocks, options.threads, [&](int64_t begin, int64_t end) {
     Block block;
     Cut cuts;
     for (int64_t b = begin; b < end; ++b) {
-      load_block(cloud, b * kBlock, block);
-      cut(block, grid, options, cuts);
+      load_block(cloud, order.get(), b * kBlock, block);
+      cut(block, grid, options, 1, cuts);
       BlockGradient result{};
       for (int k = 0; k < block.used; ++k) {
-        const Slices s = slices_of(cuts, grid, k);
-        const Job<C> job = s.template job<C>(cloud.amplitudes + C * (b * kBlock + k), raster);
-        pull_back<C>(block, cuts, k, gather_slices<C>(s, job, slice_size), result);
+        const Slices s = slices_of<C>(block, cuts, grid, k);
+        pull_back<C>(block, cuts, k, gather_slices<C>(s, raster, slice_size), result);
       }
-      write_gradient(cloud, b * kBlock, result, out);
+      write_gradient(cloud, order.get(), b * kBlock, result, out);
     }
   });
 }

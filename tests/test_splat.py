@@ -13,6 +13,7 @@ from torch import Tensor
 from holosplat import native
 from holosplat.checks import InputError
 from holosplat.geometry import rotation_y
+from holosplat.projectors import splat as splat_package
 from holosplat.projectors.splat import splat, voxelise
 
 NAMES = ("centres", "scales", "quaternions", "amplitudes")
@@ -348,6 +349,24 @@ def spoiled(index: int, value: float) -> list[Tensor]:
     arrays = cloud("small", 1, 5)
     arrays[index][2] = value
     return arrays
+
+
+@DRAWS
+@pytest.mark.parametrize("isa", native.available_isas())
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_what_is_no_number_draws_nothing(isa, value, draw, monkeypatch):
+    """The public functions refuse such clouds; the kernels must still not touch memory that is not theirs."""
+    monkeypatch.setenv("HOLOSPLAT_ISA", isa)
+    monkeypatch.setattr(splat_package, "_check_cloud", lambda *_: None)
+    arrays = cloud("ordinary", 2, 60)
+    spoilt = [(index, column) for index, width in enumerate((3, 3, 4, 2)) for column in range(width)]
+    for row, (index, column) in enumerate(spoilt):
+        arrays[index][row, column] = value
+    good = [a[len(spoilt) :] for a in arrays]
+    truth, true_gradients = value_and_gradients(lambda *a: draw(*a, "cpu"), good, torch.float32)
+    image, gradients = value_and_gradients(lambda *a: draw(*a, "cpu"), arrays, torch.float32)
+    assert error(image, truth.double()) < 1e-6
+    assert all(error(g[len(spoilt) :], t.double()) < 1e-6 for g, t in zip(gradients, true_gradients))
 
 
 BAD_CLOUDS = {
