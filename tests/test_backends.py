@@ -10,6 +10,8 @@ import torch
 from holosplat import backends, native
 from holosplat.backends import DESCRIPTIONS, NAMES, SUPPORT, missing, resolve, support_table
 from holosplat.checks import InputError, MissingError
+from holosplat.cli import commands
+from holosplat.cli.options import SettingsOptions
 
 GONE = "a reason"
 
@@ -104,3 +106,16 @@ def test_the_documented_table_is_the_table():
     page = (native.Path(__file__).resolve().parents[1] / "docs/backends.md").read_text(encoding="utf-8")
     rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in page.splitlines() if line[:1] == "|"]
     assert [row for row in rows if row in support_table()] == support_table()
+
+
+def test_the_command_line_lists_and_refuses(monkeypatch, capsys, tmp_path):
+    """`holosplat backends` has every name and reason; a backend that cannot be used stops before anything is read."""
+    monkeypatch.setattr(commands, "missing", lambda name: GONE if name == "cuda" else "")
+    commands.backends()
+    shown = capsys.readouterr().out
+    assert f"not usable here: {GONE}" in shown
+    assert all(name in shown for name in (*NAMES, *SUPPORT))
+    lack(monkeypatch, "cuda")
+    with pytest.raises(InputError, match=f"'cuda' cannot be used here. cuda: {GONE}"):
+        commands.reconstruct(tmp_path / "none.nxs", tmp_path / "run", how=SettingsOptions(backend="cuda"))
+    assert not (tmp_path / "run").exists()

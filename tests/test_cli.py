@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 
 import holosplat.cli.commands as commands
+import holosplat.cli.options as cli_options
 from holosplat.baselines import HolographicTV
 from holosplat.cli import main
 from holosplat.experiments.evaluate import evaluate, render
@@ -202,7 +203,7 @@ def test_the_demo_runs_the_chain_and_shows_its_commands(shop, tmp_path, monkeypa
     monkeypatch.setattr(
         commands, "write_demo_meshes", lambda folder: [Path(shutil.copy(c, folder)) for c in shop.cells]
     )
-    monkeypatch.setattr(commands, "preset", lambda name: QUICK)
+    monkeypatch.setattr(cli_options, "preset", lambda name: QUICK)
     outcome = worked(holosplat("demo", "--out", tmp_path / "demo"))
     found = {path.name for path in (tmp_path / "demo").iterdir()}
     assert found == {"meshes", "scan.nxs", "truth.h5", "run"}
