@@ -26,6 +26,8 @@ _WHERE = {
     "io.nxtomo": ("read_scan", "write_scan"),
     "io.volumes": ("read_volume", "write_volume"),
     "io.vtk": ("read_meshes", "write_mesh"),
+    "experiments.contrast": ("Setup", "Subject"),
+    "experiments.plan": ("Recording", "plan", "survey"),
     "experiments.settings": ("MaterialPrior", "Settings", "preset"),
     "experiments.simulate": ("Filling", "read_scene"),
     "experiments.run_folder": ("RunFolder",),
@@ -49,9 +51,14 @@ def __dir__() -> list[str]:
 
 if TYPE_CHECKING:
     from .checks import InputError as InputError
+    from .experiments.contrast import Setup as Setup
+    from .experiments.contrast import Subject as Subject
     from .experiments.evaluate import Evaluation as Evaluation
     from .experiments.evaluate import evaluate as evaluate
     from .experiments.evaluate import render as render
+    from .experiments.plan import Recording as Recording
+    from .experiments.plan import plan as plan
+    from .experiments.plan import survey as survey
     from .experiments.reconstruct import Reconstruction as Reconstruction
     from .experiments.reconstruct import load_reconstruction as load_reconstruction
     from .experiments.reconstruct import reconstruct as reconstruct

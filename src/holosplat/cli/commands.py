@@ -32,6 +32,7 @@ from ..io.volumes import read_volume, write_volume
 from ..report.run import report_run
 from ..scan import PIXEL_RANGE_M, Scan
 from .options import BeamlineOptions, MaterialOptions, MeshOptions, NoiseOptions, PriorOptions, SettingsOptions
+from .plan import plan
 from .progress import ProgressBar
 
 MOST_VOXELS = 2**31
@@ -251,6 +252,7 @@ def _say(text: str) -> None:
 
 
 COMMANDS = {
+    "plan": plan,
     "simulate": simulate,
     "reconstruct": reconstruct,
     "render": render,
