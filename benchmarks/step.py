@@ -24,6 +24,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
 import torch
+from eager_step import EagerStep
 
 import holosplat as hs
 from holosplat.backends import device_name, resolve
@@ -73,38 +74,38 @@ def fit_of(scan: hs.Scan, cloud: hs.GaussianCloud, backend: str) -> Fit:
     return Fit(scan, cloud, FitOptions(Objective(l1=0.8, ssim=0.2), schedule, backend=backend))
 
 
-def stepper(fit: Fit) -> Callable[[], float]:
-    """A function that takes one step and returns its loss."""
-    seen: list[float] = []
+def steps(fit: Fit, count: int) -> tuple[list[float], float]:
+    """Times of `count` steps of one run [ms], and the last loss."""
+    stamps, losses = [time.perf_counter()], [0.0]
 
-    def step() -> float:
-        fit.run(lambda record: seen.append(record["loss"]), until=fit.step + 1)
-        return seen[-1]
+    def mark(record: dict[str, float]) -> None:
+        stamps.append(time.perf_counter())
+        losses.append(record["loss"])
 
-    return step
+    fit.run(mark, until=fit.step + count)
+    return (1e3 * np.diff(stamps)).tolist(), losses[-1]
 
 
-def milliseconds(step: Callable[[], float], count: int) -> list[float]:
-    """Times of `count` steps [ms]."""
+def eager_steps(eager: EagerStep, count: int) -> list[float]:
+    """Times of `count` steps in eager torch [ms]."""
     times = []
     for _ in range(count):
         started = time.perf_counter()
-        step()
+        eager.step()
         times.append(1e3 * (time.perf_counter() - started))
     return times
 
 
 def compare(size: str, rounds: int) -> dict[str, float]:
     """Steps of ours and of eager torch in turns: best and median times [ms], their ratio, and both losses."""
-    from eager_step import EagerStep
-
     scan, cloud = workload(*SIZES[size])
-    ours, eager = stepper(fit_of(scan, cloud, "cpu")), EagerStep(scan, cloud, RATES).step
-    first = {"loss_ours": ours(), "loss_eager": eager()}
-    fast, slow = [], []
+    ours, eager = fit_of(scan, cloud, "cpu"), EagerStep(scan, cloud, RATES)
+    first = {"loss_ours": steps(ours, 1)[1], "loss_eager": eager.step()}
+    fast: list[float] = []
+    slow: list[float] = []
     for _ in range(rounds):
-        fast += milliseconds(ours, 10)
-        slow += milliseconds(eager, 2)
+        fast += steps(ours, 20)[0]
+        slow += eager_steps(eager, 2)
         print(f"{size}: {min(fast):.1f} ms, eager {min(slow):.0f} ms", file=sys.stderr)
     return {
         f"step_ms_{size}": min(fast),
@@ -163,15 +164,14 @@ def memory(size: str) -> dict[str, float]:
     before = _status("VmRSS")
     with open("/proc/self/clear_refs", "w") as reset:
         reset.write("5")  # the peak counts from here
-    step = stepper(fit)
-    step()
+    steps(fit, 1)
     peak = _status("VmHWM")
     kept = sum(p.numel() * p.element_size() for p in fit.cloud.parameters) / 1e6
     faults = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    milliseconds(step, 10)
+    steps(fit, 20)
     faults = resource.getrusage(resource.RUSAGE_SELF).ru_minflt - faults
     outputs = kept + scan_megabytes(fit)  # gradients, and the predicted frames
-    return {f"memory_mb_{size}": max(peak, _status("VmHWM")) - before - outputs, f"page_faults_{size}": faults / 10}
+    return {f"memory_mb_{size}": max(peak, _status("VmHWM")) - before - outputs, f"page_faults_{size}": faults / 20}
 
 
 def scan_megabytes(fit: Fit) -> float:

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from holosplat.checks import InputError
 from holosplat.forward import (
+    GUARD_PX,
     SIMULATED_FRINGE_SAMPLES,
     Instrument,
     measure,
@@ -355,7 +356,7 @@ def test_padded_lengths_are_fast_and_bounded():
                 while length % p == 0:
                     length //= p
             assert length == 1
-            assert m >= min(8 + math.ceil(distance * LAMBDA / (2 * PITCH**2)), n)
+            assert m >= min(GUARD_PX + math.ceil(distance * LAMBDA / (2 * PITCH**2)), n)
             assert n + 2 * m < 4 * n + 20
 
 

@@ -75,6 +75,13 @@ def test_frames_and_gradients_are_those_of_the_reference(matter, path):
     assert error(gradient, true_gradient) < GRADIENT_TOLERANCE
 
 
+@pytest.mark.parametrize("path", ["plain", "oversampled and blurred"])
+@pytest.mark.parametrize("mkl", [True, False])
+def test_either_library_transforms_alike(path, mkl, monkeypatch):
+    monkeypatch.setattr(torch.backends.mkl, "is_available", lambda: mkl)
+    test_frames_and_gradients_are_those_of_the_reference("free", path)
+
+
 @pytest.mark.parametrize("isa", native.available_isas())
 def test_every_build_gives_the_same(isa, monkeypatch):
     monkeypatch.setenv("HOLOSPLAT_ISA", isa)

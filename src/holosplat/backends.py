@@ -28,7 +28,7 @@ DESCRIPTIONS = {
 SUPPORT: dict[str, tuple[str, str, dict[str, str]]] = {
     "line integrals of Gaussians": ("projectors.splat", "splat", {}),
     "Gaussians on voxels": ("projectors.splat", "voxelise", {}),
-    "wave optics": ("optics.hologram", "hologram", {"cpu": "C++, scipy's FFT", "cuda": "Triton, torch's FFT"}),
+    "wave optics": ("optics.hologram", "hologram", {"cpu": "C++, MKL's or scipy's FFT", "cuda": "Triton, torch's FFT"}),
     "L1 and SSIM of frames": ("fit.fidelity", "l1_and_ssim", {}),
     "statistics of the measured frames": ("fit.fidelity", "statistics", {}),
     "Adam": ("fit.adam", "step", {}),

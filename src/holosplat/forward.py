@@ -24,7 +24,7 @@ SIMULATED_FRINGE_SAMPLES = 8
 MOST_SAMPLES = 1_000_000_000
 """Samples of all waves held at once, at most (16 GB as complex128)."""
 PHOTON_RANGE = (1e-3, 1e15)
-GUARD_PX = 8
+GUARD_PX = 5
 """Detector pixels of margin beyond the fringes' reach: room for the point-spread function and faint tails."""
 
 

@@ -22,6 +22,7 @@ from . import objective as terms
 from .capture import CapturedStep
 from .density import DensityControl, GradientRecord, control_density
 from .interrupt import interrupts_held
+from .memory import memory_kept
 from .misfit import IMAGE_TERMS, OBJECT_TERMS, Draw, Misfit
 from .objective import Objective
 from .schedule import Schedule
@@ -99,7 +100,7 @@ class Fit:
         """Advance to the end (or to step `until`); `on_record` receives one record a step, on a GPU in batches."""
         end = self.options.schedule.steps if until is None else min(until, self.options.schedule.steps)
         try:
-            with interrupts_held() as release:
+            with memory_kept(), interrupts_held() as release:
                 while self.step < end and not self.stopped_early:
                     started = time.perf_counter()
                     self._advance()
