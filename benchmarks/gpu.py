@@ -14,15 +14,14 @@ import argparse
 import importlib.util
 import json
 import statistics
-import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from machine import commit
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -134,14 +133,12 @@ def origin() -> dict[str, str]:
     """Device, versions and commit."""
     import triton
 
-    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
     return {
         "device": torch.cuda.get_device_name() if torch.cuda.is_available() else "none",
         "torch": torch.__version__,
         "triton": triton.__version__,
         "numpy": np.__version__,
-        "commit": done.stdout.strip() or "unknown",
+        "commit": commit(),
     }
 
 

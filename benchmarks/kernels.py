@@ -27,6 +27,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import plain_torch
 import torch
+from machine import commit, memory_megabytes
 from torch import Tensor
 
 from holosplat import native
@@ -227,22 +228,9 @@ def print_memory() -> None:
     for held in passes.backward.__defaults__[0]:  # type: ignore[index]
         for array in held if isinstance(held, (list, tuple)) else [held]:
             array.mul_(1)  # every page of inputs and outputs
-    before = _status("VmRSS")
+    before = memory_megabytes("VmRSS")
     passes.forward(), passes.backward()
-    print((_status("VmHWM") - before) / 1e6)
-
-
-def _status(key: str) -> int:
-    """Bytes of one entry of /proc/self/status. Its peak is this program's own; ru_maxrss has the parent's in it."""
-    lines = Path("/proc/self/status").read_text().splitlines()
-    return 1024 * int(next(line.split()[1] for line in lines if line.startswith(key + ":")))
-
-
-def commit() -> str:
-    """The commit that is measured, with a mark if the tree was changed."""
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=7", "--exclude=*"]
-    shown = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parent)
-    return shown.stdout.strip() or "unknown"
+    print(memory_megabytes("VmHWM") - before)
 
 
 def say(text: str) -> None:
@@ -273,7 +261,7 @@ def rates(repetitions: int) -> dict[str, dict[str, Any]]:
 def measure(repetitions: int) -> dict[str, Any]:
     """Everything, as one flat object with a table of rates in it."""
     torch.set_num_threads(1)
-    report: dict[str, Any] = {"seed": SEED, "commit": commit(), **environment()}
+    report: dict[str, Any] = {"seed": SEED, "commit": commit(), **environment("cpu")}
     say("ceilings")
     ceiling = machine_ceilings()
     say("plain torch")

@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
+from machine import commit
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
@@ -101,13 +101,6 @@ def run(case: Case, preset: str, seed: int) -> dict[str, Any]:
         "train_frcm": scores.train.mean["frcm"],
         "material": scores.as_dict()["material"],
     }
-
-
-def commit() -> str:
-    """The commit that is measured, with a mark if the tree was changed."""
-    command = ["git", "describe", "--always", "--dirty"]
-    shown = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parent)
-    return shown.stdout.strip() or "unknown"
 
 
 def main() -> None:

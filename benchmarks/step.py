@@ -18,6 +18,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -25,6 +26,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 import numpy as np
 import torch
 from eager_step import EagerStep
+from machine import commit, memory_megabytes
 
 import holosplat as hs
 from holosplat.backends import device_name, resolve
@@ -159,41 +161,24 @@ def parts(size: str, repeat: int = 10) -> dict[str, float]:
 
 
 def memory(size: str) -> dict[str, float]:
-    """Peak memory of steps beyond what is there before and stays after them [MB], and page faults a step."""
+    """Peak memory of steps [MB] beyond what is there before, gradients and predicted frames; page faults a step."""
     fit = fit_of(*workload(*SIZES[size]), "cpu")
-    before = _status("VmRSS")
-    with open("/proc/self/clear_refs", "w") as reset:
-        reset.write("5")  # the peak counts from here
+    before = memory_megabytes("VmRSS")
+    Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here
     steps(fit, 1)
-    peak = _status("VmHWM")
-    kept = sum(p.numel() * p.element_size() for p in fit.cloud.parameters) / 1e6
     faults = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
     steps(fit, 20)
     faults = resource.getrusage(resource.RUSAGE_SELF).ru_minflt - faults
-    outputs = kept + scan_megabytes(fit)  # gradients, and the predicted frames
-    return {f"memory_mb_{size}": max(peak, _status("VmHWM")) - before - outputs, f"page_faults_{size}": faults / 20}
-
-
-def scan_megabytes(fit: Fit) -> float:
-    """Size of the training frames [MB]."""
-    return fit.train.frames.nbytes / 1e6
-
-
-def _status(name: str) -> float:
-    with open("/proc/self/status") as lines:
-        return next(float(line.split()[1]) for line in lines if line.startswith(name)) * 1024 / 1e6
+    gradients = sum(p.numel() * p.element_size() for p in fit.cloud.parameters)
+    outputs = (gradients + fit.train.frames.nbytes) / 1e6
+    grown = memory_megabytes("VmHWM") - before - outputs
+    return {f"memory_mb_{size}": grown, f"page_faults_{size}": faults / 20}
 
 
 def in_a_fresh_process(size: str) -> dict[str, float]:
     """`memory`, where nothing else has used memory before."""
     done = subprocess.run([sys.executable, __file__, "--memory", size], capture_output=True, text=True, check=True)
     return json.loads(done.stdout)
-
-
-def commit() -> str:
-    """The commit this was run on, marked if the tree had changes."""
-    found = subprocess.run(["git", "describe", "--always", "--dirty"], capture_output=True, text=True)
-    return found.stdout.strip() or "unknown"
 
 
 def main() -> None:
