@@ -1,7 +1,7 @@
 """The splat as a competent torch programmer would write it: the opponent in `kernels.py`.
 
-Projection in eager torch, differentiated by autograd; patches of one size at a time, `exp`, and `scatter_add_` (half
-as long as `index_add_`); a custom backward that computes the patches anew, gathers, and sums per Gaussian. It draws
+Projection in eager torch, differentiated by autograd; patches of one size at a time, `exp`, and `index_add_` or
+`scatter_add_` (which takes half as long); a custom backward that computes the patches anew, gathers, and sums per Gaussian. It draws
 the same boxes as the compiled kernels: pixels of a patch outside the box get an exponent of -inf, by row and by
 column, which costs nothing per pixel. Sums over rows and columns take a tenth of the time of batched matrix products.
 """
@@ -32,8 +32,12 @@ def splat(
     shape: tuple[int, int],
     cutoff: float,
     variance: float = 1 / 12,
+    add: str = "scatter_add_",
 ) -> Tensor:
-    """Line integrals [V, C, H, W] of a cloud [N, ...] in views [V, 3, 3] without shifts; units as `holosplat.splat`."""
+    """Line integrals [V, C, H, W] of a cloud [N, ...] in views [V, 3, 3] without shifts; units as `holosplat.splat`.
+
+    add: the operation that adds patches to images, `scatter_add_` or `index_add_`.
+    """
     w, x, y, z = (quaternions / quaternions.norm(dim=1, keepdim=True)).unbind(1)
     turn = torch.stack(
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -51,7 +55,7 @@ def splat(
     det = xx * yy - xy * xy
     conic = torch.stack([-0.5 * yy / det, xy / det, -0.5 * xx / det], 2)
     reach = cutoff * torch.stack([xx, yy], 2).detach().sqrt()
-    return _Draw.apply(mean, conic, mass / det.sqrt()[..., None], reach, shape)  # type: ignore[no-any-return]
+    return _Draw.apply(mean, conic, mass / det.sqrt()[..., None], reach, shape, add)  # type: ignore[no-any-return]
 
 
 @dataclass
@@ -103,7 +107,7 @@ class _Draw(torch.autograd.Function):
 
     @staticmethod
     def forward(  # type: ignore[override]
-        ctx: Any, mean: Tensor, conic: Tensor, peak: Tensor, reach: Tensor, shape: tuple[int, int]
+        ctx: Any, mean: Tensor, conic: Tensor, peak: Tensor, reach: Tensor, shape: tuple[int, int], add: str
     ) -> Tensor:
         ctx.save_for_backward(mean, conic, peak, reach)
         ctx.shape = shape
@@ -112,7 +116,7 @@ class _Draw(torch.autograd.Function):
         images = peak.new_zeros(len(channels), len(peak) * height * width)
         for p in _patches(mean, conic, reach, shape):
             for image, own in zip(images, channels):
-                image.scatter_add_(0, p.index, (p.weight * own[p.members][:, None, None]).view(-1))
+                getattr(image, add)(0, p.index, (p.weight * own[p.members][:, None, None]).view(-1))
         return images.view(len(channels), -1, height, width)[..., : shape[0], : shape[1]].transpose(0, 1)
 
     @staticmethod
@@ -137,4 +141,11 @@ class _Draw(torch.autograd.Function):
         a, b, c = conic.view(-1, 3).unbind(1)
         x, y, xx, xy, yy = moments
         of_mean = -torch.stack([2 * a * x + b * y, b * x + 2 * c * y], 1)
-        return of_mean.view_as(mean), torch.stack([xx, xy, yy], 1).view_as(conic), by_peak.T.view_as(peak), None, None
+        return (
+            of_mean.view_as(mean),
+            torch.stack([xx, xy, yy], 1).view_as(conic),
+            by_peak.T.view_as(peak),
+            None,
+            None,
+            None,
+        )
