@@ -303,8 +303,19 @@ def as_table(report: dict[str, Any]) -> str:
             two = " / ".join(f"{gain:.2f}" for gain in row["two_threads"].values()) if isa == best else ""
             lines.append(f"| {name} | {isa} | {rate['forward']:.2f} | {rate['backward']:.2f} | {two} |")
     lines.append(f"| {MAIN} | torch | {report['torch_forward']:.3f} | {report['torch_backward']:.3f} | |")
-    keys = ("forward_ratio", "backward_ratio", "forward_ratio_scatter", "forward_ceiling", "forward_ceiling_stream", "backward_ceiling",
-            "image_error", "gradient_error", "voxel_error", "voxel_gradient_error", "memory_mb_244k")  # fmt: skip
+    keys = (
+        "forward_ratio",
+        "backward_ratio",
+        "forward_ratio_scatter",
+        "forward_ceiling",
+        "forward_ceiling_stream",
+        "backward_ceiling",
+        "image_error",
+        "gradient_error",
+        "voxel_error",
+        "voxel_gradient_error",
+        "memory_mb_244k",
+    )
     lines += ["", *(f"{key}: {report[key]:.3g}" for key in keys)]
     machine = f"{report['machine']['processor']}, torch {report['versions']['torch']}"
     return "\n".join([*lines, "", f"Measured on {machine}; commit {report['commit']}."])

@@ -1,9 +1,10 @@
 """The splat as a competent torch programmer would write it: the opponent in `kernels.py`.
 
 Projection in eager torch, differentiated by autograd; patches of one size at a time, `exp`, and `index_add_` or
-`scatter_add_` (which takes half as long); a custom backward that computes the patches anew, gathers, and sums per Gaussian. It draws
-the same boxes as the compiled kernels: pixels of a patch outside the box get an exponent of -inf, by row and by
-column, which costs nothing per pixel. Sums over rows and columns take a tenth of the time of batched matrix products.
+`scatter_add_` (which takes half as long); a custom backward that computes the patches anew, gathers, and sums per
+Gaussian. It draws the same boxes as the compiled kernels: pixels of a patch outside the box get an exponent of -inf,
+by row and by column, which costs nothing per pixel. Sums over rows and columns take a tenth of the time of batched
+matrix products.
 """
 
 from __future__ import annotations
