@@ -20,7 +20,7 @@ Files = dict[str, str]
 """Path below src/holosplat → source text."""
 
 TIERS = (
-    ("units", "checks", "native", "backends", "geometry", "scan", "volume", "mesh"),
+    ("units", "checks", "native", "backends", "memory", "geometry", "scan", "volume", "mesh"),
     ("materials", "optics", "metrics", "projectors"),
     ("specimens", "representations", "forward", "io"),
     ("fit", "baselines"),

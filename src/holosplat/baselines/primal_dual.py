@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ..backends import implementation
+from ..memory import memory_kept
 
 
 class LinearProjector(Protocol):
@@ -81,18 +82,15 @@ class PrimalDual:
     def run(self, images: Tensor, iterations: int) -> None:
         """`iterations` more steps towards the volume that explains the line integrals [V, H, W]."""
         lines = self.projector.lines_in(images)
-        for _ in range(iterations):
-            difference = self.projector.project(self._extrapolated) - lines
-            self._residual_dual = (self._residual_dual + self._dual_step * difference) / (1 + self._dual_step)
-            # σ = 1 / (2 coupling) for the gradient's rows, so that σ · coupling = ½
-            self._steps.ascend(self._extrapolated, self._gradient_dual, 0.5, self.radius)
-            slope = self.projector.backproject(self._residual_dual)
-            self._steps.descend(
-                slope,
-                self._primal_step,
-                self._gradient_dual,
-                self.coupling,
-                self.upper,
-                self._array,
-                self._extrapolated,
-            )
+        with memory_kept():
+            for _ in range(iterations):
+                self._iterate(lines)
+
+    def _iterate(self, lines: Tensor) -> None:
+        difference = self.projector.project(self._extrapolated) - lines
+        self._residual_dual = (self._residual_dual + self._dual_step * difference) / (1 + self._dual_step)
+        # σ = 1 / (2 coupling) for the gradient's rows, so that σ · coupling = ½
+        self._steps.ascend(self._extrapolated, self._gradient_dual, 0.5, self.radius)
+        slope = self.projector.backproject(self._residual_dual)
+        tau, arrays = self._primal_step, (self._array, self._extrapolated)
+        self._steps.descend(slope, tau, self._gradient_dual, self.coupling, self.upper, *arrays)

@@ -16,13 +16,13 @@ from ..backends import resolve
 from ..checks import InputError, require
 from ..forward import Instrument, resolving_oversample
 from ..geometry import Grid
+from ..memory import memory_kept
 from ..representations.gaussians import GaussianCloud
 from ..scan import Scan
 from . import objective as terms
 from .capture import CapturedStep
 from .density import DensityControl, GradientRecord, control_density
 from .interrupt import interrupts_held
-from .memory import memory_kept
 from .misfit import IMAGE_TERMS, OBJECT_TERMS, Draw, Misfit
 from .objective import Objective
 from .schedule import Schedule

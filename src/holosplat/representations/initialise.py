@@ -11,6 +11,7 @@ from torch.nn.functional import avg_pool3d, interpolate, pad
 
 from ..checks import require
 from ..geometry import Grid, Views
+from ..memory import memory_kept
 from .gaussians import GaussianCloud, raw_of
 
 SMALLEST = 1e-3
@@ -82,14 +83,16 @@ def approximate(
     cloud = cloud.replaced(leaves)
     optimiser = torch.optim.Adam([{"params": [leaf]} for leaf in leaves], lr=0.0, eps=1e-12, fused=True)
     power = float(occupancy.square().sum())
-    for step in range(steps):
-        on_progress("Gaussians for the volume", step / steps)
-        loss = (cloud.density(grid)[0] - occupancy).square().sum() / power
-        loss.backward()
-        for group, rate in zip(optimiser.param_groups, APPROXIMATION_RATES):
-            group["lr"] = rate * 0.1 ** (step / steps)
-        optimiser.step()
-        optimiser.zero_grad(set_to_none=True)
+    with memory_kept():
+        for step in range(steps):
+            on_progress("Gaussians for the volume", step / steps)
+            density = cloud.density(grid)
+            # The gradient of Σ (density - occupancy)² / power, without the arrays that autograd would keep.
+            density.backward((density.detach() - occupancy).mul_(2 / power))
+            for group, rate in zip(optimiser.param_groups, APPROXIMATION_RATES):
+                group["lr"] = rate * 0.1 ** (step / steps)
+            optimiser.step()
+            optimiser.zero_grad(set_to_none=True)
     return cloud.detached()
 
 
