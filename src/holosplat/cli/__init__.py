@@ -1,4 +1,4 @@
-"""The command line: `holosplat simulate | reconstruct | render | export | evaluate | demo`."""
+"""The command line: `holosplat plan | simulate | reconstruct | render | export | evaluate | demo | backends`."""
 
 import os
 

@@ -1,0 +1,67 @@
+"""The benchmarks' opponents compute the same as we do, and their scripts' parts work; speed is not asserted."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+
+from holosplat.projectors.splat import splat
+
+BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+
+
+@pytest.fixture
+def scripts(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
+    """The modules of benchmarks/, which import one another by bare names."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    return {name: importlib.import_module(name) for name in ("step", "eager_step", "kernels", "plain_torch")}
+
+
+@pytest.mark.parametrize("add", ["index_add_", "scatter_add_"])
+def test_the_plain_splat_is_the_splat(scripts, add):
+    work = scripts["kernels"].Workload(3, 40, 60, (1.0, 3.0), 4.0)
+    arrays, (rotations, shifts) = work.cloud(), work.poses()
+    weights = torch.randn(3, 2, 40, 40, generator=torch.Generator().manual_seed(3))
+    results = []
+    for draw in (
+        lambda *a: scripts["plain_torch"].splat(*a, rotations.float(), (40, 40), 4.0, 1 / 12, add),
+        lambda *a: splat(*a, rotations, shifts, (40, 40)),
+    ):
+        leaves = [a.clone().requires_grad_() for a in arrays]
+        image = draw(*leaves)
+        results.append([image.detach(), *torch.autograd.grad(image, leaves, weights)])
+    for found, wanted in zip(*results):  # boxes found in float32 may differ by a faint row of pixels
+        assert float((found - wanted).abs().max() / wanted.abs().max()) < 5e-3
+
+
+def test_the_eager_step_is_our_step(scripts):
+    """The same loss before the first step, up to matter beyond the frame, and a falling one after some."""
+    step = scripts["step"]
+    scan, cloud = step.workload(200, 48)
+    inside = cloud.replaced((cloud.centres * 0.5, *cloud.parameters[1:]))
+    eager, fit = scripts["eager_step"].EagerStep(scan, inside, step.RATES), step.fit_of(scan, inside, "cpu")
+    losses = [eager.step() for _ in range(3)]
+    times, last = step.steps(fit, 1)
+    assert len(times) == 1
+    assert losses[0] == pytest.approx(last, rel=2e-2)
+    assert losses[2] < losses[0]
+    assert step.steps(fit, 2)[1] < last
+
+
+def test_what_a_step_and_its_parts_report(scripts, monkeypatch):
+    step = scripts["step"]
+    monkeypatch.setattr(step, "SIZES", {"tiny": (50, 32)})
+    assert step.compare("tiny", 1).keys() >= {"step_ms_tiny", "eager_ms_tiny", "step_ratio_tiny"}
+    assert {"part_ms_tiny_splat", "part_ms_tiny_adam"} <= step.parts("tiny", 1).keys()
+
+
+def test_what_the_kernels_report(scripts):
+    kernels = scripts["kernels"]
+    work = kernels.Workload(2, 32, 40, (1.0, 2.0), 3.0)
+    assert kernels.splat_pairs(work) > 40
+    seconds = kernels.minima({"ours": kernels.calls(work), "torch": kernels.torch_calls(work, "index_add_")}, 1)
+    assert all(0 < value < 60 for pair in seconds.values() for value in pair)
