@@ -141,7 +141,7 @@ HOLO_INLINE F dissimilarity(F mean, F variance, Moments& t) {
   const F total = fma(zero + 2.0f, variance + fma(-t.mean, centred, t.cross), var);
   const F m = fma(mean_a, mean_a, fma(mean, mean, zero + kC1));
   const F n = (total > zero ? total : zero) + kC2;
-  const F both = one / (m * n), per_m = both * n, per_n = both * m;
+  const F per_m = one / m, per_n = one / n;  // one division for both would overflow where neither does
   const F p = square * per_m, q = var * per_n, one_p = one - p, one_q = one - q, scale = one_p * per_n;
   const F slope_p = one_q * per_m * fma(-p, mean_a, t.mean);
   const F slope_q = scale * fma(q, t.mean + centred, -t.mean);

@@ -5,7 +5,6 @@
 #include <atomic>
 #include <cstdint>
 #include <exception>
-#include <system_error>
 #include <thread>
 #include <type_traits>
 #include <vector>
@@ -40,8 +39,8 @@ void parallel(int64_t tasks, int64_t threads, const Work& work) {
   helpers.reserve(static_cast<size_t>(std::max<int64_t>(0, threads)));
   try {
     for (int64_t k = 1; k < std::min(tasks, threads); ++k) helpers.emplace_back(loop, k);
-  } catch (const std::system_error&) {
-    // No more threads to be had: those that started do it all.
+  } catch (const std::exception&) {
+    // No more threads to be had, or no memory for one: those that started do it all.
   }
   loop(0);
   for (auto& helper : helpers) helper.join();

@@ -81,6 +81,9 @@ HOLO_INLINE void sine_cosine(Floats<W> x, Floats<W>& sine, Floats<W>& cosine) {
   Floats<W> r = fused<W>(n, fill<W>(-1.5703125f), x);
   r = fused<W>(n, fill<W>(-4.83751297e-4f), r);
   r = fused<W>(n, fill<W>(-7.54978995e-8f), r);
+  // Phases of more than 1e7 have no digits left to be reduced by; the wave must stay on its circle all the same.
+  r = r > 1.6f ? fill<W>(1.6f) : r;
+  r = r < -1.6f ? fill<W>(-1.6f) : r;
   const Floats<W> z = r * r;
   Floats<W> s = fused<W>(fill<W>(-0.000195854334f), z, fill<W>(0.00833273693f));
   s = fused<W>(s, z, fill<W>(-0.166666646f));
@@ -108,7 +111,7 @@ HOLO_INLINE Floats<W> expm1(Floats<W> x) {
   p = fused<W>(p, r, fill<W>(0.166665734f));
   p = fused<W>(p, r, fill<W>(0.5f));
   p = fused<W>(p * r, r, r);
-  const Floats<W> power = (Floats<W>)((bits << 23) + 0x3f800000);
+  const Floats<W> power = (Floats<W>)(((Bits<W>)bits << 23) + 0x3f800000u);
   return fused<W>(power, p, power - 1.0f);
 }
 

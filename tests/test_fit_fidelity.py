@@ -247,3 +247,12 @@ def test_what_cannot_be_compared_is_refused():
     for wrong in (predicted[:1], predicted[:, 1:], predicted.double()):
         with pytest.raises(InputError, match="like the target's"):
             l1_and_ssim(wrong, target)
+
+
+@pytest.mark.parametrize("size", [1e9, 1e12, 1e18])
+def test_an_absurd_prediction_is_as_unlike_as_can_be(size):
+    """Nothing overflows on the way to a dissimilarity of one."""
+    generator = torch.Generator().manual_seed(0)
+    frames = 1 + 0.1 * torch.randn(1, 40, 40, generator=generator)
+    _, found = l1_and_ssim(size * torch.randn(1, 40, 40, generator=generator), Target(frames, 0.0, 2.0))
+    assert float(found) == pytest.approx(1, abs=1e-3)

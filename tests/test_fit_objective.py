@@ -7,6 +7,7 @@ import pytest
 import torch
 from skimage.metrics import structural_similarity as skimage_similarity
 
+from holosplat.checks import InputError
 from holosplat.fit import objective as terms
 from holosplat.fit.objective import THESIS, Objective
 from holosplat.fit.total_variation import total_variation
@@ -184,3 +185,16 @@ def test_object_terms_have_the_right_gradients(name):
         "overfull": terms.overfull,
     }[name]
     assert torch.autograd.gradcheck(term, (values,), eps=1e-7, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("density", "message"),
+    [
+        (torch.zeros(1, 4, 4, 4).double(), "must be float32"),
+        (torch.zeros(4, 4, 4), "shape"),
+        (torch.zeros(1, 4, 4, 0), "zero"),
+    ],
+)
+def test_volumes_that_the_kernel_cannot_take_are_refused(density, message):
+    with pytest.raises(InputError, match=message):
+        total_variation(density, backend="cpu")

@@ -188,3 +188,22 @@ def test_bad_input_is_named():
         hologram(some_lines(path, 3), [(1.0, 0.0)] * 3, path, "cpu")
     with pytest.raises(InputError, match="backend must be one of"):
         hologram(some_lines(path), MATTER["one"], path, "quick")
+
+
+@pytest.mark.parametrize("isa", native.available_isas())
+@pytest.mark.parametrize("strength", [1e6, 1e9, 1e13, 1e30])
+def test_senseless_phases_stay_bounded(strength, isa, monkeypatch):
+    """A Gaussian gone astray must not turn the frames into something no fit comes back from."""
+    monkeypatch.setenv("HOLOSPLAT_ISA", isa)
+    path = a_path()
+    frames, gradient = frames_and_gradient(some_lines(path).abs() * strength, [(1.0, 1e-12)], path, "cpu")
+    assert float(frames.abs().max()) < 100
+    assert bool(gradient.isfinite().all())
+
+
+def test_types_that_kernels_do_not_compute_in_are_refused():
+    path = a_path()
+    with pytest.raises(InputError, match="must be float32"):
+        hologram(some_lines(path).double(), MATTER["one"], path, "cpu")
+    with pytest.raises(InputError, match="complex64"):
+        hologram(some_lines(path), MATTER["one"], a_path(dtype=DOUBLE), "cpu")

@@ -523,3 +523,12 @@ def test_plain_and_compiled_tomography_agree():
         volumes.append(solver.volume)
     assert float((volumes[0] - volumes[1]).abs().max()) < 1e-5
     assert float(volumes[0].max()) > 0.3
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_arrays_of_another_shape_are_refused(backend):
+    projector = LatticeProjector(Grid.centred((4, 5, 6), 1.0), Views.evenly_spaced(2, (7, 8), 1.0), backend)
+    with pytest.raises(InputError, match=r"volume must have the shape \(4, 5, 6\)"):
+        projector.project(torch.ones(2, 2, 2))
+    with pytest.raises(InputError, match=r"line integrals must have the shape \(2, 7, 8\)"):
+        projector.backproject(torch.ones(1, 7, 8))

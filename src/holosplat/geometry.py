@@ -145,6 +145,7 @@ class Grid:
         require(len(self.origin) == 3, f"volume origin must be (x, y, z) in metres, but it is {self.origin}.")
         object.__setattr__(self, "shape", tuple(int(n) for n in self.shape))
         object.__setattr__(self, "voxel_size", size)
+        finite("volume origin", np.asarray(self.origin, dtype=np.float64))
         object.__setattr__(self, "origin", tuple(float(v) for v in self.origin))
 
     @classmethod

@@ -57,4 +57,8 @@ def step(
             backend == "reference" or (p.dtype == torch.float32 and all(a.is_contiguous() for a in moved)),
             f"parameters and running means must be float32 and contiguous for the {backend} backend.",
         )
+    require(
+        backend == "reference" or factors.dtype == torch.float32,
+        f"Adam's factors must be float32 for the {backend} backend, but they are {factors.dtype}.",
+    )
     implementation(__name__, backend).step(*groups, factors)

@@ -86,12 +86,18 @@ def hologram(lines: Tensor, refraction: Sequence[tuple[float, float]], path: Opt
     """Frames [V, h, w] (relative intensity) from line integrals [V, C, H, W], C = 1 or 2 channels of matter.
 
     refraction: for each channel `(k δ, k β)` per unit of its line integral, so that the wave behind the object is
-    `exp(-Σ (kβ + i kδ) T)`. Errors: `InputError` for shapes that do not fit, or an unknown backend.
+    `exp(-Σ (kβ + i kδ) T)`. Errors: `InputError` for shapes, types or devices that do not fit, or an unknown backend.
     """
     wanted = (len(path), len(refraction), *path.raster)
     require(
         tuple(lines.shape) == wanted and len(refraction) in (1, 2),
         f"line integrals must have the shape (views, channels, rows, columns) = {wanted} with 1 or 2 channels, "
         f"but they have {tuple(lines.shape)}.",
+    )
+    single = (lines.dtype, path.rows.dtype) == (torch.float32, torch.complex64) and lines.device == path.rows.device
+    require(
+        backend == "reference" or single,
+        f"line integrals must be float32, beside a path of complex64, for the {backend} backend, but they are "
+        f"{lines.dtype} on {lines.device}, beside {path.rows.dtype} on {path.rows.device}.",
     )
     return implementation(__name__, backend).hologram(lines, refraction, path)

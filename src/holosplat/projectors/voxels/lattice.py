@@ -38,6 +38,7 @@ class LatticeProjector:
 
     def project(self, array: Tensor) -> Tensor:
         """Line integrals [V, H, W] in metres × value of `array` [Z, Y, X]."""
+        _check_shape("volume", array, self.grid.shape)
         if self.backend == "reference":
             return lattice_reference(array, self.grid, self.views)
         images = torch.empty(len(self.views), *self.views.shape)
@@ -46,6 +47,7 @@ class LatticeProjector:
 
     def backproject(self, lines: Tensor) -> Tensor:
         """The adjoint of `project`: [V, H, W] → [Z, Y, X]."""
+        _check_shape("line integrals", lines, (len(self.views), *self.views.shape))
         if self.backend == "reference":
             anything = torch.zeros(self.grid.shape, requires_grad=True)
             return torch.autograd.grad(lattice_reference(anything, self.grid, self.views), anything, lines)[0]
@@ -69,6 +71,11 @@ class LatticeProjector:
         source = source.detach().float().contiguous()
         pointers = [native.c_void_p(array.data_ptr()) for array in (source, target)]
         native.call(function, self._lattice, self._views, *pointers, torch.get_num_threads())
+
+
+def _check_shape(name: str, array: Tensor, wanted: tuple[int, ...]) -> None:
+    shape = tuple(array.shape)
+    require(shape == wanted, f"the {name} must have the shape {wanted} of this projector, but the shape is {shape}.")
 
 
 def lattice_reference(volume: Tensor, grid: Grid, views: Views) -> Tensor:
