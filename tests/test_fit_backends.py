@@ -39,7 +39,7 @@ def a_cloud(channels: int = 1, seed: int = 0) -> GaussianCloud:
 
 
 def a_scan(channels: int = 1) -> Scan:
-    """Frames of another cloud, in four views, none held out."""
+    """Frames of another cloud, in three views, none held out."""
     exposures = Exposures.of(Views.evenly_spaced(3, SHAPE, PIXEL), 20.0, 0.05, 0.4)
     with torch.no_grad():
         frames = measure(a_cloud(channels, seed=1), exposures).numpy()
@@ -107,6 +107,7 @@ def test_the_gpus_fit_is_the_plain_one_and_waits_for_nothing(gpu):
     with Waits() as waits:
         fit = a_fit("cuda", detach_worst=True)
         work, fit._work = fit._work, lambda draw: waits.watched(lambda: work(draw))
+        fit._capture = None  # on a GPU, too, the steps themselves are looked at
         found = run(fit)
     assert waits.seen == []
     assert_alike(found, run(a_fit("reference", detach_worst=True)))
@@ -134,9 +135,13 @@ def test_a_plain_fit_needs_no_kernels(monkeypatch):
         Fit(scan, a_cloud(), replace(options, backend="cpu"))
 
 
-def test_a_diverging_fit_stops_with_a_sentence():
+@pytest.mark.parametrize("looks", [{}, {"validation_views": 1, "validate_every": 1}], ids=["", "validated"])
+def test_a_diverging_fit_stops_with_a_sentence(looks):
+    """And its sound steps were handed out."""
+    fit, records = a_fit("cpu", rate_scale=1e6, steps=6, **looks), []
     with pytest.raises(InputError, match=r"diverged at step [1-6].*lower the rates"):
-        run(a_fit("cpu", rate_scale=1e6))
+        fit.run(records.append)
+    assert len(records) == fit.step - 1
 
 
 def test_an_unknown_backend_is_refused():

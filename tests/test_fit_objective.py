@@ -198,3 +198,8 @@ def test_object_terms_have_the_right_gradients(name):
 def test_volumes_that_the_kernel_cannot_take_are_refused(density, message):
     with pytest.raises(InputError, match=message):
         total_variation(density, backend="cpu")
+
+
+def test_an_objective_compares_frames():
+    with pytest.raises(InputError, match="needs a term on the frames"):
+        Objective(l1=0.0, tv_volume=1.0)

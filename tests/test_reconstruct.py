@@ -571,3 +571,21 @@ def test_the_material_of_a_free_cloud_is_that_of_its_matter():
     assert not found.single_material
     assert found.ratio == pytest.approx(4 * CELL.ratio, rel=0.01)
     assert 0.1 * CELL.delta < found.delta < 0.8 * CELL.delta
+
+
+def test_a_backend_is_refused_before_the_start(scan):
+    told = []
+    settings = replace(RANDOM, fit=replace(RANDOM.fit, backend="tpu"))
+    with pytest.raises(InputError, match="backend must be one of"):
+        reconstruct(scan, KNOWN, settings, on_progress=lambda *step: told.append(step))
+    assert told == []
+
+
+def test_another_backend_goes_on_and_judges(scan, tmp_path):
+    """What the last part of a run was computed with is what its result is read for."""
+    folder = RunFolder(tmp_path / "run")
+    reconstruct(scan, KNOWN, RANDOM, seed=3, folder=folder, on_progress=Interruption(2))
+    plain = replace(RANDOM, fit=replace(RANDOM.fit, backend="reference"))
+    assert reconstruct(scan, KNOWN, plain, seed=3, folder=folder, resume=True).cloud.backend == "reference"
+    assert load_reconstruction(folder).cloud.backend == "reference"
+    assert json.loads(folder.summary.read_text())["backend"] == "reference"

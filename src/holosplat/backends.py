@@ -14,7 +14,7 @@ from types import ModuleType
 import torch
 
 from . import native
-from .checks import InputError
+from .checks import InputError, MissingError
 
 NAMES = ("auto", "cpu", "cuda", "reference")
 """What one may ask for."""
@@ -30,11 +30,11 @@ SUPPORT: dict[str, tuple[str, str, dict[str, str]]] = {
     "Gaussians on voxels": ("projectors.splat", "voxelise", {}),
     "wave optics": ("optics.hologram", "hologram", {"cpu": "C++, MKL's or scipy's FFT", "cuda": "Triton, torch's FFT"}),
     "L1 and SSIM of frames": ("fit.fidelity", "l1_and_ssim", {}),
-    "statistics of the measured frames": ("fit.fidelity", "statistics", {}),
+    "statistics of the measured frames": ("fit.fidelity", "statistics", {"cuda": "plain torch"}),
     "Adam": ("fit.adam", "step", {}),
     "total variation of a volume": ("fit.total_variation", "total_variation", {"cuda": "plain torch"}),
 }
-"""Every operation that has several implementations: its package, its function, and remarks on single backends."""
+"""Every operation of a fit: its package, its function, and remarks on single backends."""
 
 _KIND = {"cpu": "C++", "cuda": "Triton", "reference": "plain torch"}
 
@@ -43,7 +43,11 @@ def implementation(package: str, backend: str) -> ModuleType:
     """The module of `package` (a full name) that holds the functions of a resolved `backend`."""
     if backend not in DESCRIPTIONS:
         raise InputError(f"backend must be one of {', '.join(DESCRIPTIONS)} here, but it is {backend!r}.")
-    return import_module(f".{backend}", package)
+    try:
+        return import_module(f".{backend}", package)
+    except ImportError as error:
+        reason = _missing_cuda() if backend == "cuda" else ""
+        raise MissingError(f"{package} cannot use backend {backend!r}: {reason or error}.") from error
 
 
 def support_table() -> list[list[str]]:

@@ -44,6 +44,8 @@ class Instrument:
         backend: str = "cpu",
     ) -> None:
         require(oversample >= 1, f"oversample must be at least 1, but it is {oversample}.")
+        known = dtype in (torch.float32, torch.float64)
+        require(known, f"the wave optics computes in float32 or float64, but {dtype} is asked for.")
         self.exposures, self.oversample, self.dtype = exposures, int(oversample), dtype
         self.backend = resolve("reference" if dtype == torch.float64 else backend)
         self.device = device(self.backend)

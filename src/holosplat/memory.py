@@ -3,36 +3,48 @@
 from __future__ import annotations
 
 import ctypes
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
 
-M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4
-"""Parameters of glibc's `mallopt`: free memory that is kept [bytes], and arrays that may be mapped one by one."""
-KEPT, USUALLY_KEPT = 1 << 30, 1 << 26
-MOST_MAPPED = 65536
-"""glibc's own default."""
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_MMAP_MAX = -1, -3, -4
+"""Parameters of glibc's `mallopt`."""
+INSIDE = {M_MMAP_MAX: 0, M_TRIM_THRESHOLD: 1 << 30}
+"""No array is mapped on its own, and up to 1 GB of free memory is kept."""
+OUTSIDE = {M_MMAP_MAX: 65536, M_MMAP_THRESHOLD: 1 << 25, M_TRIM_THRESHOLD: 1 << 26}
+"""What glibc's thresholds, left to themselves, grow to where large arrays come and go."""
+
+_lock, _depth = threading.Lock(), 0
 
 
 @contextmanager
 def memory_kept() -> Iterator[None]:
-    """Keep what is freed inside (up to 1 GB), for the same arrays are needed again; give it back at the end.
+    """Keep what is freed inside, for the same arrays are needed again; give it back at the end of the outermost block.
 
     Otherwise glibc returns the memory of large arrays to the system after every step, and each of their pages is
     found missing, mapped and zeroed again in the next. Other C libraries are left alone.
     """
-    libc = _glibc()
-    if libc is None:
-        yield
-        return
-    libc.mallopt(M_MMAP_MAX, 0)
-    libc.mallopt(M_TRIM_THRESHOLD, KEPT)
+    _count(1, INSIDE)
     try:
         yield
     finally:
-        libc.mallopt(M_MMAP_MAX, MOST_MAPPED)
-        libc.mallopt(M_TRIM_THRESHOLD, USUALLY_KEPT)
-        libc.malloc_trim(0)
+        _count(-1, OUTSIDE)
+
+
+def _count(change: int, settings: dict[int, int]) -> None:
+    """Enter or leave a block; the settings are made where the outermost one begins or ends."""
+    global _depth
+    libc = _glibc()
+    with _lock:
+        outermost = _depth == 0 or _depth + change == 0
+        _depth += change
+        if libc is None or not outermost:
+            return
+        for parameter, value in settings.items():
+            libc.mallopt(parameter, value)
+        if change < 0:
+            libc.malloc_trim(0)
 
 
 @cache

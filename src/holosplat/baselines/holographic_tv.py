@@ -20,6 +20,7 @@ from ..checks import at_least
 from ..forward import Instrument, resolving_oversample
 from ..geometry import Grid, Views
 from ..materials import DeltaBeta
+from ..memory import memory_kept
 from ..optics.retrieval import invert_contrast, retrieve_thickness
 from ..projectors.voxels import projector_for
 from ..scan import Scan
@@ -62,6 +63,13 @@ def holographic_tv(
 
     `on_progress(stage, fraction)` is called between pieces of work.
     """
+    with memory_kept():
+        return _holographic_tv(scan, material, options, on_progress)
+
+
+def _holographic_tv(
+    scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress
+) -> tuple[Tensor, Grid]:
     scan, refine = _working_resolution(scan, options)
     exposures, pitch = scan.exposures, scan.views.pixel_size
     frames = torch.from_numpy(scan.frames)

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from ..backends import implementation
-from ..memory import memory_kept
 
 
 class LinearProjector(Protocol):
@@ -82,9 +81,8 @@ class PrimalDual:
     def run(self, images: Tensor, iterations: int) -> None:
         """`iterations` more steps towards the volume that explains the line integrals [V, H, W]."""
         lines = self.projector.lines_in(images)
-        with memory_kept():
-            for _ in range(iterations):
-                self._iterate(lines)
+        for _ in range(iterations):
+            self._iterate(lines)
 
     def _iterate(self, lines: Tensor) -> None:
         difference = self.projector.project(self._extrapolated) - lines

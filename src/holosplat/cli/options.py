@@ -115,7 +115,8 @@ class SettingsOptions:
         require(self.config is None or self.preset is None, "give --config or --preset, not both.")
         chosen = read_settings(self.config) if self.config else preset(self.preset or "default")
         if self.backend:
-            chosen = replace(chosen, fit=replace(chosen.fit, backend=self.backend))
+            start = replace(chosen.volume, backend="reference" if self.backend == "reference" else "cpu")
+            chosen = replace(chosen, fit=replace(chosen.fit, backend=self.backend), volume=start)
         resolve(chosen.fit.backend)  # before the start, which takes its time
         return chosen
 

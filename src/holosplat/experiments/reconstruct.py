@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..backends import device_name, resolve
 from ..checks import InputError, require
 from ..fit.loop import Fit, Record, split_validation
 from ..io.json import read_json, write_json
@@ -67,6 +68,8 @@ def reconstruct(
     Errors: `InputError` for scans without training frames or matter, and for folders that do not fit.
     """
     _check_frames(scan.train())
+    if resolve(settings.fit.backend) == "cuda":
+        resolve("cpu")  # the start and the judging run there
     train, _ = split_validation(scan.train(), settings.fit.schedule.validation_views)
     checkpoint = _resumed(folder, scan, prior, settings, seed, resume) if folder else None
     timing: dict[str, float] = dict(checkpoint["timing"]) if checkpoint else {}
@@ -115,7 +118,7 @@ def load_reconstruction(folder: RunFolder) -> Reconstruction:
         raise InputError(
             f"{folder.summary} must be what reconstruct wrote, but it lacks or garbles {error}."
         ) from error
-    plain = folder.read_config().get("settings", {}).get("fit", {}).get("backend") == "reference"
+    plain = summary.get("backend") == "reference"  # then it is judged without compiled kernels, too
     cloud = read_gaussians(folder.gaussians).on("reference" if plain else "cpu")
     return Reconstruction(cloud, energy, oversample, timing, finished)
 
@@ -156,6 +159,8 @@ class _Journal:
         (h, w), pitch = fit.train.views.shape, fit.train.views.pixel_size
         return {
             "finished": done.finished,
+            "backend": fit.backend,
+            "device": device_name(fit.backend),
             "steps": fit.step,
             "stopped_early": fit.stopped_early,
             "best_step": fit.best_step if fit.best_step else fit.step,
@@ -192,7 +197,8 @@ def _resumed(
         return None
     old, same = folder.read_config(), json.loads(json.dumps(_config(scan, prior, settings, seed)))
     for config in (old, same):  # another machine may go on with a run
-        config.get("settings", {}).get("fit", {}).pop("backend", None)
+        for part in ("fit", "volume"):
+            config.get("settings", {}).get(part, {}).pop("backend", None)
     for key, name in RESUMED_WITH.items():
         require(
             old.get(key) == same[key],

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -30,9 +29,9 @@ def starting_cloud(
 def _from_phase_retrieval(
     scan: Scan, prior: MaterialPrior, settings: Settings, seed: int, on_progress: Progress
 ) -> GaussianCloud:
-    backend = "reference" if settings.fit.backend == "reference" else "cpu"  # the start has no kernels for GPUs
+    backend = settings.volume.backend
     material = _material(scan, prior, on_progress, backend)
-    volume, grid = holographic_tv(scan, material, replace(settings.volume, backend=backend), on_progress)
+    volume, grid = holographic_tv(scan, material, settings.volume, on_progress)
     pitch = scan.views.pixel_size
     whole = at_pitch(volume, grid, pitch)
     cloud = cloud_from_volume(*whole, material, settings.spacing_px * pitch, pitch, settings.max_start).on(backend)

@@ -15,7 +15,7 @@ from torch import Tensor
 from ..backends import resolve
 from ..checks import InputError, require
 from ..forward import Instrument, resolving_oversample
-from ..geometry import Grid
+from ..geometry import Grid, Poses
 from ..memory import memory_kept
 from ..representations.gaussians import GaussianCloud
 from ..scan import Scan
@@ -114,10 +114,12 @@ class Fit:
 
     def _deliver(self, on_record: Callable[[Record], None], started: float) -> None:
         """Read the steps that were not read yet, count the time since `started`, and hand out their records."""
-        records = self._read()
+        unread, self._unread = self._unread, []
+        rows = [values.tolist() for _, _, values in unread]  # waits for the device
         self.seconds += time.perf_counter() - started
-        for record in records:
-            on_record({"seconds": self.seconds, **record})
+        for (record, names, _), row in zip(unread, rows):
+            self._check_sound(record, row)
+            on_record({"seconds": self.seconds, **record, **dict(zip(names, row))})
 
     def _advance(self) -> None:
         schedule, density = self.options.schedule, self.options.density
@@ -130,9 +132,9 @@ class Fit:
                 self._capture.forget()
         self.step += 1
         record: Record = {"step": self.step, "count": len(self.cloud)}
+        self._unread.append((record, self._misfit.names(self.cloud, draw), values))
         if self._judge is not None and (self.step % schedule.validate_every == 0 or self.step == schedule.steps):
             record |= self._validate()
-        self._unread.append((record, self._misfit.names(self.cloud, draw), values))
 
     def _work(self, draw: Draw) -> Tensor:
         """One step on the device: gradients, what density control wants of them, Adam. Waits for nothing."""
@@ -144,19 +146,13 @@ class Fit:
         sound = torch.stack([p.detach().sum() for p in self.cloud.parameters]).sum()[None]
         return torch.cat([values, sound])
 
-    def _read(self) -> list[Record]:
-        """The records of all steps that were not read yet; `InputError` if the fit has diverged."""
-        records = []
-        unread, self._unread = self._unread, []
-        for record, names, values in unread:
-            *numbers, sound = values.tolist()
-            if not math.isfinite(sound + numbers[0]):
-                raise InputError(
-                    f"the fit diverged at step {record['step']:.0f}: its parameters are no longer finite; "
-                    "lower the rates of the schedule (rate_position, rate_scale, rate_rotation, rate_amplitude)."
-                )
-            records.append({**record, **dict(zip(names, numbers))})
-        return records
+    def _check_sound(self, record: Record, row: list[float]) -> None:
+        """`InputError` if loss (first) or parameters (their sum, last) are no longer numbers."""
+        if not math.isfinite(row[0] + row[-1]):
+            raise InputError(
+                f"the fit diverged at step {record['step']:.0f}: its parameters are no longer finite; "
+                "lower the rates of the schedule (rate_position, rate_scale, rate_rotation, rate_amplitude)."
+            )
 
     def _draw(self) -> Draw:
         """What the next step looks at, by the schedule and the generator."""
@@ -167,9 +163,9 @@ class Fit:
         middle = self._volume_block().centre if volume else np.zeros(3)
         ramp = min(1.0, self.step / max(1.0, w.frc_ramp * schedule.steps))
         return Draw(
-            None if whole else torch.from_numpy(views).to(on),
-            torch.from_numpy(middle).to(on),
-            torch.tensor(ramp).to(on),
+            None if whole else torch.from_numpy(views).to(on, non_blocking=True),
+            torch.from_numpy(middle).to(on, non_blocking=True),
+            torch.tensor(ramp).to(on, non_blocking=True),
             volume,
         )
 
@@ -200,7 +196,8 @@ class Fit:
         """Look at the validation views; keeps the best cloud, and stops the fit when patience is over."""
         assert self._judge is not None
         with torch.no_grad():
-            predicted = self._judge.measure(self.cloud).cpu()
+            lines = self.cloud.project(Poses.of(self._judge.views, self._judge.device))
+            predicted = self._judge.frames(lines).cpu()
         frames, low, span = torch.from_numpy(self.validation.frames), self._misfit.low, self._misfit.span
         a, b = (predicted - low) / span, (frames - low) / span
         ssim, frcm = (1 - float(term(a, b).mean()) for term in (terms.one_minus_ssim, terms.one_minus_frcm))

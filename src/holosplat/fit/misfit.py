@@ -52,6 +52,8 @@ class Misfit:
         self._poses = Poses.of(instrument.views, instrument.device)
         frames = torch.from_numpy(train.frames).to(instrument.device)
         self._target = Target(frames, self.low, self.span, instrument.backend)
+        if objective.ssim > 0:
+            _ = self._target.statistics  # once, for all subsets of views
         self._block = (block.shape, block.voxel_size[0])
 
     def names(self, cloud: GaussianCloud, draw: Draw) -> list[str]:

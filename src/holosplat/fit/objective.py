@@ -9,6 +9,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from ..checks import require
 from .fidelity import reference as plain
 
 
@@ -33,6 +34,10 @@ class Objective:
     anisotropy_limit: float = 10.0
     tv_volume: float = 0.0
     overfull: float = 0.0
+
+    def __post_init__(self) -> None:
+        compared = self.l1 + self.l2_amplitude + self.ssim + self.tv_image + self.frc
+        require(compared > 0, "the objective needs a term on the frames: l1, l2_amplitude, ssim, tv_image or frc.")
 
     @property
     def uses_volume(self) -> bool:

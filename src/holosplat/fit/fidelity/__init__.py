@@ -38,7 +38,16 @@ class Target:
         )
         require(0 < span < math.inf, f"span must be positive, but it is {span}.")
         self.frames, self.low, self.span, self.backend = frames.contiguous(), float(low), float(span), backend
-        self.statistics: Tensor = implementation(__name__, backend).statistics(self.frames, self.low, self.span)
+        self._compute = implementation(__name__, backend).statistics
+        self._statistics: Tensor | None = None
+
+    @property
+    def statistics(self) -> Tensor:
+        """Local mean and variance, [V, 2, h, w]; computed when they are first needed, then kept."""
+        found = self._statistics
+        if found is None:
+            found = self._statistics = self._compute(self.frames, self.low, self.span)
+        return found
 
     def __len__(self) -> int:
         """The number of views."""
@@ -47,7 +56,8 @@ class Target:
     def __getitem__(self, index: Tensor) -> Target:
         """The views of `index` [K] int64, on the frames' device. Waits for no GPU."""
         part = copy.copy(self)
-        part.frames, part.statistics = (a.index_select(0, index) for a in (self.frames, self.statistics))
+        part.frames = self.frames.index_select(0, index)
+        part._statistics = None if self._statistics is None else self._statistics.index_select(0, index)
         return part
 
 

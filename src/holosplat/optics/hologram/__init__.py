@@ -1,6 +1,6 @@
 """From line integrals to frames in one differentiable operation: exit wave → Fresnel → intensity → PSF → pixels.
 
-Backends: `cpu` (C++ and scipy's transforms, float32), `cuda` (Triton and torch's transforms, float32) and
+Backends: `cpu` (C++ between MKL's or scipy's transforms, float32), `cuda` (Triton and torch's transforms, float32) and
 `reference` (plain torch, any float type and device), which is the specification of the others. All give gradients
 of the line integrals, and of nothing else; those of `cpu` and `cuda` are written by hand.
 """
