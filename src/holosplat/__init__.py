@@ -15,7 +15,7 @@ _WHERE = {
     "checks": ("InputError",),
     "geometry": ("Grid", "Views"),
     "scan": ("Exposures", "Scan", "interleaved_split"),
-    "volume": ("Object", "Volume"),
+    "volume": ("LineIntegrals", "Object", "Volume"),
     "mesh": ("TriangleMesh",),
     "materials": ("HAEMOGLOBIN", "PLASMA", "RED_CELL", "WATER", "Compound", "DeltaBeta", "Mixture", "parse_material"),
     "forward": ("Instrument", "measure", "simulate"),
@@ -96,5 +96,6 @@ if TYPE_CHECKING:
     from .specimens.red_cells import random_cells as random_cells
     from .specimens.repair import closed as closed
     from .specimens.scene import MeshScene as MeshScene
+    from .volume import LineIntegrals as LineIntegrals
     from .volume import Object as Object
     from .volume import Volume as Volume
