@@ -843,3 +843,13 @@ def test_a_wrong_command_line_is_explained(arguments, words):
     assert "Traceback" not in outcome.err
     for word in words:
         assert word.replace("-", " ").strip() in outcome.said, (word, outcome.err)
+
+
+def test_a_reader_that_leaves_early_sees_no_traceback():
+    """`holosplat backends | head -1`, with a reader that closes at once."""
+    command = [sys.executable, "-c", "from holosplat.cli import main; main()", "backends"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stdout
+        assert process.stderr
+        process.stdout.close()
+        assert "Traceback" not in process.stderr.read()

@@ -15,6 +15,7 @@ import pytest
 import torch
 
 import holosplat.experiments.reconstruct as module
+from holosplat import native
 from holosplat.baselines import HolographicTV
 from holosplat.checks import InputError
 from holosplat.experiments.evaluate import evaluate, material_found, render
@@ -589,3 +590,17 @@ def test_another_backend_goes_on_and_judges(scan, tmp_path):
     assert reconstruct(scan, KNOWN, plain, seed=3, folder=folder, resume=True).cloud.backend == "reference"
     assert load_reconstruction(folder).cloud.backend == "reference"
     assert json.loads(folder.summary.read_text())["backend"] == "reference"
+
+
+def test_a_whole_run_needs_no_kernels_if_asked_for_the_plain_path(scan, monkeypatch):
+    """From phase retrieval to the scores, with every call of the compiled library refused."""
+    small = scan.binned(2)
+    monkeypatch.setattr(native, "call", lambda *_: pytest.fail("a kernel was called"))
+    tiny = replace(SMALL.volume, backend="reference", refine=1, iterations=3, corrections=1, inner=2)
+    schedule = replace(SMALL.fit.schedule, steps=2, oversample=1)
+    plain = replace(
+        SMALL, volume=tiny, approximate_steps=2, fit=replace(SMALL.fit, schedule=schedule, backend="reference")
+    )
+    done = reconstruct(small, KNOWN, plain)
+    assert done.finished
+    assert math.isfinite(evaluate(done, small, None).test.mean["ssim"])

@@ -75,8 +75,8 @@ def resolve(name: str) -> str:
         return "cpu"
     state = "; ".join(f"{backend}: {reason or 'can be used'}" for backend, reason in reasons.items())
     raise InputError(
-        f"backend {name!r} cannot be used here. {state}. Mend one of them, or ask for backend 'reference', "
-        "which is slow but needs neither."
+        f"backend {name!r} cannot be used here. {state}. Mend one of them (for cpu: install a C++ compiler, "
+        "then holosplat again), or ask for backend 'reference', which is slow but needs neither."
     )
 
 
@@ -86,7 +86,7 @@ def missing(backend: str) -> str:
         try:
             native.available_isas()
         except RuntimeError as error:
-            return str(error).rstrip(".")
+            return str(error).split(". ")[0].rstrip(".")  # its advice stands where reasons are put together
     if backend == "cuda":
         return _missing_cuda()
     return ""

@@ -55,7 +55,8 @@ class Fit:
         self.train, self.validation = split_validation(scan.train(), schedule.validation_views)
         oversample = schedule.oversample or resolving_oversample(self.train.exposures, 1.5, at_least=1)
         self.instrument = Instrument(self.train.exposures, oversample, backend=self.backend)
-        self._judge = self._instrument_of(self.validation) if len(self.validation) else None
+        looks = len(self.validation) > 0
+        self._judge = Instrument(self.validation.exposures, oversample, backend=self.backend) if looks else None
         require(np.ptp(self.train.frames) > 0, "all training frames are constant, so there is nothing to fit.")
         self._grid = Grid.of_views(scan.views)
         block = self._grid.block((0, 0, 0), self._block_shape())
@@ -69,9 +70,6 @@ class Fit:
         self._order: list[int] = []
         self.best_score, self.best_step, self._best = float("inf"), 0, self.cloud.detached()
         self.stopped_early = False
-
-    def _instrument_of(self, scan: Scan) -> Instrument:
-        return Instrument(scan.exposures, self.instrument.oversample, backend=self.backend)
 
     @property
     def cloud(self) -> GaussianCloud:
