@@ -200,6 +200,26 @@ def test_a_number_of_views_that_does_not_divide_draws_as_evenly(scan, monkeypatc
     assert set(Counter(chain.from_iterable(drawn)).values()) == {24 * per_step // 6}
 
 
+@pytest.mark.parametrize("ssim", [0.0, 0.5])
+def test_drawn_views_are_compared_with_their_own_frames(scan, monkeypatch, ssim):
+    """Pose, optics and measured frame of a step are those of one view, whichever were drawn."""
+    unequal = replace(scan.exposures, distance=np.linspace(0.02, 0.08, len(scan)))
+    unlike = replace(scan, exposures=unequal)
+    fit = fit_of(unlike, steps=4, views_per_step=2, objective=Objective(l1=1.0, ssim=ssim))
+    whole = Instrument(fit.train.exposures, fit.instrument.oversample)
+    wanted, frames = [], fit.instrument.frames
+
+    def spy(lines, index=None):
+        with torch.no_grad():
+            predicted = whole.measure(fit.cloud.detached(), index.numpy())
+        difference = (predicted - torch.from_numpy(fit.train.frames)[index]).abs().mean()
+        wanted.append(float(difference) / float(np.ptp(fit.train.frames)))
+        return frames(lines, index)
+
+    monkeypatch.setattr(fit.instrument, "frames", spy)
+    assert [record["l1"] for record in run(fit)] == pytest.approx(wanted, rel=1e-4)
+
+
 # --- rates, warm-up, detached views -------------------------------------------------------------------------
 
 
