@@ -32,6 +32,7 @@ from ..io.nxtomo import read_scan, write_scan
 from ..io.volumes import read_volume, write_volume
 from ..report.run import report_run
 from ..scan import PIXEL_RANGE_M, Scan
+from .convert import convert
 from .options import BeamlineOptions, MaterialOptions, MeshOptions, NoiseOptions, PriorOptions, SettingsOptions
 from .plan import plan
 from .progress import ProgressBar
@@ -258,6 +259,7 @@ COMMANDS = {
     "reconstruct": reconstruct,
     "render": render,
     "export": export,
+    "convert": convert,
     "evaluate": evaluate,
     "demo": demo,
     "backends": backends,

@@ -1,0 +1,176 @@
+"""`holosplat convert`: scans from and to the formats that others read."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import torch
+from tyro.conf import Positional, arg
+
+from ..checks import InputError, require
+from ..experiments.settings import MaterialPrior
+from ..io.folder import require_new
+from ..io.formats import ScanFormat, format_of
+from ..io.nerf_synthetic import GivenOptics, NerfOptions, grey_range, read_nerf_synthetic, write_nerf_synthetic
+from ..io.nxtomo import read_scan, write_scan
+from ..io.png import PngKind
+from ..io.r2_gaussian import R2Options, read_r2_gaussian, write_r2_gaussian
+from ..io.tiff import TiffLayout, read_tiff, write_tiff
+from ..io.volumes import read_volume
+from ..optics import retrieve_thickness
+from ..scan import Scan
+from .options import PriorOptions
+
+
+@dataclass(frozen=True)
+class ForeignOptions:
+    """What folders of other programs do not say (those that holosplat wrote say it themselves)."""
+
+    energy_kev: float | None = None
+    """Photon energy [keV]."""
+    distance: float | None = None
+    """Effective propagation distance [m]; R²-Gaussian's data have none."""
+    pixel_size: float | None = None
+    """Effective pixel size [m]."""
+    black: float | None = None
+    """Intensity of black pixels, relative to the flat field (nerf-synthetic; default 0)."""
+    white: float | None = None
+    """Intensity of white pixels, relative to the flat field (nerf-synthetic; default 1)."""
+
+    def given(self) -> dict[str, float]:
+        """Those that are said."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+
+@dataclass(frozen=True)
+class WritingOptions:
+    """How it is written."""
+
+    png: PngKind | None = None
+    """nerf-synthetic: 16-bit grey images (default), or the 8-bit RGBA that some programs insist on."""
+    camera_distance: float | None = None
+    """nerf-synthetic: cameras' distance, in half fields of view (default 100); the farther, the more parallel."""
+    tiff: TiffLayout | None = None
+    """tiff: one stack (default), or one file a frame."""
+    truth: Path | None = None
+    """r2-gaussian: volume file of the truth, for its scores."""
+    seed_points: int | None = None
+    """nerf-synthetic, r2-gaussian: points to start from."""
+
+    def for_format(self, to: ScanFormat) -> dict[str, Any]:
+        """Those that are said; `InputError` for one that `to` does not know."""
+        said = {name: value for name, value in vars(self).items() if value is not None}
+        for name in said:
+            require(to in GOES_WITH[name], f"--{name.replace('_', '-')} goes with --to {' or '.join(GOES_WITH[name])}.")
+        return said
+
+
+GOES_WITH: dict[str, tuple[ScanFormat, ...]] = {
+    "png": ("nerf-synthetic",),
+    "camera_distance": ("nerf-synthetic",),
+    "tiff": ("tiff",),
+    "truth": ("r2-gaussian",),
+    "seed_points": ("nerf-synthetic", "r2-gaussian"),
+    "material": ("nerf-synthetic", "r2-gaussian"),
+}
+"""The formats that know an option."""
+
+
+def convert(
+    source: Annotated[Positional[Path], arg(metavar="SOURCE")],
+    out: Annotated[Positional[Path], arg(metavar="OUT")],
+    to: ScanFormat,
+    foreign: ForeignOptions,
+    writing: WritingOptions,
+    matter: PriorOptions = PriorOptions(),
+) -> None:
+    """Bring a scan into another format; what SOURCE is, its content says.
+
+    Args:
+        source: Scan file (NXtomo), or folder (nerf-synthetic, tiff, r2-gaussian).
+        out: File (nxtomo) or folder to make.
+        to: Format to write; r2-gaussian needs a material or δ/β, for which its line integrals are retrieved.
+    """
+    require_new(out)
+    said = writing.for_format(to)
+    scan = _read(source, foreign.given())
+    prior = matter.prior(scan.exposures.energy_kev)
+    require(prior.kind == "free" or to in GOES_WITH["material"], f"a material is not needed with --to {to}; leave it.")
+    if to == "nxtomo":
+        require(not out.is_dir(), f"{out} must be a file to write, but it is a folder; add a file name.")
+        write_scan(out, scan)
+    elif to == "tiff":
+        write_tiff(out, scan, writing.tiff or "stack")
+    elif to == "nerf-synthetic":
+        thickness = None if prior.kind == "free" else _retrieved(scan, prior)[0]
+        write_nerf_synthetic(out, scan, replace(NerfOptions(), **said), thickness)
+        _say_what_is_cut(scan)
+    else:
+        require(
+            prior.kind != "free", "--to r2-gaussian needs --material or --delta-beta: it takes retrieved thickness."
+        )
+        if writing.truth:
+            said["truth"] = read_volume(writing.truth)
+        write_r2_gaussian(out, scan, *_retrieved(scan, prior), replace(R2Options(), **said))
+    held_out = int(scan.is_test.sum())
+    _say(f"wrote {out}: {to}, {len(scan)} frames of {scan.views.shape[0]} × {scan.views.shape[1]} pixels, "
+         f"{held_out} of them held out")  # fmt: skip
+
+
+def _read(source: Path, given: dict[str, float]) -> Scan:
+    """The scan at `source`, with what is `given` for a folder of another program."""
+    kind = format_of(source)
+    if kind == "r2-gaussian":
+        _only(kind, given, ("energy_kev", "pixel_size"))
+        scan = read_r2_gaussian(source, **given)
+        beta = scan.provenance["beta_of_density_1"]
+        _say(f"{source} has no phase: transmission exp(-p) in contact, where a density of 1 has beta {beta}; "
+             "reconstruct it with --delta-beta 1, and read beta")  # fmt: skip
+        return scan
+    if kind == "nerf-synthetic":
+        if not given:
+            return read_nerf_synthetic(source)
+        for name in ("energy_kev", "distance", "pixel_size"):
+            require(name in given, f"--{name.replace('_', '-')} must be given too, for folders of other programs.")
+        return read_nerf_synthetic(source, GivenOptics(**given))
+    _only(kind, given, ())
+    return {"nxtomo": read_scan, "tiff": read_tiff}[kind](source)
+
+
+def _only(kind: ScanFormat, given: dict[str, float], allowed: tuple[str, ...]) -> None:
+    stray = [f"--{name.replace('_', '-')}" for name in given if name not in allowed]
+    require(not stray, f"{', '.join(stray)}: not for a source in {kind}; leave it away.")
+
+
+def _retrieved(scan: Scan, prior: MaterialPrior) -> tuple[np.ndarray, float]:
+    """Thickness [N, H, W] [m] of a material, by Paganin (2002), and the material's δ.
+
+    Where only δ/β is known, δ is such that the greatest thickness is half the field's longer side.
+    """
+    exposures, views = scan.exposures, scan.views
+    delta, beta = (prior.delta, prior.beta) if prior.kind == "known" else (1.0, 1.0 / prior.ratio)
+    found = retrieve_thickness(
+        torch.from_numpy(scan.frames), views.pixel_size, exposures.distance, exposures.energy_kev, delta, beta
+    ).numpy()
+    if prior.kind == "known":
+        return found, delta
+    scale = float(found.max()) / (0.5 * max(views.width, views.height))
+    if not scale > 0:
+        raise InputError("the frames hold no shadow of matter with this --delta-beta; check its sign.")
+    return found / scale, scale
+
+
+def _say_what_is_cut(scan: Scan) -> None:
+    low, high = grey_range(scan)
+    held_out = scan.frames[scan.is_test]
+    cut = int(((held_out < low) | (held_out > high)).sum())
+    if cut:
+        _say(f"{cut} of {held_out.size} held-out pixels lie beyond the training frames' range and were cut off to it")
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)

@@ -1,0 +1,247 @@
+"""Scans from and to the NeRF-synthetic layout (Mildenhall et al. 2020, "Blender"): PNG images and camera poses.
+
+The layout knows grey values and pinhole cameras. What it cannot say (exact parallel geometry, intensities, optics,
+times) stands in entries called `holosplat`, which other programs pass over; docs/formats.md has the table.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..checks import InputError, at_least, in_range, require
+from ..geometry import Views
+from ..scan import DISTANCE_RANGE_M, ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan
+from .exposure_tables import beam_table, exposure_table, in_order, read_exposures
+from .folder import atomic_folder
+from .json import write_json
+from .ply import write_ply
+from .png import LEVELS, PngKind, read_png, write_png
+from .seeds import hull_points, uniform_points
+from .table import Table
+
+FORMAT = "holosplat NeRF-synthetic 1"
+TRAIN, TEST, VAL = (f"transforms_{split}.json" for split in ("train", "test", "val"))
+POINTS = "points3d.ply"
+CAMERA_DISTANCES = (10.0, 1e5)
+MOST_TANGENT = 0.02
+"""The widest cameras of others that pass for parallel, as the tangent of half their angle: so much of its distance
+from the axis may a point stray, per half field of view of depth."""
+
+
+@dataclass(frozen=True)
+class NerfOptions:
+    """png: 16-bit grey, or the 8-bit RGBA that some programs insist on; camera_distance: from the origin, in units of
+    half the field of view; seed_points: points in points3d.ply."""
+
+    png: PngKind = "grey16"
+    camera_distance: float = 100.0
+    seed_points: int = 20_000
+
+    def __post_init__(self) -> None:
+        in_range("camera_distance", self.camera_distance, *CAMERA_DISTANCES, unit="half fields of view")
+        at_least(self, 1, "seed_points")
+
+
+@dataclass(frozen=True)
+class GivenOptics:
+    """What folders of other programs do not say: energy_kev; distance [m] of propagation; pixel_size [m]; the
+    intensities (relative to the flat field) of black and white."""
+
+    energy_kev: float
+    distance: float
+    pixel_size: float
+    black: float = 0.0
+    white: float = 1.0
+
+    def __post_init__(self) -> None:
+        in_range("energy", self.energy_kev, *ENERGY_RANGE_KEV, unit="keV")
+        in_range("propagation distance", self.distance, *DISTANCE_RANGE_M, unit="metres")
+        in_range("pixel size", self.pixel_size, *PIXEL_RANGE_M, unit="metres")
+        good = math.isfinite(self.black) and math.isfinite(self.white) and self.black < self.white
+        require(good, f"black must be below white, but they are {self.black:g} and {self.white:g}; exchange them.")
+
+
+def scene_scale(views: Views) -> float:
+    """Scene units per metre [1/m]: the longer side of the field of view goes from -1 to 1."""
+    return 2.0 / max(views.width, views.height)
+
+
+def camera_poses(views: Views, camera_distance: float) -> np.ndarray:
+    """Camera-to-world matrices [V, 4, 4] in scene units, as Blender and OpenGL have cameras: x right, y up, -z ahead.
+
+    The world is the object frame, scaled. Rows of R are the lab's axes seen from the object: right, down, along the
+    beam. Each camera looks along the beam at the centre of its (shifted) detector, from `camera_distance` upstream.
+    """
+    right, down, beam = views.rotations.transpose(1, 0, 2)
+    aside = scene_scale(views) * (views.shifts[:, :1] * right + views.shifts[:, 1:] * down)
+    poses = np.tile(np.eye(4), (len(views), 1, 1))
+    poses[:, :3, 0], poses[:, :3, 1], poses[:, :3, 2] = right, -down, -beam
+    poses[:, :3, 3] = aside - camera_distance * beam
+    return poses
+
+
+def grey_range(scan: Scan) -> tuple[float, float]:
+    """The intensities that become black and white: least and greatest of all training frames."""
+    frames = scan.train().frames
+    return float(frames.min()), float(frames.max())
+
+
+def write_nerf_synthetic(
+    path: str | Path, scan: Scan, options: NerfOptions = NerfOptions(), thickness: np.ndarray | None = None
+) -> None:
+    """Write `scan` as a folder with train/ and test/ images, their transforms, and points3d.ply.
+
+    Held-out frames have the same grey scale as those for training; what lies beyond it is cut off.
+    thickness: [N, H, W] retrieved for a known material; then the points fill its visual hull, else the field of view.
+    transforms_val.json is a copy of the test's: most readers ask for one.
+    """
+    views, train = scan.views, np.flatnonzero(~scan.is_test)
+    low, high = grey_range(scan)
+    head = {
+        "format": FORMAT,
+        "count": len(scan),
+        "shape": list(views.shape),
+        "scale_per_m": scene_scale(views),
+        "camera_distance": options.camera_distance,
+        "low": low,
+        "high": high,
+        "white": LEVELS[options.png],
+        "points": "uniform" if thickness is None else "visual hull",
+        **beam_table(scan),
+    }
+    half = 0.5 * views.width * scene_scale(views) / options.camera_distance
+    poses = camera_poses(views, options.camera_distance)
+    with atomic_folder(path) as folder:
+        for name, numbers in ((TRAIN, train), (TEST, np.flatnonzero(scan.is_test))):
+            split = name.removeprefix("transforms_").removesuffix(".json")
+            (folder / split).mkdir()
+            frames = [_write_frame(folder, f"{split}/r_{k:04d}", scan, n, head) for k, n in enumerate(numbers.tolist())]
+            for frame, n in zip(frames, numbers):
+                frame["transform_matrix"] = poses[n].tolist()
+            table = {"camera_angle_x": 2 * math.atan(half), "frames": frames, "holosplat": head}
+            for copy in (name, VAL) if name == TEST else (name,):
+                write_json(folder / copy, table)
+        if thickness is None:
+            points = uniform_points(views[train], options.seed_points)
+        else:
+            points = hull_points(thickness[train], views[train], options.seed_points)
+        write_ply(folder / POINTS, points * scene_scale(views))
+
+
+def read_nerf_synthetic(path: str | Path, given: GivenOptics | None = None) -> Scan:
+    """The scan of a folder in the NeRF-synthetic layout.
+
+    Of holosplat's own folders everything comes back, intensities as exact as the images' bits. For a folder of another
+    program, whose cameras must be all but parallel, `given` says what the layout does not.
+    """
+    folder = Path(path)
+    splits = [Table.read(folder / TRAIN)]
+    own = "holosplat" in splits[0]
+    if own or (folder / TEST).exists():
+        splits.append(Table.read(folder / TEST))
+    heads = [split.values.get("holosplat") for split in splits]
+    require(
+        all(head == heads[0] for head in heads),
+        f"{folder}: the entry holosplat of {TRAIN} and {TEST} must be the same, but it differs; take the two of one "
+        "folder.",
+    )
+    content = _Content.read(splits)
+    if own:
+        require(given is None, f"{folder} says itself how it was taken; leave away what is given for others' folders.")
+        return _own_scan(splits[0].table("holosplat"), content)
+    if given is None:
+        raise InputError(
+            f"{folder} must say how it was taken (the entry holosplat of {TRAIN}), but it is of another program; give "
+            "the photon energy, the propagation distance and the pixel size."
+        )
+    return _foreign_scan(folder, splits, content, given)
+
+
+@dataclass(frozen=True)
+class _Content:
+    """Frames in the files' order: their tables; levels [N, H, W] of their images, white, and which are held out."""
+
+    frames: list[Table]
+    levels: np.ndarray
+    white: int
+    is_test: np.ndarray
+
+    @classmethod
+    def read(cls, splits: list[Table]) -> _Content:
+        tables = [split.tables("frames") for split in splits]
+        require(len(tables[0]) > 0, f"{splits[0].label('frames')} must hold at least one frame, but it holds none.")
+        frames = [frame for split in tables for frame in split]
+        files = [_image_file(frame) for frame in frames]
+        images = [read_png(file) for file in files]
+        first, white = images[0]
+        for file, (image, its_white) in zip(files, images):
+            same = image.shape == first.shape and its_white == white
+            this, that = (f"{a.shape} pixels and white at {w}" for a, w in ((image, its_white), images[0]))
+            require(same, f"{file} must be as {files[0].name}, with {that}, but it has {this}; convert it.")
+        is_test = np.arange(len(frames)) >= len(tables[0])
+        return cls(frames, np.stack([image for image, _ in images]), white, is_test)
+
+    def intensities(self, low: float, high: float) -> np.ndarray:
+        """[N, H, W] float32: black is `low`, white is `high`."""
+        return (low + (high - low) / self.white * self.levels.astype(np.float64)).astype(np.float32)
+
+
+def _write_frame(folder: Path, name: str, scan: Scan, n: int, head: dict[str, Any]) -> dict[str, Any]:
+    """Write the image of frame `n`; its entry in the transforms, but for the pose."""
+    kind: PngKind = "grey16" if head["white"] == LEVELS["grey16"] else "rgba8"
+    span = head["high"] - head["low"]
+    grey = (scan.frames[n].astype(np.float64) - head["low"]) / (span or 1.0)
+    write_png(folder / f"{name}.png", grey, kind)
+    return {"file_path": f"./{name}", "holosplat": {"index": n, **exposure_table(scan.exposures, n)}}
+
+
+def _image_file(frame: Table) -> Path:
+    """The frame's image: the layout leaves .png away, some programs write it."""
+    return frame.file("file_path", "" if frame.text("file_path").lower().endswith(".png") else ".png")
+
+
+def _own_scan(head: Table, content: _Content) -> Scan:
+    head.require_format(FORMAT)
+    for name, found in (("shape", list(content.levels.shape[1:])), ("white", content.white)):
+        require(
+            head.need(name) == found,
+            f"{head.label(name)} is {head.need(name)}, but that of the images is {found}; they must be those that "
+            "were written with it.",
+        )
+    entries = [frame.table("holosplat") for frame in content.frames]
+    order = in_order(head, entries)
+    h, w = content.levels.shape[1:]
+    exposures = read_exposures(head, [entries[k] for k in order], (h, w))
+    frames = content.intensities(head.number("low"), head.number("high"))
+    return Scan(frames[order], exposures, content.is_test[order], head.texts("provenance"))
+
+
+def _foreign_scan(folder: Path, splits: list[Table], content: _Content, given: GivenOptics) -> Scan:
+    """Cameras taken as parallel: the axes turned round, and what they look at beside the origin is the shift."""
+    angles = [split.number("camera_angle_x") for split in splits]
+    require(len(set(angles)) == 1, f"{folder}: camera_angle_x must be the same for all frames, but it is {angles}.")
+    tangent = math.tan(0.5 * angles[0])
+    if not 0 < tangent <= MOST_TANGENT:
+        raise InputError(
+            f"{splits[0].label('camera_angle_x')} must be below {2 * math.atan(MOST_TANGENT):.3g} rad (beams are "
+            f"parallel here), but it is {angles[0]:g}; these are perspective views, which holosplat cannot use."
+        )
+    poses = np.array([frame.numbers("transform_matrix", (4, 4)) for frame in content.frames])
+    rotations = poses[:, :3, :3].transpose(0, 2, 1) * np.array([1.0, -1.0, -1.0])[:, None]
+    away = -np.einsum("vi,vi->v", poses[:, :3, 3], rotations[:, 2])
+    require(
+        bool((away > 0).all() and np.ptp(away) <= 1e-3 * away.max()),
+        f"{folder}: cameras must look at the origin's side from one distance, but theirs go from {away.min():g} to "
+        f"{away.max():g}; bring the images to one scale first.",
+    )
+    h, w = content.levels.shape[1:]
+    metres_per_unit = given.pixel_size * w / (2 * float(away.mean()) * tangent)
+    shifts = metres_per_unit * np.einsum("vi,vki->vk", poses[:, :3, 3], rotations[:, :2])
+    exposures = Exposures.of(Views(rotations, shifts, (h, w), given.pixel_size), given.energy_kev, given.distance)
+    origin = {"converted_from": f"NeRF-synthetic folder {folder.name}"}
+    return Scan(content.intensities(given.black, given.white), exposures, content.is_test, origin)

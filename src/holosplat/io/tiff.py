@@ -1,0 +1,75 @@
+"""Scans from and to TIFF files (float32) beside a `scan.json` that says how each frame was taken (docs/formats.md)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ..checks import InputError, finite, require
+from ..scan import Scan
+from .exposure_tables import beam_table, exposure_table, read_exposures
+from .folder import atomic_folder
+from .json import write_json
+from .table import Table
+
+FORMAT = "holosplat TIFF 1"
+SCAN = "scan.json"
+STACK = "frames.tif"
+
+TiffLayout = Literal["stack", "files"]
+
+
+def write_tiff(path: str | Path, scan: Scan, layout: TiffLayout = "stack") -> None:
+    """Write `scan` as a folder: all frames as pages of frames.tif, or one file a frame, and scan.json."""
+    import tifffile
+
+    entries = [{**exposure_table(scan.exposures, n), "test": bool(scan.is_test[n])} for n in range(len(scan))]
+    with atomic_folder(path) as folder:
+        if layout == "stack":
+            tifffile.imwrite(folder / STACK, scan.frames, photometric="minisblack", metadata=None)
+        else:
+            for n, (frame, entry) in enumerate(zip(scan.frames, entries)):
+                entry["file"] = f"frame_{n:04d}.tif"
+                tifffile.imwrite(folder / entry["file"], frame, photometric="minisblack", metadata=None)
+        pages = {"file": STACK} if layout == "stack" else {}
+        write_json(folder / SCAN, {"format": FORMAT, **beam_table(scan), **pages, "frames": entries})
+
+
+def read_tiff(path: str | Path) -> Scan:
+    """The scan of a folder with scan.json and the TIFF files that it names: one of many pages, or one a frame."""
+    table = Table.read(Path(path) / SCAN)
+    table.require_format(FORMAT)
+    entries = table.tables("frames")
+    require(len(entries) > 0, f"{table.label('frames')} must hold at least one frame, but it holds none.")
+    if "file" in table:
+        frames = _pages(table.file("file"), len(entries))
+    else:
+        frames = [_pages(entry.file("file"), 1)[0] for entry in entries]
+    h, w = frames[0].shape
+    for entry, frame in zip(entries, frames):
+        where = entry.where.rstrip(".")
+        require(
+            frame.shape == (h, w),
+            f"{table.path}: the image of {where} must have {(h, w)} pixels as the first, but it has {frame.shape}.",
+        )
+        finite(f"{table.path}: the image of {where}", frame)
+    is_test = np.array(["test" in entry and entry.flag("test") for entry in entries])
+    return Scan(np.stack(frames), read_exposures(table, entries, (h, w)), is_test, table.texts("provenance"))
+
+
+def _pages(file: Path, count: int) -> list[np.ndarray]:
+    """The `count` pages of a TIFF file, each [H, W]."""
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(file) as opened:
+            pages = [page.asarray() for page in opened.pages]
+    except Exception as error:  # tifffile raises many kinds for damaged files
+        raise InputError(f"{file} must be a complete TIFF file, but it is damaged or none: {error}.") from None
+    require(len(pages) == count, f"{file} must hold {count} pages, one a frame, but it holds {len(pages)}.")
+    for page in pages:
+        grey = page.ndim == 2 and page.dtype.kind in "iuf"
+        require(grey, f"{file} must hold grey images of numbers, but one is {page.dtype} of the shape {page.shape}.")
+    return pages
