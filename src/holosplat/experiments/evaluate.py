@@ -1,4 +1,4 @@
-"""`evaluate`: a reconstruction against held-out frames and the true volume."""
+"""`evaluate`: a reconstruction, or any Object, against held-out frames and the true volume."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ..metrics import ImageScores, VolumeScores, image_scores, intensity_range, 
 from ..metrics.images import json_number
 from ..representations import GaussianCloud
 from ..scan import Exposures, Scan
-from ..volume import Volume
+from ..volume import Object, Volume
 from .reconstruct import Reconstruction
 
 MOST_VOXELS = 8_000_000
@@ -32,24 +32,22 @@ class MaterialFound:
 
 
 @dataclass(frozen=True)
-class Evaluation:
-    """Scores on held-out and training frames, against the truth, and the material found; None: nothing to compare."""
+class Scores:
+    """Scores on held-out and training frames and against the true volume; None: nothing to compare.
+
+    predicted: the held-out frames [T, H, W] as the object gives them.
+    """
 
     test: ImageScores | None
     train: ImageScores | None
     volume: VolumeScores | None
-    material: MaterialFound
-    predicted: np.ndarray | None = None
-    """Predictions [T, H, W] of the held-out frames."""
+    predicted: np.ndarray | None
 
     def as_dict(self) -> dict[str, Any]:
         """The numbers, ready for JSON."""
         parts = {"test": self.test, "train": self.train, "volume": self.volume}
         scores: dict[str, Any] = {name: part.as_dict() if part else None for name, part in parts.items()}
-        found = self.material
-        ratio = found.ratio if np.isfinite(found.ratio) else None
-        material = {"delta": found.delta, "ratio": ratio, "single_material": found.single_material}
-        return {**{k: json_number(v) for k, v in self.headline().items()}, **scores, "material": material}
+        return {**{k: json_number(v) for k, v in self.headline().items()}, **scores}
 
     def headline(self) -> dict[str, float]:
         """The few numbers that matter: means over held-out frames, and the volume's."""
@@ -58,6 +56,20 @@ class Evaluation:
             names = ("dice", "relative_error_delta", "mean_delta", "true_mean_delta")
             numbers |= {name: float(getattr(self.volume, name)) for name in names}
         return numbers
+
+
+@dataclass(frozen=True)
+class Evaluation(Scores):
+    """Scores of a reconstruction, and the material that it found."""
+
+    material: MaterialFound
+
+    def as_dict(self) -> dict[str, Any]:
+        """The numbers, ready for JSON."""
+        found = self.material
+        ratio = found.ratio if np.isfinite(found.ratio) else None
+        material = {"delta": found.delta, "ratio": ratio, "single_material": found.single_material}
+        return super().as_dict() | {"material": material}
 
     def lines(self) -> list[str]:
         """The numbers as a few lines of text."""
@@ -80,18 +92,22 @@ class Evaluation:
 
 
 def render(reconstruction: Reconstruction, exposures: Exposures) -> np.ndarray:
-    """Frames [N, H, W] float32 that the reconstruction predicts, one exposure at a time to bound memory."""
-    energy = reconstruction.energy_kev
-    require(
-        abs(exposures.energy_kev / energy - 1) < 1e-3,
-        f"the run's δ and β are those at {energy:g} keV, but the scan's energy is {exposures.energy_kev:g} keV.",
-    )
+    """Frames [N, H, W] float32 that the reconstruction predicts."""
+    _require_energy(reconstruction, exposures)
     cloud = reconstruction.cloud
+    return render_object(cloud, exposures, reconstruction.oversample, cloud.backend)
+
+
+def render_object(obj: Object, exposures: Exposures, oversample: int, backend: str = "cpu") -> np.ndarray:
+    """Frames [N, H, W] float32 that `obj` gives, one exposure at a time to bound memory.
+
+    oversample: wave samples along a pixel; backend: of the wave optics, resolved (see `backends`).
+    """
     frames = np.empty((len(exposures), *exposures.views.shape), dtype=np.float32)
     with torch.no_grad():
         for i in range(len(exposures)):
-            instrument = Instrument(exposures[[i]], reconstruction.oversample, backend=cloud.backend)
-            frames[i] = instrument.measure(cloud)[0].cpu().numpy()
+            instrument = Instrument(exposures[[i]], oversample, backend=backend)
+            frames[i] = instrument.measure(obj)[0].cpu().numpy()
     return frames
 
 
@@ -100,17 +116,28 @@ def evaluate(reconstruction: Reconstruction, scan: Scan | None, truth: Volume | 
 
     The data range is that of the scan's training frames.
     """
+    cloud = reconstruction.cloud
+    if scan is not None:
+        _require_energy(reconstruction, scan.exposures)
+    scores = score_object(cloud, scan, truth, reconstruction.oversample, cloud.backend)
+    return Evaluation(scores.test, scores.train, scores.volume, scores.predicted, material_found(cloud))
+
+
+def score_object(obj: Object, scan: Scan | None, truth: Volume | None, oversample: int, backend: str = "cpu") -> Scores:
+    """Scores of any Object: on the frames of `scan`, and against `truth` on the truth's own grid.
+
+    The data range is that of the scan's training frames; oversample, backend: as for `render_object`.
+    """
     test = train = predicted = None
     if scan is not None:
         data_range = intensity_range(scan.train().frames)
-        train = image_scores(render(reconstruction, scan.train().exposures), scan.train().frames, data_range)
+        fitted = render_object(obj, scan.train().exposures, oversample, backend)
+        train = image_scores(fitted, scan.train().frames, data_range)
         if len(scan.test()):
-            predicted = render(reconstruction, scan.test().exposures)
+            predicted = render_object(obj, scan.test().exposures, oversample, backend)
             test = image_scores(predicted, scan.test().frames, data_range)
-    volume = None
-    if truth is not None:
-        volume = volume_scores(reconstruction.cloud.voxelise(truth.grid), truth)
-    return Evaluation(test, train, volume, material_found(reconstruction.cloud), predicted)
+    volume = None if truth is None else volume_scores(obj.voxelise(truth.grid), truth)
+    return Scores(test, train, volume, predicted)
 
 
 def material_found(cloud: GaussianCloud) -> MaterialFound:
@@ -124,6 +151,14 @@ def material_found(cloud: GaussianCloud) -> MaterialFound:
     matter = delta > 0.5 * level
     ratio = _weighted_median(delta[matter] / np.maximum(beta[matter], 1e-30), delta[matter])
     return MaterialFound(level, ratio, False)
+
+
+def _require_energy(reconstruction: Reconstruction, exposures: Exposures) -> None:
+    energy = reconstruction.energy_kev
+    require(
+        abs(exposures.energy_kev / energy - 1) < 1e-3,
+        f"the run's δ and β are those at {energy:g} keV, but the scan's energy is {exposures.energy_kev:g} keV.",
+    )
 
 
 def _enclosing_grid(cloud: GaussianCloud) -> Grid:
