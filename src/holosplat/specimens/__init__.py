@@ -1,1 +1,1 @@
-"""Truth objects: meshes made closed, and red blood cells by their published shape."""
+"""Truth objects: meshes made closed, red blood cells by their published shape, capsules, foam, and balls in series."""

@@ -24,6 +24,11 @@ DIAMETER = 2 * RADIUS
 """Mean diameter of a resting human red cell, 7.82 µm; cells of another diameter are scaled as a whole."""
 MAX_DEFORM = 0.1
 TRIES = 2000
+SHUFFLES = 50
+STEP, TURN = 0.1, 0.2
+"""Typical move of a cell in a shuffle: in diameters along each axis, in radians about each."""
+CROWDED_MARGIN = 0.01
+"""Clear distance between crowded cells, in diameters: 80 nm for cells of 8 µm."""
 COARSE_POINTS, FINE_LEVEL = 162, 4
 """Overlap is tested on the vertices of a level-4 icosphere; the first 162 (its level 2) reject quickly."""
 
@@ -104,6 +109,8 @@ def place_cells(
     deform: float = 0.03,
     margin: float | None = None,
     shape: str = "cylinder",
+    *,
+    shuffles: int = 0,
 ) -> list[RedCell]:
     """`count` cells, turned and placed uniformly at random in a channel about the origin, none touching.
 
@@ -111,31 +118,50 @@ def place_cells(
     deform: typical root-mean-square bending, in diameters, from 0 (rigid) to 0.1; at 0.03 the area
     grows by 1 % on average and 5 % at most; margin: clear distance [m] between cells and to the walls,
     by default 2 % of the diameter; shape: "box", or "cylinder" about y of diameter min(x, z), which
-    every tomographic view sees whole. `InputError` when the cells do not fit, after `TRIES` random
-    tries for one cell.
+    every tomographic view sees whole; shuffles: how often all cells placed may move a little to make room for the
+    next. `InputError` when the cells do not fit, after `TRIES` random tries for one cell (and after each shuffle).
     """
     margin = 0.02 * diameter if margin is None else margin
     _check_channel(count, box, diameter, deform, margin, shape)
+    channel = _Channel(box, margin, shape)
     rng = np.random.default_rng(seed)
     placed: list[_Placed] = []
     for _ in range(count):
         resting = _Placed.resting(diameter, margin, deform, rng)
-        for _ in range(TRIES):
-            turned = resting.moved(_random_rotation(rng), np.zeros(3))
-            centre = _random_centre(turned.points, box, margin, shape, rng)
-            if centre is None:
-                continue
-            candidate = turned.moved(np.eye(3), centre)
-            if not _overlaps_any(candidate, placed):
-                placed.append(candidate)
+        found = _inserted(resting, placed, channel, rng)
+        for _ in range(shuffles):
+            if found is not None:
                 break
-        else:
+            _shuffle(placed, channel, rng)
+            found = _inserted(resting, placed, channel, rng)
+        if found is None:
             raise InputError(
                 f"{count} red cells of {1e6 * diameter:.4g} µm must fit into the {shape} of "
                 f"{' x '.join(f'{1e6 * b:.4g}' for b in box)} µm, but only {len(placed)} found a place; "
                 "take fewer or smaller cells, a larger box or a smaller margin."
             )
+        placed.append(found)
     return [cell.cell for cell in placed]
+
+
+def crowded_cells(
+    haematocrit: float,
+    box: tuple[float, float, float],
+    seed: int | np.random.Generator = 0,
+    diameter: float = DIAMETER,
+    deform: float = 0.03,
+) -> list[RedCell]:
+    """As many cells as fill the fraction `haematocrit` of the cylinder in `box` (x, y, z) [m] about y, none touching.
+
+    To the nearest whole cell, by the volume of its mesh (642 vertices). Cells put down one after the other jam at 18 %
+    in a channel five cells wide: here they move over for the next, see `place_cells`.
+    """
+    in_range("haematocrit", haematocrit, 1e-6, 1.0)
+    margin = CROWDED_MARGIN * diameter
+    _check_channel(1, box, diameter, deform, margin, "cylinder")
+    channel = 0.25 * np.pi * min(box[0], box[2]) ** 2 * box[1]
+    count = max(1, round(haematocrit * channel / evans_fung_cell(diameter).volume))
+    return place_cells(count, box, seed, diameter, deform, margin, shuffles=SHUFFLES)
 
 
 @lru_cache(maxsize=8)
@@ -240,20 +266,63 @@ def _overlaps_any(candidate: _Placed, placed: list[_Placed]) -> bool:
     return False
 
 
-def _random_centre(
-    points: np.ndarray, box: tuple[float, float, float], margin: float, shape: str, rng: np.random.Generator
-) -> np.ndarray | None:
-    """A uniform random place [3] that keeps `points` [P, 3] inside the channel, or None (try again)."""
-    half = np.asarray(box, dtype=np.float64) / 2 - margin
-    if shape == "box":
-        low, high = -half - points.min(0), half - points.max(0)
-        return rng.uniform(low, high) if np.all(low <= high) else None
-    radius = min(half[0], half[2])
-    centre = rng.uniform([-radius, -half[1], -radius], [radius, half[1], radius]) if radius > 0 else None
-    if centre is None or half[1] <= 0:
-        return None
-    x, y, z = (points + centre).T
-    return centre if np.max(x**2 + z**2) <= radius**2 and np.max(np.abs(y)) <= half[1] else None
+@dataclass(frozen=True)
+class _Channel:
+    """Where cells may be: the extents `(x, y, z)` [m] about the origin, the clear distance [m], box or cylinder."""
+
+    box: tuple[float, float, float]
+    margin: float
+    shape: str
+
+    @property
+    def half(self) -> np.ndarray:
+        """Half the clear extents [3]."""
+        return np.asarray(self.box, dtype=np.float64) / 2 - self.margin
+
+    def holds(self, points: np.ndarray) -> bool:
+        """Whether all `points` [P, 3] keep clear of the walls."""
+        half = self.half
+        if self.shape == "box":
+            return bool((np.abs(points) <= half).all())
+        x, y, z = points.T
+        return bool(np.max(x**2 + z**2) <= min(half[0], half[2]) ** 2 and np.max(np.abs(y)) <= half[1])
+
+    def random_centre(self, points: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
+        """A uniform random place [3] that keeps `points` [P, 3] inside the channel, or None (try again)."""
+        half = self.half
+        if self.shape == "box":
+            low, high = -half - points.min(0), half - points.max(0)
+            return rng.uniform(low, high) if np.all(low <= high) else None
+        radius = min(half[0], half[2])
+        centre = rng.uniform([-radius, -half[1], -radius], [radius, half[1], radius]) if radius > 0 else None
+        if centre is None or half[1] <= 0:
+            return None
+        return centre if self.holds(points + centre) else None
+
+
+def _inserted(resting: _Placed, placed: list[_Placed], channel: _Channel, rng: np.random.Generator) -> _Placed | None:
+    """`resting` at a random place where it touches nothing, or None after `TRIES` tries."""
+    for _ in range(TRIES):
+        rotation = _random_rotation(rng)
+        centre = channel.random_centre(resting.points @ rotation.T, rng)
+        if centre is None:
+            continue
+        candidate = resting.moved(rotation, centre)
+        if not _overlaps_any(candidate, placed):
+            return candidate
+    return None
+
+
+def _shuffle(placed: list[_Placed], channel: _Channel, rng: np.random.Generator) -> None:
+    """Moves and turns every cell a little where that is allowed: hard bodies in equilibrium, which leave more room
+    than bodies put down for good (Metropolis et al. 1953, J. Chem. Phys. 21, 1087)."""
+    for i, old in enumerate(placed):
+        turn = Rotation.from_rotvec(TURN * rng.standard_normal(3)).as_matrix()
+        centre = old.cell.centre
+        shift = centre - turn @ centre + STEP * old.cell.diameter * rng.standard_normal(3)
+        moved = old.moved(turn, shift)
+        if channel.holds(moved.points) and not _overlaps_any(moved, placed[:i] + placed[i + 1 :]):
+            placed[i] = moved
 
 
 def _random_rotation(rng: np.random.Generator) -> np.ndarray:
