@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import numpy as np
@@ -13,9 +12,10 @@ from .backends import device, resolve
 from .checks import in_range, require
 from .optics.detector import poisson
 from .optics.hologram import hologram, optical_path
-from .optics.propagation import fresnel_reach_px
+from .optics.sampling import GUARD_PX as GUARD_PX
+from .optics.sampling import padding, resolving_oversample
 from .scan import Exposures, Scan, interleaved_split
-from .units import wavelength, wavenumber
+from .units import wavenumber
 from .volume import LineIntegrals, Object
 
 SIMULATED_FRINGE_SAMPLES = 8
@@ -24,8 +24,6 @@ SIMULATED_FRINGE_SAMPLES = 8
 MOST_SAMPLES = 1_000_000_000
 """Samples of all waves held at once, at most (16 GB as complex128)."""
 PHOTON_RANGE = (1e-3, 1e15)
-GUARD_PX = 5
-"""Detector pixels of margin beyond the fringes' reach: room for the point-spread function and faint tails."""
 
 
 class Instrument:
@@ -96,46 +94,9 @@ class Instrument:
         return frames
 
 
-def padding(exposures: Exposures, oversample: int) -> tuple[int, int]:
-    """Margin (rows, columns) in detector pixels that the fringes need, such that FFT lengths are 5-smooth.
-
-    At most the field of view itself is added on each side; what would travel further is cut by the
-    propagator (see `fresnel_transfer`).
-    """
-    pitch = exposures.views.pixel_size
-    reach = max(fresnel_reach_px(pitch / oversample, z, exposures.energy_kev) for z in exposures.distance)
-    blur_px = math.ceil(4 * float(exposures.psf_sigma_px.max()))
-    margin = math.ceil(reach / oversample) + blur_px + GUARD_PX
-    return tuple(_smooth_margin(n, min(margin, n + GUARD_PX)) for n in exposures.views.shape)  # type: ignore[return-value]
-
-
-def _smooth_margin(length: int, margin: int) -> int:
-    while not _is_5_smooth(length + 2 * margin):
-        margin += 1
-    return margin
-
-
-def _is_5_smooth(n: int) -> bool:
-    for p in (2, 3, 5):
-        while n % p == 0:
-            n //= p
-    return n == 1
-
-
 def measure(obj: Object, exposures: Exposures, oversample: int = 1, dtype: torch.dtype = torch.float32) -> Tensor:
     """Frames [N, H, W] (relative intensity) that `obj` gives in `exposures`, on waves `oversample` times finer."""
     return Instrument(exposures, oversample, dtype).measure(obj)
-
-
-def resolving_oversample(exposures: Exposures, samples_per_fringe: float, at_least: int) -> int:
-    """Samples per detector pixel that put `samples_per_fringe` samples on the first fringe's width √(λz).
-
-    At most `2 samples_per_fringe`, or 8: fringes far narrower than a pixel hardly change a pixel's mean (with 16,
-    cells of 64 µm on 3.2 µm pixels stay right to 1.5 % of their contrast however short the distance).
-    """
-    fringe = math.sqrt(wavelength(exposures.energy_kev) * float(exposures.distance.min()))
-    wanted = math.ceil(exposures.views.pixel_size * samples_per_fringe / fringe)
-    return max(at_least, min(wanted, max(8, math.ceil(2 * samples_per_fringe))))
 
 
 def simulate(

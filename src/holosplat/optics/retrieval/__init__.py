@@ -1,0 +1,63 @@
+"""Phase retrieval of single views for one material: frames → projected thickness, by six methods.
+
+All have the call of `Retrieval` and stand in `RETRIEVALS`. The first two are filters; the others start from
+`bounded_estimate` and see the full wave optics, point-spread function and pixels included. How they compare:
+docs/phase_retrieval.md.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from torch import Tensor
+
+from ...scan import Exposures
+from .admm import ADMM, admm
+from .bounded import Estimate, bounded_estimate
+from .iterative import Projections, gerchberg_saxton, hybrid_input_output
+from .linear import Linear, contrast_transfer, invert_contrast, paganin, retrieve_thickness
+from .nonlinear import Tikhonov, tikhonov
+from .spectra import Prior
+
+
+class Retrieval(Protocol):
+    """A method of phase retrieval; beside these arguments each has its `options` and `on_progress(fraction)`."""
+
+    def __call__(self, frames: Tensor, exposures: Exposures, delta: float, beta: float) -> Tensor:
+        """Thickness [V, H, W] in metres of one material (δ > 0, β of any sign) from relative intensities [V, H, W].
+
+        The result has the frames' type, float32 or float64. `InputError` for frames that are not those of
+        `exposures`, or not finite, or δ ≤ 0.
+        """
+        ...
+
+
+RETRIEVALS: dict[str, Retrieval] = {
+    "paganin": paganin,
+    "ctf": contrast_transfer,
+    "tikhonov": tikhonov,
+    "gerchberg-saxton": gerchberg_saxton,
+    "hybrid-input-output": hybrid_input_output,
+    "admm": admm,
+}
+"""Every method by its name."""
+
+__all__ = [
+    "ADMM",
+    "RETRIEVALS",
+    "Estimate",
+    "Linear",
+    "Prior",
+    "Projections",
+    "Retrieval",
+    "Tikhonov",
+    "admm",
+    "bounded_estimate",
+    "contrast_transfer",
+    "gerchberg_saxton",
+    "hybrid_input_output",
+    "invert_contrast",
+    "paganin",
+    "retrieve_thickness",
+    "tikhonov",
+]

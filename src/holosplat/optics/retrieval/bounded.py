@@ -1,0 +1,59 @@
+"""A first estimate for everything iterative: the linear inverse, bounded from below by zero, and where matter is.
+
+One frame says next to nothing of the lowest frequencies, nor of those where the response is zero. What it does not
+say follows from matter being nowhere negative, and nowhere at all outside its bodies.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from ...scan import Exposures
+from .spectra import Prior, Raster, filtered, response, spectra, surrounded
+
+STEPS = 25
+"""Alternations between the frame and the bound. Where noise hides the lowest frequencies they go on to drift."""
+SIGNIFICANT = 2.5
+"""Standard deviations of its noise above which a pixel is matter."""
+MODEL_ERROR = 0.05
+"""What the wave optics leaves unexplained of a frame's contrast, matter being sampled: measured on cells."""
+PRIOR = Prior(corner=6.0, decay=1.5)
+"""Wider than that of the linear filters: what it damps too much, the bound gives back."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """phase: delay [V, H, W] in radians, not negative, float64; support: [V, H, W] bool, where there may be matter."""
+
+    phase: Tensor
+    support: Tensor
+
+
+def bounded_estimate(frames: Tensor, exposures: Exposures, ratio: float, noise: float | None) -> Estimate:
+    """From frames [V, H, W] of a material with β/δ = `ratio`; noise: their standard deviation, None to estimate it.
+
+    Wiener's inverse `W` of the contrast transfer function, in alternation with the bound (Papoulis 1975 and
+    Gerchberg 1974, who extend spectra so): `φ ← φ₀ + (1 - W H) [φ]`, where `[φ]` is φ where it exceeds
+    `SIGNIFICANT` deviations of its noise and zero elsewhere, for noise with its negative half cut off would pass for
+    matter (a support found anew in every round: the "shrinkwrap" of Marchesini et al. 2003).
+    """
+    contrast, crop = surrounded(frames, exposures)
+    raster = Raster((contrast.shape[-2], contrast.shape[-1]), exposures.views.pixel_size)
+    known = spectra(frames, exposures, response(exposures, ratio, raster), raster, noise, MODEL_ERROR, PRIOR)
+    trusted = 1 - known.inverse * known.response
+    noise_gain = known.inverse.square().mean(dim=(1, 2)).sqrt()
+    least = (SIGNIFICANT * known.noise * noise_gain)[:, None, None]
+    linear = -filtered(contrast, known.inverse)
+    inside = torch.zeros_like(linear[:1])
+    inside[crop] = 1
+    phase = linear
+    for _ in range(STEPS):
+        matter = phase * (phase > least) * inside
+        phase = linear + filtered(matter, trusted)
+    matter = (phase * (phase > least))[crop]
+    grown = max_pool2d((matter > 0).double()[None], 3, 1, 1)[0] > 0  # thin rims lie below the threshold
+    return Estimate(matter, grown)

@@ -1,0 +1,124 @@
+"""Alternating projections between the measured amplitude and one material: Gerchberg–Saxton and Fienup."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from ...checks import at_least, require
+from ...scan import Exposures
+from ..propagation import exit_wave_of
+from .model import DARKEST, WaveModel, view_by_view
+
+
+@dataclass(frozen=True)
+class Projections:
+    """Options. iterations: there and back; feedback: of what violates the bounds (hybrid input–output only);
+    noise: standard deviation of the frames (None: estimated from them); backend: see `backends`."""
+
+    iterations: int = 40
+    feedback: float = 0.9
+    noise: float | None = None
+    backend: str = "cpu"
+
+    def __post_init__(self) -> None:
+        at_least(self, 1, "iterations")
+        at_least(self, 0, "feedback")
+        require(self.noise is None or self.noise >= 0, f"noise must not be negative, but it is {self.noise}.")
+
+
+def gerchberg_saxton(
+    frames: Tensor,
+    exposures: Exposures,
+    delta: float,
+    beta: float,
+    *,
+    options: Projections = Projections(),
+    on_progress: Callable[[float], None] = lambda fraction: None,
+) -> Tensor:
+    """Thickness [V, H, W] in metres of one material, β of any sign, by alternating projections.
+
+    Gerchberg & Saxton (1972), or Fienup's (1982) error reduction: the wave in the detector plane takes the measured
+    amplitude, the wave behind the object becomes `exp(-(kβ + ikδ) T)` with T ≥ 0, zero outside the support of
+    `bounded_estimate`, from which it starts. Frequencies around the zeros of the response stay as they were.
+    """
+
+    def reduce(_: Tensor, projected: Tensor, model: WaveModel) -> Tensor:
+        return model.bounded(projected)
+
+    return _alternate(frames, exposures, (delta, beta), options, reduce, on_progress)
+
+
+def hybrid_input_output(
+    frames: Tensor,
+    exposures: Exposures,
+    delta: float,
+    beta: float,
+    *,
+    options: Projections = Projections(),
+    on_progress: Callable[[float], None] = lambda fraction: None,
+) -> Tensor:
+    """Thickness [V, H, W] in metres of one material, β of any sign, by Fienup's (1982) hybrid input–output.
+
+    As `gerchberg_saxton`, but where the phase φ' after the detector's projection is negative or outside the support,
+    the next input is `φ - 0.9 φ'`: pushed away from the violation, not set to zero. The last iterate is bounded.
+    """
+
+    def push(before: Tensor, projected: Tensor, model: WaveModel) -> Tensor:
+        allowed = (projected >= 0) & (model.support > 0)
+        return torch.where(allowed, projected, before - options.feedback * projected)
+
+    return _alternate(frames, exposures, (delta, beta), options, push, on_progress)
+
+
+def _alternate(
+    frames: Tensor,
+    exposures: Exposures,
+    material: tuple[float, float],
+    options: Projections,
+    rule: Callable[[Tensor, Tensor, WaveModel], Tensor],
+    on_progress: Callable[[float], None],
+) -> Tensor:
+    delta, beta = material
+
+    def solve(frames: Tensor, exposures: Exposures, on_progress: Callable[[float], None]) -> Tensor:
+        model = WaveModel(frames, exposures, beta / delta, options.noise, options.backend)
+        phase = model.phase
+        for done in range(options.iterations):
+            on_progress(done / options.iterations)
+            phase = rule(phase, through_detector(model, phase), model)
+        return model.thickness(model.bounded(phase), delta)
+
+    return view_by_view(frames, exposures, delta, solve, on_progress)
+
+
+def through_detector(model: WaveModel, phase: Tensor) -> Tensor:
+    """The phase [V, H, W] nearest to the wave that has the measured amplitudes and comes from `phase` otherwise.
+
+    Beyond the frame nothing was measured, and the amplitude stays. With `U'` the new wave behind the object and U the
+    old one, `-ln(U'/U) = dℓ + i dφ` has no branch to choose as long as an iteration changes the phase by less
+    than π: a phase of many radians never wraps. The phase of one material nearest to it, in the logarithm, is
+    `φ + (dφ + r dℓ) / (1 + r²)`, `r = β/δ`.
+    """
+    path, r = model.path, model.ratio
+    transfer = path.rows[:, :, None] * path.columns[:, None]
+    before = exit_wave_of(r * phase, phase)
+    detector = 1 + torch.fft.ifft2(torch.fft.fft2(before) * transfer)
+    gain = _gain(model, phase)
+    after = before + torch.fft.ifft2(torch.fft.fft2((gain - 1) * detector) * transfer.conj())
+    change = (1 + after) / (1 + before)
+    loss, delay = -torch.log(change.abs().clamp_min(DARKEST)), -torch.angle(change)
+    return phase + (delay + r * loss) / (1 + r**2)
+
+
+def _gain(model: WaveModel, phase: Tensor) -> Tensor:
+    """Factor [V, H, W] of the amplitude on the waves' raster: measured over modelled pixels, one beyond the frame."""
+    (my, mx), s = model.margin, model.oversample
+    with torch.no_grad():
+        gain = model.amplitude / model.image(phase).clamp_min(DARKEST).sqrt()
+    gain = pad(gain, (mx, mx, my, my), value=1.0)
+    return gain.repeat_interleave(s, 1).repeat_interleave(s, 2)

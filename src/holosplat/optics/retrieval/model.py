@@ -1,0 +1,156 @@
+"""The full wave optics of one material in single views: phase in, frames and gradients out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate, pad
+
+from ...backends import device, resolve
+from ...scan import Exposures
+from ...units import wavelength
+from ..hologram import hologram, optical_path
+from ..sampling import padding, resolving_oversample
+from .bounded import MODEL_ERROR, PRIOR, Estimate, bounded_estimate
+from .spectra import Raster, checked, filtered, radian, response, spectra, squared_frequency
+
+SAMPLES_PER_FRINGE = 1.5
+MOST_SAMPLES = 4_000_000
+"""Samples of the waves worked on at once; more views follow in turn."""
+DARKEST = 1e-3
+"""Least intensity under a root, whose slope would have no bound."""
+SHARPENING = 3
+"""Rounds in which a finer phase learns the means of the pixels; what is then left is added to their samples."""
+CROSS_TERM = 4.0
+"""Weight of the contrast's slope in the curvature; large enough that most first steps are taken."""
+
+
+class WaveModel:
+    """Frames [V, h, w] as a function of the phase delay [V, H, W] in radians, `phase = kδT`, on the waves' raster.
+
+    That is the frame padded by the fringes' reach, `oversample` times finer; `support` [V, H, W] says where on it
+    matter may be: where the estimate has it, and beyond the frame's border where it touches that. float32 frames are
+    computed by `backend`, float64 ones by `reference`. `phase` is the estimate to start from.
+    """
+
+    def __init__(
+        self, frames: Tensor, exposures: Exposures, ratio: float, noise: float | None, backend: str = "cpu"
+    ) -> None:
+        estimate = bounded_estimate(frames, exposures, ratio, noise)
+        self.exposures, self.ratio = exposures, ratio
+        self.backend = resolve("reference" if frames.dtype == torch.float64 else backend)
+        self.frames = frames.detach().to(device(self.backend))
+        self.amplitude = self.frames.clamp_min(0).sqrt()
+        self.oversample = resolving_oversample(exposures, SAMPLES_PER_FRINGE, at_least=1)
+        self.margin = padding(exposures, self.oversample)
+        views = exposures.views.padded(self.margin).refined(self.oversample)
+        self.raster = Raster(views.shape, views.pixel_size)
+        my, mx = (m * self.oversample for m in self.margin)
+        self.path = optical_path(
+            views.shape,
+            views.pixel_size,
+            exposures.energy_kev,
+            exposures.distance,
+            exposures.psf_sigma_px * self.oversample,
+            (exposures.views.shape, (my, mx), self.oversample),
+            frames.dtype,
+        ).to(self.frames.device)
+        self.spectra = spectra(
+            frames, exposures, response(exposures, ratio, self.raster), self.raster, noise, MODEL_ERROR, PRIOR
+        )
+        self.support, self.phase = self._spread(estimate)
+
+    def _spread(self, estimate: Estimate) -> tuple[Tensor, Tensor]:
+        """The estimate's support and phase on the waves' raster, the phase with the same means over pixels."""
+        (my, mx), s = self.margin, self.oversample
+        like = {"device": self.frames.device, "dtype": self.frames.dtype}
+        support, phase = (
+            pad(image[None].to(**like), (mx, mx, my, my), mode="replicate")[0]
+            for image in (estimate.support, estimate.phase)
+        )
+        support = support.repeat_interleave(s, 1).repeat_interleave(s, 2)
+        if s > 1:
+            coarse, phase = phase, torch.zeros_like(support)
+            for _ in range(SHARPENING):
+                missing = coarse - avg_pool2d(phase[None], s)[0]
+                phase = phase + interpolate(missing[None], scale_factor=s, mode="bilinear", align_corners=False)[0]
+            missing = coarse - avg_pool2d(phase[None], s)[0]
+            phase = phase + missing.repeat_interleave(s, 1).repeat_interleave(s, 2)
+        return support, self.bounded(phase, support)
+
+    def bounded(self, phase: Tensor, support: Tensor | None = None) -> Tensor:
+        """The phase where it is positive and inside the support, zero elsewhere."""
+        return phase.clamp_min(0) * (self.support if support is None else support)
+
+    def thickness(self, phase: Tensor, delta: float) -> Tensor:
+        """Means over the frame's pixels [V, h, w], in metres."""
+        (my, mx), s, (h, w) = self.margin, self.oversample, self.exposures.views.shape
+        inside = phase[:, my * s : (my + h) * s, mx * s : (mx + w) * s]
+        return (avg_pool2d(inside[None], s)[0] if s > 1 else inside) * radian(self.exposures, delta)
+
+    def image(self, phase: Tensor) -> Tensor:
+        """Frames [V, h, w]; differentiable once."""
+        return hologram(phase[:, None], [(1.0, self.ratio)], self.path, self.backend)
+
+    def misfit(self, phase: Tensor) -> tuple[Tensor, Tensor]:
+        """`½ Σ (√I(φ) - √I)²` [V], float64, and its gradient [V, H, W].
+
+        Roots of counts have the same variance, ¼, everywhere (Anscombe 1948), so each pixel counts as it should.
+        """
+        at = phase.detach().requires_grad_()
+        difference = self.image(at).clamp_min(DARKEST).sqrt() - self.amplitude
+        value = 0.5 * difference.double().square().sum(dim=(1, 2))
+        (gradient,) = torch.autograd.grad(value.sum(), at)
+        return value.detach(), gradient
+
+    def curvature(self) -> Tensor:
+        """About the misfit's second derivative [V, H, W//2 + 1] by spatial frequency, never too small at the lowest.
+
+        `H²/4` is that of a thin object. Behind a thick one a slow change of phase, a little prism, shifts the image
+        that is there: `δI = (λz/2π) ∇δφ · ∇I` (from the transport of intensity, Teague 1983), which at low
+        frequencies is by far the larger.
+        """
+        i = self.frames.double()
+        slope2 = i.diff(dim=1).square().mean(dim=(1, 2)) + i.diff(dim=2).square().mean(dim=(1, 2))
+        slope2 = slope2.cpu() / self.exposures.views.pixel_size**2
+        lam_z = torch.from_numpy(wavelength(self.exposures.energy_kev) * self.exposures.distance)
+        shift = (lam_z.square() * slope2)[:, None, None] * squared_frequency(self.raster)
+        return (0.25 * self.spectra.response.square() + CROSS_TERM * shift) / self.oversample**2
+
+    def filter(self, images: Tensor, factor: Tensor) -> Tensor:
+        """`images` [V, H, W] with their spectra times `factor` [V, H, W//2 + 1]."""
+        return filtered(images, factor.to(images.device, images.dtype))
+
+
+def view_by_view(
+    frames: Tensor,
+    exposures: Exposures,
+    delta: float,
+    solve: Callable[[Tensor, Exposures, Callable[[float], None]], Tensor],
+    on_progress: Callable[[float], None],
+) -> Tensor:
+    """`solve(frames, exposures, on_progress)` of views that are alike, `MOST_SAMPLES` at a time, frames checked."""
+    checked(frames, exposures, delta)
+    found, done = torch.empty_like(frames), 0
+    for index in _batches(exposures):
+        start, share = done / len(exposures), len(index) / len(exposures)
+        part = solve(frames[index], exposures[index], lambda f, a=start, b=share: on_progress(a + b * f))
+        found[index] = part.to(frames.device, frames.dtype)
+        done += len(index)
+    on_progress(1.0)
+    return found
+
+
+def _batches(exposures: Exposures) -> Iterator[np.ndarray]:
+    """Indices of views that share distance and point-spread function, and so a raster, few enough for memory."""
+    optics = np.stack((exposures.distance, exposures.psf_sigma_px), axis=1)
+    for one in np.unique(optics, axis=0):
+        alike = np.flatnonzero((optics == one).all(axis=1))
+        sample = exposures[alike[:1]]
+        oversample = resolving_oversample(sample, SAMPLES_PER_FRINGE, at_least=1)
+        rows, columns = sample.views.padded(padding(sample, oversample)).refined(oversample).shape
+        at_once = max(1, MOST_SAMPLES // (rows * columns))
+        yield from (alike[i : i + at_once] for i in range(0, len(alike), at_once))

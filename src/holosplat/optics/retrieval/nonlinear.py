@@ -1,0 +1,109 @@
+"""Nonlinear Tikhonov: the smoothest non-negative thickness that explains a frame through the full wave optics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ...checks import at_least, require
+from ...scan import Exposures
+from .model import WaveModel, view_by_view
+from .spectra import TINY, squared_frequency
+
+FIRST_DAMPING = 0.05
+"""Damping at the start; 1 is the curvature of the strongest frequency."""
+EASE, TIGHTEN = 0.6, 4.0
+"""What a step that helped, and one that did not, does to the damping."""
+STIFFEST = 1.0
+"""Bound of the penalty, in the same unit: frequencies of which next to nothing is expected."""
+
+
+@dataclass(frozen=True)
+class Tikhonov:
+    """Options. iterations: steps, taken or refused; weight: of the penalty, 1 is Bayes' for Gaussian matter;
+    noise: standard deviation of the frames (None: estimated from them); backend: see `backends`."""
+
+    iterations: int = 60
+    weight: float = 0.5
+    noise: float | None = None
+    backend: str = "cpu"
+
+    def __post_init__(self) -> None:
+        at_least(self, 1, "iterations")
+        at_least(self, 0, "weight")
+        require(self.noise is None or self.noise >= 0, f"noise must not be negative, but it is {self.noise}.")
+
+
+def tikhonov(
+    frames: Tensor,
+    exposures: Exposures,
+    delta: float,
+    beta: float,
+    *,
+    options: Tikhonov = Tikhonov(),
+    on_progress: Callable[[float], None] = lambda fraction: None,
+) -> Tensor:
+    """Thickness [V, H, W] in metres of one material, β of any sign, that agrees with frames [V, H, W].
+
+    Of `½ Σ (√I(φ) - √I)² + ½ Σ R |F[φ]|²` the minimum is sought over phases φ = kδT that are not negative and lie
+    within a support, as by Huhn et al. (2022), with three differences. R is no constant below and another above
+    the first maximum, but the noise over the power expected (`Spectra`); steps are scaled by frequency, as
+    Levenberg (1944) and Marquardt (1963) damp them, so that the lowest frequencies, which say a millionth of what the
+    others do, move too; and they go out from `bounded_estimate`, whose support they keep. A step that would not
+    lower the objective is refused, and its view damped more.
+    """
+
+    def solve(frames: Tensor, exposures: Exposures, on_progress: Callable[[float], None]) -> Tensor:
+        model = WaveModel(frames, exposures, beta / delta, options.noise, options.backend)
+        return model.thickness(descend(model, options, on_progress)[0], delta)
+
+    return view_by_view(frames, exposures, delta, solve, on_progress)
+
+
+def penalty_weights(model: WaveModel, weight: float) -> Tensor:
+    """R [V, H, W//2 + 1]: variance of the roots over the expected power, in the unit of the misfit's curvature.
+
+    The power has the shape of the prior, and in all that of the estimate: what explains a frame's contrast says too
+    little of the lowest frequencies where matter is compact, and the penalty would shrink it.
+    """
+    known = model.spectra
+    seen = squared_frequency(model.raster) <= (0.5 / model.exposures.views.pixel_size) ** 2
+    found = torch.fft.rfft2(model.phase.cpu().double()).abs().square() / math.prod(model.raster.shape)
+    scale = found[:, seen].mean(dim=1) / model.oversample**2 / known.power[:, seen].mean(dim=1)
+    variance = 0.25 * known.error.square() / scale.clamp_min(TINY)
+    stiffness = (weight * variance[:, None, None] / known.power).clamp_max(STIFFEST)
+    return stiffness / model.oversample**2
+
+
+def objective(model: WaveModel, phase: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Misfit and penalty together [V], float64, and their gradient [V, H, W] on the waves' raster."""
+    value, gradient = model.misfit(phase)
+    pull = model.filter(phase, weights)
+    return value + 0.5 * (phase.double() * pull).sum(dim=(1, 2)), gradient + pull
+
+
+def descend(model: WaveModel, options: Tikhonov, on_progress: Callable[[float], None]) -> tuple[Tensor, Tensor]:
+    """The phase [V, H, W] after all steps, and the objective [iterations + 1, V] before and after each."""
+    weights = penalty_weights(model, options.weight)
+    curvature = model.curvature() + weights
+    phase = model.phase
+    value, gradient = objective(model, phase, weights)
+    damping = torch.full_like(value, FIRST_DAMPING).cpu()
+    values = [value]
+    for done in range(options.iterations):
+        on_progress(done / options.iterations)
+        scale = 1 / (curvature + damping[:, None, None] / model.oversample**2)
+        trial = model.bounded(phase - model.filter(gradient, scale))
+        trial_value, trial_gradient = objective(model, trial, weights)
+        better = trial_value < value
+        phase, gradient = (
+            torch.where(better[:, None, None], new, old) for new, old in ((trial, phase), (trial_gradient, gradient))
+        )
+        value = torch.where(better, trial_value, value)
+        damping = damping * torch.where(better.cpu(), EASE, TIGHTEN)
+        values.append(value)
+    return phase, torch.stack(values)

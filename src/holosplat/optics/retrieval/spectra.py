@@ -1,0 +1,184 @@
+"""What a frame tells of one material, frequency by frequency: response, noise, and the power to be expected.
+
+Unknown is the phase delay `φ = kδT` [rad]. A thin object's frame is `F[I - 1] = -H F[φ]` with the response
+`H = 2 (β/δ cos χ + sin χ)`, `χ = πλz f²` (Cloetens et al. 1999, eq. 3, for one material), times the transfer
+functions of point-spread function and pixel. Rasters are real ones: frequencies are those of `rfft2`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from ...checks import at_least, finite, require, shaped
+from ...scan import Exposures
+from ...units import wavelength, wavenumber
+from ..sampling import smooth_margin
+
+MEDIAN_OF_NORMAL = 0.6745
+"""Median of the magnitude of a normal deviate, in standard deviations."""
+TINY = 1e-24
+"""Variance added for frames without any contrast."""
+LEAST_SIGNAL = 0.01
+"""Share of a frame's variance that is taken for signal at least, however strong its noise seems."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Power expected of a phase: `1 / (f² + corner²)^decay`, f in cycles per field of view.
+
+    Projected bodies with sharp edges fall off as f⁻³ to f⁻⁴, below the frequency that their size sets.
+    """
+
+    corner: float = 3.0
+    decay: float = 2.0
+
+    def __post_init__(self) -> None:
+        at_least(self, 0.1, "corner", "decay")
+
+
+def checked(frames: Tensor, exposures: Exposures, delta: float) -> Tensor:
+    """The frames [V, H, W], if they are finite, floating, and those of `exposures`; and δ, if it is positive."""
+    known = frames.dtype in (torch.float32, torch.float64)
+    require(known, f"frames must be float32 or float64 for phase retrieval, but they are {frames.dtype}; convert them.")
+    shaped("frames", frames.detach().cpu().numpy(), (len(exposures), *exposures.views.shape))
+    finite("frames", frames.detach().cpu().numpy())
+    require(delta > 0, f"phase retrieval needs a material with δ > 0, but δ is {delta:g}.")
+    return frames
+
+
+def radian(exposures: Exposures, delta: float) -> float:
+    """The thickness [m] of matter that delays the wave by one radian, 1/kδ."""
+    return 1 / (wavenumber(exposures.energy_kev) * delta)
+
+
+@dataclass(frozen=True)
+class Raster:
+    """Samples of a pitch [m]: shape (H, W)."""
+
+    shape: tuple[int, int]
+    pitch: float
+
+    @property
+    def frequencies(self) -> tuple[np.ndarray, np.ndarray]:
+        """fy [H, 1] and fx [W//2 + 1] in 1/m."""
+        return np.fft.fftfreq(self.shape[0], self.pitch)[:, None], np.fft.rfftfreq(self.shape[1], self.pitch)
+
+
+def squared_frequency(raster: Raster) -> Tensor:
+    """`fx² + fy²` [H, W//2 + 1] in 1/m², float64."""
+    fy, fx = raster.frequencies
+    return torch.from_numpy(fy**2 + fx**2)
+
+
+def fresnel_phase(exposures: Exposures, raster: Raster) -> Tensor:
+    """`χ = πλz f²` [V, H, W//2 + 1] of each exposure's distance."""
+    lam_z = torch.from_numpy(wavelength(exposures.energy_kev) * exposures.distance)
+    return math.pi * lam_z[:, None, None] * squared_frequency(raster)
+
+
+def detector_transfer(exposures: Exposures, raster: Raster) -> Tensor:
+    """Transfer function [V, H, W//2 + 1] of the point-spread function and, on finer rasters, of the pixel.
+
+    On a raster of the detector's own pitch the samples of a thickness are its means over pixels already.
+    """
+    pixel, (fy, fx) = exposures.views.pixel_size, raster.frequencies
+    sigma2 = torch.from_numpy((exposures.psf_sigma_px * pixel) ** 2)[:, None, None]
+    gauss = torch.exp(-2 * math.pi**2 * sigma2 * squared_frequency(raster))
+    if raster.pitch > 0.99 * pixel:
+        return gauss
+    return gauss * torch.from_numpy(np.abs(np.sinc(fy * pixel) * np.sinc(fx * pixel)))
+
+
+def response(exposures: Exposures, ratio: float, raster: Raster) -> Tensor:
+    """`H` [V, H, W//2 + 1] of a material with β/δ = `ratio`, float64."""
+    chi = fresnel_phase(exposures, raster)
+    return 2 * (ratio * torch.cos(chi) + torch.sin(chi)) * detector_transfer(exposures, raster)
+
+
+def noise_level(frames: Tensor) -> Tensor:
+    """Standard deviation [V] of the noise, float64: median absolute deviation of the finest diagonal Haar wavelets.
+
+    Donoho & Johnstone (1994), section 4.2. Fringes of the finest pitch pass for noise.
+    """
+    i = frames.detach().double()
+    diagonal = 0.5 * (i[:, :-1, :-1] + i[:, 1:, 1:] - i[:, :-1, 1:] - i[:, 1:, :-1])
+    return diagonal.abs().flatten(1).median(1).values / MEDIAN_OF_NORMAL
+
+
+def contrast_level(frames: Tensor) -> Tensor:
+    """Root mean square [V] of `I - 1`, float64."""
+    return (frames.detach().double() - 1).square().mean(dim=(1, 2)).sqrt()
+
+
+@dataclass(frozen=True)
+class Spectra:
+    """The response H and the expected power S of the phase, both [V, H, W//2 + 1], and the standard deviation [V] of
+    what the frames hold beside: noise alone, and noise with what the model cannot explain. All float64."""
+
+    response: Tensor
+    power: Tensor
+    noise: Tensor
+    error: Tensor
+
+    @property
+    def inverse(self) -> Tensor:
+        """Wiener's inverse `H S / (H² S + σ²)` of the response."""
+        return self.response * self.power / (self.response.square() * self.power + self.error.square()[:, None, None])
+
+
+def spectra(
+    frames: Tensor,
+    exposures: Exposures,
+    h: Tensor,
+    raster: Raster,
+    noise: float | None,
+    model_error: float,
+    prior: Prior,
+) -> Spectra:
+    """Of frames [V, H, W] and a response h on `raster`; noise: as known, or None to estimate it.
+
+    model_error: what no model explains, as a share of the frames' contrast. The power has the prior's shape and
+    explains the frames' variance beyond their noise; what the detector cannot resolve does not count in that.
+    """
+    level = noise_level(frames) if noise is None else torch.full((len(frames),), noise, dtype=torch.float64)
+    contrast = contrast_level(frames)
+    signal = (contrast.square() - level.square()).clamp_min(LEAST_SIGNAL * contrast.square() + TINY)
+    f2 = squared_frequency(raster)
+    height, width = (n * exposures.views.pixel_size for n in exposures.views.shape)
+    shape = (f2 * height * width + prior.corner**2) ** -prior.decay
+    seen = f2 <= (0.5 / exposures.views.pixel_size) ** 2
+    explained = (h.square() * shape)[:, seen].mean(dim=1)
+    error = (level.square() + (model_error * contrast).square() + TINY).sqrt()
+    return Spectra(h, shape * (signal / explained)[:, None, None], level, error)
+
+
+def filtered(images: Tensor, factor: Tensor) -> Tensor:
+    """`images` [V, H, W] with their spectra times `factor` [V or 1, H, W//2 + 1], real; periodic."""
+    return torch.fft.irfft2(torch.fft.rfft2(images) * factor, s=images.shape[-2:])
+
+
+def surrounded(frames: Tensor, exposures: Exposures) -> tuple[Tensor, tuple[slice, slice, slice]]:
+    """Contrast `I - 1` in float64 on a raster of twice the frame's size, and the slices that lead back.
+
+    Beyond the frame the edge values go on, and fade within the first fringe: noise that went on for ever would be
+    taken for the shadow of matter as large as the raster.
+    """
+    h, w = frames.shape[-2:]
+    my, mx = (min(n - 1, smooth_margin(n, math.ceil(n / 2))) for n in (h, w))
+    wide = pad(frames[None].double() - 1, (mx, mx, my, my), mode="replicate")[0]
+    fringe = np.sqrt(wavelength(exposures.energy_kev) * exposures.distance) / exposures.views.pixel_size
+    length = torch.from_numpy(np.maximum(1.0, 0.5 * fringe))[:, None]
+    rows, columns = (torch.exp(-((_beyond(n, m) / length) ** 2)) for n, m in ((h, my), (w, mx)))
+    return wide * rows[:, :, None] * columns[:, None], (slice(None), slice(my, my + h), slice(mx, mx + w))
+
+
+def _beyond(length: int, margin: int) -> Tensor:
+    """How many pixels each of `length + 2 margin` lies beyond the frame."""
+    i = torch.arange(-margin, length + margin, dtype=torch.float64)
+    return torch.clamp(torch.maximum(-i, i - (length - 1)), min=0)

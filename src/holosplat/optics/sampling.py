@@ -1,0 +1,51 @@
+"""How finely, and on how large a raster, waves must be sampled."""
+
+from __future__ import annotations
+
+import math
+
+from ..scan import Exposures
+from ..units import wavelength
+from .propagation import fresnel_reach_px
+
+GUARD_PX = 5
+"""Detector pixels of margin beyond the fringes' reach: room for the point-spread function and faint tails."""
+
+
+def padding(exposures: Exposures, oversample: int) -> tuple[int, int]:
+    """Margin (rows, columns) in detector pixels that the fringes need, such that FFT lengths are 5-smooth.
+
+    At most the field of view itself is added on each side; what would travel further is cut by the
+    propagator (see `fresnel_transfer`).
+    """
+    pitch = exposures.views.pixel_size
+    reach = max(fresnel_reach_px(pitch / oversample, z, exposures.energy_kev) for z in exposures.distance)
+    blur_px = math.ceil(4 * float(exposures.psf_sigma_px.max()))
+    margin = math.ceil(reach / oversample) + blur_px + GUARD_PX
+    h, w = exposures.views.shape
+    return smooth_margin(h, min(margin, h + GUARD_PX)), smooth_margin(w, min(margin, w + GUARD_PX))
+
+
+def resolving_oversample(exposures: Exposures, samples_per_fringe: float, at_least: int) -> int:
+    """Samples per detector pixel that put `samples_per_fringe` samples on the first fringe's width √(λz).
+
+    At most `2 samples_per_fringe`, or 8: fringes far narrower than a pixel hardly change a pixel's mean (with 16,
+    cells of 64 µm on 3.2 µm pixels stay right to 1.5 % of their contrast however short the distance).
+    """
+    fringe = math.sqrt(wavelength(exposures.energy_kev) * float(exposures.distance.min()))
+    wanted = math.ceil(exposures.views.pixel_size * samples_per_fringe / fringe)
+    return max(at_least, min(wanted, max(8, math.ceil(2 * samples_per_fringe))))
+
+
+def smooth_margin(length: int, margin: int) -> int:
+    """The least margin, not below `margin`, with which `length + 2 margin` has no prime factor above 5."""
+    while not _is_5_smooth(length + 2 * margin):
+        margin += 1
+    return margin
+
+
+def _is_5_smooth(n: int) -> bool:
+    for p in (2, 3, 5):
+        while n % p == 0:
+            n //= p
+    return n == 1
