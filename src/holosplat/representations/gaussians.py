@@ -63,6 +63,11 @@ class GaussianCloud:
         """Peak values [N, C] in units of the material's δ (and β)."""
         return softplus(self.raw_amplitudes)
 
+    @property
+    def stored_bytes(self) -> int:
+        """Size of the parameters as a run folder stores them, float32."""
+        return 4 * sum(p.numel() for p in self.parameters)
+
     def replaced(self, parameters: Iterable[Tensor]) -> GaussianCloud:
         """A cloud of other parameters in the same units."""
         cloud = GaussianCloud(parameters, self.unit_length, self.delta, self.beta)
