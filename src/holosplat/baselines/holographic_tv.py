@@ -21,7 +21,7 @@ from ..forward import Instrument, resolving_oversample
 from ..geometry import Grid, Views
 from ..materials import DeltaBeta
 from ..memory import memory_kept
-from ..optics.retrieval import invert_contrast, retrieve_thickness
+from ..optics.retrieval import invert_contrast, paganin
 from ..projectors.voxels import projector_for
 from ..scan import Scan
 from ..volume import LineIntegrals
@@ -73,9 +73,8 @@ def _holographic_tv(
     scan, refine = _working_resolution(scan, options)
     exposures, pitch = scan.exposures, scan.views.pixel_size
     frames = torch.from_numpy(scan.frames)
-    physics = (pitch, exposures.distance, exposures.energy_kev, material.delta, material.beta)
     on_progress("phase retrieval", 0.0)
-    lines = retrieve_thickness(frames, *physics) / pitch
+    lines = paganin(frames, exposures, material.delta, material.beta) / pitch
 
     views = _in_pixels(scan.views)
     grid = Grid.of_views(views)

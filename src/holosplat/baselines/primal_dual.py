@@ -68,6 +68,7 @@ class PrimalDual:
         self._extrapolated = self._array.clone()
         self._residual_dual = torch.zeros_like(path)
         self._gradient_dual = self._array.new_zeros(3, *self._array.shape)
+        self._damping: Tensor | None = None
 
     @property
     def volume(self) -> Tensor:
@@ -78,6 +79,15 @@ class PrimalDual:
         """Line integrals [V, H, W] of the volume as it is now."""
         return self.projector.lines_out(self.projector.project(self._array))
 
+    def discount(self, spectrum: Tensor) -> None:
+        """From now on trust frequencies of the lines by `spectrum`: the data term is `½ Σ |F[A u - b]|² / spectrum`.
+
+        spectrum: positive, broadcast to `rfft2` (unitary) of lines in the projector's order; 1 is how it begins.
+        All rays then have one dual step, the shortest: the proximal map is diagonal in frequency.
+        """
+        self._dual_step = self._dual_step.min()
+        self._damping = 1 / (1 + self._dual_step * spectrum)
+
     def run(self, images: Tensor, iterations: int) -> None:
         """`iterations` more steps towards the volume that explains the line integrals [V, H, W]."""
         lines = self.projector.lines_in(images)
@@ -86,7 +96,12 @@ class PrimalDual:
 
     def _iterate(self, lines: Tensor) -> None:
         difference = self.projector.project(self._extrapolated) - lines
-        self._residual_dual = (self._residual_dual + self._dual_step * difference) / (1 + self._dual_step)
+        ascended = self._residual_dual + self._dual_step * difference
+        if self._damping is None:
+            self._residual_dual = ascended / (1 + self._dual_step)
+        else:
+            spectrum = torch.fft.rfft2(ascended, norm="ortho") * self._damping
+            self._residual_dual = torch.fft.irfft2(spectrum, s=ascended.shape[-2:], norm="ortho")
         # σ = 1 / (2 coupling) for the gradient's rows, so that σ · coupling = ½
         self._steps.ascend(self._extrapolated, self._gradient_dual, 0.5, self.radius)
         slope = self.projector.backproject(self._residual_dual)

@@ -7,6 +7,7 @@ docs/phase_retrieval.md.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol
 
 from torch import Tensor
@@ -21,9 +22,17 @@ from .spectra import Prior
 
 
 class Retrieval(Protocol):
-    """A method of phase retrieval; beside these arguments each has its `options` and `on_progress(fraction)`."""
+    """A method of phase retrieval; beside these arguments each has its `options`."""
 
-    def __call__(self, frames: Tensor, exposures: Exposures, delta: float, beta: float) -> Tensor:
+    def __call__(
+        self,
+        frames: Tensor,
+        exposures: Exposures,
+        delta: float,
+        beta: float,
+        *,
+        on_progress: Callable[[float], None] = lambda fraction: None,
+    ) -> Tensor:
         """Thickness [V, H, W] in metres of one material (δ > 0, β of any sign) from relative intensities [V, H, W].
 
         The result has the frames' type, float32 or float64. `InputError` for frames that are not those of

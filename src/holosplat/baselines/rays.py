@@ -1,0 +1,72 @@
+"""A tomographic problem in pixels: line integrals of thickness, and the projector that explains them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from ..checks import InputError, require
+from ..geometry import Grid, Views
+from ..projectors.voxels import LatticeProjector, SliceProjector, projector_for
+
+
+@dataclass(frozen=True)
+class Rays:
+    """What tomography works on; lengths are in detector pixels.
+
+    measured: line integrals in the projector's order; views, grid: in pixels, the views on the raster of the grid's
+    voxels; refine: voxels along a pixel's edge.
+    """
+
+    projector: SliceProjector | LatticeProjector
+    measured: Tensor
+    views: Views
+    grid: Grid
+    refine: int
+
+
+def rays_of(lines: Tensor, views: Views, grid: Grid) -> Rays:
+    """Line integrals [V, H, W] in metres and where they were taken, made ready for voxels of `grid`.
+
+    Where the voxels are finer than pixels, lines are interpolated (bilinearly) to a raster of the voxels' pitch.
+    """
+    pitch = views.pixel_size
+    views, grid = in_pixels(lines, views, grid)
+    edge = grid.voxel_size[0]
+    cubic = bool(np.allclose(grid.voxel_size, edge))
+    require(cubic, f"tomography needs cubic voxels, but their edges are {grid.voxel_size} pixels.")
+    refine = max(1, round(1 / edge))
+    images = lines.float() / pitch
+    if refine > 1:
+        views = views.refined(refine)
+        images = interpolate(images[None], scale_factor=refine, mode="bilinear", align_corners=False)[0]
+    projector = projector_for(grid, views)
+    return Rays(projector, projector.lines_in(images), views, grid, refine)
+
+
+def in_pixels(lines: Tensor, views: Views, grid: Grid) -> tuple[Views, Grid]:
+    """Views and grid with the detector's pixel as the unit of length; `InputError` unless the lines are theirs."""
+    wanted, shape = (len(views), *views.shape), tuple(lines.shape)
+    require(shape == wanted, f"line integrals must have the shape {wanted} of the views, but it is {shape}.")
+    bad = lines.numel() - int(torch.isfinite(lines).sum())
+    require(bad == 0, f"line integrals must be finite, but {bad} are not; mask or repair them first.")
+    pitch = views.pixel_size
+    (dx, dy, dz), (x, y, z) = ([length / pitch for length in lengths] for lengths in (grid.voxel_size, grid.origin))
+    in_views = Views(views.rotations, views.shifts / pitch, views.shape, 1.0)
+    return in_views, Grid(grid.shape, (dx, dy, dz), (x, y, z))
+
+
+def bounded(volume: Tensor, lowest: float | None, upper: float | None) -> Tensor:
+    """`volume`, changed in place to lie between the bounds there are."""
+    return volume if lowest is None and upper is None else volume.clamp_(lowest, upper)
+
+
+def checked_upper(upper: float | None) -> float | None:
+    """The upper bound of the occupancy, None if there is none."""
+    if upper is not None and not (np.isfinite(upper) and upper > 0):
+        raise InputError(f"the upper bound of the occupancy must be a positive number, or None, but it is {upper:g}.")
+    return upper

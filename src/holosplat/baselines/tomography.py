@@ -1,0 +1,111 @@
+"""The table of tomographies: thickness of each view in, occupancy of one material on voxels out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..checks import at_least
+from ..geometry import Grid, Views
+from ..memory import memory_kept
+from .algebraic import Algebraic, art, sirt
+from .filtered_backprojection import filtered_backprojection
+from .primal_dual import PrimalDual
+from .rays import Rays, checked_upper, rays_of
+
+QUIETEST = 1e-4
+"""The misfit's spectrum is taken to be nowhere below this fraction of its mean."""
+
+
+class Tomography(Protocol):
+    """(thickness [V, H, W] in metres, their views, grid, upper bound or None, progress) → occupancy [Z, Y, X]."""
+
+    def __call__(
+        self, lines: Tensor, views: Views, grid: Grid, upper: float | None, on_progress: Callable[[float], None], /
+    ) -> Tensor:
+        """The occupancy [Z, Y, X], dimensionless float32, never above `upper`; `on_progress(fraction)` on the way."""
+        ...
+
+
+def sirt_nonnegative(
+    lines: Tensor, views: Views, grid: Grid, upper: float | None, on_progress: Callable[[float], None]
+) -> Tensor:
+    """`sirt` with the occupancy kept from going below zero, which lets it run longer."""
+    return sirt(lines, views, grid, upper, on_progress, options=Algebraic(sweeps=200, relaxation=1.9, nonnegative=True))
+
+
+@dataclass(frozen=True)
+class TotalVariation:
+    """Options. weight: of total variation, in pixels of path length; first: iterations with all frequencies of the
+    lines trusted alike; iterations: those after, with each trusted by its misfit; discount: how much, as the power of
+    the misfit's spectrum (0: not at all, 1: as for noise of that spectrum).
+    """
+
+    weight: float = 0.5
+    first: int = 60
+    iterations: int = 100
+    discount: float = 0.5
+
+    def __post_init__(self) -> None:
+        at_least(self, 0, "weight", "first", "iterations", "discount")
+
+
+def total_variation(
+    lines: Tensor,
+    views: Views,
+    grid: Grid,
+    upper: float | None,
+    on_progress: Callable[[float], None],
+    *,
+    options: TotalVariation = TotalVariation(),
+) -> Tensor:
+    """Occupancy [Z, Y, X] ≥ 0 on `grid` from thickness `lines` [V, H, W] in metres, by total variation; float32.
+
+    `min ½ Σ |F[A u - b]|² / S + λ Σ|∇u|` with `0 ≤ u ≤ upper` (see `PrimalDual`). Errors of retrieved thickness are
+    strongest at low frequencies, and by how much depends on noise and optics. So a first solution, with S = 1, tells
+    the power spectrum of what no volume explains, and S is a power of that.
+    """
+    top, rays = checked_upper(upper), rays_of(lines, views, grid)
+    with memory_kept():
+        start = torch.zeros(grid.shape)
+        solver = PrimalDual(rays.projector, start, options.weight, top, coupling=1 / rays.refine**2)
+        images, total = rays.projector.lines_out(rays.measured), options.first + options.iterations
+        for done in range(total):
+            on_progress(done / total)
+            if done == options.first and options.discount > 0:
+                solver.discount(misfit_spectrum(rays, solver.lines() - images) ** options.discount)
+            solver.run(images, 1)
+        return solver.volume
+
+
+def misfit_spectrum(rays: Rays, misfit: Tensor) -> Tensor:
+    """Power spectrum [pixels²] of `misfit` [V, H, W], the mean over views and directions.
+
+    Of frequencies as `rfft2` has them, for lines in the projector's order; white noise of variance σ² gives σ².
+    """
+    ordered = rays.projector.lines_in(misfit).double()
+    power = torch.fft.rfft2(ordered, norm="ortho").abs().square().mean(0)
+    h, w = ordered.shape[1:]
+    frequency = np.hypot(np.fft.fftfreq(h)[:, None], np.fft.rfftfreq(w))
+    steps = min(h, w)
+    ring = torch.from_numpy(np.minimum(np.rint(frequency * steps), steps // 2).astype(np.int64)).ravel()
+    sums = torch.zeros(steps // 2 + 1, dtype=power.dtype).index_add(0, ring, power.ravel())
+    means = sums / torch.bincount(ring, minlength=len(sums)).clamp_min(1)
+    means[0] = means[1]  # of the mean itself there is one sample only, and the bounds push it
+    floor = QUIETEST * float(means.mean())
+    return means.clamp_min(max(floor, 1e-12))[ring].reshape(power.shape).float()
+
+
+TOMOGRAPHIES: dict[str, Tomography] = {
+    "fbp": filtered_backprojection,
+    "art": art,
+    "sirt": sirt,
+    "sirt-nonneg": sirt_nonnegative,
+    "tv": total_variation,
+}
+"""Name → tomography. Only fbp needs a common axis; art, sirt-nonneg and tv keep the occupancy from going below zero."""
