@@ -97,8 +97,8 @@ def presets() -> dict[str, Settings]:
                 Schedule(
                     steps=30_000,
                     views_per_step=4,
-                    rate_position=0.02,
-                    rate_scale=5e-3,
+                    rate_position=0.01,  # the thesis' 1.6e-4 of half the field, if the field is 128 pixels wide
+                    rate_scale=1e-3,
                     rate_rotation=1e-3,
                     rate_amplitude=0.01,
                     warmup_steps=1000,
@@ -106,7 +106,25 @@ def presets() -> dict[str, Settings]:
                     validation_views=1,
                     validate_every=250,
                 ),
-                DensityControl(every=500, start=0.1, stop=0.5, max_count=250_000),
+                DensityControl(every=500, start=0.1, stop=0.5, max_count=250_000, faint=1e-3),
+            ),
+        ),
+        "random": Settings(
+            start="random",
+            random_count=8_000,
+            fit=FitOptions(
+                Objective(l1=1.0, tv_volume=0.1, overfull=10.0),
+                Schedule(
+                    steps=1500,
+                    views_per_step=2,
+                    rate_position=0.1,
+                    rate_scale=0.04,
+                    rate_rotation=0.02,
+                    rate_amplitude=0.06,
+                    decay=0.05,
+                    volume_every=5,
+                ),
+                DensityControl(every=100, start=0.05, stop=0.6, grow_fraction=0.05, max_count=40_000, faint=0.003),
             ),
         ),
     }

@@ -30,7 +30,7 @@ def _from_phase_retrieval(
     scan: Scan, prior: MaterialPrior, settings: Settings, seed: int, on_progress: Progress
 ) -> GaussianCloud:
     backend = settings.volume.backend
-    material = _material(scan, prior, on_progress, backend)
+    material = assumed_material(scan, prior, on_progress, backend)
     volume, grid = holographic_tv(scan, material, settings.volume, on_progress)
     pitch = scan.views.pixel_size
     whole = at_pitch(volume, grid, pitch)
@@ -39,8 +39,8 @@ def _from_phase_retrieval(
     return freed(cloud) if prior.kind == "free" else cloud
 
 
-def _material(scan: Scan, prior: MaterialPrior, on_progress: Progress, backend: Backend) -> DeltaBeta:
-    """δ and β of the material: as known, or as the holograms suggest."""
+def assumed_material(scan: Scan, prior: MaterialPrior, on_progress: Progress, backend: Backend = "cpu") -> DeltaBeta:
+    """δ and β of the one material: as known, or as the training frames `scan` suggest."""
     if prior.kind == "known":
         return DeltaBeta(prior.delta, prior.beta)
     ratio = prior.ratio if prior.kind == "ratio" else estimate_ratio(scan, on_progress, backend)

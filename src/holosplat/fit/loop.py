@@ -35,6 +35,17 @@ Record = dict[str, float]
 """One row of metrics.csv."""
 
 
+class DivergedError(InputError):
+    """Loss or parameters are no longer finite numbers after `step`."""
+
+    def __init__(self, step: int) -> None:
+        super().__init__(
+            f"the fit diverged at step {step}: its parameters are no longer finite; "
+            "lower the rates of the schedule (rate_position, rate_scale, rate_rotation, rate_amplitude)."
+        )
+        self.step = step
+
+
 @dataclass(frozen=True)
 class FitOptions:
     """What is minimised, how, where Gaussians come and go, and which backend does it (see `backends`)."""
@@ -145,12 +156,9 @@ class Fit:
         return torch.cat([values, sound])
 
     def _check_sound(self, record: Record, row: list[float]) -> None:
-        """`InputError` if loss (first) or parameters (their sum, last) are no longer numbers."""
+        """`DivergedError` if loss (first) or parameters (their sum, last) are no longer numbers."""
         if not math.isfinite(row[0] + row[-1]):
-            raise InputError(
-                f"the fit diverged at step {record['step']:.0f}: its parameters are no longer finite; "
-                "lower the rates of the schedule (rate_position, rate_scale, rate_rotation, rate_amplitude)."
-            )
+            raise DivergedError(int(record["step"]))
 
     def _draw(self) -> Draw:
         """What the next step looks at, by the schedule and the generator."""
