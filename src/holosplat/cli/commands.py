@@ -32,6 +32,7 @@ from ..io.nxtomo import read_scan, write_scan
 from ..io.volumes import read_volume, write_volume
 from ..report.run import report_run
 from ..scan import PIXEL_RANGE_M, Scan
+from .bench import bench
 from .convert import convert
 from .options import BeamlineOptions, MaterialOptions, MeshOptions, NoiseOptions, PriorOptions, SettingsOptions
 from .plan import plan
@@ -262,6 +263,7 @@ COMMANDS = {
     "convert": convert,
     "evaluate": evaluate,
     "demo": demo,
+    "bench": bench,
     "backends": backends,
 }
 

@@ -136,10 +136,11 @@ def format_length(length: float, digits: int = 3) -> str:
     return f"{length * factor:.{digits}g}\u00a0{unit}"
 
 
-def scale_bar(axes: Axes, width: float, colour: str = "white", height: float = 0.055) -> None:
+def scale_bar(axes: Axes, width: float, colour: str = "white", height: float = 0.055, beside: bool = False) -> None:
     """A scale bar of a round length, up to a quarter of `width` [m] of the field, in the lower left corner.
 
-    height: of the bar above the lower edge, as a part of the axes; the length stands above the bar.
+    height: of the bar above the lower edge, as a part of the axes; the length stands above the bar, or `beside` it,
+    where panels are small.
     """
     target = 0.28 * width
     power = 10.0 ** math.floor(math.log10(target))
@@ -151,13 +152,13 @@ def scale_bar(axes: Axes, width: float, colour: str = "white", height: float = 0
     line.set_solid_capstyle("butt")
     line.set_path_effects([patheffects.withStroke(linewidth=2.8, foreground=halo, alpha=0.55)])
     text = axes.text(
-        x0 + fraction / 2,
-        y0 + 0.02,
+        x0 + fraction + 0.03 if beside else x0 + fraction / 2,
+        y0 if beside else y0 + 0.02,
         format_length(length),
         transform=axes.transAxes,
         color=colour,
-        ha="center",
-        va="bottom",
+        ha="left" if beside else "center",
+        va="center" if beside else "bottom",
         fontsize=6.5,
     )
     text.set_path_effects([patheffects.withStroke(linewidth=2.0, foreground=halo, alpha=0.55)])

@@ -1,0 +1,139 @@
+"""`holosplat bench`: the suite of cases × methods × seeds, and its report."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Annotated
+
+from tyro.conf import Positional, arg, subcommand
+
+from ..experiments.bench.folder import BenchFolder
+from ..experiments.bench.method import Method
+from ..experiments.bench.rows import Row
+from .progress import ProgressBar
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
+FIRST_SEED = 101
+"""Options were tuned on scenes of seeds below 100."""
+
+
+def run(
+    cases: tuple[str, ...] = (),
+    methods: tuple[str, ...] = (),
+    seeds: tuple[int, ...] = (FIRST_SEED,),
+    out: Path = Path("bench"),
+    snapshots: Path | None = None,
+    retry: bool = False,
+    list_only: Annotated[bool, arg(name="list")] = False,
+) -> None:
+    """Run methods on cases; rows that are there already are kept, so an interrupted benchmark goes on.
+
+    Args:
+        cases: Names of cases, or TOML files of your own (FILE.toml, or FILE.toml:VARIANT) (default: all).
+        methods: Names of methods (default: all).
+        seeds: Seeds of scenes and noise; options were tuned on seeds below 100.
+        out: Folder of the benchmark, new or to go on with.
+        snapshots: Folder of simulated cells (VTK files) for the cases that have them; without, cells are generated.
+        retry: Run again what failed.
+        list_only: Only list cases and methods.
+    """
+    from ..experiments.bench.case import Case, case_names, load_case  # these reach every method
+    from ..experiments.bench.methods import METHODS
+    from ..experiments.bench.references import REFERENCES
+    from ..experiments.bench.run import Suite, chosen, run_suite
+
+    if list_only:
+        _list(case_names(), METHODS)
+        return
+    wanted = {name: METHODS[name] for name in chosen("--methods", methods, list(METHODS))}
+    files = [name for name in cases if ".toml" in name]
+    listed = [name for name in cases if name not in files]
+    sources = {name: name for name in chosen("--cases", listed, case_names())} if listed or not files else {}
+    sources |= {load_case(file, min(seeds, default=0), snapshots).name: file for file in files}
+
+    def load(name: str, seed: int) -> Case:
+        return load_case(sources[name], seed, snapshots)
+
+    suite = Suite(list(sources), sorted(set(seeds)), wanted, REFERENCES, load)
+    folder = BenchFolder(out)
+    try:
+        with _Screen() as screen:
+            run_suite(suite, folder, retry=retry, on_progress=screen.show, on_row=screen.tell)
+    except KeyboardInterrupt:
+        _say(f"interrupted; what {out} holds is whole, and the same command goes on from there")
+        raise SystemExit(INTERRUPTED) from None
+    _say(f"{out} holds all {len(suite)} rows; now: holosplat bench report {out}")
+
+
+def report(folder: Positional[Path] = Path("bench")) -> None:
+    """Write report.html, report.md and their pictures into the folder of a benchmark.
+
+    Args:
+        folder: Folder of the benchmark, which may be unfinished.
+    """
+    from ..report.bench import write_bench_report  # matplotlib is slow to import
+
+    for path in write_bench_report(BenchFolder(folder)):
+        _say(f"wrote {path}")
+
+
+def bench(
+    act: Annotated[
+        Annotated[None, subcommand("run", constructor=run)] | Annotated[None, subcommand("report", constructor=report)],
+        arg(name=""),
+    ],
+) -> None:
+    """Compare methods on cases, under one physics and one set of scores: run them, then report."""
+
+
+class _Screen:
+    """What a benchmark says on standard error: a bar on a terminal, and a line for each row."""
+
+    def __init__(self) -> None:
+        self._bar: ProgressBar | None = None
+
+    def __enter__(self) -> _Screen:
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._clear()
+
+    def show(self, stage: str, fraction: float) -> None:
+        """A stage is done to `fraction`; only a terminal shows it."""
+        if sys.stderr.isatty():
+            self._bar = self._bar or ProgressBar()
+            self._bar.show(stage, fraction, {})
+
+    def tell(self, row: Row, left: int) -> None:
+        """A row is written."""
+        self._clear()
+        _say(f"{row.case} {row.seed} {row.method}: {_outcome(row)} ({left} to go)")
+
+    def _clear(self) -> None:
+        if self._bar is not None:
+            self._bar.__exit__(None, None, None)
+        self._bar = None
+
+
+def _outcome(row: Row) -> str:
+    if not row.done:
+        return f"failed: {row.reason}"
+    return (
+        f"SSIM {row.test['ssim']:.4f}, FRCM {row.test['frcm']:.4f}, Dice {row.volume['dice']:.4f}, "
+        f"relative error of δ {row.volume['relative_error_delta']:.4f}, {row.seconds:.1f} s"
+    )
+
+
+def _list(cases: list[str], methods: Mapping[str, Method]) -> None:
+    print("cases:", *cases, sep="\n  ")
+    print("methods:")
+    for name, method in methods.items():
+        print(f"  {name:24} {method.family}: {method.summary}")
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)
