@@ -65,7 +65,11 @@ SCENES = {
 FBP = [Ramp(window, cutoff) for window in ("ramlak", "shepp-logan", "hann") for cutoff in (1.0, 0.7, 0.5)]
 SIRT = [Algebraic(sweeps) for sweeps in (10, 30, 60, 100, 200)]
 SIRT_NONNEG = [Algebraic(sweeps, 1.9, True) for sweeps in (30, 60, 100, 200)]
-ART = [Algebraic(s, r, n) for n in (False, True) for s, r in ((5, 0.2), (10, 0.2), (20, 0.5), (20, 1.0), (40, 0.5), (40, 1.0))]
+ART = [
+    Algebraic(s, r, n)
+    for n in (False, True)
+    for s, r in ((5, 0.2), (10, 0.2), (20, 0.5), (20, 1.0), (40, 0.5), (40, 1.0))
+]
 TV = [TotalVariation(weight, discount=power) for power in (0.0, 0.5, 1.0) for weight in (0.2, 0.5, 1.0, 2.0)]
 TV += [TotalVariation(0.5, 60, iterations) for iterations in (60, 200)]
 MBIR = [Mbir(snr, sharpness, 1.1, threshold) for snr in (25, 30) for sharpness in (0, 1) for threshold in (0.1, 0.3)]

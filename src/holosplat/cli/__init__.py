@@ -1,4 +1,4 @@
-"""The command line: `holosplat plan | simulate | reconstruct | render | export | evaluate | demo | backends`."""
+"""The command line: `holosplat plan | simulate | reconstruct | render | export | convert | evaluate | bench | …`."""
 
 import os
 

@@ -1,4 +1,4 @@
-"""`holosplat bench`: the suite of cases × methods × seeds, and its report."""
+"""`holosplat bench`: the suite of cases × methods × seeds and its report, and the thesis' study."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from ..experiments.bench.folder import BenchFolder
 from ..experiments.bench.method import Method
 from ..experiments.bench.rows import Row
 from .progress import ProgressBar
+from .thesis import thesis
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
@@ -83,11 +84,13 @@ def report(folder: Positional[Path] = Path("bench")) -> None:
 
 def bench(
     act: Annotated[
-        Annotated[None, subcommand("run", constructor=run)] | Annotated[None, subcommand("report", constructor=report)],
+        Annotated[None, subcommand("run", constructor=run)]
+        | Annotated[None, subcommand("report", constructor=report)]
+        | Annotated[None, subcommand("thesis", constructor=thesis)],
         arg(name=""),
     ],
 ) -> None:
-    """Compare methods on cases, under one physics and one set of scores: run them, then report."""
+    """Compare methods on cases, under one physics and one set of scores (run, report); rerun the thesis' study."""
 
 
 class _Screen:
