@@ -21,7 +21,7 @@ from holosplat.experiments.thesis_findings import (
     low_frcm,
     more_gaussians_hurt,
     psnr_misleads,
-    wrong_ratio,
+    low_ratio,
 )
 from holosplat.experiments.thesis_study import (
     CURVES,
@@ -313,12 +313,12 @@ def test_frcm_peaks_early_only_where_it_falls_again():
 def test_the_thesis_levels_and_its_ratio():
     assert low_frcm(invented()).verdict == "does not reproduce"
     assert low_frcm(invented(test_frcm=np.full(LOOKS, 0.1))).verdict == "reproduces"
-    assert wrong_ratio(invented()).verdict == "does not reproduce"
-    assert wrong_ratio(invented(ratio=np.full(LOOKS, 28.0))).verdict == "reproduces"
-    assert wrong_ratio(invented(ratio=np.full(LOOKS, 1e5))).verdict == "reproduces"
-    mixed = wrong_ratio(invented(ratio=[np.full(LOOKS, r) for r in (28.0, *[2800.0] * 7)]))
+    assert low_ratio(invented()).verdict == "does not reproduce"
+    assert low_ratio(invented(ratio=np.full(LOOKS, 28.0))).verdict == "reproduces"
+    assert low_ratio(invented(ratio=np.full(LOOKS, 1e5))).verdict == "does not reproduce", "wrong the other way"
+    mixed = low_ratio(invented(ratio=[np.full(LOOKS, r) for r in (28.0, *[2800.0] * 7)]))
     assert mixed.verdict == "reproduces in part"
-    assert "wrong by a factor of 1.0 to 100.0" in mixed.evidence
+    assert "28 (100.0 times too small, 8k-v1) and 2800 (1.0 times too large, 8k-v4)" in mixed.evidence
 
 
 def test_what_was_not_run_cannot_be_judged():

@@ -22,7 +22,7 @@ class Ramp:
     """
 
     window: Literal["ramlak", "shepp-logan", "hann"] = "hann"
-    cutoff: float = 0.7
+    cutoff: float = 1.0
     nonnegative: bool = False
 
     def __post_init__(self) -> None:

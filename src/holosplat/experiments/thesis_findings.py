@@ -19,8 +19,8 @@ MARGIN = 0.02
 """A difference of SSIM, FRCM or Dice up to this is none."""
 RANK_FOLLOWS = 0.5
 """A rank correlation from which on one score follows the other."""
-WRONG_FACTOR = 10.0
-"""The thesis' δ/β is wrong by at least this factor."""
+LOW_FACTOR = 10.0
+"""The thesis' δ/β is too small by at least this factor."""
 SEEN = 0.3
 """An FRCM from which on a prediction shows what is in the frames."""
 THESIS_LEVELS = {"test_ssim": 0.870, "test_frcm": 0.096, "test_psnr": 19.5}
@@ -158,30 +158,28 @@ def low_frcm(study: Study) -> Finding:
     return Finding(claim, verdict, evidence)
 
 
-def wrong_ratio(study: Study) -> Finding:
-    """δ/β is as wrong as in the thesis if it is off by `WRONG_FACTOR` or more, either way.
+def low_ratio(study: Study) -> Finding:
+    """δ/β is too small as in the thesis if it is so by `LOW_FACTOR` or more.
 
     It reproduces if that is so in all of the thesis' configurations, and does not if it is in none.
     """
-    claim = "δ/β is wrong by a factor of 10 to 100"
+    claim = "δ/β comes out 10 to 100 times too small"
     true = study.about["true_delta"] / study.about["true_beta"]
     found = {name: row["last"]["ratio"] for name, row in study.rows.items() if _is_done(study, name)}
-    found = {name: ratio for name, ratio in found.items() if ratio}
-    ours = {c.name for c in EXTRA}
-    factors = {name: max(ratio / true, true / ratio) for name, ratio in found.items() if name not in ours}
-    if not factors:
+    judged = {name: found[name] / true for name in _names(study) if found.get(name)}
+    if not judged:
         return Finding(claim, "cannot be judged", "No configuration of the thesis is finished.")
-    wrong = [name for name, factor in factors.items() if factor >= WRONG_FACTOR]
+    low = [name for name, share in judged.items() if share <= 1 / LOW_FACTOR]
     verdict: Verdict = "reproduces in part"
-    if len(wrong) in (0, len(factors)):
-        verdict = "reproduces" if wrong else "does not reproduce"
-    low, high = (pick(ratio for name, ratio in found.items() if name in factors) for pick in (min, max))
+    if len(low) in (0, len(judged)):
+        verdict = "reproduces" if low else "does not reproduce"
+    least, most = min(judged, key=lambda name: judged[name]), max(judged, key=lambda name: judged[name])
     evidence = (
-        f"δ/β inside the cells is {low:.0f} to {high:.0f}, where {true:.0f} is true: "
-        f"wrong by a factor of {min(factors.values()):.1f} to {max(factors.values()):.1f}."
+        f"δ/β inside the cells, where {true:.0f} is true, lies between {found[least]:.0f} "
+        f"({_times(judged[least])}, {least}) and {found[most]:.0f} ({_times(judged[most])}, {most})."
     )
-    for name in (c.name for c in EXTRA if c.one_unit and c.name in found):
-        evidence += f" With one unit for δ and β ({name}) it is {found[name]:.3g}."
+    for name in (c.name for c in EXTRA if c.one_unit and found.get(c.name)):
+        evidence += f" With one unit for δ and β at the start ({name}) it is {found[name]:.0f}."
     return Finding(claim, verdict, evidence)
 
 
@@ -214,6 +212,11 @@ def _rank(a: np.ndarray, b: np.ndarray) -> float:
     if np.ptp(a) == 0 or np.ptp(b) == 0:
         return 0.0
     return float(spearmanr(a, b).statistic)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _times(share: float) -> str:
+    """0.05 → "20 times too small"."""
+    return f"{share:.1f} times too large" if share >= 1 else f"{1 / share:.1f} times too small"
 
 
 def _signed(value: float) -> str:
