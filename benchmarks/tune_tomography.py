@@ -4,7 +4,8 @@
     python benchmarks/tune_tomography.py --methods tv sirt --scenes main12 --seeds 1 2
     python benchmarks/tune_tomography.py --defaults     # the defaults only; held-out frames are predicted too
 
-Thickness is Paganin's, of the scene's own material; tomography bounds the occupancy by 1. Prints a Markdown table.
+Thickness is retrieved by --retrieval, of the scene's own material; the occupancy is bounded by 1. Prints a Markdown
+table.
 """
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ class Job:
     truth: hs.Volume
 
 
-def job(name: str, seed: int) -> Job:
+def job(name: str, seed: int, retrieval: str) -> Job:
     """Simulate and retrieve; held-out frames are free of noise."""
     scene = SCENES[name]
     meshes = hs.random_cells(scene.cells, (scene.side * scene.pitch,) * 3, seed, scene.diameter)
@@ -106,7 +107,7 @@ def job(name: str, seed: int) -> Job:
         frames = np.where(is_test[:, None, None], scan.frames, noisy.frames)
         scan = hs.Scan(frames, exposures, is_test)
     train = scan.train()
-    lines = RETRIEVALS["paganin"](torch.from_numpy(train.frames), train.exposures, *HAEMOGLOBIN)
+    lines = RETRIEVALS[retrieval](torch.from_numpy(train.frames), train.exposures, *HAEMOGLOBIN)
     return Job(scan, lines, matter.voxelise(hs.Grid.of_views(views)))
 
 
@@ -135,13 +136,14 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", choices=OPTIONS, default=list(TOMOGRAPHIES))
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=list(SCENES))
     parser.add_argument("--seeds", nargs="+", type=int, default=[1])
+    parser.add_argument("--retrieval", choices=RETRIEVALS, default="paganin")
     parser.add_argument("--defaults", action="store_true")
     chosen = parser.parse_args()
     print("| scene, seed | method | Dice | error of δ | time / s |" + " SSIM | FRCM |" * chosen.defaults)
     print("|" + " --- |" * (7 if chosen.defaults else 5))
     for name in chosen.scenes:
         for seed in chosen.seeds:
-            ready = job(name, seed)
+            ready = job(name, seed, chosen.retrieval)
             for method in chosen.methods:
                 function, options = OPTIONS[method]
                 runs = [(str(option), partial(function, options=option)) for option in options]
@@ -149,7 +151,8 @@ def main() -> None:
                     runs = [(method, TOMOGRAPHIES.get(method) or partial(function, options=Mbir()))]
                 for label, run in runs:
                     print(f"| {name}, {seed} | {label} | {row(ready, run, chosen.defaults)} |", flush=True)
-    print(f"\ncommit {commit()}, torch {torch.__version__}, {torch.get_num_threads()} threads")
+    where = f"commit {commit()}, torch {torch.__version__}, {torch.get_num_threads()} threads"
+    print(f"\nThickness by {chosen.retrieval}; {where}")
 
 
 if __name__ == "__main__":
