@@ -19,9 +19,9 @@ from holosplat.experiments.thesis_findings import (
     findings,
     frcm_peaks_early,
     low_frcm,
+    low_ratio,
     more_gaussians_hurt,
     psnr_misleads,
-    low_ratio,
 )
 from holosplat.experiments.thesis_study import (
     CURVES,

@@ -43,7 +43,7 @@ def findings(study: Study) -> list[Finding]:
         more_gaussians_hurt(study),
         frcm_peaks_early(study),
         low_frcm(study),
-        wrong_ratio(study),
+        low_ratio(study),
     ]
 
 
