@@ -307,6 +307,11 @@ def test_frcm_peaks_early_only_where_it_falls_again():
     assert frcm_peaks_early(invented()).verdict == "does not reproduce"
     assert frcm_peaks_early(invented(test_frcm=early)).verdict == "reproduces"
     assert frcm_peaks_early(invented(test_frcm=[early, early, *[rise] * 6])).verdict == "reproduces in part"
+    dip = frcm_peaks_early(invented(test_frcm=rise - 0.3 * (np.abs(rise - 0.4) < 0.1)))
+    assert dip.verdict == "reproduces in part", "it falls, and recovers"
+    assert "from a peak in the first half is 0.247" in dip.evidence
+    late = frcm_peaks_early(invented(test_frcm=rise - 0.3 * (rise > 0.9)))
+    assert late.verdict == "does not reproduce", "it falls, but late"
     assert frcm_peaks_early(invented(test_frcm=0.9 - 0.01 * rise)).verdict == "does not reproduce", "within the margin"
 
 

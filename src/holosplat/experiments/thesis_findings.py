@@ -112,28 +112,31 @@ def more_gaussians_hurt(study: Study) -> Finding:
 def frcm_peaks_early(study: Study) -> Finding:
     """FRCM peaks early if its best look lies in the first half of the steps, and the end is worse by over `MARGIN`.
 
-    It reproduces if that is so in more than half of the configurations, and does not if it is in none.
+    It reproduces if that is so in more than half of the configurations; in part if in some, or if FRCM falls so far
+    from a peak in the first half and recovers; and does not otherwise.
     """
-    claim = "FRCM peaks early, then falls"
-    curves = _judged_curves(study)
+    claim, curves = "FRCM peaks early, then falls", _judged_curves(study)
     if not curves:
         return Finding(claim, "cannot be judged", "No configuration has three looks after its warm-up.")
-    at, lost = {}, {}
+    at, lost, fallen = {}, {}, {}
     for name, curve in curves.items():
-        best = int(np.argmax(curve["test_frcm"]))
-        at[name] = float(curve["step"][best] / curve["step"][-1])
-        lost[name] = float(curve["test_frcm"][best] - curve["test_frcm"][-1])
+        frcm, first_half = curve["test_frcm"], curve["step"] <= 0.5 * curve["step"][-1]
+        at[name] = float(curve["step"][int(np.argmax(frcm))] / curve["step"][-1])
+        lost[name] = float(frcm.max() - frcm[-1])
+        highest_yet = np.maximum.accumulate(np.where(first_half, frcm, -np.inf))
+        fallen[name] = float((highest_yet - frcm).max())
     early = [name for name in curves if at[name] <= 0.5 and lost[name] > MARGIN]
-    verdict: Verdict = "reproduces in part"
+    deepest = max(fallen, key=lambda name: fallen[name])
+    verdict: Verdict = "does not reproduce"
     if 2 * len(early) > len(curves):
         verdict = "reproduces"
-    elif not early:
-        verdict = "does not reproduce"
-    worst = max(lost, key=lambda name: lost[name])
+    elif early or fallen[deepest] > MARGIN:
+        verdict = "reproduces in part"
     evidence = (
-        f"The best look comes after {100 * min(at.values()):.0f} to {100 * max(at.values()):.0f} % of the steps; "
-        f"the end is at most {lost[worst]:.3f} below it ({worst}). "
-        f"Early and lost by the end in {len(early)} of {_configurations(len(curves))}."
+        f"The best look comes after {100 * min(at.values()):.0f} to {100 * max(at.values()):.0f} % of the steps, "
+        f"and the end is at most {max(lost.values()):.3f} below it: early and lost in {len(early)} of "
+        f"{_configurations(len(curves))}. The deepest fall from a peak in the first half is {fallen[deepest]:.3f} "
+        f"({deepest})."
     )
     return Finding(claim, verdict, evidence)
 

@@ -346,6 +346,5 @@ def _row(
         "diverged_at": diverged,
         "steps": fit.step,
         "seconds": fit.seconds,
-        "step_ms": 1e3 * fit.seconds / max(1, fit.step),
         "last": {key: value if np.isfinite(value) else None for key, value in last.items()},
     }
