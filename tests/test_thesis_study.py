@@ -108,7 +108,7 @@ def test_the_schedule_is_that_of_the_thesis_or_ten_times_shorter(name, steps, wa
     assert density.every == every
     events = [step for step in range(steps) if density.due(step, steps)]
     assert (events[0] + 1, events[-1] + 1) == (steps // 10, steps // 2), "3000 to 15000 of 30000"
-    assert PACES[name].look_every % every != 0, "looks do not fall on the events of density control"
+    assert PACES[name].look_every % every != 0, "most looks do not fall on an event of density control"
 
 
 def test_the_worst_views_of_a_batch_do_not_learn_unless_asked():
@@ -309,7 +309,9 @@ def test_frcm_peaks_early_only_where_it_falls_again():
     assert frcm_peaks_early(invented(test_frcm=[early, early, *[rise] * 6])).verdict == "reproduces in part"
     dip = frcm_peaks_early(invented(test_frcm=rise - 0.3 * (np.abs(rise - 0.4) < 0.1)))
     assert dip.verdict == "reproduces in part", "it falls, and recovers"
-    assert "from a peak in the first half is 0.247" in dip.evidence
+    assert "from a peak in the first half is 0.142" in dip.evidence
+    shock = frcm_peaks_early(invented(test_frcm=rise - 0.3 * (np.arange(LOOKS) == 8)))
+    assert shock.verdict == "does not reproduce", "one look where Gaussians were just split"
     late = frcm_peaks_early(invented(test_frcm=rise - 0.3 * (rise > 0.9)))
     assert late.verdict == "does not reproduce", "it falls, but late"
     assert frcm_peaks_early(invented(test_frcm=0.9 - 0.01 * rise)).verdict == "does not reproduce", "within the margin"
@@ -323,7 +325,7 @@ def test_the_thesis_levels_and_its_ratio():
     assert low_ratio(invented(ratio=np.full(LOOKS, 1e5))).verdict == "does not reproduce", "wrong the other way"
     mixed = low_ratio(invented(ratio=[np.full(LOOKS, r) for r in (28.0, *[2800.0] * 7)]))
     assert mixed.verdict == "reproduces in part"
-    assert "28 (100.0 times too small, 8k-v1) and 2800 (1.0 times too large, 8k-v4)" in mixed.evidence
+    assert "between 28 (100.0 times too small, 8k-v1) and 2,800 (1.0 times too large, 8k-v4)" in mixed.evidence
 
 
 def test_what_was_not_run_cannot_be_judged():

@@ -5,10 +5,12 @@ One run of one scene is behind each, so differences below `MARGIN` count as none
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from scipy.ndimage import median_filter
 from scipy.stats import spearmanr
 
 from .thesis_study import EXTRA, THESIS_TABLE, Study
@@ -113,14 +115,18 @@ def frcm_peaks_early(study: Study) -> Finding:
     """FRCM peaks early if its best look lies in the first half of the steps, and the end is worse by over `MARGIN`.
 
     It reproduces if that is so in more than half of the configurations; in part if in some, or if FRCM falls so far
-    from a peak in the first half and recovers; and does not otherwise.
+    from a peak in the first half and recovers; and does not otherwise. A look counts as the median of itself and its
+    neighbours: where Gaussians were just split, one look alone is worse.
     """
     claim, curves = "FRCM peaks early, then falls", _judged_curves(study)
     if not curves:
         return Finding(claim, "cannot be judged", "No configuration has three looks after its warm-up.")
     at, lost, fallen = {}, {}, {}
     for name, curve in curves.items():
-        frcm, first_half = curve["test_frcm"], curve["step"] <= 0.5 * curve["step"][-1]
+        frcm, first_half = (
+            median_filter(curve["test_frcm"], 3, mode="nearest"),
+            curve["step"] <= 0.5 * curve["step"][-1],
+        )
         at[name] = float(curve["step"][int(np.argmax(frcm))] / curve["step"][-1])
         lost[name] = float(frcm.max() - frcm[-1])
         highest_yet = np.maximum.accumulate(np.where(first_half, frcm, -np.inf))
@@ -133,10 +139,9 @@ def frcm_peaks_early(study: Study) -> Finding:
     elif early or fallen[deepest] > MARGIN:
         verdict = "reproduces in part"
     evidence = (
-        f"The best look comes after {100 * min(at.values()):.0f} to {100 * max(at.values()):.0f} % of the steps, "
-        f"and the end is at most {max(lost.values()):.3f} below it: early and lost in {len(early)} of "
-        f"{_configurations(len(curves))}. The deepest fall from a peak in the first half is {fallen[deepest]:.3f} "
-        f"({deepest})."
+        f"The best look comes after {_span([100 * share for share in at.values()], '.0f')} % of the steps, "
+        f"and the end is at most {max(lost.values()):.3f} below it: early and lost in {len(early)} of {len(curves)}. "
+        f"The deepest fall from a peak in the first half is {fallen[deepest]:.3f} ({deepest})."
     )
     return Finding(claim, verdict, evidence)
 
@@ -152,11 +157,10 @@ def low_frcm(study: Study) -> Finding:
     verdict: Verdict = "reproduces in part"
     if len(above) in (0, len(rows)):
         verdict = "does not reproduce" if above else "reproduces"
-    low, high = ({key: pick(row[key] for row in rows.values()) for key in THESIS_LEVELS} for pick in (min, max))
+    ssim, frcm, psnr = ([row[key] for row in rows.values()] for key in THESIS_LEVELS)
     evidence = (
-        f"Here, over {_configurations(len(rows))}: SSIM {low['test_ssim']:.3f} to {high['test_ssim']:.3f}, "
-        f"FRCM {low['test_frcm']:.3f} to {high['test_frcm']:.3f}, "
-        f"PSNR {low['test_psnr']:.1f} to {high['test_psnr']:.1f} dB."
+        f"Here, over {_configurations(len(rows))}: SSIM {_span(ssim, '.3f')}, FRCM {_span(frcm, '.3f')}, "
+        f"PSNR {_span(psnr, '.1f')} dB."
     )
     return Finding(claim, verdict, evidence)
 
@@ -176,13 +180,11 @@ def low_ratio(study: Study) -> Finding:
     verdict: Verdict = "reproduces in part"
     if len(low) in (0, len(judged)):
         verdict = "reproduces" if low else "does not reproduce"
-    least, most = min(judged, key=lambda name: judged[name]), max(judged, key=lambda name: judged[name])
-    evidence = (
-        f"δ/β inside the cells, where {true:.0f} is true, lies between {found[least]:.0f} "
-        f"({_times(judged[least])}, {least}) and {found[most]:.0f} ({_times(judged[most])}, {most})."
-    )
+    ends = {pick(judged, key=lambda name: judged[name]): None for pick in (min, max)}
+    said = " and ".join(f"{found[name]:,.0f} ({_times(judged[name])}, {name})" for name in ends)
+    evidence = f"δ/β inside the cells, where {true:.0f} is true, is {'between ' * (len(ends) > 1)}{said}."
     for name in (c.name for c in EXTRA if c.one_unit and found.get(c.name)):
-        evidence += f" With one unit for δ and β at the start ({name}) it is {found[name]:.0f}."
+        evidence += f" With one unit for δ and β at the start ({name}) it is {found[name]:,.0f}."
     return Finding(claim, verdict, evidence)
 
 
@@ -218,8 +220,13 @@ def _rank(a: np.ndarray, b: np.ndarray) -> float:
 
 
 def _times(share: float) -> str:
-    """0.05 → "20 times too small"."""
-    return f"{share:.1f} times too large" if share >= 1 else f"{1 / share:.1f} times too small"
+    """0.05 → "20.0 times too small"."""
+    return f"{share:,.1f} times too large" if share >= 1 else f"{1 / share:,.1f} times too small"
+
+
+def _span(values: Sequence[float], form: str) -> str:
+    """The least and the greatest of `values`, or the one that both are: "0.5 to 0.9"."""
+    return " to ".join(dict.fromkeys(format(pick(values), form) for pick in (min, max)))
 
 
 def _signed(value: float) -> str:

@@ -35,7 +35,7 @@ from .settings import preset
 START_DENSITY = 0.01
 """Density of the random start, in units of water: about what 16 cells fill of their channel."""
 LOOK_EVERY = 400
-"""Steps of the full schedule between two looks at the held-out frames; no multiple of the densification's interval."""
+"""Steps of the full schedule between two looks; every fifth falls on a densification, and shows its shock."""
 CURVES = (
     *("step", "seconds", "count"),
     *(f"{split}_{score}" for split in ("test", "train") for score in ("ssim", "frcm", "psnr", "l1")),

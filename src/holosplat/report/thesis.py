@@ -143,7 +143,7 @@ def summary(study: Study) -> str:
     return (
         f"Case {about['case']}: {frames - about['held_out']} training and {about['held_out']} held-out frames of "
         f"{rows} × {columns} pixels of {1e6 * about['pixel_size_m']:.3g} µm, seed {about['seed']}. "
-        f"{len(study.rows)} configurations, schedule “{about['pace']['name']}” of {steps} steps, two-channel Gaussians "
+        f"{len(study.rows)} configuration{'s' * (len(study.rows) > 1)}, schedule “{about['pace']['name']}” of {steps} steps, two-channel Gaussians "
         "from a random start, no prior; held-out frames judge only."
     )
 
