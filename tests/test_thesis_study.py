@@ -382,3 +382,11 @@ def test_configurations_are_drawn_apart():
     assert list(LINES) == names
     assert len(set(LINES.values())) == len(names)
     assert all(isinstance(c, Configuration) for c in EXTRA)
+
+
+def test_the_preset_random_starts_at_random_and_judges_on_no_training_frame():
+    settings = preset("random")
+    assert settings.start == "random"
+    assert settings.fit.schedule.validation_views == 0
+    assert settings.fit.density.every > 0
+    assert settings.random_count <= 10_000

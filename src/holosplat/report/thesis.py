@@ -137,14 +137,14 @@ def _table_row(name: str, row: dict[str, Any], curve: dict[str, np.ndarray]) -> 
 
 def summary(study: Study) -> str:
     """What was run, in two sentences."""
-    about = study.about
+    about, count = study.about, len(study.rows)
     frames, rows, columns = about["frames"]
     steps = max(row["steps"] for row in study.rows.values())
     return (
         f"Case {about['case']}: {frames - about['held_out']} training and {about['held_out']} held-out frames of "
         f"{rows} × {columns} pixels of {1e6 * about['pixel_size_m']:.3g} µm, seed {about['seed']}. "
-        f"{len(study.rows)} configuration{'s' * (len(study.rows) > 1)}, schedule “{about['pace']['name']}” of {steps} steps, two-channel Gaussians "
-        "from a random start, no prior; held-out frames judge only."
+        f"{count} configuration{'s' if count > 1 else ''}, schedule “{about['pace']['name']}” of {steps} steps, "
+        "two-channel Gaussians from a random start, no prior; held-out frames judge only."
     )
 
 
