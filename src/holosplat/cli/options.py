@@ -104,7 +104,7 @@ class SettingsOptions:
     """How the reconstruction proceeds."""
 
     preset: str | None = None
-    """Named settings: default (what you get without), fast, thesis."""
+    """Named settings: default (what you get without), fast, random, thesis."""
     config: Path | None = None
     """Or: a JSON file of settings, such as the config.json of another run."""
     backend: Literal["auto", "cpu", "cuda", "reference"] | None = None
