@@ -13,11 +13,9 @@ from tyro.conf import Positional, arg, subcommand
 from ..experiments.bench.folder import BenchFolder
 from ..experiments.bench.method import Method
 from ..experiments.bench.rows import Row
-from .progress import ProgressBar
+from .progress import INTERRUPTED, ProgressBar
 from .thesis import thesis
 
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
 FIRST_SEED = 101
 """Options were tuned on scenes of seeds below 100."""
 

@@ -36,12 +36,10 @@ from .bench import bench
 from .convert import convert
 from .options import BeamlineOptions, MaterialOptions, MeshOptions, NoiseOptions, PriorOptions, SettingsOptions
 from .plan import plan
-from .progress import ProgressBar
+from .progress import INTERRUPTED, ProgressBar
 
 MOST_VOXELS = 2**31
 """The largest volume that `export` writes: 16 GB for δ and β."""
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
 
 
 def simulate(

@@ -1,4 +1,4 @@
-"""The progress bar of the command line."""
+"""What long commands share: the progress bar, and the exit code of an interrupted one."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import sys
 from types import TracebackType
 
 from tqdm import tqdm
+
+INTERRUPTED = 130
+"""Exit code after Ctrl-C, as shells have it."""
 
 
 class ProgressBar:

@@ -8,11 +8,9 @@ from typing import Literal
 
 from ..experiments.thesis_study import PACES, Measured, StudyFolder, load_study, run_study
 from ..experiments.thesis_study import configurations as named
-from .progress import ProgressBar
+from .progress import INTERRUPTED, ProgressBar
 
 CASE = "thesis16"
-INTERRUPTED = 130
-"""Exit code after Ctrl-C, as shells have it."""
 
 
 def thesis(

@@ -9,9 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...checks import at_least, require
 from ...scan import Exposures
-from .model import WaveModel, view_by_view
+from .model import Regularised, WaveModel, view_by_view
 from .nonlinear import EASE, FIRST_DAMPING, TIGHTEN
 
 EDGE = 0.5
@@ -21,20 +20,9 @@ COUPLING = 0.05
 
 
 @dataclass(frozen=True)
-class ADMM:
-    """Options. iterations: of the multipliers, a step of the wave optics each; weight: of total variation, 1 is
-    Bayes' for slopes of the mean that the estimate has; noise: standard deviation of the frames (None: estimated);
-    backend: see `backends`."""
-
-    iterations: int = 60
-    weight: float = 1.0
-    noise: float | None = None
-    backend: str = "cpu"
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "iterations")
-        at_least(self, 0, "weight")
-        require(self.noise is None or self.noise >= 0, f"noise must not be negative, but it is {self.noise}.")
+class ADMM(Regularised):
+    """Options: iterations are those of the multipliers, weight that of total variation, for slopes of the mean that the
+    estimate has."""
 
 
 def admm(

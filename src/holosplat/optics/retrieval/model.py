@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -10,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, pad
 
 from ...backends import device, resolve
+from ...checks import at_least, require
 from ...scan import Exposures
 from ...units import wavelength
 from ..hologram import hologram, optical_path
@@ -26,6 +28,23 @@ SHARPENING = 3
 """Rounds in which a finer phase learns the means of the pixels; what is then left is added to their samples."""
 CROSS_TERM = 4.0
 """Weight of the contrast's slope in the curvature; large enough that most first steps are taken."""
+
+
+@dataclass(frozen=True)
+class Regularised:
+    """Options of what is fitted through the waves. iterations: each one step of the wave optics; weight: of the
+    regularisation, 1 is Bayes' for what the method assumes of the matter; noise: standard deviation of the frames
+    (None: estimated from them); backend: see `backends`."""
+
+    iterations: int = 60
+    weight: float = 1.0
+    noise: float | None = None
+    backend: str = "cpu"
+
+    def __post_init__(self) -> None:
+        at_least(self, 1, "iterations")
+        at_least(self, 0, "weight")
+        require(self.noise is None or self.noise >= 0, f"noise must not be negative, but it is {self.noise}.")
 
 
 class WaveModel:

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ...checks import at_least, require
 from ...scan import Exposures
-from .model import WaveModel, view_by_view
+from .model import Regularised, WaveModel, view_by_view
 from .spectra import TINY, squared_frequency
 
 FIRST_DAMPING = 0.05
@@ -23,19 +22,10 @@ STIFFEST = 1.0
 
 
 @dataclass(frozen=True)
-class Tikhonov:
-    """Options. iterations: steps, taken or refused; weight: of the penalty, 1 is Bayes' for Gaussian matter;
-    noise: standard deviation of the frames (None: estimated from them); backend: see `backends`."""
+class Tikhonov(Regularised):
+    """Options: iterations are taken or refused, weight is that of the penalty, for Gaussian matter."""
 
-    iterations: int = 60
     weight: float = 0.5
-    noise: float | None = None
-    backend: str = "cpu"
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "iterations")
-        at_least(self, 0, "weight")
-        require(self.noise is None or self.noise >= 0, f"noise must not be negative, but it is {self.noise}.")
 
 
 def tikhonov(
