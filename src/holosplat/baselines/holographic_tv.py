@@ -1,6 +1,6 @@
 """The start of a reconstruction: one material's occupancy from a few holograms, on voxels.
 
-Paganin retrieval of each view, then total-variation tomography with the occupancy kept in [0, 1], then a few
+Nonlinear phase retrieval of each view, then total-variation tomography with the occupancy kept in [0, 1], then a few
 corrections that make the volume agree with the holograms themselves: single-view retrieval leaves errors at low
 frequencies that only consistency between views can mend.
 """
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import torch
@@ -21,11 +22,16 @@ from ..forward import Instrument, resolving_oversample
 from ..geometry import Grid, Views
 from ..materials import DeltaBeta
 from ..memory import memory_kept
-from ..optics.retrieval import invert_contrast, paganin
+from ..optics.noise import noise_levels
+from ..optics.retrieval import Tikhonov, tikhonov
+from ..optics.retrieval.bounded import MODEL_ERROR, PRIOR
+from ..optics.retrieval.spectra import Raster, filtered, radian, response, spectra, surrounded
 from ..projectors.voxels import projector_for
 from ..scan import Scan
 from ..volume import LineIntegrals
 from .primal_dual import PrimalDual
+from .rays import rays_of
+from .tomography import TotalVariation, tv_solver
 
 SETTLING = 2
 """Rounds of agreement after which misfits are compared."""
@@ -36,16 +42,18 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class HolographicTV:
-    """Options. weight: of total variation, in pixels of path length; iterations: primal–dual steps on the retrieved
-    thickness; corrections: rounds of agreement with the holograms, of `inner` steps each; refine: voxels along a
-    pixel's edge (0: as the first fringe needs); max_voxels: coarser voxels rather than more than this many;
-    upper: bound of the occupancy (0: none); backend: `cpu`, or `reference` (plain torch, slow).
+    """Options. retrieval: steps of the phase retrieval; iterations: primal–dual steps on the retrieved thickness;
+    weight: of total variation while the volume is made to agree with the holograms, in pixels of path length;
+    corrections: rounds of that, of `inner` steps each; refine: voxels along a pixel's edge then (0: as the first
+    fringe needs); max_voxels: coarser voxels rather than more than this many; upper: bound of the occupancy (0: none);
+    backend: `cpu`, or `reference` (plain torch, slow).
     """
 
+    retrieval: int = 60
+    iterations: int = 160
     weight: float = 0.3
-    iterations: int = 100
     corrections: int = 6
-    inner: int = 20
+    inner: int = 12
     refine: int = 0
     max_voxels: int = 70_000_000
     upper: float = 1.0
@@ -53,7 +61,7 @@ class HolographicTV:
 
     def __post_init__(self) -> None:
         at_least(self, 0, "weight", "corrections", "inner", "refine", "upper")
-        at_least(self, 1, "iterations", "max_voxels")
+        at_least(self, 1, "retrieval", "iterations", "max_voxels")
 
 
 def holographic_tv(
@@ -71,45 +79,43 @@ def _holographic_tv(
     scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress
 ) -> tuple[Tensor, Grid]:
     scan, refine = _working_resolution(scan, options)
-    exposures, pitch = scan.exposures, scan.views.pixel_size
+    solver = _tomography(scan, material, options, on_progress)
+    if options.corrections == 0:
+        return solver.volume, Grid.of_views(scan.views)
+    return _agree(scan, material, solver, options, refine, on_progress)
+
+
+def _tomography(scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress) -> PrimalDual:
+    """Phase retrieval of each view and total variation: the solver, on voxels of one pixel."""
     frames = torch.from_numpy(scan.frames)
-    on_progress("phase retrieval", 0.0)
-    lines = paganin(frames, exposures, material.delta, material.beta) / pitch
-
-    views = _in_pixels(scan.views)
-    grid = Grid.of_views(views)
-    upper = options.upper or None
-    projector = projector_for(grid, views, options.backend)
-    solver = PrimalDual(projector, torch.zeros(grid.shape), options.weight, upper, backend=options.backend)
-    for done in range(0, options.iterations, 10):
-        on_progress("tomography", done / options.iterations)
-        solver.run(lines, min(10, options.iterations - done))
-    volume = solver.volume
-
-    if options.corrections > 0:
-        volume, grid = _agree(scan, material, volume, options, refine, on_progress)
-    return volume, _in_metres(grid, pitch)
+    noise = float(noise_levels(frames).mean())
+    how = Tikhonov(iterations=options.retrieval, noise=noise, backend=options.backend)
+    report = partial(on_progress, "phase retrieval")
+    lines = tikhonov(frames, scan.exposures, *material, options=how, on_progress=report)
+    rays = rays_of(lines, scan.views, Grid.of_views(scan.views), options.backend)
+    first = min(TotalVariation.first, options.iterations)
+    steps = TotalVariation(first=first, iterations=options.iterations - first)
+    return tv_solver(rays, options.upper or None, steps, partial(on_progress, "tomography"), options.backend)
 
 
 def _agree(
-    scan: Scan, material: DeltaBeta, volume: Tensor, options: HolographicTV, refine: int, on_progress: Progress
+    scan: Scan, material: DeltaBeta, coarse: PrimalDual, options: HolographicTV, refine: int, on_progress: Progress
 ) -> tuple[Tensor, Grid]:
     """The volume after rounds of agreement with the holograms, on voxels `refine` times finer than pixels.
 
-    Each round runs the wave optics on the volume's projection, inverts what is missing from the frames, and
-    gives the corrected projection to a few primal–dual steps. The round that agrees best is returned, for the
-    iteration may diverge; the first ones, in which the solver finds its dual variables, do not count.
+    Each round runs the wave optics on the volume's projection, inverts what is missing from the frames, as far as
+    their noise lets it be known (`correction`), and gives the corrected projection to a few primal–dual steps. The
+    round that agrees best is returned, for the iteration may diverge; the first ones, in which the solver finds its
+    dual variables, do not count.
     """
     frames, pitch, views = torch.from_numpy(scan.frames), scan.views.pixel_size, _in_pixels(scan.views)
-    physics = (pitch, scan.exposures.distance, scan.exposures.energy_kev, material.delta, material.beta)
-    grid = Grid.of_views(views, refine)
+    correction = Correction(scan, material)
     finer = math.ceil(resolving_oversample(scan.exposures, 1.5, at_least=1) / refine)
     instrument = Instrument(scan.exposures, refine * finer, backend=options.backend)
+    grid = Grid.of_views(views, refine)
     projector = projector_for(grid, views.refined(refine), options.backend)
-    start = interpolate(volume[None, None], size=grid.shape, mode="trilinear", align_corners=False)[0, 0]
-    upper = options.upper or None
-    solver = PrimalDual(projector, start, options.weight, upper, 1 / refine**2, options.backend)
-    best, least = start, float("inf")
+    solver = coarse.on_finer(projector, refine, options.weight)
+    best, least = solver.volume, float("inf")
     for done in range(options.corrections + 1):
         on_progress("agreement with the holograms", done / options.corrections)
         lines = solver.lines()
@@ -118,9 +124,30 @@ def _agree(
         if misfit < least or done <= SETTLING:
             best, least = solver.volume.clone(), misfit
         if done < options.corrections:
-            change = invert_contrast(missing, *physics) / pitch
-            solver.run(lines + _refined(change, refine), options.inner)
-    return best, grid
+            solver.run(lines + _refined(correction(missing) / pitch, refine), options.inner)
+    return best, _in_metres(grid, pitch)
+
+
+class Correction:
+    """Thickness [V, H, W] in metres that explains what is missing from the frames, by Wiener's inverse of each view.
+
+    The inverse is that of `optics.retrieval.spectra`, for the noise of the frames and the power expected of the phase:
+    where noise hides a frequency, the views are not made to agree on it.
+    """
+
+    def __init__(self, scan: Scan, material: DeltaBeta) -> None:
+        self._exposures, frames = scan.exposures, torch.from_numpy(scan.frames)
+        self._radian = radian(scan.exposures, material.delta)
+        wide, _ = surrounded(frames, scan.exposures)
+        raster = Raster((wide.shape[-2], wide.shape[-1]), scan.views.pixel_size)
+        h = response(scan.exposures, material.beta / material.delta, raster)
+        known = spectra(frames, scan.exposures, h, raster, noise_levels(frames), MODEL_ERROR, PRIOR)
+        self._inverse = known.inverse
+
+    def __call__(self, missing: Tensor) -> Tensor:
+        """The thickness, float32, for missing intensity [V, H, W]."""
+        wide, crop = surrounded(missing + 1, self._exposures)
+        return (-filtered(wide, self._inverse)[crop] * self._radian).float()
 
 
 def _working_resolution(scan: Scan, options: HolographicTV) -> tuple[Scan, int]:

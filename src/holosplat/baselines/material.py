@@ -10,9 +10,12 @@ import torch
 from torch import Tensor
 
 from ..checks import require
-from ..materials import DeltaBeta
+from ..geometry import Grid
+from ..memory import memory_kept
+from ..optics.retrieval import paganin
 from ..scan import Scan
-from .holographic_tv import HolographicTV, holographic_tv
+from .rays import rays_of
+from .tomography import TotalVariation, tv_solver
 
 RATIOS = np.logspace(1.75, 4.25, 11)
 """δ/β tried by `estimate_ratio`: from heavy elements at low energy to soft matter at high energy."""
@@ -70,6 +73,9 @@ def plateau(occupancy: Tensor) -> float:
 
 
 def _trial_volume(scan: Scan, ratio: float, backend: Backend) -> Tensor:
-    options = HolographicTV(weight=0.1, iterations=40, corrections=0, upper=0.0, backend=backend)
-    material = DeltaBeta(TRIAL_DELTA, TRIAL_DELTA / ratio)
-    return holographic_tv(scan, material, options, lambda stage, fraction: None)[0]
+    """Occupancy by Paganin's retrieval and a little total variation, not negative and without an upper bound."""
+    lines = paganin(torch.from_numpy(scan.frames), scan.exposures, TRIAL_DELTA, TRIAL_DELTA / ratio)
+    rays = rays_of(lines, scan.views, Grid.of_views(scan.views), backend)
+    how = TotalVariation(weight=0.1, first=40, iterations=0)
+    with memory_kept():
+        return tv_solver(rays, None, how, lambda fraction: None, backend).volume

@@ -6,6 +6,7 @@ from typing import Protocol
 
 import torch
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from ..backends import implementation
 
@@ -57,6 +58,7 @@ class PrimalDual:
         coupling: float = 1.0,
         backend: str = "cpu",
     ) -> None:
+        self._backend = backend
         self._steps = implementation(f"{__package__}.tv_steps", backend)
         self.projector, self.coupling = projector, coupling
         self.radius = weight / coupling
@@ -78,6 +80,22 @@ class PrimalDual:
     def lines(self) -> Tensor:
         """Line integrals [V, H, W] of the volume as it is now."""
         return self.projector.lines_out(self.projector.project(self._array))
+
+    def on_finer(self, projector: LinearProjector, factor: int, weight: float) -> PrimalDual:
+        """A solver on voxels and pixels `factor` times finer, those of `projector`, which goes on from this one.
+
+        It takes over the volume (interpolated), the bound, and the dual of total variation, without which its first
+        iterations would blur what is there; the residuals' dual starts anew, and with all frequencies trusted alike.
+        """
+        volume, dual = self.volume, self._gradient_dual
+        if factor > 1:
+            volume = interpolate(volume[None, None], scale_factor=factor, mode="trilinear", align_corners=False)[0, 0]
+            for axis in (1, 2, 3):
+                dual = dual.repeat_interleave(factor, axis)
+        upper = None if self.upper == float("inf") else self.upper
+        finer = PrimalDual(projector, volume, weight, upper, self.coupling / factor**2, self._backend)
+        finer._gradient_dual.copy_(dual * factor**2)
+        return finer
 
     def discount(self, spectrum: Tensor) -> None:
         """From now on trust frequencies of the lines by `spectrum`: the data term is `½ Σ |F[A u - b]|² / spectrum`.

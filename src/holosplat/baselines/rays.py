@@ -29,7 +29,7 @@ class Rays:
     refine: int
 
 
-def rays_of(lines: Tensor, views: Views, grid: Grid) -> Rays:
+def rays_of(lines: Tensor, views: Views, grid: Grid, backend: str = "cpu") -> Rays:
     """Line integrals [V, H, W] in metres and where they were taken, made ready for voxels of `grid`.
 
     Where the voxels are finer than pixels, lines are interpolated (bilinearly) to a raster of the voxels' pitch.
@@ -44,7 +44,7 @@ def rays_of(lines: Tensor, views: Views, grid: Grid) -> Rays:
     if refine > 1:
         views = views.refined(refine)
         images = interpolate(images[None], scale_factor=refine, mode="bilinear", align_corners=False)[0]
-    projector = projector_for(grid, views)
+    projector = projector_for(grid, views, backend)
     return Rays(projector, projector.lines_in(images), views, grid, refine)
 
 

@@ -70,17 +70,27 @@ def total_variation(
     strongest at low frequencies, and by how much depends on noise and optics. So a first solution, with S = 1, tells
     the power spectrum of what no volume explains, and S is a power of that.
     """
-    top, rays = checked_upper(upper), rays_of(lines, views, grid)
     with memory_kept():
-        start = torch.zeros(grid.shape)
-        solver = PrimalDual(rays.projector, start, options.weight, top, coupling=1 / rays.refine**2)
-        images, total = rays.projector.lines_out(rays.measured), options.first + options.iterations
-        for done in range(total):
-            on_progress(done / total)
-            if done == options.first and options.discount > 0:
-                solver.discount(misfit_spectrum(rays, solver.lines() - images) ** options.discount)
-            solver.run(images, 1)
-        return solver.volume
+        return tv_solver(rays_of(lines, views, grid), upper, options, on_progress).volume
+
+
+def tv_solver(
+    rays: Rays,
+    upper: float | None,
+    options: TotalVariation,
+    on_progress: Callable[[float], None],
+    backend: str = "cpu",
+) -> PrimalDual:
+    """The solver of `total_variation` after its last iteration, for those who go on from there."""
+    start, coupling = torch.zeros(rays.grid.shape), 1 / rays.refine**2
+    solver = PrimalDual(rays.projector, start, options.weight, checked_upper(upper), coupling, backend)
+    images, total = rays.projector.lines_out(rays.measured), options.first + options.iterations
+    for done in range(total):
+        on_progress(done / total)
+        if done == options.first and options.discount > 0:
+            solver.discount(misfit_spectrum(rays, solver.lines() - images) ** options.discount)
+        solver.run(images, 1)
+    return solver
 
 
 def misfit_spectrum(rays: Rays, misfit: Tensor) -> Tensor:

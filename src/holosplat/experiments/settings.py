@@ -54,13 +54,15 @@ class Settings:
     """Everything about a reconstruction but the scan, the material and the seed.
 
     start: `phase` (phase retrieval, total-variation tomography, Gaussians where there is matter) or `random`;
-    spacing_px: distance between Gaussians at a phase start [pixels]; max_start: coarser rather than more than
+    spacing_px: distance between Gaussians at a phase start [pixels]; spacing_noise: what it grows by, as a share, for
+    the share of the frames' contrast that is noise, at most to twice; max_start: coarser rather than more than
     this many; approximate_steps: steps in which they learn the starting volume; random_count: Gaussians of a
     random start; volume, fit: options of the starting volume and of the fit.
     """
 
     start: Literal["phase", "random"] = "phase"
     spacing_px: float = 1.0
+    spacing_noise: float = 2.3
     max_start: int = 150_000
     approximate_steps: int = 50
     random_count: int = 8_000
@@ -69,16 +71,15 @@ class Settings:
 
     def __post_init__(self) -> None:
         require(self.spacing_px > 0, f"spacing_px must be positive, but it is {self.spacing_px}.")
-        at_least(self, 0, "approximate_steps")
+        at_least(self, 0, "approximate_steps", "spacing_noise")
         at_least(self, 1, "max_start", "random_count")
 
 
 def presets() -> dict[str, Settings]:
     """Named settings for `--preset`."""
     default = Settings(
-        volume=HolographicTV(weight=0.3, iterations=60, corrections=6, inner=12),
         fit=FitOptions(
-            Objective(l1=1.0, tv_volume=0.05, overfull=10.0),
+            Objective(l1=1.0, tv_volume=0.2, overfull=10.0, two_levels=1.0, noise_gain=1.0),
             Schedule(steps=200, rate_position=0.01, rate_scale=0.01, rate_rotation=0.01, rate_amplitude=0.01),
         ),
     )
@@ -87,7 +88,7 @@ def presets() -> dict[str, Settings]:
         "fast": replace(
             default,
             approximate_steps=30,
-            volume=replace(default.volume, iterations=40, corrections=3, inner=10),
+            volume=replace(default.volume, retrieval=30, iterations=80, corrections=3, inner=10),
             fit=replace(default.fit, schedule=replace(default.fit.schedule, steps=60)),
         ),
         "thesis": Settings(

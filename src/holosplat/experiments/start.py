@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -10,6 +11,7 @@ import torch
 from ..baselines import holographic_tv
 from ..baselines.material import Backend, estimate_delta, estimate_ratio
 from ..materials import WATER, DeltaBeta
+from ..optics.noise import noise_share
 from ..optics.retrieval import retrieve_thickness
 from ..representations import GaussianCloud, approximate, at_pitch, cloud_from_volume, freed, random_cloud
 from ..scan import Scan
@@ -31,12 +33,20 @@ def _from_phase_retrieval(
 ) -> GaussianCloud:
     backend = settings.volume.backend
     material = assumed_material(scan, prior, on_progress, backend)
-    volume, grid = holographic_tv(scan, material, settings.volume, on_progress)
+    options = replace(settings.volume, upper=settings.volume.upper if prior.kind != "free" else 0.0)
+    volume, grid = holographic_tv(scan, material, options, on_progress)
     pitch = scan.views.pixel_size
     whole = at_pitch(volume, grid, pitch)
-    cloud = cloud_from_volume(*whole, material, settings.spacing_px * pitch, pitch, settings.max_start).on(backend)
+    cloud = cloud_from_volume(*whole, material, _spacing_px(scan, settings) * pitch, pitch, settings.max_start).on(
+        backend
+    )
     cloud = approximate(cloud, volume, grid, settings.approximate_steps, on_progress)
     return freed(cloud) if prior.kind == "free" else cloud
+
+
+def _spacing_px(scan: Scan, settings: Settings) -> float:
+    """Distance between Gaussians [pixels]: few large ones follow the noise less than many small ones."""
+    return settings.spacing_px * min(2.0, 1 + settings.spacing_noise * noise_share(torch.from_numpy(scan.frames)))
 
 
 def assumed_material(scan: Scan, prior: MaterialPrior, on_progress: Progress, backend: Backend = "cpu") -> DeltaBeta:

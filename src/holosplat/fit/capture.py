@@ -52,9 +52,11 @@ class CapturedStep:
         """The draw's values in the tensors that the graph of its kind reads."""
         if draw.volume not in self._inputs:
             index = None if draw.index is None else draw.index.clone()
-            self._inputs[draw.volume] = replace(draw, index=index, middle=draw.middle.clone(), ramp=draw.ramp.clone())
+            self._inputs[draw.volume] = replace(
+                draw, index=index, middle=draw.middle.clone(), progress=draw.progress.clone()
+            )
         held = self._inputs[draw.volume]
-        for old, new in ((held.index, draw.index), (held.middle, draw.middle), (held.ramp, draw.ramp)):
+        for old, new in ((held.index, draw.index), (held.middle, draw.middle), (held.progress, draw.progress)):
             if old is not None and new is not None:
                 old.copy_(new, non_blocking=True)
         return held

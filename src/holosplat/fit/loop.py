@@ -71,7 +71,8 @@ class Fit:
         require(np.ptp(self.train.frames) > 0, "all training frames are constant, so there is nothing to fit.")
         self._grid = Grid.of_views(scan.views)
         block = self._grid.block((0, 0, 0), self._block_shape())
-        self._misfit = Misfit(self.train, self.instrument, options.objective, schedule.detach_worst, block)
+        depth = self._grid.shape[0]
+        self._misfit = Misfit(self.train, self.instrument, options.objective, schedule.detach_worst, block, depth)
         self.trainable = Trainable(cloud.on(self.backend), self.backend)
         self.gradients = GradientRecord()
         self.step, self.seconds = 0, 0.0
@@ -167,11 +168,10 @@ class Fit:
         whole = len(views) == len(self.train)
         volume = schedule.volume_every if w.uses_volume and self.step % schedule.volume_every == 0 else 0
         middle = self._volume_block().centre if volume else np.zeros(3)
-        ramp = min(1.0, self.step / max(1.0, w.frc_ramp * schedule.steps))
         return Draw(
             None if whole else torch.from_numpy(views).to(on, non_blocking=True),
             torch.from_numpy(middle).to(on, non_blocking=True),
-            torch.tensor(ramp).to(on, non_blocking=True),
+            torch.tensor(self.step / schedule.steps).to(on, non_blocking=True),
             volume,
         )
 

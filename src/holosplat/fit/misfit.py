@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..forward import Instrument
 from ..geometry import Grid, Poses
+from ..optics.noise import noise_share
 from ..representations.gaussians import GaussianCloud
 from ..scan import Scan
 from . import objective as terms
@@ -18,7 +19,9 @@ from .objective import Objective
 from .total_variation import total_variation
 
 IMAGE_TERMS = ("l1", "l2_amplitude", "ssim", "tv_image", "frc")
-OBJECT_TERMS = ("anisotropy", "tv_volume", "overfull")
+OBJECT_TERMS = ("anisotropy", "tv_volume", "overfull", "two_levels")
+DEPTH = 100.0
+"""Voxels along the beam for which the weights of the terms on the volume are meant."""
 
 
 @dataclass(frozen=True)
@@ -26,13 +29,13 @@ class Draw:
     """What one step looks at. The tensors live on the fit's device, where a captured step reads them again.
 
     index: views [V] int64, or None for all of them in order; middle: centre [3] `(x, y, z)` [m] of the block of volume,
-    float64; ramp: share [] of the weight of the `frc` term; volume: weight of the terms on the volume, 0 where this
+    float64; progress: share [] of the steps that are done; volume: weight of the terms on the volume, 0 where this
     step does not look at it.
     """
 
     index: Tensor | None
     middle: Tensor
-    ramp: Tensor
+    progress: Tensor
     volume: int
 
 
@@ -43,9 +46,16 @@ class Misfit:
     """
 
     def __init__(
-        self, train: Scan, instrument: Instrument, objective: Objective, detach_worst: bool, block: Grid
+        self,
+        train: Scan,
+        instrument: Instrument,
+        objective: Objective,
+        detach_worst: bool,
+        block: Grid,
+        depth: int,
     ) -> None:
-        """`train`: the frames to fit; `block`: a grid of the shape and pitch at which the volume is looked at."""
+        """`train`: the frames to fit; `block`: a grid of the shape and pitch at which the volume is looked at; `depth`:
+        voxels of the whole volume along the beam."""
         self.objective, self.instrument, self._detach_worst = objective, instrument, detach_worst
         self.low, high = float(train.frames.min()), float(train.frames.max())
         self.span = high - self.low
@@ -55,13 +65,22 @@ class Misfit:
         if objective.ssim > 0:
             _ = self._target.statistics  # once, for all subsets of views
         self._block = (block.shape, block.voxel_size[0])
+        self._depth = depth / DEPTH
+        self._two_levels = objective.two_levels * (
+            1 + objective.noise_gain * noise_share(torch.from_numpy(train.frames))
+        )
 
     def names(self, cloud: GaussianCloud, draw: Draw) -> list[str]:
         """What the values of a call with these arguments are called."""
         w = self.objective
         image = [name for name in IMAGE_TERMS if getattr(w, name) > 0]
         shape = ["anisotropy"] if w.anisotropy > 0 else []
-        used = {"tv_volume": w.tv_volume > 0, "overfull": w.overfull > 0 and cloud.single_material}
+        single = cloud.single_material
+        used = {
+            "tv_volume": w.tv_volume > 0,
+            "overfull": w.overfull > 0 and single,
+            "two_levels": w.two_levels > 0 and single,
+        }
         return ["loss", *image, *shape, *(name for name in used if used[name] and draw.volume)]
 
     def __call__(self, cloud: GaussianCloud, draw: Draw) -> tuple[Tensor, Tensor]:
@@ -95,18 +114,22 @@ class Misfit:
             ("tv_image", w.tv_image, lambda: terms.tv_image(a)),
             ("frc", w.frc, lambda: terms.one_minus_frcm(a, b)),
         ]
-        ramps = {"frc": draw.ramp}
+        ramps = {"frc": (draw.progress / max(w.frc_ramp, 1e-9)).clamp_max(1.0)}
         return {name: (weight * ramps.get(name, 1.0), value()) for name, weight, value in table if weight > 0}
 
-    def _object_terms(self, cloud: GaussianCloud, draw: Draw) -> list[tuple[float, Tensor]]:
+    def _object_terms(self, cloud: GaussianCloud, draw: Draw) -> list[tuple[float | Tensor, Tensor]]:
         """Weight and value of every term on the Gaussians in use at this step."""
-        w, found = self.objective, []
+        w = self.objective
+        found: list[tuple[float | Tensor, Tensor]] = []
         if w.anisotropy > 0:
             found.append((w.anisotropy, terms.anisotropy(cloud.log_scales, w.anisotropy_limit)))
         if draw.volume:
-            density = cloud.density_around(draw.middle, *self._block)
+            density, depth = cloud.density_around(draw.middle, *self._block), self._depth
             if w.tv_volume > 0:
-                found.append((w.tv_volume * draw.volume, total_variation(density, backend=cloud.backend)))
+                found.append((w.tv_volume * draw.volume, depth * total_variation(density, backend=cloud.backend)))
             if w.overfull > 0 and cloud.single_material:
-                found.append((w.overfull * draw.volume, terms.overfull(density)))
+                found.append((w.overfull * draw.volume, depth * terms.overfull(density)))
+            if w.two_levels > 0 and cloud.single_material:
+                ramped = self._two_levels * draw.volume * draw.progress
+                found.append((ramped, depth * terms.two_levels(density)))
         return found

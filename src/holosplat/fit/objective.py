@@ -21,7 +21,11 @@ class Objective:
     minimum and maximum to 0 and 1: `l1`, `l2_amplitude`, `ssim` (1 - SSIM), `tv_image`, `frc` (1 - FRCM, its
     weight ramped linearly from 0 over the first `frc_ramp` of the steps). Object terms act on the Gaussians:
     `anisotropy` on scales beyond `anisotropy_limit`, and, on the volume they add up to, `tv_volume`, and
-    `overfull`, the square of what exceeds an occupancy of one (single material only).
+    `overfull`, the square of what exceeds an occupancy of one, and `two_levels`, which occupancies between nothing and
+    one cost (both for a single material only). The latter's weight is ramped linearly from 0 over the whole fit, for
+    at its beginning matter may still be too faint; it is larger by `noise_gain` times the share of the frames' contrast
+    that is noise. Terms on the volume are sums along the beam in units of 100 voxels, mean over pixels, so that they
+    weigh the same however fine the pixels or wide the field.
     """
 
     l1: float = 1.0
@@ -34,6 +38,8 @@ class Objective:
     anisotropy_limit: float = 10.0
     tv_volume: float = 0.0
     overfull: float = 0.0
+    two_levels: float = 0.0
+    noise_gain: float = 0.0
 
     def __post_init__(self) -> None:
         compared = self.l1 + self.l2_amplitude + self.ssim + self.tv_image + self.frc
@@ -42,7 +48,7 @@ class Objective:
     @property
     def uses_volume(self) -> bool:
         """Whether a term needs the voxelised object."""
-        return self.tv_volume > 0 or self.overfull > 0
+        return self.tv_volume > 0 or self.overfull > 0 or self.two_levels > 0
 
 
 THESIS = Objective(l1=0.75, ssim=0.20, tv_image=0.05, frc=0.05, frc_ramp=0.5)
@@ -98,6 +104,14 @@ def anisotropy(log_scales: Tensor, limit: float) -> Tensor:
 def overfull(density: Tensor) -> Tensor:
     """Mean square of what exceeds an occupancy of one, [1, Z, Y, X] → scalar."""
     return (density - 1).clamp_min(0).square().mean()
+
+
+def two_levels(density: Tensor) -> Tensor:
+    """Mean of `u (1 - u)` over occupancies u between nothing and one, [1, Z, Y, X] → scalar.
+
+    Total variation prefers bodies that are too faint; this gives their level back, for matter is there or it is not.
+    """
+    return (density * (1 - density)).clamp_min(0).mean()
 
 
 @lru_cache(maxsize=8)

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from ..checks import require
 from ..forward import Instrument, resolving_oversample
+from ..optics.noise import noise_level
 from ..scan import Exposures, Scan
 from ..units import wavelength, wavenumber
 from ..volume import LineIntegrals
@@ -16,12 +17,8 @@ FEWEST_SAMPLES = 1.5
 """Samples of the waves on the first fringe, as in the fit of Gaussians."""
 DARKEST = 1e-12
 """Smallest intensity whose root is taken: the slope of √I has a pole at zero."""
-TILE, QUIET = 16, 0.05
-"""Edge of the tiles in which the noise is measured [pixels], and the quantile of the tiles' values that is believed."""
 NOISE_FLOOR = 5.0
 """What the floor rises by for every pixel of thickness that the noise amounts to."""
-NORMAL_MEDIAN = 0.6745
-"""The median of |x| for a standard normal x."""
 
 
 class WaveMisfit:
@@ -71,15 +68,3 @@ def linear_response(exposures: Exposures, absorption: float) -> Tensor:
     chi = np.pi * reach * (fy[:, None] ** 2 + fx**2)
     response = np.abs(np.sin(chi) + absorption * np.cos(chi))
     return torch.from_numpy(np.where(chi < 0.5 * np.pi, response, 1.0))
-
-
-def noise_level(images: Tensor) -> float:
-    """Standard deviation of white noise on images [V, H, W] of at least 3 × 3 pixels.
-
-    By the medians of |second differences along both axes| (the mask of Immerkær 1996, eq. 2, of norm 6) in tiles,
-    of which the quiet ones count: fringes are taken for noise where they fill a tile. Some per cent too low.
-    """
-    differences = images.diff(n=2, dim=1).diff(n=2, dim=2).abs()
-    h, w = (min(TILE, n) for n in differences.shape[1:])
-    tiles = differences.unfold(1, h, h).unfold(2, w, w).flatten(3).median(dim=-1).values
-    return float(tiles.flatten().quantile(QUIET)) / (6 * NORMAL_MEDIAN)

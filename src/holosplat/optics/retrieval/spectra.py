@@ -137,16 +137,17 @@ def spectra(
     exposures: Exposures,
     h: Tensor,
     raster: Raster,
-    noise: float | None,
+    noise: float | Tensor | None,
     model_error: float,
     prior: Prior,
 ) -> Spectra:
-    """Of frames [V, H, W] and a response h on `raster`; noise: as known, or None to estimate it.
+    """Of frames [V, H, W] and a response h on `raster`; noise: as known (of each frame [V], or
+    of all), or None to estimate it.
 
     model_error: what no model explains, as a share of the frames' contrast. The power has the prior's shape and
     explains the frames' variance beyond their noise; what the detector cannot resolve does not count in that.
     """
-    level = noise_level(frames) if noise is None else torch.full((len(frames),), noise, dtype=torch.float64)
+    level = noise_level(frames) if noise is None else torch.as_tensor(noise, dtype=torch.float64).expand(len(frames))
     contrast = contrast_level(frames)
     signal = (contrast.square() - level.square()).clamp_min(LEAST_SIGNAL * contrast.square() + TINY)
     f2 = squared_frequency(raster)
