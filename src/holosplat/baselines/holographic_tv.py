@@ -33,6 +33,8 @@ from .primal_dual import PrimalDual
 from .rays import rays_of
 from .tomography import TotalVariation, tv_solver
 
+FEW_VIEWS = 8
+"""With fewer, total variation has more to fill in, and its steps take longer to do so."""
 SETTLING = 2
 """Rounds of agreement after which misfits are compared."""
 
@@ -44,8 +46,9 @@ Progress = Callable[[str, float], None]
 class HolographicTV:
     """Options. retrieval: steps of the phase retrieval; iterations: primal–dual steps on the retrieved thickness;
     weight: of total variation while the volume is made to agree with the holograms, in pixels of path length;
-    corrections: rounds of that, of `inner` steps each; refine: voxels along a pixel's edge then (0: as the first
-    fringe needs); max_voxels: coarser voxels rather than more than this many; upper: bound of the occupancy (0: none);
+    corrections: rounds of that, of `inner` steps each, more with fewer than 8 views; refine: voxels along a pixel's
+    edge then (0: as the first fringe needs); max_voxels: coarser voxels rather than more than this many; upper: bound
+    of the occupancy (0: none);
     backend: `cpu`, or `reference` (plain torch, slow).
     """
 
@@ -115,6 +118,7 @@ def _agree(
     grid = Grid.of_views(views, refine)
     projector = projector_for(grid, views.refined(refine), options.backend)
     solver = coarse.on_finer(projector, refine, options.weight)
+    inner = math.ceil(options.inner * max(1.0, FEW_VIEWS / len(scan)))
     best, least = solver.volume, float("inf")
     for done in range(options.corrections + 1):
         on_progress("agreement with the holograms", done / options.corrections)
@@ -124,7 +128,7 @@ def _agree(
         if misfit < least or done <= SETTLING:
             best, least = solver.volume.clone(), misfit
         if done < options.corrections:
-            solver.run(lines + _refined(correction(missing) / pitch, refine), options.inner)
+            solver.run(lines + _refined(correction(missing) / pitch, refine), inner)
     return best, _in_metres(grid, pitch)
 
 

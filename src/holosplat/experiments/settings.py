@@ -79,8 +79,8 @@ def presets() -> dict[str, Settings]:
     """Named settings for `--preset`."""
     default = Settings(
         fit=FitOptions(
-            Objective(l1=1.0, tv_volume=0.2, overfull=10.0, two_levels=1.0, noise_gain=1.0),
-            Schedule(steps=200, rate_position=0.01, rate_scale=0.01, rate_rotation=0.01, rate_amplitude=0.01),
+            Objective(l1=1.0, tv_volume=0.25, overfull=10.0, two_levels=1.25, noise_gain=1.0),
+            Schedule(steps=300, rate_position=0.01, rate_scale=0.01, rate_rotation=0.01, rate_amplitude=0.01),
         ),
     )
     return {
@@ -114,7 +114,7 @@ def presets() -> dict[str, Settings]:
             start="random",
             random_count=8_000,
             fit=FitOptions(
-                Objective(l1=1.0, tv_volume=0.1, overfull=10.0),
+                Objective(l1=1.0, tv_volume=0.1, overfull=10.0, two_levels=1.0, noise_gain=1.0),
                 Schedule(
                     steps=1500,
                     views_per_step=2,

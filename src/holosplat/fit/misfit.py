@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -20,8 +21,9 @@ from .total_variation import total_variation
 
 IMAGE_TERMS = ("l1", "l2_amplitude", "ssim", "tv_image", "frc")
 OBJECT_TERMS = ("anisotropy", "tv_volume", "overfull", "two_levels")
-DEPTH = 100.0
-"""Voxels along the beam for which the weights of the terms on the volume are meant."""
+DEPTH, VIEWS = 100.0, 8.0
+"""Voxels along the beam, and views, for which the weights of the terms on the volume are meant. Few views leave more
+to what is known of the volume; the weights go with one over the root of their number."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class Misfit:
         if objective.ssim > 0:
             _ = self._target.statistics  # once, for all subsets of views
         self._block = (block.shape, block.voxel_size[0])
-        self._depth = depth / DEPTH
+        self._volume_scale = depth / DEPTH * math.sqrt(VIEWS / len(train))
         self._two_levels = objective.two_levels * (
             1 + objective.noise_gain * noise_share(torch.from_numpy(train.frames))
         )
@@ -124,12 +126,12 @@ class Misfit:
         if w.anisotropy > 0:
             found.append((w.anisotropy, terms.anisotropy(cloud.log_scales, w.anisotropy_limit)))
         if draw.volume:
-            density, depth = cloud.density_around(draw.middle, *self._block), self._depth
+            density, scale = cloud.density_around(draw.middle, *self._block), self._volume_scale
             if w.tv_volume > 0:
-                found.append((w.tv_volume * draw.volume, depth * total_variation(density, backend=cloud.backend)))
+                found.append((w.tv_volume * draw.volume, scale * total_variation(density, backend=cloud.backend)))
             if w.overfull > 0 and cloud.single_material:
-                found.append((w.overfull * draw.volume, depth * terms.overfull(density)))
+                found.append((w.overfull * draw.volume, scale * terms.overfull(density)))
             if w.two_levels > 0 and cloud.single_material:
                 ramped = self._two_levels * draw.volume * draw.progress
-                found.append((ramped, depth * terms.two_levels(density)))
+                found.append((ramped, scale * terms.two_levels(density)))
         return found

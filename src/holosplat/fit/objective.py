@@ -25,7 +25,8 @@ class Objective:
     one cost (both for a single material only). The latter's weight is ramped linearly from 0 over the whole fit, for
     at its beginning matter may still be too faint; it is larger by `noise_gain` times the share of the frames' contrast
     that is noise. Terms on the volume are sums along the beam in units of 100 voxels, mean over pixels, so that they
-    weigh the same however fine the pixels or wide the field.
+    weigh the same however fine the pixels or wide the field; and they weigh more with fewer views (the weights are
+    those for eight, and go with one over the root).
     """
 
     l1: float = 1.0
