@@ -10,6 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from holosplat.baselines import HolographicTV, PrimalDual, holographic_tv
+from holosplat.baselines.holographic_tv import Correction
 from holosplat.baselines.material import estimate_delta, estimate_ratio, plateau
 from holosplat.checks import InputError
 from holosplat.forward import measure, simulate
@@ -17,6 +18,7 @@ from holosplat.geometry import Grid, Views, rotation_y
 from holosplat.materials import HAEMOGLOBIN, PLASMA, RED_CELL, DeltaBeta
 from holosplat.mesh import TriangleMesh
 from holosplat.metrics import dice
+from holosplat.optics.detector import poisson
 from holosplat.projectors.voxels import LatticeProjector, SliceProjector, projector_for, voxel_line_integrals
 from holosplat.projectors.voxels.lattice import lattice_reference
 from holosplat.representations import GaussianCloud
@@ -154,6 +156,23 @@ def test_a_solver_is_warm():
     assert torch.equal(started.lines(), wanted.lines_out(wanted.project(wanted.volume_in(disc_truth()))))
 
 
+def test_a_solver_goes_on_from_a_coarser_one():
+    """With volume and dual of total variation taken over, the first iterations do not undo what was found."""
+    coarse, lines = a_solver(0.4), disc_lines()
+    coarse.run(lines, 300)
+    fine_views = disc_views().refined(2)
+    fine = SliceProjector(Grid.of_views(fine_views), fine_views)
+    images = lines.repeat_interleave(2, 1).repeat_interleave(2, 2)
+    truth = disc_truth().repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
+    errors = []
+    warm = coarse.on_finer(fine, 2, 0.4)
+    for solver in (warm, PrimalDual(fine, warm.volume, 0.4, 1.0, 0.25)):
+        solver.run(images, 5)
+        errors.append(float((solver.volume - truth).norm() / truth.norm()))
+    assert warm.upper == 1.0
+    assert errors[0] < 0.9 * errors[1]
+
+
 # --- holographic tomography ---------------------------------------------------------------------------------
 
 
@@ -252,6 +271,19 @@ def test_views_about_one_axis_may_be_shifted_along_it_by_part_of_a_pixel():
     assert overlap(volume, grid, scene) > 0.93
 
 
+def test_corrections_explain_what_is_missing_as_far_as_noise_lets(cell_scan):
+    """Of thickness that is missing, half is given back at once, and less where noise hides it; of noise, no matter."""
+    lines, shares = cells(CELL).project(cell_scan.views)[1] / CELL.delta, []
+    for photons in (None, 1e4, 1e3):
+        frames = poisson(cell_scan.frames, photons, 0) if photons else cell_scan.frames
+        correction = Correction(replace(cell_scan, frames=frames), CELL)
+        found = correction(torch.from_numpy(cell_scan.frames - 1))
+        shares.append(float((found * lines).sum() / lines.square().sum()))
+        alone = correction(torch.from_numpy(frames - cell_scan.frames))
+        assert float(alone.norm() / lines.norm()) < 0.1
+    assert 1 > shares[0] > 0.5 > shares[1] > shares[2] > 0
+
+
 class Voxels:
     """A volume of one material as an Object."""
 
@@ -278,7 +310,7 @@ def test_corrections_bring_the_volume_in_agreement_with_the_holograms(request, m
     assert errors[1] < 0.7 * errors[0]
     assert errors[1] < 0.4
     assert min(dices) > 0.94  # noise-aware retrieval is good at this by itself; the corrections must not spoil it
-    assert dices[1] > dices[0] - 0.005
+    assert dices[1] > dices[0] - 0.015
 
 
 def test_too_many_voxels_become_larger_ones(cell_scan):
@@ -298,11 +330,10 @@ def test_progress_is_told_stage_by_stage(cell_scan):
     stages = list(dict.fromkeys(stage for stage, _ in told))
     assert stages == ["phase retrieval", "tomography", "agreement with the holograms"]
     assert all(0 <= fraction <= 1 for _, fraction in told)
-    assert [fraction for stage, fraction in told if stage == "tomography"] == [0, 0.4, 0.8]
+    assert [fraction for stage, fraction in told if stage == "tomography"] == pytest.approx([k / 25 for k in range(25)])
 
 
 def test_iterations_are_counted(cell_scan):
-    """Whole tens and what remains of them."""
     some, more, same = (
         holographic_tv(cell_scan, CELL, replace(USUAL, iterations=n, corrections=0), quiet)[0] for n in (5, 10, 5)
     )

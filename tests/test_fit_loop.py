@@ -19,9 +19,11 @@ from holosplat.fit.density import DensityControl, GradientRecord, control_densit
 from holosplat.fit.loop import Fit, FitOptions, split_validation
 from holosplat.fit.objective import Objective
 from holosplat.fit.schedule import Schedule
+from holosplat.fit.total_variation import total_variation
 from holosplat.fit.trainable import Trainable
 from holosplat.forward import Instrument, simulate
-from holosplat.geometry import Views, rotation_y
+from holosplat.geometry import Grid, Views, rotation_y
+from holosplat.optics.noise import noise_share
 from holosplat.representations import GaussianCloud, random_cloud
 from holosplat.representations.gaussians import PARAMETERS, raw_of
 from holosplat.scan import Exposures, Scan
@@ -107,7 +109,7 @@ def test_the_loss_falls_and_held_out_frames_are_predicted_better(scan):
 
 def test_a_loss_is_the_weighted_sum_of_its_recorded_terms(scan):
     """Weights, the linear FRC ramp, and volume terms made up for the steps they are left out of."""
-    weights = Objective(0.7, 0.5, 0.2, 0.05, 0.3, 0.5, 0.4, 1.001, 0.02, 3.0)
+    weights = Objective(0.7, 0.5, 0.2, 0.05, 0.3, 0.5, 0.4, 1.001, 0.02, 3.0, 0.5)
     fit = fit_of(scan, objective=weights, steps=12, volume_every=3, volume_edge=10)
     bright = a_cloud()
     bright.raw_amplitudes += 3  # so that the occupancy exceeds one somewhere
@@ -115,7 +117,8 @@ def test_a_loss_is_the_weighted_sum_of_its_recorded_terms(scan):
     for step, record in enumerate(run(fit)):
         factors = dict.fromkeys(("l1", "l2_amplitude", "ssim", "tv_image", "anisotropy"), 1.0)
         factors["frc"] = min(1.0, step / 6)
-        factors |= dict.fromkeys(("tv_volume", "overfull"), 3.0) if step % 3 == 0 else {}
+        if step % 3 == 0:
+            factors |= {"tv_volume": 3.0, "overfull": 3.0, "two_levels": 3.0 * step / 12}
         assert set(record) == {"step", "loss", "count", *factors}
         assert all(record[name] > 0 for name in factors if name != "anisotropy" or step > 0)
         wanted = sum(factor * getattr(weights, name) * record[name] for name, factor in factors.items())
@@ -145,11 +148,39 @@ def test_constant_frames_are_refused(scan):
         fit_of(replace(scan, frames=np.ones_like(scan.frames)))
 
 
-def test_overfull_is_for_one_material_only(scan):
+def test_bounds_of_the_occupancy_are_for_one_material_only(scan):
     two = random_cloud(30, scan.views, MATERIAL, 2, 1e-5, 0)
-    (record,) = run(fit_of(scan, objective=Objective(overfull=1.0, tv_volume=0.1), steps=1, cloud=two))
+    weights = Objective(overfull=1.0, two_levels=1.0, tv_volume=0.1)
+    (record,) = run(fit_of(scan, objective=weights, steps=1, cloud=two))
     assert "tv_volume" in record
-    assert "overfull" not in record
+    assert not {"overfull", "two_levels"} & set(record)
+
+
+def test_terms_on_the_volume_weigh_by_its_depth_and_the_number_of_views(scan):
+    """The same object counts the same however deep the field; and more, the fewer views there are."""
+    weights, found = Objective(tv_volume=0.1), {}
+    for train in (scan.train(), scan.train()[[0, 1]]):
+        fit = fit_of(train, objective=weights, steps=1)
+        grid = Grid.of_views(train.views)
+        with torch.no_grad():
+            plain = float(
+                total_variation(fit.cloud.density_around(torch.tensor(grid.centre), grid.shape, grid.voxel_size[0]))
+            )
+        (record,) = run(fit)
+        found[len(train)] = record["tv_volume"] / plain
+    depth = scan.views.shape[1] / 100
+    assert found == {n: pytest.approx(depth * (8 / n) ** 0.5, rel=1e-4) for n in found}
+
+
+def test_two_levels_weighs_more_for_noisy_frames(scan):
+    noisy = replace(scan, frames=scan.frames + np.random.default_rng(0).normal(0, 0.1, scan.frames.shape).astype("f4"))
+    share = noise_share(torch.from_numpy(noisy.train().frames))
+    assert share > 0.2
+    for gain in (0.0, 2.0):
+        fit = fit_of(noisy, objective=Objective(two_levels=1.0, noise_gain=gain), steps=2)
+        last = run(fit)[-1]  # the first has no such term yet
+        wanted = last["l1"] + 0.5 * (1 + gain * share) * last["two_levels"]
+        assert last["loss"] == pytest.approx(wanted, rel=1e-5)
 
 
 def test_a_fit_can_run_in_parts(scan):

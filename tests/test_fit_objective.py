@@ -40,6 +40,7 @@ def test_the_default_objective_is_l1_and_the_thesis_objective_is_as_published():
     assert not THESIS.uses_volume
     assert Objective(tv_volume=0.1).uses_volume
     assert Objective(overfull=0.1).uses_volume
+    assert Objective(two_levels=0.1).uses_volume
 
 
 # --- image terms --------------------------------------------------------------------------------------------
@@ -174,7 +175,14 @@ def test_overfull_is_the_mean_square_beyond_one():
     assert float(terms.overfull(torch.rand(1, 3, 4, 5))) == 0
 
 
-@pytest.mark.parametrize("name", ["anisotropy", "tv_volume", "overfull"])
+def test_two_levels_costs_what_lies_between_nothing_and_one():
+    density = torch.tensor([0.0, 0.5, 1.0, 0.25, 1.5, -0.1]).reshape(1, 1, 2, 3)
+    assert float(terms.two_levels(density)) == pytest.approx((0.25 + 0.1875) / 6)
+    (slope,) = torch.autograd.grad(terms.two_levels(faint := torch.tensor([0.2, 0.8], requires_grad=True)), faint)
+    assert slope[0] > 0 > slope[1]  # what is nearly nothing is pushed down, what is nearly one up
+
+
+@pytest.mark.parametrize("name", ["anisotropy", "tv_volume", "overfull", "two_levels"])
 def test_object_terms_have_the_right_gradients(name):
     rng = torch.Generator().manual_seed(2)
     shape = (7, 3) if name == "anisotropy" else (2, 3, 5, 4)
@@ -183,6 +191,7 @@ def test_object_terms_have_the_right_gradients(name):
         "anisotropy": lambda x: terms.anisotropy(x, 2.0),
         "tv_volume": total_variation,
         "overfull": terms.overfull,
+        "two_levels": terms.two_levels,
     }[name]
     assert torch.autograd.gradcheck(term, (values,), eps=1e-7, atol=1e-5)
 

@@ -18,6 +18,7 @@ from torch import Tensor
 from holosplat.checks import InputError
 from holosplat.forward import Instrument
 from holosplat.geometry import Views
+from holosplat.optics.noise import wavelet_noise
 from holosplat.optics.retrieval import (
     ADMM,
     RETRIEVALS,
@@ -44,7 +45,6 @@ from holosplat.optics.retrieval.nonlinear import descend, objective, penalty_wei
 from holosplat.optics.retrieval.spectra import (
     Raster,
     detector_transfer,
-    noise_level,
     response,
     spectra,
     squared_frequency,
@@ -183,7 +183,7 @@ def test_noise_is_measured():
     for sigma in (0.003, 0.05):
         generator = torch.Generator().manual_seed(4)
         frames = 1 + sigma * torch.randn(3, 91, 77, dtype=DOUBLE, generator=generator)
-        assert noise_level(frames).numpy() == pytest.approx(np.full(3, sigma), rel=0.05)
+        assert wavelet_noise(frames).numpy() == pytest.approx(np.full(3, sigma), rel=0.05)
 
 
 def test_expected_power_explains_the_frames():

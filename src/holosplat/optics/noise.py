@@ -25,9 +25,24 @@ def noise_level(images: Tensor) -> float:
     return float(tiles.flatten().quantile(QUIET)) / (6 * NORMAL_MEDIAN)
 
 
+def wavelet_noise(frames: Tensor) -> Tensor:
+    """Standard deviation [V] of the noise, float64: median absolute deviation of the finest diagonal Haar wavelets.
+
+    Donoho & Johnstone (1994), section 4.2. Fringes of the finest pitch pass for noise.
+    """
+    i = frames.detach().double()
+    diagonal = 0.5 * (i[:, :-1, :-1] + i[:, 1:, 1:] - i[:, :-1, 1:] - i[:, 1:, :-1])
+    return diagonal.abs().flatten(1).median(1).values / NORMAL_MEDIAN
+
+
 def noise_levels(frames: Tensor) -> Tensor:
-    """Standard deviation [V] of the white noise on each of frames [V, H, W], float64, the quiet tiles' bias mended."""
-    return torch.tensor([noise_level(frame[None]) / QUIET_TILE for frame in frames], dtype=torch.float64)
+    """Standard deviation [V] of the white noise on each of frames [V, H, W], float64.
+
+    The lesser of two estimates, for each takes some signal for noise: `noise_level`, its bias mended, where fringes
+    fill all tiles (small frames), and `wavelet_noise` where they fill most of the frame (crowded ones).
+    """
+    tiles = torch.tensor([noise_level(frame[None]) / QUIET_TILE for frame in frames], dtype=torch.float64)
+    return torch.minimum(tiles, wavelet_noise(frames).cpu())
 
 
 def noise_share(frames: Tensor) -> float:

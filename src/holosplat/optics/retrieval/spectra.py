@@ -18,10 +18,9 @@ from torch.nn.functional import pad
 from ...checks import at_least, finite, require, shaped
 from ...scan import Exposures
 from ...units import wavelength, wavenumber
+from ..noise import wavelet_noise
 from ..sampling import smooth_margin
 
-MEDIAN_OF_NORMAL = 0.6745
-"""Median of the magnitude of a normal deviate, in standard deviations."""
 TINY = 1e-24
 """Variance added for frames without any contrast."""
 LEAST_SIGNAL = 0.01
@@ -101,16 +100,6 @@ def response(exposures: Exposures, ratio: float, raster: Raster) -> Tensor:
     return 2 * (ratio * torch.cos(chi) + torch.sin(chi)) * detector_transfer(exposures, raster)
 
 
-def noise_level(frames: Tensor) -> Tensor:
-    """Standard deviation [V] of the noise, float64: median absolute deviation of the finest diagonal Haar wavelets.
-
-    Donoho & Johnstone (1994), section 4.2. Fringes of the finest pitch pass for noise.
-    """
-    i = frames.detach().double()
-    diagonal = 0.5 * (i[:, :-1, :-1] + i[:, 1:, 1:] - i[:, :-1, 1:] - i[:, 1:, :-1])
-    return diagonal.abs().flatten(1).median(1).values / MEDIAN_OF_NORMAL
-
-
 def contrast_level(frames: Tensor) -> Tensor:
     """Root mean square [V] of `I - 1`, float64."""
     return (frames.detach().double() - 1).square().mean(dim=(1, 2)).sqrt()
@@ -147,7 +136,7 @@ def spectra(
     model_error: what no model explains, as a share of the frames' contrast. The power has the prior's shape and
     explains the frames' variance beyond their noise; what the detector cannot resolve does not count in that.
     """
-    level = noise_level(frames) if noise is None else torch.as_tensor(noise, dtype=torch.float64).expand(len(frames))
+    level = wavelet_noise(frames) if noise is None else torch.as_tensor(noise, dtype=torch.float64).expand(len(frames))
     contrast = contrast_level(frames)
     signal = (contrast.square() - level.square()).clamp_min(LEAST_SIGNAL * contrast.square() + TINY)
     f2 = squared_frequency(raster)

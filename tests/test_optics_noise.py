@@ -1,0 +1,45 @@
+"""How noisy frames are, by the frames alone."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from holosplat.optics.noise import noise_level, noise_levels, noise_share, wavelet_noise
+
+
+def noise(shape: tuple[int, int, int], sigma: float, seed: int = 0) -> torch.Tensor:
+    return sigma * torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+
+
+def stripes(shape: tuple[int, int, int], period: float) -> torch.Tensor:
+    """Fringes that fill the frames."""
+    return torch.sin(2 * torch.pi * torch.arange(shape[2]) / period).expand(shape)
+
+
+@pytest.mark.parametrize("shape", [(2, 96, 96), (2, 81, 117)])
+def test_the_noise_of_each_frame_is_found_beside_an_object(shape):
+    frames = torch.ones(shape)
+    frames[:, 20:60, 30:70] += 0.2 * stripes((2, 40, 40), 6)
+    sigmas = torch.tensor([0.01, 0.04])
+    found = noise_levels(frames + sigmas[:, None, None] * noise(shape, 1.0))
+    assert found.dtype == torch.float64
+    assert found.numpy() == pytest.approx(sigmas.numpy(), rel=0.12)
+
+
+def test_of_two_estimates_the_lesser_is_taken():
+    """Fine fringes over most of a frame mislead the wavelets, small frames without a quiet tile the tiles."""
+    crowded = torch.ones(1, 96, 96)
+    crowded[:, :, :70] += 0.1 * stripes((1, 96, 70), 3.3) * stripes((1, 70, 96), 3.7).mT
+    assert float(noise_levels(crowded)) < 0.1 * float(wavelet_noise(crowded))
+    small = 1 + 0.1 * stripes((1, 13, 12), 2.2) * stripes((1, 12, 13), 2.2).mT
+    assert float(noise_levels(small)) == float(wavelet_noise(small)) < noise_level(small)
+
+
+def test_the_share_of_the_contrast_that_is_noise():
+    assert noise_share(torch.ones(2, 20, 24)) == 0
+    assert noise_share(1 + noise((3, 64, 70), 0.02)) == pytest.approx(1.0, abs=0.15)
+    smooth = 1 + 0.1 * stripes((2, 64, 70), 40) * stripes((2, 70, 64), 40).mT
+    assert noise_share(smooth) < 0.05
+    half = float((smooth - 1).square().mean().sqrt())
+    assert noise_share(smooth + noise(smooth.shape, half)) == pytest.approx(2**-0.5, rel=0.15)
