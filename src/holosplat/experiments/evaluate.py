@@ -86,7 +86,7 @@ class Evaluation(Scores):
                 f"volume: Dice {v.dice:.4f}, relative error of δ {v.relative_error_delta:.4f}, mean δ inside "
                 f"{v.mean_delta:.3e} (true {v.true_mean_delta:.3e}, {100 * v.delta_deviation:+.1f} %)"
             )
-        kind = "given" if self.material.single_material else "found"
+        kind = "one for all" if self.material.single_material else "found apart"
         lines.append(f"material: δ {self.material.delta:.3e}, δ/β {self.material.ratio:.0f} ({kind})")
         return lines
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ import torch
 
 from ..backends import device_name, resolve
 from ..checks import InputError, require
-from ..fit.loop import Fit, Record, split_validation
+from ..fit.loop import Fit, FitOptions, Record, split_validation
 from ..io.json import read_json, write_json
 from ..representations import GaussianCloud
 from ..scan import Scan
@@ -79,7 +79,7 @@ def reconstruct(
         began = time.perf_counter()
         cloud = starting_cloud(train, prior, settings, seed, lambda stage, part: on_progress(stage, part, {}))
         timing["start"] = time.perf_counter() - began
-    fit = Fit(scan, cloud, settings.fit, seed)
+    fit = Fit(scan, cloud, _fit_options(prior, settings), seed)
     if checkpoint:
         fit.load(checkpoint["fit"])
     elif folder:
@@ -90,6 +90,13 @@ def reconstruct(
     except KeyboardInterrupt:
         on_progress("interrupted", 1.0, {})
     return journal.close()
+
+
+def _fit_options(prior: MaterialPrior, settings: Settings) -> FitOptions:
+    """Those of the settings; without what bounds the occupancy where nothing says what an occupancy of one is."""
+    if prior.kind != "free":
+        return settings.fit
+    return replace(settings.fit, objective=replace(settings.fit.objective, overfull=0.0, two_levels=0.0))
 
 
 def _check_frames(train: Scan) -> None:

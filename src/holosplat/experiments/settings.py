@@ -57,7 +57,8 @@ class Settings:
     spacing_px: distance between Gaussians at a phase start [pixels]; spacing_noise: what it grows by, as a share, for
     the share of the frames' contrast that is noise, at most to twice; max_start: coarser rather than more than
     this many; approximate_steps: steps in which they learn the starting volume; random_count: Gaussians of a
-    random start; volume, fit: options of the starting volume and of the fit.
+    random start; separate: after a phase start with nothing known of the matter, δ and β are fitted apart, not at the
+    one ratio that the frames suggest; volume, fit: options of the starting volume and of the fit.
     """
 
     start: Literal["phase", "random"] = "phase"
@@ -66,6 +67,7 @@ class Settings:
     max_start: int = 150_000
     approximate_steps: int = 50
     random_count: int = 8_000
+    separate: bool = False
     volume: HolographicTV = field(default_factory=HolographicTV)
     fit: FitOptions = field(default_factory=FitOptions)
 
@@ -79,7 +81,7 @@ def presets() -> dict[str, Settings]:
     """Named settings for `--preset`."""
     default = Settings(
         fit=FitOptions(
-            Objective(l1=1.0, tv_volume=0.25, overfull=10.0, two_levels=1.25, noise_gain=1.0),
+            Objective(l1=1.0, tv_volume=0.25, overfull=10.0, two_levels=1.25, noise_gain=1.6),
             Schedule(steps=300, rate_position=0.01, rate_scale=0.01, rate_rotation=0.01, rate_amplitude=0.01),
         ),
     )
@@ -93,6 +95,7 @@ def presets() -> dict[str, Settings]:
         ),
         "thesis": Settings(
             start="random",
+            separate=True,
             fit=FitOptions(
                 THESIS,
                 Schedule(

@@ -23,7 +23,8 @@ Progress = Callable[[str, float], None]
 def starting_cloud(
     scan: Scan, prior: MaterialPrior, settings: Settings, seed: int, on_progress: Progress
 ) -> GaussianCloud:
-    """The cloud to start from, by the training frames `scan`; δ and β are free if nothing is known of the matter."""
+    """The cloud to start from, by the training frames `scan`; where nothing is known of the
+    matter, δ and β are free (`settings.separate`, and at a random start), or of the one ratio that frames suggest."""
     start = _random if settings.start == "random" else _from_phase_retrieval
     return start(scan, prior, settings, seed, on_progress)
 
@@ -41,7 +42,7 @@ def _from_phase_retrieval(
         backend
     )
     cloud = approximate(cloud, volume, grid, settings.approximate_steps, on_progress)
-    return freed(cloud) if prior.kind == "free" else cloud
+    return freed(cloud) if prior.kind == "free" and settings.separate else cloud
 
 
 def _spacing_px(scan: Scan, settings: Settings) -> float:
