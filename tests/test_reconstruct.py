@@ -189,19 +189,21 @@ def test_with_the_ratio_alone_delta_is_found(scan, truth):
     assert found.material.ratio == pytest.approx(CELL.ratio)
     assert found.material.delta == pytest.approx(CELL.delta, rel=0.25, abs=0)
     assert found.volume.dice > 0.93
-    assert "given" in found.lines()[-1]
+    assert "one for all" in found.lines()[-1]
 
 
-def test_with_nothing_known_delta_and_beta_are_found(scan, truth):
-    result = reconstruct(scan, MaterialPrior(), SMALL)
+@pytest.mark.parametrize("separate", [False, True])
+def test_with_nothing_known_delta_and_beta_are_found(scan, truth, separate):
+    """At the one ratio that the frames suggest, or fitted apart; nothing bounds the occupancy, whose unit is a guess."""
+    result = reconstruct(scan, MaterialPrior(), replace(SMALL, separate=separate))
     found = evaluate(result, scan, truth)
-    assert not found.material.single_material
-    assert result.cloud.raw_amplitudes.shape[1] == 2
+    assert found.material.single_material != separate
+    assert result.cloud.raw_amplitudes.shape[1] == 1 + separate
     assert found.material.delta == pytest.approx(CELL.delta, rel=0.35, abs=0)
     assert CELL.ratio / 2.5 < found.material.ratio < 2.5 * CELL.ratio
     assert found.volume.dice > 0.92
     assert f"δ {found.material.delta:.3e}" in found.lines()[-1]
-    assert "found" in found.lines()[-1]
+    assert ("found apart" if separate else "one for all") in found.lines()[-1]
 
 
 @pytest.mark.parametrize("prior", [KNOWN, MaterialPrior.of_ratio(2800.0), MaterialPrior()], ids=lambda p: p.kind)

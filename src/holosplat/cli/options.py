@@ -123,7 +123,7 @@ class SettingsOptions:
 
 @dataclass(frozen=True)
 class PriorOptions:
-    """What is known of the matter; without any of these, δ and β are both free."""
+    """What is known of the matter; without any of these, δ is free and δ/β is estimated."""
 
     material: str | None = None
     """Formula or preset of the one material, if known (then δ and β are)."""
