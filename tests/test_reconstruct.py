@@ -194,7 +194,7 @@ def test_with_the_ratio_alone_delta_is_found(scan, truth):
 
 @pytest.mark.parametrize("separate", [False, True])
 def test_with_nothing_known_delta_and_beta_are_found(scan, truth, separate):
-    """At the one ratio that the frames suggest, or fitted apart; nothing bounds the occupancy, whose unit is a guess."""
+    """At the one ratio that the frames suggest, or fitted apart; nothing bounds the occupancy then."""
     result = reconstruct(scan, MaterialPrior(), replace(SMALL, separate=separate))
     found = evaluate(result, scan, truth)
     assert found.material.single_material != separate
