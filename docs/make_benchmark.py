@@ -1,7 +1,7 @@
 """The benchmark's pages, after `holosplat bench run --out bench` and `report`: `python docs/make_benchmark.py bench`.
 
 Writes docs/benchmark_tables.md (the report's Markdown with the pictures of a few cases), docs/images/benchmark/,
-docs/data/benchmark.csv (a line for each row), and the numbers of the suite in docs/overview.md.
+docs/data/benchmark.csv (a line for each row), and tables of means over seeds in docs/overview.md and docs/benchmark.md.
 """
 
 from __future__ import annotations
@@ -9,10 +9,12 @@ from __future__ import annotations
 import csv
 import re
 import sys
+from collections import defaultdict
 from pathlib import Path
 
 from PIL import Image
 
+from holosplat.experiments.bench.case import case_names
 from holosplat.experiments.bench.folder import BenchFolder
 from holosplat.experiments.bench.rows import Row, read_row
 
@@ -39,6 +41,9 @@ OVERVIEW_METHODS = {
     "gaussians": "Gaussians",
 }
 """What docs/overview.md shows: cases, numbers, and methods as it calls them."""
+OURS = "gaussians"
+STANDING = {"ssim": 1, "frcm": 1, "dice": 1, "relative_error_delta": -1}
+"""The scores in which methods are compared, and whether more of it is better."""
 SCORES = ("ssim", "frcm", "psnr", "l1")
 VOLUME = ("dice", "relative_error_delta", "delta_deviation", "ratio", "resolution_half")
 
@@ -50,7 +55,9 @@ def main(bench: Path) -> None:
     rows = [read_row(path) for path in sorted(folder.rows.glob("*.json"))]
     write_table(rows, DOCS / "data" / "benchmark.csv")
     write_page(folder, DOCS / "benchmark_tables.md")
-    fill(DOCS / "overview.md", rows)
+    means = means_of(rows)
+    fill(DOCS / "overview.md", overview(means))
+    fill(DOCS / "benchmark.md", standing(rows, means))
 
 
 def write_table(rows: list[Row], path: Path) -> None:
@@ -98,28 +105,70 @@ def shrink(source: Path, target: Path) -> None:
     image.quantize(COLOURS, dither=Image.Dither.NONE).save(target, optimize=True)
 
 
-def fill(path: Path, rows: list[Row]) -> None:
-    """Put the table of the two cases `OVERVIEW_CASES` into a page, between its marks."""
-    found = {(row.case, row.method): row for row in rows if row.done}
+Means = dict[tuple[str, str], dict[str, float]]
+"""(case, method) → numbers, means over the seeds that are done."""
+
+
+def means_of(rows: list[Row]) -> Means:
+    """Numbers of every method on every case, means over seeds."""
+    found: dict[tuple[str, str], list[dict[str, float | None]]] = defaultdict(list)
+    for row in rows:
+        if row.done:
+            extra = {"seconds": row.seconds, "stored": row.stored_bytes and row.stored_bytes / 1e6}
+            found[row.case, row.method].append({**row.test, **row.volume, **extra})
+    return {
+        key: {
+            name: sum(values) / len(values)
+            for name in several[0]
+            if len(values := [v for one in several if (v := one.get(name)) is not None]) == len(several)
+        }
+        for key, several in found.items()
+    }
+
+
+def overview(means: Means) -> str:
+    """The table of the cases `OVERVIEW_CASES`."""
     cases = " / ".join(f"{case}" for case in OVERVIEW_CASES)
     lines = ["| method | SSIM | Dice | error of δ | time / s | stored / MB |", "| --- | --- | --- | --- | --- | --- |"]
     for method, label in OVERVIEW_METHODS.items():
-        chosen = [found.get((case, method)) for case in OVERVIEW_CASES]
-        cells = [" / ".join(_shown(row, name) for row in chosen) for name in OVERVIEW_NUMBERS]
+        chosen = [means.get((case, method), {}) for case in OVERVIEW_CASES]
+        cells = [" / ".join(_shown(numbers, name) for numbers in chosen) for name in OVERVIEW_NUMBERS]
         lines.append(f"| {' | '.join([label, *cells])} |")
-    table = "\n".join([f"*{cases}*", "", *lines])
+    return "\n".join([f"*{cases}*", "", *lines])
+
+
+def standing(rows: list[Row], means: Means) -> str:
+    """The Gaussians beside the best other method on every case and score; what they lose is in italics."""
+    references = {row.method for row in rows if row.is_reference}
+    lines = ["| case | SSIM | FRCM | Dice | error of δ | time / s |", "| --- " * 6 + "|"]
+    won = dict.fromkeys(STANDING, 0)
+    cases = [case for case in case_names() if (case, OURS) in means]
+    for case in cases:
+        others = {m: n for (c, m), n in means.items() if c == case and not m.startswith(OURS) and m not in references}
+        cells = []
+        for name, sign in STANDING.items():
+            ours = means[case, OURS][name]
+            method, best = max(((m, n[name]) for m, n in others.items()), key=lambda item: sign * item[1])
+            ahead = sign * ours >= sign * best
+            won[name] += ahead
+            cells.append(f"**{ours:.3f}** ({best:.3f})" if ahead else f"*{ours:.3f}* ({best:.3f}, {method})")
+        lines.append(f"| {case} | {' | '.join(cells)} | {means[case, OURS]['seconds']:.0f} |")
+    lines.append(f"| best on, of {len(cases)} | {' | '.join(str(count) for count in won.values())} | |")
+    return "\n".join(lines)
+
+
+def fill(path: Path, table: str) -> None:
+    """Put a table into a page, between its marks."""
     text = path.read_text(encoding="utf-8")
     marked = re.compile(r"(<!-- made by make_benchmark.py -->\n).*?(<!-- end -->)", re.DOTALL)
     path.write_text(marked.sub(lambda m: f"{m[1]}{table}\n{m[2]}", text), encoding="utf-8")
 
 
-def _shown(row: Row | None, name: str) -> str:
-    """A number of a row as the table has it; a dash where there is none."""
-    values = {} if row is None else {**row.test, **row.volume, "seconds": row.seconds, "stored": row.stored_bytes}
-    value = values.get(name)
-    if value is None:
+def _shown(numbers: dict[str, float], name: str) -> str:
+    """A number as the table has it; a dash where there is none."""
+    if name not in numbers:
         return "–"
-    return {"seconds": f"{value:.0f}", "stored": f"{value / 1e6:.1f}"}.get(name, f"{value:.3f}")
+    return f"{numbers[name]:.{ {'seconds': 0, 'stored': 1}.get(name, 3) }f}"
 
 
 if __name__ == "__main__":

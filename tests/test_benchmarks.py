@@ -9,6 +9,7 @@ from types import ModuleType
 import pytest
 import torch
 
+from holosplat.experiments.settings import preset
 from holosplat.projectors.splat import splat
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
@@ -18,7 +19,9 @@ BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 def scripts(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
     """The modules of benchmarks/, which import one another by bare names."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
-    return {name: importlib.import_module(name) for name in ("step", "eager_step", "kernels", "plain_torch")}
+    return {
+        name: importlib.import_module(name) for name in ("step", "eager_step", "kernels", "plain_torch", "ablation")
+    }
 
 
 @pytest.mark.parametrize("add", ["index_add_", "scatter_add_"])
@@ -65,3 +68,11 @@ def test_what_the_kernels_report(scripts):
     assert kernels.splat_pairs(work) > 40
     seconds = kernels.minima({"ours": kernels.calls(work), "torch": kernels.torch_calls(work, "index_add_")}, 1)
     assert all(0 < value < 60 for pair in seconds.values() for value in pair)
+
+
+def test_every_ablation_removes_something(scripts):
+    settings = preset("default")
+    variants = {name: change(settings) for name, change in scripts["ablation"].VARIANTS.items()}
+    assert variants.pop("as it is") == settings
+    assert settings not in variants.values()
+    assert len({repr(variant) for variant in variants.values()}) == len(variants)
