@@ -48,8 +48,7 @@ class HolographicTV:
     weight: of total variation while the volume is made to agree with the holograms, in pixels of path length;
     corrections: rounds of that, of `inner` steps each, more with fewer than 8 views; refine: voxels along a pixel's
     edge then (0: as the first fringe needs); max_voxels: coarser voxels rather than more than this many; upper: bound
-    of the occupancy (0: none);
-    backend: `cpu`, or `reference` (plain torch, slow).
+    of the occupancy (0: none); backend: `cpu`, or `reference` (plain torch, slow).
     """
 
     retrieval: int = 60
@@ -107,7 +106,7 @@ def _agree(
     """The volume after rounds of agreement with the holograms, on voxels `refine` times finer than pixels.
 
     Each round runs the wave optics on the volume's projection, inverts what is missing from the frames, as far as
-    their noise lets it be known (`correction`), and gives the corrected projection to a few primal–dual steps. The
+    their noise lets it be known (`Correction`), and gives the corrected projection to a few primal–dual steps. The
     round that agrees best is returned, for the iteration may diverge; the first ones, in which the solver finds its
     dual variables, do not count.
     """

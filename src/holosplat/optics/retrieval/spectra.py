@@ -130,8 +130,8 @@ def spectra(
     model_error: float,
     prior: Prior,
 ) -> Spectra:
-    """Of frames [V, H, W] and a response h on `raster`; noise: as known (of each frame [V], or
-    of all), or None to estimate it.
+    """Of frames [V, H, W] and a response h on `raster`; noise: as known (of each frame [V], or of
+    all), or None to estimate it.
 
     model_error: what no model explains, as a share of the frames' contrast. The power has the prior's shape and
     explains the frames' variance beyond their noise; what the detector cannot resolve does not count in that.
