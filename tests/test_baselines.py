@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -312,6 +313,15 @@ def test_corrections_bring_the_volume_in_agreement_with_the_holograms(request, m
     assert errors[1] < 0.4
     assert min(dices) > 0.94  # noise-aware retrieval is good at this by itself; the corrections must not spoil it
     assert dices[1] > dices[0] - 0.015
+
+
+def test_few_views_get_more_steps_a_round(cell_scan, monkeypatch):
+    few = cell_scan[np.arange(0, 8, 2)]
+    options = replace(USUAL, corrections=1, inner=5)
+    as_it_is, _ = holographic_tv(few, CELL, options, quiet)
+    monkeypatch.setattr(import_module("holosplat.baselines.holographic_tv"), "FEW_VIEWS", 0)
+    twice, _ = holographic_tv(few, CELL, replace(options, inner=10), quiet)
+    assert torch.equal(as_it_is, twice)
 
 
 def test_too_many_voxels_become_larger_ones(cell_scan):

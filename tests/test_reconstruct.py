@@ -22,6 +22,7 @@ from holosplat.experiments.evaluate import evaluate, material_found, render
 from holosplat.experiments.reconstruct import Reconstruction, load_reconstruction, reconstruct
 from holosplat.experiments.run_folder import RunFolder, scan_hash
 from holosplat.experiments.settings import MaterialPrior, Settings, from_plain, preset, presets, read_settings
+from holosplat.experiments.start import starting_cloud
 from holosplat.fit.density import DensityControl
 from holosplat.fit.loop import FitOptions
 from holosplat.fit.objective import Objective
@@ -204,6 +205,27 @@ def test_with_nothing_known_delta_and_beta_are_found(scan, truth, separate):
     assert found.volume.dice > 0.92
     assert f"δ {found.material.delta:.3e}" in found.lines()[-1]
     assert ("found apart" if separate else "one for all") in found.lines()[-1]
+
+
+@pytest.mark.parametrize("prior", [KNOWN, MaterialPrior()], ids=lambda p: p.kind)
+def test_the_occupancy_is_bounded_only_where_one_means_something(scan, prior):
+    weights = Objective(tv_volume=0.05, overfull=10.0, two_levels=1.0)
+    settings = replace(SMALL, fit=FitOptions(weights, Schedule(steps=2)))
+    recorded: set[str] = set()
+    result = reconstruct(scan, prior, settings, on_progress=lambda stage, part, record: recorded.update(record))
+    assert result.cloud.single_material
+    assert "tv_volume" in recorded
+    assert ({"overfull", "two_levels"} <= recorded) == (prior.kind == "known")
+
+
+def test_noisy_frames_get_fewer_and_larger_gaussians(scan):
+    noisy = replace(scan, frames=scan.frames + np.random.default_rng(0).normal(0, 0.02, scan.frames.shape).astype("f4"))
+    clouds = [
+        starting_cloud(noisy.train(), KNOWN, replace(SMALL, spacing_noise=rule), 0, lambda stage, part: None)
+        for rule in (0.0, 2.3)
+    ]
+    assert len(clouds[1]) < 0.5 * len(clouds[0])
+    assert float(clouds[1].scales.median()) > 1.3 * float(clouds[0].scales.median())
 
 
 @pytest.mark.parametrize("prior", [KNOWN, MaterialPrior.of_ratio(2800.0), MaterialPrior()], ids=lambda p: p.kind)
