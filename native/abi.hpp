@@ -69,6 +69,12 @@ struct HoloLattice {
   double pitch;                  // voxel edge
 };
 
+struct HoloSurface {  // triangles seen in V views
+  int64_t vertices, faces;  // P, F
+  const double* points;     // [V, P, 3] column, row, depth; pixel (i, j) has its centre at row i, column j
+  const int64_t* corners;   // [F, 3] vertices, counter-clockwise seen from outside
+};
+
 struct HoloOptions {
   double cutoff;    // half-width of a Gaussian's box in standard deviations
   double variance;  // added to the covariance: what a pixel or voxel does
@@ -107,6 +113,11 @@ HOLO_EXPORT int64_t holosplat_lattice_project(const HoloLattice*, const HoloView
                                               int64_t threads);
 HOLO_EXPORT int64_t holosplat_lattice_backproject(const HoloLattice*, const HoloViews*, const float* image,
                                                   float* volume, int64_t threads);
+
+// Thickness of what closed surfaces enclose, image [V, H, W]: along rows the mean over each pixel, across them the mean
+// over `lines` lines of it.
+HOLO_EXPORT int64_t holosplat_surface(const HoloSurface*, const HoloRaster*, int64_t lines, double* image,
+                                      int64_t threads);
 
 // Wave optics, between the Fourier transforms that the caller does. Complex arrays are float pairs (re, im).
 // wave [V, H, W] <- exp(-loss - i phase) - 1 with phase = sum over channels of refraction[c][0] lines[c], and loss of

@@ -23,6 +23,7 @@ _WHERE = {
     "specimens.red_cells": ("evans_fung_cell", "random_cells"),
     "specimens.repair": ("closed",),
     "representations.gaussians": ("GaussianCloud",),
+    "representations.surfaces": ("SurfaceMesh",),
     "io.nxtomo": ("read_scan", "write_scan"),
     "io.volumes": ("read_volume", "write_volume"),
     "io.vtk": ("read_meshes", "write_mesh"),
@@ -33,6 +34,7 @@ _WHERE = {
     "experiments.run_folder": ("RunFolder",),
     "experiments.reconstruct": ("Reconstruction", "load_reconstruction", "reconstruct"),
     "experiments.evaluate": ("Evaluation", "evaluate", "render"),
+    "experiments.surfaces": ("refine_surfaces",),
 }
 _MODULE_OF = {name: module for module, names in _WHERE.items() for name in names}
 
@@ -68,6 +70,7 @@ if TYPE_CHECKING:
     from .experiments.settings import preset as preset
     from .experiments.simulate import Filling as Filling
     from .experiments.simulate import read_scene as read_scene
+    from .experiments.surfaces import refine_surfaces as refine_surfaces
     from .forward import Instrument as Instrument
     from .forward import measure as measure
     from .forward import simulate as simulate
@@ -89,6 +92,7 @@ if TYPE_CHECKING:
     from .materials import parse_material as parse_material
     from .mesh import TriangleMesh as TriangleMesh
     from .representations.gaussians import GaussianCloud as GaussianCloud
+    from .representations.surfaces import SurfaceMesh as SurfaceMesh
     from .scan import Exposures as Exposures
     from .scan import Scan as Scan
     from .scan import interleaved_split as interleaved_split

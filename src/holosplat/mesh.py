@@ -67,3 +67,25 @@ class TriangleMesh:
     def transformed(self, rotation: np.ndarray, translation: np.ndarray) -> TriangleMesh:
         """The mesh moved to `rotation @ vertex + translation` ([3, 3], [3] in metres)."""
         return replace(self, vertices=self.vertices @ np.asarray(rotation).T + np.asarray(translation))
+
+
+def shell_labels(faces: np.ndarray, vertex_count: int) -> np.ndarray:
+    """[F] the number, from 0 on, of the connected shell that each of `faces` [F, 3] belongs to."""
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    graph = coo_array((np.ones(len(ends)), tuple(ends.T)), shape=(vertex_count,) * 2)
+    _, group = connected_components(graph, directed=False)
+    return np.unique(group[faces[:, 0]], return_inverse=True)[1].reshape(-1)
+
+
+def winding_number(triangles: np.ndarray, point: np.ndarray) -> float:
+    """How often the closed surface `triangles` [F, 3, 3] winds about `point` [3], without its sign.
+
+    The triangles' solid angles, summed (van Oosterom & Strackee 1983, IEEE Trans. Biomed. Eng. 30, 125,
+    eq. 8).
+    """
+    a, b, c = np.moveaxis(triangles - point, 1, 0)
+    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
+    numerator = np.einsum("fi,fi->f", a, np.cross(b, c))
+    dots = [np.einsum("fi,fi->f", u, v) for u, v in ((a, b), (b, c), (c, a))]
+    denominator = la * lb * lc + dots[0] * lc + dots[1] * la + dots[2] * lb
+    return float(abs(2 * np.arctan2(numerator, denominator).sum()) / (4 * np.pi))

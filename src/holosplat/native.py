@@ -17,7 +17,7 @@ from pathlib import Path
 
 from .checks import MissingError
 
-ABI = 3
+ABI = 4
 ISAS = ("sse2", "avx2", "avx512")
 """Builds for x86-64, slowest first. Other processors have one build, `generic`."""
 
@@ -110,6 +110,12 @@ class Adam(ctypes.Structure):
     ]
 
 
+class Surface(ctypes.Structure):
+    """Triangles seen in V views: counts of vertices and faces, pointers to float64 points and int64 corners."""
+
+    _fields_ = [("vertices", c_int64), ("faces", c_int64), ("points", c_void_p), ("corners", c_void_p)]
+
+
 class Options(ctypes.Structure):
     """Cutoff in standard deviations, variance added [px²], number of threads."""
 
@@ -133,6 +139,7 @@ _FUNCTIONS = {
     ),
     "holosplat_lattice_project": (POINTER(Lattice), POINTER(Views), c_void_p, c_void_p, c_int64),
     "holosplat_lattice_backproject": (POINTER(Lattice), POINTER(Views), c_void_p, c_void_p, c_int64),
+    "holosplat_surface": (POINTER(Surface), POINTER(Raster), c_int64, c_void_p, c_int64),
     "holosplat_exit_wave": (POINTER(Raster), *(c_void_p,) * 3, c_int64),
     "holosplat_exit_wave_backward": (POINTER(Raster), *(c_void_p,) * 4, c_int64),
     "holosplat_transfer": (POINTER(Raster), *(c_void_p,) * 2, c_double, c_int64, c_void_p, c_int64),

@@ -37,6 +37,7 @@ from .convert import convert
 from .options import BeamlineOptions, MaterialOptions, MeshOptions, NoiseOptions, PriorOptions, SettingsOptions
 from .plan import plan
 from .progress import INTERRUPTED, ProgressBar
+from .surface import surface
 
 MOST_VOXELS = 2**31
 """The largest volume that `export` writes: 16 GB for δ and β."""
@@ -184,7 +185,7 @@ def evaluate(
     """
     folder = RunFolder(run)
     result = load_reconstruction(folder)
-    measured, true_volume = read_scan(scan or _source(folder)), read_volume(truth) if truth else None
+    measured, true_volume = read_scan(scan or folder.source_scan()), read_volume(truth) if truth else None
     evaluation = score(result, measured, true_volume)
     if as_json:
         print(json.dumps(evaluation.as_dict(), indent=2, allow_nan=False))
@@ -236,13 +237,6 @@ def _auto() -> str:
         return "finds neither cpu nor cuda"
 
 
-def _source(folder: RunFolder) -> Path:
-    require(folder.source.is_file(), f"{folder.path} does not say which scan it is of; name it with --scan.")
-    path = Path(str(read_json(folder.source).get("scan", "")))
-    require(path.is_file(), f"the scan {path} of this run is no longer there; name it with --scan.")
-    return path
-
-
 def _print_scores(evaluation: Evaluation) -> None:
     for line in evaluation.lines():
         print(line)
@@ -258,6 +252,7 @@ COMMANDS = {
     "reconstruct": reconstruct,
     "render": render,
     "export": export,
+    "surface": surface,
     "convert": convert,
     "evaluate": evaluate,
     "demo": demo,

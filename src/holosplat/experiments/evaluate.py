@@ -57,6 +57,23 @@ class Scores:
             numbers |= {name: float(getattr(self.volume, name)) for name in names}
         return numbers
 
+    def lines(self) -> list[str]:
+        """The numbers as a few lines of text."""
+        lines = []
+        for name, scores in (("held-out frames", self.test), ("training frames", self.train)):
+            if scores:
+                m = scores.mean
+                lines.append(
+                    f"{name}: SSIM {m['ssim']:.4f}, FRCM {m['frcm']:.4f}, PSNR {m['psnr']:.1f} dB, L1 {m['l1']:.5f}"
+                )
+        if self.volume:
+            v = self.volume
+            lines.append(
+                f"volume: Dice {v.dice:.4f}, relative error of δ {v.relative_error_delta:.4f}, mean δ inside "
+                f"{v.mean_delta:.3e} (true {v.true_mean_delta:.3e}, {100 * v.delta_deviation:+.1f} %)"
+            )
+        return lines
+
 
 @dataclass(frozen=True)
 class Evaluation(Scores):
@@ -73,22 +90,8 @@ class Evaluation(Scores):
 
     def lines(self) -> list[str]:
         """The numbers as a few lines of text."""
-        lines = []
-        for name, scores in (("held-out frames", self.test), ("training frames", self.train)):
-            if scores:
-                m = scores.mean
-                lines.append(
-                    f"{name}: SSIM {m['ssim']:.4f}, FRCM {m['frcm']:.4f}, PSNR {m['psnr']:.1f} dB, L1 {m['l1']:.5f}"
-                )
-        if self.volume:
-            v = self.volume
-            lines.append(
-                f"volume: Dice {v.dice:.4f}, relative error of δ {v.relative_error_delta:.4f}, mean δ inside "
-                f"{v.mean_delta:.3e} (true {v.true_mean_delta:.3e}, {100 * v.delta_deviation:+.1f} %)"
-            )
         kind = "one for all" if self.material.single_material else "found apart"
-        lines.append(f"material: δ {self.material.delta:.3e}, δ/β {self.material.ratio:.0f} ({kind})")
-        return lines
+        return [*super().lines(), f"material: δ {self.material.delta:.3e}, δ/β {self.material.ratio:.0f} ({kind})"]
 
 
 def render(reconstruction: Reconstruction, exposures: Exposures) -> np.ndarray:

@@ -3,7 +3,9 @@
 from .encodings import Encoding
 from .gaussians import GaussianCloud
 from .initialise import approximate, at_pitch, cloud_from_volume, freed, random_cloud
+from .isosurface import isosurface
 from .neural_field import Matter, Network, NeuralField
+from .surfaces import SurfaceMesh
 from .voxel_lines import VoxelLines
 from .voxels import VoxelGrid
 
@@ -13,11 +15,13 @@ __all__ = [
     "Matter",
     "Network",
     "NeuralField",
+    "SurfaceMesh",
     "VoxelGrid",
     "VoxelLines",
     "approximate",
     "at_pitch",
     "cloud_from_volume",
     "freed",
+    "isosurface",
     "random_cloud",
 ]

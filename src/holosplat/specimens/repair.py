@@ -9,7 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from ..checks import InputError
-from ..mesh import TriangleMesh
+from ..mesh import TriangleMesh, winding_number
 from ..units import LENGTH_UNITS, unit_factor
 
 
@@ -139,18 +139,4 @@ def _shells_around(s: int, parts: list[np.ndarray], boxes: np.ndarray, vertices:
     low, high = boxes[s]
     candidates = np.flatnonzero((boxes[:, 0] <= low).all(1) & (boxes[:, 1] >= high).all(1))
     point = vertices[parts[s][0]].mean(0)
-    return [int(o) for o in candidates if o != s and _winding_number(vertices[parts[o]], point) > 0.5]
-
-
-def _winding_number(triangles: np.ndarray, point: np.ndarray) -> float:
-    """How often the closed surface `triangles` [F, 3, 3] winds about `point` [3], without its sign.
-
-    The triangles' solid angles, summed (van Oosterom & Strackee 1983, IEEE Trans. Biomed. Eng. 30, 125,
-    eq. 8).
-    """
-    a, b, c = np.moveaxis(triangles - point, 1, 0)
-    la, lb, lc = (np.linalg.norm(v, axis=1) for v in (a, b, c))
-    numerator = np.einsum("fi,fi->f", a, np.cross(b, c))
-    dots = [np.einsum("fi,fi->f", u, v) for u, v in ((a, b), (b, c), (c, a))]
-    denominator = la * lb * lc + dots[0] * lc + dots[1] * la + dots[2] * lb
-    return float(abs(2 * np.arctan2(numerator, denominator).sum()) / (4 * np.pi))
+    return [int(o) for o in candidates if o != s and winding_number(vertices[parts[o]], point) > 0.5]

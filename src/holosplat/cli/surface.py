@@ -1,0 +1,88 @@
+"""`holosplat surface`: the bodies of a run as closed surfaces, fitted to its frames."""
+
+from __future__ import annotations
+
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from tyro.conf import Positional
+
+from ..checks import require
+from ..experiments.evaluate import Scores, score_object
+from ..experiments.evaluate import evaluate as score
+from ..experiments.reconstruct import load_reconstruction
+from ..experiments.run_folder import RunFolder, scan_hash
+from ..experiments.surfaces import Extraction, refine_surfaces
+from ..fit.surfaces import SurfaceFit, oversampling
+from ..io.folder import atomic_folder, require_new
+from ..io.json import write_json
+from ..io.nxtomo import read_scan
+from ..io.volumes import read_volume
+from ..io.vtk import write_mesh
+from ..representations import SurfaceMesh
+from .progress import ProgressBar
+
+LENGTH_UNIT = "um"
+
+
+def surface(
+    run: Positional[Path],
+    out: Path,
+    scan: Path | None = None,
+    truth: Path | None = None,
+    extraction: Extraction = Extraction(),
+    how: SurfaceFit = SurfaceFit(),
+) -> None:
+    """Cut the bodies of a run out as closed surfaces, fit these to the frames, and write them as VTK files (µm).
+
+    Args:
+        run: Run folder, of a reconstruction that was given --material or --delta-beta.
+        out: Folder to make: body000.vtk …, the largest first, each with its cavities, and summary.json.
+        scan: Scan file (default: the one that was reconstructed).
+        truth: Volume file of the truth, to score both against.
+    """
+    require_new(out)
+    folder = RunFolder(run)
+    result = load_reconstruction(folder)
+    kind = folder.read_config().get("prior", {}).get("kind")
+    require(
+        kind in ("known", "ratio"),
+        f"surfaces need one material whose δ and β are known, but {run} was reconstructed without; "
+        "reconstruct with --material or --delta-beta.",
+    )
+    measured, volume = read_scan(scan or folder.source_scan()), read_volume(truth) if truth else None
+    if scan_hash(measured) != folder.read_config().get("scan_hash"):
+        _say("this is not the scan that was reconstructed: its held-out frames may have been fitted")
+    before = score(result, measured, volume)
+    began = time.perf_counter()
+    with ProgressBar() as bar:
+        found = refine_surfaces(result.cloud, measured, extraction, how, lambda *now: bar.show(now[0], now[1], {}))
+    seconds = time.perf_counter() - began
+    after = score_object(found, measured, volume, oversampling(measured.train(), how))
+    settings = {"extraction": asdict(extraction), "fit": asdict(how)}
+    count = _write(out, found, {"seconds": seconds, "settings": settings, "gaussians": before.as_dict()}, after)
+    for name, scores in (("Gaussians", before), ("surfaces", after)):
+        print(f"{name}:", *scores.lines(), sep="\n  ")
+    _say(f"wrote {out}: {count} bodies of {len(found.faces)} triangles, {seconds:.1f} s")
+
+
+def _write(out: Path, found: SurfaceMesh, summary: dict[str, Any], after: Scores) -> int:
+    """The folder, whole or not at all; returns the number of bodies."""
+    bodies = found.bodies()
+    with atomic_folder(out) as temporary:
+        for body in bodies:
+            write_mesh(temporary / f"{body.name}.vtk", body, LENGTH_UNIT)
+        about = {
+            "bodies": {body.name: {"triangles": len(body.faces), "volume_m3": body.volume} for body in bodies},
+            "length_unit": LENGTH_UNIT,
+            "material": {"delta": found.delta, "beta": found.beta},
+        }
+        write_json(temporary / "summary.json", about | summary | {"surfaces": after.as_dict()})
+    return len(bodies)
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)
