@@ -34,7 +34,7 @@ _WHERE = {
     "experiments.run_folder": ("RunFolder",),
     "experiments.reconstruct": ("Reconstruction", "load_reconstruction", "reconstruct"),
     "experiments.evaluate": ("Evaluation", "evaluate", "render"),
-    "experiments.surfaces": ("refine_surfaces",),
+    "experiments.surfaces": ("SurfaceSettings", "refine_surfaces"),
 }
 _MODULE_OF = {name: module for module, names in _WHERE.items() for name in names}
 
@@ -70,6 +70,7 @@ if TYPE_CHECKING:
     from .experiments.settings import preset as preset
     from .experiments.simulate import Filling as Filling
     from .experiments.simulate import read_scene as read_scene
+    from .experiments.surfaces import SurfaceSettings as SurfaceSettings
     from .experiments.surfaces import refine_surfaces as refine_surfaces
     from .forward import Instrument as Instrument
     from .forward import measure as measure

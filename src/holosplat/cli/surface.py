@@ -15,8 +15,8 @@ from ..experiments.evaluate import Scores, score_object
 from ..experiments.evaluate import evaluate as score
 from ..experiments.reconstruct import load_reconstruction
 from ..experiments.run_folder import RunFolder, scan_hash
-from ..experiments.surfaces import Extraction, refine_surfaces
-from ..fit.surfaces import SurfaceFit, oversampling
+from ..experiments.surfaces import SurfaceSettings, refine_surfaces
+from ..fit.surfaces import oversampling
 from ..io.folder import atomic_folder, require_new
 from ..io.json import write_json
 from ..io.nxtomo import read_scan
@@ -33,8 +33,7 @@ def surface(
     out: Path,
     scan: Path | None = None,
     truth: Path | None = None,
-    extraction: Extraction = Extraction(),
-    how: SurfaceFit = SurfaceFit(),
+    how: SurfaceSettings = SurfaceSettings(),
 ) -> None:
     """Cut the bodies of a run out as closed surfaces, fit these to the frames, and write them as VTK files (µm).
 
@@ -59,11 +58,10 @@ def surface(
     before = score(result, measured, volume)
     began = time.perf_counter()
     with ProgressBar() as bar:
-        found = refine_surfaces(result.cloud, measured, extraction, how, lambda *now: bar.show(now[0], now[1], {}))
+        found = refine_surfaces(result.cloud, measured, how, lambda *now: bar.show(now[0], now[1], {}))
     seconds = time.perf_counter() - began
-    after = score_object(found, measured, volume, oversampling(measured.train(), how))
-    settings = {"extraction": asdict(extraction), "fit": asdict(how)}
-    count = _write(out, found, {"seconds": seconds, "settings": settings, "gaussians": before.as_dict()}, after)
+    after = score_object(found, measured, volume, oversampling(measured.train(), how.fit))
+    count = _write(out, found, {"seconds": seconds, "settings": asdict(how), "gaussians": before.as_dict()}, after)
     for name, scores in (("Gaussians", before), ("surfaces", after)):
         print(f"{name}:", *scores.lines(), sep="\n  ")
     _say(f"wrote {out}: {count} bodies of {len(found.faces)} triangles, {seconds:.1f} s")

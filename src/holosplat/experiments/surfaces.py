@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 
@@ -33,6 +33,14 @@ class Extraction:
         at_least(self, 0, "least_volume", "smoothing")
 
 
+@dataclass(frozen=True)
+class SurfaceSettings:
+    """Everything about surfaces but the scan and the Gaussians: how they are cut out, and how they are fitted."""
+
+    extraction: Extraction = field(default_factory=Extraction)
+    fit: SurfaceFit = field(default_factory=SurfaceFit)
+
+
 def extract_surfaces(cloud: GaussianCloud, scan: Scan, options: Extraction = Extraction()) -> SurfaceMesh:
     """The surfaces where the occupancy of `cloud` crosses the level, in the field of view of `scan`.
 
@@ -54,11 +62,10 @@ def extract_surfaces(cloud: GaussianCloud, scan: Scan, options: Extraction = Ext
 def refine_surfaces(
     cloud: GaussianCloud,
     scan: Scan,
-    extraction: Extraction = Extraction(),
-    options: SurfaceFit = SurfaceFit(),
+    settings: SurfaceSettings = SurfaceSettings(),
     on_progress: Progress = lambda stage, fraction, record: None,
 ) -> SurfaceMesh:
     """Surfaces cut out of `cloud` and fitted to the training frames of `scan`; errors: of both parts."""
     on_progress(f"{STAGE}: extraction", 0.0, {})
-    start = extract_surfaces(cloud, scan, extraction)
-    return fit_surfaces(scan, start, options, on_progress)
+    start = extract_surfaces(cloud, scan, settings.extraction)
+    return fit_surfaces(scan, start, settings.fit, on_progress)

@@ -11,7 +11,7 @@ from scipy.sparse import csc_array, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
-from ..checks import InputError, at_least, require
+from ..checks import InputError, at_least, positive, require
 from ..forward import Instrument, resolving_oversample
 from ..geometry import Poses
 from ..memory import memory_kept
@@ -24,6 +24,8 @@ STAGE = "surfaces"
 BETAS = (0.9, 0.99)
 SMALLEST_ROUNDING = 1e-6
 """Of the misfit at zero, in units of the frames' range."""
+FARTHEST = 1e6
+"""Coordinates beyond this many pixels, and those that are no numbers, are a fit that diverged."""
 
 Progress = Callable[[str, float, dict[str, float]], None]
 """Called with (stage, fraction done, record of the step)."""
@@ -40,8 +42,8 @@ class SurfaceFit:
     oversample: wave samples a pixel (0: one more than the fit of Gaussians takes, see `Schedule`).
     """
 
-    steps: int = 60
-    rate: float = 0.2
+    steps: int = 100
+    rate: float = 0.3
     decay: float = 0.1
     stiffness: float = 10.0
     smoothness: float = 1.0
@@ -51,7 +53,7 @@ class SurfaceFit:
 
     def __post_init__(self) -> None:
         at_least(self, 0, "steps", "stiffness", "smoothness", "noise_gain", "rounding", "oversample")
-        require(self.rate > 0, f"rate must be positive, but it is {self.rate:g}.")
+        positive("rate", self.rate, "pixels")
         require(0 < self.decay <= 1, f"decay must lie in (0, 1], but it is {self.decay:g}.")
 
 
@@ -67,7 +69,7 @@ def fit_surfaces(
     training frames' range and c the rounding, plus smoothness · Σ |L² x|² / (pixels of a frame), x the vertices in
     pixels and L x their distance from the mean of their neighbours. Steps are Adam's in the coordinates (1 + λΔ) x,
     one length for all vertices (Nicolet, Jacobson & Jakob 2021, "Large steps in inverse rendering of geometry",
-    eqs. 8 to 11). Errors: `InputError` without training frames, or where vertices are no longer finite.
+    eqs. 8 to 11). Errors: `InputError` without training frames, or where vertices are no longer numbers.
     """
     train = scan.train()
     require(np.ptp(train.frames) > 0, "all training frames are constant, so there is nothing to fit.")
@@ -82,7 +84,7 @@ def fit_surfaces(
             loss.backward()
             assert vertices.grad is not None
             bending = descent.advance(vertices.grad, weight)
-            if not torch.isfinite(descent.vertices).all():
+            if not bool((descent.vertices.abs() < FARTHEST).all()):
                 raise InputError(f"the fit of surfaces diverged at step {step + 1}; lower its rate.")
             record = {"step": step + 1.0, "loss": loss.item() + bending, "bending": bending}
             on_progress(STAGE, (step + 1) / options.steps, record)

@@ -105,7 +105,7 @@ class _Thickness(torch.autograd.Function):
         vertices, faces, points = ctx.saved_tensors
         h, w = ctx.shape
         corners = points[:, faces.reshape(-1), :2].reshape(len(points), *faces.shape, 2)
-        weights = torch.tensor(QUADRATURE).to(vertices)
+        weights = torch.tensor(QUADRATURE, dtype=vertices.dtype)
         samples = torch.einsum("qc,vfcx->vfqx", weights, corners)
         # grid_sample has its first and last pixel at -1 and 1; a single row or column has no such scale.
         samples = samples * (2 / torch.tensor([max(w - 1, 1), max(h - 1, 1)]).to(vertices)) - 1

@@ -50,7 +50,7 @@ def pieces(points: Tensor, faces: Tensor, shape: tuple[int, int], lines: int) ->
     upright = upright.take_along_dim(upright[..., 1].argsort(dim=1, stable=True)[..., None], 1)
     low, high = (((upright[:, i, 1] + 0.5) * lines - 0.5).ceil().clamp(0, h * lines).long() for i in (0, 2))
     owner, line = _every((low - 1).clamp(min=0), torch.where(area == 0, low - 1, high + 1).clamp(0, h * lines))
-    row = (line + 0.5) / lines - 0.5
+    row = (line.to(points) + 0.5) / lines - 0.5
     bottom, middle, top = upright[owner].unbind(1)
     hit = (row >= bottom[:, 1]) & (row < top[:, 1])  # the ranges may be off by their rounding
     owner, line, row, bottom, middle, top = (x[hit] for x in (owner, line, row, bottom, middle, top))
