@@ -43,7 +43,7 @@ class SurfaceFit:
     """
 
     steps: int = 100
-    rate: float = 0.3
+    rate: float = 0.2
     decay: float = 0.1
     stiffness: float = 10.0
     smoothness: float = 1.0

@@ -1,0 +1,115 @@
+"""Surfaces against the Gaussians that they are cut out of, on scenes of the benchmark that no setting was chosen on.
+
+    python benchmarks/surfaces.py --json > surfaces.json              # four cases, seeds 101 and 102
+    python benchmarks/surfaces.py --cases main4 --seeds 101 --runs RUNS
+
+Settings were chosen on seed 1. `--runs` keeps scans, truths and runs by Gaussians in a folder, and uses those that are
+there. Seconds are CPU time of the step alone, all threads together, so that they do not depend on who else uses the
+machine; those of the Gaussians are in docs/results.md.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+import torch
+from machine import commit
+
+import holosplat as hs
+from holosplat.experiments.bench.case import load_case
+from holosplat.experiments.evaluate import Scores, score_object
+from holosplat.experiments.run_folder import environment
+from holosplat.experiments.surfaces import extract_surfaces
+from holosplat.fit.surfaces import fit_surfaces, oversampling
+from holosplat.representations import SurfaceMesh
+
+CASES = ("main12", "main4", "noise12-2000", "shells8")
+
+
+def prepared(name: str, seed: int, runs: Path) -> tuple[hs.Scan, hs.Volume, hs.Reconstruction]:
+    """Scan, truth and reconstruction by Gaussians, from `runs` or made there."""
+    folder = runs / f"{name}_{seed}"
+    scan, truth, run = folder / "scan.nxs", folder / "truth.h5", hs.RunFolder(folder / "run")
+    if not run.summary.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        case = load_case(name, seed)
+        measured = case.scan()
+        hs.write_scan(scan, measured)
+        hs.write_volume(truth, case.truth())
+        hs.reconstruct(measured, case.prior, hs.preset("default"), seed, folder=run)
+    return hs.read_scan(scan), hs.read_volume(truth), hs.load_reconstruction(run)
+
+
+def measured(name: str, seed: int, runs: Path) -> list[dict[str, Any]]:
+    """One row each for the Gaussians, for the surfaces cut out of them, and for these after the fit."""
+    scan, truth, result = prepared(name, seed, runs)
+    settings = hs.SurfaceSettings()
+    sampling = oversampling(scan.train(), settings.fit)
+    rows = [
+        row("Gaussians", score_object(result.cloud, scan, truth, result.oversample), 0.0),
+        row("Gaussians, finer waves", score_object(result.cloud, scan, truth, sampling), 0.0),
+    ]
+    began = time.process_time()
+    start = extract_surfaces(result.cloud, scan, settings.extraction)
+    cut = time.process_time() - began
+    rows.append(row("marching cubes", score_object(start, scan, truth, sampling), cut) | sizes(start))
+    began = time.process_time()
+    found = fit_surfaces(scan, start, settings.fit)
+    fitted = time.process_time() - began
+    rows.append(row("surfaces", score_object(found, scan, truth, sampling), fitted) | sizes(found))
+    return [{"case": name, "seed": seed, **r} for r in rows]
+
+
+def row(method: str, scores: Scores, seconds: float) -> dict[str, Any]:
+    """The numbers of one method."""
+    assert scores.train is not None
+    return {"method": method, "seconds": seconds, **scores.headline(), "train_ssim": scores.train.mean["ssim"]}
+
+
+def sizes(surfaces: SurfaceMesh) -> dict[str, Any]:
+    """What the surfaces are made of."""
+    return {"triangles": len(surfaces.faces), "bodies": len(surfaces.bodies()), "stored_bytes": surfaces.stored_bytes}
+
+
+def table(report: dict[str, Any]) -> str:
+    """The rows as Markdown."""
+    lines = ["| case, seed | method | SSIM | FRCM | Dice | error of δ | mean δ | s |", "|" + " --- |" * 8]
+    for r in report["rows"]:
+        deviation = 100 * (r["mean_delta"] / r["true_mean_delta"] - 1)
+        seconds = f"{r['seconds']:.0f}" if r["seconds"] else ""
+        lines.append(
+            f"| {r['case']}, {r['seed']} | {r['method']} | {r['ssim']:.4f} | {r['frcm']:.4f} | {r['dice']:.4f} "
+            f"| {r['relative_error_delta']:.4f} | {deviation:+.2f} % | {seconds} |"
+        )
+    machine = report["machine"]
+    measured_on = f"{machine['processor']}, torch {report['versions']['torch']}"
+    return "\n".join([*lines, "", f"Measured on {measured_on}; commit {report['commit']}."])
+
+
+def main() -> None:
+    """Run the cases and print their table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cases", nargs="+", default=list(CASES))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[101, 102])
+    parser.add_argument("--runs", type=Path)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    with tempfile.TemporaryDirectory() as scratch:
+        runs = options.runs or Path(scratch)
+        rows = [r for name in options.cases for seed in options.seeds for r in measured(name, seed, runs)]
+    report = {"commit": commit(), **environment("cpu"), "rows": rows}
+    print(json.dumps(report, indent=2) if options.json else table(report))
+
+
+if __name__ == "__main__":
+    main()
