@@ -1,7 +1,7 @@
 """Surfaces against the Gaussians that they are cut out of, on scenes of the benchmark that no setting was chosen on.
 
     python benchmarks/surfaces.py --json > surfaces.json              # four cases, seeds 101 and 102
-    python benchmarks/surfaces.py --cases main4 --seeds 101 --runs RUNS
+    python benchmarks/surfaces.py --cases main4 noise12-2000 --seeds 101 --variants --runs RUNS
 
 Settings were chosen on seed 1. `--runs` keeps scans, truths and runs by Gaussians in a folder, and uses those that are
 there. Seconds are CPU time of the step alone, all threads together, so that they do not depend on who else uses the
@@ -15,6 +15,7 @@ import json
 import os
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +28,22 @@ import holosplat as hs
 from holosplat.experiments.bench.case import load_case
 from holosplat.experiments.evaluate import Scores, score_object
 from holosplat.experiments.run_folder import environment
-from holosplat.experiments.surfaces import extract_surfaces
-from holosplat.fit.surfaces import fit_surfaces, oversampling
+from holosplat.experiments.surfaces import Extraction, extract_surfaces
+from holosplat.fit.surfaces import SurfaceFit, fit_surfaces, oversampling
 from holosplat.representations import SurfaceMesh
 
 CASES = ("main12", "main4", "noise12-2000", "shells8")
+VARIANTS: dict[str, dict[str, Any]] = {
+    "as they are": {},
+    "triangles of 1.5 px": {"spacing": 1.5},
+    "waves as coarse as the Gaussians'": {"coarser": 1},
+    "no smoothness": {"smoothness": 0.0},
+    "plain L1": {"rounding": 0.0},
+    "no membrane": {"stiffness": 0.0},
+    "40 steps": {"steps": 40},
+    "rate 0.4 px": {"rate": 0.4},
+}
+"""What is changed, one thing at a time, in options of the extraction or the fit."""
 
 
 def prepared(name: str, seed: int, runs: Path) -> tuple[hs.Scan, hs.Volume, hs.Reconstruction]:
@@ -68,6 +80,23 @@ def measured(name: str, seed: int, runs: Path) -> list[dict[str, Any]]:
     return [{"case": name, "seed": seed, **r} for r in rows]
 
 
+def variants(name: str, seed: int, runs: Path) -> list[dict[str, Any]]:
+    """One row for each of `VARIANTS`, judged with the same waves."""
+    scan, truth, result = prepared(name, seed, runs)
+    sampling = oversampling(scan.train())
+    rows = []
+    for called, changes in VARIANTS.items():
+        changed = {k: v for k, v in changes.items() if k not in ("spacing", "coarser")}
+        fit = replace(SurfaceFit(oversample=sampling - changes.get("coarser", 0)), **changed)
+        start = extract_surfaces(result.cloud, scan, Extraction(spacing=changes.get("spacing", 1.0)))
+        began = time.process_time()
+        found = fit_surfaces(scan, start, fit)
+        seconds = time.process_time() - began
+        scores = score_object(found, scan, truth, sampling)
+        rows.append({"case": name, "seed": seed, **row(called, scores, seconds)})
+    return rows
+
+
 def row(method: str, scores: Scores, seconds: float) -> dict[str, Any]:
     """The numbers of one method."""
     assert scores.train is not None
@@ -100,13 +129,15 @@ def main() -> None:
     parser.add_argument("--cases", nargs="+", default=list(CASES))
     parser.add_argument("--seeds", type=int, nargs="+", default=[101, 102])
     parser.add_argument("--runs", type=Path)
+    parser.add_argument("--variants", action="store_true", help="change one setting at a time")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     with tempfile.TemporaryDirectory() as scratch:
         runs = options.runs or Path(scratch)
-        rows = [r for name in options.cases for seed in options.seeds for r in measured(name, seed, runs)]
+        measure = variants if options.variants else measured
+        rows = [r for name in options.cases for seed in options.seeds for r in measure(name, seed, runs)]
     report = {"commit": commit(), **environment("cpu"), "rows": rows}
     print(json.dumps(report, indent=2) if options.json else table(report))
 
