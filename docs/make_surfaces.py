@@ -15,6 +15,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
+from PIL import Image
 
 import holosplat as hs
 from holosplat.report.style import SIGNED_MAP
@@ -44,7 +45,9 @@ def main(run: Path, truth: Path) -> None:
     end = 1e6 * limit
     bar = figure.colorbar(ScalarMappable(Normalize(-end, end), SIGNED_MAP), ax=axes, shrink=0.7, pad=0.01)
     bar.set_label("outside the true surface by / µm", fontsize=9)
-    figure.savefig(Path(__file__).parent / "images" / "surfaces.png", dpi=110)
+    target = Path(__file__).parent / "images" / "surfaces.png"
+    figure.savefig(target, dpi=110)
+    Image.open(target).convert("RGB").quantize(160).save(target, optimize=True)
 
 
 if __name__ == "__main__":
