@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import signal
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -109,6 +109,14 @@ def test_without_a_truth_there_are_frames_alone(shop, tmp_path):
     )
     assert "volume" not in done.out
     assert "not the scan" not in done.err
+
+
+def test_another_scan_is_remarked_upon(shop, tmp_path):
+    scan = read_scan(shop / "scan.nxs")
+    write_scan(tmp_path / "other.nxs", replace(scan, frames=scan.frames[::-1].copy()))
+    options = ["--scan", tmp_path / "other.nxs", "--steps", 0]
+    done = worked(holosplat("surface", shop / "run", "--out", tmp_path / "b", *options))
+    assert "not the scan that was reconstructed" in done.err
 
 
 def test_a_run_without_a_material_is_refused(shop, tmp_path):

@@ -69,7 +69,7 @@ def fit_surfaces(
     training frames' range and c the rounding, plus smoothness · Σ |L² x|² / (pixels of a frame), x the vertices in
     pixels and L x their distance from the mean of their neighbours. Steps are Adam's in the coordinates (1 + λΔ) x,
     one length for all vertices (Nicolet, Jacobson & Jakob 2021, "Large steps in inverse rendering of geometry",
-    eqs. 8 to 11). Errors: `InputError` without training frames, or where vertices are no longer numbers.
+    section 3). Errors: `InputError` without training frames, or where vertices are no longer numbers.
     """
     train = scan.train()
     require(np.ptp(train.frames) > 0, "all training frames are constant, so there is nothing to fit.")

@@ -10,7 +10,8 @@ from ..geometry import Grid
 from ..mesh import TriangleMesh, shell_labels
 
 SHRINK, SWELL = 0.5, -0.53
-"""Taubin's two factors: together they smooth and keep the volume (Taubin 1995, section 3.2)."""
+"""Taubin's two factors, which together smooth and keep the volume (1995, "A signal processing approach to fair surface
+design")."""
 
 
 def isosurface(

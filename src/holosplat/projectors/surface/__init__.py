@@ -5,8 +5,8 @@ here lines are integrated over pixels.
 
 Forward: the thickness along a line of constant row is integrated exactly over each pixel it crosses, and averaged
 over `lines` lines a pixel. Backward: for an image G of derivatives, `d/dv ∫ G(x, y) T(x, y) dx dy` is the integral
-of `G λ_v n` over the surface, λ_v the vertex' barycentric hat and n the outward normal (Reynolds' transport theorem;
-Delfour & Zolésio 2011, "Shapes and Geometries", chapter 9, theorem 4.2). It is finite where the surface is seen
+of `G λ_v n` over the surface, λ_v the vertex' barycentric hat and n the outward normal (Reynolds' transport theorem, or
+Hadamard's formula: Delfour & Zolésio 2011, "Shapes and Geometries", chapter 9). It is finite where the surface is seen
 edge-on, and the derivative of T is not. G is linear between pixels, so it is the derivative of the thickness
 averaged under a hat of one pixel's reach: both agree to second order in the pixel.
 
