@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from torch import Tensor
 
 from ..checks import require
 from ..geometry import Grid, Views
 from ..materials import DeltaBeta
 from ..mesh import TriangleMesh
 from ..projectors.mesh import mesh_line_integrals, voxelise_meshes
-from ..volume import Volume
+from ..volume import LineIntegrals, Volume
 
 
 @dataclass(frozen=True)
@@ -46,11 +45,15 @@ class MeshScene:
         """The scene itself: it does not move."""
         return self
 
-    def project(self, views: Views) -> tuple[Tensor, Tensor]:
-        """Line integrals (B, D) [V, H, W] in metres, float64, `2 × 2` rays a pixel."""
+    def project(self, views: Views) -> LineIntegrals:
+        """Line integrals of each material, or of δ and β where there are more than two; float64, 2 × 2 rays a pixel."""
         vertices, faces, values = self._soup()
-        delta, beta = mesh_line_integrals(vertices, faces, values, views)
-        return beta, delta
+        kinds = tuple(dict.fromkeys((m.delta, m.beta) for m in self.materials))
+        if len(kinds) > 2:
+            kinds = ((1.0, 0.0), (0.0, 1.0))
+        else:
+            values = np.stack([(values == np.array(kind)[:, None]).all(0) for kind in kinds]).astype(float)
+        return LineIntegrals(mesh_line_integrals(vertices, faces, values, views).swapaxes(0, 1), kinds)
 
     def voxelise(self, grid: Grid) -> Volume:
         """δ and β averaged over voxels (partial occupancy at surfaces)."""
