@@ -9,12 +9,12 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 
 from ..checks import InputError, positive, require
 from ..units import TIME_UNITS, unit_factor
+from .pvd import read_pvd
 from .vtk import mesh_files
 
 NUMBERED = re.compile(r"(?P<body>.*?)[_.\-]?(?P<number>\d+)")
@@ -49,7 +49,7 @@ def find_snapshots(
         time_unit is None or bool(collections), f"a time unit goes with a collection ({COLLECTION}), which has none."
     )
     if collections:
-        listed = _read_collection(collections[0])
+        listed = {step.time: list(step.files) for step in read_pvd(collections[0])}
         factor = unit_factor("time unit", time_unit or "s", TIME_UNITS)
         said = {key: key * factor for key in listed}
     else:
@@ -129,24 +129,3 @@ def _header_time(file: Path) -> float | None:
         return float(match[1]) * unit_factor(f"{file}: the time in its header", match[2], TIME_UNITS)
     except ValueError as error:
         raise error if isinstance(error, InputError) else InputError(f"{file}: {match[0]!r} is no time.") from None
-
-
-def _read_collection(path: Path) -> dict[float, list[Path]]:
-    require(path.is_file(), f"{path} must be a collection of mesh files, but there is no such file; check the path.")
-    try:
-        root = ElementTree.parse(path).getroot()
-        entries = [(float(e.get("timestep", "nan")), e.get("file")) for e in root.iter("DataSet")]
-    except (ElementTree.ParseError, ValueError, UnicodeError, OSError) as error:
-        raise InputError(f"{path} must be a ParaView collection (XML), but it is damaged: {error}.") from None
-    whole = all(np.isfinite(time) and file for time, file in entries)
-    require(
-        len(entries) > 0 and whole,
-        f"{path} must list DataSets, each with a timestep and a file, but it holds {len(entries)} DataSets, "
-        "or one lacks either.",
-    )
-    found: dict[float, list[Path]] = {}
-    for time, file in entries:
-        target = path.parent / str(file)
-        require(target.is_file(), f"{path} names {file}, but there is no such file beside it.")
-        found.setdefault(time, []).append(target)
-    return found
