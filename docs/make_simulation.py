@@ -28,9 +28,13 @@ MATERIAL = hs.HAEMOGLOBIN.delta_beta(20.0)
 CONTRAST = {"cmap": "gray", "vmin": 0.55, "vmax": 1.6}
 
 
-def scene(count: int, box: tuple[float, float, float]) -> hs.MeshScene:
-    """Red cells in a box [m]."""
-    return hs.MeshScene.of_one_material(hs.random_cells(count, box, SEED, 8e-6), MATERIAL)
+INNER = (slice(12, 60), slice(12, 60))
+"""What is shown of a frame and of a slice: around is nothing."""
+
+
+def scene(count: int, edge: float, seed: int = SEED) -> hs.MeshScene:
+    """Red cells in a cube of `edge` [m]."""
+    return hs.MeshScene.of_one_material(hs.random_cells(count, (edge,) * 3, seed, 8e-6), MATERIAL)
 
 
 def drifting(still: hs.MeshScene, seconds: float) -> MeshSeries:
@@ -54,8 +58,10 @@ def draw(axes: Axes, image: np.ndarray, title: str, **style: object) -> None:
 
 def time_series() -> None:
     """Two beams × four times of cells in a channel."""
-    shape, times = (60, 150), np.arange(4) * 100e-6
-    obj = drifting(scene(6, (50e-6, 20e-6, 20e-6)), 200e-6).delayed(150e-6)
+    shape, times = (48, 140), np.arange(4) * 100e-6
+    groups = [scene(3, 17e-6, SEED + n).moved(np.array([at, 0, 0])) for n, at in enumerate((-18e-6, 0, 18e-6))]
+    cells = hs.MeshScene.of_one_material([mesh for group in groups for mesh in group.meshes], MATERIAL)
+    obj = drifting(cells, 200e-6).delayed(150e-6)
     scan = hs.simulate(obj, exposures(Directions(geometry="xmpi_2beam"), shape).repeated(times))
     figure, panels = plt.subplots(2, 4, figsize=(9, 2.3), layout="constrained")
     for n, (frame, time) in enumerate(zip(scan.frames, scan.exposures.time)):
@@ -66,7 +72,7 @@ def time_series() -> None:
 
 def imperfections() -> None:
     """What motion and misalignment do to a hologram, and to a reconstruction that does not know of them."""
-    still = scene(5, (18e-6, 18e-6, 18e-6))
+    still = scene(5, 18e-6)
     told = exposures(Directions(views=16), SHAPE)
     grid = hs.Grid.of_views(told.views)
     truth = still.voxelise(grid)
@@ -88,10 +94,10 @@ def imperfections() -> None:
         result = hs.reconstruct(scan, hs.MaterialPrior.known(MATERIAL), hs.preset("fast"))
         scores = hs.evaluate(result, scan, truth).headline()
         print(f"| {name} | {scores['ssim']:.3f} | {scores['dice']:.3f} | {scores['relative_error_delta']:.3f} |")
-        draw(above, scan.frames[2], name, **CONTRAST)
-        delta = result.cloud.voxelise(grid).delta[middle] / MATERIAL.delta
+        draw(above, scan.frames[2][INNER], name, **CONTRAST)
+        delta, outline = (v.delta[middle][INNER] / MATERIAL.delta for v in (result.cloud.voxelise(grid), truth))
         draw(below, delta, f"δ of a slice, Dice {scores['dice']:.2f}", cmap="magma", vmin=0, vmax=1)
-        below.contour(truth.delta[middle] / MATERIAL.delta, [0.5], colors="w", linewidths=0.6)
+        below.contour(outline, [0.5], colors="w", linewidths=0.6)
     figure.savefig(IMAGES / "simulation_imperfections.png", dpi=110)
 
 
