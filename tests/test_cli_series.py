@@ -115,6 +115,8 @@ def test_one_time_of_a_series_is_reconstructed_and_judged(folder, tmp_path, monk
         worked(holosplat("evaluate", tmp_path / "run", "--truth", tmp_path / "t_t0002.h5", "--json")).out
     )
     assert scored["dice"] > 0.5
+    worked(holosplat("render", tmp_path / "run", "--scan", tmp_path / "s.nxs", "--out", tmp_path / "p.nxs"))
+    assert len(read_scan(tmp_path / "p.nxs")) == 1  # the held-out view of that time
     every = holosplat("reconstruct", tmp_path / "s.nxs", "--out", tmp_path / "all", *known, "--time-frame", "all")
     worked(every)
     mixed = json.loads(

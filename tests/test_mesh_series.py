@@ -191,6 +191,9 @@ def test_snapshots_that_cannot_be_are_refused(tmp_path):
     written(tmp_path, bodies=("b",), header="t=1%gms")
     with pytest.raises(InputError, match="must be of one time"):
         find_snapshots(files)
+    written(tmp_path, header="t=-%gus")
+    with pytest.raises(InputError, match=r"a_001\.vtk, at -4e-06 s, is not after a_000\.vtk, at -?0 s"):
+        find_snapshots(files)
 
 
 def test_times_of_frames():

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -64,7 +65,14 @@ def find_snapshots(
         times = [float(step * count) for count in counts]
     else:
         times = [_time(list(bodies.values()), said.get(key)) for key, bodies in zip(keys, ordered)]
-    return [Snapshot(time, tuple(bodies.values())) for time, bodies in zip(times, ordered)]
+    found = [Snapshot(time, tuple(bodies.values())) for time, bodies in zip(times, ordered)]
+    for before, after in pairwise(found):
+        require(
+            after.time > before.time,
+            f"snapshots must follow one another in time, but {after.files[0].name}, at {after.time:g} s, is not after "
+            f"{before.files[0].name}, at {before.time:g} s; correct the files, or give --snapshot-interval.",
+        )
+    return found
 
 
 def _by_number(files: list[Path]) -> dict[float, list[Path]]:
