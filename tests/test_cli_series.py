@@ -187,6 +187,13 @@ def test_bad_series_are_refused_and_leave_nothing(folder, tmp_path, monkeypatch,
     assert list(tmp_path.iterdir()) == []
 
 
+def test_snapshots_taken_for_one_scene_are_a_warning(folder, tmp_path):
+    for source, count in ((folder, 4), (folder / "b0_1.vtk", 1)):
+        outcome = worked(holosplat("simulate", source, *BEAM, "--views", 1, "--out", tmp_path / "s.nxs"))
+        assert (f"warning: the files seem to be {count} snapshots" in outcome.err) == (count > 1)
+        assert ("--frame-rate" in outcome.err) == (count > 1)
+
+
 def test_a_collection_needs_a_frame_rate(folder, tmp_path):
     outcome = holosplat("simulate", folder / "all.pvd", *BEAM, "--views", 2, "--out", tmp_path / "s.nxs")
     refused(outcome, "all.pvd", "--frame-rate")

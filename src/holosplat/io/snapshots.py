@@ -75,6 +75,20 @@ def find_snapshots(
     return found
 
 
+def seeming_snapshots(paths: Sequence[Path]) -> int:
+    """How many snapshots mesh files seem to be of, by their names alone: two bodies or more, each with all the numbers.
+
+    1 where they do not.
+    """
+    numbers: dict[str, set[int]] = {}
+    for file in mesh_files(paths):
+        if (match := NUMBERED.fullmatch(file.stem)) is None:
+            return 1
+        numbers.setdefault(match["body"], set()).add(int(match["number"]))
+    first, *others = numbers.values()
+    return len(first) if others and all(other == first for other in others) else 1
+
+
 def _by_number(files: list[Path]) -> dict[float, list[Path]]:
     found: dict[float, list[Path]] = {}
     for file in files:
