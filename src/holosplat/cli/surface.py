@@ -19,11 +19,11 @@ from ..experiments.surfaces import SurfaceSettings, refine_surfaces
 from ..fit.surfaces import oversampling
 from ..io.folder import atomic_folder, require_new
 from ..io.json import write_json
-from ..io.nxtomo import read_scan
 from ..io.volumes import read_volume
 from ..io.vtk import write_mesh
 from ..representations import SurfaceMesh
 from .progress import ProgressBar
+from .scans import scan_for
 
 LENGTH_UNIT = "um"
 
@@ -52,7 +52,7 @@ def surface(
         f"surfaces need one material whose δ and β are known, but {run} was reconstructed without; "
         "reconstruct with --material or --delta-beta.",
     )
-    measured, volume = read_scan(scan or folder.source_scan()), read_volume(truth) if truth else None
+    measured, volume = scan_for(folder, scan or folder.source_scan()), read_volume(truth) if truth else None
     if scan_hash(measured) != folder.read_config().get("scan_hash"):
         _say("this is not the scan that was reconstructed: its held-out frames may have been fitted")
     before = score(result, measured, volume)
