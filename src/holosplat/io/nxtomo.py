@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
@@ -10,6 +13,7 @@ import numpy as np
 from .. import __version__
 from ..checks import InputError, finite, in_range, require, shaped
 from ..geometry import Views, rotation_y
+from ..preprocess.flat_field import mean_frame, relative_intensity, unlit
 from ..scan import DISTANCE_RANGE_M, ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan
 from ..units import ANGLE_UNITS, ENERGY_UNITS, LENGTH_UNITS, TIME_UNITS
 from .atomic import atomic_path
@@ -17,6 +21,8 @@ from .hdf5 import Fields, attribute_text, open_hdf5
 
 DATA = "instrument/detector/data"
 IMAGE_KEY = "instrument/detector/image_key"
+MASK = "instrument/detector/pixel_mask"
+FLIPS = ("instrument/detector/y_flipped", "instrument/detector/x_flipped")
 PIXEL_SIZES = ("instrument/detector/x_pixel_size", "instrument/detector/y_pixel_size")
 DISTANCES = ("sample/propagation_distance", "instrument/detector/distance")
 ENERGIES = ("instrument/beam/incident_energy", "beam/incident_energy")
@@ -34,48 +40,122 @@ MOST_RADIANS = 4 * np.pi
 """Angles without a unit are radians (the SI unit); beyond two turns they are degrees in all likelihood."""
 
 
-def read_scan(path: str | Path) -> Scan:
-    """The projections of an NXtomo file, flat-field corrected, and how they were taken.
+@dataclass(frozen=True)
+class ScanFile:
+    """An NXtomo file that is open: how its n projections were taken, and its N frames of all kinds, read one by one.
 
-    Frames marked flat and dark correct the others: (frame - mean dark) / (mean flat - mean dark); frames
-    marked invalid are dropped. Per-frame datasets may count all frames or the projections only. `InputError`
-    names the file, the dataset, what it must be and what it is.
+    kinds: [N], PROJECTION, FLAT, DARK or INVALID; exposures, is_test: of the projections; flips: whether the file's
+    frames are upside down, and whether they are mirrored left to right.
+    """
+
+    fields: Fields
+    kinds: np.ndarray
+    exposures: Exposures
+    is_test: np.ndarray
+    flips: tuple[bool, bool]
+
+    def numbers(self, kind: int) -> np.ndarray:
+        """Which of the N frames are of `kind`."""
+        return np.flatnonzero(self.kinds == kind)
+
+    def frame(self, number: int) -> np.ndarray:
+        """Frame `number` [H, W] as float64, turned upright."""
+        return self.rows(number, slice(0, self.exposures.views.shape[0]))
+
+    def rows(self, number: int, rows: slice) -> np.ndarray:
+        """The rows `rows` (from start to stop) of frame `number`, float64, turned upright."""
+        upside_down, mirrored = self.flips
+        height = self.exposures.views.shape[0]
+        stored = slice(height - rows.stop, height - rows.start) if upside_down else rows
+        found = self.fields.dataset(DATA)[number, stored].astype(np.float64)
+        return found[:: -1 if upside_down else 1, :: -1 if mirrored else 1]
+
+    def mean(self, kind: int) -> np.ndarray:
+        """The mean [H, W] of the frames of `kind`; zeros where there are none."""
+        return mean_frame((self.frame(n) for n in self.numbers(kind)), self.exposures.views.shape)
+
+    def mask(self) -> np.ndarray:
+        """[H, W] bool: the pixels that the file marks as defective (`pixel_mask` of NXdetector), turned upright."""
+        shape = self.exposures.views.shape
+        if not self.fields.find(MASK):
+            return np.zeros(shape, dtype=bool)
+        marked = shaped(self.fields.label(MASK), self.fields.numbers(MASK), shape) != 0
+        return marked[:: -1 if self.flips[0] else 1, :: -1 if self.flips[1] else 1]
+
+    def provenance(self) -> dict[str, str]:
+        """What made the scan."""
+        return _read_provenance(self.fields)
+
+
+@contextmanager
+def open_scan(path: str | Path) -> Iterator[ScanFile]:
+    """An NXtomo file, checked but for its frames.
+
+    Per-frame datasets may count all frames or the projections only. `InputError` names the file, the dataset, what it
+    must be and what it is.
     """
     with open_hdf5(path) as file:
         fields = Fields(Path(path), _entry(file, path))
         kinds = _frame_kinds(fields)
-        frames = _corrected_frames(fields, kinds)
-        views = _views(fields, kinds, frames.shape[1:])
+        views = _views(fields, kinds, fields.dataset(DATA).shape[1:])
         psf_sigma = _optional(fields, kinds, PSF_SIGMA, PIXEL_UNITS, "px")
         time = _optional(fields, kinds, TIME, TIME_UNITS, "s")
         energy, distance = _energy(fields, kinds), _distances(fields, kinds)
         is_test = _split(fields, kinds)
         require(bool((psf_sigma >= 0).all()), f"{fields.label(PSF_SIGMA)} must not be negative; correct it.")
         exposures = Exposures(views, energy, distance, psf_sigma, time)
-        return Scan(frames, exposures, is_test, _read_provenance(fields))
+        flips = [bool(fields.numbers(name).any()) if fields.find(name) else False for name in FLIPS]
+        yield ScanFile(fields, kinds, exposures, is_test, (flips[0], flips[1]))
+
+
+def read_scan(path: str | Path) -> Scan:
+    """The projections of an NXtomo file, flat-field corrected, and how they were taken.
+
+    Frames marked flat and dark correct the others: (frame - mean dark) / (mean flat - mean dark); frames
+    marked invalid are dropped. `InputError` as of `open_scan`.
+    """
+    with open_scan(path) as file:
+        return Scan(_corrected_frames(file), file.exposures, file.is_test, file.provenance())
 
 
 def write_scan(path: str | Path, scan: Scan) -> None:
-    """Write `scan` as NXtomo (docs/conventions.md), replacing `path` only once all is written.
+    """Write `scan` as NXtomo (docs/conventions.md), replacing `path` only once all is written."""
+    with scan_writer(path, scan.exposures, scan.is_test, scan.provenance) as data:
+        data[...] = scan.frames
 
-    `view_rotation` holds the poses exactly; `rotation_angle`, which other programs read, holds the nearest
-    rotation about y. Provenance goes to /entry/process/provenance, one text a dataset.
+
+@contextmanager
+def scan_writer(
+    path: str | Path,
+    exposures: Exposures,
+    is_test: np.ndarray,
+    provenance: dict[str, str],
+    kinds: np.ndarray | None = None,
+    dtype: type = np.float32,
+) -> Iterator[h5py.Dataset]:
+    """A new NXtomo file, whose dataset of frames [N, H, W] of `dtype` is filled in the block, one by one if need be.
+
+    exposures, is_test, kinds: of all N frames (kinds: default all projections). The file replaces `path` only once the
+    block ends well. `view_rotation` holds the poses exactly; `rotation_angle`, which other programs read, holds the
+    nearest rotation about y. Provenance goes to /entry/process/provenance, one text a dataset.
     """
-    for key, value in scan.provenance.items():
+    for key, value in provenance.items():
         good = isinstance(key, str) and isinstance(value, str) and key and "\0" not in key + value
         require(bool(good), f"provenance must map names to texts, but {key!r} maps to {value!r}; correct it.")
+    kinds = np.full(len(exposures), PROJECTION) if kinds is None else kinds
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         file.attrs.update(NX_class="NXroot", default="entry", creator=f"holosplat {__version__}")
         entry = _group(file, "entry", "NXentry", default="data")
         entry["definition"] = "NXtomo"
-        entry[SPLIT] = scan.is_test.astype(np.uint8)
-        _write_instrument(_group(entry, "instrument", "NXinstrument"), scan)
-        _write_sample(_group(entry, "sample", "NXsample"), scan)
-        _write_process(_group(entry, "process", "NXprocess"), scan.provenance)
+        entry[SPLIT] = is_test.astype(np.uint8)
+        data = _write_instrument(_group(entry, "instrument", "NXinstrument"), exposures, kinds, dtype)
+        _write_sample(_group(entry, "sample", "NXsample"), exposures)
+        _write_process(_group(entry, "process", "NXprocess"), provenance)
         plot = _group(entry, "data", "NXdata", signal="data", axes=["rotation_angle", ".", "."])
         for source in (DATA, IMAGE_KEY, ANGLE):
             entry[source].attrs["target"] = f"/entry/{source}"
             plot[source.rsplit("/", 1)[1]] = entry[source]
+        yield data
 
 
 def _entry(file: h5py.File, path: str | Path) -> h5py.Group:
@@ -112,35 +192,25 @@ def _frame_kinds(fields: Fields) -> np.ndarray:
     return kinds.astype(int)
 
 
-def _corrected_frames(fields: Fields, kinds: np.ndarray) -> np.ndarray:
+def _corrected_frames(file: ScanFile) -> np.ndarray:
     """The projections [n, H, W] float32, relative to the flat field where the file has one."""
-    data = fields.dataset(DATA)
-    flat, dark = _mean_frame(data, kinds == FLAT), _mean_frame(data, kinds == DARK)
-    if flat is None and dark is not None:
-        raise InputError(f"{fields.label(IMAGE_KEY)} must mark flats (1) beside the dark ones (2), but it marks none.")
-    offset = np.zeros(data.shape[1:]) if dark is None else dark
-    gain = np.ones(data.shape[1:]) if flat is None else flat - offset
-    dead = int((~(gain > 0)).sum())
+    label, shape = file.fields.label, file.exposures.views.shape
+    flats, darks = file.numbers(FLAT), file.numbers(DARK)
+    if len(darks) and not len(flats):
+        raise InputError(f"{label(IMAGE_KEY)} must mark flats (1) beside the dark ones (2), but it marks none.")
+    dark = file.mean(DARK)
+    light = file.mean(FLAT) - dark if len(flats) else np.ones(shape)
+    bad = int(unlit(light).sum())
     require(
-        dead == 0,
-        f"{fields.label(DATA)} must have flat frames brighter than dark ones everywhere, but in {dead} of "
-        f"{gain.size} pixels they are not; repair these pixels first.",
+        bad == 0,
+        f"{label(DATA)} must have flat frames brighter than dark ones everywhere, but in {bad} of {light.size} pixels "
+        "they are not; `holosplat correct` repairs such pixels.",
     )
-    selected = np.flatnonzero(kinds == PROJECTION)
-    frames = np.empty((len(selected), *data.shape[1:]), dtype=np.float32)
+    selected = file.numbers(PROJECTION)
+    frames = np.empty((len(selected), *shape), dtype=np.float32)
     for i, n in enumerate(selected):  # one by one: the raw file may be larger than memory
-        frames[i] = data[n] if flat is None else (data[n] - offset) / gain
-    return finite(fields.label(DATA), frames)
-
-
-def _mean_frame(data: h5py.Dataset, chosen: np.ndarray) -> np.ndarray | None:
-    numbers = np.flatnonzero(chosen)
-    if len(numbers) == 0:
-        return None
-    total = np.zeros(data.shape[1:])
-    for n in numbers:
-        total += data[n]
-    return total / len(numbers)
+        frames[i] = relative_intensity(file.frame(n), dark, light) if len(flats) else file.frame(n)
+    return finite(label(DATA), frames)
 
 
 def _per_frame(fields: Fields, kinds: np.ndarray, name: str, tail: tuple[int, ...] = ()) -> np.ndarray:
@@ -263,30 +333,31 @@ def _put(group: h5py.Group, name: str, value: np.ndarray | float, units: str) ->
     group[name].attrs["units"] = units
 
 
-def _write_instrument(instrument: h5py.Group, scan: Scan) -> None:
-    exposures = scan.exposures
+def _write_instrument(instrument: h5py.Group, exposures: Exposures, kinds: np.ndarray, dtype: type) -> h5py.Dataset:
+    """The beam and the detector; returns the dataset of its frames, still empty."""
     source = _group(instrument, "source", "NXsource")
     source["probe"] = "x-ray"
     _put(_group(instrument, "beam", "NXbeam"), "incident_energy", float(exposures.energy_kev), "keV")
     detector = _group(instrument, "detector", "NXdetector")
-    detector["data"] = scan.frames
-    detector["image_key"] = np.full(len(scan), PROJECTION, dtype=np.int32)
+    data = detector.create_dataset("data", (len(exposures), *exposures.views.shape), dtype)
+    detector["image_key"] = kinds.astype(np.int32)
     for axis in "xy":
         _put(detector, f"{axis}_pixel_size", exposures.views.pixel_size, "m")
     same = bool((exposures.distance == exposures.distance[0]).all())  # a scalar is what most programs expect
     _put(detector, "distance", exposures.distance[0] if same else exposures.distance, "m")
     _put(detector, "shift", exposures.views.shifts, "m")
     _put(detector, "psf_sigma", exposures.psf_sigma_px, "px")
+    return data
 
 
-def _write_sample(sample: h5py.Group, scan: Scan) -> None:
+def _write_sample(sample: h5py.Group, exposures: Exposures) -> None:
     sample["name"] = "sample"
-    rotations = scan.views.rotations
+    rotations = exposures.views.rotations
     sample["view_rotation"] = rotations
     # R(θ) is nearest to R where tr(R(θ)ᵀ R) = cos θ (R00 + R22) + sin θ (R02 - R20) is largest.
     theta = np.arctan2(rotations[:, 0, 2] - rotations[:, 2, 0], rotations[:, 0, 0] + rotations[:, 2, 2])
     _put(sample, "rotation_angle", np.rad2deg(theta), "deg")
-    _put(sample, "time", scan.exposures.time, "s")
+    _put(sample, "time", exposures.time, "s")
 
 
 def _write_process(process: h5py.Group, provenance: dict[str, str]) -> None:
