@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,101 +11,24 @@ import h5py
 import numpy as np
 
 from .. import __version__
-from ..checks import InputError, finite, in_range, require, shaped
-from ..geometry import Views, rotation_y
-from ..preprocess.flat_field import mean_frame, relative_intensity, unlit
-from ..scan import DISTANCE_RANGE_M, ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan
-from ..units import ANGLE_UNITS, ENERGY_UNITS, LENGTH_UNITS, TIME_UNITS
+from ..checks import InputError, finite, require, shaped
+from ..preprocess.flat_field import relative_intensity, unlit
+from ..scan import Exposures, Scan
 from .atomic import atomic_path
-from .hdf5 import Fields, attribute_text, open_hdf5
-
-DATA = "instrument/detector/data"
-IMAGE_KEY = "instrument/detector/image_key"
-MASK = "instrument/detector/pixel_mask"
-FLIPS = ("instrument/detector/y_flipped", "instrument/detector/x_flipped")
-PIXEL_SIZES = ("instrument/detector/x_pixel_size", "instrument/detector/y_pixel_size")
-DISTANCES = ("sample/propagation_distance", "instrument/detector/distance")
-ENERGIES = ("instrument/beam/incident_energy", "beam/incident_energy")
-ANGLE = "sample/rotation_angle"
-ROTATION = "sample/view_rotation"
-SHIFT = "instrument/detector/shift"
-TIME = "sample/time"
-PSF_SIGMA = "instrument/detector/psf_sigma"
-SPLIT = "split"
-PROVENANCE = "process/provenance"
-
-PROJECTION, FLAT, DARK, INVALID = range(4)
-PIXEL_UNITS = {"px": 1.0, "pixel": 1.0, "pixels": 1.0, "": 1.0}
-MOST_RADIANS = 4 * np.pi
-"""Angles without a unit are radians (the SI unit); beyond two turns they are degrees in all likelihood."""
+from .scan_file import ANGLE, DARK, DATA, FLAT, FLIPS, IMAGE_KEY, MASK, PROJECTION, SPLIT, ScanFile, open_scan
 
 
 @dataclass(frozen=True)
-class ScanFile:
-    """An NXtomo file that is open: how its n projections were taken, and its N frames of all kinds, read one by one.
+class RawLayout:
+    """What a file of raw counts says beside a scan's exposures.
 
-    kinds: [N], PROJECTION, FLAT, DARK or INVALID; exposures, is_test: of the projections; flips: whether the file's
-    frames are upside down, and whether they are mirrored left to right.
+    kinds: [N] image keys of all frames (0 projection, 1 flat, 2 dark); mask: [H, W] `pixel_mask` of NXdetector, 0 for
+    good pixels, as stored; flips: whether the stored frames are upside down, and mirrored left to right.
     """
 
-    fields: Fields
     kinds: np.ndarray
-    exposures: Exposures
-    is_test: np.ndarray
-    flips: tuple[bool, bool]
-
-    def numbers(self, kind: int) -> np.ndarray:
-        """Which of the N frames are of `kind`."""
-        return np.flatnonzero(self.kinds == kind)
-
-    def frame(self, number: int) -> np.ndarray:
-        """Frame `number` [H, W] as float64, turned upright."""
-        return self.rows(number, slice(0, self.exposures.views.shape[0]))
-
-    def rows(self, number: int, rows: slice) -> np.ndarray:
-        """The rows `rows` (from start to stop) of frame `number`, float64, turned upright."""
-        upside_down, mirrored = self.flips
-        height = self.exposures.views.shape[0]
-        stored = slice(height - rows.stop, height - rows.start) if upside_down else rows
-        found = self.fields.dataset(DATA)[number, stored].astype(np.float64)
-        return found[:: -1 if upside_down else 1, :: -1 if mirrored else 1]
-
-    def mean(self, kind: int) -> np.ndarray:
-        """The mean [H, W] of the frames of `kind`; zeros where there are none."""
-        return mean_frame((self.frame(n) for n in self.numbers(kind)), self.exposures.views.shape)
-
-    def mask(self) -> np.ndarray:
-        """[H, W] bool: the pixels that the file marks as defective (`pixel_mask` of NXdetector), turned upright."""
-        shape = self.exposures.views.shape
-        if not self.fields.find(MASK):
-            return np.zeros(shape, dtype=bool)
-        marked = shaped(self.fields.label(MASK), self.fields.numbers(MASK), shape) != 0
-        return marked[:: -1 if self.flips[0] else 1, :: -1 if self.flips[1] else 1]
-
-    def provenance(self) -> dict[str, str]:
-        """What made the scan."""
-        return _read_provenance(self.fields)
-
-
-@contextmanager
-def open_scan(path: str | Path) -> Iterator[ScanFile]:
-    """An NXtomo file, checked but for its frames.
-
-    Per-frame datasets may count all frames or the projections only. `InputError` names the file, the dataset, what it
-    must be and what it is.
-    """
-    with open_hdf5(path) as file:
-        fields = Fields(Path(path), _entry(file, path))
-        kinds = _frame_kinds(fields)
-        views = _views(fields, kinds, fields.dataset(DATA).shape[1:])
-        psf_sigma = _optional(fields, kinds, PSF_SIGMA, PIXEL_UNITS, "px")
-        time = _optional(fields, kinds, TIME, TIME_UNITS, "s")
-        energy, distance = _energy(fields, kinds), _distances(fields, kinds)
-        is_test = _split(fields, kinds)
-        require(bool((psf_sigma >= 0).all()), f"{fields.label(PSF_SIGMA)} must not be negative; correct it.")
-        exposures = Exposures(views, energy, distance, psf_sigma, time)
-        flips = [bool(fields.numbers(name).any()) if fields.find(name) else False for name in FLIPS]
-        yield ScanFile(fields, kinds, exposures, is_test, (flips[0], flips[1]))
+    mask: np.ndarray
+    flips: tuple[bool, bool] = (False, False)
 
 
 def read_scan(path: str | Path) -> Scan:
@@ -116,80 +39,6 @@ def read_scan(path: str | Path) -> Scan:
     """
     with open_scan(path) as file:
         return Scan(_corrected_frames(file), file.exposures, file.is_test, file.provenance())
-
-
-def write_scan(path: str | Path, scan: Scan) -> None:
-    """Write `scan` as NXtomo (docs/conventions.md), replacing `path` only once all is written."""
-    with scan_writer(path, scan.exposures, scan.is_test, scan.provenance) as data:
-        data[...] = scan.frames
-
-
-@contextmanager
-def scan_writer(
-    path: str | Path,
-    exposures: Exposures,
-    is_test: np.ndarray,
-    provenance: dict[str, str],
-    kinds: np.ndarray | None = None,
-    dtype: type = np.float32,
-) -> Iterator[h5py.Dataset]:
-    """A new NXtomo file, whose dataset of frames [N, H, W] of `dtype` is filled in the block, one by one if need be.
-
-    exposures, is_test, kinds: of all N frames (kinds: default all projections). The file replaces `path` only once the
-    block ends well. `view_rotation` holds the poses exactly; `rotation_angle`, which other programs read, holds the
-    nearest rotation about y. Provenance goes to /entry/process/provenance, one text a dataset.
-    """
-    for key, value in provenance.items():
-        good = isinstance(key, str) and isinstance(value, str) and key and "\0" not in key + value
-        require(bool(good), f"provenance must map names to texts, but {key!r} maps to {value!r}; correct it.")
-    kinds = np.full(len(exposures), PROJECTION) if kinds is None else kinds
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
-        file.attrs.update(NX_class="NXroot", default="entry", creator=f"holosplat {__version__}")
-        entry = _group(file, "entry", "NXentry", default="data")
-        entry["definition"] = "NXtomo"
-        entry[SPLIT] = is_test.astype(np.uint8)
-        data = _write_instrument(_group(entry, "instrument", "NXinstrument"), exposures, kinds, dtype)
-        _write_sample(_group(entry, "sample", "NXsample"), exposures)
-        _write_process(_group(entry, "process", "NXprocess"), provenance)
-        plot = _group(entry, "data", "NXdata", signal="data", axes=["rotation_angle", ".", "."])
-        for source in (DATA, IMAGE_KEY, ANGLE):
-            entry[source].attrs["target"] = f"/entry/{source}"
-            plot[source.rsplit("/", 1)[1]] = entry[source]
-        yield data
-
-
-def _entry(file: h5py.File, path: str | Path) -> h5py.Group:
-    """/entry, or else the file's default or only NXentry group."""
-    groups = {name: item for name, item in file.items() if isinstance(item, h5py.Group)}
-    entries = [g for g in groups.values() if attribute_text(g.attrs.get("NX_class")) == "NXentry"]
-    for name in ("entry", attribute_text(file.attrs.get("default"))):
-        if name in groups:
-            return groups[name]
-    if len(entries) != 1:
-        raise InputError(
-            f"{path} must hold the group /entry (NeXus NXtomo), but it holds {', '.join(file) or 'nothing'}."
-        )
-    return entries[0]
-
-
-def _frame_kinds(fields: Fields) -> np.ndarray:
-    """What each of all N frames is (the image key), [N] int; checks the frames' shape on the way."""
-    data = fields.dataset(fields.need(DATA))
-    if data.ndim != 3 or 0 in data.shape:
-        raise InputError(f"{fields.label(DATA)} must have the shape [N, H, W], but it has {data.shape}.")
-    if not fields.find(IMAGE_KEY):
-        return np.full(len(data), PROJECTION)
-    kinds = shaped(fields.label(IMAGE_KEY), fields.numbers(IMAGE_KEY), (len(data),))
-    known = np.isin(kinds, (PROJECTION, FLAT, DARK, INVALID))
-    if not known.all():
-        wrong = kinds[~known][0]
-        raise InputError(
-            f"{fields.label(IMAGE_KEY)} must hold 0 (projection), 1 (flat), 2 (dark) or 3 (invalid), "
-            f"but it holds {wrong:g}."
-        )
-    if not (kinds == PROJECTION).any():
-        raise InputError(f"{fields.label(IMAGE_KEY)} must mark at least one projection (0), but it marks none.")
-    return kinds.astype(int)
 
 
 def _corrected_frames(file: ScanFile) -> np.ndarray:
@@ -213,112 +62,69 @@ def _corrected_frames(file: ScanFile) -> np.ndarray:
     return finite(label(DATA), frames)
 
 
-def _per_frame(fields: Fields, kinds: np.ndarray, name: str, tail: tuple[int, ...] = ()) -> np.ndarray:
-    """The dataset `name` for the projections, [n, *tail] float64, all finite; one value serves all."""
-    values = fields.numbers(name)
-    projections = np.flatnonzero(kinds == PROJECTION)
-    if tail == () and values.size == 1:
-        values = np.full(len(projections), values.reshape(-1)[0])
-    elif values.shape == (len(kinds), *tail):
-        values = values[projections]
-    elif values.shape != (len(projections), *tail):
-        one = "one value or " if tail == () else ""
-        shape = ", ".join(str(n) for n in (len(kinds), *tail))
-        raise InputError(
-            f"{fields.label(name)} must hold {one}an entry for each frame, [{shape}], but its shape is "
-            f"{list(values.shape)}."
-        )
-    return finite(fields.label(name), values)
+def write_scan(path: str | Path, scan: Scan) -> None:
+    """Write `scan` as NXtomo (docs/conventions.md), replacing `path` only once all is written."""
+    with scan_writer(path, scan.exposures, scan.is_test, scan.provenance) as add:
+        for frame in scan.frames:
+            add(frame)
 
 
-def _optional(
-    fields: Fields,
-    kinds: np.ndarray,
-    name: str,
-    table: dict[str, float],
-    unit: str,
-    tail: tuple[int, ...] = (),
-) -> np.ndarray:
-    """The dataset `name` for the projections in the base unit of `table`; zeros [n, *tail] if absent."""
-    if not fields.find(name):
-        return np.zeros((int((kinds == PROJECTION).sum()), *tail))
-    return _per_frame(fields, kinds, name, tail) * fields.unit(name, table, unit)
+@contextmanager
+def scan_writer(
+    path: str | Path,
+    exposures: Exposures,
+    is_test: np.ndarray,
+    provenance: dict[str, str],
+    raw: RawLayout | None = None,
+) -> Iterator[Callable[[np.ndarray], None]]:
+    """A scan file that grows frame by frame: yields a function that takes the next frame, [H, W] relative intensity.
+
+    With `raw` the file holds counts (uint16), and exposures and is_test are those of all its frames.
+
+    The file appears at `path` when the block ends and all frames are there, and not at all when the block raises
+    (Ctrl-C too): no frame is kept in memory. is_test: [N] bool. `view_rotation` holds the poses exactly;
+    `rotation_angle`, which other programs read, the nearest rotation about y. Provenance goes to
+    /entry/process/provenance, one text a dataset. Errors: `InputError` for frames of another shape, not finite,
+    or not as many as there are exposures, and where the file cannot be written.
+    """
+    for key, value in provenance.items():
+        good = isinstance(key, str) and isinstance(value, str) and key and "\0" not in key + value
+        require(bool(good), f"provenance must map names to texts, but {key!r} maps to {value!r}; correct it.")
+    is_test = shaped("split", np.asarray(is_test, dtype=bool), (len(exposures),))
+    count = 0
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        data = _write_entry(file, exposures, is_test, provenance, raw)
+
+        def add(frame: np.ndarray) -> None:
+            nonlocal count
+            require(count < len(data), f"a scan of {len(data)} exposures takes as many frames, but there are more.")
+            data[count] = finite("frames", shaped("frame", np.asarray(frame), exposures.views.shape))
+            count += 1
+
+        yield add
+        require(count == len(data), f"a scan of {len(data)} exposures needs as many frames, but there are {count}.")
 
 
-def _views(fields: Fields, kinds: np.ndarray, shape: tuple[int, int]) -> Views:
-    shifts = _optional(fields, kinds, SHIFT, LENGTH_UNITS, "m", (2,))
-    pixel_size = _pixel_size(fields)
-    if not fields.find(ROTATION):
-        return Views(_rotations_of_angles(fields, kinds), shifts, shape, pixel_size)
-    rotations = _per_frame(fields, kinds, ROTATION, (3, 3))
-    try:
-        return Views(rotations, shifts, shape, pixel_size)
-    except InputError as error:
-        raise InputError(f"{fields.label(ROTATION)}: {error}") from None
-
-
-def _rotations_of_angles(fields: Fields, kinds: np.ndarray) -> np.ndarray:
-    angles = _per_frame(fields, kinds, fields.need(ANGLE))
-    if "units" not in fields.dataset(ANGLE).attrs and np.abs(angles).max() > MOST_RADIANS:
-        raise InputError(
-            f"{fields.label(ANGLE)} must carry @units, without which it is in radians, but it reaches "
-            f"{np.abs(angles).max():g}; set @units to 'deg' if these are degrees."
-        )
-    return rotation_y(np.rad2deg(angles * fields.unit(ANGLE, ANGLE_UNITS, "rad")))
-
-
-def _pixel_size(fields: Fields) -> float:
-    sizes = []
-    for name in PIXEL_SIZES:
-        if fields.find(name):
-            number = shaped(fields.label(name), fields.numbers(name).reshape(-1), (1,))[0]
-            size = number * fields.unit(name, LENGTH_UNITS, "m")
-            sizes.append(in_range(fields.label(name), size, *PIXEL_RANGE_M, unit="metres"))
-    if not sizes:
-        fields.need(PIXEL_SIZES[0])
-    if not np.isclose(sizes[0], sizes[-1], rtol=1e-6, atol=0):
-        raise InputError(
-            f"{fields.label(PIXEL_SIZES[0])} and y_pixel_size must be equal (square pixels), but they are "
-            f"{sizes[0]:g} m and {sizes[1]:g} m; resample the frames first."
-        )
-    return sizes[0]
-
-
-def _energy(fields: Fields, kinds: np.ndarray) -> float:
-    name = fields.need(*ENERGIES)
-    energies = _per_frame(fields, kinds, name) * fields.unit(name, ENERGY_UNITS, "keV")
-    if not np.allclose(energies, energies[0], rtol=1e-6, atol=0):
-        raise InputError(
-            f"{fields.label(name)} must be the same for all frames, but it goes from {energies.min():g} to "
-            f"{energies.max():g} keV; split the scan by energy."
-        )
-    return in_range(fields.label(name), float(energies[0]), *ENERGY_RANGE_KEV, unit="keV")
-
-
-def _distances(fields: Fields, kinds: np.ndarray) -> np.ndarray:
-    name = fields.need(*DISTANCES)
-    distances = _per_frame(fields, kinds, name) * fields.unit(name, LENGTH_UNITS, "m")
-    for distance in (distances.min(), distances.max()):
-        in_range(fields.label(name), float(distance), *DISTANCE_RANGE_M, unit="metres")
-    return distances
-
-
-def _split(fields: Fields, kinds: np.ndarray) -> np.ndarray:
-    split = _optional(fields, kinds, SPLIT, PIXEL_UNITS, "")
-    wrong = split[~np.isin(split, (0, 1))]
-    require(len(wrong) == 0, f"{fields.label(SPLIT)} must hold 0 (train) or 1 (test), but it holds {wrong[:1]}.")
-    return split == 1
-
-
-def _read_provenance(fields: Fields) -> dict[str, str]:
-    group = fields.group.get(PROVENANCE)
-    if not isinstance(group, h5py.Group):
-        return {}
-    texts = {}
-    for name, item in group.items():
-        if isinstance(item, h5py.Dataset) and h5py.check_string_dtype(item.dtype) and item.shape == ():
-            texts[_unescaped(name)] = item.asstr(errors="replace")[()]
-    return texts
+def _write_entry(
+    file: h5py.File,
+    exposures: Exposures,
+    is_test: np.ndarray,
+    provenance: dict[str, str],
+    raw: RawLayout | None,
+) -> h5py.Dataset:
+    """All of a scan file but its frames, whose dataset is returned."""
+    file.attrs.update(NX_class="NXroot", default="entry", creator=f"holosplat {__version__}")
+    entry = _group(file, "entry", "NXentry", default="data")
+    entry["definition"] = "NXtomo"
+    entry[SPLIT] = is_test.astype(np.uint8)
+    data = _write_instrument(_group(entry, "instrument", "NXinstrument"), exposures, raw)
+    _write_sample(_group(entry, "sample", "NXsample"), exposures)
+    _write_process(_group(entry, "process", "NXprocess"), provenance)
+    plot = _group(entry, "data", "NXdata", signal="data", axes=["rotation_angle", ".", "."])
+    for source in (DATA, IMAGE_KEY, ANGLE):
+        entry[source].attrs["target"] = f"/entry/{source}"
+        plot[source.rsplit("/", 1)[1]] = entry[source]
+    return data
 
 
 def _group(parent: h5py.Group, name: str, nx_class: str, **attributes: str | list[str]) -> h5py.Group:
@@ -333,14 +139,18 @@ def _put(group: h5py.Group, name: str, value: np.ndarray | float, units: str) ->
     group[name].attrs["units"] = units
 
 
-def _write_instrument(instrument: h5py.Group, exposures: Exposures, kinds: np.ndarray, dtype: type) -> h5py.Dataset:
-    """The beam and the detector; returns the dataset of its frames, still empty."""
+def _write_instrument(instrument: h5py.Group, exposures: Exposures, raw: RawLayout | None) -> h5py.Dataset:
     source = _group(instrument, "source", "NXsource")
     source["probe"] = "x-ray"
     _put(_group(instrument, "beam", "NXbeam"), "incident_energy", float(exposures.energy_kev), "keV")
     detector = _group(instrument, "detector", "NXdetector")
-    data = detector.create_dataset("data", (len(exposures), *exposures.views.shape), dtype)
-    detector["image_key"] = kinds.astype(np.int32)
+    shape = (len(exposures), *exposures.views.shape)
+    data = detector.create_dataset("data", shape, np.uint16 if raw else np.float32)
+    detector["image_key"] = np.asarray(raw.kinds if raw else np.full(len(exposures), PROJECTION), dtype=np.int32)
+    if raw is not None:
+        detector[MASK.rsplit("/", 1)[1]] = np.asarray(raw.mask, dtype=np.uint32)
+        for name, flipped in zip(FLIPS, raw.flips):
+            detector[name.rsplit("/", 1)[1]] = flipped
     for axis in "xy":
         _put(detector, f"{axis}_pixel_size", exposures.views.pixel_size, "m")
     same = bool((exposures.distance == exposures.distance[0]).all())  # a scalar is what most programs expect
@@ -371,7 +181,3 @@ def _escaped(key: str) -> str:
     """A provenance name as an HDF5 name, in which "/" and a lone "." have a meaning of their own."""
     escaped = key.replace("%", "%25").replace("/", "%2F")
     return escaped.replace(".", "%2E") if set(escaped) == {"."} else escaped
-
-
-def _unescaped(name: str) -> str:
-    return name.replace("%2E", ".").replace("%2F", "/").replace("%25", "%")

@@ -46,9 +46,13 @@ class Camera:
         if self.gain is not None:
             positive("gain", self.gain, "counts a photon")
         at_least(self, 0, "offset", "read_noise", "gain_spread", "offset_spread", "dead", "hot", "scintillator_px")
-        require(self.offset < self.most, f"offset must be below the range of {self.most} counts, but it is {self.offset}.")
+        require(
+            self.offset < self.most, f"offset must be below the range of {self.most} counts, but it is {self.offset}."
+        )
         require(self.gain_spread <= 0.3, f"gain_spread must be at most 0.3, but it is {self.gain_spread}.")
-        require(self.dead + self.hot <= 0.2, f"dead and hot pixels must be at most a fifth, but are {self.dead + self.hot}.")
+        require(
+            self.dead + self.hot <= 0.2, f"dead and hot pixels must be at most a fifth, but are {self.dead + self.hot}."
+        )
 
     @property
     def most(self) -> int:
@@ -114,4 +118,4 @@ def spread(image: np.ndarray, sigma_px: float) -> np.ndarray:
     if sigma_px == 0:
         return image
     rows, columns = (np.exp(-2 * np.pi**2 * sigma_px**2 * (0.5 * np.arange(n) / n) ** 2) for n in image.shape)
-    return idctn(dctn(image, norm="ortho") * rows[:, None] * columns, norm="ortho")
+    return np.asarray(idctn(np.asarray(dctn(image, norm="ortho")) * rows[:, None] * columns, norm="ortho"))

@@ -61,9 +61,9 @@ class Spectrum:
 
 
 def source_blur(source_size: float, source_distance: float, distance: float | np.ndarray) -> np.ndarray:
-    """Standard deviation [m], in the sample plane, of the blur by a Gaussian source of standard deviation `source_size`.
+    """Standard deviation [m], in the sample plane, of the blur by a Gaussian source.
 
-    source_distance: from source to sample [m]; distance: effective propagation distance(s) [m]. An incoherent source
+    source_size: standard deviation of the source [m]; source_distance: from source to sample [m]; distance: effective propagation distance(s) [m]. An incoherent source
     blurs a frame by its image through the sample's points (Van Cittert–Zernike theorem; Goodman 1985, *Statistical
     Optics*, sect. 5.6): by `σ z₂/z₁` on the detector, which is `σ z_eff/z₁` in the sample plane, since
     `z_eff = z₂/M`. Gaussian blurs add in quadrature, so this one joins the point-spread function without loss.
