@@ -63,10 +63,11 @@ class Spectrum:
 def source_blur(source_size: float, source_distance: float, distance: float | np.ndarray) -> np.ndarray:
     """Standard deviation [m], in the sample plane, of the blur by a Gaussian source.
 
-    source_size: standard deviation of the source [m]; source_distance: from source to sample [m]; distance: effective propagation distance(s) [m]. An incoherent source
-    blurs a frame by its image through the sample's points (Van Cittert–Zernike theorem; Goodman 1985, *Statistical
-    Optics*, sect. 5.6): by `σ z₂/z₁` on the detector, which is `σ z_eff/z₁` in the sample plane, since
-    `z_eff = z₂/M`. Gaussian blurs add in quadrature, so this one joins the point-spread function without loss.
+    source_size: standard deviation of the source [m]; source_distance: from source to sample [m]; distance: effective
+    propagation distance(s) [m]. An incoherent source blurs a frame by its image through each point of the sample
+    (Van Cittert–Zernike theorem; Goodman 1985, *Statistical Optics*, sect. 5.6): by `σ z₂/z₁` on the detector, which
+    is `σ z_eff/z₁` in the sample plane, since `z_eff = z₂/M`. Gaussian blurs add in quadrature, so this one joins the
+    point-spread function without loss.
     """
     size = in_range("source size", source_size, *SOURCE_RANGE_M, unit="metres")
     z1 = in_range("source distance", source_distance, *SOURCE_DISTANCE_RANGE_M, unit="metres")

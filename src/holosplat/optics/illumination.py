@@ -92,7 +92,7 @@ class PulseModel:
         return cls(mean, *_principal(np.stack(moved + random)), options.energy_jitter)
 
     def pulses(self, count: int, rng: np.random.Generator) -> Pulses:
-        """`count` pulses: normal weights, energies of a gamma distribution (Saldin et al. 1998, Opt. Commun. 148, 383)."""
+        """`count` pulses: normal weights, gamma-distributed energies (Saldin et al. 1998, Opt. Commun. 148, 383)."""
         modes = self.energy_jitter**-2 if self.energy_jitter > 0 else np.inf
         energy = rng.gamma(modes, 1 / modes, count) if np.isfinite(modes) else np.ones(count)
         return Pulses(energy, self.deviations * rng.standard_normal((count, len(self.deviations))))
