@@ -107,7 +107,7 @@ class Shutter:
     """How long a frame gathers light, and when: a train of flashes, each shorter than any motion.
 
     exposure: its length [s], about the frame's time; pulses: flashes, each in the middle of an equal part of it. A
-    steady beam is many pulses. Errors: `InputError` for a negative length, and for pulses or a length without the other.
+    steady beam is many pulses. Errors: `InputError` for a negative length, and for one without the other.
     """
 
     exposure: float = 0.0

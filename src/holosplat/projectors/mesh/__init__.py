@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ...checks import require, shaped
 from ...geometry import Grid, Views
-from .reference import occupancy, mean_depths
+from .reference import mean_depths, occupancy
 
 __all__ = ["mesh_line_integrals", "voxelise_meshes"]
 
