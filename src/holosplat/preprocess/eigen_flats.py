@@ -15,7 +15,7 @@ ROWS = 64
 TRACY_WIDOM = (-1.2065, 1.268)
 """Mean and standard deviation of the largest eigenvalue of pure noise, once standardised (Tracy & Widom 1996)."""
 OBVIOUS = 4.0
-"""An eigenvalue of so many times the median one needs no test."""
+"""An eigenvalue of so many times the median one, and the width of noise's spectrum, needs no test."""
 DEVIATIONS = 2.0
 """An eigenvalue counts that exceeds the mean of noise's by so many standard deviations."""
 
@@ -84,10 +84,11 @@ def significant(eigenvalues: np.ndarray, pixels: float) -> int:
     such frames is not needed: the largest eigenvalue of n pixels of white noise in m frames follows the law of Tracy
     and Widom (Johnstone 2001, Ann. Stat. 29, 295, theorem 1.1). Each eigenvalue is tested against the ones below it.
     `pixels`: how many independent ones there are at most; neighbours that share their noise (a scintillator) make them
-    fewer, which the spread of the lower eigenvalues tells (Patterson et al. 2006, PLoS Genet. 2, e190, eq. 10).
+    fewer, which the spread of the lower eigenvalues tells (as in Patterson et al. 2006, PLoS Genet. 2, e190).
     """
     most = len(eigenvalues) // 2
-    kept = min(most, int((eigenvalues > OBVIOUS * np.median(eigenvalues)).sum()))
+    wide = OBVIOUS * (1 + math.sqrt(len(eigenvalues) / max(pixels, 1.0))) ** 2 * float(np.median(eigenvalues))
+    kept = min(most, int((eigenvalues > wide).sum()))
     while kept < most:
         n = min(pixels, _effective(eigenvalues[kept:]))
         found = next((k for k in range(kept, most) if not _stands_out(eigenvalues[k:], n)), most)

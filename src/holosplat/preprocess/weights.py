@@ -39,7 +39,7 @@ class TotalVariationWeights:
         for k, (deviation, component) in enumerate(zip(flats.deviations, flats.components)):
             self.components[k] = _binned(deviation * component, binning)
         self.deviations = flats.deviations
-        self._inverse = np.linalg.pinv(self.components.reshape(len(flats), -1).T)
+        self._inverse = np.linalg.pinv(self.components.reshape(len(flats), self.mean.size).T)
 
     def __call__(self, light: np.ndarray) -> np.ndarray:
         """Weights [K] for a dark-subtracted frame `light` [H, W], to be used with `EigenFlats.light`."""
