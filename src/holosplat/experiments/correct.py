@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..checks import InputError, require
+from ..checks import require
 from ..io.atomic import require_writable
 from ..io.nxtomo import scan_writer
 from ..io.scan_file import DARK, FLAT, PROJECTION, ScanFile, open_scan
@@ -94,34 +94,35 @@ class FlatFielding:
         self.dark = self.repair(dark)
         self.light = self.repair(mean_flat) - self.dark
         self.eigen = self._eigen_flats() if dynamic else None
-        self._weights = TotalVariationWeights(self.eigen, options.binning) if self.eigen else None
+        self._weights = None if self.eigen is None else TotalVariationWeights(self.eigen, options.binning)
         on_progress(0.3)
 
     def __call__(self, number: int) -> np.ndarray:
         """The relative intensity [H, W] of frame `number` of the file."""
         raw = self.repair(self.file.frame(number))
-        light = self.light
-        if self.eigen is not None and self._weights is not None:
-            require(
-                raw.mean() > self.dark.mean(), f"{self.file.fields.path}: frame {number} is as dark as the dark ones."
-            )
-            light = self.eigen.light(self._weights(raw - self.dark))
-        frame = relative_intensity(raw, self.dark, light)
+        bright = raw.mean() > self.dark.mean()
+        require(
+            bool(bright), f"{self.file.fields.path}: frame {number} is as dark as the dark ones; mark it invalid (3)."
+        )
+        frame = relative_intensity(raw, self.dark, self.flat_field(raw))
         return frame / self._level(frame)
+
+    def flat_field(self, raw: np.ndarray) -> np.ndarray:
+        """The flat field less the dark one, [H, W] counts, for a frame of counts `raw` [H, W] already repaired."""
+        if self.eigen is None or self._weights is None:
+            return self.light
+        return self.eigen.light(self._weights(raw - self.dark))
 
     def _level(self, frame: np.ndarray) -> float:
         """What is brought to 1."""
         if self.options.reference == "none":
             return 1.0
-        rim = np.ones(frame.shape, dtype=bool)
+        counted = np.ones(frame.shape, dtype=bool)
         if self.options.reference == "rim":
             width = max(1, round(RIM * min(frame.shape)))
-            rim[width:-width, width:-width] = False
-        level = float(frame[rim].mean())
-        if not level > 0:
-            raise InputError(
-                f"{self.file.fields.path} has a projection without light; mark it invalid (3) in image_key."
-            )
+            counted[width:-width, width:-width] = False
+        level = float(frame[counted].mean())
+        require(level > 0, f"{self.file.fields.path} has a projection whose rim is dark; normalise by its mean.")
         return level
 
     def _eigen_flats(self) -> EigenFlats:
