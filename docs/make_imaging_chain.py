@@ -145,7 +145,7 @@ def light_picture() -> None:
     view = 2
     shown = {
         "ideal": ideal().frames[view],
-        "source 200 µm at 30 m": blurred(True).frames[view],
+        "source 200 µm": blurred(True).frames[view],
         "bandwidth 5 %": banded(0.05).frames[view],
         "1000 photons": noisy(1000).frames[view],
         "distance off by 5 %": hs.simulate(scene(), replace(told(), distance=1.05 * told().distance)).frames[view],
@@ -194,9 +194,9 @@ def flat_field_picture(work: Path) -> None:
     for column, (name, frames) in enumerate(found.items()):
         left = image_panel(grid.axes[1][column], frames[view], (PIXEL, PIXEL), GREY, (0.7, 1.4))
         letter(grid.axes[1][column], 5 + column, name)
-    for column, name in ((3, "plain, normalised"), (4, "dynamic")):
+    for column, (name, panel) in enumerate({"plain, normalised": "g", "dynamic": "h"}.items(), start=3):
         off = image_panel(grid.axes[1][column], found[name][view] - clean[view], (PIXEL, PIXEL), "RdBu_r", (-0.2, 0.2))
-        letter(grid.axes[1][column], 5 + column, f"left by {name.split(',')[0]}")
+        letter(grid.axes[1][column], 5 + column, f"{panel} less the ideal")
     grid.bar(drawn, 2, (0, 0), "counts")
     grid.bar(pattern, 4, (0, 0), "relative")
     grid.bar(left, 2, (1, 1), "intensity", "both")

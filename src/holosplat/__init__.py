@@ -19,6 +19,9 @@ _WHERE = {
     "mesh": ("TriangleMesh",),
     "materials": ("HAEMOGLOBIN", "PLASMA", "RED_CELL", "WATER", "Compound", "DeltaBeta", "Mixture", "parse_material"),
     "forward": ("Instrument", "measure", "simulate"),
+    "optics.camera": ("Camera",),
+    "optics.coherence": ("Spectrum", "effective_geometry", "source_blur"),
+    "optics.illumination": ("Illumination",),
     "specimens.scene": ("MeshScene",),
     "specimens.red_cells": ("evans_fung_cell", "random_cells"),
     "specimens.repair": ("closed",),
@@ -30,6 +33,9 @@ _WHERE = {
     "experiments.plan": ("Recording", "plan", "survey"),
     "experiments.settings": ("MaterialPrior", "Settings", "preset"),
     "experiments.simulate": ("Filling", "read_scene"),
+    "experiments.record": ("RecordingOptions", "record"),
+    "experiments.correct": ("CorrectionOptions", "correct"),
+    "experiments.join": ("join",),
     "experiments.run_folder": ("RunFolder",),
     "experiments.reconstruct": ("Reconstruction", "load_reconstruction", "reconstruct"),
     "experiments.evaluate": ("Evaluation", "evaluate", "render"),
@@ -53,15 +59,20 @@ if TYPE_CHECKING:
     from .checks import InputError as InputError
     from .experiments.contrast import Setup as Setup
     from .experiments.contrast import Subject as Subject
+    from .experiments.correct import CorrectionOptions as CorrectionOptions
+    from .experiments.correct import correct as correct
     from .experiments.evaluate import Evaluation as Evaluation
     from .experiments.evaluate import evaluate as evaluate
     from .experiments.evaluate import render as render
+    from .experiments.join import join as join
     from .experiments.plan import Recording as Recording
     from .experiments.plan import plan as plan
     from .experiments.plan import survey as survey
     from .experiments.reconstruct import Reconstruction as Reconstruction
     from .experiments.reconstruct import load_reconstruction as load_reconstruction
     from .experiments.reconstruct import reconstruct as reconstruct
+    from .experiments.record import RecordingOptions as RecordingOptions
+    from .experiments.record import record as record
     from .experiments.run_folder import RunFolder as RunFolder
     from .experiments.settings import MaterialPrior as MaterialPrior
     from .experiments.settings import Settings as Settings
@@ -88,6 +99,11 @@ if TYPE_CHECKING:
     from .materials import Mixture as Mixture
     from .materials import parse_material as parse_material
     from .mesh import TriangleMesh as TriangleMesh
+    from .optics.camera import Camera as Camera
+    from .optics.coherence import Spectrum as Spectrum
+    from .optics.coherence import effective_geometry as effective_geometry
+    from .optics.coherence import source_blur as source_blur
+    from .optics.illumination import Illumination as Illumination
     from .representations.gaussians import GaussianCloud as GaussianCloud
     from .scan import Exposures as Exposures
     from .scan import Scan as Scan
