@@ -162,6 +162,10 @@ def test_what_cannot_be_recorded(shop, tmp_path):
     for name in ("flats", "darks"):
         with pytest.raises(InputError, match=f"{name} must be at least 1"):
             RecordingOptions(**{name: 0})
+    with pytest.raises(InputError, match=r"clean\.nxs is read or written already"):
+        record(shop.clean, shop.clean, options, QUIET, STEADY)
+    with pytest.raises(InputError, match=r"raw\.nxs is read or written already"):
+        record(shop.clean, tmp_path / "raw.nxs", options, QUIET, STEADY, tmp_path / "raw.nxs")
     with pytest.raises(InputError, match="flip must be one of"):
         RecordingOptions(flip="up")  # type: ignore[arg-type]
     assert sorted(p.name for p in tmp_path.iterdir()) == ["noisy.nxs"]
@@ -260,6 +264,8 @@ def test_what_cannot_be_corrected(shop, tmp_path):
         file["/entry/instrument/detector/data"][-1] = 0
     with pytest.raises(InputError, match="frame 73 is as dark as the dark ones"):
         correct(dark, out)
+    with pytest.raises(InputError, match=r"raw\.nxs is read or written already"):
+        correct(shop.raw, shop.raw)
     with pytest.raises(InputError, match="components goes with the method dynamic"):
         CorrectionOptions("plain", components=3)
     with pytest.raises(InputError, match="binning must be at least 1"):
@@ -342,6 +348,8 @@ def test_what_cannot_be_joined(tmp_path):
     out = tmp_path / "scan.nxs"
     with pytest.raises(InputError, match=r"other\.nxs has 17 keV, but .*a\.nxs has 20 keV: a scan has one energy"):
         join((paths[0], other), out)
+    with pytest.raises(InputError, match=r"a\.nxs is read or written already"):
+        join(paths, paths[0])
     with pytest.raises(InputError, match="needs at least two"):
         join(paths[:1], out)
     with pytest.raises(InputError, match=r"--flip must say one of .* for each of the 2 files, but it says 1"):

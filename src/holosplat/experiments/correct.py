@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from ..checks import require
-from ..io.atomic import require_writable
+from ..io.atomic import require_apart, require_writable
 from ..io.nxtomo import scan_writer
 from ..io.scan_file import DARK, FLAT, PROJECTION, ScanFile, open_scan
 from ..preprocess import (
@@ -159,6 +159,7 @@ def correct(
     turned upright. `InputError` when the file has no flats, or too many defective pixels.
     """
     require_writable(out)
+    require_apart(out, source)
     with open_scan(source) as file:
         fielding = FlatFielding(file, options, on_progress)
         projections = file.numbers(PROJECTION)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..checks import in_range, require
 from ..geometry import Views
-from ..io.atomic import require_writable
+from ..io.atomic import require_apart, require_writable
 from ..io.nxtomo import read_scan, scan_writer
 from ..io.scan_file import open_scan
 from ..optics.coherence import joined_blur_px
@@ -37,6 +37,7 @@ def join(
     are corrected plainly. `InputError` for energies that differ, which no reconstruction here can use together.
     """
     require_writable(out)
+    require_apart(out, *sources)
     require(len(sources) >= 2, "join needs at least two scan files, one a beam.")
     require(
         len(flips) in (0, len(sources)),

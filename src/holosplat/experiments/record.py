@@ -12,7 +12,7 @@ import numpy as np
 
 from ..checks import at_least, in_range, require
 from ..forward import PHOTON_RANGE
-from ..io.atomic import atomic_path, require_writable
+from ..io.atomic import atomic_path, require_apart, require_writable
 from ..io.nxtomo import RawLayout, scan_writer
 from ..io.scan_file import DARK, FLAT, PROJECTION, ScanFile, open_scan
 from ..optics.camera import Camera, Sensor
@@ -105,6 +105,8 @@ def record(
     """
     for path in (out, truth) if truth else (out,):
         require_writable(path)
+    require_apart(out, source, *([truth] if truth else []))
+    require_apart(truth or out, source)
     with open_scan(source) as file:
         _require_clean(source, file)
         bench = _Bench.drawn(file, options, camera, light)
