@@ -224,7 +224,7 @@ def test_binning_is_as_coarse_as_the_weights_let_it():
     few = EigenFlats(np.ones((H, W)), waves(2), np.ones(2), np.ones(9))
     assert TotalVariationWeights(few).binning == 8
     many = EigenFlats(np.ones((H, W)), np.repeat(waves(6), 4, 0), np.ones(24), np.ones(40))
-    assert TotalVariationWeights(many).binning == 2
+    assert TotalVariationWeights(many).binning == 4
     none = EigenFlats(np.ones((H, W)), np.empty((0, H, W)), np.empty(0), np.ones(9))
     assert TotalVariationWeights(none)(np.ones((H, W))).shape == (0,)
     with pytest.raises(InputError, match="binning must leave at least"):

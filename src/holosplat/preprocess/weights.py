@@ -13,7 +13,7 @@ FAINTEST = 0.02
 REACH = 6.0
 """Weights lie within so many standard deviations of those of the flat frames."""
 ITERATIONS = 200
-BINNINGS, SAMPLES = (8, 4, 2), 16
+BINNINGS, SAMPLES = (8, 4, 2), 6
 """Binning, where none is asked for: the coarsest that leaves so many samples for each weight."""
 
 
