@@ -20,7 +20,8 @@ def scripts(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
     """The modules of benchmarks/, which import one another by bare names."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     return {
-        name: importlib.import_module(name) for name in ("step", "eager_step", "kernels", "plain_torch", "ablation")
+        name: importlib.import_module(name)
+        for name in ("step", "eager_step", "kernels", "plain_torch", "ablation", "simulate")
     }
 
 
@@ -76,3 +77,21 @@ def test_every_ablation_removes_something(scripts):
     assert variants.pop("as it is") == settings
     assert settings not in variants.values()
     assert len({repr(variant) for variant in variants.values()}) == len(variants)
+
+
+def test_what_the_benchmark_of_simulation_reports(scripts, monkeypatch):
+    """On a small field: frames by time and view, the volume, and an error well within what the docs promise."""
+    script = scripts["simulate"]
+    monkeypatch.setattr(script, "CELLS", 2)
+    monkeypatch.setattr(script, "CASES", {"frames": (48, 2, 3, 1e-6), "voxels": (48, 1, 0, 1e-6)})
+    rows = [script.run(name) for name in script.CASES]
+    assert [row["frames"] for row in rows] == [6, 0]
+    assert all(row["seconds"] > 0 for row in rows)
+    monkeypatch.setattr(script, "SMALL", (33, 28))
+    monkeypatch.setattr(script, "FINER", 8)
+    errors = script.accuracy(1e-6)
+    assert 0 < errors["single_precision"] < 1e-5
+    assert 1e-4 < errors["method"] < 5e-3
+    report = {"rows": rows, "accuracy": [errors], "load": 0.5, "commit": "abc", **script.environment("reference")}
+    assert "| frames | 48² of 1 µm | 6 | 4 |" in script.table(report)
+    assert "| voxels | 48³ of 1 µm | – | – |" in script.table(report)

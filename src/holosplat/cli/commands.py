@@ -86,7 +86,7 @@ def render(run: Positional[Path], scan: Path, out: Path, split: Literal["test", 
         split: Which frames.
     """
     require_writable(out)
-    result, wanted = load_reconstruction(RunFolder(run)), read_scan(scan)
+    result, wanted = load_reconstruction(RunFolder(run)), _scan_for(RunFolder(run), scan)
     chosen = {"test": wanted.test, "train": wanted.train, "all": lambda: wanted}[split]()
     require(len(chosen) > 0, f"{scan} has no {split} frames to render; choose another --split.")
     frames = predict(result, chosen.exposures)
@@ -137,11 +137,7 @@ def evaluate(
     """
     folder = RunFolder(run)
     result = load_reconstruction(folder)
-    time_frame = read_json(folder.source).get("time_frame") if folder.source.is_file() else None
-    measured, true_volume = read_scan(scan or _source(folder)), read_volume(truth) if truth else None
-    if measured.is_series:
-        measured = _at_time(measured, time_frame)
-        require_one_time(measured)
+    measured, true_volume = _scan_for(folder, scan or _source(folder)), read_volume(truth) if truth else None
     evaluation = score(result, measured, true_volume)
     if as_json:
         print(json.dumps(evaluation.as_dict(), indent=2, allow_nan=False))
@@ -198,6 +194,15 @@ def _at_time(scan: Scan, time_frame: int | str | None) -> Scan:
     if time_frame is None:
         return scan
     return scan.at_instant(time_frame) if isinstance(time_frame, int) else scan.as_static()
+
+
+def _scan_for(folder: RunFolder, scan: Path) -> Scan:
+    """A scan to compare a run with: of a time-resolved one, the frames of the time that the run is of."""
+    found = read_scan(scan)
+    if found.is_series:
+        found = _at_time(found, read_json(folder.source).get("time_frame") if folder.source.is_file() else None)
+        require_one_time(found)
+    return found
 
 
 def _source(folder: RunFolder) -> Path:

@@ -17,7 +17,7 @@ from ..experiments.series import Timing, held_out, read_series
 from ..experiments.simulate import Filling, read_scene
 from ..geometry import Grid, Views
 from ..io.nxtomo import scan_writer
-from ..io.snapshots import COLLECTION
+from ..io.snapshots import COLLECTION, seeming_snapshots
 from ..io.volumes import write_voxels
 from ..scan import Exposures
 from ..specimens.mesh_series import MeshSeries
@@ -89,9 +89,7 @@ def simulate(
     if truth.true_exposures:
         _say(f"wrote {truth.true_exposures}: the same frames, with the exposures as they were")
     for path, frame in volumes:
-        with ProgressBar() as bar:
-            show = partial(bar.show, "voxels", record={})
-            write_voxels(path, specimen.matter.at(times[frame]), Grid.of_views(views.views), show)
+        _write_truth(path, specimen.matter.at(times[frame]), views.views)
         _say(f"wrote {path}: the true volume{f' at {times[frame]:.6g} s' if motion.frame_rate else ''}")
 
 
@@ -111,6 +109,11 @@ def _specimen(
             collection is None, f"{collection} is a collection of snapshots; give --frame-rate to simulate a series."
         )
         matter = read_scene(meshes, filling, beamline.energy_kev, length_unit=files.length_unit, origin=files.origin)
+        if (count := seeming_snapshots(meshes)) > 1:
+            _say(
+                f"warning: the files seem to be {count} snapshots, but they are taken for one still scene, with "
+                "all bodies at once; for a series give --frame-rate."
+            )
         return _Specimen(matter, np.zeros(1), _facts(matter))
     show = partial(bar.show, "reading snapshots", record={})
     series, times = read_series(meshes, filling, beamline.energy_kev, timing, files.series(), show)
@@ -145,6 +148,11 @@ def _write_frames(
             for add in writers:
                 add(frame)
             bar.show("simulating views", (n + 1) / len(is_test), {})
+
+
+def _write_truth(path: Path, matter: MeshScene, views: Views) -> None:
+    with ProgressBar() as bar:
+        write_voxels(path, matter, Grid.of_views(views), partial(bar.show, "voxels", record={}))
 
 
 def _say(text: str) -> None:

@@ -88,10 +88,9 @@ def read_series(
     the snapshots. `on_progress(fraction)` is called after each snapshot.
     """
     snapshots = find_snapshots(paths, files.interval, files.time_unit)
-    taken = np.array([snapshot.time for snapshot in snapshots])
-    times = timing.times(float(taken[-1] - taken[0]))
-    absolute = taken[0] + times
-    needed = _needed(taken, absolute[0] + timing.shutter.offsets[0], absolute[-1] + timing.shutter.offsets[-1])
+    taken = np.array([snapshot.time - snapshots[0].time for snapshot in snapshots])
+    times = timing.times(float(taken[-1]))
+    needed = _needed(taken, times[0] + timing.shutter.offsets[0], times[-1] + timing.shutter.offsets[-1])
     scenes = []
     for n, snapshot in enumerate(snapshots[needed]):
         scenes.append(filled_scene(snapshot.files, filling, energy_kev, files.length_unit))
@@ -102,7 +101,7 @@ def read_series(
     else:
         series = series.unfolded(unit_factor("length unit", files.length_unit, LENGTH_UNITS) * np.array(files.period))
     series = series.moved(-field_centre(series.bounds, files.origin, files.length_unit))
-    return series.delayed(-float(absolute[0])), times - times[0]
+    return series.delayed(-float(times[0])), times - times[0]
 
 
 def held_out(split: np.ndarray, views: int, times: int, what: Literal["views", "times"]) -> np.ndarray:
@@ -112,6 +111,6 @@ def held_out(split: np.ndarray, views: int, times: int, what: Literal["views", "
 
 def _needed(taken: np.ndarray, first: float, last: float) -> slice:
     """The snapshots between which the times from `first` to `last` lie."""
-    slack = ROUNDING * (taken[-1] - taken[0])
+    slack = ROUNDING * taken[-1]
     start = max(int(np.searchsorted(taken, first + slack, side="right")) - 1, 0)
     return slice(start, int(np.searchsorted(taken, last - slack, side="left")) + 1)

@@ -8,13 +8,14 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 
 from ..checks import InputError, positive, require
 from ..units import TIME_UNITS, unit_factor
+from .pvd import read_pvd
 from .vtk import mesh_files
 
 NUMBERED = re.compile(r"(?P<body>.*?)[_.\-]?(?P<number>\d+)")
@@ -49,7 +50,7 @@ def find_snapshots(
         time_unit is None or bool(collections), f"a time unit goes with a collection ({COLLECTION}), which has none."
     )
     if collections:
-        listed = _read_collection(collections[0])
+        listed = {step.time: list(step.files) for step in read_pvd(collections[0])}
         factor = unit_factor("time unit", time_unit or "s", TIME_UNITS)
         said = {key: key * factor for key in listed}
     else:
@@ -64,7 +65,28 @@ def find_snapshots(
         times = [float(step * count) for count in counts]
     else:
         times = [_time(list(bodies.values()), said.get(key)) for key, bodies in zip(keys, ordered)]
-    return [Snapshot(time, tuple(bodies.values())) for time, bodies in zip(times, ordered)]
+    found = [Snapshot(time, tuple(bodies.values())) for time, bodies in zip(times, ordered)]
+    for before, after in pairwise(found):
+        require(
+            after.time > before.time,
+            f"snapshots must follow one another in time, but {after.files[0].name}, at {after.time:g} s, is not after "
+            f"{before.files[0].name}, at {before.time:g} s; correct the files, or give --snapshot-interval.",
+        )
+    return found
+
+
+def seeming_snapshots(paths: Sequence[Path]) -> int:
+    """How many snapshots mesh files seem to be of, by their names alone: two bodies or more, each with all the numbers.
+
+    1 where they do not.
+    """
+    numbers: dict[str, set[int]] = {}
+    for file in mesh_files(paths):
+        if (match := NUMBERED.fullmatch(file.stem)) is None:
+            return 1
+        numbers.setdefault(match["body"], set()).add(int(match["number"]))
+    first, *others = numbers.values()
+    return len(first) if others and all(other == first for other in others) else 1
 
 
 def _by_number(files: list[Path]) -> dict[float, list[Path]]:
@@ -129,24 +151,3 @@ def _header_time(file: Path) -> float | None:
         return float(match[1]) * unit_factor(f"{file}: the time in its header", match[2], TIME_UNITS)
     except ValueError as error:
         raise error if isinstance(error, InputError) else InputError(f"{file}: {match[0]!r} is no time.") from None
-
-
-def _read_collection(path: Path) -> dict[float, list[Path]]:
-    require(path.is_file(), f"{path} must be a collection of mesh files, but there is no such file; check the path.")
-    try:
-        root = ElementTree.parse(path).getroot()
-        entries = [(float(e.get("timestep", "nan")), e.get("file")) for e in root.iter("DataSet")]
-    except (ElementTree.ParseError, ValueError, UnicodeError, OSError) as error:
-        raise InputError(f"{path} must be a ParaView collection (XML), but it is damaged: {error}.") from None
-    whole = all(np.isfinite(time) and file for time, file in entries)
-    require(
-        len(entries) > 0 and whole,
-        f"{path} must list DataSets, each with a timestep and a file, but it holds {len(entries)} DataSets, "
-        "or one lacks either.",
-    )
-    found: dict[float, list[Path]] = {}
-    for time, file in entries:
-        target = path.parent / str(file)
-        require(target.is_file(), f"{path} names {file}, but there is no such file beside it.")
-        found.setdefault(time, []).append(target)
-    return found

@@ -12,6 +12,7 @@ from ..mesh import TriangleMesh
 from ..volume import LineIntegrals, Volume
 from .scene import MeshScene
 
+JUMP = 4.0
 ROUNDING = 1e-9
 """Times beyond the series by less than this share of its length are its ends."""
 
@@ -100,11 +101,11 @@ class MeshSeries:
         return replace(self, snapshots=tuple(_shifted(s, by) for s, by in zip(self.snapshots, shifts)))
 
     def require_continuous(self) -> None:
-        """`InputError` where a body jumps by more than its size and half the scene: it was folded into a box."""
+        """`InputError` where a body jumps by more than its size and `JUMP` usual steps: it was folded into a box."""
         steps = np.abs(np.diff(self._centres(), axis=0))  # [T - 1, M, 3]
-        extent = np.max([np.subtract(*scene.bounds[::-1]) for scene in self.snapshots], axis=0)
+        usual = np.median(steps, axis=(0, 1)) if len(steps) else np.zeros(3)
         size = np.array([np.subtract(*mesh.bounds[::-1]) for mesh in self.snapshots[0].meshes])
-        found = np.argwhere(steps > np.maximum(0.5 * extent, size))
+        found = np.argwhere(steps > np.maximum(JUMP * usual, size))
         if len(found):
             t, body, axis = found[0]
             raise InputError(

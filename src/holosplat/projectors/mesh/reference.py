@@ -102,7 +102,7 @@ def _scan_convert(
     r, column = _expand(start, stop)  # one entry a hit
     t, row = t[r], row[r]
     z = a[t, 2] + slope_u[t] * (column - a[t, 0]) + slope_v[t] * (row - a[t, 1])
-    z = np.clip(z, corners[t, :, 2].min(1), corners[t, :, 2].max(1))
+    z = np.clip(z, corners[..., 2].min(1)[t], corners[..., 2].max(1)[t])
     return row * shape[1] + column, z, np.sign(area)[t], face[t]
 
 
