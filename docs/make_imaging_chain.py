@@ -115,6 +115,7 @@ CASES: dict[str, Callable[[Path], hs.Scan]] = {
     "1000 photons a pixel": lambda work: noisy(1000),
     "camera, steady light, plain": lambda work: recorded(work, STEADY, PLAIN),
     "camera, pulses, plain": lambda work: recorded(work, Illumination(), PLAIN),
+    "camera, pulses, plain, mean 1": lambda work: recorded(work, Illumination(), CorrectionOptions("plain", "mean")),
     "camera, pulses, dynamic": lambda work: recorded(work, Illumination(), DYNAMIC),
     "shifts of 0.5 px": lambda work: misaligned(shift_px=0.5),
     "turns of 0.5°": lambda work: misaligned(rotation_deg=0.5),
@@ -218,7 +219,11 @@ def slices_picture(work: Path, preset: str) -> None:
         "source of 200 µm at 30 m, not known": "source, not known",
         "camera, steady light, plain": "camera, steady",
     }
-    short |= {"camera, pulses, plain": "pulses, plain", "camera, pulses, dynamic": "pulses, dynamic"}
+    short |= {
+        "camera, pulses, plain": "pulses, plain",
+        "camera, pulses, plain, mean 1": "pulses, plain, mean 1",
+        "camera, pulses, dynamic": "pulses, dynamic",
+    }
     panels = [axes for line in grid.axes for axes in line]
     for index, (axes, (name, image)) in enumerate(zip(panels, shown.items())):
         drawn = image_panel(axes, 1e7 * image, (PIXEL, PIXEL), "magma", (0, 8))
