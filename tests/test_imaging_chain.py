@@ -139,6 +139,22 @@ def test_recording_is_repeatable_and_flips_are_undone_when_read(shop, tmp_path):
         assert not np.array_equal(file.frame(0), frames["none"][0])
 
 
+def test_what_is_interrupted_leaves_nothing(shop, tmp_path):
+    def stop(fraction: float) -> None:
+        if fraction > 0.5:
+            raise KeyboardInterrupt
+
+    out, truth = tmp_path / "out.nxs", tmp_path / "truth.h5"
+    for act in (
+        lambda: record(shop.clean, out, RecordingOptions(flats=4, darks=2), QUIET, STEADY, truth, stop),
+        lambda: correct(shop.raw, out, CorrectionOptions("plain"), stop),
+        lambda: join((shop.clean, shop.clean), out, on_progress=stop),
+    ):
+        with pytest.raises(KeyboardInterrupt):
+            act()
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_scintillator_joins_the_point_spread_function(shop, tmp_path):
     record(
         shop.clean,

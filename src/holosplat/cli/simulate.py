@@ -72,19 +72,17 @@ def simulate(
     with ProgressBar() as bar:
         specimen = _specimen(meshes, beamline, files, filled, motion.timing(), bar)
     times, how = specimen.times, noise.simulation(motion.shutter())
-    volumes = truth.volumes(len(times))
     _warn_of_missing_field(specimen.matter, true_views.views, beamline.pixel_size)
     split = beamline.split(len(views) if motion.hold_out == "views" else len(times))
     is_test = held_out(split, len(views), len(times), motion.hold_out)
-    nominal, true = views.repeated(times), true_views.repeated(times)
+    nominal, true, volumes = views.repeated(times), true_views.repeated(times), truth.volumes(len(times))
     facts = {**how.provenance(true), **specimen.facts, **of_source, "medium": filling.medium or "vacuum"}
     targets = [(out, nominal, facts)]
     if truth.true_exposures:
         targets.append((truth.true_exposures, true, facts | misalignment.facts()))
     with ProgressBar() as bar:
         _write_frames(targets, is_test, source.frames(specimen.matter, filled, true, how), bar)
-    rows, columns = beamline.detector
-    text = f"{len(true)} frames of {rows} × {columns} pixels, {int(is_test.sum())} of them held out"
+    text = "{} frames of {} × {} pixels, {} of them held out".format(len(true), *beamline.detector, is_test.sum())
     _say(f"wrote {out}: {text}{f', at {len(times)} times from {len(views)} views' if motion.frame_rate else ''}")
     if truth.true_exposures:
         _say(f"wrote {truth.true_exposures}: the same frames, with the exposures as they were")
