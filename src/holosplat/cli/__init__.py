@@ -1,4 +1,4 @@
-"""The command line: `holosplat plan | simulate | reconstruct | render | export | convert | evaluate | bench | …`."""
+"""The command line: `holosplat plan | simulate | record | correct | join | reconstruct | render | evaluate | …`."""
 
 import os
 
