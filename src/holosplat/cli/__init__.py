@@ -1,4 +1,4 @@
-"""The command line: `holosplat plan | simulate | reconstruct | render | export | surface | convert | evaluate | …`."""
+"""The command line: `holosplat plan | simulate | record | correct | join | reconstruct | surface | evaluate | …`."""
 
 import os
 
