@@ -27,6 +27,11 @@ def stretching_energy(nodes: Tensor, rest: RestShape, stiffness: float) -> Tenso
     return stiffness * (rest.length**2 * (_spring(ratio) - _spring(torch.ones_like(rest.length)))).sum(-1)
 
 
+def linear_energy(nodes: Tensor, rest: RestShape, stiffness: float) -> Tensor:
+    """Springs that do not soften, Σ k/2 (L - L₀)² over edges; stiffness k [N/m]."""
+    return 0.5 * stiffness * ((edge_lengths(nodes, rest.edges) - rest.length) ** 2).sum(-1)
+
+
 def neo_hookean(ratio: Tensor) -> Tensor:
     """κ(λ) = (λ^½ + λ^-2.5)/(λ + λ⁻³): springs soften as rubber does (Dupin 2007, eq. 19)."""
     return (ratio**0.5 + ratio**-2.5) / (ratio + ratio**-3)

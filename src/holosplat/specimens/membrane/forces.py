@@ -36,12 +36,12 @@ class Shape:
         return 0.5 * self.normals.norm(dim=-1)
 
 
-def stretching_forces(shape: Shape, rest: RestShape, stiffness: float) -> Tensor:
-    """Of the springs: k κ(λ) (L - L₀) along each edge (Dupin 2007, eq. 18)."""
+def stretching_forces(shape: Shape, rest: RestShape, softening: float, linear: float) -> Tensor:
+    """Of the springs: (k κ(λ) + k') (L - L₀) along each edge (Dupin 2007, eq. 18); stiffnesses k, k' [N/m]."""
     edge = shape.nodes[..., rest.edges[:, 1], :] - shape.nodes[..., rest.edges[:, 0], :]
     length = edge.norm(dim=-1)
-    pull = stiffness * neo_hookean(length / rest.length) * (length - rest.length) / length
-    pulls = pull.unsqueeze(-1) * edge
+    stiffness = softening * neo_hookean(length / rest.length) + linear if softening else linear
+    pulls = (stiffness * (length - rest.length) / length).unsqueeze(-1) * edge
     return _gathered(shape.nodes, rest.edges, torch.stack([pulls, -pulls], dim=-2))
 
 

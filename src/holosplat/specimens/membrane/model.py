@@ -17,22 +17,27 @@ from .rest import RestShape
 
 @dataclass(frozen=True)
 class Elasticity:
-    """Elastic moduli of a membrane; what is 0 is left out."""
+    """Elastic moduli of a membrane; what is 0 is left out.
 
-    springs: float = 1.2e-5
-    """Springs along edges, k_s [N/m]; the shear modulus is √3/4 of it."""
-    bending: float = 3e-19
-    """Bending of an edge, k_b [J]."""
-    local_area: float = 1e-5
-    """Area of each triangle, k_al [N/m]."""
-    global_area: float = 5e-4
-    """Area of the whole surface, k_ag [N/m]."""
-    volume: float = 1e3
-    """Volume, k_v [N/m²]."""
-    skalak_shear: float = 0.0
-    """Skalak's shear modulus G [N/m], instead of springs."""
+    The defaults are those with which a cell in optical tweezers behaves as measured (docs/cells.md).
+    """
+
+    skalak_shear: float = 2.9e-6
+    """Skalak's shear modulus G [N/m]."""
     skalak_dilation: float = 1.0
     """Skalak's number C: the area modulus is G (1 + 2 C)."""
+    springs: float = 0.0
+    """Or: springs along edges that soften as rubber does, k_s [N/m]; the shear modulus is √3/4 of it."""
+    linear_springs: float = 0.0
+    """Springs along edges that do not soften, k_lin [N/m]."""
+    bending: float = 3.5e-19
+    """Bending of an edge, k_b [J]; on even triangles the bending rigidity is √3/2 of it."""
+    local_area: float = 0.0
+    """Area of each triangle, k_al [N/m]."""
+    global_area: float = 1e-3
+    """Area of the whole surface, k_ag [N/m]."""
+    volume: float = 1e4
+    """Volume, k_v [N/m²]."""
 
     def __post_init__(self) -> None:
         at_least(self, 0, *(field.name for field in fields(self)))
@@ -54,6 +59,8 @@ class Membrane:
         found = {}
         if of.springs:
             found["stretching"] = energies.stretching_energy(nodes, rest, of.springs)
+        if of.linear_springs:
+            found["linear stretching"] = energies.linear_energy(nodes, rest, of.linear_springs)
         if of.skalak_shear:
             found["skalak"] = energies.skalak_energy(nodes, rest, of.skalak_shear, of.skalak_dilation)
         if of.bending:
@@ -75,8 +82,8 @@ class Membrane:
         of, rest = self.elasticity, self.rest
         shape = forces.Shape.of(nodes, rest)
         total = torch.zeros_like(nodes)
-        if of.springs:
-            total = total + forces.stretching_forces(shape, rest, of.springs)
+        if of.springs or of.linear_springs:
+            total = total + forces.stretching_forces(shape, rest, of.springs, of.linear_springs)
         if of.skalak_shear:
             total = total + forces.skalak_forces(shape, rest, of.skalak_shear, of.skalak_dilation)
         if of.bending:
