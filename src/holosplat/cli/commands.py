@@ -34,6 +34,7 @@ from ..report.run import report_run
 from ..scan import PIXEL_RANGE_M, Scan
 from .bench import bench
 from .convert import convert
+from .grow import grow
 from .options import BeamlineOptions, MaterialOptions, MeshOptions, NoiseOptions, PriorOptions, SettingsOptions
 from .plan import plan
 from .progress import INTERRUPTED, ProgressBar
@@ -254,6 +255,7 @@ def _say(text: str) -> None:
 
 COMMANDS = {
     "plan": plan,
+    "grow": grow,
     "simulate": simulate,
     "reconstruct": reconstruct,
     "render": render,

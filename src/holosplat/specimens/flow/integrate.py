@@ -38,8 +38,8 @@ class Stepper:
     def __init__(self, velocity: Callable[[Tensor], Tensor], tolerance: float) -> None:
         self.velocity, self.tolerance = velocity, tolerance
 
-    def advance(self, state: State, until: float, check: Callable[[], None] = lambda: None) -> State:
-        """`state` at the time `until` [s]; `check` is called after every step. `InputError` where steps vanish."""
+    def advance(self, state: State, until: float, check: Callable[[Tensor, float], None] = lambda nodes, time: None) -> State:
+        """`state` at the time `until` [s]; `check` is called with nodes and time after every step. `InputError` where steps vanish."""
         require(until >= state.time, f"the time to reach must lie ahead, but {until} s is before {state.time} s.")
         nodes, time, step, taken, refused = state.nodes, state.time, state.step, state.taken, state.refused
         shortest = SMALLEST * (until - time)
@@ -60,7 +60,7 @@ class Stepper:
                         f"the motion must be smooth, but at {time:.6g} s steps became shorter than {step:.3g} s: the "
                         "membranes or contacts are too stiff, or the flow too fast; lower one of them."
                     )
-            check()
+            check(nodes, time)
         return State(nodes, time, step, taken, refused)
 
     def _step(self, nodes: Tensor, slope: Tensor, step: float) -> tuple[Tensor, Tensor, float]:

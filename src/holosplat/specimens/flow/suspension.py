@@ -25,14 +25,18 @@ class Medium:
     viscosity: float = PLASMA_VISCOSITY
     """[Pa s]."""
     reach: float | None = None
-    """Cells whose centres are farther apart do not feel each other's flow [m] (default: the channel's shorter side)."""
+    """Cells whose centres are farther apart do not feel each other's flow [m] (default: the channel's shorter side, but
+    at most half its length)."""
     repulsion: float = 2e-11
     """Force between nodes of different cells, or of a node and a wall, at half the range [N]."""
-    range_: float | None = None
+    repulsion_range: float | None = None
     """Distance at which it begins [m] (default: the mean edge of the mesh)."""
 
     def __post_init__(self) -> None:
         in_range("viscosity", self.viscosity, 1e-6, 1e3, unit="pascal seconds")
+        for name in ("reach", "repulsion_range"):
+            if getattr(self, name) is not None:
+                in_range(name.replace("_", " "), getattr(self, name), 1e-10, 1.0, unit="metres")
 
 
 class Suspension:
@@ -49,12 +53,13 @@ class Suspension:
         spacing = math.sqrt(float(membrane.rest.surface) / len(membrane.mesh.vertices))
         self.blob = BLOB * spacing
         edge = float(membrane.rest.length.mean())
-        self.repulsion = Repulsion(medium.repulsion, edge if medium.range_ is None else medium.range_)
-        reach = min(channel.box[1:]) if medium.reach is None else medium.reach
-        self.reach = in_range("reach", reach, 1e-9, 1.0, unit="metres")
-        size = float((membrane.mesh.vertices.max(0) - membrane.mesh.vertices.min(0)).max())
-        room = min(channel.box) > size
-        require(room, f"box must be wider than a cell, {1e6 * size:.3g} µm, but it is {channel.box}; enlarge it.")
+        self.repulsion = Repulsion(medium.repulsion, medium.repulsion_range or edge)
+        half = 0.5 * channel.box[0]
+        self.reach = min(*channel.box[1:], half) if medium.reach is None else medium.reach
+        require(
+            0 < self.reach <= half,
+            f"reach must lie between 0 and half the channel's length, {half:.4g} m, but it is {self.reach:.4g} m.",
+        )
 
     def forces(self, nodes: Tensor) -> Tensor:
         """Forces [C, P, 3] [N] on nodes [C, P, 3] [m]: elastic ones, of walls, and between cells."""

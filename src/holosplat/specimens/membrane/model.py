@@ -36,7 +36,7 @@ class Elasticity:
     """Area of each triangle, k_al [N/m]."""
     global_area: float = 1e-3
     """Area of the whole surface, k_ag [N/m]."""
-    volume: float = 1e4
+    volume: float = 3e3
     """Volume, k_v [N/m²]."""
 
     def __post_init__(self) -> None:
