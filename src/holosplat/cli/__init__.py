@@ -1,4 +1,4 @@
-"""The command line: `holosplat plan | grow | simulate | reconstruct | render | export | convert | evaluate | bench | …`."""
+"""The command line: `holosplat plan | grow | simulate | reconstruct | render | export | convert | evaluate | …`."""
 
 import os
 

@@ -90,9 +90,7 @@ class Growth:
     def placed(self, suspension: Suspension) -> Tensor:
         """Resting cells [C, P, 3] [m] at random in the channel, clear of walls and of each other."""
         mesh, margin = suspension.membrane.mesh, suspension.repulsion.range_
-        found = place_cells(
-            self.cells, self.box, self.seed, self.diameter, 0.0, margin, "box", shuffles=SHUFFLES
-        )  # fmt: skip
+        found = place_cells(self.cells, self.box, self.seed, self.diameter, 0.0, margin, "box", shuffles=SHUFFLES)
         nodes = np.stack([mesh.vertices @ cell.rotation.T + cell.centre for cell in found])
         return torch.from_numpy(nodes + 0.5 * np.asarray(self.box))
 
@@ -125,9 +123,7 @@ class SeriesFolder:
     def require_new(self) -> None:
         """`InputError` if something is there already."""
         taken = self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir()))
-        require(
-            not taken, f"--out must be new or empty, but {self.path} holds files; choose another, or add --resume."
-        )
+        require(not taken, f"--out must be new or empty, but {self.path} holds files; choose another, or add --resume.")
         parent = self.path.resolve().parent
         require(parent.is_dir(), f"--out must lie in an existing folder, but {parent} is none; create it.")
 
@@ -178,8 +174,8 @@ class SeriesFolder:
             raise InputError(f"{self.state} must be a state that grow wrote, but it is damaged; start anew.") from error
         wanted = (growth.cells, len(suspension.membrane.mesh.vertices), 3)
         require(nodes.shape == wanted and bool(np.isfinite(nodes).all()), f"{self.state} is damaged; start anew.")
-        snapshot, taken, refused = counts
-        return snapshot, State(torch.from_numpy(nodes), *numbers, taken, refused)
+        (time, step), (snapshot, taken, refused) = numbers, counts
+        return snapshot, State(torch.from_numpy(nodes), time, step, taken, refused)
 
 
 def grow(
@@ -204,10 +200,11 @@ def grow(
         reached = -1, State(growth.placed(suspension), 0.0, first)
     if not resume:
         folder.create(growth)
-    snapshot, state = reached
+    last, state = reached
+    require(last < growth.snapshots, f"{folder.path} has {last + 1} snapshots already; ask for more of them.")
     end = growth.instant(growth.snapshots - 1)
     stepper = Stepper(suspension.velocity, growth.tolerance * float(suspension.membrane.rest.length.mean()))
-    worst = np.zeros(2)
+    worst = _greatest(suspension.membrane, state.nodes)
     with interrupts_held() as release:
 
         def between(nodes: Tensor, time: float) -> None:
@@ -215,11 +212,11 @@ def grow(
             on_progress(time / end if end > 0 else 1.0)
             _require_kept(suspension.membrane, nodes, time)
 
-        for snapshot in range(snapshot + 1, growth.snapshots):
+        for snapshot in range(last + 1, growth.snapshots):
             state = stepper.advance(state, growth.instant(snapshot), between)
             folder.write_snapshot(growth, suspension, snapshot, state)
-            worst = np.maximum(worst, [c.abs().max() for c in _changes(suspension.membrane, state.nodes)])
-    return Grown(state, float(worst[0]), float(worst[1]), snapshot + 1)
+            worst = np.maximum(worst, _greatest(suspension.membrane, state.nodes))
+    return Grown(state, float(worst[0]), float(worst[1]), growth.snapshots)
 
 
 def _changes(membrane: Membrane, nodes: Tensor) -> tuple[Tensor, Tensor]:
@@ -228,6 +225,11 @@ def _changes(membrane: Membrane, nodes: Tensor) -> tuple[Tensor, Tensor]:
         membrane.volume(nodes) / membrane.rest.volume - 1,
         membrane.surface(nodes) / membrane.rest.surface - 1,
     )
+
+
+def _greatest(membrane: Membrane, nodes: Tensor) -> np.ndarray:
+    """The greatest relative changes [2] of any cell's volume and area."""
+    return np.array([float(change.abs().max()) for change in _changes(membrane, nodes)])
 
 
 def _require_kept(membrane: Membrane, nodes: Tensor, time: float) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,7 +19,6 @@ from scipy.spatial.transform import Rotation
 from ..checks import InputError, finite, in_range, require, shaped
 from ..mesh import TriangleMesh
 
-_Array = TypeVar("_Array")
 RADIUS = 3.91e-6
 THICKNESS = (0.81e-6, 7.83e-6, -4.39e-6)
 DIAMETER = 2 * RADIUS
@@ -204,7 +203,7 @@ def _icosahedron() -> tuple[np.ndarray, np.ndarray]:
     return vertices / np.linalg.norm(vertices[0]), faces
 
 
-def half_thickness(t: _Array) -> _Array:
+def half_thickness(t: Any) -> Any:
     """(C0 + C1 t + C2 t²)/2 in radii: half the thickness of Evans & Fung without its root (arrays or tensors)."""
     c0, c1, c2 = (0.5 * c / RADIUS for c in THICKNESS)
     return c0 + t * (c1 + t * c2)

@@ -14,6 +14,8 @@ SAFETY, SHRINK, GROW = 0.9, 0.2, 3.0
 SMALLEST = 1e-6
 """A step shorter than this fraction of the time to cover is taken for a failure."""
 
+Check = Callable[[Tensor, float], None]
+
 
 @dataclass(frozen=True)
 class State:
@@ -38,8 +40,11 @@ class Stepper:
     def __init__(self, velocity: Callable[[Tensor], Tensor], tolerance: float) -> None:
         self.velocity, self.tolerance = velocity, tolerance
 
-    def advance(self, state: State, until: float, check: Callable[[Tensor, float], None] = lambda nodes, time: None) -> State:
-        """`state` at the time `until` [s]; `check` is called with nodes and time after every step. `InputError` where steps vanish."""
+    def advance(self, state: State, until: float, check: Check = lambda nodes, time: None) -> State:
+        """`state` at the time `until` [s]; `check` is called with nodes and time after every step.
+
+        `InputError` where steps vanish.
+        """
         require(until >= state.time, f"the time to reach must lie ahead, but {until} s is before {state.time} s.")
         nodes, time, step, taken, refused = state.nodes, state.time, state.step, state.taken, state.refused
         shortest = SMALLEST * (until - time)

@@ -32,7 +32,8 @@ class Medium:
     repulsion_range: float | None = None
     """Distance at which it begins [m] (default: the mean edge of the mesh)."""
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """`InputError` for numbers that cannot be."""
         in_range("viscosity", self.viscosity, 1e-6, 1e3, unit="pascal seconds")
         for name in ("reach", "repulsion_range"):
             if getattr(self, name) is not None:
@@ -49,6 +50,7 @@ class Suspension:
     """
 
     def __init__(self, membrane: Membrane, channel: Channel, medium: Medium = Medium()) -> None:
+        medium.check()
         self.membrane, self.channel, self.medium = membrane, channel, medium
         spacing = math.sqrt(float(membrane.rest.surface) / len(membrane.mesh.vertices))
         self.blob = BLOB * spacing

@@ -18,7 +18,7 @@ from .rest import RestShape
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Nodes [..., P, 3] [m], corners [..., F, 3, 3] of the triangles, their normals [..., F, 3], twice the area long."""
+    """Nodes [..., P, 3] [m], the triangles' corners [..., F, 3, 3] and normals [..., F, 3] (twice the area long)."""
 
     nodes: Tensor
     corners: Tensor

@@ -39,16 +39,21 @@ class Elasticity:
     volume: float = 3e3
     """Volume, k_v [N/m²]."""
 
-    def __post_init__(self) -> None:
+    def check(self) -> None:
+        """`InputError` for a modulus that is negative or not finite."""
         at_least(self, 0, *(field.name for field in fields(self)))
         finite = all(np.isfinite(getattr(self, field.name)) for field in fields(self))
         require(finite, "the moduli of a membrane must be finite numbers, but one is not; correct it.")
 
 
 class Membrane:
-    """A closed elastic surface. All methods take nodes [..., P, 3] [m], any number of cells of this rest shape."""
+    """The elastic surface of a cell, a closed mesh (else `InputError`, see `RestShape.of`).
+
+    All methods take nodes [..., P, 3] [m], any number of cells of this rest shape.
+    """
 
     def __init__(self, mesh: TriangleMesh, elasticity: Elasticity = Elasticity()) -> None:
+        elasticity.check()
         self.mesh = mesh
         self.elasticity = elasticity
         self.rest = RestShape.of(mesh)
