@@ -130,7 +130,7 @@ def place_cells(
     for _ in range(count):
         resting = _Placed.resting(diameter, margin, deform, rng)
         found = _inserted(resting, placed, channel, rng)
-        for _ in range(shuffles):
+        for _ in range(shuffles if placed else 0):
             if found is not None:
                 break
             _shuffle(placed, channel, rng)
