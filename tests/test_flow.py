@@ -211,7 +211,7 @@ def test_stiff_motion_stays_stable_and_wild_motion_stops():
 
 
 def test_a_cell_drifts_deforms_and_keeps_its_volume():
-    """Off the axis a cell is sheared, falls behind the fluid at its centre (Faxén's a²/6 ∇²u or so), and keeps volume."""
+    """Off the axis a cell is sheared, falls behind the fluid at its centre (by Faxén's a²/6 ∇²u or so), and keeps."""
     system = suspension()
     rest = torch.from_numpy(system.membrane.mesh.vertices.copy())
     start = (rest[:, [2, 0, 1]] + MIDDLE + torch.tensor([0, 5e-6, 0]))[None]

@@ -22,11 +22,17 @@ _WHERE = {
     "specimens.scene": ("MeshScene",),
     "specimens.red_cells": ("evans_fung_cell", "random_cells"),
     "specimens.repair": ("closed",),
+    "specimens.membrane.model": ("Elasticity", "Membrane"),
+    "specimens.membrane.resting": ("resting_cell",),
+    "specimens.membrane.tweezers": ("stretch",),
+    "specimens.flow.suspension": ("Medium", "Suspension"),
     "representations.gaussians": ("GaussianCloud",),
     "io.nxtomo": ("read_scan", "write_scan"),
     "io.volumes": ("read_volume", "write_volume"),
     "io.vtk": ("read_meshes", "write_mesh"),
+    "io.pvd": ("read_pvd", "write_pvd"),
     "experiments.contrast": ("Setup", "Subject"),
+    "experiments.grow": ("Growth", "grow"),
     "experiments.plan": ("Recording", "plan", "survey"),
     "experiments.settings": ("MaterialPrior", "Settings", "preset"),
     "experiments.simulate": ("Filling", "read_scene"),
@@ -56,6 +62,8 @@ if TYPE_CHECKING:
     from .experiments.evaluate import Evaluation as Evaluation
     from .experiments.evaluate import evaluate as evaluate
     from .experiments.evaluate import render as render
+    from .experiments.grow import Growth as Growth
+    from .experiments.grow import grow as grow
     from .experiments.plan import Recording as Recording
     from .experiments.plan import plan as plan
     from .experiments.plan import survey as survey
@@ -75,6 +83,8 @@ if TYPE_CHECKING:
     from .geometry import Views as Views
     from .io.nxtomo import read_scan as read_scan
     from .io.nxtomo import write_scan as write_scan
+    from .io.pvd import read_pvd as read_pvd
+    from .io.pvd import write_pvd as write_pvd
     from .io.volumes import read_volume as read_volume
     from .io.volumes import write_volume as write_volume
     from .io.vtk import read_meshes as read_meshes
@@ -92,6 +102,12 @@ if TYPE_CHECKING:
     from .scan import Exposures as Exposures
     from .scan import Scan as Scan
     from .scan import interleaved_split as interleaved_split
+    from .specimens.flow.suspension import Medium as Medium
+    from .specimens.flow.suspension import Suspension as Suspension
+    from .specimens.membrane.model import Elasticity as Elasticity
+    from .specimens.membrane.model import Membrane as Membrane
+    from .specimens.membrane.resting import resting_cell as resting_cell
+    from .specimens.membrane.tweezers import stretch as stretch
     from .specimens.red_cells import evans_fung_cell as evans_fung_cell
     from .specimens.red_cells import random_cells as random_cells
     from .specimens.repair import closed as closed
