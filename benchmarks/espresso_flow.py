@@ -54,12 +54,12 @@ class Run:
     rest: TriangleMesh
 
     @classmethod
-    def read(cls, folder: Path) -> Run:
-        """ESPResSo's run."""
+    def read(cls, folder: Path, most: int | None = None) -> Run:
+        """ESPResSo's run, `most` of its snapshots or all."""
         parameters = json.loads((folder / "params.json").read_text(encoding="utf-8"))
         with np.load(folder / "burst64_1p128MHz.npz") as burst:
             rest = closed(TriangleMesh(1e-6 * burst["rest"].astype(np.float64), burst["tri"].astype(np.int64), "rest"))
-        cells, count = parameters["n_cells"], parameters["n_snapshots"]
+        cells, count = parameters["n_cells"], most or parameters["n_snapshots"]
         files = [[folder / "vtk" / f"rbc{c:02d}_{t:03d}.vtk" for c in range(cells)] for t in range(count)]
         nodes = np.stack([[mesh.vertices for mesh in read_meshes(of_time, "um")] for of_time in files])
         times = np.array([1e-6 * float(re.search(rb" t=([0-9.]+)us", f[0].read_bytes()[:200])[1]) for f in files])
