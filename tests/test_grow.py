@@ -34,12 +34,12 @@ def series(tmp_path_factory) -> Path:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix in (".vtk", ".pvd")}
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix in (".vtp", ".pvd")}
 
 
 def test_the_series_reads_back(series):
     assert {path.name for path in series.iterdir()} == {
-        *(f"rbc{c:02d}_{t:03d}.vtk" for c in range(2) for t in range(3)),
+        *(f"rbc{c:02d}_{t:03d}.vtp" for c in range(2) for t in range(3)),
         "cells.pvd",
         "grow.json",
         "state.npz",
@@ -159,7 +159,7 @@ def test_interrupting_the_command(tmp_path, monkeypatch, capsys):
 
 def test_collections(tmp_path):
     """Odd names survive; files of one time come in the order of their parts, times in theirs."""
-    files = [tmp_path / 'a & "b".vtk', tmp_path / "c.vtk"]
+    files = [tmp_path / 'a & "b".vtp', tmp_path / "c.vtu"]
     for file in files:
         file.touch()
     path = tmp_path / "all.pvd"
@@ -169,7 +169,7 @@ def test_collections(tmp_path):
     for damage, said in (
         (good[:60], "readable ParaView collection"),
         ("<other/>", "must be a ParaView collection"),
-        (good.replace("c.vtk", "d.vtk"), "names 'd.vtk'"),
+        (good.replace("c.vtu", "d.vtu"), "names 'd.vtu'"),
         (good.replace('timestep="1e-06"', 'timestep="soon"'), "must be a number, but it is 'soon'"),
         ('<VTKFile type="Collection"><Collection/></VTKFile>', "at least one file"),
     ):
@@ -180,3 +180,5 @@ def test_collections(tmp_path):
         read_pvd(tmp_path / "none.pvd")
     with pytest.raises(InputError, match="times must be finite"):
         write_pvd(path, [TimeStep(float("nan"), (files[0],))])
+    with pytest.raises(InputError, match=r"legacy one; write it as \.vtp"):  # ParaView would not open it
+        write_pvd(path, [TimeStep(0.0, (tmp_path / "a.vtk",))])

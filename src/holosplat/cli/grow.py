@@ -14,7 +14,7 @@ def grow(out: Path, what: Growth, resume: bool = False) -> None:
     """Let red cells flow through a channel, and write their meshes (VTK, µm) at every snapshot.
 
     Args:
-        out: Folder to make: rbcCC_TTT.vtk for cell CC at snapshot TTT, and cells.pvd, which ParaView opens.
+        out: Folder to make: rbcCC_TTT.vtp for cell CC at snapshot TTT, and cells.pvd, which ParaView opens.
         resume: Go on with an interrupted run, or to more snapshots.
     """
     try:

@@ -107,7 +107,7 @@ class Grown:
 
 
 class SeriesFolder:
-    """`grow.json` (the options), `rbcCC_TTT.vtk` (cell, snapshot; µm), `cells.pvd` (opens as a time series),
+    """`grow.json` (the options), `rbcCC_TTT.vtp` (cell, snapshot; µm), `cells.pvd` (opens as a time series),
     `state.npz` (where to go on). Every file is written whole or not at all, the state last."""
 
     def __init__(self, path: str | Path) -> None:
@@ -118,7 +118,7 @@ class SeriesFolder:
 
     def file(self, cell: int, snapshot: int) -> Path:
         """The mesh of a cell, counted from 0, at a snapshot."""
-        return self.path / f"rbc{cell:02d}_{snapshot:03d}.vtk"
+        return self.path / f"rbc{cell:02d}_{snapshot:03d}.vtp"
 
     def require_new(self) -> None:
         """`InputError` if something is there already."""
@@ -146,10 +146,8 @@ class SeriesFolder:
 
     def write_snapshot(self, growth: Growth, suspension: Suspension, snapshot: int, state: State) -> None:
         """Add a snapshot: its meshes, the collection, and the state."""
-        time = growth.instant(snapshot) - growth.warm_up
         for cell, nodes in enumerate(suspension.channel.folded(state.nodes).numpy()):
-            name = f"rbc{cell:02d} t={1e6 * time:.6g}us"
-            write_mesh(self.file(cell, snapshot), TriangleMesh(nodes, suspension.membrane.mesh.faces, name))
+            write_mesh(self.file(cell, snapshot), TriangleMesh(nodes, suspension.membrane.mesh.faces))
         steps = [
             TimeStep(growth.instant(n) - growth.warm_up, tuple(self.file(c, n) for c in range(growth.cells)))
             for n in range(snapshot + 1)
