@@ -28,8 +28,8 @@ demo: setup ## simulate, reconstruct and report a small specimen into demo/
 	rm -rf demo
 	$(VENV)/bin/holosplat demo --out demo
 
-test: setup ## run the tests
-	$(VENV)/bin/python -m pytest
+test: setup ## run the tests, in two processes
+	$(VENV)/bin/python -m pytest -n 2 --dist loadfile
 
 check: setup ## lint, formatting and types
 	$(VENV)/bin/ruff check .

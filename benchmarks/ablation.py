@@ -1,4 +1,4 @@
-"""What each ingredient of the reconstruction is worth: every one removed in turn, on cases of the suite.
+"""What each ingredient of the reconstruction is worth: every one changed in turn, on cases of the suite.
 
     python benchmarks/ablation.py --snapshots DIR --csv docs/data/ablation.csv     # twenty minutes on two cores
     python benchmarks/ablation.py --cases noise12-2000 cells4 --seeds 101 102
@@ -53,7 +53,9 @@ VARIANTS: dict[str, Callable[[Settings], Settings]] = {
     "no bound at one in the fit": objective(overfull=0.0),
     "no rounds of agreement": lambda s: replace(s, volume=replace(s.volume, corrections=0)),
     "no rules for noise": without_noise_rules,
+    "rounds of agreement in noise, too": lambda s: replace(s, volume=replace(s.volume, noisy=1.0)),
     "100 steps": schedule(steps=100),
+    "600 steps": schedule(steps=600),
     "no fit (the start alone)": schedule(steps=0),
 }
 

@@ -315,6 +315,14 @@ def test_corrections_bring_the_volume_in_agreement_with_the_holograms(request, m
     assert dices[1] > dices[0] - 0.015
 
 
+def test_noisy_frames_get_no_rounds_of_agreement(cell_scan):
+    noisy = replace(cell_scan, frames=poisson(cell_scan.frames, 300, 0))
+    options = replace(USUAL, corrections=1)
+    for scan, rounds in ((cell_scan, True), (noisy, False)):
+        volume, without = (holographic_tv(scan, CELL, o, quiet)[0] for o in (options, replace(options, corrections=0)))
+        assert (volume.shape != without.shape or not torch.equal(volume, without)) == rounds
+
+
 def test_few_views_get_more_steps_a_round(cell_scan, monkeypatch):
     few = cell_scan[np.arange(0, 8, 2)]
     options = replace(USUAL, corrections=1, inner=5)

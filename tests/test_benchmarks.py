@@ -23,7 +23,10 @@ def scripts(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     return {
         name: importlib.import_module(name)
-        for name in ("step", "eager_step", "kernels", "plain_torch", "ablation", "tweezers", "espresso_flow")
+        for name in (
+            *("step", "eager_step", "kernels", "plain_torch", "ablation", "simulate"),
+            *("tweezers", "espresso_flow"),
+        )
     }
 
 
@@ -110,3 +113,21 @@ def test_espressos_cells_go_on_as_espresso_has_them(scripts, espresso_rbc):
     found = flow.statistics(run.nodes, run.suspension(None).membrane, run.times)
     assert 0.03 < found["drift"].min() < found["drift"].max() < 0.06
     assert abs(found["volume"]).max() < 0.01
+
+
+def test_what_the_benchmark_of_simulation_reports(scripts, monkeypatch):
+    """On a small field: frames by time and view, the volume, and an error well within what the docs promise."""
+    script = scripts["simulate"]
+    monkeypatch.setattr(script, "CELLS", 2)
+    monkeypatch.setattr(script, "CASES", {"frames": (48, 2, 3, 1e-6), "voxels": (48, 1, 0, 1e-6)})
+    rows = [script.run(name) for name in script.CASES]
+    assert [row["frames"] for row in rows] == [6, 0]
+    assert all(row["seconds"] > 0 for row in rows)
+    monkeypatch.setattr(script, "SMALL", (33, 28))
+    monkeypatch.setattr(script, "FINER", 8)
+    errors = script.accuracy(1e-6)
+    assert 0 < errors["single_precision"] < 1e-5
+    assert 1e-4 < errors["method"] < 5e-3
+    report = {"rows": rows, "accuracy": [errors], "load": 0.5, "commit": "abc", **script.environment("reference")}
+    assert "| frames | 48² of 1 µm | 6 | 4 |" in script.table(report)
+    assert "| voxels | 48³ of 1 µm | – | – |" in script.table(report)

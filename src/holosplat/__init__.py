@@ -18,8 +18,9 @@ _WHERE = {
     "volume": ("LineIntegrals", "Object", "Volume"),
     "mesh": ("TriangleMesh",),
     "materials": ("HAEMOGLOBIN", "PLASMA", "RED_CELL", "WATER", "Compound", "DeltaBeta", "Mixture", "parse_material"),
-    "forward": ("Instrument", "measure", "simulate"),
+    "forward": ("Instrument", "Shutter", "Simulation", "measure", "simulate", "simulated_frames"),
     "specimens.scene": ("MeshScene",),
+    "specimens.mesh_series": ("MeshSeries",),
     "specimens.red_cells": ("evans_fung_cell", "random_cells"),
     "specimens.repair": ("closed",),
     "specimens.membrane.model": ("Elasticity", "Membrane"),
@@ -27,8 +28,8 @@ _WHERE = {
     "specimens.membrane.tweezers": ("stretch",),
     "specimens.flow.suspension": ("Medium", "Suspension"),
     "representations.gaussians": ("GaussianCloud",),
-    "io.nxtomo": ("read_scan", "write_scan"),
-    "io.volumes": ("read_volume", "write_volume"),
+    "io.nxtomo": ("read_scan", "scan_writer", "write_scan"),
+    "io.volumes": ("read_volume", "write_volume", "write_voxels"),
     "io.vtk": ("read_meshes", "write_mesh"),
     "io.pvd": ("read_pvd", "write_pvd"),
     "experiments.contrast": ("Setup", "Subject"),
@@ -36,6 +37,8 @@ _WHERE = {
     "experiments.plan": ("Recording", "plan", "survey"),
     "experiments.settings": ("MaterialPrior", "Settings", "preset"),
     "experiments.simulate": ("Filling", "read_scene"),
+    "experiments.series": ("SeriesFiles", "Timing", "read_series"),
+    "experiments.misalignment": ("Misalignment",),
     "experiments.run_folder": ("RunFolder",),
     "experiments.reconstruct": ("Reconstruction", "load_reconstruction", "reconstruct"),
     "experiments.evaluate": ("Evaluation", "evaluate", "render"),
@@ -64,6 +67,7 @@ if TYPE_CHECKING:
     from .experiments.evaluate import render as render
     from .experiments.grow import Growth as Growth
     from .experiments.grow import grow as grow
+    from .experiments.misalignment import Misalignment as Misalignment
     from .experiments.plan import Recording as Recording
     from .experiments.plan import plan as plan
     from .experiments.plan import survey as survey
@@ -71,22 +75,30 @@ if TYPE_CHECKING:
     from .experiments.reconstruct import load_reconstruction as load_reconstruction
     from .experiments.reconstruct import reconstruct as reconstruct
     from .experiments.run_folder import RunFolder as RunFolder
+    from .experiments.series import SeriesFiles as SeriesFiles
+    from .experiments.series import Timing as Timing
+    from .experiments.series import read_series as read_series
     from .experiments.settings import MaterialPrior as MaterialPrior
     from .experiments.settings import Settings as Settings
     from .experiments.settings import preset as preset
     from .experiments.simulate import Filling as Filling
     from .experiments.simulate import read_scene as read_scene
     from .forward import Instrument as Instrument
+    from .forward import Shutter as Shutter
+    from .forward import Simulation as Simulation
     from .forward import measure as measure
     from .forward import simulate as simulate
+    from .forward import simulated_frames as simulated_frames
     from .geometry import Grid as Grid
     from .geometry import Views as Views
     from .io.nxtomo import read_scan as read_scan
+    from .io.nxtomo import scan_writer as scan_writer
     from .io.nxtomo import write_scan as write_scan
     from .io.pvd import read_pvd as read_pvd
     from .io.pvd import write_pvd as write_pvd
     from .io.volumes import read_volume as read_volume
     from .io.volumes import write_volume as write_volume
+    from .io.volumes import write_voxels as write_voxels
     from .io.vtk import read_meshes as read_meshes
     from .io.vtk import write_mesh as write_mesh
     from .materials import HAEMOGLOBIN as HAEMOGLOBIN
@@ -108,6 +120,7 @@ if TYPE_CHECKING:
     from .specimens.membrane.model import Membrane as Membrane
     from .specimens.membrane.resting import resting_cell as resting_cell
     from .specimens.membrane.tweezers import stretch as stretch
+    from .specimens.mesh_series import MeshSeries as MeshSeries
     from .specimens.red_cells import evans_fung_cell as evans_fung_cell
     from .specimens.red_cells import random_cells as random_cells
     from .specimens.repair import closed as closed

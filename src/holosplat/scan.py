@@ -60,6 +60,12 @@ class Exposures:
             time=self.time[index],
         )
 
+    def repeated(self, times: np.ndarray) -> Exposures:
+        """All N exposures at each of `times` [T] seconds: frame `t · N + v` is exposure v at `times[t]`."""
+        times = np.asarray(times, dtype=np.float64).reshape(-1)
+        index = np.tile(np.arange(len(self)), len(times))
+        return replace(self[index], time=np.repeat(times, len(self)))
+
 
 @dataclass(frozen=True)
 class Scan:
@@ -91,6 +97,31 @@ class Scan:
     def views(self) -> Views:
         """The exposures' poses and raster."""
         return self.exposures.views
+
+    @property
+    def instants(self) -> np.ndarray:
+        """The distinct times [T] of the frames [s], in order."""
+        return np.unique(self.exposures.time)
+
+    @property
+    def is_series(self) -> bool:
+        """Whether the frames show several times of what may move: some of them simultaneous, or all from one side.
+
+        Frames of as many times as directions are a scan of one object that is turned, as in tomography.
+        """
+        count = len(self.instants)
+        one_side = np.allclose(self.views.rotations, self.views.rotations[0], atol=1e-6)
+        return count > 1 and (count < len(self) or bool(one_side))
+
+    def at_instant(self, index: int) -> Scan:
+        """The frames of the instant `index` (0 is the first), as a scan of what does not move: all at time 0."""
+        last = len(self.instants) - 1
+        require(0 <= index <= last, f"the scan's instants are counted from 0 to {last}, but {index} is asked for.")
+        return self[np.flatnonzero(self.exposures.time == self.instants[index])].as_static()
+
+    def as_static(self) -> Scan:
+        """All frames as if taken at the same time, 0."""
+        return replace(self, exposures=replace(self.exposures, time=np.zeros(len(self))))
 
     def binned(self, factor: int) -> Scan:
         """The scan on pixels `factor` times larger (means of `factor × factor`); odd rows and columns are cut."""

@@ -42,6 +42,11 @@ class LineIntegrals:
         """From the integrals of β and δ themselves, each [V, H, W] in metres."""
         return cls(torch.stack((D, B), dim=1), ((1.0, 0.0), (0.0, 1.0)))
 
+    @classmethod
+    def of_any(cls, lines: LineIntegrals | tuple[torch.Tensor, torch.Tensor]) -> LineIntegrals:
+        """What an `Object` projects to: these themselves, or the integrals `(B, D)` [V, H, W] in metres."""
+        return lines if isinstance(lines, LineIntegrals) else cls.of(*lines)
+
     def __getitem__(self, index: int) -> torch.Tensor:
         """0: B, 1: D."""
         if not 0 <= index < 2:

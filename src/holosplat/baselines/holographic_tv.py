@@ -22,7 +22,7 @@ from ..forward import Instrument, resolving_oversample
 from ..geometry import Grid, Views
 from ..materials import DeltaBeta
 from ..memory import memory_kept
-from ..optics.noise import noise_levels
+from ..optics.noise import noise_share
 from ..optics.retrieval import Tikhonov, tikhonov
 from ..optics.retrieval.bounded import MODEL_ERROR, PRIOR
 from ..optics.retrieval.spectra import Raster, filtered, radian, response, spectra, surrounded
@@ -46,9 +46,10 @@ Progress = Callable[[str, float], None]
 class HolographicTV:
     """Options. retrieval: steps of the phase retrieval; iterations: primal–dual steps on the retrieved thickness;
     weight: of total variation while the volume is made to agree with the holograms, in pixels of path length;
-    corrections: rounds of that, of `inner` steps each, more with fewer than 8 views; refine: voxels along a pixel's
-    edge then (0: as the first fringe needs); max_voxels: coarser voxels rather than more than this many; upper: bound
-    of the occupancy (0: none); backend: `cpu`, or `reference` (plain torch, slow).
+    corrections: rounds of that, of `inner` steps each, more with fewer than 8 views; noisy: share of the frames'
+    contrast that is noise from which on there are no rounds, for the volume would agree with the noise; refine: voxels
+    along a pixel's edge in the rounds (0: as the first fringe needs); max_voxels: coarser voxels rather than more than
+    this many; upper: bound of the occupancy (0: none); backend: `cpu`, or `reference` (plain torch, slow).
     """
 
     retrieval: int = 60
@@ -56,13 +57,14 @@ class HolographicTV:
     weight: float = 0.3
     corrections: int = 6
     inner: int = 12
+    noisy: float = 0.2
     refine: int = 0
     max_voxels: int = 70_000_000
     upper: float = 1.0
     backend: Literal["cpu", "reference"] = "cpu"
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "weight", "corrections", "inner", "refine", "upper")
+        at_least(self, 0, "weight", "corrections", "inner", "noisy", "refine", "upper")
         at_least(self, 1, "retrieval", "iterations", "max_voxels")
 
 
@@ -80,9 +82,10 @@ def holographic_tv(
 def _holographic_tv(
     scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress
 ) -> tuple[Tensor, Grid]:
+    noise = noise_share(torch.from_numpy(scan.frames))
     scan, refine = _working_resolution(scan, options)
     solver = _tomography(scan, material, options, on_progress)
-    if options.corrections == 0:
+    if options.corrections == 0 or noise > options.noisy:
         return solver.volume, Grid.of_views(scan.views)
     return _agree(scan, material, solver, options, refine, on_progress)
 
@@ -90,8 +93,7 @@ def _holographic_tv(
 def _tomography(scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress) -> PrimalDual:
     """Phase retrieval of each view and total variation: the solver, on voxels of one pixel."""
     frames = torch.from_numpy(scan.frames)
-    noise = float(noise_levels(frames).mean())
-    how = Tikhonov(iterations=options.retrieval, noise=noise, backend=options.backend)
+    how = Tikhonov(iterations=options.retrieval, backend=options.backend)
     report = partial(on_progress, "phase retrieval")
     lines = tikhonov(frames, scan.exposures, *material, options=how, on_progress=report)
     rays = rays_of(lines, scan.views, Grid.of_views(scan.views), options.backend)
@@ -144,7 +146,7 @@ class Correction:
         wide, _ = surrounded(frames, scan.exposures)
         raster = Raster((wide.shape[-2], wide.shape[-1]), scan.views.pixel_size)
         h = response(scan.exposures, material.beta / material.delta, raster)
-        known = spectra(frames, scan.exposures, h, raster, noise_levels(frames), MODEL_ERROR, PRIOR)
+        known = spectra(frames, scan.exposures, h, raster, None, MODEL_ERROR, PRIOR)
         self._inverse = known.inverse
 
     def __call__(self, missing: Tensor) -> Tensor:

@@ -6,7 +6,6 @@ import json
 import math
 import os
 import sys
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -20,75 +19,26 @@ from ..experiments.demo import DETECTOR, write_demo_meshes
 from ..experiments.evaluate import Evaluation
 from ..experiments.evaluate import evaluate as score
 from ..experiments.evaluate import render as predict
-from ..experiments.reconstruct import load_reconstruction
+from ..experiments.reconstruct import load_reconstruction, require_one_time
 from ..experiments.reconstruct import reconstruct as fit
 from ..experiments.run_folder import RunFolder, scan_hash
-from ..experiments.simulate import read_scene
-from ..forward import simulate as image_scene
 from ..geometry import Grid
 from ..io.atomic import require_writable
 from ..io.json import read_json, write_json
 from ..io.nxtomo import read_scan, write_scan
-from ..io.volumes import read_volume, write_volume
+from ..io.volumes import read_volume, write_voxels
 from ..report.run import report_run
 from ..scan import PIXEL_RANGE_M, Scan
 from .bench import bench
 from .convert import convert
 from .grow import grow
-from .options import BeamlineOptions, MaterialOptions, MeshOptions, NoiseOptions, PriorOptions, SettingsOptions
+from .options import BeamlineOptions, PriorOptions, SettingsOptions, TruthOptions
 from .plan import plan
 from .progress import INTERRUPTED, ProgressBar
+from .simulate import simulate
 
 MOST_VOXELS = 2**31
 """The largest volume that `export` writes: 16 GB for δ and β."""
-
-
-def simulate(
-    meshes: Positional[tuple[Path, ...]],
-    beamline: BeamlineOptions,
-    out: Path,
-    files: MeshOptions = MeshOptions(),
-    filling: MaterialOptions = MaterialOptions(),
-    noise: NoiseOptions = NoiseOptions(),
-    truth: Path | None = None,
-) -> None:
-    """Simulate the holograms of closed triangle meshes.
-
-    Args:
-        meshes: VTK files (.vtk, .vtu, .vtp), one a cell; x, y, z are the object frame's, y is the rotation axis.
-        out: Scan file to write (NXtomo).
-        truth: Also write the true volume here.
-    """
-    require(len(meshes) > 0, "simulate needs at least one mesh file.")
-    for path in (out, truth) if truth else (out,):
-        require_writable(path)
-    exposures = beamline.exposures()
-    split = beamline.split(len(exposures))
-    materials = filling.filling()
-    scene = read_scene(meshes, materials, beamline.energy_kev, length_unit=files.length_unit, origin=files.origin)
-    missing = scene.missing_field(exposures.views)
-    if missing > 0:
-        _say(
-            f"warning: the scene reaches {1e6 * missing:.3g} µm ({missing / beamline.pixel_size:.3g} pixels) beyond "
-            "the detector in at least one view; enlarge --detector, or move --origin."
-        )
-    with ProgressBar() as bar:
-        scan = image_scene(
-            scene,
-            exposures,
-            photons_per_pixel=noise.photons_per_pixel,
-            seed=noise.seed,
-            is_test=split,
-            on_progress=lambda fraction: bar.show("simulating views", fraction, {}),
-        )
-    found = sorted({f"delta {m.delta:.6g}, beta {m.beta:.6g}" for m in scene.materials})
-    of_scene = {"meshes": str(len(meshes)), "materials": "; ".join(found), "medium": filling.medium or "vacuum"}
-    write_scan(out, replace(scan, provenance={**scan.provenance, **of_scene}))
-    rows, columns = beamline.detector
-    _say(f"wrote {out}: {len(scan)} frames of {rows} × {columns} pixels, {int(split.sum())} of them held out")
-    if truth is not None:
-        write_volume(truth, scene.voxelise(Grid.of_views(exposures.views)))
-        _say(f"wrote {truth}: the true volume")
 
 
 def reconstruct(
@@ -98,6 +48,7 @@ def reconstruct(
     how: SettingsOptions = SettingsOptions(),
     seed: int = 0,
     resume: bool = False,
+    time_frame: int | Literal["all"] | None = None,
 ) -> None:
     """Reconstruct a scan as Gaussians; the run folder holds the result and its report.
 
@@ -106,15 +57,16 @@ def reconstruct(
         out: Run folder to make.
         seed: Seed of everything random.
         resume: Go on with an interrupted run.
+        time_frame: Of a time-resolved scan: the time to reconstruct, counted from 0, or all if nothing moved.
     """
     settings = how.settings()
     require(seed >= 0, f"--seed must be 0 or more, but it is {seed}.")
-    measured = read_scan(scan)
+    measured = _at_time(read_scan(scan), time_frame)
     prior = matter.prior(measured.exposures.energy_kev)
     folder = RunFolder(out)
     with ProgressBar() as bar:
         result = fit(measured, prior, settings, seed, folder=folder, resume=resume, on_progress=bar.show)
-    write_json(folder.source, {"scan": str(scan.resolve())})
+    write_json(folder.source, {"scan": str(scan.resolve()), "time_frame": time_frame})
     evaluation = score(result, measured, None)
     report = report_run(folder, result, measured, evaluation, None)
     _print_scores(evaluation)
@@ -134,7 +86,7 @@ def render(run: Positional[Path], scan: Path, out: Path, split: Literal["test", 
         split: Which frames.
     """
     require_writable(out)
-    result, wanted = load_reconstruction(RunFolder(run)), read_scan(scan)
+    result, wanted = load_reconstruction(RunFolder(run)), _scan_for(RunFolder(run), scan)
     chosen = {"test": wanted.test, "train": wanted.train, "all": lambda: wanted}[split]()
     require(len(chosen) > 0, f"{scan} has no {split} frames to render; choose another --split.")
     frames = predict(result, chosen.exposures)
@@ -165,7 +117,7 @@ def export(
     grid = Grid.centred(shape or (columns, rows, columns), in_range("voxel size", edge, *PIXEL_RANGE_M, unit="metres"))
     count = math.prod(grid.shape)
     require(count <= MOST_VOXELS, f"shape must have at most {MOST_VOXELS:.0e} voxels, but it has {count:.0e}.")
-    write_volume(volume, result.cloud.voxelise(grid))
+    write_voxels(volume, result.cloud, grid)
     _say(f"wrote {volume}: {' × '.join(map(str, grid.shape))} voxels of {1e6 * grid.voxel_size[0]:.4g} µm")
 
 
@@ -185,7 +137,7 @@ def evaluate(
     """
     folder = RunFolder(run)
     result = load_reconstruction(folder)
-    measured, true_volume = read_scan(scan or _source(folder)), read_volume(truth) if truth else None
+    measured, true_volume = _scan_for(folder, scan or _source(folder)), read_volume(truth) if truth else None
     evaluation = score(result, measured, true_volume)
     if as_json:
         print(json.dumps(evaluation.as_dict(), indent=2, allow_nan=False))
@@ -212,7 +164,7 @@ def demo(out: Path = Path("demo")) -> None:
     _say(
         f"\n$ holosplat simulate {meshes}/*.vtk {detector} --views 16 --psf-sigma-px 0.05 --out {scan} --truth {truth}"
     )
-    simulate(tuple(paths), BeamlineOptions(DETECTOR, psf_sigma_px=0.05, views=16), scan, truth=truth)
+    simulate(tuple(paths), BeamlineOptions(DETECTOR, psf_sigma_px=0.05, views=16), scan, truth=TruthOptions(truth))
     _say(f"\n$ holosplat reconstruct {scan} --material haemoglobin --out {run}")
     reconstruct(scan, run, PriorOptions("haemoglobin"))
     _say(f"\n$ holosplat evaluate {run} --truth {truth}")
@@ -235,6 +187,22 @@ def _auto() -> str:
         return f"would take {resolve('auto')}"
     except InputError:
         return "finds neither cpu nor cuda"
+
+
+def _at_time(scan: Scan, time_frame: int | str | None) -> Scan:
+    """The frames of one time, of all as if nothing moved, or the scan as it is."""
+    if time_frame is None:
+        return scan
+    return scan.at_instant(time_frame) if isinstance(time_frame, int) else scan.as_static()
+
+
+def _scan_for(folder: RunFolder, scan: Path) -> Scan:
+    """A scan to compare a run with: of a time-resolved one, the frames of the time that the run is of."""
+    found = read_scan(scan)
+    if found.is_series:
+        found = _at_time(found, read_json(folder.source).get("time_frame") if folder.source.is_file() else None)
+        require_one_time(found)
+    return found
 
 
 def _source(folder: RunFolder) -> Path:

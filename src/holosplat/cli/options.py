@@ -10,8 +10,13 @@ import numpy as np
 
 from ..backends import resolve
 from ..checks import require
+from ..experiments.misalignment import Misalignment
+from ..experiments.poses import Directions, Geometry
+from ..experiments.series import SeriesFiles, Timing
 from ..experiments.settings import MaterialPrior, Settings, preset, read_settings
-from ..experiments.simulate import Filling, poses
+from ..experiments.simulate import Filling
+from ..forward import Shutter, Simulation
+from ..io.atomic import require_writable
 from ..materials import parse_material, read_material_table
 from ..scan import Exposures, interleaved_split
 
@@ -24,6 +29,21 @@ class MeshOptions:
     """Unit of the mesh files' coordinates."""
     origin: tuple[float, float, float] | None = None
     """Point on the rotation axis at the field's centre, in the files' coordinates (default: the meshes' centre)."""
+    snapshot_interval: float | None = None
+    """Series: seconds from one snapshot to the next (default: as the files say)."""
+    time_unit: str | None = None
+    """Series: unit of a collection's time steps (default: s)."""
+    period: tuple[float, float, float] | None = None
+    """Series: edges x, y, z of the periodic box that bodies were folded into, in the files' coordinates; 0: none."""
+
+    def series(self) -> SeriesFiles:
+        """How the files of a series are read."""
+        return SeriesFiles(self.length_unit, self.origin, self.snapshot_interval, self.time_unit, self.period)
+
+    def require_static(self) -> None:
+        """`InputError` if something is given that only a series has."""
+        stray = [name for name in ("snapshot_interval", "time_unit", "period") if getattr(self, name) is not None]
+        require(not stray, f"--{stray[0].replace('_', '-') if stray else ''} goes with --frame-rate, of a series.")
 
 
 @dataclass(frozen=True)
@@ -72,14 +92,19 @@ class BeamlineOptions:
     """Number of views, evenly spaced over 180°."""
     angles_deg: tuple[float, ...] = ()
     """Or: the views' angles [degrees]."""
+    tilts_deg: tuple[float, ...] = ()
+    """With these: how far each view leaves the plane normal to the axis [degrees]."""
     rotations: Path | None = None
     """Or: a .npy file of rotation matrices [V, 3, 3], x_lab = R x_obj."""
+    geometry: Geometry | None = None
+    """Or: a known geometry: 16 even views, or two beams (0°, 23.8°) or three (0°, 30°, 48°) at once."""
     test_every: int = 4
     """One view in so many is held out of the fit (0: none)."""
 
     def exposures(self) -> Exposures:
         """How each frame is taken."""
-        views = poses(self.views, self.angles_deg, self.rotations, self.detector, self.pixel_size)
+        directions = Directions(self.views, self.angles_deg, self.tilts_deg, self.rotations, self.geometry)
+        views = directions.on(self.detector, self.pixel_size)
         return Exposures.of(views, self.energy_kev, self.distance, self.psf_sigma_px)
 
     def split(self, count: int) -> np.ndarray:
@@ -97,6 +122,95 @@ class NoiseOptions:
     """Mean photons a pixel for Poisson noise; none means noise-free."""
     seed: int = 0
     """Seed of the noise."""
+
+    def simulation(self, shutter: Shutter = Shutter()) -> Simulation:
+        """How frames are simulated."""
+        return Simulation(self.photons_per_pixel, self.seed, shutter=shutter)
+
+
+@dataclass(frozen=True)
+class MotionOptions:
+    """Moving meshes: a time-resolved scan, all views of a time taken at the same instant."""
+
+    frame_rate: float | None = None
+    """Times a second [Hz]; the meshes are then snapshots of a motion, and between them move straight."""
+    frames: int | None = None
+    """Number of times (default: as many as the snapshots cover)."""
+    start: float | None = None
+    """Time of the first frames after the first snapshot [s] (default: as early as can be)."""
+    exposure: float = 0.0
+    """Motion blur: how long a frame gathers light, about its time [s]."""
+    pulses: int = 1
+    """Motion blur: flashes in that, evenly spaced, whose intensities are averaged."""
+    hold_out: Literal["views", "times"] = "views"
+    """What --test-every counts: views, the same ones at every time, or times, with all their views."""
+
+    def shutter(self) -> Shutter:
+        """The motion blur."""
+        return Shutter(self.exposure, self.pulses)
+
+    def timing(self) -> Timing | None:
+        """When frames are taken; None for meshes that do not move."""
+        if self.frame_rate is not None:
+            return Timing(self.frame_rate, self.frames, self.start, self.shutter())
+        for name, default in vars(MotionOptions()).items():
+            require(getattr(self, name) == default, f"--{name.replace('_', '-')} needs --frame-rate, of moving meshes.")
+        return None
+
+
+@dataclass(frozen=True)
+class MisalignmentOptions:
+    """Errors of each view that the scan file does not know of; --true-exposures keeps them."""
+
+    misalign_shift: float = 0.0
+    """Standard deviation of the detector's shift along rows and columns [pixels]."""
+    misalign_rotation: float = 0.0
+    """Standard deviation of small turns about x, y and z [degrees]."""
+    misalign_distance: float = 0.0
+    """Standard deviation of the distance, as a share of it."""
+    misalign_seed: int = 0
+    """Seed of these errors."""
+
+    def errors(self) -> Misalignment:
+        """The errors that the options name."""
+        return Misalignment(self.misalign_shift, self.misalign_rotation, self.misalign_distance, self.misalign_seed)
+
+    def facts(self) -> dict[str, str]:
+        """What the file of the true exposures says of them."""
+        return {name: f"{value:g}" for name, value in vars(self).items()}
+
+
+@dataclass(frozen=True)
+class TruthOptions:
+    """What is also written, for judging."""
+
+    truth: Path | None = None
+    """Volume file: the true δ and β, of a series at its first time."""
+    truth_frames: tuple[int, ...] = ()
+    """Series: write the true volume at these times instead, counted from 0, to TRUTH_t0000.h5 and so on."""
+    true_exposures: Path | None = None
+    """Scan file: the same frames, with poses and distances as they were, not as --out tells them."""
+
+    def require_usable(self, out: Path) -> None:
+        """`InputError` unless all files, `out` among them, can be written, and are different ones."""
+        require(self.truth is not None or not self.truth_frames, "--truth-frames needs --truth.")
+        paths = [path for path in (out, self.truth, self.true_exposures) if path]
+        for path in paths:
+            require_writable(path)
+        different = len({path.resolve() for path in paths}) == len(paths)
+        require(different, "--out, --truth and --true-exposures must be different files.")
+
+    def volumes(self, times: int) -> list[tuple[Path, int]]:
+        """Each volume file to write, and the number of its time, one of `times`."""
+        if self.truth is None:
+            return []
+        for frame in self.truth_frames:
+            require(
+                0 <= frame < times,
+                f"--truth-frames counts the scan's {times} times from 0 to {times - 1}, but {frame} is asked for.",
+            )
+        named = [(self.truth.with_stem(f"{self.truth.stem}_t{frame:04d}"), frame) for frame in self.truth_frames]
+        return named or [(self.truth, 0)]
 
 
 @dataclass(frozen=True)

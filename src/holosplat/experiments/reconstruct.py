@@ -65,8 +65,10 @@ def reconstruct(
     With a `folder`, everything is written there, and a later call with `resume=True` goes on from the last
     checkpoint, with the same result as if nothing had happened. Ctrl-C (KeyboardInterrupt) ends the fit with
     what it has reached (`finished` is False); during the start there is nothing yet, and it is passed on.
-    Errors: `InputError` for scans without training frames or matter, and for folders that do not fit.
+    Errors: `InputError` for scans without training frames or matter, or of several times (`Scan.is_series`), and for
+    folders that do not fit.
     """
+    require_one_time(scan)
     _check_frames(scan.train())
     if resolve(settings.fit.backend) == "cuda":
         resolve("cpu")  # the start and the judging run there
@@ -97,6 +99,17 @@ def _fit_options(prior: MaterialPrior, settings: Settings) -> FitOptions:
     if prior.kind != "free":
         return settings.fit
     return replace(settings.fit, objective=replace(settings.fit.objective, overfull=0.0, two_levels=0.0))
+
+
+def require_one_time(scan: Scan) -> None:
+    """`InputError` for a time-resolved scan: one still volume cannot be all of its times."""
+    times = scan.instants
+    require(
+        not scan.is_series,
+        f"the scan must show one time, but its frames are of {len(times)}, from {times[0]:g} to {times[-1]:g} s, and "
+        f"the reconstruction stands still; choose a time with --time-frame 0 … {len(times) - 1} (Scan.at_instant), or "
+        "--time-frame all if nothing moved (Scan.as_static).",
+    )
 
 
 def _check_frames(train: Scan) -> None:

@@ -74,16 +74,8 @@ class Misfit:
 
     def names(self, cloud: GaussianCloud, draw: Draw) -> list[str]:
         """What the values of a call with these arguments are called."""
-        w = self.objective
-        image = [name for name in IMAGE_TERMS if getattr(w, name) > 0]
-        shape = ["anisotropy"] if w.anisotropy > 0 else []
-        single = cloud.single_material
-        used = {
-            "tv_volume": w.tv_volume > 0,
-            "overfull": w.overfull > 0 and single,
-            "two_levels": w.two_levels > 0 and single,
-        }
-        return ["loss", *image, *shape, *(name for name in used if used[name] and draw.volume)]
+        image = [name for name in IMAGE_TERMS if getattr(self.objective, name) > 0]
+        return ["loss", *image, *self._object_weights(cloud, draw)]
 
     def __call__(self, cloud: GaussianCloud, draw: Draw) -> tuple[Tensor, Tensor]:
         """The loss, and the values [K] of `names(cloud, draw)`, detached."""
@@ -119,19 +111,27 @@ class Misfit:
         ramps = {"frc": (draw.progress / max(w.frc_ramp, 1e-9)).clamp_max(1.0)}
         return {name: (weight * ramps.get(name, 1.0), value()) for name, weight, value in table if weight > 0}
 
+    def _object_weights(self, cloud: GaussianCloud, draw: Draw) -> dict[str, float]:
+        """Weight of every term on the Gaussians in use at this step, before it is ramped."""
+        w, bounded = self.objective, draw.volume * cloud.single_material
+        table = {
+            "anisotropy": w.anisotropy,
+            "tv_volume": w.tv_volume * draw.volume,
+            "overfull": w.overfull * bounded,
+            "two_levels": self._two_levels * bounded,
+        }
+        return {name: weight for name, weight in table.items() if weight > 0}
+
     def _object_terms(self, cloud: GaussianCloud, draw: Draw) -> list[tuple[float | Tensor, Tensor]]:
         """Weight and value of every term on the Gaussians in use at this step."""
-        w = self.objective
-        found: list[tuple[float | Tensor, Tensor]] = []
-        if w.anisotropy > 0:
-            found.append((w.anisotropy, terms.anisotropy(cloud.log_scales, w.anisotropy_limit)))
-        if draw.volume:
-            density, scale = cloud.density_around(draw.middle, *self._block), self._volume_scale
-            if w.tv_volume > 0:
-                found.append((w.tv_volume * draw.volume, scale * total_variation(density, backend=cloud.backend)))
-            if w.overfull > 0 and cloud.single_material:
-                found.append((w.overfull * draw.volume, scale * terms.overfull(density)))
-            if w.two_levels > 0 and cloud.single_material:
-                ramped = self._two_levels * draw.volume * draw.progress
-                found.append((ramped, scale * terms.two_levels(density)))
-        return found
+        weights, scale = self._object_weights(cloud, draw), self._volume_scale
+        of_volume = any(name != "anisotropy" for name in weights)
+        density = cloud.density_around(draw.middle, *self._block) if of_volume else draw.middle
+        values: dict[str, Callable[[], Tensor]] = {
+            "anisotropy": lambda: terms.anisotropy(cloud.log_scales, self.objective.anisotropy_limit),
+            "tv_volume": lambda: scale * total_variation(density, backend=cloud.backend),
+            "overfull": lambda: scale * terms.overfull(density),
+            "two_levels": lambda: scale * terms.two_levels(density),
+        }
+        ramps = {"two_levels": draw.progress}
+        return [(weight * ramps.get(name, 1.0), values[name]()) for name, weight in weights.items()]

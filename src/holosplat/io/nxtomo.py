@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import h5py
@@ -56,26 +58,58 @@ def read_scan(path: str | Path) -> Scan:
 
 
 def write_scan(path: str | Path, scan: Scan) -> None:
-    """Write `scan` as NXtomo (docs/conventions.md), replacing `path` only once all is written.
+    """Write `scan` as NXtomo (docs/conventions.md), replacing `path` only once all is written."""
+    with scan_writer(path, scan.exposures, scan.is_test, scan.provenance) as add:
+        for frame in scan.frames:
+            add(frame)
 
-    `view_rotation` holds the poses exactly; `rotation_angle`, which other programs read, holds the nearest
-    rotation about y. Provenance goes to /entry/process/provenance, one text a dataset.
+
+@contextmanager
+def scan_writer(
+    path: str | Path, exposures: Exposures, is_test: np.ndarray, provenance: dict[str, str]
+) -> Iterator[Callable[[np.ndarray], None]]:
+    """A scan file that grows frame by frame: yields a function that takes the next frame, [H, W] relative intensity.
+
+    The file appears at `path` when the block ends and all frames are there, and not at all when the block raises
+    (Ctrl-C too): no frame is kept in memory. is_test: [N] bool. `view_rotation` holds the poses exactly;
+    `rotation_angle`, which other programs read, the nearest rotation about y. Provenance goes to
+    /entry/process/provenance, one text a dataset. Errors: `InputError` for frames of another shape, not finite,
+    or not as many as there are exposures, and where the file cannot be written.
     """
-    for key, value in scan.provenance.items():
+    for key, value in provenance.items():
         good = isinstance(key, str) and isinstance(value, str) and key and "\0" not in key + value
         require(bool(good), f"provenance must map names to texts, but {key!r} maps to {value!r}; correct it.")
+    is_test = shaped("split", np.asarray(is_test, dtype=bool), (len(exposures),))
+    count = 0
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
-        file.attrs.update(NX_class="NXroot", default="entry", creator=f"holosplat {__version__}")
-        entry = _group(file, "entry", "NXentry", default="data")
-        entry["definition"] = "NXtomo"
-        entry[SPLIT] = scan.is_test.astype(np.uint8)
-        _write_instrument(_group(entry, "instrument", "NXinstrument"), scan)
-        _write_sample(_group(entry, "sample", "NXsample"), scan)
-        _write_process(_group(entry, "process", "NXprocess"), scan.provenance)
-        plot = _group(entry, "data", "NXdata", signal="data", axes=["rotation_angle", ".", "."])
-        for source in (DATA, IMAGE_KEY, ANGLE):
-            entry[source].attrs["target"] = f"/entry/{source}"
-            plot[source.rsplit("/", 1)[1]] = entry[source]
+        data = _write_entry(file, exposures, is_test, provenance)
+
+        def add(frame: np.ndarray) -> None:
+            nonlocal count
+            require(count < len(data), f"a scan of {len(data)} exposures takes as many frames, but there are more.")
+            data[count] = finite("frames", shaped("frame", np.asarray(frame), exposures.views.shape))
+            count += 1
+
+        yield add
+        require(count == len(data), f"a scan of {len(data)} exposures needs as many frames, but there are {count}.")
+
+
+def _write_entry(
+    file: h5py.File, exposures: Exposures, is_test: np.ndarray, provenance: dict[str, str]
+) -> h5py.Dataset:
+    """All of a scan file but its frames, whose dataset is returned."""
+    file.attrs.update(NX_class="NXroot", default="entry", creator=f"holosplat {__version__}")
+    entry = _group(file, "entry", "NXentry", default="data")
+    entry["definition"] = "NXtomo"
+    entry[SPLIT] = is_test.astype(np.uint8)
+    data = _write_instrument(_group(entry, "instrument", "NXinstrument"), exposures)
+    _write_sample(_group(entry, "sample", "NXsample"), exposures)
+    _write_process(_group(entry, "process", "NXprocess"), provenance)
+    plot = _group(entry, "data", "NXdata", signal="data", axes=["rotation_angle", ".", "."])
+    for source in (DATA, IMAGE_KEY, ANGLE):
+        entry[source].attrs["target"] = f"/entry/{source}"
+        plot[source.rsplit("/", 1)[1]] = entry[source]
+    return data
 
 
 def _entry(file: h5py.File, path: str | Path) -> h5py.Group:
@@ -263,30 +297,30 @@ def _put(group: h5py.Group, name: str, value: np.ndarray | float, units: str) ->
     group[name].attrs["units"] = units
 
 
-def _write_instrument(instrument: h5py.Group, scan: Scan) -> None:
-    exposures = scan.exposures
+def _write_instrument(instrument: h5py.Group, exposures: Exposures) -> h5py.Dataset:
     source = _group(instrument, "source", "NXsource")
     source["probe"] = "x-ray"
     _put(_group(instrument, "beam", "NXbeam"), "incident_energy", float(exposures.energy_kev), "keV")
     detector = _group(instrument, "detector", "NXdetector")
-    detector["data"] = scan.frames
-    detector["image_key"] = np.full(len(scan), PROJECTION, dtype=np.int32)
+    data = detector.create_dataset("data", (len(exposures), *exposures.views.shape), np.float32)
+    detector["image_key"] = np.full(len(exposures), PROJECTION, dtype=np.int32)
     for axis in "xy":
         _put(detector, f"{axis}_pixel_size", exposures.views.pixel_size, "m")
     same = bool((exposures.distance == exposures.distance[0]).all())  # a scalar is what most programs expect
     _put(detector, "distance", exposures.distance[0] if same else exposures.distance, "m")
     _put(detector, "shift", exposures.views.shifts, "m")
     _put(detector, "psf_sigma", exposures.psf_sigma_px, "px")
+    return data
 
 
-def _write_sample(sample: h5py.Group, scan: Scan) -> None:
+def _write_sample(sample: h5py.Group, exposures: Exposures) -> None:
     sample["name"] = "sample"
-    rotations = scan.views.rotations
+    rotations = exposures.views.rotations
     sample["view_rotation"] = rotations
     # R(θ) is nearest to R where tr(R(θ)ᵀ R) = cos θ (R00 + R22) + sin θ (R02 - R20) is largest.
     theta = np.arctan2(rotations[:, 0, 2] - rotations[:, 2, 0], rotations[:, 0, 0] + rotations[:, 2, 2])
     _put(sample, "rotation_angle", np.rad2deg(theta), "deg")
-    _put(sample, "time", scan.exposures.time, "s")
+    _put(sample, "time", exposures.time, "s")
 
 
 def _write_process(process: h5py.Group, provenance: dict[str, str]) -> None:

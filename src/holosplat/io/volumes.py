@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import h5py
@@ -9,12 +10,16 @@ import numpy as np
 
 from ..checks import InputError, finite, in_range
 from ..geometry import Grid
-from ..volume import Volume
+from ..volume import Object, Volume
 from .atomic import atomic_path
 from .hdf5 import Fields, attribute_numbers, open_hdf5
 
 NAMES = ("delta", "beta")
 VOXEL_RANGE_M = (1e-10, 1e-2)
+SLAB_VOXELS = 1 << 22
+"""Voxels that `write_voxels` makes at once: meshes take about 250 MB for them."""
+
+Progress = Callable[[float], None]
 
 
 def read_volume(path: str | Path) -> Volume:
@@ -40,12 +45,41 @@ def read_volume(path: str | Path) -> Volume:
 
 def write_volume(path: str | Path, volume: Volume) -> None:
     """Write `volume` as /delta and /beta with their grid, replacing `path` only once all is written."""
-    grid = {"voxel_size": np.array(volume.grid.voxel_size), "origin": np.array(volume.grid.origin)}
+    write_slabs(path, volume.grid, [(0, volume)])
+
+
+def write_slabs(path: str | Path, grid: Grid, slabs: Iterable[tuple[int, Volume]]) -> None:
+    """Write the volume on `grid` of which `slabs` gives parts, each with the y index of its first slice.
+
+    The parts must cover the grid; `path` is replaced only once all are written.
+    """
+    attributes = {"voxel_size": np.array(grid.voxel_size), "origin": np.array(grid.origin)}
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
-        file.attrs.update(grid)
-        for name in NAMES:
-            file[name] = getattr(volume, name)
-            file[name].attrs.update(grid)
+        file.attrs.update(attributes)
+        arrays = {name: file.create_dataset(name, grid.shape, np.float32) for name in NAMES}
+        for array in arrays.values():
+            array.attrs.update(attributes)
+        for start, part in slabs:
+            for name, array in arrays.items():
+                array[:, start : start + part.grid.shape[1]] = getattr(part, name)
+
+
+def write_voxels(path: str | Path, obj: Object, grid: Grid, on_progress: Progress = lambda fraction: None) -> None:
+    """Write `obj` voxelised on `grid`, slab by slab: memory is that of `SLAB_VOXELS` voxels, however large the grid.
+
+    `on_progress(fraction)` is called after each slab.
+    """
+    rows = grid.shape[1]
+    step = max(1, SLAB_VOXELS // (grid.shape[0] * grid.shape[2]))
+
+    def slabs() -> Iterator[tuple[int, Volume]]:
+        for start in range(0, rows, step):
+            stop = min(start + step, rows)
+            block = grid.block((0, start, 0), (grid.shape[0], stop - start, grid.shape[2]))
+            yield start, obj.voxelise(block)
+            on_progress(stop / rows)
+
+    write_slabs(path, grid, slabs())
 
 
 def _array(fields: Fields, name: str) -> np.ndarray:

@@ -37,10 +37,15 @@ def read_meshes(paths: str | Path | Iterable[str | Path], length_unit: str) -> l
     names the file that is missing, damaged, truncated, no VTK file, or holds no triangles.
     """
     factor = unit_factor("length_unit", length_unit, LENGTH_UNITS)
+    return [_read_mesh(file, factor) for file in mesh_files(paths)]
+
+
+def mesh_files(paths: str | Path | Iterable[str | Path]) -> list[Path]:
+    """The files that `read_meshes` reads, in its order."""
     several = [paths] if isinstance(paths, (str, Path)) else list(paths)
     files = [file for path in several for file in _files(Path(path))]
     require(len(files) > 0, "mesh files must be at least one, but the list of paths is empty.")
-    return [_read_mesh(file, factor) for file in files]
+    return files
 
 
 def write_mesh(path: str | Path, mesh: TriangleMesh, length_unit: str = "um") -> None:

@@ -38,8 +38,11 @@ def blur(image: Tensor, transfer: Tensor) -> Tensor:
     return torch.fft.irfft2(torch.fft.rfft2(image) * transfer, s=image.shape[-2:])
 
 
-def poisson(intensity: np.ndarray, photons_per_pixel: float, seed: int) -> np.ndarray:
-    """Relative intensity [N, H, W] with photon noise: Poisson counts of mean `I · photons_per_pixel`, divided by it."""
+def poisson(intensity: np.ndarray, photons_per_pixel: float, seed: int | np.random.Generator) -> np.ndarray:
+    """Relative intensity [..., H, W] with photon noise: Poisson counts of mean `I · photons_per_pixel`, divided by it.
+
+    seed: a seed, or a generator to draw on: frames one by one then get the same noise as all at once.
+    """
     photons = positive("photons_per_pixel", photons_per_pixel)
     counts = np.random.default_rng(seed).poisson(np.clip(intensity, 0, None) * photons)
     return (counts / photons).astype(np.float32)

@@ -12,8 +12,8 @@ from .style import format_length, scientific
 from .tables import duration
 
 PROTOCOL = (
-    "Each scene is made of closed triangle meshes; its holograms are simulated in float64 by a mesh projector on a "
-    "raster several times finer than the detector, which no method uses. A method gets the training frames, their "
+    "Each scene is made of closed triangle meshes; its holograms are simulated by a mesh projector on a raster "
+    "several times finer than the detector, which no method uses. A method gets the training frames, their "
     "geometry, and what the case says is known of the matter. Held-out frames are free of noise and never reach it:"
     " they serve the scores only, not the choice of options, nor when to stop. Options were tuned on scenes of "
     "seeds below 100, one set for all cases.",

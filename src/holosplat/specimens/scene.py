@@ -6,14 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from torch import Tensor
 
 from ..checks import require
 from ..geometry import Grid, Views
 from ..materials import DeltaBeta
 from ..mesh import TriangleMesh
 from ..projectors.mesh import mesh_line_integrals, voxelise_meshes
-from ..volume import Volume
+from ..volume import LineIntegrals, Volume
 
 
 @dataclass(frozen=True)
@@ -46,15 +45,16 @@ class MeshScene:
         """The scene itself: it does not move."""
         return self
 
-    def project(self, views: Views) -> tuple[Tensor, Tensor]:
-        """Line integrals (B, D) [V, H, W] in metres, float64, `2 × 2` rays a pixel."""
-        vertices, faces, values = self._soup()
-        delta, beta = mesh_line_integrals(vertices, faces, values, views)
-        return beta, delta
+    def project(self, views: Views) -> LineIntegrals:
+        """Line integrals of each material, or of δ and β where there are more than two; float64, 2 × 2 rays a pixel."""
+        vertices, faces, values, kinds = self._soup()
+        return LineIntegrals(mesh_line_integrals(vertices, faces, values, views).swapaxes(0, 1), kinds)
 
     def voxelise(self, grid: Grid) -> Volume:
         """δ and β averaged over voxels (partial occupancy at surfaces)."""
-        delta, beta = voxelise_meshes(*self._soup(), grid)
+        vertices, faces, values, kinds = self._soup()
+        shares = voxelise_meshes(vertices, faces, values, grid)
+        delta, beta = (sum((n * share for n, share in zip(of, shares)), np.zeros(grid.shape)) for of in zip(*kinds))
         return Volume(delta, beta, grid)
 
     def missing_field(self, views: Views) -> float:
@@ -64,10 +64,18 @@ class MeshScene:
         half = 0.5 * np.array([views.width, views.height])
         return float((np.abs(lab) - half).max())
 
-    def _soup(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """All meshes as one: vertices [P, 3], faces [F, 3], and (δ, β) of each face's body [2, F]."""
+    def _soup(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[tuple[float, float], ...]]:
+        """All meshes as one: vertices [P, 3], faces [F, 3], and of what each face's body is made, [C, F] of C kinds.
+
+        The kinds are the (δ, β) of the materials, or units of δ and of β where there are more than two materials.
+        """
         offsets = np.cumsum([0] + [len(m.vertices) for m in self.meshes[:-1]])
         faces = np.concatenate([m.faces + o for m, o in zip(self.meshes, offsets)])
-        counts = [len(m.faces) for m in self.meshes]
-        values = np.repeat(np.array(self.materials, dtype=np.float64).T, counts, axis=1)
-        return np.concatenate([m.vertices for m in self.meshes]), faces, values
+        matter = np.array([(m.delta, m.beta) for m in self.materials], dtype=np.float64)  # [M, 2]
+        kinds = tuple(dict.fromkeys((float(delta), float(beta)) for delta, beta in matter))
+        if len(kinds) > 2:
+            values, kinds = matter.T, ((1.0, 0.0), (0.0, 1.0))
+        else:
+            values = np.stack([(matter == kind).all(1) for kind in kinds]).astype(np.float64)
+        values = np.repeat(values, [len(m.faces) for m in self.meshes], axis=1)
+        return np.concatenate([m.vertices for m in self.meshes]), faces, values, kinds

@@ -11,11 +11,10 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ...checks import InputError, in_range, require
 from ...forward import PHOTON_RANGE
-from ...geometry import Views, rotation_y
+from ...geometry import Views, rotation_tilted, rotation_y
 from ...materials import DeltaBeta, parse_material
 from ...scan import Exposures, interleaved_split
 from ...specimens.scene import MeshScene
@@ -119,11 +118,7 @@ class Between:
 
 @dataclass(frozen=True)
 class Listed:
-    """Directions `[angle, tilt]` [degrees] for training, and held out: `R = R_x(tilt) R_y(angle)`.
-
-    angle: about the object's y axis, as in tomography; tilt: by which the beam then leaves the plane that is normal to
-    that axis, so that the views have no common axis.
-    """
+    """Directions `[angle, tilt]` [degrees] (`geometry.rotation_tilted`) for training, and held out."""
 
     kind: ClassVar[str] = "listed"
     train: tuple[tuple[float, float], ...]
@@ -136,7 +131,7 @@ class Listed:
     def poses(self) -> tuple[np.ndarray, np.ndarray]:
         """Rotations [V, 3, 3], those for training first, and which of them are held out [V] bool."""
         angles, tilts = np.array(self.train + self.test).T
-        rotations = Rotation.from_euler("x", tilts[:, None], degrees=True).as_matrix() @ rotation_y(angles)
+        rotations = rotation_tilted(angles, tilts)
         return rotations, np.arange(len(rotations)) >= len(self.train)
 
 

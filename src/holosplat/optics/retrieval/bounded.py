@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from ...scan import Exposures
+from ..noise import wavelet_noise
 from .spectra import Prior, Raster, filtered, response, spectra, surrounded
 
 STEPS = 25
@@ -46,7 +47,8 @@ def bounded_estimate(frames: Tensor, exposures: Exposures, ratio: float, noise: 
     known = spectra(frames, exposures, response(exposures, ratio, raster), raster, noise, MODEL_ERROR, PRIOR)
     trusted = 1 - known.inverse * known.response
     noise_gain = known.inverse.square().mean(dim=(1, 2)).sqrt()
-    least = (SIGNIFICANT * known.noise * noise_gain)[:, None, None]
+    doubtful = wavelet_noise(frames) if noise is None else known.noise
+    least = (SIGNIFICANT * doubtful * noise_gain)[:, None, None]
     linear = -filtered(contrast, known.inverse)
     inside = torch.zeros_like(linear[:1])
     inside[crop] = 1

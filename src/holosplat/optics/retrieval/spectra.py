@@ -18,7 +18,7 @@ from torch.nn.functional import pad
 from ...checks import at_least, finite, require, shaped
 from ...scan import Exposures
 from ...units import wavelength, wavenumber
-from ..noise import wavelet_noise
+from ..noise import noise_levels
 from ..sampling import smooth_margin
 
 TINY = 1e-24
@@ -126,17 +126,16 @@ def spectra(
     exposures: Exposures,
     h: Tensor,
     raster: Raster,
-    noise: float | Tensor | None,
+    noise: float | None,
     model_error: float,
     prior: Prior,
 ) -> Spectra:
-    """Of frames [V, H, W] and a response h on `raster`; noise: as known (of each frame [V], or of
-    all), or None to estimate it.
+    """Of frames [V, H, W] and a response h on `raster`; noise: their standard deviation, or None to estimate it.
 
     model_error: what no model explains, as a share of the frames' contrast. The power has the prior's shape and
     explains the frames' variance beyond their noise; what the detector cannot resolve does not count in that.
     """
-    level = wavelet_noise(frames) if noise is None else torch.as_tensor(noise, dtype=torch.float64).expand(len(frames))
+    level = noise_levels(frames) if noise is None else torch.full((len(frames),), noise, dtype=torch.float64)
     contrast = contrast_level(frames)
     signal = (contrast.square() - level.square()).clamp_min(LEAST_SIGNAL * contrast.square() + TINY)
     f2 = squared_frequency(raster)

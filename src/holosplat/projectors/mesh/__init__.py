@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ...checks import require, shaped
 from ...geometry import Grid, Views
-from .reference import occupancy, signed_depths
+from .reference import mean_depths, occupancy
 
 __all__ = ["mesh_line_integrals", "voxelise_meshes"]
 
@@ -27,14 +27,11 @@ def mesh_line_integrals(
     `Σ sign(n·z) z_hit` over the faces it crosses.
     """
     _check(vertices, faces, face_values, rays)
-    fine = views.refined(rays)
     out = np.empty((len(face_values), len(views), *views.shape))
     for v in range(len(views)):
         lab = vertices @ views.rotations[v].T
         lab[:, :2] -= views.shifts[v]
-        depth = signed_depths(lab, faces, face_values, fine.shape, fine.pixel_size)
-        h, w = views.shape
-        out[:, v] = depth.reshape(-1, h, rays, w, rays).mean(axis=(2, 4))
+        out[:, v] = mean_depths(lab, faces, face_values, views.shape, views.pixel_size, rays)
     return torch.from_numpy(out)
 
 

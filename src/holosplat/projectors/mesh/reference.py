@@ -20,18 +20,25 @@ NUDGE = (3.1e-8, 7.3e-8)
 """Lattice offset (columns, rows): keeps rays off vertices of axis-aligned bodies; far below any accuracy."""
 
 
-def signed_depths(
-    lab: np.ndarray, faces: np.ndarray, values: np.ndarray, shape: tuple[int, int], pitch: float
+def mean_depths(
+    lab: np.ndarray, faces: np.ndarray, values: np.ndarray, shape: tuple[int, int], pitch: float, rays: int
 ) -> np.ndarray:
-    """[C, H, W] float64: Σ over hits of `sign · z · value`; lab: [P, 3] vertices [m], rays at pixel centres."""
-    h, w = shape
-    u = lab[:, 0] / pitch + 0.5 * (w - 1) + NUDGE[0]
-    v = lab[:, 1] / pitch + 0.5 * (h - 1) + NUDGE[1]
+    """[C, H, W] float64: Σ over hits of `sign · z · value`, the mean over the `rays × rays` rays of each pixel.
+
+    lab: [P, 3] vertices [m]; shape: pixels (H, W) of `pitch` [m].
+    """
+    (h, w), fine = shape, (shape[0] * rays, shape[1] * rays)
+    u = rays * lab[:, 0] / pitch + 0.5 * (fine[1] - 1) + NUDGE[0]
+    v = rays * lab[:, 1] / pitch + 0.5 * (fine[0] - 1) + NUDGE[1]
     out = np.zeros((len(values), h * w))
-    for ray, z, sign, face in ray_hits(np.stack([u, v, lab[:, 2]], 1), faces, shape):
+    for ray, z, sign, face in ray_hits(np.stack([u, v, lab[:, 2]], 1), faces, fine):
+        row, column = ray // fine[1], ray % fine[1]
+        pixel = row // rays * w + column // rays  # at once: the raster of all rays would not fit the caches
+        first, last = pixel.min(initial=h * w), pixel.max(initial=0)
+        count = max(last - first + 1, 0)
         for c, value in enumerate(values):
-            out[c] += np.bincount(ray, sign * z * value[face], h * w)
-    return out.reshape(-1, h, w)
+            out[c, first : last + 1] += np.bincount(pixel - first, sign * z * value[face], count)
+    return (out / rays**2).reshape(-1, h, w)
 
 
 def occupancy(vertices: np.ndarray, faces: np.ndarray, values: np.ndarray, grid: Grid, rays: int) -> np.ndarray:
@@ -95,7 +102,7 @@ def _scan_convert(
     r, column = _expand(start, stop)  # one entry a hit
     t, row = t[r], row[r]
     z = a[t, 2] + slope_u[t] * (column - a[t, 0]) + slope_v[t] * (row - a[t, 1])
-    z = np.clip(z, corners[t, :, 2].min(1), corners[t, :, 2].max(1))
+    z = np.clip(z, corners[..., 2].min(1)[t], corners[..., 2].max(1)[t])
     return row * shape[1] + column, z, np.sign(area)[t], face[t]
 
 

@@ -1,0 +1,157 @@
+"""`holosplat simulate`: meshes, still or moving, to a scan file, and the truth beside it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from tyro.conf import Positional
+
+from ..checks import require
+from ..experiments.series import Timing, held_out, read_series
+from ..experiments.simulate import Filling, read_scene
+from ..forward import simulated_frames
+from ..geometry import Grid, Views
+from ..io.nxtomo import scan_writer
+from ..io.snapshots import COLLECTION, seeming_snapshots
+from ..io.volumes import write_voxels
+from ..scan import Exposures
+from ..specimens.mesh_series import MeshSeries
+from ..specimens.scene import MeshScene
+from .options import (
+    BeamlineOptions,
+    MaterialOptions,
+    MeshOptions,
+    MisalignmentOptions,
+    MotionOptions,
+    NoiseOptions,
+    TruthOptions,
+)
+from .progress import ProgressBar
+
+
+@dataclass(frozen=True)
+class _Specimen:
+    """What is imaged, and at which times [T] of the frames [s]; facts: what the scan file says of it."""
+
+    matter: MeshScene | MeshSeries
+    times: np.ndarray
+    facts: dict[str, str]
+
+
+def simulate(
+    meshes: Positional[tuple[Path, ...]],
+    beamline: BeamlineOptions,
+    out: Path,
+    files: MeshOptions = MeshOptions(),
+    filling: MaterialOptions = MaterialOptions(),
+    noise: NoiseOptions = NoiseOptions(),
+    motion: MotionOptions = MotionOptions(),
+    *,
+    misalignment: MisalignmentOptions = MisalignmentOptions(),
+    truth: TruthOptions = TruthOptions(),
+) -> None:
+    """Simulate the holograms of closed triangle meshes; with --frame-rate, of moving ones, many times over.
+
+    Args:
+        meshes: VTK files (.vtk, .vtu, .vtp), one a cell; x, y, z are the object frame's, y is the rotation axis. With
+            --frame-rate: numbered snapshots (cell00_000.vtk, cell00_001.vtk …), or one collection (.pvd).
+        out: Scan file to write (NXtomo).
+    """
+    require(len(meshes) > 0, "simulate needs at least one mesh file.")
+    truth.require_usable(out)
+    views, filled = beamline.exposures(), filling.filling()
+    true_views = misalignment.errors().true_exposures(views)
+    with ProgressBar() as bar:
+        specimen = _specimen(meshes, beamline, files, filled, motion.timing(), bar)
+    times, how = specimen.times, noise.simulation(motion.shutter())
+    volumes = truth.volumes(len(times))
+    _warn_of_missing_field(specimen.matter, true_views.views, beamline.pixel_size)
+    split = beamline.split(len(views) if motion.hold_out == "views" else len(times))
+    is_test = held_out(split, len(views), len(times), motion.hold_out)
+    nominal, true = views.repeated(times), true_views.repeated(times)
+    facts = {**how.provenance(true), **specimen.facts, "medium": filling.medium or "vacuum"}
+    targets = [(out, nominal, facts)]
+    if truth.true_exposures:
+        targets.append((truth.true_exposures, true, facts | misalignment.facts()))
+    with ProgressBar() as bar:
+        _write_frames(targets, is_test, simulated_frames(specimen.matter, true, how), bar)
+    rows, columns = beamline.detector
+    text = f"{len(true)} frames of {rows} × {columns} pixels, {int(is_test.sum())} of them held out"
+    _say(f"wrote {out}: {text}{f', at {len(times)} times from {len(views)} views' if motion.frame_rate else ''}")
+    if truth.true_exposures:
+        _say(f"wrote {truth.true_exposures}: the same frames, with the exposures as they were")
+    for path, frame in volumes:
+        _write_truth(path, specimen.matter.at(times[frame]), views.views)
+        _say(f"wrote {path}: the true volume{f' at {times[frame]:.6g} s' if motion.frame_rate else ''}")
+
+
+def _specimen(
+    meshes: tuple[Path, ...],
+    beamline: BeamlineOptions,
+    files: MeshOptions,
+    filling: Filling,
+    timing: Timing | None,
+    bar: ProgressBar,
+) -> _Specimen:
+    """The bodies of `meshes`: moving, where there is a `timing`."""
+    if timing is None:
+        files.require_static()
+        collection = next((path for path in meshes if path.suffix.lower() == COLLECTION), None)
+        require(
+            collection is None, f"{collection} is a collection of snapshots; give --frame-rate to simulate a series."
+        )
+        matter = read_scene(meshes, filling, beamline.energy_kev, length_unit=files.length_unit, origin=files.origin)
+        if (count := seeming_snapshots(meshes)) > 1:
+            _say(
+                f"warning: the files seem to be {count} snapshots, but they are taken for one still scene, with "
+                "all bodies at once; for a series give --frame-rate."
+            )
+        return _Specimen(matter, np.zeros(1), _facts(matter))
+    show = partial(bar.show, "reading snapshots", record={})
+    series, times = read_series(meshes, filling, beamline.energy_kev, timing, files.series(), show)
+    facts = {"frame_rate_hz": f"{timing.frame_rate:g}", "snapshots": str(len(series.snapshots))}
+    return _Specimen(series, times, _facts(series.snapshots[0]) | facts)
+
+
+def _facts(scene: MeshScene) -> dict[str, str]:
+    found = sorted({f"delta {m.delta:.6g}, beta {m.beta:.6g}" for m in scene.materials})
+    return {"meshes": str(len(scene.meshes)), "materials": "; ".join(found)}
+
+
+def _warn_of_missing_field(matter: MeshScene | MeshSeries, views: Views, pixel_size: float) -> None:
+    missing = matter.missing_field(views)
+    if missing > 0:
+        _say(
+            f"warning: the scene reaches {1e6 * missing:.3g} µm ({missing / pixel_size:.3g} pixels) beyond "
+            "the detector in at least one view; enlarge --detector, or move --origin."
+        )
+
+
+def _write_frames(
+    targets: list[tuple[Path, Exposures, dict[str, str]]],
+    is_test: np.ndarray,
+    frames: Iterator[np.ndarray],
+    bar: ProgressBar,
+) -> None:
+    """Every frame to all `targets`, as it comes."""
+    with ExitStack() as stack:
+        writers = [stack.enter_context(scan_writer(path, e, is_test, facts)) for path, e, facts in targets]
+        for n, frame in enumerate(frames):
+            for add in writers:
+                add(frame)
+            bar.show("simulating views", (n + 1) / len(is_test), {})
+
+
+def _write_truth(path: Path, matter: MeshScene, views: Views) -> None:
+    with ProgressBar() as bar:
+        write_voxels(path, matter, Grid.of_views(views), partial(bar.show, "voxels", record={}))
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)

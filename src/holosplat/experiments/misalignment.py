@@ -1,0 +1,57 @@
+"""Beamlines that are not where they say: errors of each view's pose and distance, drawn by a seed."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..checks import require
+from ..scan import Exposures
+
+MOST_SHIFT_PX, MOST_ROTATION_DEG, MOST_DISTANCE = 1000.0, 45.0, 0.1
+
+
+@dataclass(frozen=True)
+class Misalignment:
+    """Standard deviations of the errors of each view, all independent and normally distributed.
+
+    shift_px: of the detector along rows and along columns [pixels]; rotation_deg: of small turns about x, y and z of
+    the lab frame [degrees]; distance: of the propagation distance, as a share of it; seed: draws them.
+    Errors: `InputError` for values below 0 or too large to be errors of alignment.
+    """
+
+    shift_px: float = 0.0
+    rotation_deg: float = 0.0
+    distance: float = 0.0
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        limits = {"shift_px": MOST_SHIFT_PX, "rotation_deg": MOST_ROTATION_DEG, "distance": MOST_DISTANCE}
+        for name, most in limits.items():
+            value = getattr(self, name)
+            inside = math.isfinite(value) and 0 <= value <= most
+            require(inside, f"misalignment {name} must lie between 0 and {most:g}, but it is {value:g}.")
+        require(self.seed >= 0, f"misalignment seed must be 0 or more, but it is {self.seed}.")
+
+    def __bool__(self) -> bool:
+        return self.shift_px > 0 or self.rotation_deg > 0 or self.distance > 0
+
+    def true_exposures(self, nominal: Exposures) -> Exposures:
+        """What the exposures `nominal` [V] really are: `R' = exp([ω]×) R`, `s' = s + p e`, `z' = z (1 + ε)`.
+
+        ω, e and ε come from generators of their own, so that one kind of error does not change with another's size.
+        """
+        count, views = len(nominal), nominal.views
+        of_turn, of_shift, of_distance = (np.random.default_rng([self.seed, kind]) for kind in range(3))
+        turns = np.deg2rad(self.rotation_deg) * of_turn.standard_normal((count, 3))
+        shifts = self.shift_px * views.pixel_size * of_shift.standard_normal((count, 2))
+        stretched = 1 + self.distance * of_distance.standard_normal(count)
+        rotations = Rotation.from_rotvec(turns).as_matrix() @ views.rotations
+        return replace(
+            nominal,
+            views=replace(views, rotations=rotations, shifts=views.shifts + shifts),
+            distance=nominal.distance * stretched,
+        )

@@ -1,0 +1,57 @@
+"""Where views look from: evenly spaced, listed, tilted, as matrices, or as a known beamline has them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ..checks import require
+from ..geometry import Views, rotation_tilted
+
+Geometry = Literal["thesis16", "xmpi_2beam", "xmpi_3beam"]
+
+GEOMETRIES: dict[Geometry, tuple[float, ...]] = {
+    "thesis16": tuple(180 / 16 * n for n in range(16)),
+    "xmpi_2beam": (0.0, 23.8),
+    "xmpi_3beam": (0.0, 30.0, 48.0),
+}
+"""Angles [degrees] about y: the thesis' sixteen views, and beams split by crystals (X-ray multi-projection imaging)."""
+
+
+@dataclass(frozen=True)
+class Directions:
+    """Views as the options name them: exactly one of `views` (evenly spaced over 180°), `angles_deg` (with a tilt each
+    in `tilts_deg`, or none), `rotations` (a .npy file of matrices [V, 3, 3]) and `geometry` (a key of `GEOMETRIES`)."""
+
+    views: int | None = None
+    angles_deg: tuple[float, ...] = ()
+    tilts_deg: tuple[float, ...] = ()
+    rotations: Path | None = None
+    geometry: Geometry | None = None
+
+    def on(self, shape: tuple[int, int], pixel_size: float) -> Views:
+        """The views on a detector of `shape` pixels of `pixel_size` [m]; `InputError` unless one way is named."""
+        angles = GEOMETRIES[self.geometry] if self.geometry else self.angles_deg
+        given = (self.views is not None) + bool(self.angles_deg) + (self.rotations is not None) + bool(self.geometry)
+        require(given == 1, "give exactly one of --views, --angles-deg, --rotations and --geometry.")
+        require(not self.tilts_deg or bool(self.angles_deg), "--tilts-deg needs --angles-deg, one tilt for each angle.")
+        if self.rotations is not None:
+            return Views.from_rotations(_matrices(self.rotations), shape, pixel_size)
+        if self.views is not None:
+            return Views.evenly_spaced(self.views, shape, pixel_size)
+        tilts = self.tilts_deg or (0.0,) * len(angles)
+        return Views.from_rotations(rotation_tilted(list(angles), list(tilts)), shape, pixel_size)
+
+
+def _matrices(path: Path) -> np.ndarray:
+    require(path.is_file(), f"--rotations must name a .npy file of matrices, but {path} does not exist.")
+    try:
+        matrices = np.load(path, allow_pickle=False)
+    except (ValueError, OSError, EOFError):
+        matrices = np.empty(0)
+    numeric = matrices.dtype.kind in "fiu" and matrices.ndim == 3
+    require(numeric, f"--rotations must hold numbers of the shape (V, 3, 3) as .npy, but {path} does not.")
+    return matrices
