@@ -21,7 +21,7 @@ Files = dict[str, str]
 
 TIERS = (
     ("units", "checks", "native", "backends", "memory", "geometry", "scan", "volume", "mesh"),
-    ("materials", "optics", "metrics", "projectors"),
+    ("materials", "optics", "metrics", "projectors", "preprocess"),
     ("specimens", "representations", "forward", "io"),
     ("fit", "baselines"),
     ("experiments",),

@@ -18,6 +18,9 @@ _WHERE = {
     "volume": ("LineIntegrals", "Object", "Volume"),
     "mesh": ("TriangleMesh",),
     "materials": ("HAEMOGLOBIN", "PLASMA", "RED_CELL", "WATER", "Compound", "DeltaBeta", "Mixture", "parse_material"),
+    "optics.camera": ("Camera",),
+    "optics.coherence": ("Spectrum", "effective_geometry", "source_blur"),
+    "optics.illumination": ("Illumination",),
     "forward": ("Instrument", "Shutter", "Simulation", "measure", "simulate", "simulated_frames"),
     "specimens.scene": ("MeshScene",),
     "specimens.mesh_series": ("MeshSeries",),
@@ -37,6 +40,9 @@ _WHERE = {
     "experiments.plan": ("Recording", "plan", "survey"),
     "experiments.settings": ("MaterialPrior", "Settings", "preset"),
     "experiments.simulate": ("Filling", "read_scene"),
+    "experiments.record": ("RecordingOptions", "record"),
+    "experiments.correct": ("CorrectionOptions", "correct"),
+    "experiments.join": ("join",),
     "experiments.series": ("SeriesFiles", "Timing", "read_series"),
     "experiments.misalignment": ("Misalignment",),
     "experiments.run_folder": ("RunFolder",),
@@ -62,11 +68,14 @@ if TYPE_CHECKING:
     from .checks import InputError as InputError
     from .experiments.contrast import Setup as Setup
     from .experiments.contrast import Subject as Subject
+    from .experiments.correct import CorrectionOptions as CorrectionOptions
+    from .experiments.correct import correct as correct
     from .experiments.evaluate import Evaluation as Evaluation
     from .experiments.evaluate import evaluate as evaluate
     from .experiments.evaluate import render as render
     from .experiments.grow import Growth as Growth
     from .experiments.grow import grow as grow
+    from .experiments.join import join as join
     from .experiments.misalignment import Misalignment as Misalignment
     from .experiments.plan import Recording as Recording
     from .experiments.plan import plan as plan
@@ -74,6 +83,8 @@ if TYPE_CHECKING:
     from .experiments.reconstruct import Reconstruction as Reconstruction
     from .experiments.reconstruct import load_reconstruction as load_reconstruction
     from .experiments.reconstruct import reconstruct as reconstruct
+    from .experiments.record import RecordingOptions as RecordingOptions
+    from .experiments.record import record as record
     from .experiments.run_folder import RunFolder as RunFolder
     from .experiments.series import SeriesFiles as SeriesFiles
     from .experiments.series import Timing as Timing
@@ -110,6 +121,11 @@ if TYPE_CHECKING:
     from .materials import Mixture as Mixture
     from .materials import parse_material as parse_material
     from .mesh import TriangleMesh as TriangleMesh
+    from .optics.camera import Camera as Camera
+    from .optics.coherence import Spectrum as Spectrum
+    from .optics.coherence import effective_geometry as effective_geometry
+    from .optics.coherence import source_blur as source_blur
+    from .optics.illumination import Illumination as Illumination
     from .representations.gaussians import GaussianCloud as GaussianCloud
     from .scan import Exposures as Exposures
     from .scan import Scan as Scan

@@ -1,4 +1,4 @@
-"""The command line: `holosplat plan | grow | simulate | reconstruct | render | export | convert | evaluate | …`."""
+"""The command line: `holosplat plan | grow | simulate | record | correct | join | reconstruct | render | …`."""
 
 import os
 

@@ -32,6 +32,7 @@ from ..scan import PIXEL_RANGE_M, Scan
 from .bench import bench
 from .convert import convert
 from .grow import grow
+from .imaging import correct, join, record
 from .options import BeamlineOptions, PriorOptions, SettingsOptions, TruthOptions
 from .plan import plan
 from .progress import INTERRUPTED, ProgressBar
@@ -225,6 +226,9 @@ COMMANDS = {
     "plan": plan,
     "grow": grow,
     "simulate": simulate,
+    "record": record,
+    "correct": correct,
+    "join": join,
     "reconstruct": reconstruct,
     "render": render,
     "export": export,

@@ -15,7 +15,6 @@ from tyro.conf import Positional
 from ..checks import require
 from ..experiments.series import Timing, held_out, read_series
 from ..experiments.simulate import Filling, read_scene
-from ..forward import simulated_frames
 from ..geometry import Grid, Views
 from ..io.nxtomo import scan_writer
 from ..io.snapshots import COLLECTION, seeming_snapshots
@@ -33,6 +32,7 @@ from .options import (
     TruthOptions,
 )
 from .progress import ProgressBar
+from .source import SourceOptions
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,7 @@ def simulate(
     *,
     misalignment: MisalignmentOptions = MisalignmentOptions(),
     truth: TruthOptions = TruthOptions(),
+    source: SourceOptions = SourceOptions(),
 ) -> None:
     """Simulate the holograms of closed triangle meshes; with --frame-rate, of moving ones, many times over.
 
@@ -65,24 +66,23 @@ def simulate(
     """
     require(len(meshes) > 0, "simulate needs at least one mesh file.")
     truth.require_usable(out)
+    of_source, beamline = source.facts(beamline), source.applied(beamline)
     views, filled = beamline.exposures(), filling.filling()
     true_views = misalignment.errors().true_exposures(views)
     with ProgressBar() as bar:
         specimen = _specimen(meshes, beamline, files, filled, motion.timing(), bar)
     times, how = specimen.times, noise.simulation(motion.shutter())
-    volumes = truth.volumes(len(times))
     _warn_of_missing_field(specimen.matter, true_views.views, beamline.pixel_size)
     split = beamline.split(len(views) if motion.hold_out == "views" else len(times))
     is_test = held_out(split, len(views), len(times), motion.hold_out)
-    nominal, true = views.repeated(times), true_views.repeated(times)
-    facts = {**how.provenance(true), **specimen.facts, "medium": filling.medium or "vacuum"}
+    nominal, true, volumes = views.repeated(times), true_views.repeated(times), truth.volumes(len(times))
+    facts = {**how.provenance(true), **specimen.facts, **of_source, "medium": filling.medium or "vacuum"}
     targets = [(out, nominal, facts)]
     if truth.true_exposures:
         targets.append((truth.true_exposures, true, facts | misalignment.facts()))
     with ProgressBar() as bar:
-        _write_frames(targets, is_test, simulated_frames(specimen.matter, true, how), bar)
-    rows, columns = beamline.detector
-    text = f"{len(true)} frames of {rows} × {columns} pixels, {int(is_test.sum())} of them held out"
+        _write_frames(targets, is_test, source.frames(specimen.matter, filled, true, how), bar)
+    text = "{} frames of {} × {} pixels, {} of them held out".format(len(true), *beamline.detector, is_test.sum())
     _say(f"wrote {out}: {text}{f', at {len(times)} times from {len(views)} views' if motion.frame_rate else ''}")
     if truth.true_exposures:
         _say(f"wrote {truth.true_exposures}: the same frames, with the exposures as they were")

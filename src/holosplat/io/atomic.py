@@ -18,6 +18,12 @@ def require_writable(path: str | Path) -> None:
     require(folder.is_dir(), f"{path} must lie in an existing folder, but {folder} is none; create it.")
 
 
+def require_apart(out: Path, *others: Path) -> None:
+    """`InputError` if the file to write is one of `others`, which would be lost."""
+    for other in others:
+        require(Path(out).resolve() != Path(other).resolve(), f"{out} is read or written already; name another file.")
+
+
 @contextmanager
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """A temporary path beside `path` (same suffix) to write to; it replaces `path` when the block ends well.

@@ -1,0 +1,83 @@
+"""`holosplat record | correct | join`: camera and pulses, flat fields, and beams brought together."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from ..experiments.correct import CorrectionOptions
+from ..experiments.correct import correct as correct_file
+from ..experiments.join import join as join_files
+from ..experiments.record import Flip, RecordingOptions
+from ..experiments.record import record as record_file
+from ..optics.camera import Camera
+from ..optics.illumination import Illumination
+from .progress import ProgressBar
+
+
+def record(
+    scan: Positional[Path],
+    out: Path,
+    what: RecordingOptions,
+    camera: Camera,
+    light: Illumination,
+    truth: Path | None = None,
+) -> None:
+    """Record a noise-free scan as raw counts: pulses of a free-electron laser, a camera, flats and darks.
+
+    Args:
+        scan: Scan file (NXtomo) of relative intensities without noise, such as `holosplat simulate` writes.
+        out: File of raw counts to write (NXtomo with image_key).
+        truth: Also write what the frames do not say: light, pulse energies, gains and defects (HDF5).
+    """
+    with ProgressBar() as bar:
+        done = record_file(
+            scan, out, what, camera, light, truth, lambda fraction: bar.show("recording frames", fraction, {})
+        )
+    _say(
+        f"wrote {out}: {done.projections} projections, {done.flats} flats and {done.darks} darks, {camera.bits} bits, "
+        f"{done.gain:.4g} counts a photon, {done.defects} defective pixels"
+    )
+    if done.saturated > 0:
+        _say(
+            f"warning: {done.saturated:.2%} of the projections' good pixels are saturated; lower --gain or the photons"
+        )
+    if truth is not None:
+        _say(f"wrote {truth}: what the frames do not say")
+
+
+def correct(raw: Positional[Path], out: Path, how: CorrectionOptions) -> None:
+    """Correct raw counts by dark and flat fields into a scan of relative intensities.
+
+    Args:
+        raw: File of raw counts (NXtomo with image_key).
+        out: Scan file to write (NXtomo).
+    """
+    with ProgressBar() as bar:
+        done = correct_file(raw, out, how, lambda fraction: bar.show("correcting frames", fraction, {}))
+    flat = f"flat fields of {done.components} components" if how.method == "dynamic" else "the mean flat field"
+    _say(f"wrote {out}: {done.frames} frames by {flat}, normalised: {how.reference}")
+    _say(f"filled defective pixels from their neighbours: {done.marked} marked in the file, {done.found} found beside")
+
+
+def join(
+    scans: Positional[tuple[Path, ...]], out: Path, pixel_size: float | None = None, flip: tuple[Flip, ...] = ()
+) -> None:
+    """Join scans of several beams, one file each, on one raster.
+
+    Args:
+        scans: Scan files (NXtomo) of the same photon energy.
+        out: Scan file to write.
+        pixel_size: Pixel of the result [m] (default: the coarsest of the files).
+        flip: What each detector saw reversed, one word a file (default: what the files say themselves).
+    """
+    with ProgressBar() as bar:
+        joined = join_files(scans, out, pixel_size, flip, lambda fraction: bar.show("joining frames", fraction, {}))
+    rows, columns = joined.views.shape
+    _say(f"wrote {out}: {len(joined)} frames of {rows} × {columns} pixels of {1e6 * joined.views.pixel_size:.4g} µm")
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)

@@ -1,0 +1,81 @@
+"""The options of the source: its size, its distance and its spectrum."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..checks import require
+from ..experiments.polychromatic import polychromatic_frames, read_spectrum, refilled
+from ..experiments.simulate import Filling
+from ..forward import Simulation, simulated_frames
+from ..optics.coherence import Spectrum, effective_geometry, joined_blur_px, source_blur
+from ..scan import Exposures
+from ..specimens.mesh_series import MeshSeries
+from ..specimens.scene import MeshScene
+from .options import BeamlineOptions
+
+
+@dataclass(frozen=True)
+class SourceOptions:
+    """What the light comes from; without any of these, a plane wave of one energy."""
+
+    source_size: float | None = None
+    """Standard deviation of the Gaussian source [m]; it blurs by this times distance / source distance."""
+    source_distance: float | None = None
+    """Distance from source to sample [m]."""
+    cone: bool = False
+    """--distance and --pixel-size are the detector's own, in a cone beam from --source-distance."""
+    bandwidth: float | None = None
+    """Relative full width at half maximum of a Gaussian spectrum about --energy-kev."""
+    energies: int = 7
+    """Energies that stand for such a spectrum; each costs a simulation."""
+    spectrum: Path | None = None
+    """Or: a text file of two columns, energy [keV] and weight; the scan's energy is then their mean."""
+
+    def light(self, energy_kev: float) -> Spectrum | None:
+        """The spectrum about `energy_kev` [keV]; None for one energy."""
+        require(self.bandwidth is None or self.spectrum is None, "give --bandwidth or --spectrum, not both.")
+        if self.spectrum is not None:
+            return read_spectrum(self.spectrum)
+        return None if self.bandwidth is None else Spectrum.gaussian(energy_kev, self.bandwidth, self.energies)
+
+    def applied(self, beamline: BeamlineOptions) -> BeamlineOptions:
+        """The beamline in effective terms: a parallel beam's pixel and distance, the source's blur, the mean energy."""
+        for name in ("source_size", "cone"):
+            told = self.source_distance is not None or not getattr(self, name)
+            require(told, f"--{name.replace('_', '-')} needs --source-distance.")
+        used = self.source_distance is None or self.cone or self.source_size is not None
+        require(used, "--source-distance needs --source-size or --cone, without which it changes nothing.")
+        light = self.light(beamline.energy_kev)
+        if light is not None and self.spectrum is not None:
+            beamline = replace(beamline, energy_kev=light.mean_kev)
+        if self.source_distance is not None and self.cone:
+            found = effective_geometry(self.source_distance, beamline.distance, beamline.pixel_size)
+            beamline = replace(beamline, distance=found.distance, pixel_size=found.pixel_size)
+        if self.source_distance is not None and self.source_size is not None:
+            blur = source_blur(self.source_size, self.source_distance, beamline.distance)
+            beamline = replace(
+                beamline, psf_sigma_px=float(joined_blur_px(beamline.psf_sigma_px, blur, beamline.pixel_size))
+            )
+        return beamline
+
+    def frames(
+        self, matter: MeshScene | MeshSeries, filling: Filling, exposures: Exposures, how: Simulation
+    ) -> Iterator[np.ndarray]:
+        """Frames [H, W] of `matter`, one after another."""
+        light = self.light(exposures.energy_kev)
+        if light is None:
+            return simulated_frames(matter, exposures, how)
+        return polychromatic_frames(lambda energy: refilled(matter, filling, energy), light, exposures, how)
+
+    def facts(self, beamline: BeamlineOptions) -> dict[str, str]:
+        """What the scan file says of the source; `beamline` as it was given."""
+        said = {name: str(value) for name, value in vars(self).items() if value is not None and name != "energies"}
+        said.pop("cone")
+        if self.cone:
+            said |= {"cone_distance": str(beamline.distance), "cone_pixel_size": str(beamline.pixel_size)}
+        return said

@@ -1,0 +1,17 @@
+"""From raw counts to relative intensities: dark and flat fields, defective pixels, flat fields that change."""
+
+from .eigen_flats import EigenFlats, eigen_flats, significant
+from .flat_field import relative_intensity, unlit
+from .pixels import PixelRepair, defective_pixels
+from .weights import TotalVariationWeights
+
+__all__ = [
+    "EigenFlats",
+    "PixelRepair",
+    "TotalVariationWeights",
+    "defective_pixels",
+    "eigen_flats",
+    "relative_intensity",
+    "significant",
+    "unlit",
+]

@@ -1,0 +1,76 @@
+"""Defective pixels: found by what they show in dark and flat frames, and filled from their neighbours."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import median_filter
+from scipy.sparse import csr_array
+
+from ..checks import require, shaped
+
+NEIGHBOURHOOD = 5
+"""Edge of the window that says what is usual for a pixel."""
+RESPONSE_RANGE = (1 / 3, 3.0)
+"""A pixel whose flat, less its dark, is not within these multiples of its neighbours' is defective."""
+OUTLIER = 12.0
+"""So is one whose dark, or the noise of it, is so many robust standard deviations off its neighbours'."""
+LEAST_COUNTS = 1.0
+NORMAL_MEDIAN = 0.6745
+"""The median of |x| for a standard normal x."""
+
+
+def defective_pixels(dark: np.ndarray, dark_noise: np.ndarray, flat: np.ndarray) -> np.ndarray:
+    """[H, W] bool: pixels that do not do as their neighbours do.
+
+    dark, flat: mean frames [H, W] [counts]; dark_noise: standard deviations [H, W] over the dark frames [counts],
+    zeros where there are too few.
+    """
+    light = flat - dark
+    usual = median_filter(light, NEIGHBOURHOOD, mode="mirror")
+    low, high = RESPONSE_RANGE
+    bad = (light <= 0) | (light < low * usual) | (light > high * usual)
+    for image in (dark, dark_noise):
+        off = image - median_filter(image, NEIGHBOURHOOD, mode="mirror")
+        usual_off = max(float(np.median(np.abs(off))) / NORMAL_MEDIAN, LEAST_COUNTS / OUTLIER)
+        bad |= off > OUTLIER * usual_off
+    return bad
+
+
+class PixelRepair:
+    """Fills the pixels of a mask [H, W] with the mean of their good neighbours, of the nearest ring that has any."""
+
+    def __init__(self, mask: np.ndarray) -> None:
+        shaped("pixel mask", mask, (None, None))
+        require(not bool(mask.all()), "every pixel is defective; check the mask and the flat frames.")
+        self.mask = np.asarray(mask, dtype=bool)
+        self.places = np.flatnonzero(self.mask)
+        self._means = self._neighbours()
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def __call__(self, frame: np.ndarray) -> np.ndarray:
+        """A copy of `frame` [H, W], float64, with its defective pixels filled."""
+        repaired = np.array(frame, dtype=np.float64)
+        repaired.reshape(-1)[self.places] = self.values(repaired)
+        return repaired
+
+    def values(self, frame: np.ndarray) -> np.ndarray:
+        """What the defective pixels of `frame` [H, W] are filled with, [B] in raster order."""
+        return self._means @ np.asarray(frame, dtype=np.float64).reshape(-1)
+
+    def _neighbours(self) -> csr_array:
+        """The sparse matrix [B, H·W] that takes a frame to the means."""
+        h, w = self.mask.shape
+        rows, columns, entries = [], [], []
+        for number, place in enumerate(self.places):
+            i, j = divmod(int(place), w)
+            for radius in range(1, max(h, w)):
+                top, left = max(i - radius, 0), max(j - radius, 0)
+                good = np.argwhere(~self.mask[top : i + radius + 1, left : j + radius + 1]) + (top, left)
+                if len(good):
+                    rows += [number] * len(good)
+                    columns += (good @ (w, 1)).tolist()
+                    entries += [1 / len(good)] * len(good)
+                    break
+        return csr_array((entries, (rows, columns)), shape=(len(self.places), h * w))
