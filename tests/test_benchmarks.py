@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import importlib
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
+import numpy as np
 import pytest
 import torch
 
@@ -21,7 +23,10 @@ def scripts(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     return {
         name: importlib.import_module(name)
-        for name in ("step", "eager_step", "kernels", "plain_torch", "ablation", "simulate")
+        for name in (
+            *("step", "eager_step", "kernels", "plain_torch", "ablation", "simulate"),
+            *("tweezers", "espresso_flow"),
+        )
     }
 
 
@@ -77,6 +82,37 @@ def test_every_ablation_removes_something(scripts):
     assert variants.pop("as it is") == settings
     assert settings not in variants.values()
     assert len({repr(variant) for variant in variants.values()}) == len(variants)
+
+
+def test_the_table_of_the_tweezers(scripts):
+    """Values outside the bounds are bold and not counted; means of what was measured lie within."""
+    tweezers = scripts["tweezers"]
+    found = [
+        tweezers.Stretched(1e-12 * pn, 1e-6 * axial[0], 1e-6 * transverse[0], 0.001, -0.002, 0.0, torch.zeros(1, 3))
+        for pn, axial, transverse in zip(tweezers.FORCES_PN, tweezers.AXIAL, tweezers.TRANSVERSE)
+    ]
+    assert tweezers.within(found) == (10, 10)
+    assert "**" not in "".join(tweezers.table(found))
+    found[3] = replace(found[3], axial=11.8e-6)
+    found[4] = replace(found[4], transverse=5.3e-6)
+    assert tweezers.within(found) == (9, 9)
+    lines = tweezers.table(found)
+    assert len(lines) == 12
+    assert "| 68 | **11.80** | 12.87 (11.88–13.87) | 4.64 |" in lines[5]
+    assert "| **5.30** |" in lines[6]
+
+
+def test_espressos_cells_go_on_as_espresso_has_them(scripts, espresso_rbc):
+    """Two cells, from one snapshot to the next: they move by a micrometre, and their nodes end 0.05 µm from ours."""
+    flow = scripts["espresso_flow"]
+    run = flow.Run.read(espresso_rbc, most=2)
+    run = replace(run, nodes=run.nodes[:, :2])
+    nodes, _ = flow.ours(run, run.suspension(None))
+    assert abs(nodes[1] - nodes[0]).max() > 0.5e-6
+    assert np.linalg.norm(nodes[1] - run.nodes[1], axis=-1).mean() < 0.05e-6
+    found = flow.statistics(run.nodes, run.suspension(None).membrane, run.times)
+    assert 0.03 < found["drift"].min() < found["drift"].max() < 0.06
+    assert abs(found["volume"]).max() < 0.01
 
 
 def test_what_the_benchmark_of_simulation_reports(scripts, monkeypatch):

@@ -154,14 +154,16 @@ def test_folders_are_read_in_natural_order(tmp_path):
     assert [m.name for m in read_meshes(tmp_path, "um")] == ["cell1.vtk", "cell9.vtk", "cell10.vtk"]
 
 
-def test_written_meshes_are_read_back(tmp_path):
+@pytest.mark.parametrize(("name", "start"), [("cell.vtk", b"# vtk DataFile"), ("cell.vtp", b"<?xml")])
+def test_written_meshes_are_read_back(tmp_path, name, start):
     mesh = evans_fung_cell()
     for unit in ("um", "m"):
-        write_mesh(tmp_path / "cell.vtk", mesh, unit)
-        (back,) = read_meshes(tmp_path / "cell.vtk", unit)
+        write_mesh(tmp_path / name, mesh, unit)
+        assert (tmp_path / name).read_bytes().startswith(start)
+        (back,) = read_meshes(tmp_path / name, unit)
         assert back.vertices == pytest.approx(mesh.vertices, rel=1e-12, abs=0)
         assert np.array_equal(back.faces, mesh.faces)
-    assert [p.name for p in tmp_path.iterdir()] == ["cell.vtk"]
+    assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
 def test_writing_where_one_cannot(tmp_path):

@@ -26,12 +26,18 @@ _WHERE = {
     "specimens.mesh_series": ("MeshSeries",),
     "specimens.red_cells": ("evans_fung_cell", "random_cells"),
     "specimens.repair": ("closed",),
+    "specimens.membrane.model": ("Elasticity", "Membrane"),
+    "specimens.membrane.resting": ("resting_cell",),
+    "specimens.membrane.tweezers": ("stretch",),
+    "specimens.flow.suspension": ("Medium", "Suspension"),
     "representations.gaussians": ("GaussianCloud",),
     "representations.surfaces": ("SurfaceMesh",),
     "io.nxtomo": ("read_scan", "scan_writer", "write_scan"),
     "io.volumes": ("read_volume", "write_volume", "write_voxels"),
     "io.vtk": ("read_meshes", "write_mesh"),
+    "io.pvd": ("read_pvd", "write_pvd"),
     "experiments.contrast": ("Setup", "Subject"),
+    "experiments.grow": ("Growth", "grow"),
     "experiments.plan": ("Recording", "plan", "survey"),
     "experiments.settings": ("MaterialPrior", "Settings", "preset"),
     "experiments.simulate": ("Filling", "read_scene"),
@@ -69,6 +75,8 @@ if TYPE_CHECKING:
     from .experiments.evaluate import Evaluation as Evaluation
     from .experiments.evaluate import evaluate as evaluate
     from .experiments.evaluate import render as render
+    from .experiments.grow import Growth as Growth
+    from .experiments.grow import grow as grow
     from .experiments.join import join as join
     from .experiments.misalignment import Misalignment as Misalignment
     from .experiments.plan import Recording as Recording
@@ -101,6 +109,8 @@ if TYPE_CHECKING:
     from .io.nxtomo import read_scan as read_scan
     from .io.nxtomo import scan_writer as scan_writer
     from .io.nxtomo import write_scan as write_scan
+    from .io.pvd import read_pvd as read_pvd
+    from .io.pvd import write_pvd as write_pvd
     from .io.volumes import read_volume as read_volume
     from .io.volumes import write_volume as write_volume
     from .io.volumes import write_voxels as write_voxels
@@ -125,6 +135,12 @@ if TYPE_CHECKING:
     from .scan import Exposures as Exposures
     from .scan import Scan as Scan
     from .scan import interleaved_split as interleaved_split
+    from .specimens.flow.suspension import Medium as Medium
+    from .specimens.flow.suspension import Suspension as Suspension
+    from .specimens.membrane.model import Elasticity as Elasticity
+    from .specimens.membrane.model import Membrane as Membrane
+    from .specimens.membrane.resting import resting_cell as resting_cell
+    from .specimens.membrane.tweezers import stretch as stretch
     from .specimens.mesh_series import MeshSeries as MeshSeries
     from .specimens.red_cells import evans_fung_cell as evans_fung_cell
     from .specimens.red_cells import random_cells as random_cells

@@ -57,7 +57,7 @@ class HolographicTV:
     weight: float = 0.3
     corrections: int = 6
     inner: int = 12
-    noisy: float = 0.2
+    noisy: float = 0.35
     refine: int = 0
     max_voxels: int = 70_000_000
     upper: float = 1.0

@@ -1,4 +1,4 @@
-"""The command line: `holosplat plan | simulate | record | correct | join | reconstruct | surface | evaluate | …`."""
+"""The command line: `holosplat plan | grow | simulate | record | correct | join | reconstruct | surface | …`."""
 
 import os
 

@@ -31,6 +31,7 @@ from ..report.run import report_run
 from ..scan import PIXEL_RANGE_M, Scan
 from .bench import bench
 from .convert import convert
+from .grow import grow
 from .imaging import correct, join, record
 from .options import BeamlineOptions, PriorOptions, SettingsOptions, TruthOptions
 from .plan import plan
@@ -202,6 +203,7 @@ def _say(text: str) -> None:
 
 COMMANDS = {
     "plan": plan,
+    "grow": grow,
     "simulate": simulate,
     "record": record,
     "correct": correct,

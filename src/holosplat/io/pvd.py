@@ -1,4 +1,7 @@
-"""Time series of mesh files: ParaView's collection (.pvd), an XML list of files with the time of each."""
+"""Time series of mesh files: ParaView's collection (.pvd), an XML list of files with the time of each.
+
+ParaView opens only VTK's XML files from a collection, such as .vtp and .vtu, and no legacy .vtk; `read_pvd` takes both.
+"""
 
 from __future__ import annotations
 
@@ -23,13 +26,20 @@ class TimeStep:
 
 
 def write_pvd(path: str | Path, steps: Sequence[TimeStep]) -> None:
-    """Write the collection `path` of `steps`; files are named relative to its folder, so that it can move with them."""
+    """Write the collection `path` of `steps`; files are named relative to its folder, so that it can move with them.
+
+    `InputError` for a time that is not finite, and for legacy files.
+    """
     folder = Path(path).resolve().parent
     lines = ['<?xml version="1.0"?>', '<VTKFile type="Collection" version="0.1">', "  <!-- timestep in seconds -->"]
     lines.append("  <Collection>")
     for step in steps:
         require(math.isfinite(step.time), f"{path}: times must be finite, but one is {step.time}; correct it.")
         for part, file in enumerate(step.files):
+            legacy = Path(file).suffix.lower() == ".vtk"
+            require(
+                not legacy, f"{path} must name XML files (.vtp, .vtu), but {file} is a legacy one; write it as .vtp."
+            )
             name = quoteattr(Path(os.path.relpath(Path(file).resolve(), folder)).as_posix())
             lines.append(f'    <DataSet timestep="{step.time!r}" part="{part}" file={name}/>')
     lines += ["  </Collection>", "</VTKFile>", ""]

@@ -49,11 +49,16 @@ def mesh_files(paths: str | Path | Iterable[str | Path]) -> list[Path]:
 
 
 def write_mesh(path: str | Path, mesh: TriangleMesh, length_unit: str = "um") -> None:
-    """Write `mesh` as legacy binary VTK polydata (version 4.2, which all readers take) in `length_unit`."""
+    """Write `mesh` as VTK polydata in `length_unit`.
+
+    XML for the suffix .vtp, which ParaView's collections ask for, else legacy binary (version 4.2, which all readers
+    take), with the mesh's name as title.
+    """
     from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
     from vtkmodules.vtkCommonCore import vtkPoints
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
     from vtkmodules.vtkIOLegacy import vtkPolyDataWriter
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
     points, cells, data = vtkPoints(), vtkCellArray(), vtkPolyData()
     scaled = mesh.vertices / unit_factor("length_unit", length_unit, LENGTH_UNITS)
@@ -63,11 +68,14 @@ def write_mesh(path: str | Path, mesh: TriangleMesh, length_unit: str = "um") ->
     data.SetPoints(points)
     data.SetPolys(cells)
     with atomic_path(path) as temporary, _quiet() as complaints:
-        writer = vtkPolyDataWriter()
+        if Path(path).suffix.lower() == ".vtp":
+            writer = vtkXMLPolyDataWriter()
+        else:
+            writer = vtkPolyDataWriter()
+            writer.SetFileVersion(writer.VTK_LEGACY_READER_VERSION_4_2)
+            writer.SetFileTypeToBinary()
+            writer.SetHeader(f"{mesh.name[:200]} length_unit={length_unit}".replace("\n", " "))
         writer.SetFileName(str(temporary))
-        writer.SetFileVersion(writer.VTK_LEGACY_READER_VERSION_4_2)
-        writer.SetFileTypeToBinary()
-        writer.SetHeader(f"{mesh.name[:200]} length_unit={length_unit}".replace("\n", " "))
         writer.SetInputData(data)
         if not writer.Write() or complaints():
             raise InputError(f"{path} must be writable, but VTK could not write it: {complaints()}.")

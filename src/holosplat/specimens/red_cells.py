@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -58,7 +59,7 @@ class RedCell:
     def surface(self, sphere: np.ndarray) -> np.ndarray:
         """Object-frame points [..., 3] (metres) of the unit-sphere points `sphere` [..., 3]."""
         x, y, z = np.moveaxis(sphere, -1, 0)
-        z = z * _half_thickness(x**2 + y**2)
+        z = z * half_thickness(x**2 + y**2)
         x, y = x * np.exp(self.stretch), y * np.exp(-self.stretch)
         bent = np.stack([x, y, z + _bending(x, y, self.bend)], axis=-1)
         return 0.5 * self.diameter * bent @ self.rotation.T + self.centre
@@ -70,7 +71,7 @@ class RedCell:
         z = z - _bending(x, y, self.bend)
         x, y = x * np.exp(-self.stretch), y * np.exp(self.stretch)
         t = x**2 + y**2
-        return np.sqrt(t + (z / _half_thickness(np.minimum(t, 1.0))) ** 2)
+        return np.sqrt(t + (z / half_thickness(np.minimum(t, 1.0))) ** 2)
 
     def contains(self, points: np.ndarray) -> np.ndarray:
         """Whether object-frame `points` [..., 3] (metres) lie inside the smooth cell: [...] bool."""
@@ -129,7 +130,7 @@ def place_cells(
     for _ in range(count):
         resting = _Placed.resting(diameter, margin, deform, rng)
         found = _inserted(resting, placed, channel, rng)
-        for _ in range(shuffles):
+        for _ in range(shuffles if placed else 0):
             if found is not None:
                 break
             _shuffle(placed, channel, rng)
@@ -202,8 +203,8 @@ def _icosahedron() -> tuple[np.ndarray, np.ndarray]:
     return vertices / np.linalg.norm(vertices[0]), faces
 
 
-def _half_thickness(t: np.ndarray) -> np.ndarray:
-    """(C0 + C1 t + C2 t²)/2 in radii: half the thickness of Evans & Fung without its root."""
+def half_thickness(t: Any) -> Any:
+    """(C0 + C1 t + C2 t²)/2 in radii: half the thickness of Evans & Fung without its root (arrays or tensors)."""
     c0, c1, c2 = (0.5 * c / RADIUS for c in THICKNESS)
     return c0 + t * (c1 + t * c2)
 

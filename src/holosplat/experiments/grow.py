@@ -1,0 +1,249 @@
+"""Specimens that move: cells in a channel, grown into a time series of mesh files. What `holosplat grow` does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..checks import InputError, in_range, require
+from ..fit.interrupt import interrupts_held
+from ..io.atomic import atomic_path
+from ..io.json import read_json, write_json
+from ..io.pvd import TimeStep, write_pvd
+from ..io.vtk import write_mesh
+from ..mesh import TriangleMesh
+from ..specimens.flow.channel import Channel
+from ..specimens.flow.integrate import State, Stepper
+from ..specimens.flow.suspension import Medium, Suspension
+from ..specimens.membrane.model import Elasticity, Membrane
+from ..specimens.membrane.resting import resting_cell
+from ..specimens.red_cells import DIAMETER, SHUFFLES, place_cells
+
+FORMAT = "holosplat cells 1"
+TRAVEL = 1e-6
+"""How far the fastest fluid goes from snapshot to snapshot, unless an interval is given [m]."""
+MOST_VOLUME, MOST_AREA = 0.01, 0.05
+"""Greatest change of a cell's volume and area, relative to rest."""
+FIRST_STEP = 0.01
+"""The first step to try, in inverse shear rates."""
+MOST_CELLS, MOST_SNAPSHOTS = 1000, 100_000
+
+
+@dataclass(frozen=True)
+class Growth:
+    """Which cells, in which flow, recorded when."""
+
+    cells: int = 16
+    """Number of cells."""
+    box: tuple[float, float, float] = (80e-6, 34e-6, 26e-6)
+    """The channel (x, y, z) [m]: flow along x, periodic; walls across y and z."""
+    flow: float = 0.05
+    """Velocity of the undisturbed flow on the channel's axis [m/s]."""
+    snapshots: int = 50
+    """Number of snapshots."""
+    interval: float | None = None
+    """Time between snapshots [s] (default: in which the fastest fluid goes 1 µm)."""
+    warm_up: float = 0.0
+    """Time before the first snapshot, in which resting cells take up the flow [s]."""
+    diameter: float = DIAMETER
+    """Of a resting cell [m]."""
+    frequency: int = 6
+    """Resolution f of the meshes: 10 f² + 2 nodes (6: 362)."""
+    seed: int = 0
+    """Seed of the cells' places and directions."""
+    tolerance: float = 1e-3
+    """Greatest estimated error of a step in time, in mean edges of the mesh."""
+    elasticity: Elasticity = field(default_factory=Elasticity)
+    medium: Medium = field(default_factory=Medium)
+
+    def check(self) -> None:
+        """`InputError` for what cannot be; the other classes check the rest."""
+        Channel(self.box, self.flow)
+        for name, most in (("cells", MOST_CELLS), ("snapshots", MOST_SNAPSHOTS)):
+            number = getattr(self, name)
+            require(1 <= number <= most, f"{name} must be from 1 to {most}, but it is {number}.")
+        in_range("interval", self.period, 1e-12, 1e3, unit="seconds")
+        require(0 <= self.warm_up <= 1e3, f"warm_up must be from 0 to 1000 s, but it is {self.warm_up}.")
+        require(self.seed >= 0, f"seed must be 0 or more, but it is {self.seed}.")
+        in_range("tolerance", self.tolerance, 1e-8, 0.1)
+
+    @property
+    def period(self) -> float:
+        """Time between snapshots [s]."""
+        return TRAVEL / self.flow if self.interval is None else self.interval
+
+    def instant(self, snapshot: int) -> float:
+        """Time of a snapshot since the start [s]."""
+        return self.warm_up + snapshot * self.period
+
+    def suspension(self) -> Suspension:
+        """The cells' membrane in the channel."""
+        membrane = Membrane(resting_cell(self.frequency, self.diameter), self.elasticity)
+        return Suspension(membrane, Channel(self.box, self.flow), self.medium)
+
+    def placed(self, suspension: Suspension) -> Tensor:
+        """Resting cells [C, P, 3] [m] at random in the channel, clear of walls and of each other."""
+        mesh, margin = suspension.membrane.mesh, suspension.repulsion.range_
+        found = place_cells(self.cells, self.box, self.seed, self.diameter, 0.0, margin, "box", shuffles=SHUFFLES)
+        nodes = np.stack([mesh.vertices @ cell.rotation.T + cell.centre for cell in found])
+        return torch.from_numpy(nodes + 0.5 * np.asarray(self.box))
+
+
+@dataclass(frozen=True)
+class Grown:
+    """What came out: the state at the last snapshot, the greatest relative changes of any cell's volume and area at a
+    snapshot of this run, and the snapshots in the folder."""
+
+    state: State
+    volume: float
+    area: float
+    snapshots: int
+
+
+class SeriesFolder:
+    """`grow.json` (the options), `rbcCC_TTT.vtp` (cell, snapshot; µm), `cells.pvd` (opens as a time series),
+    `state.npz` (where to go on). Every file is written whole or not at all, the state last."""
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self.options = self.path / "grow.json"
+        self.collection = self.path / "cells.pvd"
+        self.state = self.path / "state.npz"
+
+    def file(self, cell: int, snapshot: int) -> Path:
+        """The mesh of a cell, counted from 0, at a snapshot."""
+        return self.path / f"rbc{cell:02d}_{snapshot:03d}.vtp"
+
+    def require_new(self) -> None:
+        """`InputError` if something is there already."""
+        taken = self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir()))
+        require(not taken, f"--out must be new or empty, but {self.path} holds files; choose another, or add --resume.")
+        parent = self.path.resolve().parent
+        require(parent.is_dir(), f"--out must lie in an existing folder, but {parent} is none; create it.")
+
+    def create(self, growth: Growth) -> None:
+        """Make the folder."""
+        try:
+            self.path.mkdir(exist_ok=True)
+        except OSError as error:
+            raise InputError(f"{self.path} must be writable, but making it failed: {error}.") from None
+        write_json(self.options, {"format": FORMAT, **_plain(growth)})
+
+    def require_same(self, growth: Growth) -> None:
+        """`InputError` unless the folder was begun with the same options; only `snapshots` may differ."""
+        require(self.options.is_file(), f"--resume needs a folder that grow began, but {self.path} is none.")
+        wanted = {"format": FORMAT, **_plain(growth)}
+        found = read_json(self.options)
+        for name in wanted:
+            same = name == "snapshots" or found.get(name) == wanted[name]
+            require(same, f"--resume must be with the options of the start, but {name} was {found.get(name)}.")
+
+    def write_snapshot(self, growth: Growth, suspension: Suspension, snapshot: int, state: State) -> None:
+        """Add a snapshot: its meshes, the collection, and the state."""
+        for cell, nodes in enumerate(suspension.channel.folded(state.nodes).numpy()):
+            write_mesh(self.file(cell, snapshot), TriangleMesh(nodes, suspension.membrane.mesh.faces))
+        steps = [
+            TimeStep(growth.instant(n) - growth.warm_up, tuple(self.file(c, n) for c in range(growth.cells)))
+            for n in range(snapshot + 1)
+        ]
+        write_pvd(self.collection, steps)
+        with atomic_path(self.state) as temporary:
+            np.savez(
+                temporary,
+                nodes=state.nodes.numpy(),
+                numbers=np.array([state.time, state.step]),
+                counts=np.array([snapshot, state.taken, state.refused]),
+            )
+
+    def read_state(self, growth: Growth, suspension: Suspension) -> tuple[int, State] | None:
+        """The last snapshot and the state at it; None if there is none yet."""
+        if not self.state.is_file():
+            return None
+        try:
+            with np.load(self.state, allow_pickle=False) as file:
+                nodes, numbers, counts = file["nodes"], file["numbers"].tolist(), file["counts"].tolist()
+        except Exception as error:  # a damaged archive raises many kinds
+            raise InputError(f"{self.state} must be a state that grow wrote, but it is damaged; start anew.") from error
+        wanted = (growth.cells, len(suspension.membrane.mesh.vertices), 3)
+        require(nodes.shape == wanted and bool(np.isfinite(nodes).all()), f"{self.state} is damaged; start anew.")
+        (time, step), (snapshot, taken, refused) = numbers, counts
+        return snapshot, State(torch.from_numpy(nodes), time, step, taken, refused)
+
+
+def grow(
+    growth: Growth,
+    out: str | Path,
+    resume: bool = False,
+    on_progress: Callable[[float], None] = lambda fraction: None,
+) -> Grown:
+    """Let cells flow, and write a time series of meshes to the folder `out` (see `SeriesFolder`).
+
+    Ctrl-C is held back until a step is done, then raised; `resume` goes on behind the last snapshot, to the same
+    nodes, bit by bit, as without the interruption. `InputError` for options that do not fit, and where a cell's volume
+    or area would change by more than 1 % or 5 %.
+    """
+    growth.check()
+    folder = SeriesFolder(out)
+    suspension = growth.suspension()
+    (folder.require_same(growth) if resume else folder.require_new())
+    reached = folder.read_state(growth, suspension) if resume else None
+    if reached is None:
+        first = FIRST_STEP / suspension.channel.shear_rate()
+        reached = -1, State(growth.placed(suspension), 0.0, first)
+    if not resume:
+        folder.create(growth)
+    last, state = reached
+    require(last < growth.snapshots, f"{folder.path} has {last + 1} snapshots already; ask for more of them.")
+    end = growth.instant(growth.snapshots - 1)
+    stepper = Stepper(suspension.velocity, growth.tolerance * float(suspension.membrane.rest.length.mean()))
+    worst = _greatest(suspension.membrane, state.nodes)
+    with interrupts_held() as release:
+
+        def between(nodes: Tensor, time: float) -> None:
+            release()
+            on_progress(time / end if end > 0 else 1.0)
+            _require_kept(suspension.membrane, nodes, time)
+
+        for snapshot in range(last + 1, growth.snapshots):
+            state = stepper.advance(state, growth.instant(snapshot), between)
+            folder.write_snapshot(growth, suspension, snapshot, state)
+            worst = np.maximum(worst, _greatest(suspension.membrane, state.nodes))
+    return Grown(state, float(worst[0]), float(worst[1]), growth.snapshots)
+
+
+def _changes(membrane: Membrane, nodes: Tensor) -> tuple[Tensor, Tensor]:
+    """Relative changes of volume and area against rest, each [C]."""
+    return (
+        membrane.volume(nodes) / membrane.rest.volume - 1,
+        membrane.surface(nodes) / membrane.rest.surface - 1,
+    )
+
+
+def _greatest(membrane: Membrane, nodes: Tensor) -> np.ndarray:
+    """The greatest relative changes [2] of any cell's volume and area."""
+    return np.array([float(change.abs().max()) for change in _changes(membrane, nodes)])
+
+
+def _require_kept(membrane: Membrane, nodes: Tensor, time: float) -> None:
+    volume, area = _changes(membrane, nodes)
+    for name, change, most, modulus in (
+        ("volume", volume, MOST_VOLUME, "--volume"),
+        ("area", area, MOST_AREA, "--global-area"),
+    ):
+        cell = int(change.abs().argmax())
+        require(
+            abs(float(change[cell])) <= most,
+            f"the {name} of a cell must stay within {100 * most:g} % of that at rest, but that of cell {cell} changed "
+            f"by {100 * float(change[cell]):.2g} % at {time:.4g} s; raise {modulus}, or lower --flow.",
+        )
+
+
+def _plain(growth: Growth) -> dict[str, Any]:
+    """The options as JSON has them."""
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(growth).items()}

@@ -1,0 +1,100 @@
+"""Flow through a straight rectangular channel: Poiseuille's, in closed form.
+
+For half widths a ≤ b across the channel, with y and z measured from its axis (White 2006, Viscous Fluid Flow, eq. 3-48,
+the parabola of the shorter side taken out of the series, so that what is left falls off exponentially from the ends):
+
+    u = G/2μ (a² - y² - 32 a²/π³ Σ (-1)^((n-1)/2)/n³ cos(nπy/2a) cosh(nπz/2a)/cosh(nπb/2a)),   n = 1, 3, 5 …
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ...checks import in_range, require
+
+TERMS = 40
+"""Terms of the series: no slip holds to 1/(4 (2·40)²) = 4e-5 of the peak."""
+SPEED_RANGE = (1e-9, 10.0)
+
+
+@dataclass(frozen=True)
+class Channel:
+    """A channel along x with walls at y = 0, Ly and z = 0, Lz, periodic in x.
+
+    box: (Lx, Ly, Lz) [m]; peak: velocity on the axis [m/s].
+    """
+
+    box: tuple[float, float, float]
+    peak: float
+
+    def __post_init__(self) -> None:
+        require(len(self.box) == 3, f"box must be three extents (x, y, z) in metres, but it is {self.box!r}.")
+        for axis, extent in zip("xyz", self.box):
+            in_range(f"box extent {axis}", extent, 1e-9, 1.0, unit="metres")
+        in_range("peak velocity", self.peak, *SPEED_RANGE, unit="metres a second")
+
+    @property
+    def halves(self) -> tuple[float, float]:
+        """Half the shorter and half the longer side across the flow [m]."""
+        return 0.5 * min(self.box[1:]), 0.5 * max(self.box[1:])
+
+    def speed(self, points: Tensor) -> Tensor:
+        """Velocity along x [...] [m/s] at `points` [..., 3] [m]; 0 in the walls."""
+        profile = self._profile(points)
+        middle = self._profile(points.new_tensor([0.0, 0.5 * self.box[1], 0.5 * self.box[2]]))
+        return self.peak * profile / middle
+
+    def velocity(self, points: Tensor) -> Tensor:
+        """Velocity [..., 3] [m/s] at `points` [..., 3] [m]."""
+        speed = self.speed(points)
+        return torch.stack([speed, torch.zeros_like(speed), torch.zeros_like(speed)], dim=-1)
+
+    def pressure_gradient(self, viscosity: float) -> float:
+        """G = -dp/dx [Pa/m] that drives it, for a viscosity [Pa s]."""
+        middle = torch.tensor([0.0, 0.5 * self.box[1], 0.5 * self.box[2]], dtype=torch.float64)
+        a, _ = self.halves
+        return 2 * viscosity * self.peak / (a**2 * float(self._profile(middle)))
+
+    def flow_rate(self) -> float:
+        """Volume a second [m³/s]: 4ba³G/3μ (1 - 192a/(π⁵b) Σ tanh(nπb/2a)/n⁵) (White 2006, eq. 3-48)."""
+        a, b = self.halves
+        odd = range(1, 2 * TERMS, 2)
+        series = sum(math.tanh(n * math.pi * b / (2 * a)) / n**5 for n in odd)
+        return 4 / 3 * b * a**3 * self.pressure_gradient(1.0) * (1 - 192 * a / (math.pi**5 * b) * series)
+
+    def mean_speed(self) -> float:
+        """Flow rate over cross-section [m/s]."""
+        return self.flow_rate() / (self.box[1] * self.box[2])
+
+    def shear_rate(self) -> float:
+        """Greatest shear rate of a plane channel as wide as the shorter side, 2 peak/a [1/s]."""
+        return 2 * self.peak / self.halves[0]
+
+    def depth(self, points: Tensor) -> Tensor:
+        """Distance [..., 4] [m] from the walls y = 0, y = Ly, z = 0, z = Lz, negative behind them."""
+        y, z = points[..., 1], points[..., 2]
+        return torch.stack([y, self.box[1] - y, z, self.box[2] - z], dim=-1)
+
+    def folded(self, nodes: Tensor) -> Tensor:
+        """Cells [C, P, 3] moved by whole periods such that their centres lie in 0 ≤ x < Lx."""
+        turns = torch.floor(nodes[..., 0].mean(-1) / self.box[0])
+        return nodes - turns[:, None, None] * nodes.new_tensor([self.box[0], 0.0, 0.0])
+
+    def _profile(self, points: Tensor) -> Tensor:
+        """2μu/(Ga²) [...], from the formula above; y is the shorter side's coordinate."""
+        a, b = self.halves
+        short, long = (1, 2) if self.box[1] <= self.box[2] else (2, 1)
+        y = (points[..., short] - a) / a
+        z = ((points[..., long] - b) / a).abs()
+        n = torch.arange(1, 2 * TERMS, 2, dtype=points.dtype)
+        k = 0.5 * math.pi * n
+        sign = 1 - 2 * (torch.arange(TERMS, dtype=points.dtype) % 2)
+        decay = torch.exp(k * (z.clamp(max=b / a).unsqueeze(-1) - b / a))
+        decay = decay * (1 + torch.exp(-2 * k * z.unsqueeze(-1))) / (1 + torch.exp(-2 * k * b / a))
+        series = (sign / n**3 * torch.cos(k * y.unsqueeze(-1)) * decay).sum(-1)
+        profile = 1 - y**2 - 32 / math.pi**3 * series
+        return torch.where((y.abs() < 1) & (z < b / a), profile, torch.zeros_like(profile))

@@ -1,0 +1,106 @@
+"""Cells in a channel: how fast each node moves, given where all are."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ...checks import in_range, require
+from ..membrane.model import Membrane
+from .channel import Channel
+from .contacts import Repulsion, contact_forces, wall_forces
+from .stokeslets import BLOB, mutual_velocity, stokeslet_velocity
+
+PLASMA_VISCOSITY = 1.2e-3
+"""Of blood plasma at 37 °C [Pa s] (Késmárky et al. 2008, Clin. Hemorheol. Microcirc. 39, 243)."""
+
+
+@dataclass(frozen=True)
+class Medium:
+    """The fluid, the same inside and outside the cells, and what stands in for thin films of it."""
+
+    viscosity: float = PLASMA_VISCOSITY
+    """[Pa s]."""
+    reach: float | None = None
+    """Cells whose centres are farther apart do not feel each other's flow [m] (default: the channel's shorter side, but
+    at most half its length)."""
+    repulsion: float = 2e-11
+    """Force between nodes of different cells, or of a node and a wall, at half the range [N]."""
+    repulsion_range: float | None = None
+    """Distance at which it begins [m] (default: the mean edge of the mesh)."""
+
+    def check(self) -> None:
+        """`InputError` for numbers that cannot be."""
+        in_range("viscosity", self.viscosity, 1e-6, 1e3, unit="pascal seconds")
+        for name in ("reach", "repulsion_range"):
+            if getattr(self, name) is not None:
+                in_range(name.replace("_", " "), getattr(self, name), 1e-10, 1.0, unit="metres")
+
+
+class Suspension:
+    """Cells of one rest shape in a channel.
+
+    The velocity of a node is that of the fluid there: the undisturbed flow and what the forces of all membranes make of
+    it. With one viscosity inside and outside, that is the whole of Stokes flow, but for the walls, which here do not
+    answer the cells: between walls the flow about a force-free cell falls off exponentially with their distance, so it
+    ends at `reach` (fading from half of it on), where in free space it would go on as 1/r².
+    """
+
+    def __init__(self, membrane: Membrane, channel: Channel, medium: Medium = Medium()) -> None:
+        medium.check()
+        self.membrane, self.channel, self.medium = membrane, channel, medium
+        spacing = math.sqrt(float(membrane.rest.surface) / len(membrane.mesh.vertices))
+        self.blob = BLOB * spacing
+        edge = float(membrane.rest.length.mean())
+        self.repulsion = Repulsion(medium.repulsion, medium.repulsion_range or edge)
+        half = 0.5 * channel.box[0]
+        self.reach = min(*channel.box[1:], half) if medium.reach is None else medium.reach
+        require(
+            0 < self.reach <= half,
+            f"reach must lie between 0 and half the channel's length, {half:.4g} m, but it is {self.reach:.4g} m.",
+        )
+
+    def forces(self, nodes: Tensor) -> Tensor:
+        """Forces [C, P, 3] [N] on nodes [C, P, 3] [m]: elastic ones, of walls, and between cells."""
+        elastic = self.membrane.forces(nodes)
+        return (
+            elastic
+            + wall_forces(nodes, self.channel, self.repulsion)
+            + contact_forces(nodes, self.channel, self.repulsion)
+        )
+
+    def velocity(self, nodes: Tensor) -> Tensor:
+        """Velocity [C, P, 3] [m/s] of nodes [C, P, 3] [m]."""
+        forces = self.forces(nodes)
+        centres = nodes.mean(1)
+        local = nodes - centres[:, None]  # small numbers, whose squares keep their digits
+        disturbance = torch.stack(
+            [stokeslet_velocity(x, x, f, self.blob, self.medium.viscosity) for x, f in zip(local, forces)]
+        )
+        scale = 1 / (8 * math.pi * self.medium.viscosity)
+        for i, j, shift, weight in self._neighbours(centres):
+            of_both = forces[i], forces[j]
+            on_i, on_j = mutual_velocity(local[i], local[j] + shift, of_both, self.blob)
+            disturbance[i] += weight * scale * on_i
+            disturbance[j] += weight * scale * on_j
+        return self.channel.velocity(nodes) + disturbance
+
+    def _neighbours(self, centres: Tensor) -> list[tuple[int, int, Tensor, float]]:
+        """Pairs of cells within reach: their numbers, the way [3] from the first to the second, and the weight."""
+        first, second = torch.triu_indices(len(centres), len(centres), 1)
+        way = centres[second] - centres[first]
+        period = self.channel.box[0]
+        way[:, 0] -= period * torch.round(way[:, 0] / period)
+        weight = _fading(way.norm(dim=-1) / self.reach)
+        return [
+            (int(first[k]), int(second[k]), way[k], float(weight[k])) for k in torch.nonzero(weight > 0)[:, 0].tolist()
+        ]
+
+
+def _fading(ratio: Tensor) -> Tensor:
+    """1 up to a half, 0 from 1 on, smooth in between."""
+    s = (2 - 2 * ratio).clamp(0, 1)
+    return s**3 * (10 - 15 * s + 6 * s**2)

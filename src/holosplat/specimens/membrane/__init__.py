@@ -1,0 +1,1 @@
+"""Elastic membranes: energies, forces, resting meshes, and the test in optical tweezers."""

@@ -1,0 +1,96 @@
+"""The unstressed membrane: which nodes, edges and triangles it has, and their lengths, areas and angles at rest."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...checks import InputError, require
+from ...mesh import TriangleMesh
+from .geometry import corners_of, cross, dihedral_angles, edge_lengths, enclosed_volume, triangle_areas
+
+
+@dataclass(frozen=True, eq=False)
+class RestShape:
+    """A closed surface of P nodes, F triangles and E edges, and its measures at rest (float64 unless `to` changed it).
+
+    faces: [F, 3]; edges: [E, 2], nodes a and b of each; opposite: [E, 2], the third nodes c and d of the triangles
+    (a, b, c) and (b, a, d) beside it; beside: [E, 2], the numbers of these triangles; length: [E] [m]; angle: [E]
+    between the triangles' normals, positive where the surface is convex [rad]; area: [F] [m²]; frame: [F, 2, 2], the
+    inverse of each triangle's two sides (columns, in its own plane) [1/m]; surface [m²]; volume [m³].
+    """
+
+    faces: Tensor
+    edges: Tensor
+    opposite: Tensor
+    beside: Tensor
+    length: Tensor
+    angle: Tensor
+    area: Tensor
+    frame: Tensor
+    surface: Tensor
+    volume: Tensor
+
+    @classmethod
+    def of(cls, mesh: TriangleMesh) -> RestShape:
+        """The rest shape `mesh`; `InputError` unless it is closed, wound outwards, and has no triangle without area."""
+        require(mesh.volume > 0, f"{mesh.name} must be wound outwards, but its volume is not positive; repair it.")
+        edges, opposite, beside = _hinges(mesh)
+        faces = torch.from_numpy(mesh.faces.copy())
+        nodes = torch.from_numpy(mesh.vertices.copy())
+        corners = corners_of(nodes, faces)
+        area = triangle_areas(corners)
+        whole = bool((area > 1e-9 * area.mean()).all())
+        require(whole, f"{mesh.name}: triangles of a membrane must have an area, but some have none; remesh it.")
+        return cls(
+            faces,
+            edges,
+            opposite,
+            beside,
+            edge_lengths(nodes, edges),
+            dihedral_angles(nodes, edges, opposite),
+            area,
+            _frames(corners),
+            area.sum(),
+            enclosed_volume(corners),
+        )
+
+    def to(self, dtype: torch.dtype) -> RestShape:
+        """The same with its measures in `dtype`."""
+        found = {field.name: getattr(self, field.name) for field in fields(self)}
+        return RestShape(**{name: t.to(dtype) if t.is_floating_point() else t for name, t in found.items()})
+
+
+def _hinges(mesh: TriangleMesh) -> tuple[Tensor, Tensor, Tensor]:
+    """Edges, opposite nodes and triangles on either side, each [E, 2]."""
+    start = mesh.faces.reshape(-1)
+    end = np.roll(mesh.faces, -1, axis=1).reshape(-1)
+    third = np.roll(mesh.faces, -2, axis=1).reshape(-1)
+    triangle = np.repeat(np.arange(len(mesh.faces)), 3)
+    count = len(mesh.vertices)
+    forth, back = start * count + end, end * count + start
+    unique = len(np.unique(forth)) == len(forth)
+    if not (unique and np.array_equal(np.sort(forth), np.sort(back))):
+        raise InputError(
+            f"{mesh.name} must be a closed surface, wound the same way everywhere, each side shared by two triangles, "
+            "but it is not; repair it first."
+        )
+    require(len(np.unique(start)) == count, f"{mesh.name} must have no loose nodes, but it has; merge or remove them.")
+    order, reverse = np.argsort(forth), np.argsort(back)
+    first, second = order[start[order] < end[order]], reverse[start[order] < end[order]]
+    pairs = ((start[first], end[first]), (third[first], third[second]), (triangle[first], triangle[second]))
+    edges, opposite, beside = (torch.from_numpy(np.stack(pair, axis=1)) for pair in pairs)
+    return edges, opposite, beside
+
+
+def _frames(corners: Tensor) -> Tensor:
+    """[F, 2, 2]: the inverse of the sides (b - a, c - a) of triangles [F, 3, 3] in orthonormal axes of their planes."""
+    a, b, c = corners.unbind(-2)
+    along = (b - a) / (b - a).norm(dim=-1, keepdim=True)
+    normal = cross(b - a, c - a)
+    across = cross(normal / normal.norm(dim=-1, keepdim=True), along)
+    axes = torch.stack([along, across], dim=-2)
+    return torch.linalg.inv(axes @ torch.stack([b - a, c - a], dim=-1))
