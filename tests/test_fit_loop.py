@@ -559,7 +559,7 @@ def test_validation_frames_do_not_move_the_fit(scan):
     assert a[-1]["val_l1"] != b[-1]["val_l1"]
 
 
-HASTY = {"rate_position": 1.0, "rate_scale": 0.3, "rate_amplitude": 1.5, "decay": 1.0}
+HASTY = {"rate_position": 3.0, "rate_scale": 0.5, "rate_amplitude": 2.0, "decay": 1.0}
 """Rates at which the fit soon gets worse on views it does not see."""
 
 
