@@ -13,12 +13,13 @@ from ...fit.neural import NeuralFit, fit_neural
 from ...fit.voxels import VoxelFit, fit_voxels
 from ...geometry import Grid, Views
 from ...optics.retrieval import RETRIEVALS
-from ...representations import GaussianCloud, VoxelGrid
+from ...representations import GaussianCloud, SurfaceMesh, VoxelGrid
 from ...representations.neural_field import Matter, NeuralField
 from ...scan import Scan
 from ..reconstruct import reconstruct
 from ..settings import MaterialPrior, Settings, preset
 from ..start import assumed_material
+from ..surfaces import SurfaceSettings, refine_surfaces
 from .method import Method, Progress
 from .svmbir import svmbir_volume
 
@@ -26,6 +27,7 @@ PER_VIEW = "phase retrieval of each view, then tomography"
 VOXELS = "voxels through the waves"
 NEURAL = "neural field through the waves"
 GAUSSIANS = "Gaussians through the waves"
+SURFACES = "surfaces through the waves"
 
 Volumetric = Callable[[Tensor, Views, Grid, Callable[[float], None]], Tensor]
 """(thickness [V, H, W] in metres, views, grid, on_progress) → occupancy [Z, Y, X]."""
@@ -110,9 +112,17 @@ def gaussians(scan: Scan, prior: MaterialPrior, seed: int, settings: Settings, o
     return found.cloud
 
 
+def surfaces(
+    scan: Scan, prior: MaterialPrior, seed: int, settings: Settings, how: SurfaceSettings, on_progress: Progress
+) -> SurfaceMesh:
+    """What `holosplat surface` makes of what `holosplat reconstruct` does."""
+    cloud = gaussians(scan, prior, seed, settings, on_progress)
+    return refine_surfaces(cloud, scan, how, lambda stage, part, record: on_progress(stage, part))
+
+
 def methods(effort: float = 1.0) -> dict[str, Method]:
     """Name → method. effort: share of the steps of those that fit in many steps (1: as published)."""
-    table = (*_per_view(), *_through_waves(effort), *_gaussians(effort))
+    table = (*_per_view(), *_through_waves(effort), *_gaussians(effort), _surfaces(effort))
     return {method.name: method for method in table}
 
 
@@ -187,6 +197,17 @@ def _gaussians(effort: float) -> list[Method]:
             lambda scan, prior, seed, on_progress: gaussians(scan, prior, seed, default, on_progress),
         ),
     ]
+
+
+def _surfaces(effort: float) -> Method:
+    default, how = _scaled(preset("default"), effort), SurfaceSettings()
+    how = replace(how, fit=replace(how.fit, steps=_share(how.fit.steps, effort)))
+    return Method(
+        "surfaces",
+        SURFACES,
+        "closed surfaces cut out of the Gaussians and fitted to the holograms: what surface does by default",
+        lambda scan, prior, seed, on_progress: surfaces(scan, prior, seed, default, how, on_progress),
+    )
 
 
 def _stage(on_progress: Progress, stage: str) -> Callable[[float], None]:
