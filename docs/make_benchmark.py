@@ -39,9 +39,10 @@ OVERVIEW_METHODS = {
     "neural-field": "neural field",
     "gaussians-random": "Gaussians, random start",
     "gaussians": "Gaussians",
+    "surfaces": "surfaces, from Gaussians",
 }
 """What docs/overview.md shows: cases, numbers, and methods as it calls them."""
-OURS = "gaussians"
+OURS = ("gaussians", "surfaces")
 STANDING = {"ssim": 1, "frcm": 1, "dice": 1, "relative_error_delta": -1}
 """The scores in which methods are compared, and whether more of it is better."""
 SCORES = ("ssim", "frcm", "psnr", "l1")
@@ -138,23 +139,35 @@ def overview(means: Means) -> str:
 
 
 def standing(rows: list[Row], means: Means) -> str:
-    """The Gaussians beside the best other method on every case and score; what they lose is in italics."""
+    """Gaussians and surfaces beside the best other method on every case and score."""
     references = {row.method for row in rows if row.is_reference}
     lines = ["| case | SSIM | FRCM | Dice | error of δ | time / s |", "| --- " * 6 + "|"]
-    won = dict.fromkeys(STANDING, 0)
-    cases = [case for case in case_names() if (case, OURS) in means]
+    won: dict[str, dict[str, int]] = {name: dict.fromkeys((*OURS, "either"), 0) for name in STANDING}
+    cases = [case for case in case_names() if all((case, method) in means for method in OURS)]
     for case in cases:
         others = {m: n for (c, m), n in means.items() if c == case and not m.startswith(OURS) and m not in references}
-        cells = []
-        for name, sign in STANDING.items():
-            ours = means[case, OURS][name]
-            method, best = max(((m, n[name]) for m, n in others.items()), key=lambda item: sign * item[1])
-            ahead = sign * ours >= sign * best
-            won[name] += ahead
-            cells.append(f"**{ours:.3f}** ({best:.3f})" if ahead else f"*{ours:.3f}* ({best:.3f}, {method})")
-        lines.append(f"| {case} | {' | '.join(cells)} | {means[case, OURS]['seconds']:.0f} |")
-    lines.append(f"| best on, of {len(cases)} | {' | '.join(str(count) for count in won.values())} | |")
+        cells = [_compared(case, name, means, others, won[name]) for name in STANDING]
+        times = " / ".join(f"{means[case, method]['seconds']:.0f}" for method in OURS)
+        lines.append(f"| {case} | {' | '.join(cells)} | {times} |")
+    for method in (*OURS, "either"):
+        counts = " | ".join(str(count[method]) for count in won.values())
+        lines.append(f"| {method}: best on, of {len(cases)} | {counts} | |")
     return "\n".join(lines)
+
+
+def _compared(case: str, name: str, means: Means, others: dict[str, dict[str, float]], won: dict[str, int]) -> str:
+    """One cell: ours, bold where no other method is better, and the best other; `won` counts."""
+    sign = STANDING[name]
+    method, best = max(((m, n[name]) for m, n in others.items()), key=lambda item: sign * item[1])
+    shown, ahead = [], False
+    for mine in OURS:
+        value = means[case, mine][name]
+        as_good = sign * value >= sign * best
+        won[mine] += as_good
+        ahead |= as_good
+        shown.append(f"**{value:.3f}**" if as_good else f"{value:.3f}")
+    won["either"] += ahead
+    return f"{' / '.join(shown)} ({best:.3f}{'' if ahead else ', *' + str(method) + '*'})"
 
 
 def fill(path: Path, table: str) -> None:

@@ -95,6 +95,8 @@ def test_a_body_is_followed_through_the_sides_of_a_periodic_box():
         folded.require_continuous()
     with pytest.raises(InputError, match="period must not be negative"):
         folded.unfolded(np.array([-1.0, 0, 0]))
+    with pytest.raises(InputError, match=r"at least as long as the bodies, .* m along x, but it is 2e-11 m; mind"):
+        folded.unfolded(np.array([20e-12, 0, 0]))
 
 
 def test_series_that_cannot_be_are_refused():

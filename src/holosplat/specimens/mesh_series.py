@@ -89,10 +89,17 @@ class MeshSeries:
         """The series with bodies followed through the sides of a periodic box, where their centres jump.
 
         period: the box's edges (x, y, z) [m], 0 along axes that are not periodic. A body must move by less than half
-        a period from one snapshot to the next; in the first snapshot all stay where they are.
+        a period from one snapshot to the next; in the first snapshot all stay where they are. Errors: `InputError` for
+        a negative period, and for one that bodies do not fit into.
         """
         period = finite("period", np.asarray(period, dtype=np.float64).reshape(3))
         require(bool((period >= 0).all()), f"period must not be negative, but it is {period.tolist()} m.")
+        largest = self._sizes().max(axis=0)
+        for axis in np.flatnonzero((period > 0) & (period < largest)):
+            raise InputError(
+                f"period must be at least as long as the bodies, {largest[axis]:.3g} m along {'xyz'[axis]}, but it is "
+                f"{period[axis]:.3g} m; mind the unit: it is that of the files."
+            )
         centres = self._centres()
         jumps = np.zeros_like(centres)
         wraps = period > 0
@@ -104,8 +111,7 @@ class MeshSeries:
         """`InputError` where a body jumps by more than its size and `JUMP` usual steps: it was folded into a box."""
         steps = np.abs(np.diff(self._centres(), axis=0))  # [T - 1, M, 3]
         usual = np.median(steps, axis=(0, 1)) if len(steps) else np.zeros(3)
-        size = np.array([np.subtract(*mesh.bounds[::-1]) for mesh in self.snapshots[0].meshes])
-        found = np.argwhere(steps > np.maximum(JUMP * usual, size))
+        found = np.argwhere(steps > np.maximum(JUMP * usual, self._sizes()))
         if len(found):
             t, body, axis = found[0]
             raise InputError(
@@ -117,6 +123,10 @@ class MeshSeries:
     def _centres(self) -> np.ndarray:
         """Means of the bodies' vertices [T, M, 3]."""
         return np.array([[mesh.vertices.mean(0) for mesh in scene.meshes] for scene in self.snapshots])
+
+    def _sizes(self) -> np.ndarray:
+        """Extents [M, 3] of the bodies in the first snapshot."""
+        return np.array([np.subtract(*mesh.bounds[::-1]) for mesh in self.snapshots[0].meshes])
 
 
 def _between(before: TriangleMesh, after: TriangleMesh, part: float) -> TriangleMesh:
