@@ -1,7 +1,7 @@
 """The main job, measured: simulate, reconstruct, judge, on scenes that no setting was chosen on.
 
     python benchmarks/main_job.py --json                                  # 24 generated cells, seeds 101, 102, 103
-    python benchmarks/main_job.py --cases ratio free poses noise nine plasma   # harder ones
+    python benchmarks/main_job.py --cases ratio free poses noise nine plasma --surfaces     # harder ones, and surfaces
     python benchmarks/main_job.py --cases snapshot --meshes DIR/rbc*_049.vtk
 
 Settings were chosen on other scenes (seeds below 100). Prints one JSON object, or a Markdown table.
@@ -26,7 +26,9 @@ from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from holosplat.experiments.bench.declaration import Between
+from holosplat.experiments.evaluate import Scores, score_object
 from holosplat.experiments.run_folder import environment
+from holosplat.fit.surfaces import oversampling
 
 HAEMOGLOBIN = hs.HAEMOGLOBIN.delta_beta(20.0)
 
@@ -103,26 +105,38 @@ CASES: dict[str, Callable[[int], Case]] = {
 }
 
 
-def run(case: Case, preset: str, seed: int) -> dict[str, Any]:
-    """Simulate, reconstruct and score one case."""
+def run(case: Case, preset: str, seed: int, surfaces: bool = False) -> list[dict[str, Any]]:
+    """Simulate, reconstruct and score one case; with `surfaces`, a second row for those fitted from the Gaussians."""
     scan = case.scan(seed)
     truth = case.scene.voxelise(hs.Grid.of_views(case.exposures.views))
     began = time.perf_counter()
     result = hs.reconstruct(scan, case.prior, hs.preset(preset), seed)
     seconds = time.perf_counter() - began
     scores = hs.evaluate(result, scan, truth)
+    material = scores.as_dict()["material"]
+    rows = [
+        {
+            "method": "gaussians",
+            "seconds": seconds,
+            **{f"{stage}_seconds": value for stage, value in result.timing.items()},
+            "gaussians": len(result.cloud),
+            **numbers(scores, material),
+        }
+    ]
+    if surfaces:
+        began = time.perf_counter()
+        found = hs.refine_surfaces(result.cloud, scan)
+        seconds += time.perf_counter() - began
+        refined = score_object(found, scan, truth, oversampling(scan.train()))
+        rows.append({"method": "surfaces", "seconds": seconds, "gaussians": 0, **numbers(refined, material)})
+    return [{"seed": seed, "preset": preset, **row} for row in rows]
+
+
+def numbers(scores: Scores, material: dict[str, Any]) -> dict[str, Any]:
+    """What a row says of a result."""
     assert scores.train is not None
-    return {
-        "seed": seed,
-        "preset": preset,
-        "seconds": seconds,
-        **{f"{stage}_seconds": value for stage, value in result.timing.items()},
-        "gaussians": len(result.cloud),
-        **scores.headline(),
-        "train_ssim": scores.train.mean["ssim"],
-        "train_frcm": scores.train.mean["frcm"],
-        "material": scores.as_dict()["material"],
-    }
+    train = {f"train_{name}": scores.train.mean[name] for name in ("ssim", "frcm")}
+    return {**scores.headline(), **train, "material": material}
 
 
 def main() -> None:
@@ -132,6 +146,7 @@ def main() -> None:
     parser.add_argument("--meshes", type=Path, nargs="*", default=[])
     parser.add_argument("--seeds", type=int, nargs="+", default=[101, 102, 103])
     parser.add_argument("--preset", default="default")
+    parser.add_argument("--surfaces", action="store_true", help="also fit surfaces; times are those of both together")
     parser.add_argument("--json", action="store_true")
     options = parser.parse_args()
     if "snapshot" in options.cases and not options.meshes:
@@ -140,7 +155,7 @@ def main() -> None:
     for name in options.cases:
         for seed in [0] if name == "snapshot" else options.seeds:
             case = snapshot(options.meshes) if name == "snapshot" else CASES[name](seed)
-            rows.append({"case": name, **run(case, options.preset, seed)})
+            rows += [{"case": name, **row} for row in run(case, options.preset, seed, options.surfaces)]
     report = {"commit": commit(), **environment("cpu"), "rows": rows}
     print(json.dumps(report, indent=2) if options.json else table(report))
 
@@ -152,11 +167,12 @@ def table(report: dict[str, Any]) -> str:
     for row in report["rows"]:
         deviation = 100 * (row["mean_delta"] / row["true_mean_delta"] - 1)
         found = row["material"]
+        called = f"{row['case']}, {row['seed']}" + (", surfaces" if row["method"] == "surfaces" else "")
         ratio = f"{found['ratio']:.0f}" + ("" if found["single_material"] else " (found)")
         lines.append(
-            f"| {row['case']}, {row['seed']} | {row['ssim']:.3f} | {row['frcm']:.3f} | {row['psnr']:.1f} "
+            f"| {called} | {row['ssim']:.3f} | {row['frcm']:.3f} | {row['psnr']:.1f} "
             f"| {row['dice']:.3f} | {deviation:+.1f} % | {row['relative_error_delta']:.3f} | {ratio} "
-            f"| {row['gaussians']} | {row['seconds']:.0f} |"
+            f"| {row['gaussians'] or '–'} | {row['seconds']:.0f} |"
         )
     machine = report["machine"]
     measured = f"{machine['processor']}, {machine['threads']}, torch {report['versions']['torch']}"
