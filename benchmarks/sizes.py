@@ -1,7 +1,7 @@
 """How quality, time and memory grow with the frames: the first case of the suite on finer and finer pixels.
 
     python benchmarks/sizes.py                       # 64, 128 and 256 pixels across the same field
-    python benchmarks/sizes.py --pixels 512          # never run yet
+    python benchmarks/sizes.py --pixels 512          # four minutes, 6 GB
 
 24 generated cells in a field of 410 µm, 20 keV, 10 cm, 12 views for the fit and 4 held out, haemoglobin known, without
 noise. Prints a Markdown table. Each size runs in a process of its own, whose peak of memory is told; where that was
