@@ -327,6 +327,17 @@ def test_each_kind_of_error_is_drawn_apart():
     assert np.array_equal(none.views.shifts, nominal.views.shifts)
 
 
+def test_turns_are_about_the_axes_of_the_lab():
+    """Whatever the pose, the same seed turns the beamline by the same."""
+    error = Misalignment(rotation_deg=0.5, seed=4)
+    tilted, straight = many(5), views_of(*[0.0] * 5)
+    turns = [
+        error.true_exposures(nominal).views.rotations @ nominal.views.rotations.swapaxes(1, 2)
+        for nominal in (tilted, straight)
+    ]
+    np.testing.assert_allclose(turns[0], turns[1], atol=1e-12)
+
+
 def test_a_detector_shifted_by_whole_pixels_shifts_the_frame():
     """A detector moved to the right by 3 pixels and up by 2 sees the ball as much further left and lower."""
     straight = views_of(25)
