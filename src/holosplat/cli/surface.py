@@ -38,7 +38,7 @@ def surface(
     """Cut the bodies of a run out as closed surfaces, fit these to the frames, and write them as VTK files (µm).
 
     Args:
-        run: Run folder, of a reconstruction that was given --material or --delta-beta.
+        run: Run folder, of a reconstruction as one material: any but those that fit δ and β apart.
         out: Folder to make: body000.vtk …, the largest first, each with its cavities, and summary.json.
         scan: Scan file (default: the one that was reconstructed).
         truth: Volume file of the truth, to score both against.
