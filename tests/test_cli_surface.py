@@ -14,7 +14,7 @@ import pytest
 from holosplat.baselines import HolographicTV
 from holosplat.checks import InputError
 from holosplat.experiments.reconstruct import load_reconstruction, reconstruct
-from holosplat.experiments.run_folder import RunFolder
+from holosplat.experiments.run_folder import RunFolder, write_gaussians
 from holosplat.experiments.settings import MaterialPrior, Settings
 from holosplat.experiments.surfaces import extract_surfaces
 from holosplat.fit.loop import FitOptions
@@ -119,11 +119,21 @@ def test_another_scan_is_remarked_upon(shop, tmp_path):
     assert "not the scan that was reconstructed" in done.err
 
 
-def test_a_run_without_a_material_is_refused(shop, tmp_path):
+def test_a_run_of_an_estimated_material_is_taken(shop, tmp_path):
     unknown = RunFolder(shutil.copytree(shop / "run", tmp_path / "unknown"))
     write_json(unknown.config, unknown.read_config() | {"prior": asdict(MaterialPrior())})
+    options = ["--scan", shop / "scan.nxs", "--steps", 1]
+    assert "what the run estimated" in worked(holosplat("surface", unknown.path, "--out", tmp_path / "b", *options)).err
+    known = worked(holosplat("surface", shop / "run", "--out", tmp_path / "c", *options))
+    assert "run estimated" not in known.err
+
+
+def test_a_run_with_delta_and_beta_apart_is_refused(shop, tmp_path):
+    apart = RunFolder(shutil.copytree(shop / "run", tmp_path / "apart"))
+    write_gaussians(apart.gaussians, freed(load_reconstruction(apart).cloud))
     out = tmp_path / "bodies"
-    refused(holosplat("surface", unknown.path, "--out", out), "surfaces need one material", "--material")
+    command = holosplat("surface", apart.path, "--scan", shop / "scan.nxs", "--out", out)
+    refused(command, "surfaces need one material", "δ and β apart", "--material")
     assert not out.exists()
 
 

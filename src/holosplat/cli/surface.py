@@ -10,7 +10,6 @@ from typing import Any
 
 from tyro.conf import Positional
 
-from ..checks import require
 from ..experiments.evaluate import Scores, score_object
 from ..experiments.evaluate import evaluate as score
 from ..experiments.reconstruct import load_reconstruction
@@ -46,15 +45,11 @@ def surface(
     require_new(out)
     folder = RunFolder(run)
     result = load_reconstruction(folder)
-    kind = folder.read_config().get("prior", {}).get("kind")
-    require(
-        kind in ("known", "ratio"),
-        f"surfaces need one material whose δ and β are known, but {run} was reconstructed without; "
-        "reconstruct with --material or --delta-beta.",
-    )
     measured, volume = scan_for(folder, scan or folder.source_scan()), read_volume(truth) if truth else None
     if scan_hash(measured) != folder.read_config().get("scan_hash"):
         _say("this is not the scan that was reconstructed: its held-out frames may have been fitted")
+    if folder.read_config().get("prior", {}).get("kind") == "free":
+        _say("nothing was known of the matter: δ and β of the surfaces are what the run estimated")
     before = score(result, measured, volume)
     began = time.perf_counter()
     with ProgressBar() as bar:
