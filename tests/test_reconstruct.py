@@ -218,6 +218,20 @@ def test_the_occupancy_is_bounded_only_where_one_means_something(scan, prior):
     assert ({"overfull", "two_levels"} <= recorded) == (prior.kind == "known")
 
 
+@pytest.mark.parametrize(("prior", "upper"), [(KNOWN, 1.0), (MaterialPrior(), 0.0)], ids=["known", "free"])
+def test_so_is_the_occupancy_of_the_start(scan, monkeypatch, prior, upper):
+    begun: list[HolographicTV] = []
+
+    def begin(scan, material, options, on_progress):
+        begun.append(options)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("holosplat.experiments.start.holographic_tv", begin)
+    with pytest.raises(KeyboardInterrupt):
+        starting_cloud(scan.train(), prior, SMALL, 0, lambda stage, part: None)
+    assert [options.upper for options in begun] == [upper]
+
+
 def test_noisy_frames_get_fewer_and_larger_gaussians(scan):
     noisy = replace(scan, frames=scan.frames + np.random.default_rng(0).normal(0, 0.02, scan.frames.shape).astype("f4"))
     clouds = [
