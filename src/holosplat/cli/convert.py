@@ -100,6 +100,7 @@ def convert(
     scan = _read(source, foreign.given())
     prior = matter.prior(scan.exposures.energy_kev)
     require(prior.kind == "free" or to in GOES_WITH["material"], f"a material is not needed with --to {to}; leave it.")
+    require(len(prior.materials) < 2, f"--to {to} takes one material; leave --second-material.")
     if to == "nxtomo":
         require(not out.is_dir(), f"{out} must be a file to write, but it is a folder; add a file name.")
         write_scan(out, scan)

@@ -17,7 +17,7 @@ from ..experiments.settings import MaterialPrior, Settings, preset, read_setting
 from ..experiments.simulate import Filling
 from ..forward import Shutter, Simulation
 from ..io.atomic import require_writable
-from ..materials import parse_material, read_material_table
+from ..materials import DeltaBeta, parse_material, read_material_table
 from ..scan import Exposures, interleaved_split
 
 
@@ -237,14 +237,18 @@ class SettingsOptions:
 
 @dataclass(frozen=True)
 class PriorOptions:
-    """What is known of the matter; without any of these, δ is free and δ/β is estimated."""
+    """What is known of the matter; without any of these, one material or two are found, with their δ and β."""
 
     material: str | None = None
-    """Formula or preset of the one material, if known (then δ and β are)."""
+    """Formula or preset of the material, if known (then δ and β are)."""
     density: float | None = None
     """Its density [g/cm³]; a preset has its own."""
+    second_material: str | None = None
+    """Formula or preset of another material, where there are two."""
+    second_density: float | None = None
+    """Its density [g/cm³]; a preset has its own."""
     medium: str | None = None
-    """Formula or preset of what surrounds it; none means vacuum."""
+    """Formula or preset of what surrounds them; none means vacuum."""
     medium_density: float | None = None
     """The medium's density [g/cm³]."""
     delta_beta: float | None = None
@@ -253,13 +257,17 @@ class PriorOptions:
     def prior(self, energy_kev: float) -> MaterialPrior:
         """The prior at `energy_kev` [keV]."""
         require(self.material is None or self.delta_beta is None, "give --material or --delta-beta, not both.")
-        if self.delta_beta is not None:
-            alone = self.density is None and self.medium is None and self.medium_density is None
-            require(alone, "--density and --medium go with --material, not with --delta-beta.")
-            return MaterialPrior.of_ratio(self.delta_beta)
         if self.material is None:
-            stray = self.density is not None or self.medium is not None or self.medium_density is not None
-            require(not stray, "--density, --medium and --medium-density need --material.")
-            return MaterialPrior()
-        chosen = MaterialOptions(self.material, self.density, self.medium, self.medium_density)
-        return MaterialPrior.known(chosen.filling().of("", energy_kev))
+            belongs = ("density", "second_material", "second_density", "medium", "medium_density")
+            stray = [f"--{name.replace('_', '-')}" for name in belongs if getattr(self, name) is not None]
+            beside = " rather than --delta-beta" if self.delta_beta is not None else ""
+            require(not stray, f"{', '.join(stray)} can only go with --material{beside}; add it, or leave them.")
+            return MaterialPrior() if self.delta_beta is None else MaterialPrior.of_ratio(self.delta_beta)
+        first = self._known(self.material, self.density, energy_kev)
+        if self.second_material is None:
+            require(self.second_density is None, "--second-density needs --second-material.")
+            return MaterialPrior.known(first)
+        return MaterialPrior.known(first, self._known(self.second_material, self.second_density, energy_kev))
+
+    def _known(self, name: str, density: float | None, energy_kev: float) -> DeltaBeta:
+        return MaterialOptions(name, density, self.medium, self.medium_density).filling().of("", energy_kev)

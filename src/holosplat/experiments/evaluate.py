@@ -11,6 +11,7 @@ import torch
 from ..checks import require
 from ..forward import Instrument
 from ..geometry import Grid
+from ..materials import DeltaBeta
 from ..metrics import ImageScores, VolumeScores, image_scores, intensity_range, volume_scores
 from ..metrics.images import json_number
 from ..representations import GaussianCloud
@@ -24,11 +25,13 @@ MOST_VOXELS = 8_000_000
 
 @dataclass(frozen=True)
 class MaterialFound:
-    """What the cloud says about the matter: mass-weighted medians of δ over its volume, and of δ/β in the matter."""
+    """What the cloud says about the matter: mass-weighted medians of δ over its volume, and of δ/β in the matter; or
+    those of the one material, or the two (`second`: the lighter one's), that it is made of."""
 
     delta: float
     ratio: float
     single_material: bool
+    second: DeltaBeta | None = None
 
 
 @dataclass(frozen=True)
@@ -84,14 +87,18 @@ class Evaluation(Scores):
     def as_dict(self) -> dict[str, Any]:
         """The numbers, ready for JSON."""
         found = self.material
-        ratio = found.ratio if np.isfinite(found.ratio) else None
-        material = {"delta": found.delta, "ratio": ratio, "single_material": found.single_material}
+        material: dict[str, Any] = _as_dict(found.delta, found.ratio) | {"single_material": found.single_material}
+        if found.second is not None:
+            material["second"] = _as_dict(found.second.delta, found.second.ratio)
         return super().as_dict() | {"material": material}
 
     def lines(self) -> list[str]:
         """The numbers as a few lines of text."""
-        kind = "one for all" if self.material.single_material else "found apart"
-        return [*super().lines(), f"material: δ {self.material.delta:.3e}, δ/β {self.material.ratio:.0f} ({kind})"]
+        found = self.material
+        kind = "one for all" if found.single_material else "found apart"
+        if found.second is not None:
+            kind = f"of two; the other: δ {found.second.delta:.3e}, δ/β {found.second.ratio:.0f}"
+        return [*super().lines(), f"material: δ {found.delta:.3e}, δ/β {found.ratio:.0f} ({kind})"]
 
 
 def render(reconstruction: Reconstruction, exposures: Exposures) -> np.ndarray:
@@ -144,16 +151,20 @@ def score_object(obj: Object, scan: Scan | None, truth: Volume | None, oversampl
 
 
 def material_found(cloud: GaussianCloud) -> MaterialFound:
-    """What the cloud, where δ and β are free, says about the matter; the given values for a single material."""
-    if cloud.single_material:
-        ratio = cloud.delta / cloud.beta if cloud.beta else float("inf")
-        return MaterialFound(cloud.delta, ratio, True)
+    """What the cloud, where δ and β are free, says about the matter; what it is made of for one material or two."""
+    if cloud.occupancies:
+        second = None if cloud.second is None else DeltaBeta(*cloud.second)
+        return MaterialFound(cloud.delta, DeltaBeta(cloud.delta, cloud.beta).ratio, cloud.single_material, second)
     volume = cloud.voxelise(_enclosing_grid(cloud))
     delta, beta = volume.delta.ravel().astype(np.float64), volume.beta.ravel().astype(np.float64)
     level = _weighted_median(delta, delta)
     matter = delta > 0.5 * level
     ratio = _weighted_median(delta[matter] / np.maximum(beta[matter], 1e-30), delta[matter])
     return MaterialFound(level, ratio, False)
+
+
+def _as_dict(delta: float, ratio: float) -> dict[str, float | None]:
+    return {"delta": delta, "ratio": ratio if np.isfinite(ratio) else None}
 
 
 def _require_energy(reconstruction: Reconstruction, exposures: Exposures) -> None:

@@ -81,7 +81,7 @@ def reconstruct(
         began = time.perf_counter()
         cloud = starting_cloud(train, prior, settings, seed, lambda stage, part: on_progress(stage, part, {}))
         timing["start"] = time.perf_counter() - began
-    fit = Fit(scan, cloud, _fit_options(prior, settings), seed)
+    fit = Fit(scan, cloud, fit_options(prior, settings, cloud), seed)
     if checkpoint:
         fit.load(checkpoint["fit"])
     elif folder:
@@ -94,9 +94,9 @@ def reconstruct(
     return journal.close()
 
 
-def _fit_options(prior: MaterialPrior, settings: Settings) -> FitOptions:
+def fit_options(prior: MaterialPrior, settings: Settings, cloud: GaussianCloud) -> FitOptions:
     """Those of the settings; without what bounds the occupancy where nothing says what an occupancy of one is."""
-    if prior.kind != "free":
+    if prior.kind != "free" or cloud.second is not None:
         return settings.fit
     return replace(settings.fit, objective=replace(settings.fit.objective, overfull=0.0, two_levels=0.0))
 
@@ -189,6 +189,7 @@ class _Journal:
             "detector": {"rows": h, "columns": w, "pixel_size_m": pitch},
             "energy_kev": fit.train.exposures.energy_kev,
             "material": {"delta": cloud.delta, "beta": cloud.beta, "single": cloud.single_material},
+            "second_material": cloud.second and {"delta": cloud.second[0], "beta": cloud.second[1]},
             "timing_s": done.timing,
         }
 
@@ -198,7 +199,7 @@ class _Journal:
         self._folder.append_metrics(self._pending)
         self._pending = []
         cloud = self._fit.cloud
-        units = {"unit_length": cloud.unit_length, "delta": cloud.delta, "beta": cloud.beta}
+        units = {"unit_length": cloud.unit_length, "delta": cloud.delta, "beta": cloud.beta, "second": cloud.second}
         self._folder.save_checkpoint({"fit": self._fit.state_dict(), "cloud": units, "timing": dict(self._timing)})
         self._saved = time.perf_counter()
 
@@ -234,4 +235,4 @@ def _begin(folder: RunFolder, config: dict[str, Any]) -> None:
 
 
 def _config(scan: Scan, prior: MaterialPrior, settings: Settings, seed: int) -> dict[str, Any]:
-    return {"settings": asdict(settings), "prior": asdict(prior), "seed": seed, "scan_hash": scan_hash(scan)}
+    return {"settings": asdict(settings), "prior": prior.as_dict(), "seed": seed, "scan_hash": scan_hash(scan)}

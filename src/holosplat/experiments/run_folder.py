@@ -114,7 +114,7 @@ class RunFolder:
 
 
 def write_gaussians(path: Path, cloud: GaussianCloud) -> None:
-    """Write a cloud: its parameters (float32, as the class documents them), `unit_length` [m], `delta` and `beta`."""
+    """Write a cloud: its parameters (float32, as the class documents them), `unit_length` [m] and its materials."""
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         file.attrs.update(
             format=FORMAT,
@@ -123,6 +123,8 @@ def write_gaussians(path: Path, cloud: GaussianCloud) -> None:
             delta=cloud.delta,
             beta=cloud.beta,
         )
+        if cloud.second is not None:
+            file.attrs["second"] = cloud.second
         for name, parameter in zip(PARAMETERS, cloud.parameters):
             file[name] = parameter.detach().numpy()
 
@@ -136,7 +138,11 @@ def read_gaussians(path: Path) -> GaussianCloud:
             float(attribute_numbers(f"{path}: @{name}", file.attrs.get(name), (1,))[0])
             for name in ("unit_length", "delta", "beta")
         )
-    return GaussianCloud([torch.from_numpy(a) for a in arrays], unit, delta, beta)
+        other = file.attrs.get("second")
+        second = None if other is None else attribute_numbers(f"{path}: @second", other, (2,))
+    return GaussianCloud(
+        [torch.from_numpy(a) for a in arrays], unit, delta, beta, None if second is None else (second[0], second[1])
+    )
 
 
 def scan_hash(scan: Scan) -> str:

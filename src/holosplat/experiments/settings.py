@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from ..baselines import HolographicTV
+from ..baselines.two_materials import LEAST_CONTRAST
 from ..checks import InputError, at_least, require
 from ..fit.density import DensityControl
 from ..fit.loop import FitOptions
@@ -21,23 +22,46 @@ from ..materials import DeltaBeta
 class MaterialPrior:
     """What is known of the matter: its δ and β (`known`), only their `ratio`, or nothing (`free`).
 
-    delta, beta: of the material against its medium (β of either sign); ratio: δ/β.
+    delta, beta: of the material against its medium (β of either sign); ratio: δ/β; second_delta, second_beta: of
+    another material, lighter, where two are known (0: there is one).
     """
 
     kind: Literal["known", "ratio", "free"] = "free"
     delta: float = 0.0
     beta: float = 0.0
     ratio: float = 0.0
+    second_delta: float = 0.0
+    second_beta: float = 0.0
 
     @classmethod
-    def known(cls, material: DeltaBeta) -> MaterialPrior:
-        """One material whose δ (above zero) and β are known."""
+    def known(cls, material: DeltaBeta, second: DeltaBeta | None = None) -> MaterialPrior:
+        """One material, or two, whose δ (above zero, and not the same) and β are known."""
+        for one in (material, second or material):
+            require(
+                one.delta > 0,
+                f"the material must have δ above its medium's, but the difference is {one.delta:.3g}; "
+                "exchange the two.",
+            )
+        if second is None:
+            return cls("known", material.delta, material.beta)
+        denser, lighter = sorted((material, second), reverse=True)
         require(
-            material.delta > 0,
-            f"the material must have δ above its medium's, but the difference is {material.delta:.3g}; "
-            "exchange the two.",
+            denser.delta >= LEAST_CONTRAST * lighter.delta,
+            f"two materials are told apart by δ, of which one must have at least {LEAST_CONTRAST:g} times the other's, "
+            f"but they have {denser.delta:.3g} and {lighter.delta:.3g}; take them for one.",
         )
-        return cls("known", material.delta, material.beta)
+        return cls("known", *denser, second_delta=lighter.delta, second_beta=lighter.beta)
+
+    @property
+    def materials(self) -> tuple[DeltaBeta, ...]:
+        """The known materials, the denser first; none where not both δ and β are known."""
+        known = (DeltaBeta(self.delta, self.beta), DeltaBeta(self.second_delta, self.second_beta))
+        return tuple(one for one in known if one.delta > 0)
+
+    def as_dict(self) -> dict[str, Any]:
+        """What is known, ready for JSON; nothing of a second material where there is none."""
+        values = dataclasses.asdict(self)
+        return {name: value for name, value in values.items() if value or not name.startswith("second_")}
 
     @classmethod
     def of_ratio(cls, ratio: float) -> MaterialPrior:

@@ -44,11 +44,12 @@ class SurfaceSettings:
 def extract_surfaces(cloud: GaussianCloud, scan: Scan, options: Extraction = Extraction()) -> SurfaceMesh:
     """The surfaces where the occupancy of `cloud` crosses the level, in the field of view of `scan`.
 
-    Errors: `InputError` if the cloud has δ and β apart, or there is no such surface.
+    Errors: `InputError` if the cloud is not of one material, or there is no such surface.
     """
+    has = "two materials" if cloud.second else "δ and β apart"
     require(
         cloud.single_material,
-        "surfaces need one material of known δ and β, but this run has δ and β apart; "
+        f"surfaces need one material of known δ and β, but this run has {has}; "
         "reconstruct with --material or --delta-beta.",
     )
     grid = Grid.of_views(scan.views, 1 / options.spacing)

@@ -113,7 +113,7 @@ class Misfit:
 
     def _object_weights(self, cloud: GaussianCloud, draw: Draw) -> dict[str, float]:
         """Weight of every term on the Gaussians in use at this step, before it is ramped."""
-        w, bounded = self.objective, draw.volume * cloud.single_material
+        w, bounded = self.objective, draw.volume * cloud.occupancies
         table = {
             "anisotropy": w.anisotropy,
             "tv_volume": w.tv_volume * draw.volume,
@@ -129,7 +129,7 @@ class Misfit:
         density = cloud.density_around(draw.middle, *self._block) if of_volume else draw.middle
         values: dict[str, Callable[[], Tensor]] = {
             "anisotropy": lambda: terms.anisotropy(cloud.log_scales, self.objective.anisotropy_limit),
-            "tv_volume": lambda: scale * total_variation(density, backend=cloud.backend),
+            "tv_volume": lambda: scale * len(density) * total_variation(density, backend=cloud.backend),
             "overfull": lambda: scale * terms.overfull(density),
             "two_levels": lambda: scale * terms.two_levels(density),
         }

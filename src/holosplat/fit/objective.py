@@ -104,7 +104,7 @@ def anisotropy(log_scales: Tensor, limit: float) -> Tensor:
 
 def overfull(density: Tensor) -> Tensor:
     """Mean square of what exceeds an occupancy of one, [1, Z, Y, X] → scalar."""
-    return (density - 1).clamp_min(0).square().mean()
+    return (density.sum(dim=0) - 1).clamp_min(0).square().mean()
 
 
 def two_levels(density: Tensor) -> Tensor:
@@ -112,7 +112,7 @@ def two_levels(density: Tensor) -> Tensor:
 
     Total variation prefers bodies that are too faint; this gives their level back, for matter is there or it is not.
     """
-    return (density * (1 - density)).clamp_min(0).mean()
+    return (density * (1 - density)).clamp_min(0).sum(dim=0).mean()
 
 
 @lru_cache(maxsize=8)

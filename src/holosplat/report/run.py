@@ -13,6 +13,7 @@ from ..experiments.reconstruct import Reconstruction
 from ..experiments.run_folder import RunFolder
 from ..geometry import Grid, Views
 from ..projectors.voxels import voxel_line_integrals
+from ..representations import GaussianCloud
 from ..scan import Scan
 from ..volume import Volume
 from .content import HeldOutViews, ProjectedMaps, ReportContent, view_labels
@@ -38,7 +39,7 @@ def report_run(
         test = scan.test()
         held_out = HeldOutViews(test.frames, evaluation.predicted, view_labels(test.views), evaluation.test)
     content = ReportContent(
-        title=_title(config),
+        title=_title(config, cloud),
         summary=_summary(reconstruction, scan),
         reconstruction=cloud.voxelise(grid),
         truth=truth,
@@ -59,13 +60,10 @@ def report_run(
     return write_report(content, folder.report)
 
 
-def _title(config: Mapping[str, Any]) -> str:
-    kinds = {
-        "known": "one known material",
-        "ratio": "one material of known δ/β",
-        "free": "δ and β free",
-    }
-    return f"Gaussian reconstruction, {kinds[config['prior']['kind']]}"
+def _title(config: Mapping[str, Any], cloud: GaussianCloud) -> str:
+    count = "two materials" if cloud.second else "one material" if cloud.single_material else "δ and β free"
+    said = {"known": ", known", "ratio": " of known δ/β", "free": ", found" if cloud.occupancies else ""}
+    return f"Gaussian reconstruction, {count}{said[config['prior']['kind']]}"
 
 
 def _summary(reconstruction: Reconstruction, scan: Scan) -> str:

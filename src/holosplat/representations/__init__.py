@@ -2,7 +2,7 @@
 
 from .encodings import Encoding
 from .gaussians import GaussianCloud
-from .initialise import approximate, at_pitch, cloud_from_volume, freed, random_cloud
+from .initialise import approximate, at_pitch, cloud_from_two, cloud_from_volume, freed, random_cloud
 from .isosurface import isosurface
 from .neural_field import Matter, Network, NeuralField
 from .surfaces import SurfaceMesh
@@ -20,6 +20,7 @@ __all__ = [
     "VoxelLines",
     "approximate",
     "at_pitch",
+    "cloud_from_two",
     "cloud_from_volume",
     "freed",
     "isosurface",

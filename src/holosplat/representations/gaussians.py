@@ -1,4 +1,4 @@
-"""Anisotropic 3D Gaussians that add up: one density of a known material, or free δ and β."""
+"""Anisotropic 3D Gaussians that add up: the density of one material, of each of two, or free δ and β."""
 
 from __future__ import annotations
 
@@ -28,12 +28,21 @@ class GaussianCloud:
     quaternions [N, 4] `(w, x, y, z)`, normalised on use; raw_amplitudes [N, C], peak values through softplus.
 
     With C = 1 the amplitude is an *occupancy*, the density of one material: δ = a·delta, β = a·beta (β may be
-    negative). With C = 2 it is `(δ/delta, β/beta)`, both free and non-negative, in the units `delta`, `beta`.
+    negative). With C = 2 it is `(δ/delta, β/beta)`, both free and non-negative, in the units `delta`, `beta`; or,
+    with `second` the (δ, β) of another material, the occupancies of the two: δ = a₁·delta + a₂·second[0].
     """
 
-    def __init__(self, parameters: Iterable[Tensor], unit_length: float, delta: float, beta: float) -> None:
+    def __init__(
+        self,
+        parameters: Iterable[Tensor],
+        unit_length: float,
+        delta: float,
+        beta: float,
+        second: tuple[float, float] | None = None,
+    ) -> None:
         self.centres, self.log_scales, self.quaternions, self.raw_amplitudes = parameters
         self.unit_length, self.delta, self.beta = float(unit_length), float(delta), float(beta)
+        self.second = None if second is None else (float(second[0]), float(second[1]))
         n = len(self.centres)
         shapes = [tuple(p.shape) for p in self.parameters]
         fits = shapes[:3] == [(n, 3), (n, 3), (n, 4)] and shapes[3] in ((n, 1), (n, 2))
@@ -54,6 +63,18 @@ class GaussianCloud:
         return self.raw_amplitudes.shape[1] == 1
 
     @property
+    def materials(self) -> tuple[tuple[float, float], ...]:
+        """(δ, β) of amplitude one in each channel."""
+        if self.single_material:
+            return ((self.delta, self.beta),)
+        return ((self.delta, self.beta), self.second) if self.second else ((self.delta, 0.0), (0.0, self.beta))
+
+    @property
+    def occupancies(self) -> bool:
+        """Whether amplitudes are shares of materials, which cannot add up to more than one."""
+        return self.single_material or self.second is not None
+
+    @property
     def scales(self) -> Tensor:
         """Standard deviations [N, 3] in units of `unit_length`."""
         return torch.exp(self.log_scales)
@@ -70,7 +91,7 @@ class GaussianCloud:
 
     def replaced(self, parameters: Iterable[Tensor]) -> GaussianCloud:
         """A cloud of other parameters in the same units."""
-        cloud = GaussianCloud(parameters, self.unit_length, self.delta, self.beta)
+        cloud = GaussianCloud(parameters, self.unit_length, self.delta, self.beta, self.second)
         cloud.backend = self.backend
         return cloud
 
@@ -107,8 +128,8 @@ class GaussianCloud:
 
     def project(self, views: Views | Poses) -> LineIntegrals:
         """Line integrals (B, D), differentiable in the parameters."""
-        delta, beta = self.delta * self.unit_length, self.beta * self.unit_length
-        materials = ((delta, beta),) if self.single_material else ((delta, 0.0), (0.0, beta))
+        scale = self.unit_length
+        materials = tuple((delta * scale, beta * scale) for delta, beta in self.materials)
         return LineIntegrals(self.thickness(views), materials)
 
     def density(self, grid: Grid) -> Tensor:
@@ -139,7 +160,8 @@ class GaussianCloud:
         """δ and β on `grid`."""
         with torch.no_grad():
             density = self.density(grid).cpu().numpy()
-        return Volume(density[0] * self.delta, density[-1] * self.beta, grid)
+        delta, beta = np.tensordot(np.array(self.materials, dtype=np.float32).T, density, axes=1)
+        return Volume(delta, beta, grid)
 
     def masses(self) -> Tensor:
         """Integrals [N, C] of each Gaussian, in units of `unit_length³` × amplitude: `a (2π)^{3/2} s₁s₂s₃`."""

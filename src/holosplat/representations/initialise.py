@@ -18,6 +18,9 @@ SMALLEST = 1e-3
 """Smallest starting amplitude: softplus needs some slope to start from."""
 
 
+NEXT_TO_NOTHING = 1e-4
+"""Amplitude of the material that a Gaussian is not of: so little that softplus hardly lets it grow."""
+
 FILLED = 0.05
 """Share of matter from which on a block becomes a Gaussian."""
 
@@ -61,13 +64,36 @@ def cloud_from_volume(
     )
 
 
+def cloud_from_two(
+    occupancies: Tensor,
+    grid: Grid,
+    materials: tuple[tuple[float, float], tuple[float, float]],
+    spacing: float,
+    unit_length: float,
+    max_count: int = 1_000_000,
+) -> GaussianCloud:
+    """A cloud of two materials that approximates `occupancies` [2, Z, Y, X] on `grid`; each Gaussian is of one.
+
+    The Gaussians of each are those of `cloud_from_volume`, with next to nothing of the other material. materials:
+    (δ, β) of each; the rest as there. Errors: `InputError` if there is nothing of one of them.
+    """
+    parts = []
+    for channel, (occupancy, material) in enumerate(zip(occupancies, materials)):
+        one = cloud_from_volume(occupancy, grid, material, spacing, unit_length, max_count // 2)
+        raw = raw_of(torch.full((len(one), 2), NEXT_TO_NOTHING))
+        raw[:, channel] = one.raw_amplitudes[:, 0]
+        parts.append((*one.parameters[:3], raw))
+    return GaussianCloud([torch.cat(arrays) for arrays in zip(*parts)], unit_length, *materials[0], second=materials[1])
+
+
 def at_pitch(volume: Tensor, grid: Grid, pitch: float) -> tuple[Tensor, Grid]:
-    """The volume [Z, Y, X] interpolated to voxels of `pitch` [m] if its own are coarser (a whole number of times)."""
+    """The volume […, Z, Y, X] interpolated to voxels of `pitch` [m] if its own are coarser (by a whole number)."""
     factor = round(grid.voxel_size[0] / pitch)
     if factor <= 1:
         return volume, grid
     shape = (grid.shape[0] * factor, grid.shape[1] * factor, grid.shape[2] * factor)
-    fine = interpolate(volume[None, None], size=shape, mode="trilinear", align_corners=False)[0, 0]
+    channels = volume.reshape(1, -1, *volume.shape[-3:])
+    fine = interpolate(channels, size=shape, mode="trilinear", align_corners=False).reshape(*volume.shape[:-3], *shape)
     x, y, z = (o - 0.5 * (factor - 1) * pitch for o in grid.origin)
     return fine, Grid(shape, (pitch, pitch, pitch), (x, y, z))
 
@@ -75,9 +101,10 @@ def at_pitch(volume: Tensor, grid: Grid, pitch: float) -> tuple[Tensor, Grid]:
 def approximate(
     cloud: GaussianCloud, occupancy: Tensor, grid: Grid, steps: int, on_progress: Callable[[str, float], None]
 ) -> GaussianCloud:
-    """The cloud after `steps` of Adam towards `occupancy` [Z, Y, X] on `grid`, by mean squared difference.
+    """The cloud after `steps` of Adam towards `occupancy` on `grid`, by mean squared difference.
 
-    It starts a hologram fit where the classical reconstruction ended. `on_progress(stage, fraction)`.
+    occupancy: [Z, Y, X], or [C, Z, Y, X] of each of the cloud's channels. It starts a hologram fit where the classical
+    reconstruction ended. `on_progress(stage, fraction)`.
     """
     leaves = [p.detach().clone().requires_grad_() for p in cloud.parameters]
     cloud = cloud.replaced(leaves)
@@ -97,12 +124,19 @@ def approximate(
 
 
 def random_cloud(
-    count: int, views: Views, material: tuple[float, float], channels: int, thickness: float, seed: int
+    count: int,
+    views: Views,
+    material: tuple[float, float],
+    channels: int,
+    thickness: float,
+    seed: int,
+    second: tuple[float, float] | None = None,
 ) -> GaussianCloud:
     """`count` Gaussians, uniform in the ball that every view sees, as the thesis starts.
 
     Their size is the mean distance between neighbours and their summed mass that of a slab of `thickness` [m]
-    of material over the ball's cross-section. material: (δ, β) of amplitude one; channels: 1 or 2.
+    of material over the ball's cross-section. material: (δ, β) of amplitude one; channels: 1 or 2; second: (δ, β) of
+    the material of the second channel, None where the two are δ and β apart.
     """
     require(count > 0, f"the number of Gaussians must be positive, but it is {count}.")
     generator = torch.Generator().manual_seed(seed)
@@ -114,7 +148,7 @@ def random_cloud(
     mass = np.pi * radius**2 * thickness / views.pixel_size / count
     peak = torch.full((count, channels), mass / ((2 * np.pi) ** 1.5 * sigma**3))
     log_scales = torch.full((count, 3), float(np.log(sigma)))
-    return GaussianCloud((centres, log_scales, _identity(count), raw_of(peak)), views.pixel_size, *material)
+    return GaussianCloud((centres, log_scales, _identity(count), raw_of(peak)), views.pixel_size, *material, second)
 
 
 def freed(cloud: GaussianCloud) -> GaussianCloud:

@@ -52,7 +52,7 @@ def fingerprint(case: Case) -> str:
     digest = hashlib.sha256()
     for array in _arrays(case):
         digest.update(np.ascontiguousarray(array).tobytes())
-    numbers = (views.shape, views.pixel_size, exposures.energy_kev, case.photons, asdict(case.prior), case.seed)
+    numbers = (views.shape, views.pixel_size, exposures.energy_kev, case.photons, case.prior.as_dict(), case.seed)
     digest.update(repr((numbers, [tuple(material) for material in case.scene.materials])).encode())
     return digest.hexdigest()[:16]
 
@@ -82,5 +82,5 @@ def described(case: Case) -> dict[str, Any]:
         "held_out_frames": int(np.count_nonzero(case.is_test)),
         "shares_axis": views.shares_axis,
         "photons": case.photons,
-        "prior": asdict(case.prior),
+        "prior": case.prior.as_dict(),
     }

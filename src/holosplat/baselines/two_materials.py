@@ -1,0 +1,146 @@
+"""Two materials in one scan: whether there are two, where each of them is, and what it absorbs.
+
+Phase retrieval of single views needs one ratio δ/β for all matter. Where there are two, it leaves halos and levels
+that are wrong by tens of per cent. But its volume tells the two apart by their δ, and frames blurred beyond their
+fringes then tell their β, for two numbers are all that is asked of all frames. With both, the frames are turned into
+those that the same matter would give at one ratio (`at_one_ratio`), which single-view retrieval inverts without that
+error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.ndimage import binary_opening, gaussian_filter, gaussian_gradient_magnitude
+from scipy.optimize import nnls
+from torch import Tensor
+from torch.nn.functional import avg_pool3d
+
+from ..forward import Instrument, resolving_oversample
+from ..geometry import Grid
+from ..materials import DeltaBeta
+from ..representations.voxel_lines import VoxelLines
+from ..scan import Scan
+from ..units import wavelength
+from ..volume import LineIntegrals
+from .material import plateau
+
+FAINT = 0.3
+"""Below this share of the level that most matter has, there are halos rather than matter."""
+LEAST_CONTRAST = 1.6
+"""Levels nearer to each other than this factor pass for one."""
+LARGEST_SPREAD = 0.4
+"""Mean distance of values from the nearer of two levels, over that from their median: at most 0.32 for two materials in
+the tuning scenes, 0.5 to 0.65 for one."""
+LEAST_SHARE = 0.1
+"""Share of all matter that the lighter material must have where it is more than a layer of partly filled voxels."""
+LARGEST_DEVIATION = 0.3
+"""Mean deviation of δ from its level where the lighter material is: below 0.2 for one, more on blurred rims."""
+SLIVER = 0.05
+"""Occupancies below this are noise."""
+BLUR = 1.5
+"""Standard deviation of the blur of frames in which absorption is looked for, in widths √(λz) of the first fringe."""
+STEP, ITERATIONS = 1e-10, 5
+"""Of the linearisation in β."""
+
+
+@dataclass(frozen=True)
+class Shares:
+    """Occupancies of two materials on a grid: values [2, Z, Y, X] float32, materials: (δ, β) of each, denser first."""
+
+    values: Tensor
+    grid: Grid
+    materials: tuple[DeltaBeta, DeltaBeta]
+
+
+def two_levels(delta: Tensor, pixel: int) -> tuple[float, float] | None:
+    """The two values (higher, lower) that δ takes in a volume [Z, Y, X], or None if it takes but one.
+
+    Voxels where δ changes little are split in two so that each is as near as possible to its group's median
+    (k-medians). There are two materials if that leaves little of the spread, if the levels are far apart, and if the
+    lighter one fills more than the rims of the denser, at its own level. pixel: voxels along a pixel's edge.
+    """
+    coarse = avg_pool3d(delta[None, None], pixel)[0, 0]
+    values = coarse.numpy()
+    matter = values > FAINT * plateau(coarse)
+    slope = gaussian_gradient_magnitude(values, 1.0)
+    flat = values[matter & (slope <= np.median(slope[matter]))]
+    high, low = _two_medians(flat)
+    nearer = np.minimum(np.abs(flat - high), np.abs(flat - low)).mean()
+    spread = np.abs(flat - np.median(flat)).mean()
+    if high < LEAST_CONTRAST * low or nearer > LARGEST_SPREAD * spread:
+        return None
+    denser, lighter = told_apart(coarse, (high, low), 1)
+    share = float(lighter.sum() / (denser.sum() + lighter.sum()))
+    deviation = np.abs(values[lighter.numpy() > 0] / low - 1).mean() if share else np.inf
+    return (high, low) if share > LEAST_SHARE and deviation < LARGEST_DEVIATION else None
+
+
+def _two_medians(values: np.ndarray) -> tuple[float, float]:
+    low, high = np.quantile(values, [0.25, 0.75])
+    for _ in range(50):
+        upper = values > 0.5 * (low + high)
+        if upper.all() or not upper.any():
+            break
+        before, (low, high) = (low, high), (np.median(values[~upper]), np.median(values[upper]))
+        if before == (low, high):
+            break
+    return float(high), float(low)
+
+
+def told_apart(delta: Tensor, levels: Sequence[float], pixel: int) -> Tensor:
+    """Occupancies [2, Z, Y, X] of the materials of δ `levels` (higher, lower) in a volume [Z, Y, X] of δ.
+
+    Voxels nearer to the lower level are full of the lighter material, unless they are part of a layer thinner than
+    about two pixels: between the denser one and nothing every value occurs. All others hold the denser one in part.
+    """
+    values = delta.numpy()
+    high, low = levels
+    between = (values > 0.5 * low) & (values <= 0.5 * (low + high))
+    lighter = binary_opening(between, iterations=pixel)
+    denser = np.where(lighter, 0, np.clip(values / high, 0, 1))
+    denser[denser < SLIVER] = 0
+    return torch.from_numpy(np.stack([denser, lighter]).astype(np.float32))
+
+
+def absorption(scan: Scan, values: Tensor, grid: Grid, deltas: Sequence[float]) -> list[float]:
+    """β, none below zero, of the materials of δ `deltas` with the occupancies `values` [C, Z, Y, X] on `grid`.
+
+    Those whose frames, blurred until no fringe is left, come nearest to the blurred frames of `scan` (least squares,
+    linearised a few times): refraction moves light about, only absorption takes it away.
+    """
+    instrument, lines = _lines(scan, values, grid)
+    fringe = np.sqrt(wavelength(scan.exposures.energy_kev) * scan.exposures.distance.max()) / scan.views.pixel_size
+
+    def blurred(frames: Tensor) -> np.ndarray:
+        return gaussian_filter(frames.numpy().astype(np.float64), (0, BLUR * fringe, BLUR * fringe)).ravel()
+
+    measured = blurred(torch.from_numpy(scan.frames))
+    betas = np.zeros(len(deltas))
+    for _ in range(ITERATIONS):
+        now = blurred(_frames(instrument, lines, zip(deltas, betas)))
+        varied = (betas + STEP * unit for unit in np.eye(len(betas)))
+        slopes = np.stack([blurred(_frames(instrument, lines, zip(deltas, b))) - now for b in varied], axis=1)
+        betas = STEP * nnls(slopes, measured - now + slopes @ (betas / STEP))[0]
+    return [float(beta) for beta in betas]
+
+
+def at_one_ratio(scan: Scan, shares: Shares, ratio: float) -> Scan:
+    """The scan as if both materials had the ratio δ/β `ratio`, by what the wave optics says of `shares`."""
+    instrument, lines = _lines(scan, shares.values, shares.grid)
+    same = [(delta, delta / ratio) for delta, _ in shares.materials]
+    change = _frames(instrument, lines, same) / _frames(instrument, lines, shares.materials).clamp_min(1e-3)
+    return replace(scan, frames=scan.frames * change.numpy())
+
+
+def _lines(scan: Scan, values: Tensor, grid: Grid) -> tuple[Instrument, Tensor]:
+    """The instrument of a scan, and the line integrals [V, C, H, W] in metres that it wants of `values`."""
+    instrument = Instrument(scan.exposures, resolving_oversample(scan.exposures, 1.5, at_least=1))
+    return instrument, VoxelLines(grid, instrument.views)(values)
+
+
+def _frames(instrument: Instrument, lines: Tensor, materials: Sequence[tuple[float, float]] | zip) -> Tensor:
+    return instrument.frames(LineIntegrals(lines, tuple((float(delta), float(beta)) for delta, beta in materials)))
