@@ -24,6 +24,7 @@ from machine import commit
 import holosplat as hs
 from holosplat.experiments.bench.case import Case, load_case
 from holosplat.experiments.evaluate import score_object
+from holosplat.experiments.reconstruct import fit_options
 from holosplat.experiments.start import starting_cloud
 from holosplat.fit.loop import Fit
 
@@ -53,6 +54,7 @@ VARIANTS: dict[str, Callable[[Settings], Settings]] = {
     "no bound at one in the fit": objective(overfull=0.0),
     "no rounds of agreement": lambda s: replace(s, volume=replace(s.volume, corrections=0)),
     "no rules for noise": without_noise_rules,
+    "one ratio for all matter": lambda s: replace(s, most_materials=1),
     "rounds of agreement in noise, too": lambda s: replace(s, volume=replace(s.volume, noisy=1.0)),
     "100 steps": schedule(steps=100),
     "600 steps": schedule(steps=600),
@@ -74,7 +76,8 @@ class Runs:
             train, prior = self._scan.train(), self._case.prior
             self._starts[key] = starting_cloud(train, prior, settings, 0, lambda stage, fraction: None)
         began = time.perf_counter()
-        fit = Fit(self._scan, self._starts[key].detached(), settings.fit, 0)
+        cloud = self._starts[key].detached()
+        fit = Fit(self._scan, cloud, fit_options(self._case.prior, settings, cloud), 0)
         fit.run(lambda record: None)
         seconds = time.perf_counter() - began
         found = score_object(fit.result(), self._scan, self._truth, fit.instrument.oversample).headline()

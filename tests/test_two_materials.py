@@ -276,6 +276,13 @@ def test_delta_and_beta_apart_are_still_to_be_had(scan):
     assert not cloud.occupancies
 
 
+def test_a_second_material_is_not_looked_for_where_there_shall_be_one(scan):
+    cloud = starting_cloud(scan.train(), MaterialPrior(), replace(QUICK, most_materials=1), 0, lambda *now: None)
+    assert cloud.single_material
+    with pytest.raises(InputError, match="most_materials must be 1 or 2"):
+        replace(QUICK, most_materials=3)
+
+
 def test_a_random_start_of_two_known_materials_has_both(scan):
     cloud = starting_cloud(scan.train(), PRIOR, preset("random"), 0, lambda *now: None)
     assert cloud.materials == BOTH

@@ -82,7 +82,8 @@ class Settings:
     the share of the frames' contrast that is noise, at most to twice; max_start: coarser rather than more than
     this many; approximate_steps: steps in which they learn the starting volume; random_count: Gaussians of a
     random start; separate: after a phase start with nothing known of the matter, δ and β are fitted apart, not at the
-    one ratio that the frames suggest; volume, fit: options of the starting volume and of the fit.
+    one ratio that the frames suggest; most_materials: how many (1 or 2) may be found there; volume, fit: options of
+    the starting volume and of the fit.
     """
 
     start: Literal["phase", "random"] = "phase"
@@ -92,6 +93,7 @@ class Settings:
     approximate_steps: int = 50
     random_count: int = 8_000
     separate: bool = False
+    most_materials: int = 2
     volume: HolographicTV = field(default_factory=HolographicTV)
     fit: FitOptions = field(default_factory=FitOptions)
 
@@ -99,6 +101,10 @@ class Settings:
         require(self.spacing_px > 0, f"spacing_px must be positive, but it is {self.spacing_px}.")
         at_least(self, 0, "approximate_steps", "spacing_noise")
         at_least(self, 1, "max_start", "random_count")
+        require(
+            self.most_materials in (1, 2),
+            f"most_materials must be 1 or 2, but it is {self.most_materials}; no more than two can be told apart.",
+        )
 
 
 def presets() -> dict[str, Settings]:

@@ -57,7 +57,9 @@ def _from_phase_retrieval(
         return holographic_tv(frames, material, options, on_progress)
 
     volume, grid = retrieve(scan)
-    shares = None if settings.separate else _shares(scan, prior, material, volume, grid, retrieve)
+    may_be_found = settings.most_materials == 2 and not settings.separate
+    may_be_two = len(prior.materials) == 2 or may_be_found
+    shares = _shares(scan, prior, material, volume, grid, retrieve) if may_be_two else None
     pitch = scan.views.pixel_size
     spacing = _spacing_px(scan, settings) * pitch
     if shares is None:
