@@ -44,18 +44,24 @@ class _Specimen:
     facts: dict[str, str]
 
 
+@dataclass(frozen=True)
+class ExperimentOptions:
+    """What an experiment does to frames beside recording them."""
+
+    noise: NoiseOptions = NoiseOptions()
+    motion: MotionOptions = MotionOptions()
+    misalignment: MisalignmentOptions = MisalignmentOptions()
+    source: SourceOptions = SourceOptions()
+
+
 def simulate(
     meshes: Positional[tuple[Path, ...]],
     beamline: BeamlineOptions,
     out: Path,
     files: MeshOptions = MeshOptions(),
     filling: MaterialOptions = MaterialOptions(),
-    noise: NoiseOptions = NoiseOptions(),
-    motion: MotionOptions = MotionOptions(),
-    *,
-    misalignment: MisalignmentOptions = MisalignmentOptions(),
+    experiment: ExperimentOptions = ExperimentOptions(),
     truth: TruthOptions = TruthOptions(),
-    source: SourceOptions = SourceOptions(),
 ) -> None:
     """Simulate the holograms of closed triangle meshes; with --frame-rate, of moving ones, many times over.
 
@@ -66,12 +72,13 @@ def simulate(
     """
     require(len(meshes) > 0, "simulate needs at least one mesh file.")
     truth.require_usable(out)
+    motion, source = experiment.motion, experiment.source
     of_source, beamline = source.facts(beamline), source.applied(beamline)
     views, filled = beamline.exposures(), filling.filling()
-    true_views = misalignment.errors().true_exposures(views)
+    true_views = experiment.misalignment.errors().true_exposures(views)
     with ProgressBar() as bar:
         specimen = _specimen(meshes, beamline, files, filled, motion.timing(), bar)
-    times, how = specimen.times, noise.simulation(motion.shutter())
+    times, how = specimen.times, experiment.noise.simulation(motion.shutter())
     _warn_of_missing_field(specimen.matter, true_views.views, beamline.pixel_size)
     split = beamline.split(len(views) if motion.hold_out == "views" else len(times))
     is_test = held_out(split, len(views), len(times), motion.hold_out)
@@ -79,7 +86,7 @@ def simulate(
     facts = {**how.provenance(true), **specimen.facts, **of_source, "medium": filling.medium or "vacuum"}
     targets = [(out, nominal, facts)]
     if truth.true_exposures:
-        targets.append((truth.true_exposures, true, facts | misalignment.facts()))
+        targets.append((truth.true_exposures, true, facts | experiment.misalignment.facts()))
     with ProgressBar() as bar:
         _write_frames(targets, is_test, source.frames(specimen.matter, filled, true, how), bar)
     text = "{} frames of {} × {} pixels, {} of them held out".format(len(true), *beamline.detector, is_test.sum())
