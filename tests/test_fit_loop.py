@@ -17,12 +17,14 @@ from holosplat.checks import InputError
 from holosplat.fit import objective as terms
 from holosplat.fit.density import DensityControl, GradientRecord, control_density, doomed, outside
 from holosplat.fit.loop import Fit, FitOptions, split_validation
+from holosplat.fit.misfit import photon_noise
 from holosplat.fit.objective import Objective
 from holosplat.fit.schedule import Schedule
 from holosplat.fit.total_variation import total_variation
 from holosplat.fit.trainable import Trainable
 from holosplat.forward import Instrument, simulate
 from holosplat.geometry import Grid, Views, rotation_y
+from holosplat.optics.detector import poisson
 from holosplat.optics.noise import noise_share
 from holosplat.representations import GaussianCloud, random_cloud
 from holosplat.representations.gaussians import PARAMETERS, raw_of
@@ -141,6 +143,29 @@ def test_recorded_image_terms_are_those_of_the_frames_on_the_training_range(scan
     assert record["ssim"] == pytest.approx(float(terms.one_minus_ssim(a, b).mean()), rel=1e-4)
     assert record["tv_image"] == pytest.approx(float(terms.tv_image(a).mean()), rel=1e-4)
     assert record["l2_amplitude"] == pytest.approx(float(terms.l2_amplitude(predicted, measured).mean()), rel=1e-4)
+
+
+def test_differences_within_the_noise_count_by_their_square(scan):
+    """Frames without noise: the plain absolute difference. With it: Huber's, as wide as each pixel's own noise."""
+    noisy = replace(scan, frames=poisson(scan.frames, 500.0, 3))
+    for frames, wide in ((scan, False), (noisy, True)):
+        found = [run(fit_of(frames, objective=Objective(noise_width=k), steps=1))[0]["l1"] for k in (0.0, 1.2)]
+        assert (found[1] < 0.98 * found[0]) == wide
+    measured = torch.from_numpy(noisy.train().frames)
+    width = 1.2 * photon_noise(measured)
+    with torch.no_grad():
+        fit = fit_of(noisy, objective=Objective(noise_width=1.2), steps=1)
+        predicted = Instrument(noisy.train().exposures, fit.instrument.oversample).measure(fit.cloud)
+    wanted = terms.huber(predicted, measured, width).mean() / (measured.max() - measured.min())
+    assert found[1] == pytest.approx(float(wanted), rel=1e-5)
+
+
+def test_the_noise_of_a_pixel_is_that_of_its_photons():
+    """Its root, where frames show it: a ramp of intensity, on 61 × 75 pixels."""
+    clean = np.broadcast_to(np.linspace(0.5, 1.5, 75, dtype="f4"), (4, 61, 75)).copy()
+    found = photon_noise(torch.from_numpy(poisson(clean, 1000.0, 0))).numpy()
+    np.testing.assert_allclose(found.mean(axis=(0, 1)), np.sqrt(clean[0, 0] / 1000), rtol=0.25)
+    assert found.mean() == pytest.approx(np.sqrt(1 / 1000), rel=0.2)
 
 
 def test_constant_frames_are_refused(scan):

@@ -29,6 +29,7 @@ def images(shape: tuple[int, int], views: int = 3, seed: int = 0) -> tuple[torch
 IMAGE_TERMS = {
     "l1": terms.l1,
     "l2_amplitude": terms.l2_amplitude,
+    "huber": lambda a, b: terms.huber(a, b, 0.05 + 0.1 * b.abs()),
     "ssim": terms.one_minus_ssim,
     "frc": terms.one_minus_frcm,
 }
@@ -50,6 +51,19 @@ def test_the_default_objective_is_l1_and_the_thesis_objective_is_as_published():
 def test_l1_is_the_mean_absolute_difference_of_each_view(shape):
     a, b = images(shape)
     np.testing.assert_allclose(terms.l1(a, b), [np.abs(x - y).mean() for x, y in zip(a.numpy(), b.numpy())])
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_huber_is_the_absolute_difference_but_for_small_ones(shape):
+    """Half its width less than the absolute difference beyond the width, `z²/2w` within: one and the other at z = w."""
+    a, b = images(shape)
+    width = 0.02 + 0.2 * torch.rand(a.shape, generator=torch.Generator().manual_seed(1), dtype=a.dtype)
+    z, w = np.abs(a.numpy() - b.numpy()), width.numpy()
+    wanted = np.where(z < w, z**2 / (2 * w), z - w / 2).mean(axis=(1, 2))
+    np.testing.assert_allclose(terms.huber(a, b, width), wanted)
+    np.testing.assert_allclose(terms.huber(a, b, 1e-9 * width), terms.l1(a, b), rtol=1e-6)
+    wide = 100 * torch.ones_like(a)
+    np.testing.assert_allclose(terms.huber(a, b, wide), (a - b).square().mean(dim=(1, 2)) / 200)
 
 
 @pytest.mark.parametrize("shape", SHAPES)

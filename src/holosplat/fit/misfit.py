@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..forward import Instrument
 from ..geometry import Grid, Poses
-from ..optics.noise import noise_share
+from ..optics.noise import noise_levels, noise_share
 from ..representations.gaussians import GaussianCloud
 from ..scan import Scan
 from . import objective as terms
@@ -21,6 +21,8 @@ from .total_variation import total_variation
 
 IMAGE_TERMS = ("l1", "l2_amplitude", "ssim", "tv_image", "frc")
 OBJECT_TERMS = ("anisotropy", "tv_volume", "overfull", "two_levels")
+DARK = 0.05
+"""Relative intensity below which noise falls no further."""
 DEPTH, VIEWS = 100.0, 8.0
 """Voxels along the beam, and views, for which the weights of the terms on the volume are meant. Few views leave more
 to what is known of the volume; the weights go with one over the root of their number."""
@@ -62,15 +64,15 @@ class Misfit:
         self.low, high = float(train.frames.min()), float(train.frames.max())
         self.span = high - self.low
         self._poses = Poses.of(instrument.views, instrument.device)
-        frames = torch.from_numpy(train.frames).to(instrument.device)
+        measured = torch.from_numpy(train.frames)
+        frames = measured.to(instrument.device)
         self._target = Target(frames, self.low, self.span, instrument.backend)
         if objective.ssim > 0:
             _ = self._target.statistics  # once, for all subsets of views
         self._block = (block.shape, block.voxel_size[0])
         self._volume_scale = depth / DEPTH * math.sqrt(VIEWS / len(train))
-        self._two_levels = objective.two_levels * (
-            1 + objective.noise_gain * noise_share(torch.from_numpy(train.frames))
-        )
+        self._two_levels = objective.two_levels * (1 + objective.noise_gain * noise_share(measured))
+        self._width = (objective.noise_width * photon_noise(measured)).clamp_min(1e-6 * self.span).to(frames.device)
 
     def names(self, cloud: GaussianCloud, draw: Draw) -> list[str]:
         """What the values of a call with these arguments are called."""
@@ -100,6 +102,9 @@ class Misfit:
             difference, dissimilarity = l1_and_ssim(predicted, target)
         else:  # statistics of frames are not needed
             difference, dissimilarity = terms.l1(predicted, target.frames) / self.span, predicted
+        if w.noise_width > 0:
+            width = self._width if draw.index is None else self._width.index_select(0, draw.index)
+            difference = terms.huber(predicted, target.frames, width) / self.span
         a, b = ((f - self.low) / self.span if w.tv_image + w.frc > 0 else f for f in (predicted, target.frames))
         table: list[tuple[str, float, Callable[[], Tensor]]] = [
             ("l1", w.l1, lambda: difference),
@@ -135,3 +140,11 @@ class Misfit:
         }
         ramps = {"two_levels": draw.progress}
         return [(weight * ramps.get(name, 1.0), values[name]()) for name, weight in weights.items()]
+
+
+def photon_noise(frames: Tensor) -> Tensor:
+    """Standard deviation of each pixel of relative frames [V, H, W] that photons make noisy.
+
+    The frames' own noise is that of their quiet parts, where the intensity is about 1, and goes with its root.
+    """
+    return noise_levels(frames).to(frames)[:, None, None] * frames.clamp_min(DARK).sqrt()

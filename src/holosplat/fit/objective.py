@@ -18,11 +18,12 @@ class Objective:
     """Weights of the terms; a weight of zero leaves the term out.
 
     Image terms compare predicted with measured frames, after the affine map that takes the training frames'
-    minimum and maximum to 0 and 1: `l1`, `l2_amplitude`, `ssim` (1 - SSIM), `tv_image`, `frc` (1 - FRCM, its
-    weight ramped linearly from 0 over the first `frc_ramp` of the steps). Object terms act on the Gaussians:
-    `anisotropy` on scales beyond `anisotropy_limit`, and, on the volume they add up to, `tv_volume`, and
+    minimum and maximum to 0 and 1: `l1` (where differences below `noise_width` standard deviations of the frames' own
+    noise count by their square, as the likelihood of noise has it), `l2_amplitude`, `ssim` (1 - SSIM), `tv_image`,
+    `frc` (1 - FRCM, its weight ramped linearly from 0 over the first `frc_ramp` of the steps). Object terms act on the
+    Gaussians: `anisotropy` on scales beyond `anisotropy_limit`, and, on the volume they add up to, `tv_volume`, and
     `overfull`, the square of what exceeds an occupancy of one, and `two_levels`, which occupancies between nothing and
-    one cost (both for a single material only). The latter's weight is ramped linearly from 0 over the whole fit, for
+    one cost (both not where δ and β are apart). The latter's weight is ramped linearly from 0 over the whole fit, for
     at its beginning matter may still be too faint; it is larger by `noise_gain` times the share of the frames' contrast
     that is noise. Terms on the volume are sums along the beam in units of 100 voxels, mean over pixels, so that they
     weigh the same however fine the pixels or wide the field; and they weigh more with fewer views (the weights are
@@ -41,6 +42,7 @@ class Objective:
     overfull: float = 0.0
     two_levels: float = 0.0
     noise_gain: float = 0.0
+    noise_width: float = 0.0
 
     def __post_init__(self) -> None:
         compared = self.l1 + self.l2_amplitude + self.ssim + self.tv_image + self.frc
@@ -59,6 +61,17 @@ THESIS = Objective(l1=0.75, ssim=0.20, tv_image=0.05, frc=0.05, frc_ramp=0.5)
 def l1(predicted: Tensor, measured: Tensor) -> Tensor:
     """Mean absolute difference of each view: [V, H, W] → [V]."""
     return (predicted - measured).abs().mean(dim=(1, 2))
+
+
+def huber(predicted: Tensor, measured: Tensor, width: Tensor) -> Tensor:
+    """Mean of Huber's function of the difference in each view: [V, H, W] → [V], width [V, H, W] > 0.
+
+    `|z| - w/2`, and `z²/2w` where `|z| < w` (Huber 1964, eq. 1.3, over w): the absolute difference, but for what may be
+    noise.
+    """
+    size = (predicted - measured).abs()
+    short = torch.minimum(size, width)
+    return (short * (size - 0.5 * short) / width).mean(dim=(1, 2))
 
 
 def l2_amplitude(predicted: Tensor, measured: Tensor) -> Tensor:
