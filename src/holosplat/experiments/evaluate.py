@@ -97,8 +97,8 @@ class Evaluation(Scores):
         found = self.material
         kind = "one for all" if found.single_material else "found apart"
         if found.second is not None:
-            kind = f"of two; the other: δ {found.second.delta:.3e}, δ/β {found.second.ratio:.0f}"
-        return [*super().lines(), f"material: δ {found.delta:.3e}, δ/β {found.ratio:.0f} ({kind})"]
+            kind = f"of two; the other: {_as_text(*found.second)}"
+        return [*super().lines(), f"material: {_as_text(found.delta, found.delta / found.ratio)} ({kind})"]
 
 
 def render(reconstruction: Reconstruction, exposures: Exposures) -> np.ndarray:
@@ -161,6 +161,10 @@ def material_found(cloud: GaussianCloud) -> MaterialFound:
     matter = delta > 0.5 * level
     ratio = _weighted_median(delta[matter] / np.maximum(beta[matter], 1e-30), delta[matter])
     return MaterialFound(level, ratio, False)
+
+
+def _as_text(delta: float, beta: float) -> str:
+    return f"δ {delta:.3e}, " + (f"δ/β {delta / beta:.0f}" if beta else "no β seen")
 
 
 def _as_dict(delta: float, ratio: float) -> dict[str, float | None]:
