@@ -41,11 +41,11 @@ CASES, SEEDS = ["cells8", "noise12-2000", "thesis16"], [11]
 
 VOXELS: dict[str, Sequence[Any]] = {
     "weight": (0.02, 0.1, 0.2),
-    "noise_weight": (0.5, 1.0, 6.0),
-    "steps": (10, 20, 30, 120),
+    "noise_weight": (0.3, 3.0),
+    "steps": (30, 120),
     "coarse_steps": (50, 150),
     "floor": (0.05, 0.3),
-    "smoothing": (0.01, 0.05),
+    "smoothing": (0.0025, 0.02),
 }
 NEURAL: dict[str, Sequence[Any]] = {
     "rate": (0.01, 0.04),

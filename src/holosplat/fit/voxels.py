@@ -44,8 +44,8 @@ class VoxelFit:
     coarse_steps: int = 0
     steps: int = 60
     weight: float = 0.05
-    noise_weight: float = 3.0
-    smoothing: float = 0.02
+    noise_weight: float = 1.0
+    smoothing: float = 0.005
     floor: float = 0.1
     upper: float = 1.0
     refine: int = 0
