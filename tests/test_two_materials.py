@@ -9,6 +9,7 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
+from holosplat import native
 from holosplat.baselines import HolographicTV
 from holosplat.baselines.two_materials import Shares, absorption, at_one_ratio, told_apart, two_levels
 from holosplat.checks import InputError
@@ -313,6 +314,17 @@ def test_a_run_of_two_materials_is_resumed_as_one(scan, tmp_path):
     for a, b in zip(found.parameters, expected.parameters):
         torch.testing.assert_close(a, b, rtol=0, atol=0)
     assert read_json(parts.summary)["second_material"] == {"delta": OIL.delta, "beta": OIL.beta}
+
+
+def test_the_plain_path_needs_no_kernels(scan, monkeypatch):
+    monkeypatch.setattr(native, "call", lambda *_: pytest.fail("a kernel was called"))
+    volume = replace(QUICK.volume, backend="reference", iterations=8)
+    plain = replace(QUICK, volume=volume, fit=replace(QUICK.fit, backend="reference"))
+    cloud = starting_cloud(scan.train()[[0, 3, 6]], PRIOR, plain, 0, lambda *now: None)
+    assert cloud.materials == BOTH
+    values = torch.rand(2, 9, 11, 13, generator=torch.Generator().manual_seed(2))
+    grid = Grid((9, 11, 13), (PIXEL,) * 3, (-6 * PIXEL, -5 * PIXEL, -4 * PIXEL))
+    assert len(absorption(scan.train(), values, grid, [1e-6, 4e-7], "reference")) == 2
 
 
 def test_surfaces_of_two_materials_are_refused(scan, tmp_path):

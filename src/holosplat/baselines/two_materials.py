@@ -22,11 +22,12 @@ from torch.nn.functional import avg_pool3d
 from ..forward import Instrument, resolving_oversample
 from ..geometry import Grid
 from ..materials import DeltaBeta
+from ..projectors.voxels import voxel_line_integrals
 from ..representations.voxel_lines import VoxelLines
 from ..scan import Scan
 from ..units import wavelength
 from ..volume import LineIntegrals
-from .material import plateau
+from .material import Backend, plateau
 
 FAINT = 0.3
 """Below this share of the level that most matter has, there are halos rather than matter."""
@@ -106,13 +107,15 @@ def told_apart(delta: Tensor, levels: Sequence[float], pixel: int) -> Tensor:
     return torch.from_numpy(np.stack([denser, lighter]).astype(np.float32))
 
 
-def absorption(scan: Scan, values: Tensor, grid: Grid, deltas: Sequence[float]) -> list[float]:
+def absorption(
+    scan: Scan, values: Tensor, grid: Grid, deltas: Sequence[float], backend: Backend = "cpu"
+) -> list[float]:
     """β, none below zero, of the materials of δ `deltas` with the occupancies `values` [C, Z, Y, X] on `grid`.
 
     Those whose frames, blurred until no fringe is left, come nearest to the blurred frames of `scan` (least squares,
     linearised a few times): refraction moves light about, only absorption takes it away.
     """
-    instrument, lines = _lines(scan, values, grid)
+    instrument, lines = _lines(scan, values, grid, backend)
     fringe = np.sqrt(wavelength(scan.exposures.energy_kev) * scan.exposures.distance.max()) / scan.views.pixel_size
 
     def blurred(frames: Tensor) -> np.ndarray:
@@ -128,17 +131,19 @@ def absorption(scan: Scan, values: Tensor, grid: Grid, deltas: Sequence[float]) 
     return [float(beta) for beta in betas]
 
 
-def at_one_ratio(scan: Scan, shares: Shares, ratio: float) -> Scan:
+def at_one_ratio(scan: Scan, shares: Shares, ratio: float, backend: Backend = "cpu") -> Scan:
     """The scan as if both materials had the ratio δ/β `ratio`, by what the wave optics says of `shares`."""
-    instrument, lines = _lines(scan, shares.values, shares.grid)
+    instrument, lines = _lines(scan, shares.values, shares.grid, backend)
     same = [(delta, delta / ratio) for delta, _ in shares.materials]
     change = _frames(instrument, lines, same) / _frames(instrument, lines, shares.materials).clamp_min(1e-3)
     return replace(scan, frames=scan.frames * change.numpy())
 
 
-def _lines(scan: Scan, values: Tensor, grid: Grid) -> tuple[Instrument, Tensor]:
+def _lines(scan: Scan, values: Tensor, grid: Grid, backend: Backend) -> tuple[Instrument, Tensor]:
     """The instrument of a scan, and the line integrals [V, C, H, W] in metres that it wants of `values`."""
-    instrument = Instrument(scan.exposures, resolving_oversample(scan.exposures, 1.5, at_least=1))
+    instrument = Instrument(scan.exposures, resolving_oversample(scan.exposures, 1.5, at_least=1), backend=backend)
+    if backend == "reference":
+        return instrument, voxel_line_integrals(values, grid, instrument.views, step=1.0).transpose(0, 1)
     return instrument, VoxelLines(grid, instrument.views)(values)
 
 

@@ -59,7 +59,7 @@ def _from_phase_retrieval(
     volume, grid = retrieve(scan)
     may_be_found = settings.most_materials == 2 and not settings.separate
     may_be_two = len(prior.materials) == 2 or may_be_found
-    shares = _shares(scan, prior, material, volume, grid, retrieve) if may_be_two else None
+    shares = _shares(scan, prior, material, (volume, grid), retrieve, backend) if may_be_two else None
     pitch = scan.views.pixel_size
     spacing = _spacing_px(scan, settings) * pitch
     if shares is None:
@@ -74,9 +74,15 @@ def _from_phase_retrieval(
 
 
 def _shares(
-    scan: Scan, prior: MaterialPrior, material: DeltaBeta, volume: Tensor, grid: Grid, retrieve: Retrieve
+    scan: Scan,
+    prior: MaterialPrior,
+    material: DeltaBeta,
+    found: tuple[Tensor, Grid],
+    retrieve: Retrieve,
+    backend: Backend,
 ) -> Shares | None:
-    """Where two materials are, if two are known, or nothing is and `volume`, of `material` alone, shows two."""
+    """Where two materials are, if two are known, or nothing is and the volume `found` of `material` shows two."""
+    volume, grid = found
     pixel = round(scan.views.pixel_size / grid.voxel_size[0]) or 1
     known = prior.materials if len(prior.materials) == 2 else ()
     levels = (known[0].delta, known[1].delta) if known else None
@@ -88,10 +94,10 @@ def _shares(
         delta = volume * material.delta
         levels = levels if known else two_levels(delta, pixel) or levels
         values = told_apart(delta, levels, pixel)
-        betas = [m.beta for m in known] or absorption(scan, values, grid, levels)
+        betas = [m.beta for m in known] or absorption(scan, values, grid, levels, backend)
         first, second = (DeltaBeta(*pair) for pair in zip(levels, betas))
         shares = Shares(values, grid, (first, second))
-        volume, grid = retrieve(at_one_ratio(scan, shares, material.ratio))
+        volume, grid = retrieve(at_one_ratio(scan, shares, material.ratio, backend))
     return replace(shares, values=told_apart(volume * material.delta, levels, pixel), grid=grid)
 
 
