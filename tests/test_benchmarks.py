@@ -25,7 +25,7 @@ def scripts(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
         name: importlib.import_module(name)
         for name in (
             *("step", "eager_step", "kernels", "plain_torch", "ablation", "simulate"),
-            *("tweezers", "espresso_flow"),
+            *("tweezers", "espresso_flow", "tune_fields"),
         )
     }
 
@@ -131,3 +131,22 @@ def test_what_the_benchmark_of_simulation_reports(scripts, monkeypatch):
     report = {"rows": rows, "accuracy": [errors], "load": 0.5, "commit": "abc", **script.environment("reference")}
     assert "| frames | 48² of 1 µm | 6 | 4 |" in script.table(report)
     assert "| voxels | 48³ of 1 µm | – | – |" in script.table(report)
+
+
+def test_options_of_fields_are_varied_one_by_one(scripts):
+    tune = scripts["tune_fields"]
+    for options, table in ((tune.VoxelFit(), tune.VOXELS), (tune.NeuralFit(), tune.NEURAL)):
+        found = tune.variants(options, table)
+        assert found[0] == ("as it is", options)
+        assert len({label for label, _ in found}) == len(found) == 1 + sum(map(len, table.values()))
+        for _, other in found[1:]:  # a variant that is the default would be wasted
+            assert sum(a != b for a, b in zip(vars(options).values(), vars(other).values())) == 1
+
+
+def test_the_table_of_fields_compares_with_the_defaults(scripts):
+    numbers = {"dice": 0.9, "ssim": 0.8, "frcm": 0.7}
+    rows = [
+        {"case": case, "seed": 1, "method": "voxels", "variant": label, "relative_error_delta": error, **numbers}
+        for case, label, error in (("a", "as it is", 0.2), ("b", "as it is", 0.1), ("a", "x", 0.1), ("b", "x", 0.2))
+    ]
+    assert scripts["tune_fields"].table(rows, "voxels")[-1] == "| x | 0.150 | ×0.50, ×2.00 | 0.900 | 0.800 / 0.700 |"
