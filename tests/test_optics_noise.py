@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from holosplat.optics.noise import noise_level, noise_levels, noise_share, wavelet_noise
+from holosplat.optics.noise import noise_level, noise_levels, noise_share, sure_noise, wavelet_noise
 
 
 def noise(shape: tuple[int, int, int], sigma: float, seed: int = 0) -> torch.Tensor:
@@ -34,6 +34,18 @@ def test_of_two_estimates_the_lesser_is_taken():
     assert float(noise_levels(crowded)) < 0.1 * float(wavelet_noise(crowded))
     small = 1 + 0.1 * stripes((1, 13, 12), 2.2) * stripes((1, 12, 13), 2.2).mT
     assert float(noise_levels(small)) == float(wavelet_noise(small)) < noise_level(small)
+
+
+@pytest.mark.parametrize("shape", [(2, 96, 96), (2, 81, 117)])
+def test_what_is_surely_noise_is_noise_and_never_fringes(shape):
+    fringes = torch.ones(shape)
+    fringes[:, :, :70] += 0.1 * stripes((2, shape[1], 70), 3.3) * stripes((2, 70, shape[1]), 3.7).mT
+    assert float(sure_noise(fringes).max()) == 0
+    assert float(wavelet_noise(fringes).min()) > 0.01
+    for sigma in (0.01, 0.04):
+        found = sure_noise(1 + noise(shape, sigma)).numpy()
+        assert found == pytest.approx(sigma, rel=0.2)
+        assert (found <= noise_levels(1 + noise(shape, sigma)).numpy()).all()
 
 
 def test_the_share_of_the_contrast_that_is_noise():

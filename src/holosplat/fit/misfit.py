@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..forward import Instrument
 from ..geometry import Grid, Poses
-from ..optics.noise import noise_levels, noise_share
+from ..optics.noise import noise_share, sure_noise
 from ..representations.gaussians import GaussianCloud
 from ..scan import Scan
 from . import objective as terms
@@ -147,4 +147,4 @@ def photon_noise(frames: Tensor) -> Tensor:
 
     The frames' own noise is that of their quiet parts, where the intensity is about 1, and goes with its root.
     """
-    return noise_levels(frames).to(frames)[:, None, None] * frames.clamp_min(DARK).sqrt()
+    return sure_noise(frames).to(frames)[:, None, None] * frames.clamp_min(DARK).sqrt()

@@ -41,8 +41,22 @@ def noise_levels(frames: Tensor) -> Tensor:
     The lesser of two estimates, for each takes some signal for noise: `noise_level`, its bias mended, where fringes
     fill all tiles (small frames), and `wavelet_noise` where they fill most of the frame (crowded ones).
     """
-    tiles = torch.tensor([noise_level(frame[None]) / QUIET_TILE for frame in frames], dtype=torch.float64)
-    return torch.minimum(tiles, wavelet_noise(frames).cpu())
+    return torch.minimum(_of_quiet_tiles(frames), wavelet_noise(frames).cpu())
+
+
+def sure_noise(frames: Tensor) -> Tensor:
+    """What of `noise_levels` is surely noise, [V], float64: nothing where fringes fill the frames.
+
+    White noise looks the same to both estimates, fringes do not. If those of the quiet tiles hold signal of variance a,
+    and all wavelets at least twice as much, then `σ² ≥ 2 t² - w²`.
+    """
+    tiles, wavelets = _of_quiet_tiles(frames), wavelet_noise(frames).cpu()
+    surely = (2 * tiles.square() - wavelets.square()).clamp_min(0).sqrt()
+    return torch.minimum(surely, torch.minimum(tiles, wavelets))
+
+
+def _of_quiet_tiles(frames: Tensor) -> Tensor:
+    return torch.tensor([noise_level(frame[None]) / QUIET_TILE for frame in frames], dtype=torch.float64)
 
 
 def noise_share(frames: Tensor) -> float:
