@@ -205,6 +205,12 @@ def test_gaussians_of_two_start_as_one_or_the_other(shares, grid):
         assert float(difference.norm() / shares.values[c].norm()) < 0.15
 
 
+def test_a_material_that_is_not_there_is_named(shares, grid):
+    alone = torch.stack([shares.values[0], torch.zeros(grid.shape)])
+    with pytest.raises(InputError, match="nothing of the lighter"):
+        cloud_from_two(alone, grid, BOTH, PIXEL, PIXEL)
+
+
 def test_occupancies_of_two_are_bounded_together():
     half = torch.full((2, 3, 4, 5), 0.5)
     assert float(terms.overfull(half)) == 0

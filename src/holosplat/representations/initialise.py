@@ -79,6 +79,11 @@ def cloud_from_two(
     """
     parts = []
     for channel, (occupancy, material) in enumerate(zip(occupancies, materials)):
+        which = ("denser", "lighter")[channel]
+        require(
+            bool((occupancy > FILLED).any()),
+            f"the start found nothing of the {which} of the two materials; check both, or name one only.",
+        )
         one = cloud_from_volume(occupancy, grid, material, spacing, unit_length, max_count // 2)
         raw = raw_of(torch.full((len(one), 2), NEXT_TO_NOTHING))
         raw[:, channel] = one.raw_amplitudes[:, 0]
