@@ -1,9 +1,9 @@
 """The options of voxels and neural fields fitted through the waves, each varied by itself on tuning scenes.
 
     python benchmarks/tune_fields.py --csv docs/data/tune_fields.csv     # an hour on two cores
-    python benchmarks/tune_fields.py --methods voxels --cases cells8 --seeds 11 12
+    python benchmarks/tune_fields.py --methods neural --options noise_weight --cases noise12-500 --seeds 12
 
-Cases are those of the suite with seeds below 100, which its table does not have. Both methods start from the volume of
+Cases are those of the suite, of known material, with seeds below 100, which its table does not have. Both methods start from the volume of
 `holographic_tv`, as in the suite. Prints a Markdown table a method: the relative error of δ, its ratio to that of the
 defaults on each scene, Dice, and SSIM / FRCM of noise-free held-out frames.
 """
@@ -55,6 +55,7 @@ NEURAL: dict[str, Sequence[Any]] = {
     "floor": (0.05, 0.3),
     "network": (Network(hidden=64), Network(Encoding(levels=5)), Network(Encoding(kind="fourier"))),
 }
+TABLES = {"voxels": VOXELS, "neural": NEURAL}
 Fitted = Callable[[Any], Object]
 
 
@@ -91,13 +92,18 @@ def _of_encoding(encoding: Encoding) -> str:
     return "encoding: " + ", ".join(f"{k} = {v}" for k, v in changed.items() if v != getattr(plain, k))
 
 
-def scored(case: Case, methods: Sequence[str]) -> list[dict[str, Any]]:
+def scored(case: Case, methods: Sequence[str], varied: Sequence[str]) -> list[dict[str, Any]]:
     """A row for every variant of every method on one case."""
+    if case.prior.kind != "known":
+        raise SystemExit(f"{case.name} tells nothing of its material; choose cases of a known one.")
     scan, truth = case.scan(), case.truth()
     start = holographic_voxels(scan.train(), case.prior, preset("default").volume, lambda stage, fraction: None)
     oversample, rows = resolving_oversample(scan.exposures, 1.5, at_least=1), []
-    for name, (options, fit) in fits(case, start).items():
-        for label, chosen in variants(options, {"voxels": VOXELS, "neural": NEURAL}[name]) if name in methods else ():
+    runs = fits(case, start)
+    for name in methods:
+        options, fit = runs[name]
+        table = {k: v for k, v in TABLES[name].items() if not varied or k in varied}
+        for label, chosen in variants(options, table):
             began = time.perf_counter()
             found = fit(chosen)
             seconds = time.perf_counter() - began
@@ -128,7 +134,8 @@ def table(rows: Sequence[dict[str, Any]], method: str) -> list[str]:
 def main() -> None:
     """Run what was asked for; print a table a method and write the rows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--methods", nargs="+", choices=("voxels", "neural"), default=["voxels", "neural"])
+    parser.add_argument("--methods", nargs="+", choices=TABLES, default=list(TABLES))
+    parser.add_argument("--options", nargs="+", default=[], choices=sorted({*VOXELS, *NEURAL}), help="default: all")
     parser.add_argument("--cases", nargs="+", default=CASES)
     parser.add_argument("--seeds", nargs="+", type=int, default=SEEDS)
     parser.add_argument("--csv", type=Path)
@@ -136,7 +143,7 @@ def main() -> None:
     rows: list[dict[str, Any]] = []
     for name in chosen.cases:
         for seed in chosen.seeds:
-            rows += scored(load_case(name, seed, None), chosen.methods)
+            rows += scored(load_case(name, seed, None), chosen.methods, chosen.options)
             if chosen.csv:  # after every scene, for there is an hour to lose
                 with chosen.csv.open("w", newline="") as file:
                     writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
