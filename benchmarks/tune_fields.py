@@ -3,9 +3,9 @@
     python benchmarks/tune_fields.py --csv docs/data/tune_fields.csv     # an hour on two cores
     python benchmarks/tune_fields.py --methods neural --options noise_weight --cases noise12-500 --seeds 12
 
-Cases are those of the suite, of known material, with seeds below 100, which its table does not have. Both methods start from the volume of
-`holographic_tv`, as in the suite. Prints a Markdown table a method: the relative error of δ, its ratio to that of the
-defaults on each scene, Dice, and SSIM / FRCM of noise-free held-out frames.
+Cases are those of the suite, of known material, with seeds below 100, which its table does not have. Both methods start
+from the volume of `holographic_tv`, as in the suite. Prints a Markdown table a method: the relative error of δ, its
+ratio to that of the defaults on each scene, Dice, and SSIM / FRCM of noise-free held-out frames.
 """
 
 from __future__ import annotations

@@ -9,7 +9,7 @@ error.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,8 +34,7 @@ FAINT = 0.3
 LEAST_CONTRAST = 1.6
 """Levels nearer to each other than this factor pass for one."""
 LARGEST_SPREAD = 0.4
-"""Mean distance of values from the nearer of two levels, over that from their median: at most 0.32 for two materials in
-the tuning scenes, 0.5 to 0.65 for one."""
+"""Share of the spread that two levels leave where there are two (both kinds of scenes: `benchmarks/two_levels.py`)."""
 LEAST_SHARE = 0.1
 """Share of all matter that the lighter material must have where it is more than a layer of partly filled voxels."""
 LARGEST_DEVIATION = 0.3
@@ -57,12 +56,40 @@ class Shares:
     materials: tuple[DeltaBeta, DeltaBeta]
 
 
-def two_levels(delta: Tensor, pixel: int) -> tuple[float, float] | None:
-    """The two values (higher, lower) that δ takes in a volume [Z, Y, X], or None if it takes but one.
+@dataclass(frozen=True)
+class Levels:
+    """The two values of δ that split a volume best, and how well they do.
 
-    Voxels where δ changes little are split in two so that each is as near as possible to its group's median
-    (k-medians). There are two materials if that leaves little of the spread, if the levels are far apart, and if the
-    lighter one fills more than the rims of the denser, at its own level. pixel: voxels along a pixel's edge.
+    spread: mean distance from the nearer of the two, over that from the median; share: of all matter that the lighter
+    one has where it is more than a rim of the denser; deviation: mean of |δ/low - 1| there.
+    """
+
+    high: float
+    low: float
+    spread: float
+    share: float
+    deviation: float
+
+    @property
+    def are_two(self) -> bool:
+        """Whether these are two materials: far apart, near to all values, the lower one more than rims and level."""
+        apart = self.high >= LEAST_CONTRAST * self.low and self.spread <= LARGEST_SPREAD
+        return apart and self.share > LEAST_SHARE and self.deviation < LARGEST_DEVIATION
+
+
+def two_levels(delta: Tensor, pixel: int) -> tuple[float, float] | None:
+    """The two values (higher, lower) that δ takes in a volume [Z, Y, X], or None if it takes but one (`Levels`).
+
+    pixel: voxels along a pixel's edge.
+    """
+    found = best_levels(delta, pixel)
+    return (found.high, found.low) if found.are_two else None
+
+
+def best_levels(delta: Tensor, pixel: int) -> Levels:
+    """The split of voxels where δ changes little that leaves each nearest to its group's median (k-medians).
+
+    Arguments as for `two_levels`.
     """
     coarse = avg_pool3d(delta[None, None], pixel)[0, 0]
     values = coarse.numpy()
@@ -72,12 +99,10 @@ def two_levels(delta: Tensor, pixel: int) -> tuple[float, float] | None:
     high, low = _two_medians(flat)
     nearer = np.minimum(np.abs(flat - high), np.abs(flat - low)).mean()
     spread = np.abs(flat - np.median(flat)).mean()
-    if high < LEAST_CONTRAST * low or nearer > LARGEST_SPREAD * spread:
-        return None
     denser, lighter = told_apart(coarse, (high, low), 1)
     share = float(lighter.sum() / (denser.sum() + lighter.sum()))
-    deviation = np.abs(values[lighter.numpy() > 0] / low - 1).mean() if share else np.inf
-    return (high, low) if share > LEAST_SHARE and deviation < LARGEST_DEVIATION else None
+    deviation = float(np.abs(values[lighter.numpy() > 0] / low - 1).mean()) if share else np.inf
+    return Levels(high, low, float(nearer / max(spread, np.finfo(np.float32).tiny)), share, deviation)
 
 
 def _two_medians(values: np.ndarray) -> tuple[float, float]:
@@ -147,5 +172,5 @@ def _lines(scan: Scan, values: Tensor, grid: Grid, backend: Backend) -> tuple[In
     return instrument, VoxelLines(grid, instrument.views)(values)
 
 
-def _frames(instrument: Instrument, lines: Tensor, materials: Sequence[tuple[float, float]] | zip) -> Tensor:
+def _frames(instrument: Instrument, lines: Tensor, materials: Iterable[tuple[float, float]]) -> Tensor:
     return instrument.frames(LineIntegrals(lines, tuple((float(delta), float(beta)) for delta, beta in materials)))

@@ -57,9 +57,7 @@ def _from_phase_retrieval(
         return holographic_tv(frames, material, options, on_progress)
 
     volume, grid = retrieve(scan)
-    may_be_found = settings.most_materials == 2 and not settings.separate
-    may_be_two = len(prior.materials) == 2 or may_be_found
-    shares = _shares(scan, prior, material, (volume, grid), retrieve, backend) if may_be_two else None
+    shares = _shares(scan, prior, settings, material, (volume, grid), retrieve)
     pitch = scan.views.pixel_size
     spacing = _spacing_px(scan, settings) * pitch
     if shares is None:
@@ -76,17 +74,17 @@ def _from_phase_retrieval(
 def _shares(
     scan: Scan,
     prior: MaterialPrior,
+    settings: Settings,
     material: DeltaBeta,
     found: tuple[Tensor, Grid],
     retrieve: Retrieve,
-    backend: Backend,
 ) -> Shares | None:
     """Where two materials are, if two are known, or nothing is and the volume `found` of `material` shows two."""
-    volume, grid = found
+    (volume, grid), backend = found, settings.volume.backend
     pixel = round(scan.views.pixel_size / grid.voxel_size[0]) or 1
     known = prior.materials if len(prior.materials) == 2 else ()
     levels = (known[0].delta, known[1].delta) if known else None
-    if prior.kind == "free":
+    if prior.kind == "free" and settings.most_materials == 2 and not settings.separate:
         levels = two_levels(volume * material.delta, pixel)
     if levels is None:
         return None
