@@ -173,7 +173,7 @@ def test_constant_frames_are_refused(scan):
         fit_of(replace(scan, frames=np.ones_like(scan.frames)))
 
 
-def test_bounds_of_the_occupancy_are_for_one_material_only(scan):
+def test_bounds_are_for_amplitudes_that_are_occupancies(scan):
     two = random_cloud(30, scan.views, MATERIAL, 2, 1e-5, 0)
     weights = Objective(overfull=1.0, two_levels=1.0, tv_volume=0.1)
     (record,) = run(fit_of(scan, objective=weights, steps=1, cloud=two))
@@ -195,6 +195,17 @@ def test_terms_on_the_volume_weigh_by_its_depth_and_the_number_of_views(scan):
         found[len(train)] = record["tv_volume"] / plain
     depth = scan.views.shape[1] / 100
     assert found == {n: pytest.approx(depth * (8 / n) ** 0.5, rel=1e-4) for n in found}
+
+
+def test_total_variation_of_two_channels_is_the_sum_of_theirs(scan):
+    """A material counts the same whether another one is there or not."""
+    two = random_cloud(30, scan.views, MATERIAL, 2, 1e-5, 0)
+    channels = two.raw_amplitudes.detach() + torch.tensor([0.0, 1.5])
+    amplitudes = [channels, channels[:, :1], channels[:, 1:]]
+    clouds = [GaussianCloud([*two.parameters[:3], a], two.unit_length, *MATERIAL) for a in amplitudes]
+    both, first, second = (run(fit_of(scan, objective=Objective(tv_volume=1.0), cloud=c, steps=1))[0] for c in clouds)
+    assert first["tv_volume"] < 0.8 * second["tv_volume"]
+    assert both["tv_volume"] == pytest.approx(first["tv_volume"] + second["tv_volume"], rel=1e-4)
 
 
 def test_two_levels_weighs_more_for_noisy_frames(scan):
