@@ -50,7 +50,7 @@ VOXELS: dict[str, Sequence[Any]] = {
 NEURAL: dict[str, Sequence[Any]] = {
     "rate": (0.01, 0.04),
     "weight": (0.003, 0.03),
-    "noise_weight": (0.03, 0.1, 1.0),
+    "noise_weight": (0.03, 0.3, 1.0),
     "steps": (125, 500),
     "floor": (0.05, 0.3),
     "network": (Network(hidden=64), Network(Encoding(levels=5)), Network(Encoding(kind="fourier"))),

@@ -48,6 +48,20 @@ def test_what_is_surely_noise_is_noise_and_never_fringes(shape):
         assert (found <= noise_levels(1 + noise(shape, sigma)).numpy()).all()
 
 
+def test_noise_is_surely_there_as_far_as_both_estimates_agree():
+    """Faint fine fringes beside it leave less of it, strong ones nothing, although the quiet part is as noisy."""
+    shape, sigma = (1, 96, 128), 0.02
+    fringes = stripes(shape, 2.0 * (1 + 5**0.5)) * stripes((1, shape[2], shape[1]), 5.3).mT
+    fringes[:, :, :40] = 0
+    found = []
+    for height in (0.0, 0.06, 0.3):
+        frames = 1 + noise(shape, sigma) + height * fringes
+        found.append(float(sure_noise(frames)))
+        assert float(noise_levels(frames)) == pytest.approx(sigma, rel=0.2)
+    assert 0.2 * found[0] < found[1] < 0.9 * found[0]
+    assert found[2] == 0
+
+
 def test_the_share_of_the_contrast_that_is_noise():
     assert noise_share(torch.ones(2, 20, 24)) == 0
     assert noise_share(1 + noise((3, 64, 70), 0.02)) == pytest.approx(1.0, abs=0.15)

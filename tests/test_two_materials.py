@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 from holosplat import native
 from holosplat.baselines import HolographicTV
-from holosplat.baselines.two_materials import Shares, absorption, at_one_ratio, told_apart, two_levels
+from holosplat.baselines.two_materials import Levels, Shares, absorption, at_one_ratio, told_apart, two_levels
 from holosplat.checks import InputError
 from holosplat.experiments.evaluate import evaluate
 from holosplat.experiments.reconstruct import load_reconstruction, reconstruct
@@ -98,6 +98,14 @@ def test_levels_that_are_near_each_other_pass_for_one(delta):
     core = (delta > 0.8 * OIL.delta) & (delta < 1.2 * OIL.delta)
     near = torch.where(core, delta * 0.8 * SILICA.delta / OIL.delta, delta)
     assert two_levels(near, 1) is None
+
+
+def test_two_materials_need_all_four_signs_of_them():
+    """Levels apart, near to all values, the lower one more than a rim, and level."""
+    two = Levels(high=2.0, low=1.0, spread=0.25, share=0.5, deviation=0.15)
+    assert two.are_two
+    for sign in ({"low": 1.5}, {"spread": 0.6}, {"share": 0.05}, {"deviation": 0.5}):
+        assert not replace(two, **sign).are_two
 
 
 def test_voxels_are_of_the_material_that_they_are_full_of(shares, grid):

@@ -53,7 +53,7 @@ class NeuralFit:
     rate_left: float = 0.05
     shrinkage: float = 0.01
     weight: float = 0.01
-    noise_weight: float = 0.3
+    noise_weight: float = 0.1
     probes: int = 4096
     floor: float = 0.1
     hull: float = 0.1
