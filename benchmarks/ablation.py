@@ -1,9 +1,12 @@
 """What each ingredient of the reconstruction is worth: every one changed in turn, on cases of the suite.
 
-    python benchmarks/ablation.py --snapshots DIR --csv docs/data/ablation.csv     # twenty minutes on two cores
+    python benchmarks/ablation.py --snapshots DIR --csv docs/data/ablation.csv     # the suite, two hours on one core
     python benchmarks/ablation.py --cases noise12-2000 cells4 --seeds 101 102
+    python benchmarks/ablation.py --summary docs/data/ablation.csv
 
-Prints a Markdown table: SSIM / FRCM on noise-free held-out frames, Dice / relative error of δ against the true volume.
+Prints Markdown: a line for every run (SSIM / FRCM on noise-free held-out frames, Dice / relative error of δ against the
+true volume), then what each variant changes, on cases without noise and with it. Runs that the CSV file has are not
+repeated.
 """
 
 from __future__ import annotations
@@ -19,17 +22,19 @@ from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
+import numpy as np
 from machine import commit
 
 import holosplat as hs
-from holosplat.experiments.bench.case import Case, load_case
+from holosplat.experiments.bench.case import Case, case_names, load_case
 from holosplat.experiments.evaluate import score_object
 from holosplat.experiments.reconstruct import fit_options
 from holosplat.experiments.start import starting_cloud
 from holosplat.fit.loop import Fit
 
-CASES = ["thesis16", "main4", "cells4", "cells8", "xmpi4", "noise12-2000", "plasma8-1e4", "shells8", "foam12"]
+AS_IT_IS = "as it is"
 Settings = hs.Settings
+Row = dict[str, Any]
 
 
 def objective(**changed: float) -> Callable[[Settings], Settings]:
@@ -48,7 +53,7 @@ def without_noise_rules(s: Settings) -> Settings:
 
 
 VARIANTS: dict[str, Callable[[Settings], Settings]] = {
-    "as it is": lambda s: s,
+    AS_IT_IS: lambda s: s,
     "no two levels": objective(two_levels=0.0),
     "no total variation in the fit": objective(tv_volume=0.0),
     "no bound at one in the fit": objective(overfull=0.0),
@@ -70,7 +75,7 @@ class Runs:
         self._case, self._scan, self._truth = case, case.scan(), case.truth()
         self._starts: dict[str, hs.GaussianCloud] = {}
 
-    def score(self, settings: Settings) -> dict[str, Any]:
+    def score(self, settings: Settings) -> Row:
         """The numbers that matter, and how long the fit took (without the start) [s]."""
         key = repr(replace(settings, fit=hs.preset("default").fit))
         if key not in self._starts:
@@ -82,36 +87,88 @@ class Runs:
         fit.run(lambda record: None)
         seconds = time.perf_counter() - began
         found = score_object(fit.result(), self._scan, self._truth, fit.instrument.oversample).headline()
-        return {"seconds": seconds, **found}
+        return {"photons": self._case.photons or 0, "seconds": seconds, **found}
+
+
+def read(file: Path | None) -> list[Row]:
+    """The rows of a CSV file, numbers as such; none where there is no file."""
+    if file is None or not file.exists():
+        return []
+    with file.open(newline="") as lines:
+        words = ("case", "variant", "commit")
+        return [{k: v if k in words else float(v) for k, v in row.items()} for row in csv.DictReader(lines)]
+
+
+def write(rows: list[Row], file: Path) -> None:
+    """Rows as a CSV file."""
+    with file.open("w", newline="") as lines:
+        writer = csv.DictWriter(lines, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def shown(row: Row) -> str:
+    """A run as a line of the first table."""
+    pairs = (("ssim", "frcm"), ("dice", "relative_error_delta"))
+    images, volume = (" / ".join(f"{row[key]:.3f}" for key in keys) for keys in pairs)
+    return f"| {row['case']} | {row['seed']:.0f} | {row['variant']} | {images} | {volume} | {row['seconds']:.0f} |"
+
+
+def summary(rows: list[Row]) -> list[str]:
+    """What each variant changes, the one that costs most first: the mean error of δ as a multiple of that as it is, and
+    the mean gain of FRCM, on cases without noise and with it; the case where it changes the error most."""
+    whole = {(row["case"], row["seed"]): row for row in rows if row["variant"] == AS_IT_IS}
+    compared: dict[str, list[tuple[Row, float, float]]] = {}
+    for row in rows:
+        base = whole.get((row["case"], row["seed"]))
+        if base is not None and row["variant"] != AS_IT_IS:
+            error = row["relative_error_delta"] / base["relative_error_delta"]
+            compared.setdefault(row["variant"], []).append((row, error, row["frcm"] - base["frcm"]))
+
+    def part(found: list[tuple[Row, float, float]]) -> str:
+        if not found:
+            return "– | –"
+        errors, gains = [error for _, error, _ in found], [gain for _, _, gain in found]
+        return f"×{np.exp(np.log(errors).mean()):.2f} | {np.mean(gains):+.3f}"
+
+    lines = [
+        "| changed | error, no noise | FRCM | error, noise | FRCM | most on |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    for variant, found in sorted(compared.items(), key=lambda item: -np.mean([np.log(e) for _, e, _ in item[1]])):
+        clean, noisy = ([f for f in found if bool(f[0]["photons"]) is noise] for noise in (False, True))
+        row, error, _ = max(found, key=lambda f: abs(np.log(f[1])))
+        lines.append(f"| {variant} | {part(clean)} | {part(noisy)} | `{row['case']}`, ×{error:.2f} |")
+    return lines
 
 
 def main() -> None:
     """Run all variants on all cases; print and write their table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cases", nargs="+", default=CASES)
+    parser.add_argument("--cases", nargs="+", default=case_names())
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS))
     parser.add_argument("--seeds", type=int, nargs="+", default=[101])
     parser.add_argument("--snapshots", type=Path)
     parser.add_argument("--csv", type=Path)
+    parser.add_argument("--summary", type=Path, help="only sum up this file")
     options = parser.parse_args()
-    rows: list[dict[str, Any]] = []
+    if options.summary:
+        print("\n".join(summary(read(options.summary))))
+        return
+    rows = read(options.csv)
+    done = {(row["case"], row["seed"], row["variant"]) for row in rows}
     print("| case | seed | variant | SSIM / FRCM | Dice / error | fit [s] |\n| --- | --- | --- | --- | --- | --- |")
     for name in options.cases:
         for seed in options.seeds:
-            runs = Runs(load_case(name, seed, options.snapshots))
-            for variant in options.variants:
-                row = runs.score(VARIANTS[variant](hs.preset("default")))
-                rows.append({"case": name, "seed": seed, "variant": variant, "commit": commit(), **row})
-                images, volume = (
-                    " / ".join(f"{row[key]:.3f}" for key in keys)
-                    for keys in (("ssim", "frcm"), ("dice", "relative_error_delta"))
-                )
-                print(f"| {name} | {seed} | {variant} | {images} | {volume} | {row['seconds']:.0f} |", flush=True)
-    if options.csv:
-        with options.csv.open("w", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
+            wanted = [variant for variant in options.variants if (name, seed, variant) not in done]
+            runs = Runs(load_case(name, seed, options.snapshots)) if wanted else None
+            for variant in wanted if runs else ():
+                found = runs.score(VARIANTS[variant](hs.preset("default")))
+                rows.append({"case": name, "seed": seed, "variant": variant, "commit": commit(), **found})
+                print(shown(rows[-1]), flush=True)
+                if options.csv:
+                    write(rows, options.csv)
+    print("\n" + "\n".join(summary(rows)))
 
 
 if __name__ == "__main__":
