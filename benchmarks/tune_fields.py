@@ -41,7 +41,7 @@ CASES, SEEDS = ["cells8", "noise12-2000", "thesis16"], [11]
 
 VOXELS: dict[str, Sequence[Any]] = {
     "weight": (0.02, 0.1, 0.2),
-    "noise_weight": (0.3, 3.0),
+    "noise_weight": (0.0, 0.3, 1.0),
     "steps": (30, 120),
     "coarse_steps": (50, 150),
     "floor": (0.05, 0.3),

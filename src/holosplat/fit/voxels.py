@@ -44,7 +44,7 @@ class VoxelFit:
     coarse_steps: int = 0
     steps: int = 60
     weight: float = 0.05
-    noise_weight: float = 1.0
+    noise_weight: float = 0.03
     smoothing: float = 0.005
     floor: float = 0.1
     upper: float = 1.0
