@@ -60,6 +60,7 @@ VARIANTS: dict[str, Callable[[Settings], Settings]] = {
     "no rounds of agreement": lambda s: replace(s, volume=replace(s.volume, corrections=0)),
     "no rules for noise": without_noise_rules,
     "L1 within the noise, too": objective(noise_width=0.0),
+    "noisy frames not blurred": objective(coarse=0.0),
     "one ratio for all matter": lambda s: replace(s, most_materials=1),
     "rounds of agreement in noise, too": lambda s: replace(s, volume=replace(s.volume, noisy=1.0)),
     "100 steps": schedule(steps=100),

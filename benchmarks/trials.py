@@ -34,7 +34,7 @@ from holosplat.experiments.start import starting_cloud
 from holosplat.fit.density import _pair
 from holosplat.fit.fidelity import Target
 from holosplat.fit.loop import Fit, FitOptions
-from holosplat.fit.misfit import Draw
+from holosplat.fit.misfit import Draw, NarrowingBlur
 from holosplat.fit.waves import linear_response
 from holosplat.geometry import Poses
 from holosplat.optics.noise import sure_noise
@@ -109,20 +109,6 @@ class Filtered(Fit):
         misfit = self._misfit
         misfit._target = Target(filtered(self._frames, transfer), misfit.low, misfit.span, self.backend)
         return self._plain(filtered(predicted, transfer), draw)
-
-
-class CoarseToFine(Filtered):
-    """Frames blurred by three pixels at first, and less and less until two fifths of the steps."""
-
-    def __init__(self, scan: hs.Scan, cloud: GaussianCloud, options: FitOptions) -> None:
-        super().__init__(scan, cloud, options)
-        h, w = self._frames.shape[1:]
-        self._squares = torch.fft.fftfreq(h)[:, None] ** 2 + torch.fft.rfftfreq(w) ** 2
-        self.transfer = self._blur
-
-    def _blur(self, progress: float) -> Tensor:
-        sigma = 3 * max(0.0, 1 - progress / 0.4)
-        return torch.exp(-2 * (torch.pi * sigma) ** 2 * self._squares)[None]
 
 
 class Weighted(Filtered):
@@ -312,6 +298,13 @@ def conjugate_gradients(matrix: Callable[[Tensor], Tensor], right: Tensor, steps
     return found
 
 
+def blurred(scan: hs.Scan, cloud: GaussianCloud, options: FitOptions, sigma: float) -> Fit:
+    """Frames compared coarse to fine from `sigma` pixels on, whether there is noise or not."""
+    fit = Fit(scan, cloud, options)
+    fit._misfit._blur = NarrowingBlur(fit.train.frames.shape[1:], sigma, torch.device("cpu"))
+    return fit
+
+
 def judged(scan: hs.Scan, cloud: GaussianCloud, options: FitOptions) -> Fit:
     """Two training views set aside, looked at every 25 steps, to choose the best state."""
     return Fit(scan, cloud, replace(options, schedule=replace(options.schedule, validation_views=2)))
@@ -328,7 +321,8 @@ TRIALS: dict[str, Callable[[hs.Scan, GaussianCloud, FitOptions], Fit]] = {
     "mean of the late iterates": Averaged,
     "dropout of a tenth": partial(Dropout, share=0.1),
     "dropout of three tenths": partial(Dropout, share=0.3),
-    "coarse to fine": CoarseToFine,
+    "blurred by 1 px at first": partial(blurred, sigma=1.0),
+    "blurred by 2 px at first": partial(blurred, sigma=2.0),
     "weighted by the response": Weighted,
     "Gauss–Newton for the amplitudes": GaussNewton,
     "L-BFGS": QuasiNewton,

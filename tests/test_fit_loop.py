@@ -11,6 +11,7 @@ from itertools import chain
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import fourier_gaussian
 from torch import Tensor
 
 from holosplat.checks import InputError
@@ -158,6 +159,32 @@ def test_differences_within_the_noise_count_by_their_square(scan):
         predicted = Instrument(noisy.train().exposures, fit.instrument.oversample).measure(fit.cloud)
     wanted = terms.huber(predicted, measured, width).mean() / (measured.max() - measured.min())
     assert found[1] == pytest.approx(float(wanted), rel=1e-5)
+
+
+def test_noisy_frames_are_compared_coarse_to_fine(scan):
+    """Both blurred by the pixels asked for at first, by half of them half-way; less where there is less noise."""
+    for sigma, photons in ((1.4, 200), (0.9, 100_000)):
+        frames = poisson(scan.frames, photons, 3).astype(np.float32)
+        noisy = replace(scan, frames=frames)
+        train = noisy.train()
+        share = noise_share(torch.from_numpy(train.frames))
+        fit = fit_of(noisy, objective=Objective(coarse=sigma), steps=4)
+        predicted = [fit.instrument.measure(fit.cloud).detach().numpy()]
+        records = run(fit, 1)
+        fit.step = 2
+        predicted.append(fit.instrument.measure(fit.cloud).detach().numpy())
+        records += run(fit, 3)
+        for record, prediction, narrower in zip(records, predicted, (1.0, 0.5)):
+            width = narrower * sigma * min(1.0, share / 0.5)
+            spectra = [fourier_gaussian(np.fft.fft2(frame), width) for frame in prediction - train.frames]
+            wanted = np.abs(np.fft.ifft2(spectra).real).mean() / np.ptp(train.frames)
+            assert record["l1"] == pytest.approx(wanted, rel=1e-3)
+    assert 0.1 < share < 0.5
+
+
+def test_frames_without_noise_are_compared_as_they_are(scan):
+    records = [run(fit_of(scan, objective=Objective(coarse=coarse), steps=3)) for coarse in (0.0, 1.0)]
+    assert records[0] == records[1]
 
 
 def test_the_noise_of_a_pixel_is_that_of_its_photons():

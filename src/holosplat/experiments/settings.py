@@ -111,7 +111,15 @@ def presets() -> dict[str, Settings]:
     """Named settings for `--preset`."""
     default = Settings(
         fit=FitOptions(
-            Objective(l1=1.0, tv_volume=0.25, overfull=10.0, two_levels=1.25, noise_gain=0.5, noise_width=1.0),
+            Objective(
+                l1=1.0,
+                tv_volume=0.25,
+                overfull=10.0,
+                two_levels=1.25,
+                noise_gain=0.5,
+                noise_width=1.0,
+                coarse=1.0,
+            ),
             Schedule(steps=300, rate_position=0.01, rate_scale=0.01, rate_rotation=0.01, rate_amplitude=0.01),
         ),
     )

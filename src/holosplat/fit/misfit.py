@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..forward import Instrument
 from ..geometry import Grid, Poses
+from ..optics.detector import blur
 from ..optics.noise import noise_share, sure_noise
 from ..representations.gaussians import GaussianCloud
 from ..scan import Scan
@@ -26,6 +27,10 @@ DARK = 0.05
 DEPTH, VIEWS = 100.0, 8.0
 """Voxels along the beam, and views, for which the weights of the terms on the volume are meant. Few views leave more
 to what is known of the volume; the weights go with one over the root of their number."""
+COARSEST_NOISE = 0.5
+"""Noise, as a share of the frames' contrast, from which on frames are blurred by all of `Objective.coarse` at first."""
+LEAST_BLUR = 0.1
+"""Pixels below which a blur changes nothing, and is left out."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +77,8 @@ class Misfit:
         self._block = (block.shape, block.voxel_size[0])
         self._volume_scale = depth / DEPTH * math.sqrt(VIEWS / len(train))
         self._two_levels = objective.two_levels * (1 + objective.noise_gain * noise_share(measured))
+        coarse = objective.coarse * min(1.0, noise_share(measured) / COARSEST_NOISE)
+        self._blur = NarrowingBlur(frames.shape[1:], coarse, frames.device) if coarse > LEAST_BLUR else None
         self._width = (objective.noise_width * photon_noise(measured)).clamp_min(1e-6 * self.span).to(frames.device)
 
     def names(self, cloud: GaussianCloud, draw: Draw) -> list[str]:
@@ -102,9 +109,8 @@ class Misfit:
             difference, dissimilarity = l1_and_ssim(predicted, target)
         else:  # statistics of frames are not needed
             difference, dissimilarity = terms.l1(predicted, target.frames) / self.span, predicted
-        if w.noise_width > 0:
-            width = self._width if draw.index is None else self._width.index_select(0, draw.index)
-            difference = terms.huber(predicted, target.frames, width) / self.span
+        if w.noise_width > 0 or self._blur:
+            difference = self._beyond_noise(predicted, target.frames, draw) / self.span
         a, b = ((f - self.low) / self.span if w.tv_image + w.frc > 0 else f for f in (predicted, target.frames))
         table: list[tuple[str, float, Callable[[], Tensor]]] = [
             ("l1", w.l1, lambda: difference),
@@ -115,6 +121,13 @@ class Misfit:
         ]
         ramps = {"frc": (draw.progress / max(w.frc_ramp, 1e-9)).clamp_max(1.0)}
         return {name: (weight * ramps.get(name, 1.0), value()) for name, weight, value in table if weight > 0}
+
+    def _beyond_noise(self, predicted: Tensor, measured: Tensor, draw: Draw) -> Tensor:
+        """Huber's function of the differences [V] of frames [V, H, W] that are as blurred as is due."""
+        width = self._width if draw.index is None else self._width.index_select(0, draw.index)
+        if self._blur:
+            predicted, measured = (self._blur(frames, draw.progress) for frames in (predicted, measured))
+        return terms.huber(predicted, measured, width)
 
     def _object_weights(self, cloud: GaussianCloud, draw: Draw) -> dict[str, float]:
         """Weight of every term on the Gaussians in use at this step, before it is ramped."""
@@ -140,6 +153,18 @@ class Misfit:
         }
         ramps = {"two_levels": draw.progress}
         return [(weight * ramps.get(name, 1.0), values[name]()) for name, weight in weights.items()]
+
+
+class NarrowingBlur:
+    """A Gaussian blur of frames of `shape` whose standard deviation falls from `sigma` [pixels] to 0 during the fit."""
+
+    def __init__(self, shape: Sequence[int], sigma: float, device: torch.device) -> None:
+        rows, columns = torch.fft.fftfreq(shape[0]), torch.fft.rfftfreq(shape[1])
+        self._exponent = (-2 * (math.pi * sigma) ** 2 * (rows[:, None] ** 2 + columns**2)).to(device)
+
+    def __call__(self, frames: Tensor, progress: Tensor) -> Tensor:
+        """Frames [V, H, W], blurred as is due when `progress` [] of the steps are done; periodic."""
+        return blur(frames, torch.exp((1 - progress) ** 2 * self._exponent))
 
 
 def photon_noise(frames: Tensor) -> Tensor:

@@ -19,8 +19,10 @@ class Objective:
 
     Image terms compare predicted with measured frames, after the affine map that takes the training frames'
     minimum and maximum to 0 and 1: `l1` (where differences below `noise_width` standard deviations of the frames' own
-    noise count by their square, as the likelihood of noise has it), `l2_amplitude`, `ssim` (1 - SSIM), `tv_image`,
-    `frc` (1 - FRCM, its weight ramped linearly from 0 over the first `frc_ramp` of the steps). Object terms act on the
+    noise count by their square, as the likelihood of noise has it, and noisy frames are compared coarse to fine: both
+    blurred by `coarse` pixels at first where noise is half their contrast or more, by less in proportion where it is
+    less, and not at all at the end), `l2_amplitude`, `ssim` (1 - SSIM), `tv_image`, `frc` (1 - FRCM, its weight ramped
+    linearly from 0 over the first `frc_ramp` of the steps). Object terms act on the
     Gaussians: `anisotropy` on scales beyond `anisotropy_limit`, and, on the volume they add up to, `tv_volume`, and
     `overfull`, the square of what exceeds an occupancy of one, and `two_levels`, which occupancies between nothing and
     one cost (both not where δ and β are apart). The latter's weight is ramped linearly from 0 over the whole fit, for
@@ -43,6 +45,7 @@ class Objective:
     two_levels: float = 0.0
     noise_gain: float = 0.0
     noise_width: float = 0.0
+    coarse: float = 0.0
 
     def __post_init__(self) -> None:
         compared = self.l1 + self.l2_amplitude + self.ssim + self.tv_image + self.frc
