@@ -94,24 +94,7 @@ class Dropout(Fit):
         return values
 
 
-class Filtered(Fit):
-    """Frames compared after a linear filter of both: `transfer(progress)`, [V or 1, H, W//2 + 1] for `rfft2`."""
-
-    transfer: Callable[[float], Tensor]
-
-    def __init__(self, scan: hs.Scan, cloud: GaussianCloud, options: FitOptions) -> None:
-        super().__init__(scan, cloud, options)
-        self._frames, self._plain = self._misfit._target.frames, self._misfit._image_terms
-        self._misfit._image_terms = self._filtered_terms
-
-    def _filtered_terms(self, predicted: Tensor, draw: Draw) -> dict[str, tuple[float | Tensor, Tensor]]:
-        transfer = self.transfer(float(draw.progress))
-        misfit = self._misfit
-        misfit._target = Target(filtered(self._frames, transfer), misfit.low, misfit.span, self.backend)
-        return self._plain(filtered(predicted, transfer), draw)
-
-
-class Weighted(Filtered):
+class Weighted(Fit):
     """Frames divided by the linear response of a view, above a floor that grows with noise: large shapes count more.
 
     The weight of the term is such that at the start its gradient in the amplitudes is as long as that of plain frames.
@@ -119,21 +102,26 @@ class Weighted(Filtered):
 
     def __init__(self, scan: hs.Scan, cloud: GaussianCloud, options: FitOptions) -> None:
         super().__init__(scan, cloud, options)
+        self._frames, self._plain = self._misfit._target.frames, self._misfit._image_terms
+        self._misfit._image_terms = self._weighted_terms
         noise = sure_noise(self._frames).mean() / self._misfit.span
         response = linear_response(self.train.exposures, cloud.beta / cloud.delta)
         weight = (1 / (response**2 + (FLOOR + 5 * noise) ** 2).sqrt()).float()
-        identity = torch.ones_like(weight)
-        self.transfer = lambda progress: identity
+        self._weight = torch.ones_like(weight)
         plain = self._pull()
-        self.transfer = lambda progress: weight
-        factor = plain / self._pull()
-        self.transfer = lambda progress: factor * weight
+        self._weight = weight
+        self._weight = weight * (plain / self._pull())
+
+    def _weighted_terms(self, predicted: Tensor, draw: Draw) -> dict[str, tuple[float | Tensor, Tensor]]:
+        misfit = self._misfit
+        misfit._target = Target(filtered(self._frames, self._weight), misfit.low, misfit.span, self.backend)
+        return self._plain(filtered(predicted, self._weight), draw)
 
     def _pull(self) -> float:
         """Length of the gradient of the image terms in the amplitudes."""
         cloud, draw = self.cloud, self._draw()
         predicted = self.instrument.frames(cloud.project(Poses.of(self.instrument.views, self.instrument.device)))
-        loss = sum(weight * value.mean() for weight, value in self._filtered_terms(predicted, draw).values())
+        loss = sum(weight * value.mean() for weight, value in self._weighted_terms(predicted, draw).values())
         return float(torch.autograd.grad(loss, cloud.raw_amplitudes)[0].norm())
 
 
