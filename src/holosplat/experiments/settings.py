@@ -155,7 +155,15 @@ def presets() -> dict[str, Settings]:
             start="random",
             random_count=8_000,
             fit=FitOptions(
-                Objective(l1=1.0, tv_volume=0.1, overfull=10.0, two_levels=1.0, noise_gain=1.0, noise_width=1.0),
+                Objective(
+                    l1=1.0,
+                    tv_volume=0.1,
+                    overfull=10.0,
+                    two_levels=0.1,
+                    noise_gain=15.0,
+                    noise_width=1.0,
+                    coarse=1.0,
+                ),
                 Schedule(
                     steps=1500,
                     views_per_step=2,
