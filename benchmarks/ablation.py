@@ -133,13 +133,13 @@ def summary(rows: list[Row]) -> list[str]:
         return f"×{np.exp(np.log(errors).mean()):.2f} | {np.mean(gains):+.3f}"
 
     lines = [
-        "| changed | error, no noise | FRCM | error, noise | FRCM | most on |",
-        "| --- | --- | --- | --- | --- | --- |",
+        "| changed | cases | error, no noise | FRCM | error, noise | FRCM | most on |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
     ]
     for variant, found in sorted(compared.items(), key=lambda item: -np.mean([np.log(e) for _, e, _ in item[1]])):
         clean, noisy = ([f for f in found if bool(f[0]["photons"]) is noise] for noise in (False, True))
         row, error, _ = max(found, key=lambda f: abs(np.log(f[1])))
-        lines.append(f"| {variant} | {part(clean)} | {part(noisy)} | `{row['case']}`, ×{error:.2f} |")
+        lines.append(f"| {variant} | {len(found)} | {part(clean)} | {part(noisy)} | `{row['case']}`, ×{error:.2f} |")
     return lines
 
 

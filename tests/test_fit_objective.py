@@ -226,3 +226,9 @@ def test_volumes_that_the_kernel_cannot_take_are_refused(density, message):
 def test_an_objective_compares_frames():
     with pytest.raises(InputError, match="needs a term on the frames"):
         Objective(l1=0.0, tv_volume=1.0)
+
+
+@pytest.mark.parametrize("name", ["l1", "two_levels", "noise_width", "coarse"])
+def test_weights_are_not_negative(name):
+    with pytest.raises(InputError, match=f"{name} must not be negative, but it is -0.5"):
+        Objective(**{name: -0.5})

@@ -9,7 +9,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from ..checks import require
+from ..checks import at_least, require
 from .fidelity import reference as plain
 
 
@@ -48,6 +48,7 @@ class Objective:
     coarse: float = 0.0
 
     def __post_init__(self) -> None:
+        at_least(self, 0, *vars(self))
         compared = self.l1 + self.l2_amplitude + self.ssim + self.tv_image + self.frc
         require(compared > 0, "the objective needs a term on the frames: l1, l2_amplitude, ssim, tv_image or frc.")
 
