@@ -162,8 +162,10 @@ def main() -> None:
     for name in options.cases:
         for seed in options.seeds:
             wanted = [variant for variant in options.variants if (name, seed, variant) not in done]
-            runs = Runs(load_case(name, seed, options.snapshots)) if wanted else None
-            for variant in wanted if runs else ():
+            if not wanted:
+                continue
+            runs = Runs(load_case(name, seed, options.snapshots))
+            for variant in wanted:
                 found = runs.score(VARIANTS[variant](hs.preset("default")))
                 rows.append({"case": name, "seed": seed, "variant": variant, "commit": commit(), **found})
                 print(shown(rows[-1]), flush=True)

@@ -12,6 +12,9 @@ import pytest
 import torch
 
 from holosplat.experiments.settings import preset
+from holosplat.fit.loop import FitOptions
+from holosplat.fit.objective import Objective
+from holosplat.fit.schedule import Schedule
 from holosplat.projectors.splat import splat
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
@@ -25,7 +28,7 @@ def scripts(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
         name: importlib.import_module(name)
         for name in (
             *("step", "eager_step", "kernels", "plain_torch", "ablation", "simulate"),
-            *("tweezers", "espresso_flow", "tune_fields"),
+            *("tweezers", "espresso_flow", "tune_fields", "trials", "two_levels", "cavity"),
         )
     }
 
@@ -82,6 +85,56 @@ def test_every_ablation_removes_something(scripts):
     assert variants.pop("as it is") == settings
     assert settings not in variants.values()
     assert len({repr(variant) for variant in variants.values()}) == len(variants)
+
+
+def test_the_summary_of_an_ablation_compares_with_the_whole_of_each_case(scripts):
+    def row(case, photons, variant, error, frcm):
+        values = {"photons": photons, "relative_error_delta": error, "frcm": frcm}
+        return {"case": case, "seed": 101.0, "variant": variant, **values}
+
+    rows = [
+        row("a", 0.0, "as it is", 0.1, 0.9),
+        row("a", 0.0, "less", 0.2, 0.8),
+        row("b", 500.0, "as it is", 0.2, 0.7),
+        row("b", 500.0, "less", 0.1, 0.75),
+        row("c", 0.0, "less", 0.5, 0.1),  # nothing to compare it with
+        row("b", 500.0, "worse", 1.0, 0.2),
+    ]
+    assert scripts["ablation"].summary(rows)[2:] == [
+        "| worse | 1 | – | – | ×5.00 | -0.500 | `b`, ×5.00 |",
+        "| less | 2 | ×2.00 | -0.100 | ×0.50 | +0.050 | `a`, ×2.00 |",
+    ]
+
+
+def test_rows_of_an_ablation_are_read_as_they_were_written(scripts, tmp_path):
+    rows = [{"case": "a", "seed": 101.0, "variant": "as it is", "commit": "0e5", "photons": 0.0, "frcm": 0.25}]
+    scripts["ablation"].write(rows, tmp_path / "rows.csv")
+    assert scripts["ablation"].read(tmp_path / "rows.csv") == rows
+    assert scripts["ablation"].read(tmp_path / "none.csv") == []
+
+
+def test_every_trial_lowers_the_misfit_in_a_way_of_its_own(scripts):
+    """No two of them, and none but the first, are the fit as it is."""
+    scan, cloud = scripts["step"].workload(60, 40)
+    found = {}
+    for name, make in scripts["trials"].TRIALS.items():
+        schedule = Schedule(steps=100, rate_position=0.05, rate_scale=0.03, rate_amplitude=0.05, validate_every=10)
+        fit = make(scan, cloud.detached(), FitOptions(Objective(), schedule))
+        before = fit.instrument.measure(cloud.detached())
+        fit.run(lambda record: None)
+        after = fit.instrument.measure(fit.result())
+        measured = torch.from_numpy(fit.train.frames)
+        gain = float((after - measured).abs().mean() / (before - measured).abs().mean())
+        assert gain < 0.95, name
+        found[name] = (len(fit.cloud), round(gain, 3))
+    assert len(set(found.values())) == len(found), found
+
+
+def test_conjugate_gradients_solve_what_they_are_given(scripts):
+    factor = torch.randn(6, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    matrix, right = factor @ factor.T + torch.eye(6), torch.arange(6.0, dtype=torch.float64)
+    found = scripts["trials"].conjugate_gradients(lambda v: matrix @ v, right)
+    torch.testing.assert_close(matrix @ found, right, rtol=1e-6, atol=1e-6)
 
 
 def test_the_table_of_the_tweezers(scripts):

@@ -76,8 +76,9 @@ class Misfit:
             _ = self._target.statistics  # once, for all subsets of views
         self._block = (block.shape, block.voxel_size[0])
         self._volume_scale = depth / DEPTH * math.sqrt(VIEWS / len(train))
-        self._two_levels = objective.two_levels * (1 + objective.noise_gain * noise_share(measured))
-        coarse = objective.coarse * min(1.0, noise_share(measured) / COARSEST_NOISE)
+        noise = noise_share(measured)
+        self._two_levels = objective.two_levels * (1 + objective.noise_gain * noise)
+        coarse = objective.coarse * min(1.0, noise / COARSEST_NOISE)
         self._blur = NarrowingBlur(frames.shape[1:], coarse, frames.device) if coarse > LEAST_BLUR else None
         self._width = (objective.noise_width * photon_noise(measured)).clamp_min(1e-6 * self.span).to(frames.device)
 

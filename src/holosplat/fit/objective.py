@@ -17,19 +17,19 @@ from .fidelity import reference as plain
 class Objective:
     """Weights of the terms; a weight of zero leaves the term out.
 
-    Image terms compare predicted with measured frames, after the affine map that takes the training frames'
-    minimum and maximum to 0 and 1: `l1` (where differences below `noise_width` standard deviations of the frames' own
-    noise count by their square, as the likelihood of noise has it, and noisy frames are compared coarse to fine: both
-    blurred by `coarse` pixels at first where noise is half their contrast or more, by less in proportion where it is
-    less, and not at all at the end), `l2_amplitude`, `ssim` (1 - SSIM), `tv_image`, `frc` (1 - FRCM, its weight ramped
-    linearly from 0 over the first `frc_ramp` of the steps). Object terms act on the
-    Gaussians: `anisotropy` on scales beyond `anisotropy_limit`, and, on the volume they add up to, `tv_volume`, and
-    `overfull`, the square of what exceeds an occupancy of one, and `two_levels`, which occupancies between nothing and
-    one cost (both not where δ and β are apart). The latter's weight is ramped linearly from 0 over the whole fit, for
-    at its beginning matter may still be too faint; it is larger by `noise_gain` times the share of the frames' contrast
-    that is noise. Terms on the volume are sums along the beam in units of 100 voxels, mean over pixels, so that they
-    weigh the same however fine the pixels or wide the field; and they weigh more with fewer views (the weights are
-    those for eight, and go with one over the root).
+    Image terms compare predicted with measured frames, after the affine map that takes the training frames' minimum and
+    maximum to 0 and 1: `l1` (where differences below `noise_width` standard deviations of the frames' own noise count
+    by their square, as the likelihood of noise has it, and noisy frames are compared coarse to fine: both blurred by
+    `coarse` pixels at first where noise is half their contrast or more, by less in proportion where it is less, and not
+    at all at the end), `l2_amplitude`, `ssim` (1 - SSIM), `tv_image`, `frc` (1 - FRCM, its weight ramped linearly from
+    0 over the first `frc_ramp` of the steps). Object terms act on the Gaussians: `anisotropy` on scales beyond
+    `anisotropy_limit`, and, on the volume they add up to, `tv_volume`, and `overfull`, the square of what exceeds an
+    occupancy of one, and `two_levels`, which occupancies between nothing and one cost (both not where δ and β are
+    apart). The latter's weight is ramped linearly from 0 over the whole fit, for at its beginning matter may still be
+    too faint; it is larger by `noise_gain` times the share of the frames' contrast that is noise. Terms on the volume
+    are sums along the beam in units of 100 voxels, mean over pixels, so that they weigh the same however fine the
+    pixels or wide the field; and they weigh more with fewer views (the weights are those for eight, and go with one
+    over the root).
     """
 
     l1: float = 1.0
