@@ -26,11 +26,11 @@ import numpy as np
 from machine import commit
 
 import holosplat as hs
-from holosplat.experiments.bench.case import Case, case_names, load_case
-from holosplat.experiments.evaluate import score_object
-from holosplat.experiments.reconstruct import fit_options
-from holosplat.experiments.start import starting_cloud
+from holosplat.bench.case import Case, case_names, load_case
 from holosplat.fit.loop import Fit
+from holosplat.workflows.evaluate import score_object
+from holosplat.workflows.reconstruct import fit_options
+from holosplat.workflows.start import starting_cloud
 
 AS_IT_IS = "as it is"
 Settings = hs.Settings

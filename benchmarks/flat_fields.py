@@ -21,11 +21,11 @@ import numpy as np
 from machine import commit
 
 import holosplat as hs
-from holosplat.experiments.correct import CorrectionOptions, FlatFielding, correct
-from holosplat.experiments.record import RecordingOptions, record
+from holosplat.beamline.record import RecordingOptions, record
 from holosplat.io.scan_file import PROJECTION, open_scan
 from holosplat.optics.camera import Camera, spread
 from holosplat.optics.illumination import Illumination
+from holosplat.workflows.correct import CorrectionOptions, FlatFielding, correct
 
 PIXEL = {"3.2 µm": 3.2e-6, "0.5 µm": 0.5e-6}
 CASES: dict[str, tuple[str, float, Camera]] = {

@@ -31,9 +31,9 @@ from machine import commit, memory_megabytes
 from torch import Tensor
 
 from holosplat import native
-from holosplat.experiments.run_folder import environment
 from holosplat.geometry import rotation_y
 from holosplat.projectors.splat import cpu, reference, splat, voxelise
+from holosplat.workflows.provenance import environment
 
 SEED = 0
 VARIANCE = 1 / 12

@@ -25,10 +25,10 @@ from machine import commit
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
-from holosplat.experiments.bench.declaration import Between
-from holosplat.experiments.evaluate import Scores, score_object
-from holosplat.experiments.run_folder import environment
+from holosplat.bench.declaration import Between
 from holosplat.fit.surfaces import oversampling
+from holosplat.workflows.evaluate import Scores, score_object
+from holosplat.workflows.provenance import environment
 
 HAEMOGLOBIN = hs.HAEMOGLOBIN.delta_beta(20.0)
 

@@ -27,11 +27,11 @@ import torch
 from machine import commit, memory_megabytes
 
 import holosplat as hs
-from holosplat.experiments.run_folder import environment
-from holosplat.forward import Simulation, simulated_frames
+from holosplat.beamline.simulate import Simulation, simulated_frames
 from holosplat.io.nxtomo import scan_writer
 from holosplat.io.volumes import write_voxels
 from holosplat.specimens.mesh_series import MeshSeries
+from holosplat.workflows.provenance import environment
 
 SEED, CELLS, DIAMETER = 1, 16, 8e-6
 SPEED, FRAME_RATE = 0.05, 1.128e6

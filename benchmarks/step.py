@@ -30,7 +30,6 @@ from machine import commit, memory_megabytes
 
 import holosplat as hs
 from holosplat.backends import device_name, resolve
-from holosplat.experiments.run_folder import environment
 from holosplat.fit.fidelity import Target, l1_and_ssim
 from holosplat.fit.loop import Fit, FitOptions
 from holosplat.fit.objective import Objective
@@ -38,6 +37,7 @@ from holosplat.fit.schedule import Schedule
 from holosplat.geometry import Poses
 from holosplat.representations.gaussians import raw_of
 from holosplat.volume import LineIntegrals
+from holosplat.workflows.provenance import environment
 
 SEED, VIEWS, PIXEL = 0, 4, 0.5e-6
 SIZES = {"256": (8_000, 256), "512": (30_000, 512), "512_244k": (244_000, 512)}

@@ -25,12 +25,12 @@ import torch
 from machine import commit
 
 import holosplat as hs
-from holosplat.experiments.bench.case import load_case
-from holosplat.experiments.evaluate import Scores, score_object
-from holosplat.experiments.run_folder import environment
-from holosplat.experiments.surfaces import Extraction, extract_surfaces
+from holosplat.bench.case import load_case
 from holosplat.fit.surfaces import SurfaceFit, fit_surfaces, oversampling
 from holosplat.representations import SurfaceMesh
+from holosplat.workflows.evaluate import Scores, score_object
+from holosplat.workflows.provenance import environment
+from holosplat.workflows.surfaces import Extraction, extract_surfaces
 
 CASES = ("main12", "main4", "noise12-2000", "shells8")
 VARIANTS: dict[str, dict[str, Any]] = {

@@ -28,10 +28,10 @@ import holosplat as hs
 from holosplat.baselines.algebraic import Algebraic, art, sirt
 from holosplat.baselines.filtered_backprojection import Ramp, filtered_backprojection
 from holosplat.baselines.tomography import TOMOGRAPHIES, TotalVariation, total_variation
-from holosplat.experiments.bench.svmbir import Mbir, svmbir_volume
-from holosplat.forward import resolving_oversample
+from holosplat.bench.svmbir import Mbir, svmbir_volume
 from holosplat.metrics import image_scores, intensity_range, volume_scores
 from holosplat.optics.retrieval import RETRIEVALS
+from holosplat.optics.sampling import resolving_oversample
 from holosplat.representations.voxels import VoxelGrid
 
 HAEMOGLOBIN = hs.HAEMOGLOBIN.delta_beta(20.0)

@@ -20,9 +20,9 @@ from machine import commit
 
 from holosplat.baselines import holographic_tv
 from holosplat.baselines.two_materials import Levels, best_levels
-from holosplat.experiments.bench.case import Case, case_names, load_case
-from holosplat.experiments.settings import MaterialPrior, preset
-from holosplat.experiments.start import assumed_material
+from holosplat.bench.case import Case, case_names, load_case
+from holosplat.workflows.settings import MaterialPrior, preset
+from holosplat.workflows.start import assumed_material
 
 
 def levels_of(case: Case) -> Levels:

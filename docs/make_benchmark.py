@@ -14,9 +14,9 @@ from pathlib import Path
 
 from PIL import Image
 
-from holosplat.experiments.bench.case import case_names
-from holosplat.experiments.bench.folder import BenchFolder
-from holosplat.experiments.bench.rows import Row, read_row
+from holosplat.bench.case import case_names
+from holosplat.bench.folder import BenchFolder
+from holosplat.bench.rows import Row, read_row
 
 DOCS = Path(__file__).parent
 PICTURES = {

@@ -20,17 +20,17 @@ import h5py
 import numpy as np
 
 import holosplat as hs
-from holosplat.experiments.correct import CorrectionOptions, correct
-from holosplat.experiments.misalignment import Misalignment
-from holosplat.experiments.polychromatic import polychromatic_frames, refilled
-from holosplat.experiments.record import RecordingOptions, record
-from holosplat.forward import Simulation
+from holosplat.beamline.misalignment import Misalignment
+from holosplat.beamline.polychromatic import polychromatic_frames, refilled
+from holosplat.beamline.record import RecordingOptions, record
+from holosplat.beamline.simulate import Simulation
 from holosplat.io.scan_file import FLAT, PROJECTION, open_scan
 from holosplat.optics.camera import Camera
 from holosplat.optics.coherence import Spectrum, joined_blur_px, source_blur
 from holosplat.optics.detector import poisson
 from holosplat.optics.illumination import Illumination
 from holosplat.report.style import PanelGrid, image_panel, letter, scale_bar, styled
+from holosplat.workflows.correct import CorrectionOptions, correct
 
 DOCS = Path(__file__).parent
 SIDE, PIXEL, ENERGY, DISTANCE, PSF, VIEWS, SEED = 64, 0.5e-6, 20.0, 0.1, 0.3, 16, 2

@@ -16,9 +16,9 @@ import numpy as np
 from matplotlib.axes import Axes
 
 import holosplat as hs
-from holosplat.experiments.misalignment import Misalignment
-from holosplat.experiments.poses import Directions
-from holosplat.forward import Shutter
+from holosplat.beamline.misalignment import Misalignment
+from holosplat.beamline.poses import Directions
+from holosplat.beamline.simulate import Shutter
 from holosplat.specimens.mesh_series import MeshSeries
 
 IMAGES = Path(__file__).parent / "images"

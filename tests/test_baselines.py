@@ -13,12 +13,13 @@ from scipy.spatial.transform import Rotation
 from holosplat.baselines import HolographicTV, PrimalDual, holographic_tv
 from holosplat.baselines.holographic_tv import Correction
 from holosplat.baselines.material import estimate_delta, estimate_ratio, plateau
+from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
-from holosplat.forward import measure, simulate
 from holosplat.geometry import Grid, Views, rotation_y
 from holosplat.materials import HAEMOGLOBIN, PLASMA, RED_CELL, DeltaBeta
 from holosplat.mesh import TriangleMesh
 from holosplat.metrics import dice
+from holosplat.model.instrument import measure
 from holosplat.optics.detector import poisson
 from holosplat.projectors.voxels import LatticeProjector, SliceProjector, projector_for, voxel_line_integrals
 from holosplat.projectors.voxels.lattice import lattice_reference

@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from holosplat.bench.case import FOLDER, Case, case_names, load_case
+from holosplat.bench.declaration import declared_names
+from holosplat.bench.tables import merged
 from holosplat.checks import InputError
-from holosplat.experiments.bench.case import FOLDER, Case, case_names, load_case
-from holosplat.experiments.bench.declaration import declared_names
-from holosplat.experiments.bench.tables import merged
-from holosplat.experiments.settings import MaterialPrior
 from holosplat.geometry import Grid, Views
 from holosplat.materials import DeltaBeta, parse_material
 from holosplat.scan import Exposures
 from holosplat.specimens.phantoms import Ball
 from holosplat.specimens.scene import MeshScene
+from holosplat.workflows.settings import MaterialPrior
 
 SLOW = ("crowded12",)
 """Scenes that take seconds to make: that they follow their seed is tested on smaller ones (test_specimens_phantoms)."""
@@ -123,8 +123,8 @@ def test_frames_for_training_are_noisy_and_held_out_ones_are_not(name):
 
 
 def test_main12_with_seed_0_is_the_demonstration(loaded):
-    from holosplat.experiments.demo import CELL_PX, CELLS, DETECTOR, PIXEL_SIZE, SEED
     from holosplat.specimens.red_cells import random_cells
+    from holosplat.workflows.demo import CELL_PX, CELLS, DETECTOR, PIXEL_SIZE, SEED
 
     case = load_case("main12")
     rows, columns = (n * PIXEL_SIZE for n in DETECTOR)

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 import holosplat as hs
-from holosplat.experiments.bench.method import Method
-from holosplat.experiments.bench.methods import METHODS, methods
-from holosplat.forward import Instrument
+from holosplat.bench.method import Method
+from holosplat.bench.methods import METHODS, methods
+from holosplat.model.instrument import Instrument
 from holosplat.specimens.red_cells import icosphere
 
 MATERIAL = hs.DeltaBeta(2e-7, 2e-10)

@@ -11,15 +11,11 @@ import numpy as np
 import pytest
 from matplotlib.text import Text
 
-from holosplat.checks import InputError
-from holosplat.experiments.bench.folder import BenchFolder
-from holosplat.experiments.bench.rows import REFERENCE, Row
-from holosplat.io.json import write_json
-from holosplat.report.bench import write_bench_report
-from holosplat.report.bench_marks import marks_of
-from holosplat.report.bench_page import escaped
-from holosplat.report.bench_pictures import Shown, holograms_figure, slices_figure
-from holosplat.report.bench_plots import (
+from holosplat.bench.folder import BenchFolder
+from holosplat.bench.pages.marks import marks_of
+from holosplat.bench.pages.page import escaped
+from holosplat.bench.pages.pictures import Shown, holograms_figure, slices_figure
+from holosplat.bench.pages.plots import (
     SMALLEST,
     curves_figure,
     deficit,
@@ -27,8 +23,12 @@ from holosplat.report.bench_plots import (
     pareto_front,
     tradeoff_figure,
 )
-from holosplat.report.bench_results import BYTES, DICE, ERROR, MEASURES, SECONDS, SSIM, beaten, read_results
-from holosplat.report.bench_text import beaten_table, case_table, summary_table, verdict, wins_table
+from holosplat.bench.pages.report import write_bench_report
+from holosplat.bench.pages.results import BYTES, DICE, ERROR, MEASURES, SECONDS, SSIM, beaten, read_results
+from holosplat.bench.pages.text import beaten_table, case_table, summary_table, verdict, wins_table
+from holosplat.bench.rows import REFERENCE, Row
+from holosplat.checks import InputError
+from holosplat.io.json import write_json
 
 MEAN, RESOLUTION = MEASURES[5], MEASURES[6]
 FAMILIES = {"fbp": "tomography", "sirt-nonneg": "tomography", "gaussians": "Gaussians", "neural-field": "neural"}

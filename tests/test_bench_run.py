@@ -17,21 +17,21 @@ import torch
 from scipy.ndimage import gaussian_filter
 
 import holosplat as hs
+from holosplat.bench import record, references
+from holosplat.bench.case import Case
+from holosplat.bench.folder import BenchFolder
+from holosplat.bench.method import Method
+from holosplat.bench.prepare import fingerprint, prepared
+from holosplat.bench.references import REFERENCES
+from holosplat.bench.rows import Row, read_row, write_row
+from holosplat.bench.run import Suite, chosen, run_suite
+from holosplat.bench.sizes import contrast_by_size
 from holosplat.cli import main
-from holosplat.experiments.bench import record, references
-from holosplat.experiments.bench.case import Case
-from holosplat.experiments.bench.folder import BenchFolder
-from holosplat.experiments.bench.method import Method
-from holosplat.experiments.bench.prepare import fingerprint, prepared
-from holosplat.experiments.bench.references import REFERENCES
-from holosplat.experiments.bench.rows import Row, read_row, write_row
-from holosplat.experiments.bench.run import Suite, chosen, run_suite
-from holosplat.experiments.bench.sizes import contrast_by_size
-from holosplat.experiments.evaluate import score_object
-from holosplat.forward import resolving_oversample
+from holosplat.optics.sampling import resolving_oversample
 from holosplat.representations.voxels import VoxelGrid
 from holosplat.specimens.phantoms import star_of_balls
 from holosplat.specimens.red_cells import icosphere
+from holosplat.workflows.evaluate import score_object
 
 MATERIAL = hs.DeltaBeta(2e-7, 2e-10)
 PITCH = 1e-6
@@ -435,14 +435,14 @@ def holosplat(*arguments: object) -> tuple[int, str, str]:
 def shop(recorder, monkeypatch) -> Recorder:
     """The command line with two small cases and two fast methods."""
     methods = {name: recorder.method(name) for name in ("one", "two")}
-    monkeypatch.setattr("holosplat.experiments.bench.methods.METHODS", methods)
-    monkeypatch.setattr("holosplat.experiments.bench.references.REFERENCES", {})
-    monkeypatch.setattr("holosplat.experiments.bench.case.case_names", lambda: list(SHAPES))
+    monkeypatch.setattr("holosplat.bench.methods.METHODS", methods)
+    monkeypatch.setattr("holosplat.bench.references.REFERENCES", {})
+    monkeypatch.setattr("holosplat.bench.case.case_names", lambda: list(SHAPES))
 
     def load(name, seed, snapshots):
         return replace(make_case("round", seed), name="mine") if name.endswith(".toml") else make_case(name, seed)
 
-    monkeypatch.setattr("holosplat.experiments.bench.case.load_case", load)
+    monkeypatch.setattr("holosplat.bench.case.load_case", load)
     return recorder
 
 
@@ -485,7 +485,7 @@ def test_bad_requests_are_refused_in_one_line(shop, tmp_path, arguments, words):
 
 def test_ctrl_c_says_how_to_go_on(shop, tmp_path, monkeypatch):
     stopped = {"one": shop.method("one"), "two": shop.method("two", fail(KeyboardInterrupt()))}
-    monkeypatch.setattr("holosplat.experiments.bench.methods.METHODS", stopped)
+    monkeypatch.setattr("holosplat.bench.methods.METHODS", stopped)
     code, _, err = holosplat("bench", "run", "--cases", "round", "--out", tmp_path / "bench")
     assert code == 130
     assert "the same command goes on" in err

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 import torch
 
-from holosplat.experiments.settings import preset
 from holosplat.fit.loop import FitOptions
 from holosplat.fit.objective import Objective
 from holosplat.fit.schedule import Schedule
 from holosplat.projectors.splat import splat
+from holosplat.workflows.settings import preset
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 

@@ -25,10 +25,6 @@ import holosplat.cli.commands as commands
 import holosplat.cli.options as cli_options
 from holosplat.baselines import HolographicTV
 from holosplat.cli import main
-from holosplat.experiments.evaluate import evaluate, render
-from holosplat.experiments.reconstruct import load_reconstruction
-from holosplat.experiments.run_folder import RunFolder
-from holosplat.experiments.settings import Settings, preset
 from holosplat.fit.loop import FitOptions
 from holosplat.fit.objective import Objective
 from holosplat.fit.schedule import Schedule
@@ -39,6 +35,10 @@ from holosplat.io.vtk import read_meshes, write_mesh
 from holosplat.materials import HAEMOGLOBIN, PLASMA, RED_CELL, Compound
 from holosplat.mesh import TriangleMesh
 from holosplat.specimens.red_cells import icosphere, random_cells
+from holosplat.workflows.evaluate import evaluate, render
+from holosplat.workflows.reconstruct import load_reconstruction
+from holosplat.workflows.run_folder import RunFolder
+from holosplat.workflows.settings import Settings, preset
 
 PIXEL = 3.2e-6
 ROWS, COLUMNS = 24, 28

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import holosplat.cli.commands as commands
-from holosplat.experiments.simulate import Filling, read_scene
-from holosplat.forward import simulate
+from holosplat.beamline.scenes import Filling, read_scene
+from holosplat.beamline.simulate import simulate
 from holosplat.geometry import Views, rotation_tilted
 from holosplat.io.nxtomo import read_scan
 from holosplat.io.volumes import read_volume

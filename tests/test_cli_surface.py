@@ -12,16 +12,13 @@ import numpy as np
 import pytest
 
 from holosplat.baselines import HolographicTV
+from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
-from holosplat.experiments.reconstruct import load_reconstruction, reconstruct
-from holosplat.experiments.run_folder import RunFolder, write_gaussians
-from holosplat.experiments.settings import MaterialPrior, Settings
-from holosplat.experiments.surfaces import extract_surfaces
 from holosplat.fit.loop import FitOptions
 from holosplat.fit.objective import Objective
 from holosplat.fit.schedule import Schedule
-from holosplat.forward import simulate
 from holosplat.geometry import Grid, Views
+from holosplat.io.gaussians import write_gaussians
 from holosplat.io.json import read_json, write_json
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.volumes import write_volume
@@ -32,6 +29,10 @@ from holosplat.scan import Exposures, interleaved_split
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.repair import closed
 from holosplat.specimens.scene import MeshScene
+from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
+from holosplat.workflows.run_folder import RunFolder
+from holosplat.workflows.settings import MaterialPrior, Settings
+from holosplat.workflows.surfaces import extract_surfaces
 from test_cli import Outcome, holosplat, worked
 
 PIXEL = 1e-6

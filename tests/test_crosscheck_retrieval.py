@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from holosplat.forward import measure
 from holosplat.geometry import Grid, Views
+from holosplat.model.instrument import measure
 from holosplat.optics.retrieval import Linear, contrast_transfer, paganin, retrieve_thickness
 from holosplat.scan import Exposures
 from holosplat.units import wavelength, wavenumber

@@ -11,8 +11,8 @@ import torch
 
 from holosplat.baselines.algebraic import Algebraic, sirt
 from holosplat.baselines.filtered_backprojection import Ramp, filtered_backprojection
+from holosplat.bench import svmbir as bench
 from holosplat.checks import InputError, MissingError
-from holosplat.experiments.bench import svmbir as bench
 from holosplat.geometry import Grid, Views
 from holosplat.projectors.voxels import SliceProjector
 

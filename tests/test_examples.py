@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from holosplat.experiments.run_folder import RunFolder
 from holosplat.geometry import Grid
 from holosplat.io.nxtomo import read_scan
 from holosplat.io.volumes import read_volume
+from holosplat.workflows.run_folder import RunFolder
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 

@@ -17,8 +17,8 @@ from holosplat.fit.density import DensityControl
 from holosplat.fit.loop import Fit, FitOptions
 from holosplat.fit.objective import Objective
 from holosplat.fit.schedule import Schedule
-from holosplat.forward import measure
 from holosplat.geometry import Views
+from holosplat.model.instrument import measure
 from holosplat.representations import GaussianCloud, random_cloud
 from holosplat.scan import Exposures, Scan
 

@@ -14,6 +14,7 @@ import torch
 from scipy.ndimage import fourier_gaussian
 from torch import Tensor
 
+from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.fit import objective as terms
 from holosplat.fit.density import DensityControl, GradientRecord, control_density, doomed, outside
@@ -23,8 +24,8 @@ from holosplat.fit.objective import Objective
 from holosplat.fit.schedule import Schedule
 from holosplat.fit.total_variation import total_variation
 from holosplat.fit.trainable import Trainable
-from holosplat.forward import Instrument, simulate
 from holosplat.geometry import Grid, Views, rotation_y
+from holosplat.model.instrument import Instrument
 from holosplat.optics.detector import poisson
 from holosplat.optics.noise import noise_share
 from holosplat.representations import GaussianCloud, random_cloud

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from holosplat.beamline.grow import Growth, SeriesFolder, grow
 from holosplat.checks import InputError
 from holosplat.cli import main
-from holosplat.experiments.grow import Growth, SeriesFolder, grow
 from holosplat.io.pvd import TimeStep, read_pvd, write_pvd
 from holosplat.io.vtk import read_meshes
 from holosplat.specimens.membrane.model import Elasticity

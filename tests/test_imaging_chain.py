@@ -13,14 +13,12 @@ import numpy as np
 import pytest
 
 import holosplat.io.scan_file as scan_file
+from holosplat.beamline.polychromatic import polychromatic_frames, read_spectrum, refilled
+from holosplat.beamline.record import RecordingOptions, record
+from holosplat.beamline.scenes import Filling
+from holosplat.beamline.simulate import Simulation, simulate
 from holosplat.checks import InputError
 from holosplat.cli import main
-from holosplat.experiments.correct import CorrectionOptions, correct
-from holosplat.experiments.join import join
-from holosplat.experiments.polychromatic import polychromatic_frames, read_spectrum, refilled
-from holosplat.experiments.record import RecordingOptions, record
-from holosplat.experiments.simulate import Filling
-from holosplat.forward import Simulation, simulate
 from holosplat.geometry import Views, rotation_y
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.scan_file import DARK, FLAT, PROJECTION, open_scan
@@ -34,6 +32,8 @@ from holosplat.scan import Exposures, Scan
 from holosplat.specimens.mesh_series import MeshSeries
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
+from holosplat.workflows.correct import CorrectionOptions, correct
+from holosplat.workflows.join import join
 
 PIXEL, SHAPE = 3.2e-6, (65, 80)
 STEADY = Illumination(0.0, structure=0.0, variation=0.0, components=0, pointing=0.0, beam_width=1e3)

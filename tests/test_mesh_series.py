@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from holosplat.beamline.scenes import Filling
+from holosplat.beamline.series import SeriesFiles, Timing, held_out, read_series
+from holosplat.beamline.simulate import Shutter
 from holosplat.checks import InputError
-from holosplat.experiments.series import SeriesFiles, Timing, held_out, read_series
-from holosplat.experiments.simulate import Filling
-from holosplat.forward import Shutter
 from holosplat.geometry import Grid, Views
 from holosplat.io.snapshots import find_snapshots
 from holosplat.io.vtk import read_meshes, write_mesh

@@ -16,19 +16,12 @@ import torch
 from scipy.special import fresnel
 from torch import Tensor
 
+from holosplat.beamline.simulate import SIMULATED_FRINGE_SAMPLES, simulate
 from holosplat.checks import InputError
-from holosplat.forward import (
-    GUARD_PX,
-    SIMULATED_FRINGE_SAMPLES,
-    Instrument,
-    measure,
-    padding,
-    resolving_oversample,
-    simulate,
-)
 from holosplat.geometry import Grid, Views
 from holosplat.materials import DeltaBeta
 from holosplat.mesh import TriangleMesh
+from holosplat.model.instrument import Instrument, measure
 from holosplat.optics import (
     bin_pixels,
     blur,
@@ -40,6 +33,7 @@ from holosplat.optics import (
     poisson,
 )
 from holosplat.optics.detector import gaussian_transfer
+from holosplat.optics.sampling import GUARD_PX, padding, resolving_oversample
 from holosplat.scan import Exposures
 from holosplat.specimens.red_cells import icosphere
 from holosplat.specimens.scene import MeshScene

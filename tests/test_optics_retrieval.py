@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from holosplat.checks import InputError
-from holosplat.forward import Instrument
 from holosplat.geometry import Views
+from holosplat.model.instrument import Instrument
 from holosplat.optics.noise import wavelet_noise
 from holosplat.optics.retrieval import (
     ADMM,

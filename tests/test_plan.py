@@ -16,13 +16,13 @@ import torch
 
 from holosplat.checks import InputError
 from holosplat.cli import main
-from holosplat.experiments.contrast import Setup, Subject, signal_to_noise_squared, visibility
-from holosplat.experiments.plan import Recording, crowther_limit, plan, survey
-from holosplat.forward import measure
 from holosplat.geometry import Views
 from holosplat.io.vtk import write_mesh
 from holosplat.materials import HAEMOGLOBIN, PLASMA, RED_CELL, WATER, Compound, DeltaBeta
 from holosplat.mesh import TriangleMesh
+from holosplat.model.instrument import measure
+from holosplat.planning.contrast import Setup, Subject, signal_to_noise_squared, visibility
+from holosplat.planning.plan import Recording, crowther_limit, plan, survey
 from holosplat.report.plan import survey_figure
 from holosplat.scan import Exposures
 from holosplat.specimens.red_cells import evans_fung_cell, icosphere

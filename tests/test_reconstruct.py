@@ -14,29 +14,31 @@ import numpy as np
 import pytest
 import torch
 
-import holosplat.experiments.reconstruct as module
+import holosplat.workflows.reconstruct as module
 from holosplat import native
 from holosplat.baselines import HolographicTV
+from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
-from holosplat.experiments.evaluate import evaluate, material_found, render
-from holosplat.experiments.reconstruct import Reconstruction, load_reconstruction, reconstruct
-from holosplat.experiments.run_folder import RunFolder, scan_hash
-from holosplat.experiments.settings import MaterialPrior, Settings, from_plain, preset, presets, read_settings
-from holosplat.experiments.start import starting_cloud
 from holosplat.fit.density import DensityControl
 from holosplat.fit.loop import FitOptions
 from holosplat.fit.objective import Objective
 from holosplat.fit.schedule import Schedule
 from holosplat.fit.trainable import Trainable
-from holosplat.forward import Instrument, measure, simulate
 from holosplat.geometry import Grid, Views
 from holosplat.materials import HAEMOGLOBIN, DeltaBeta
+from holosplat.model.instrument import Instrument, measure
 from holosplat.representations import GaussianCloud
 from holosplat.representations.gaussians import PARAMETERS, raw_of
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
 from holosplat.volume import Volume
+from holosplat.workflows.evaluate import evaluate, material_found, render
+from holosplat.workflows.provenance import scan_hash
+from holosplat.workflows.reconstruct import Reconstruction, load_reconstruction, reconstruct
+from holosplat.workflows.run_folder import RunFolder
+from holosplat.workflows.settings import MaterialPrior, Settings, from_plain, preset, presets, read_settings
+from holosplat.workflows.start import starting_cloud
 
 PIXEL = 3.2e-6
 SHAPE = (40, 48)
@@ -226,7 +228,7 @@ def test_so_is_the_occupancy_of_the_start(scan, monkeypatch, prior, upper):
         begun.append(options)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("holosplat.experiments.start.holographic_tv", begin)
+    monkeypatch.setattr("holosplat.workflows.start.holographic_tv", begin)
     with pytest.raises(KeyboardInterrupt):
         starting_cloud(scan.train(), prior, SMALL, 0, lambda stage, part: None)
     assert [options.upper for options in begun] == [upper]

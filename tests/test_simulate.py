@@ -12,15 +12,16 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import holosplat.io.volumes as volumes
+from holosplat.beamline.misalignment import Misalignment
+from holosplat.beamline.poses import GEOMETRIES, Directions
+from holosplat.beamline.simulate import Shutter, Simulation, simulate, simulated_frames
 from holosplat.checks import InputError
-from holosplat.experiments.misalignment import Misalignment
-from holosplat.experiments.poses import GEOMETRIES, Directions
-from holosplat.forward import Shutter, Simulation, measure, simulate, simulated_frames
 from holosplat.geometry import Grid, Views, rotation_tilted
 from holosplat.io.nxtomo import read_scan, scan_writer, write_scan
 from holosplat.io.volumes import read_volume, write_voxels
 from holosplat.materials import DeltaBeta
 from holosplat.mesh import TriangleMesh
+from holosplat.model.instrument import measure
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.mesh_series import MeshSeries
 from holosplat.specimens.red_cells import icosphere

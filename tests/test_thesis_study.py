@@ -9,13 +9,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from holosplat.bench import case as bench_case
+from holosplat.bench.case import Case
 from holosplat.checks import InputError
 from holosplat.cli import thesis as command
-from holosplat.experiments import thesis_study
-from holosplat.experiments.bench import case as bench_case
-from holosplat.experiments.bench.case import Case
-from holosplat.experiments.settings import MaterialPrior, preset
-from holosplat.experiments.thesis_findings import (
+from holosplat.fit.loop import DivergedError, Fit
+from holosplat.geometry import Grid, Views
+from holosplat.materials import HAEMOGLOBIN, WATER
+from holosplat.mesh import TriangleMesh
+from holosplat.scan import Exposures, interleaved_split
+from holosplat.specimens.red_cells import icosphere
+from holosplat.specimens.scene import MeshScene
+from holosplat.thesis import pages as report
+from holosplat.thesis import study as thesis_study
+from holosplat.thesis.findings import (
     findings,
     frcm_peaks_early,
     low_frcm,
@@ -23,7 +30,8 @@ from holosplat.experiments.thesis_findings import (
     more_gaussians_hurt,
     psnr_misleads,
 )
-from holosplat.experiments.thesis_study import (
+from holosplat.thesis.pages import LINES, study_markdown, write_study
+from holosplat.thesis.study import (
     CURVES,
     EXTRA,
     PACES,
@@ -39,16 +47,8 @@ from holosplat.experiments.thesis_study import (
     random_start,
     run_study,
 )
-from holosplat.fit.loop import DivergedError, Fit
-from holosplat.geometry import Grid, Views
-from holosplat.materials import HAEMOGLOBIN, WATER
-from holosplat.mesh import TriangleMesh
-from holosplat.report import thesis as report
-from holosplat.report.thesis import LINES, study_markdown, write_study
-from holosplat.scan import Exposures, interleaved_split
-from holosplat.specimens.red_cells import icosphere
-from holosplat.specimens.scene import MeshScene
 from holosplat.volume import Volume
+from holosplat.workflows.settings import MaterialPrior, preset
 
 PIXEL = 1e-6
 SHAPE = (15, 22)

@@ -12,19 +12,15 @@ from scipy.ndimage import gaussian_filter
 from holosplat import native
 from holosplat.baselines import HolographicTV
 from holosplat.baselines.two_materials import Levels, Shares, absorption, at_one_ratio, told_apart, two_levels
+from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
-from holosplat.experiments.evaluate import evaluate
-from holosplat.experiments.reconstruct import load_reconstruction, reconstruct
-from holosplat.experiments.run_folder import RunFolder, read_gaussians, write_gaussians
-from holosplat.experiments.settings import MaterialPrior, Settings, preset
-from holosplat.experiments.start import starting_cloud
-from holosplat.experiments.surfaces import extract_surfaces
 from holosplat.fit import objective as terms
-from holosplat.forward import Instrument, measure, simulate
 from holosplat.geometry import Grid, Views
+from holosplat.io.gaussians import read_gaussians, write_gaussians
 from holosplat.io.json import read_json
 from holosplat.io.nxtomo import write_scan
 from holosplat.materials import Compound, DeltaBeta
+from holosplat.model.instrument import Instrument, measure
 from holosplat.representations import GaussianCloud, VoxelLines, approximate, cloud_from_two
 from holosplat.representations.gaussians import raw_of
 from holosplat.scan import Exposures, Scan
@@ -32,6 +28,12 @@ from holosplat.specimens.capsules import place_capsules
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
 from holosplat.volume import LineIntegrals
+from holosplat.workflows.evaluate import evaluate
+from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
+from holosplat.workflows.run_folder import RunFolder
+from holosplat.workflows.settings import MaterialPrior, Settings, preset
+from holosplat.workflows.start import starting_cloud
+from holosplat.workflows.surfaces import extract_surfaces
 from test_cli import holosplat, refused, worked
 
 PIXEL = 1e-6

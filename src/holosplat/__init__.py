@@ -9,7 +9,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from .version import __version__ as __version__
 
 _WHERE = {
     "checks": ("InputError",),
@@ -21,7 +21,8 @@ _WHERE = {
     "optics.camera": ("Camera",),
     "optics.coherence": ("Spectrum", "effective_geometry", "source_blur"),
     "optics.illumination": ("Illumination",),
-    "forward": ("Instrument", "Shutter", "Simulation", "measure", "simulate", "simulated_frames"),
+    "model.instrument": ("Instrument", "measure"),
+    "beamline.simulate": ("Shutter", "Simulation", "simulate", "simulated_frames"),
     "specimens.scene": ("MeshScene",),
     "specimens.mesh_series": ("MeshSeries",),
     "specimens.red_cells": ("evans_fung_cell", "random_cells"),
@@ -36,20 +37,20 @@ _WHERE = {
     "io.volumes": ("read_volume", "write_volume", "write_voxels"),
     "io.vtk": ("read_meshes", "write_mesh"),
     "io.pvd": ("read_pvd", "write_pvd"),
-    "experiments.contrast": ("Setup", "Subject"),
-    "experiments.grow": ("Growth", "grow"),
-    "experiments.plan": ("Recording", "plan", "survey"),
-    "experiments.settings": ("MaterialPrior", "Settings", "preset"),
-    "experiments.simulate": ("Filling", "read_scene"),
-    "experiments.record": ("RecordingOptions", "record"),
-    "experiments.correct": ("CorrectionOptions", "correct"),
-    "experiments.join": ("join",),
-    "experiments.series": ("SeriesFiles", "Timing", "read_series"),
-    "experiments.misalignment": ("Misalignment",),
-    "experiments.run_folder": ("RunFolder",),
-    "experiments.reconstruct": ("Reconstruction", "load_reconstruction", "reconstruct"),
-    "experiments.evaluate": ("Evaluation", "evaluate", "render"),
-    "experiments.surfaces": ("SurfaceSettings", "refine_surfaces"),
+    "planning.contrast": ("Setup", "Subject"),
+    "beamline.grow": ("Growth", "grow"),
+    "planning.plan": ("Recording", "plan", "survey"),
+    "workflows.settings": ("MaterialPrior", "Settings", "preset"),
+    "beamline.scenes": ("Filling", "read_scene"),
+    "beamline.record": ("RecordingOptions", "record"),
+    "workflows.correct": ("CorrectionOptions", "correct"),
+    "workflows.join": ("join",),
+    "beamline.series": ("SeriesFiles", "Timing", "read_series"),
+    "beamline.misalignment": ("Misalignment",),
+    "workflows.run_folder": ("RunFolder",),
+    "workflows.reconstruct": ("Reconstruction", "load_reconstruction", "reconstruct"),
+    "workflows.evaluate": ("Evaluation", "evaluate", "render"),
+    "workflows.surfaces": ("SurfaceSettings", "refine_surfaces"),
 }
 _MODULE_OF = {name: module for module, names in _WHERE.items() for name in names}
 
@@ -67,43 +68,21 @@ def __dir__() -> list[str]:
 
 
 if TYPE_CHECKING:
+    from .beamline.grow import Growth as Growth
+    from .beamline.grow import grow as grow
+    from .beamline.misalignment import Misalignment as Misalignment
+    from .beamline.record import RecordingOptions as RecordingOptions
+    from .beamline.record import record as record
+    from .beamline.scenes import Filling as Filling
+    from .beamline.scenes import read_scene as read_scene
+    from .beamline.series import SeriesFiles as SeriesFiles
+    from .beamline.series import Timing as Timing
+    from .beamline.series import read_series as read_series
+    from .beamline.simulate import Shutter as Shutter
+    from .beamline.simulate import Simulation as Simulation
+    from .beamline.simulate import simulate as simulate
+    from .beamline.simulate import simulated_frames as simulated_frames
     from .checks import InputError as InputError
-    from .experiments.contrast import Setup as Setup
-    from .experiments.contrast import Subject as Subject
-    from .experiments.correct import CorrectionOptions as CorrectionOptions
-    from .experiments.correct import correct as correct
-    from .experiments.evaluate import Evaluation as Evaluation
-    from .experiments.evaluate import evaluate as evaluate
-    from .experiments.evaluate import render as render
-    from .experiments.grow import Growth as Growth
-    from .experiments.grow import grow as grow
-    from .experiments.join import join as join
-    from .experiments.misalignment import Misalignment as Misalignment
-    from .experiments.plan import Recording as Recording
-    from .experiments.plan import plan as plan
-    from .experiments.plan import survey as survey
-    from .experiments.reconstruct import Reconstruction as Reconstruction
-    from .experiments.reconstruct import load_reconstruction as load_reconstruction
-    from .experiments.reconstruct import reconstruct as reconstruct
-    from .experiments.record import RecordingOptions as RecordingOptions
-    from .experiments.record import record as record
-    from .experiments.run_folder import RunFolder as RunFolder
-    from .experiments.series import SeriesFiles as SeriesFiles
-    from .experiments.series import Timing as Timing
-    from .experiments.series import read_series as read_series
-    from .experiments.settings import MaterialPrior as MaterialPrior
-    from .experiments.settings import Settings as Settings
-    from .experiments.settings import preset as preset
-    from .experiments.simulate import Filling as Filling
-    from .experiments.simulate import read_scene as read_scene
-    from .experiments.surfaces import SurfaceSettings as SurfaceSettings
-    from .experiments.surfaces import refine_surfaces as refine_surfaces
-    from .forward import Instrument as Instrument
-    from .forward import Shutter as Shutter
-    from .forward import Simulation as Simulation
-    from .forward import measure as measure
-    from .forward import simulate as simulate
-    from .forward import simulated_frames as simulated_frames
     from .geometry import Grid as Grid
     from .geometry import Views as Views
     from .io.nxtomo import read_scan as read_scan
@@ -125,11 +104,18 @@ if TYPE_CHECKING:
     from .materials import Mixture as Mixture
     from .materials import parse_material as parse_material
     from .mesh import TriangleMesh as TriangleMesh
+    from .model.instrument import Instrument as Instrument
+    from .model.instrument import measure as measure
     from .optics.camera import Camera as Camera
     from .optics.coherence import Spectrum as Spectrum
     from .optics.coherence import effective_geometry as effective_geometry
     from .optics.coherence import source_blur as source_blur
     from .optics.illumination import Illumination as Illumination
+    from .planning.contrast import Setup as Setup
+    from .planning.contrast import Subject as Subject
+    from .planning.plan import Recording as Recording
+    from .planning.plan import plan as plan
+    from .planning.plan import survey as survey
     from .representations.gaussians import GaussianCloud as GaussianCloud
     from .representations.surfaces import SurfaceMesh as SurfaceMesh
     from .scan import Exposures as Exposures
@@ -149,3 +135,18 @@ if TYPE_CHECKING:
     from .volume import LineIntegrals as LineIntegrals
     from .volume import Object as Object
     from .volume import Volume as Volume
+    from .workflows.correct import CorrectionOptions as CorrectionOptions
+    from .workflows.correct import correct as correct
+    from .workflows.evaluate import Evaluation as Evaluation
+    from .workflows.evaluate import evaluate as evaluate
+    from .workflows.evaluate import render as render
+    from .workflows.join import join as join
+    from .workflows.reconstruct import Reconstruction as Reconstruction
+    from .workflows.reconstruct import load_reconstruction as load_reconstruction
+    from .workflows.reconstruct import reconstruct as reconstruct
+    from .workflows.run_folder import RunFolder as RunFolder
+    from .workflows.settings import MaterialPrior as MaterialPrior
+    from .workflows.settings import Settings as Settings
+    from .workflows.settings import preset as preset
+    from .workflows.surfaces import SurfaceSettings as SurfaceSettings
+    from .workflows.surfaces import refine_surfaces as refine_surfaces

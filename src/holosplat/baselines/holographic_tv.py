@@ -18,14 +18,15 @@ from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
 from ..checks import at_least
-from ..forward import Instrument, resolving_oversample
 from ..geometry import Grid, Views
 from ..materials import DeltaBeta
 from ..memory import memory_kept
+from ..model.instrument import Instrument
 from ..optics.noise import noise_share
 from ..optics.retrieval import Tikhonov, tikhonov
 from ..optics.retrieval.bounded import MODEL_ERROR, PRIOR
 from ..optics.retrieval.spectra import Raster, filtered, radian, response, spectra, surrounded
+from ..optics.sampling import resolving_oversample
 from ..projectors.voxels import projector_for
 from ..scan import Scan
 from ..volume import LineIntegrals

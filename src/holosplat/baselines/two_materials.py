@@ -19,9 +19,10 @@ from scipy.optimize import nnls
 from torch import Tensor
 from torch.nn.functional import avg_pool3d
 
-from ..forward import Instrument, resolving_oversample
 from ..geometry import Grid
 from ..materials import DeltaBeta
+from ..model.instrument import Instrument
+from ..optics.sampling import resolving_oversample
 from ..projectors.voxels import voxel_line_integrals
 from ..representations.voxel_lines import VoxelLines
 from ..scan import Scan

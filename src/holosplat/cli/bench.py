@@ -10,9 +10,9 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg, subcommand
 
-from ..experiments.bench.folder import BenchFolder
-from ..experiments.bench.method import Method
-from ..experiments.bench.rows import Row
+from ..bench.folder import BenchFolder
+from ..bench.method import Method
+from ..bench.rows import Row
 from .progress import INTERRUPTED, ProgressBar
 from .thesis import thesis
 
@@ -40,10 +40,10 @@ def run(
         retry: Run again what failed.
         list_only: Only list cases and methods.
     """
-    from ..experiments.bench.case import Case, case_names, load_case  # these reach every method
-    from ..experiments.bench.methods import METHODS
-    from ..experiments.bench.references import REFERENCES
-    from ..experiments.bench.run import Suite, chosen, run_suite
+    from ..bench.case import Case, case_names, load_case  # these reach every method
+    from ..bench.methods import METHODS
+    from ..bench.references import REFERENCES
+    from ..bench.run import Suite, chosen, run_suite
 
     if list_only:
         _list(case_names(), METHODS)
@@ -74,7 +74,7 @@ def report(folder: Positional[Path] = Path("bench")) -> None:
     Args:
         folder: Folder of the benchmark, which may be unfinished.
     """
-    from ..report.bench import write_bench_report  # matplotlib is slow to import
+    from ..bench.pages.report import write_bench_report  # matplotlib is slow to import
 
     for path in write_bench_report(BenchFolder(folder)):
         _say(f"wrote {path}")

@@ -12,16 +12,8 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import OmitArgPrefixes, Positional, arg
 
-from .. import __version__
 from ..backends import DESCRIPTIONS, device_name, missing, resolve, support_table
 from ..checks import InputError, in_range, require
-from ..experiments.demo import DETECTOR, write_demo_meshes
-from ..experiments.evaluate import Evaluation
-from ..experiments.evaluate import evaluate as score
-from ..experiments.evaluate import render as predict
-from ..experiments.reconstruct import load_reconstruction
-from ..experiments.reconstruct import reconstruct as fit
-from ..experiments.run_folder import RunFolder, scan_hash
 from ..geometry import Grid
 from ..io.atomic import require_writable
 from ..io.json import read_json, write_json
@@ -29,6 +21,15 @@ from ..io.nxtomo import read_scan, write_scan
 from ..io.volumes import read_volume, write_voxels
 from ..report.run import report_run
 from ..scan import PIXEL_RANGE_M, Scan
+from ..version import __version__
+from ..workflows.demo import DETECTOR, write_demo_meshes
+from ..workflows.evaluate import Evaluation
+from ..workflows.evaluate import evaluate as score
+from ..workflows.evaluate import render as predict
+from ..workflows.provenance import scan_hash
+from ..workflows.reconstruct import load_reconstruction
+from ..workflows.reconstruct import reconstruct as fit
+from ..workflows.run_folder import RunFolder
 from .bench import bench
 from .convert import convert
 from .grow import grow

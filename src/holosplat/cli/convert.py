@@ -12,7 +12,6 @@ import torch
 from tyro.conf import Positional, arg
 
 from ..checks import InputError, require
-from ..experiments.settings import MaterialPrior
 from ..io.folder import require_new
 from ..io.formats import ScanFormat, format_of
 from ..io.nerf_synthetic import GivenOptics, NerfOptions, grey_range, read_nerf_synthetic, write_nerf_synthetic
@@ -23,6 +22,7 @@ from ..io.tiff import TiffLayout, read_tiff, write_tiff
 from ..io.volumes import read_volume
 from ..optics import retrieve_thickness
 from ..scan import Scan
+from ..workflows.settings import MaterialPrior
 from .options import PriorOptions
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from ..experiments.grow import Growth, SeriesFolder
-from ..experiments.grow import grow as run
+from ..beamline.grow import Growth, SeriesFolder
+from ..beamline.grow import grow as run
 from .progress import INTERRUPTED, ProgressBar
 
 

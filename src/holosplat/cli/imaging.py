@@ -7,13 +7,14 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from ..experiments.correct import CorrectionOptions
-from ..experiments.correct import correct as correct_file
-from ..experiments.join import join as join_files
-from ..experiments.record import Flip, RecordingOptions
-from ..experiments.record import record as record_file
+from ..beamline.record import RecordingOptions
+from ..beamline.record import record as record_file
 from ..optics.camera import Camera
 from ..optics.illumination import Illumination
+from ..optics.resampling import Flip
+from ..workflows.correct import CorrectionOptions
+from ..workflows.correct import correct as correct_file
+from ..workflows.join import join as join_files
 from .progress import ProgressBar
 
 

@@ -9,16 +9,16 @@ from typing import Literal
 import numpy as np
 
 from ..backends import resolve
+from ..beamline.misalignment import Misalignment
+from ..beamline.poses import Directions, Geometry
+from ..beamline.scenes import Filling
+from ..beamline.series import SeriesFiles, Timing
+from ..beamline.simulate import Shutter, Simulation
 from ..checks import require
-from ..experiments.misalignment import Misalignment
-from ..experiments.poses import Directions, Geometry
-from ..experiments.series import SeriesFiles, Timing
-from ..experiments.settings import MaterialPrior, Settings, preset, read_settings
-from ..experiments.simulate import Filling
-from ..forward import Shutter, Simulation
 from ..io.atomic import require_writable
 from ..materials import DeltaBeta, parse_material, read_material_table
 from ..scan import Exposures, interleaved_split
+from ..workflows.settings import MaterialPrior, Settings, preset, read_settings
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,12 @@ import numpy as np
 from tyro.conf import arg
 
 from ..checks import in_range, require
-from ..experiments.contrast import Setup, Subject
-from ..experiments.plan import Plan, Recording, Survey, survey
-from ..experiments.plan import plan as make_plan
 from ..io.atomic import atomic_path, require_writable
 from ..io.vtk import read_meshes
 from ..mesh import TriangleMesh
+from ..planning.contrast import Setup, Subject
+from ..planning.plan import Plan, Recording, Survey, survey
+from ..planning.plan import plan as make_plan
 from ..scan import DISTANCE_RANGE_M, ENERGY_RANGE_KEV
 from ..specimens.red_cells import evans_fung_cell, icosphere
 from ..specimens.repair import closed

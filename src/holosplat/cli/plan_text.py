@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..experiments.contrast import Setup
-from ..experiments.plan import Motion, Plan, Recording, Sampling, Storage, Survey
+from ..planning.contrast import Setup
+from ..planning.plan import Motion, Plan, Recording, Sampling, Storage, Survey
 
 WIDTH = 38
 MOST_ROWS = 9

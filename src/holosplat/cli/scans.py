@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..experiments.reconstruct import require_one_time
-from ..experiments.run_folder import RunFolder
 from ..io.json import read_json
 from ..io.nxtomo import read_scan
 from ..scan import Scan
+from ..workflows.reconstruct import require_one_time
+from ..workflows.run_folder import RunFolder
 
 
 def at_time(scan: Scan, time_frame: int | str | None) -> Scan:

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 from tyro.conf import Positional
 
+from ..beamline.scenes import Filling, read_scene
+from ..beamline.series import Timing, held_out, read_series
 from ..checks import require
-from ..experiments.series import Timing, held_out, read_series
-from ..experiments.simulate import Filling, read_scene
 from ..geometry import Grid, Views
 from ..io.nxtomo import scan_writer
 from ..io.snapshots import COLLECTION, seeming_snapshots

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ..beamline.polychromatic import polychromatic_frames, read_spectrum, refilled
+from ..beamline.scenes import Filling
+from ..beamline.simulate import Simulation, simulated_frames
 from ..checks import require
-from ..experiments.polychromatic import polychromatic_frames, read_spectrum, refilled
-from ..experiments.simulate import Filling
-from ..forward import Simulation, simulated_frames
 from ..optics.coherence import Spectrum, effective_geometry, joined_blur_px, source_blur
 from ..scan import Exposures
 from ..specimens.mesh_series import MeshSeries

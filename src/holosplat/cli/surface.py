@@ -10,17 +10,18 @@ from typing import Any
 
 from tyro.conf import Positional
 
-from ..experiments.evaluate import Scores, score_object
-from ..experiments.evaluate import evaluate as score
-from ..experiments.reconstruct import load_reconstruction
-from ..experiments.run_folder import RunFolder, scan_hash
-from ..experiments.surfaces import SurfaceSettings, refine_surfaces
 from ..fit.surfaces import oversampling
 from ..io.folder import atomic_folder, require_new
 from ..io.json import write_json
 from ..io.volumes import read_volume
 from ..io.vtk import write_mesh
 from ..representations import SurfaceMesh
+from ..workflows.evaluate import Scores, score_object
+from ..workflows.evaluate import evaluate as score
+from ..workflows.provenance import scan_hash
+from ..workflows.reconstruct import load_reconstruction
+from ..workflows.run_folder import RunFolder
+from ..workflows.surfaces import SurfaceSettings, refine_surfaces
 from .progress import ProgressBar
 from .scans import scan_for
 

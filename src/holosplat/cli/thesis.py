@@ -6,8 +6,8 @@ import sys
 from pathlib import Path
 from typing import Literal
 
-from ..experiments.thesis_study import PACES, Measured, StudyFolder, load_study, run_study
-from ..experiments.thesis_study import configurations as named
+from ..thesis.study import PACES, Measured, StudyFolder, load_study, run_study
+from ..thesis.study import configurations as named
 from .progress import INTERRUPTED, ProgressBar
 
 CASE = "thesis16"
@@ -31,7 +31,7 @@ def thesis(
         snapshots: Folder of simulated cells (VTK files), of which the seed takes one; without, cells are generated.
         seed: Seed of the scene and of the random start.
     """
-    from ..experiments.bench.case import load_case  # reaches every specimen, other commands need none
+    from ..bench.case import load_case  # reaches every specimen, other commands need none
 
     chosen, folder, interrupted = named(configurations), StudyFolder(out), False
     try:
@@ -49,7 +49,7 @@ def thesis(
 
 
 def _report(folder: StudyFolder) -> None:
-    from ..report.thesis import write_study  # matplotlib is slow to import
+    from ..thesis.pages import write_study  # matplotlib is slow to import
 
     for path in write_study(load_study(folder), folder.path):
         _say(f"wrote {path}")

@@ -14,9 +14,10 @@ from torch import Tensor
 
 from ..backends import resolve
 from ..checks import InputError, require
-from ..forward import Instrument, resolving_oversample
 from ..geometry import Grid, Poses
 from ..memory import memory_kept
+from ..model.instrument import Instrument
+from ..optics.sampling import resolving_oversample
 from ..representations.gaussians import GaussianCloud
 from ..scan import Scan
 from . import objective as terms

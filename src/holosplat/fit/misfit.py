@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..forward import Instrument
 from ..geometry import Grid, Poses
+from ..model.instrument import Instrument
 from ..optics.detector import blur
 from ..optics.noise import noise_share, sure_noise
 from ..representations.gaussians import GaussianCloud

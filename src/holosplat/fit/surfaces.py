@@ -12,10 +12,11 @@ from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from ..checks import InputError, at_least, positive, require
-from ..forward import Instrument, resolving_oversample
 from ..geometry import Poses
 from ..memory import memory_kept
+from ..model.instrument import Instrument
 from ..optics.noise import noise_levels, noise_share
+from ..optics.sampling import resolving_oversample
 from ..representations.isosurface import adjacency, neighbour_mean
 from ..representations.surfaces import SurfaceMesh
 from ..scan import Scan

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from ..checks import at_least, require
-from ..forward import resolving_oversample
 from ..geometry import Grid
 from ..memory import memory_kept
+from ..optics.sampling import resolving_oversample
 from ..representations.voxel_lines import VoxelLines
 from ..representations.voxels import VoxelGrid
 from ..scan import Scan

@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from ..checks import require
-from ..forward import Instrument, resolving_oversample
+from ..model.instrument import Instrument
 from ..optics.noise import noise_level
+from ..optics.sampling import resolving_oversample
 from ..scan import Exposures, Scan
 from ..units import wavelength, wavenumber
 from ..volume import LineIntegrals

@@ -10,10 +10,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from .. import __version__
 from ..checks import InputError, finite, require, shaped
 from ..preprocess.flat_field import relative_intensity, unlit
 from ..scan import Exposures, Scan
+from ..version import __version__
 from .atomic import atomic_path
 from .scan_file import ANGLE, DARK, DATA, FLAT, FLIPS, IMAGE_KEY, MASK, PROJECTION, SPLIT, ScanFile, open_scan
 

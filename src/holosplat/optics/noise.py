@@ -12,6 +12,9 @@ NORMAL_MEDIAN = 0.6745
 QUIET_TILE = 0.86
 """What the quiet tiles of pure noise show of its standard deviation (measured on frames of about 96 × 96 pixels)."""
 
+PHOTON_RANGE = (1e-3, 1e15)
+"""Photons a pixel that noise can be simulated for."""
+
 
 def noise_level(images: Tensor) -> float:
     """Standard deviation of white noise on images [V, H, W] of at least 3 × 3 pixels.

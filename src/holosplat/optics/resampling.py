@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import numpy as np
 from scipy.fft import dct
 
 from ..checks import positive
+
+Flip = Literal["none", "rows", "columns", "both"]
+"""How a beam's optics turn its frames over."""
+FLIPS: dict[Flip, tuple[bool, bool]] = {
+    "none": (False, False),
+    "rows": (True, False),
+    "columns": (False, True),
+    "both": (True, True),
+}
+"""For each flip: whether rows, and columns, are read backwards."""
 
 
 class Resampling:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib import resources
 from pathlib import Path
 
 import jinja2
@@ -26,11 +25,7 @@ def write_report(content: ReportContent, path: str | Path) -> Path:
 
 def render_page(content: ReportContent) -> str:
     """`content` as HTML; equal content gives equal text."""
-    source = resources.files(__package__ or "").joinpath("template.html").read_text(encoding="utf-8")
-    environment = jinja2.Environment(
-        autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
-    )
-    return environment.from_string(source).render(
+    return template("template.html").render(
         title=content.title,
         summary=content.summary,
         verdict=verdict(content),
@@ -39,3 +34,16 @@ def render_page(content: ReportContent) -> str:
         scores=score_tables(content),
         records=record_tables(content),
     )
+
+
+def template(name: str, package: str = "") -> jinja2.Template:
+    """The page template `name` of this room or of another `package`; all extend this room's `template.html`."""
+    folders = [jinja2.PackageLoader(folder, "") for folder in (package, __package__ or "") if folder]
+    environment = jinja2.Environment(
+        loader=jinja2.ChoiceLoader(folders),
+        autoescape=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        undefined=jinja2.StrictUndefined,
+    )
+    return environment.get_template(name)

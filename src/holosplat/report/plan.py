@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
-from ..experiments.plan import NEARLY, WANTED_SNR, Survey
+from ..planning.plan import NEARLY, WANTED_SNR, Survey
 from .style import (
     CYCLE,
     FAINT,

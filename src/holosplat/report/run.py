@@ -8,14 +8,14 @@ from typing import Any
 
 import torch
 
-from ..experiments.evaluate import Evaluation
-from ..experiments.reconstruct import Reconstruction
-from ..experiments.run_folder import RunFolder
 from ..geometry import Grid, Views
 from ..projectors.voxels import voxel_line_integrals
 from ..representations import GaussianCloud
 from ..scan import Scan
 from ..volume import Volume
+from ..workflows.evaluate import Evaluation
+from ..workflows.reconstruct import Reconstruction
+from ..workflows.run_folder import RunFolder
 from .content import HeldOutViews, ProjectedMaps, ReportContent, view_labels
 from .page import write_report
 

@@ -1,0 +1,1 @@
+"""A beamline in software: specimens in the beam, pulses, camera, misalignment, series."""

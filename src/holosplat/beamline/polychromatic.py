@@ -1,0 +1,64 @@
+"""Frames of light of many energies: each energy sees its own δ, β and wavelength, and intensities add."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ..checks import InputError, require
+from ..optics.coherence import Spectrum
+from ..optics.detector import poisson
+from ..scan import Exposures
+from ..specimens.mesh_series import MeshSeries
+from ..specimens.scene import MeshScene
+from ..volume import Object
+from .scenes import Filling
+from .simulate import Simulation, simulated_frames
+
+
+def polychromatic_frames(
+    matter_at: Callable[[float], Object], spectrum: Spectrum, exposures: Exposures, how: Simulation
+) -> Iterator[np.ndarray]:
+    """Frames [H, W] float32 as `simulate.simulated_frames`, but of light with a `spectrum`.
+
+    `matter_at(energy_kev)` is the object with its δ and β at that energy. A frame is `Σ w_e I_e`, each energy's
+    intensity relative to its own flat; photon noise comes last. All energies are sampled as the exposures' own is.
+    """
+    quiet = replace(how, photons_per_pixel=None, oversample=how.samples(exposures))
+    parts = [
+        simulated_frames(matter_at(energy), replace(exposures, energy_kev=energy), quiet)
+        for energy in map(float, spectrum.energies_kev)
+    ]
+    noise = np.random.default_rng(how.seed)
+    for of_energies in zip(*parts):
+        frame = np.tensordot(spectrum.weights, np.stack(of_energies), 1)
+        photons = how.photons_per_pixel
+        yield (frame if photons is None else poisson(frame, photons, noise)).astype(np.float32)
+
+
+def refilled(matter: MeshScene | MeshSeries, filling: Filling, energy_kev: float) -> MeshScene | MeshSeries:
+    """The same bodies, filled with their materials' δ and β at `energy_kev` [keV]."""
+    if isinstance(matter, MeshSeries):
+        return replace(matter, snapshots=tuple(_refilled(scene, filling, energy_kev) for scene in matter.snapshots))
+    return _refilled(matter, filling, energy_kev)
+
+
+def _refilled(scene: MeshScene, filling: Filling, energy_kev: float) -> MeshScene:
+    return replace(scene, materials=tuple(filling.of(mesh.name, energy_kev) for mesh in scene.meshes))
+
+
+def read_spectrum(path: Path) -> Spectrum:
+    """A spectrum from a text file of two columns, energy [keV] and weight; `#` begins a comment."""
+    require(path.is_file(), f"--spectrum must name a text file of energies and weights, but {path} does not exist.")
+    try:
+        table = np.loadtxt(path, ndmin=2)
+    except (ValueError, UnicodeDecodeError):
+        table = np.empty((0, 0))
+    if table.shape[1] != 2 or len(table) == 0:
+        raise InputError(
+            f"{path} must hold two columns of numbers, energy [keV] and weight, but it does not; correct it."
+        )
+    return Spectrum(table[:, 0], table[:, 1])

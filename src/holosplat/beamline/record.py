@@ -1,0 +1,195 @@
+"""The camera and the free-electron laser: a scan of relative intensities becomes raw counts, with flats and darks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from ..checks import at_least, in_range, require
+from ..io.atomic import atomic_path, require_apart, require_writable
+from ..io.nxtomo import RawLayout, scan_writer
+from ..io.scan_file import DARK, FLAT, PROJECTION, ScanFile, open_scan
+from ..optics.camera import Camera, Sensor
+from ..optics.coherence import joined_blur_px
+from ..optics.illumination import Illumination, PulseModel, Pulses
+from ..optics.noise import PHOTON_RANGE
+from ..optics.resampling import FLIPS, Flip
+from ..scan import Exposures
+
+DEAD_BIT, HOT_BIT = 1 << 1, 1 << 3
+"""Bits of NeXus' `pixel_mask`: dead, over-responding."""
+
+
+@dataclass(frozen=True)
+class RecordingOptions:
+    """What is recorded, beside the scan itself."""
+
+    photons_per_pixel: float = 10_000.0
+    """Mean photons detected in a pixel without the object."""
+    flats: int = 100
+    """Frames without the object, each of a pulse of its own; they come before the projections."""
+    darks: int = 20
+    """Frames without light; they come first."""
+    flip: Flip = "none"
+    """What the detector sees reversed: the order of its rows, of its columns, or both."""
+    seed: int = 0
+    """Seed of everything random."""
+
+    def __post_init__(self) -> None:
+        in_range("photons_per_pixel", self.photons_per_pixel, *PHOTON_RANGE)
+        at_least(self, 1, "flats", "darks")
+        at_least(self, 0, "seed")
+        require(self.flip in FLIPS, f"flip must be one of {', '.join(FLIPS)}, but it is {self.flip!r}.")
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """What was recorded: numbers of frames, the camera's gain [counts a photon], defective and saturated pixels.
+
+    saturated: the share of the projections' good pixels that are.
+    """
+
+    projections: int
+    flats: int
+    darks: int
+    gain: float
+    defects: int
+    saturated: float
+
+
+@dataclass(frozen=True)
+class _Bench:
+    """All that is drawn once: the sensor, the light, the pulses of flats and projections, and the dice for the rest."""
+
+    sensor: Sensor
+    model: PulseModel
+    flats: Pulses
+    projections: Pulses
+    rng: np.random.Generator
+
+    @classmethod
+    def drawn(cls, file: ScanFile, options: RecordingOptions, camera: Camera, light: Illumination) -> _Bench:
+        shape = file.exposures.views.shape
+        of_sensor, of_model, of_flats, of_projections, rest = np.random.default_rng(options.seed).spawn(5)
+        model = PulseModel.drawn(light, shape, of_model)
+        return cls(
+            Sensor.drawn(camera, shape, options.photons_per_pixel, of_sensor),
+            model,
+            model.pulses(options.flats, of_flats),
+            model.pulses(len(file.exposures), of_projections),
+            rest,
+        )
+
+
+def record(
+    source: Path,
+    out: Path,
+    options: RecordingOptions,
+    camera: Camera,
+    light: Illumination,
+    truth: Path | None = None,
+    on_progress: Callable[[float], None] = lambda fraction: None,
+) -> Recorded:
+    """Record the noise-free scan file `source` as raw counts into `out`: darks, flats, then one pulse a projection.
+
+    The file is NXtomo with `image_key`, uint16, frame by frame. `truth` gets what a reconstruction must not see: the
+    light's mean, components and weights, pulse energies, and the sensor's maps (HDF5). `InputError` when the scan
+    already has photon noise, is raw itself, or holds no light.
+    """
+    for path in (out, truth) if truth else (out,):
+        require_writable(path)
+    require_apart(out, source, *([truth] if truth else []))
+    require_apart(truth or out, source)
+    with open_scan(source) as file:
+        _require_clean(source, file)
+        bench = _Bench.drawn(file, options, camera, light)
+        upright = RawLayout(_kinds(options, len(file.exposures)), _mask(bench.sensor))
+        layout = replace(upright, mask=_flipped(upright.mask, options.flip), flips=FLIPS[options.flip])
+        exposures, is_test = _all_frames(file, options, camera)
+        provenance = file.provenance() | _provenance(options, camera, light)
+        saturated = 0
+        with scan_writer(out, exposures, is_test, provenance, layout) as add:
+            for number, kind in enumerate(layout.kinds):
+                counts = bench.sensor.read_out(_photons(bench, file, options, number), bench.rng)
+                if kind == PROJECTION:
+                    saturated += int((counts[~bench.sensor.defects] == camera.most).sum())
+                add(_flipped(counts, options.flip))
+                on_progress((number + 1) / len(layout.kinds))
+        if truth is not None:
+            _write_truth(truth, bench, options)
+        good = len(file.exposures) * int((~bench.sensor.defects).sum())
+    defects = int(bench.sensor.defects.sum())
+    gain = camera.gain_for(options.photons_per_pixel)
+    return Recorded(
+        len(exposures) - options.flats - options.darks, options.flats, options.darks, gain, defects, saturated / good
+    )
+
+
+def _require_clean(source: Path, file: ScanFile) -> None:
+    """`InputError` unless the frames are noise-free relative intensities."""
+    only = bool((file.kinds == PROJECTION).all())
+    require(only, f"{source} must hold projections only, but it has flats, darks or invalid frames: it is raw already.")
+    photons = file.provenance().get("photons_per_pixel", "none")
+    require(
+        photons == "none",
+        f"{source} must be noise-free, but it has the noise of {photons} photons; simulate it without.",
+    )
+
+
+def _photons(bench: _Bench, file: ScanFile, options: RecordingOptions, number: int) -> np.ndarray:
+    """Photons [H, W] expected in frame `number` of all: darks first, then flats, then projections."""
+    shape = file.exposures.views.shape
+    flat, projection = number - options.darks, number - options.darks - options.flats
+    if flat < 0:
+        return np.zeros(shape)
+    if projection < 0:
+        return options.photons_per_pixel * bench.model.light(bench.flats, flat)
+    relative = np.clip(file.frame(projection), 0, None)
+    return options.photons_per_pixel * bench.model.light(bench.projections, projection) * relative
+
+
+def _kinds(options: RecordingOptions, projections: int) -> np.ndarray:
+    return np.repeat([DARK, FLAT, PROJECTION], [options.darks, options.flats, projections])
+
+
+def _all_frames(file: ScanFile, options: RecordingOptions, camera: Camera) -> tuple[Exposures, np.ndarray]:
+    """Exposures and split of all frames; darks and flats, which have no pose, repeat those of the first projection."""
+    before, exposures = options.darks + options.flats, file.exposures
+    blurred = joined_blur_px(exposures.psf_sigma_px, camera.scintillator_px, 1.0)
+    index = np.concatenate([np.zeros(before, dtype=int), np.arange(len(exposures))])
+    is_test = np.concatenate([np.zeros(before, dtype=bool), file.is_test])
+    return replace(exposures, psf_sigma_px=blurred)[index], is_test
+
+
+def _mask(sensor: Sensor) -> np.ndarray:
+    return DEAD_BIT * sensor.dead.astype(np.uint32) + HOT_BIT * sensor.hot.astype(np.uint32)
+
+
+def _flipped(image: np.ndarray, flip: Flip) -> np.ndarray:
+    rows, columns = FLIPS[flip]
+    return image[:: -1 if rows else 1, :: -1 if columns else 1]
+
+
+def _provenance(options: RecordingOptions, camera: Camera, light: Illumination) -> dict[str, str]:
+    """What was asked for; what was drawn is in the truth file only."""
+    return {
+        f"{name}.{key}": str(value)
+        for name, group in (("recorded", options), ("camera", camera), ("illumination", light))
+        for key, value in vars(group).items()
+    } | {"photons_per_pixel": f"{options.photons_per_pixel:g}"}
+
+
+def _write_truth(path: Path, bench: _Bench, options: RecordingOptions) -> None:
+    """What was drawn, upright: light, pulses and sensor."""
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs["photons_per_pixel"] = options.photons_per_pixel
+        for name in ("mean", "components", "deviations"):
+            file[f"light/{name}"] = getattr(bench.model, name)
+        for name, pulses in (("flats", bench.flats), ("projections", bench.projections)):
+            file[f"{name}/energy"], file[f"{name}/weights"] = pulses.energy, pulses.weights
+        for name in ("gain", "offset", "dead", "hot"):
+            file[f"sensor/{name}"] = getattr(bench.sensor, name)

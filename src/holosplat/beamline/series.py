@@ -1,0 +1,116 @@
+"""From snapshots of moving bodies to a time-resolved scan: what `holosplat simulate --frame-rate` does."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ..checks import in_range, require
+from ..io.snapshots import find_snapshots
+from ..specimens.mesh_series import ROUNDING, MeshSeries
+from ..units import LENGTH_UNITS, unit_factor
+from .scenes import Filling, field_centre, filled_scene
+from .simulate import Shutter
+
+FRAME_RATE_RANGE = (1e-6, 1e12)
+MOST_TIMES = 1_000_000
+
+
+@dataclass(frozen=True)
+class Timing:
+    """When frames are taken: frame_rate [Hz]; frames: how many times, or as many as the snapshots cover; start: the
+    first one's time after the first snapshot [s], or the earliest whose pulses all lie within the snapshots; shutter:
+    motion blur about each time. Errors: `InputError` for a rate or count out of range, or a start below 0."""
+
+    frame_rate: float
+    frames: int | None = None
+    start: float | None = None
+    shutter: Shutter = field(default_factory=Shutter)
+
+    def __post_init__(self) -> None:
+        in_range("frame rate", self.frame_rate, *FRAME_RATE_RANGE, unit="Hz")
+        if self.frames is not None:
+            require(
+                1 <= self.frames <= MOST_TIMES, f"frames must lie between 1 and {MOST_TIMES}, but it is {self.frames}."
+            )
+        early = self.start is not None and not (np.isfinite(self.start) and self.start >= 0)
+        require(not early, f"start must be 0 seconds or more after the first snapshot, but it is {self.start}.")
+
+    def times(self, length: float) -> np.ndarray:
+        """Times [T] of the frames [s] after the first of snapshots that last `length` [s]; `InputError` if too few."""
+        before = after = float(self.shutter.offsets[-1])
+        start = before if self.start is None else self.start
+        slack = ROUNDING * length
+        require(
+            start >= before - slack, f"start must be at least {before:g} s, half the pulses, but it is {start:g} s."
+        )
+        room = int(np.floor((length - after - start + slack) * self.frame_rate)) + 1
+        room = min(max(room, 0), MOST_TIMES)
+        count = room if self.frames is None else self.frames
+        require(
+            1 <= count <= room,
+            f"the snapshots last {length:g} s, in which there is room for {room} frames at {self.frame_rate:g} Hz from "
+            f"{start:g} s on, but {count} are asked for; ask for fewer, or a higher rate.",
+        )
+        return start + np.arange(count) / self.frame_rate
+
+
+@dataclass(frozen=True)
+class SeriesFiles:
+    """How files of snapshots are read: length_unit of their coordinates; origin: the point on the rotation axis at the
+    field's centre, in that unit (default: the middle of what the bodies sweep); interval: seconds from one snapshot to
+    the next (default: as the files say); time_unit: of a collection's time steps; period: edges of the periodic box
+    that the bodies were folded into, in `length_unit`, 0 where it is not periodic (default: none is expected)."""
+
+    length_unit: str = "um"
+    origin: tuple[float, float, float] | None = None
+    interval: float | None = None
+    time_unit: str | None = None
+    period: tuple[float, float, float] | None = None
+
+
+def read_series(
+    paths: Sequence[Path],
+    filling: Filling,
+    energy_kev: float,
+    timing: Timing,
+    files: SeriesFiles = SeriesFiles(),
+    on_progress: Callable[[float], None] = lambda fraction: None,
+) -> tuple[MeshSeries, np.ndarray]:
+    """The moving bodies, filled and centred, and the times [T] of the frames [s], of which the first is 0.
+
+    Only the snapshots that the frames need are read (`io.snapshots.find_snapshots` says how files are named). Errors:
+    `InputError` for what cannot be read, bodies that change their triangles, or jump (`MeshSeries`), and times beyond
+    the snapshots. `on_progress(fraction)` is called after each snapshot.
+    """
+    snapshots = find_snapshots(paths, files.interval, files.time_unit)
+    taken = np.array([snapshot.time - snapshots[0].time for snapshot in snapshots])
+    times = timing.times(float(taken[-1]))
+    needed = _needed(taken, times[0] + timing.shutter.offsets[0], times[-1] + timing.shutter.offsets[-1])
+    scenes = []
+    for n, snapshot in enumerate(snapshots[needed]):
+        scenes.append(filled_scene(snapshot.files, filling, energy_kev, files.length_unit))
+        on_progress((n + 1) / len(snapshots[needed]))
+    series = MeshSeries(tuple(scenes), taken[needed])
+    if files.period is None:
+        series.require_continuous()
+    else:
+        series = series.unfolded(unit_factor("length unit", files.length_unit, LENGTH_UNITS) * np.array(files.period))
+    series = series.moved(-field_centre(series.bounds, files.origin, files.length_unit))
+    return series.delayed(-float(times[0])), times - times[0]
+
+
+def held_out(split: np.ndarray, views: int, times: int, what: Literal["views", "times"]) -> np.ndarray:
+    """[times · views] bool: `split` of the views, the same at all times, or of the times, all their views."""
+    return np.tile(split, times) if what == "views" else np.repeat(split, views)
+
+
+def _needed(taken: np.ndarray, first: float, last: float) -> slice:
+    """The snapshots between which the times from `first` to `last` lie."""
+    slack = ROUNDING * taken[-1]
+    start = max(int(np.searchsorted(taken, first + slack, side="right")) - 1, 0)
+    return slice(start, int(np.searchsorted(taken, last - slack, side="left")) + 1)

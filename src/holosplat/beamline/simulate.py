@@ -1,0 +1,133 @@
+"""`simulate`: frames of an Object, on a raster fine enough for its fringes, with motion blur and photon noise."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ..checks import in_range, require
+from ..memory import memory_kept
+from ..model.instrument import Instrument
+from ..optics.detector import poisson
+from ..optics.noise import PHOTON_RANGE
+from ..optics.sampling import resolving_oversample
+from ..scan import Exposures, Scan, interleaved_split
+from ..volume import LineIntegrals, Object
+
+SIMULATED_FRINGE_SAMPLES = 8
+"""Samples on the first fringe in simulations: frames of rounded bodies are then right to 0.5 % of their contrast
+(rms); faces exactly along the beam, where the phase jumps, converge more slowly (a few per cent)."""
+MOST_PULSES = 10_000
+
+
+@dataclass(frozen=True)
+class Shutter:
+    """How long a frame gathers light, and when: a train of flashes, each shorter than any motion.
+
+    exposure: its length [s], about the frame's time; pulses: flashes, each in the middle of an equal part of it. A
+    steady beam is many pulses. Errors: `InputError` for a negative length, and for one without the other.
+    """
+
+    exposure: float = 0.0
+    pulses: int = 1
+
+    def __post_init__(self) -> None:
+        require(
+            math.isfinite(self.exposure) and self.exposure >= 0,
+            f"exposure must be 0 seconds or more, but it is {self.exposure:g}; correct it.",
+        )
+        require(
+            1 <= self.pulses <= MOST_PULSES, f"pulses must lie between 1 and {MOST_PULSES}, but it is {self.pulses}."
+        )
+        require(
+            (self.exposure > 0) == (self.pulses > 1),
+            f"motion blur needs both an exposure above 0 s and at least 2 pulses, but they are {self.exposure:g} s and "
+            f"{self.pulses}; give both or neither.",
+        )
+
+    @property
+    def offsets(self) -> np.ndarray:
+        """When the pulses come, [pulses] seconds after the frame's time; their mean is 0."""
+        return ((np.arange(self.pulses) + 0.5) / self.pulses - 0.5) * self.exposure
+
+
+@dataclass(frozen=True)
+class Simulation:
+    """How frames are simulated: photons_per_pixel: mean counts of Poisson noise, or none; seed: of the noise;
+    oversample: samples a pixel, or by default as many as the fringes need; shutter: when light is gathered.
+
+    Errors: `InputError` for photons or a seed out of range.
+    """
+
+    photons_per_pixel: float | None = None
+    seed: int = 0
+    oversample: int | None = None
+    shutter: Shutter = Shutter()
+
+    def __post_init__(self) -> None:
+        if self.photons_per_pixel is not None:
+            in_range("photons_per_pixel", self.photons_per_pixel, *PHOTON_RANGE)
+        require(self.seed >= 0, f"seed must be 0 or more, but it is {self.seed}.")
+
+    def samples(self, exposures: Exposures) -> int:
+        """Samples along a pixel's edge for `exposures`."""
+        return self.oversample or resolving_oversample(exposures, SIMULATED_FRINGE_SAMPLES, at_least=4)
+
+    def provenance(self, exposures: Exposures) -> dict[str, str]:
+        """What a scan file says of how its frames were made."""
+        made_by = {
+            "simulated_with_oversample": str(self.samples(exposures)),
+            "photons_per_pixel": str(self.photons_per_pixel or "none"),
+            "seed": str(self.seed),
+        }
+        shutter = {"exposure_s": f"{self.shutter.exposure:g}", "pulses": str(self.shutter.pulses)}
+        return made_by | (shutter if self.shutter.pulses > 1 else {})
+
+
+def simulated_frames(obj: Object, exposures: Exposures, how: Simulation = Simulation()) -> Iterator[np.ndarray]:
+    """Frames [H, W] float32 of `obj`, one after another: memory is that of one frame, however many there are.
+
+    Plain torch (the `reference` of the optics, which no fit uses) on a fine raster in single precision, 1e-6 of the
+    contrast from double precision. A frame is the mean of the intensities at its pulses, with noise if asked for.
+    """
+    fine, noise = how.samples(exposures), np.random.default_rng(how.seed)
+    with memory_kept():
+        for i, time in enumerate(exposures.time):
+            instrument = Instrument(exposures[[i]], fine, torch.float32, "reference")
+            frame = np.zeros(exposures.views.shape)
+            for offset in how.shutter.offsets:
+                lines = obj.at(float(time + offset)).project(instrument.views)
+                frame += instrument.frames(LineIntegrals.of_any(lines))[0].numpy()
+            frame /= how.shutter.pulses
+            photons = how.photons_per_pixel
+            yield (frame if photons is None else poisson(frame, photons, noise)).astype(np.float32)
+
+
+def simulate(
+    obj: Object,
+    exposures: Exposures,
+    *,
+    photons_per_pixel: float | None = None,
+    seed: int = 0,
+    is_test: np.ndarray | None = None,
+    oversample: int | None = None,
+    shutter: Shutter = Shutter(),
+    on_progress: Callable[[float], None] = lambda fraction: None,
+) -> Scan:
+    """A scan of `obj`, held in memory (`simulated_frames` gives frame by frame): waves on a fine raster, integrated
+    over pixels, then photon noise if asked for.
+
+    is_test: [N] bool, default every fourth frame; oversample: samples per pixel, default from the fringe width;
+    shutter: motion blur; `on_progress(fraction)` is called after each frame.
+    """
+    how = Simulation(photons_per_pixel, seed, oversample, shutter)
+    frames = np.empty((len(exposures), *exposures.views.shape), dtype=np.float32)
+    for i, frame in enumerate(simulated_frames(obj, exposures, how)):
+        frames[i] = frame
+        on_progress((i + 1) / len(exposures))
+    split = interleaved_split(len(exposures)) if is_test is None else is_test
+    return Scan(frames, exposures, split, how.provenance(exposures))

@@ -1,0 +1,85 @@
+"""The scan and the truth of a case, simulated once and kept."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..checks import require
+from ..io.json import read_json, write_json
+from ..io.nxtomo import read_scan, write_scan
+from ..io.volumes import read_volume, write_volume
+from ..scan import Scan
+from ..volume import Volume
+from ..workflows.provenance import scan_hash
+from .case import Case
+
+
+def prepared(case: Case, folder: Path) -> tuple[Scan, Volume]:
+    """The scan and the true volume of `case`: those in `folder`, or else simulated and written there.
+
+    `InputError` if the folder holds another case of that name, or frames that were changed. What is returned was
+    read from the files in either way, so that a benchmark that goes on sees the same bytes as one that begins.
+    """
+    record, scan_file, truth_file = (folder / name for name in ("case.json", "scan.nxs", "truth.h5"))
+    mark = fingerprint(case)
+    if record.is_file():
+        require(
+            read_json(record).get("fingerprint") == mark,
+            f"{folder} holds an earlier {case.name} of seed {case.seed}, other than the present one; "
+            "choose another --out, as their rows cannot be compared.",
+        )
+    else:
+        folder.mkdir(exist_ok=True)
+        write_scan(scan_file, case.scan())
+        write_volume(truth_file, case.truth())
+    scan, truth = read_scan(scan_file), read_volume(truth_file)
+    if not record.is_file():  # last, so that a folder with it is complete
+        write_json(record, {**described(case), "fingerprint": mark, "scan_hash": scan_hash(scan)})
+    whole = read_json(record)["scan_hash"] == scan_hash(scan)
+    require(whole, f"{scan_file} is not the scan that was simulated, its frames were changed; choose another --out.")
+    return scan, truth
+
+
+def fingerprint(case: Case) -> str:
+    """A short hash (SHA-256) of a case: scene, exposures, split, photons, and what methods are told."""
+    exposures, views = case.exposures, case.exposures.views
+    digest = hashlib.sha256()
+    for array in _arrays(case):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    numbers = (views.shape, views.pixel_size, exposures.energy_kev, case.photons, case.prior.as_dict(), case.seed)
+    digest.update(repr((numbers, [tuple(material) for material in case.scene.materials])).encode())
+    return digest.hexdigest()[:16]
+
+
+def _arrays(case: Case) -> Iterable[np.ndarray]:
+    for mesh in case.scene.meshes:
+        yield from (mesh.vertices, mesh.faces)
+    exposures = case.exposures
+    yield from (exposures.views.rotations, exposures.views.shifts)
+    yield from (exposures.distance, exposures.psf_sigma_px, exposures.time, np.asarray(case.is_test, dtype=bool))
+
+
+def described(case: Case) -> dict[str, Any]:
+    """A case in numbers, for the report: how it is measured, and what methods are told."""
+    exposures, views = case.exposures, case.exposures.views
+    return {
+        "case": case.name,
+        "seed": case.seed,
+        "summary": case.summary,
+        "specimen": case.specimen,
+        "detector": list(views.shape),
+        "pixel_size_m": views.pixel_size,
+        "energy_kev": exposures.energy_kev,
+        "distance_m": [float(exposures.distance.min()), float(exposures.distance.max())],
+        "psf_sigma_px": [float(exposures.psf_sigma_px.min()), float(exposures.psf_sigma_px.max())],
+        "training_frames": int(np.count_nonzero(~np.asarray(case.is_test))),
+        "held_out_frames": int(np.count_nonzero(case.is_test)),
+        "shares_axis": views.shares_axis,
+        "photons": case.photons,
+        "prior": case.prior.as_dict(),
+    }

@@ -1,0 +1,1 @@
+"""From matter to frames: the only way that leads there."""

@@ -1,0 +1,1 @@
+"""What an experiment would see, before it is done or simulated."""

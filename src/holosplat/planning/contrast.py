@@ -1,0 +1,252 @@
+"""What one object changes in one frame, and how surely photon noise lets that be seen.
+
+The frame is that of `model.Instrument` in float64 on a raster of its own, made for the object: fine enough for
+the fringes and the object, wide enough for what the fringes reach, and blurred by the pixel in Fourier space. It
+says what a detector sees wherever the object lies on its pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from ..checks import finite, in_range, require
+from ..geometry import Views
+from ..materials import ENERGY_RANGE_KEV, DeltaBeta, Material
+from ..mesh import TriangleMesh
+from ..model.instrument import Instrument
+from ..scan import DISTANCE_RANGE_M, PIXEL_RANGE_M, Exposures
+from ..specimens.scene import MeshScene
+from ..units import wavelength, wavenumber
+from ..volume import LineIntegrals
+
+FINE, COARSE = (8, 32), (4, 16)
+"""Samples on the first fringe's width √(λz), and across the object. SNR² of a red cell is then right to 1 % or 2 %;
+where fringes are so wide that `COARSE` is taken, it costs no more than another 1 %."""
+SAMPLES_A_PIXEL = 16
+"""Finer than this the raster need not be: fringes far narrower than a pixel hardly change a pixel's mean."""
+COMFORTABLE, MOST_SAMPLES = 640, 2048
+"""Samples along the raster's edge: up to the first it is `FINE`, beyond the second there is no frame."""
+MOST_PSF_PX, MOST_SOURCE_ANGLE = 1000.0, 1.0
+SPREAD = 0.9
+"""The part of SNR² within `Visibility.spread`."""
+
+
+@dataclass(frozen=True)
+class Subject:
+    """The one object of a plan: a closed mesh [m] as it lies in the beam (along z), its filling and surroundings.
+
+    material, medium: what fills it and what surrounds it; a medium of None is vacuum.
+    """
+
+    mesh: TriangleMesh
+    material: Material
+    medium: Material | None = None
+
+    def __post_init__(self) -> None:
+        low, high = self.mesh.bounds
+        centred = self.mesh.transformed(np.eye(3), -0.5 * (low + high))
+        require(bool(np.all(high > low)), f"{self.mesh.name} must have an extent along x, y and z; it is flat.")
+        object.__setattr__(self, "mesh", centred)
+
+    @property
+    def extent(self) -> np.ndarray:
+        """Size along `(x, y, z)` [m]."""
+        low, high = self.mesh.bounds
+        return high - low
+
+    @property
+    def diameter(self) -> float:
+        """The larger extent across the beam [m]."""
+        return float(self.extent[:2].max())
+
+    def tilted(self, degrees: float) -> Subject:
+        """The object turned by `degrees` about x, an axis across the beam."""
+        finite("tilt", np.array(degrees))
+        c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+        return replace(self, mesh=self.mesh.transformed(np.array([[1, 0, 0], [0, c, -s], [0, s, c]]), np.zeros(3)))
+
+    def contrast(self, energy_kev: float) -> DeltaBeta:
+        """What the object adds to its medium, Δδ and Δβ, at `energy_kev` [keV]."""
+        inside = self.material.delta_beta(energy_kev)
+        added = inside.against(self.medium.delta_beta(energy_kev)) if self.medium else inside
+        require(
+            added != DeltaBeta(0.0, 0.0),
+            "the object and its medium must differ, but they are the same material; nothing would be seen.",
+        )
+        return added
+
+
+@dataclass(frozen=True)
+class Setup:
+    """How a frame is taken.
+
+    energy_kev [keV]; distance, pixel_size: effective ones, in the sample plane [m]; psf_sigma_px: standard deviation
+    of the detector's Gaussian point-spread function [pixels]; source_angle: standard deviation of the Gaussian source
+    as the object sees it [rad], which blurs by `source_angle × distance`.
+    """
+
+    energy_kev: float = 20.0
+    distance: float = 0.1
+    pixel_size: float = 3.2e-6
+    psf_sigma_px: float = 0.0
+    source_angle: float = 0.0
+
+    def __post_init__(self) -> None:
+        in_range("energy", self.energy_kev, *ENERGY_RANGE_KEV, unit="keV")
+        in_range("propagation distance", self.distance, *DISTANCE_RANGE_M, unit="metres")
+        in_range("pixel size", self.pixel_size, *PIXEL_RANGE_M, unit="metres")
+        for name, high, unit in (("psf_sigma_px", MOST_PSF_PX, "pixels"), ("source_angle", MOST_SOURCE_ANGLE, "rad")):
+            value = getattr(self, name)
+            require(0 <= value <= high, f"{name} must lie between 0 and {high:g} {unit}, but it is {value:g}.")
+
+    @property
+    def fringe(self) -> float:
+        """Width of the first Fresnel fringe, √(λz) [m]."""
+        return math.sqrt(wavelength(self.energy_kev) * self.distance)
+
+    @property
+    def blur_px(self) -> float:
+        """Standard deviation of detector and source together [pixels]."""
+        return math.hypot(self.psf_sigma_px, self.source_angle * self.distance / self.pixel_size)
+
+    def fresnel_number(self, radius: float) -> float:
+        """Fresnel number a²/(λz) of a half-width `radius` [m] (Goodman 2005, *Fourier Optics*, sect. 4.5.1)."""
+        return (radius / self.fringe) ** 2
+
+
+@dataclass(frozen=True)
+class Visibility:
+    """One object in one frame.
+
+    phase: largest phase shift k |Δδ| T [rad]; absorption: largest loss of intensity 1 - exp(-2 k Δβ T), negative
+    where the object absorbs less than its medium; lowest, highest: extremes of the contrast `I - 1` that a pixel
+    can see; rms: root mean square of the contrast over the object's shadow; spread: diameter [m] of the circle about
+    the object's centre that holds 90 % of SNR²;
+    information: [f, f] SNR² at one photon a pixel, for f × f places (y, x) of the object on the pixels, evenly
+    spread over one pixel; middle: [n, n] contrast of the pixels with the object's centre on the corner of four.
+    """
+
+    phase: float
+    absorption: float
+    lowest: float
+    highest: float
+    rms: float
+    spread: float
+    information: np.ndarray
+    middle: np.ndarray
+
+    @property
+    def information_in_the_middle(self) -> float:
+        """SNR² at one photon a pixel, the object's centre on the corner of four pixels (an even detector's middle)."""
+        place = _middle(len(self.information))
+        return float(self.information[place, place])
+
+
+def signal_to_noise_squared(contrast: np.ndarray) -> np.ndarray:
+    """What pixels of `contrast` c = I - 1 [...] add to the squared signal to noise, at one photon a pixel: [...].
+
+    The optimal linear filter's (Hotelling's) `SNR² = Σ Δ² / v`, with Δ the difference of the mean counts with and
+    without the object, and v the mean of their two variances (Barrett & Myers 2004, *Foundations of Image Science*,
+    chap. 13). Counts are Poisson, of mean N and N (1 + c), so `SNR² = N Σ c² / (1 + c/2)`. For weak contrast that is
+    North's matched filter in white noise, N Σ c² (North 1943, reprinted in Proc. IEEE 51, 1016, 1963). The filter,
+    c / (1 + c/2), is ln(1 + c) to second order, which is the likelihood-ratio test of Poisson counts.
+    """
+    return contrast**2 / np.maximum(1 + 0.5 * contrast, 0.5)  # 1 + c is an intensity: below 0 it is rounding
+
+
+def visibility(subject: Subject, setup: Setup) -> Visibility:
+    """What `subject` changes in a frame taken with `setup`; `InputError` if its fringes reach too far to compute."""
+    raster = _raster(subject, setup)
+    added = subject.contrast(setup.energy_kev)
+    thickness, intensity = _frame(subject, setup, added, raster)
+    contrast = _seen_by_pixels(intensity - 1, 1 / raster.factor)
+    blocks, f = raster.count // raster.factor, raster.factor
+    signal = signal_to_noise_squared(contrast)
+    thickest, k = float(thickness.max()), wavenumber(setup.energy_kev)
+    place = _middle(f)
+    return Visibility(
+        phase=k * abs(added.delta) * thickest,
+        absorption=-math.expm1(-2 * k * added.beta * thickest),
+        lowest=float(contrast.min()),
+        highest=float(contrast.max()),
+        rms=float(np.sqrt(np.mean(contrast[thickness > 0] ** 2))),
+        spread=_spread(signal, raster.pitch),
+        information=signal.reshape(blocks, f, blocks, f).sum(axis=(0, 2)),
+        middle=contrast[place::f, place::f],
+    )
+
+
+@dataclass(frozen=True)
+class _Raster:
+    """`count × count` samples of `pitch` [m], `factor` along a pixel's edge; count is a multiple of 2 factor."""
+
+    factor: int
+    count: int
+    pitch: float
+
+
+def _raster(subject: Subject, setup: Setup) -> _Raster:
+    """The raster for one object; see the constants above."""
+    raster = _raster_of(subject, setup, FINE)
+    if raster.count > COMFORTABLE:
+        raster = _raster_of(subject, setup, COARSE)
+    require(
+        raster.count <= MOST_SAMPLES,
+        f"one object and its fringes must fit into {MOST_SAMPLES} samples, but at {setup.distance:g} m and "
+        f"{setup.energy_kev:g} keV they need {raster.count}; take a shorter distance, larger pixels or a smaller "
+        "object.",
+    )
+    return raster
+
+
+def _raster_of(subject: Subject, setup: Setup, samples: tuple[int, int]) -> _Raster:
+    fringe, pixel, narrow = setup.fringe, setup.pixel_size, float(subject.extent[:2].min())
+    wanted = min(fringe / samples[0], narrow / samples[1])
+    finest = min(pixel / SAMPLES_A_PIXEL, narrow / samples[1])
+    factor = math.ceil(pixel / max(wanted, finest))
+    # Detail of frequency f travels sideways by λ z f. Beyond 4 / width the object has little detail left; short
+    # of 2 / √(λz) it travels less than two fringes; and beyond 1 / pixel no detail is seen.
+    frequency = min(1 / pixel, max(4 / narrow, 2 / fringe))
+    half = 0.5 * subject.diameter + fringe**2 * frequency + (4 + 4 * setup.blur_px) * pixel
+    return _Raster(factor, 2 * factor * math.ceil(half / pixel), pixel / factor)
+
+
+def _frame(subject: Subject, setup: Setup, added: DeltaBeta, raster: _Raster) -> tuple[np.ndarray, np.ndarray]:
+    """The object's thickness [m] and the intensity behind it at the raster's samples, both [count, count]."""
+    shift = 0.5 * raster.pitch if raster.factor % 2 == 0 else 0.0  # a sample lies on each pixel's centre
+    shape = (raster.count, raster.count)
+    views = Views(np.eye(3)[None], np.full((1, 2), shift), shape, raster.pitch)
+    sigma = setup.blur_px * raster.factor
+    instrument = Instrument(Exposures.of(views, setup.energy_kev, setup.distance, sigma), 1, torch.float64)
+    _, depth = MeshScene((subject.mesh,), (DeltaBeta(1.0, 0.0),)).project(instrument.views)
+    intensity = instrument.frames(LineIntegrals(depth[:, None], ((added.delta, added.beta),)))[0].numpy()
+    my, mx = instrument.margin
+    return depth[0, my : my + raster.count, mx : mx + raster.count].numpy(), intensity
+
+
+def _seen_by_pixels(image: np.ndarray, frequency_scale: float) -> np.ndarray:
+    """`image` [n, n] averaged over the square pixel about each sample; a sample is `frequency_scale` of a pixel.
+
+    The pixel's transfer function is `sinc(p fx) sinc(p fy)`, exact for what the raster resolves.
+    """
+    n = len(image)
+    rows, columns = (np.sinc(f / frequency_scale) for f in (np.fft.fftfreq(n), np.fft.rfftfreq(n)))
+    return np.fft.irfft2(np.fft.rfft2(image) * rows[:, None] * columns, s=image.shape)
+
+
+def _spread(signal: np.ndarray, pitch: float) -> float:
+    """Diameter [m] of the circle about the middle of `signal` [n, n] that holds `SPREAD` of its sum."""
+    at = np.arange(len(signal)) - 0.5 * (len(signal) - 1)
+    radius = np.hypot(at[:, None], at).reshape(-1)
+    order = np.argsort(radius)
+    inside = np.cumsum(signal.reshape(-1)[order])
+    return 2 * pitch * float(radius[order][np.searchsorted(inside, SPREAD * inside[-1])])
+
+
+def _middle(factor: int) -> int:
+    """Which of `factor` places along a pixel has the object's centre on the pixel's edge (see `_frame`)."""
+    return (factor + 1) // 2 - 1

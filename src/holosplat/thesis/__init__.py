@@ -1,0 +1,1 @@
+"""The study of the thesis that began this project: runs, findings, pages."""

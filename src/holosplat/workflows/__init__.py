@@ -1,0 +1,1 @@
+"""What one does with a scan: correct, join, reconstruct, evaluate."""

@@ -1,0 +1,196 @@
+"""`evaluate`: a reconstruction, or any Object, against held-out frames and the true volume."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..checks import require
+from ..geometry import Grid
+from ..materials import DeltaBeta
+from ..metrics import ImageScores, VolumeScores, image_scores, intensity_range, volume_scores
+from ..metrics.images import json_number
+from ..model.instrument import Instrument
+from ..representations import GaussianCloud
+from ..scan import Exposures, Scan
+from ..volume import Object, Volume
+from .reconstruct import Reconstruction
+
+MOST_VOXELS = 8_000_000
+"""Voxels of the volume on which the material is read off, at most."""
+
+
+@dataclass(frozen=True)
+class MaterialFound:
+    """What the cloud says about the matter: mass-weighted medians of δ over its volume, and of δ/β in the matter; or
+    those of the one material, or the two (`second`: the lighter one's), that it is made of."""
+
+    delta: float
+    ratio: float
+    single_material: bool
+    second: DeltaBeta | None = None
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Scores on held-out and training frames and against the true volume; None: nothing to compare.
+
+    predicted: the held-out frames [T, H, W] as the object gives them.
+    """
+
+    test: ImageScores | None
+    train: ImageScores | None
+    volume: VolumeScores | None
+    predicted: np.ndarray | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """The numbers, ready for JSON."""
+        parts = {"test": self.test, "train": self.train, "volume": self.volume}
+        scores: dict[str, Any] = {name: part.as_dict() if part else None for name, part in parts.items()}
+        return {**{k: json_number(v) for k, v in self.headline().items()}, **scores}
+
+    def headline(self) -> dict[str, float]:
+        """The few numbers that matter: means over held-out frames, and the volume's."""
+        numbers = dict(self.test.mean) if self.test else {}
+        if self.volume:
+            names = ("dice", "relative_error_delta", "mean_delta", "true_mean_delta")
+            numbers |= {name: float(getattr(self.volume, name)) for name in names}
+        return numbers
+
+    def lines(self) -> list[str]:
+        """The numbers as a few lines of text."""
+        lines = []
+        for name, scores in (("held-out frames", self.test), ("training frames", self.train)):
+            if scores:
+                m = scores.mean
+                lines.append(
+                    f"{name}: SSIM {m['ssim']:.4f}, FRCM {m['frcm']:.4f}, PSNR {m['psnr']:.1f} dB, L1 {m['l1']:.5f}"
+                )
+        if self.volume:
+            v = self.volume
+            lines.append(
+                f"volume: Dice {v.dice:.4f}, relative error of δ {v.relative_error_delta:.4f}, mean δ inside "
+                f"{v.mean_delta:.3e} (true {v.true_mean_delta:.3e}, {100 * v.delta_deviation:+.1f} %)"
+            )
+        return lines
+
+
+@dataclass(frozen=True)
+class Evaluation(Scores):
+    """Scores of a reconstruction, and the material that it found."""
+
+    material: MaterialFound
+
+    def as_dict(self) -> dict[str, Any]:
+        """The numbers, ready for JSON."""
+        found = self.material
+        material: dict[str, Any] = _as_dict(found.delta, found.ratio) | {"single_material": found.single_material}
+        if found.second is not None:
+            material["second"] = _as_dict(found.second.delta, found.second.ratio)
+        return super().as_dict() | {"material": material}
+
+    def lines(self) -> list[str]:
+        """The numbers as a few lines of text."""
+        found = self.material
+        kind = "one for all" if found.single_material else "found apart"
+        if found.second is not None:
+            kind = f"of two; the other: {_as_text(*found.second)}"
+        return [*super().lines(), f"material: {_as_text(found.delta, found.delta / found.ratio)} ({kind})"]
+
+
+def render(reconstruction: Reconstruction, exposures: Exposures) -> np.ndarray:
+    """Frames [N, H, W] float32 that the reconstruction predicts."""
+    _require_energy(reconstruction, exposures)
+    cloud = reconstruction.cloud
+    return render_object(cloud, exposures, reconstruction.oversample, cloud.backend)
+
+
+def render_object(obj: Object, exposures: Exposures, oversample: int, backend: str = "cpu") -> np.ndarray:
+    """Frames [N, H, W] float32 that `obj` gives, one exposure at a time to bound memory.
+
+    oversample: wave samples along a pixel; backend: of the wave optics, resolved (see `backends`).
+    """
+    frames = np.empty((len(exposures), *exposures.views.shape), dtype=np.float32)
+    with torch.no_grad():
+        for i in range(len(exposures)):
+            instrument = Instrument(exposures[[i]], oversample, backend=backend)
+            frames[i] = instrument.measure(obj)[0].cpu().numpy()
+    return frames
+
+
+def evaluate(reconstruction: Reconstruction, scan: Scan | None, truth: Volume | None) -> Evaluation:
+    """Scores of `reconstruction`: on the frames of `scan`, and against `truth` on the truth's own grid.
+
+    The data range is that of the scan's training frames.
+    """
+    cloud = reconstruction.cloud
+    if scan is not None:
+        _require_energy(reconstruction, scan.exposures)
+    scores = score_object(cloud, scan, truth, reconstruction.oversample, cloud.backend)
+    return Evaluation(scores.test, scores.train, scores.volume, scores.predicted, material_found(cloud))
+
+
+def score_object(obj: Object, scan: Scan | None, truth: Volume | None, oversample: int, backend: str = "cpu") -> Scores:
+    """Scores of any Object: on the frames of `scan`, and against `truth` on the truth's own grid.
+
+    The data range is that of the scan's training frames; oversample, backend: as for `render_object`.
+    """
+    test = train = predicted = None
+    if scan is not None:
+        data_range = intensity_range(scan.train().frames)
+        fitted = render_object(obj, scan.train().exposures, oversample, backend)
+        train = image_scores(fitted, scan.train().frames, data_range)
+        if len(scan.test()):
+            predicted = render_object(obj, scan.test().exposures, oversample, backend)
+            test = image_scores(predicted, scan.test().frames, data_range)
+    volume = None if truth is None else volume_scores(obj.voxelise(truth.grid), truth)
+    return Scores(test, train, volume, predicted)
+
+
+def material_found(cloud: GaussianCloud) -> MaterialFound:
+    """What the cloud, where δ and β are free, says about the matter; what it is made of for one material or two."""
+    if cloud.occupancies:
+        second = None if cloud.second is None else DeltaBeta(*cloud.second)
+        return MaterialFound(cloud.delta, DeltaBeta(cloud.delta, cloud.beta).ratio, cloud.single_material, second)
+    volume = cloud.voxelise(_enclosing_grid(cloud))
+    delta, beta = volume.delta.ravel().astype(np.float64), volume.beta.ravel().astype(np.float64)
+    level = _weighted_median(delta, delta)
+    matter = delta > 0.5 * level
+    ratio = _weighted_median(delta[matter] / np.maximum(beta[matter], 1e-30), delta[matter])
+    return MaterialFound(level, ratio, False)
+
+
+def _as_text(delta: float, beta: float) -> str:
+    return f"δ {delta:.3e}, " + (f"δ/β {delta / beta:.0f}" if beta else "no β seen")
+
+
+def _as_dict(delta: float, ratio: float) -> dict[str, float | None]:
+    return {"delta": delta, "ratio": ratio if np.isfinite(ratio) else None}
+
+
+def _require_energy(reconstruction: Reconstruction, exposures: Exposures) -> None:
+    energy = reconstruction.energy_kev
+    require(
+        abs(exposures.energy_kev / energy - 1) < 1e-3,
+        f"the run's δ and β are those at {energy:g} keV, but the scan's energy is {exposures.energy_kev:g} keV.",
+    )
+
+
+def _enclosing_grid(cloud: GaussianCloud) -> Grid:
+    """A grid around all centres, of the cloud's unit as voxel, or coarser where that would be too many."""
+    centres = cloud.centres.detach().double().numpy()
+    low, high = centres.min(0) - 2, centres.max(0) + 2
+    pitch = max(1.0, float((np.prod(high - low) / MOST_VOXELS) ** (1 / 3)))
+    x, y, z = (int(n) for n in np.ceil((high - low) / pitch))
+    origin = (0.5 * (low + high) - 0.5 * (np.array([x, y, z]) - 1) * pitch) * cloud.unit_length
+    edge = pitch * cloud.unit_length
+    return Grid((z, y, x), (edge, edge, edge), (origin[0], origin[1], origin[2]))
+
+
+def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
+    order = np.argsort(values)
+    cumulative = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(cumulative, 0.5 * cumulative[-1])])
