@@ -85,8 +85,18 @@ class Views:
         require(count >= 1, f"the number of views must be at least 1, but it is {count}.")
         return cls.from_angles(np.arange(count) * (180.0 / count), shape, pixel_size)
 
+    @classmethod
+    def of_poses(cls, poses: Poses) -> Views:
+        """The views that `poses` were made of, in main memory."""
+        rotations, shifts = (a.detach().cpu().numpy() for a in (poses.rotations, poses.shifts))
+        return cls(rotations, shifts, poses.shape, poses.pixel_size)
+
     def __len__(self) -> int:
         return len(self.rotations)
+
+    def fingerprint(self) -> bytes:
+        """Equal for equal views, different for different ones."""
+        return self.rotations.tobytes() + self.shifts.tobytes() + repr((self.shape, self.pixel_size)).encode()
 
     def __getitem__(self, index: np.ndarray | list[int] | slice) -> Views:
         return replace(self, rotations=self.rotations[index], shifts=self.shifts[index])

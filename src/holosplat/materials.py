@@ -9,41 +9,23 @@ Densities are in g/cm³, the unit chemists and tables use; energies in keV.
 from __future__ import annotations
 
 import json
-import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import xraydb
 
 from .checks import InputError, in_range, require
+from .matter import DeltaBeta as DeltaBeta
 
 ENERGY_RANGE_KEV = (0.1, 400.0)
 """Where Chantler's tables hold both f1 and f2 [keV]."""
 MAX_DENSITY_G_CM3 = 30.0
 """Above osmium (22.6 g/cm³), the densest element: what is denser is a unit mixed up."""
-
-
-class DeltaBeta(NamedTuple):
-    """Refractive index n = 1 - delta + i·beta, dimensionless; of a difference, either may be negative."""
-
-    delta: float
-    beta: float
-
-    def against(self, medium: DeltaBeta) -> DeltaBeta:
-        """What an object in `medium` adds to it: `(δ - δ_medium, β - β_medium)`."""
-        return DeltaBeta(self.delta - medium.delta, self.beta - medium.beta)
-
-    @property
-    def ratio(self) -> float:
-        """δ/β; infinite (with δ's sign) for β = 0, negative where the two differ in sign, NaN for vacuum."""
-        if self.beta == 0:
-            return math.copysign(math.inf, self.delta) if self.delta else math.nan
-        return self.delta / self.beta
 
 
 def _density(name: str, value: Any) -> float:

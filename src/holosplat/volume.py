@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
 import torch
 
 from .checks import finite, shaped
-from .geometry import Grid, Views
+from .geometry import Grid, Poses, Views
 
 
 @dataclass(frozen=True)
@@ -70,4 +71,26 @@ class Object(Protocol):
 
     def voxelise(self, grid: Grid) -> Volume:
         """δ and β averaged over (or sampled on) the voxels of `grid`."""
+        ...
+
+
+@runtime_checkable
+class Component(Protocol):
+    """A part of a model whose numbers can be fitted: they have names, and other ones can take their place."""
+
+    def parameters(self) -> Mapping[str, torch.Tensor]:
+        """The tensors that can be fitted, by name."""
+        ...
+
+    def with_parameters(self, parameters: Mapping[str, torch.Tensor]) -> Self:
+        """The same part with other tensors in the place of those named; the others stay."""
+        ...
+
+
+@runtime_checkable
+class TrainableObject(Object, Component, Protocol):
+    """An Object whose numbers can be fitted; it projects poses without waiting for a device."""
+
+    def project(self, views: Views | Poses) -> LineIntegrals | tuple[torch.Tensor, torch.Tensor]:
+        """Line integrals as of `Object`, differentiable in the parameters."""
         ...

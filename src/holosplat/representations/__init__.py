@@ -4,7 +4,7 @@ from .encodings import Encoding
 from .gaussians import GaussianCloud
 from .initialise import approximate, at_pitch, cloud_from_two, cloud_from_volume, freed, random_cloud
 from .isosurface import isosurface
-from .neural_field import Matter, Network, NeuralField
+from .neural_field import Network, NeuralField
 from .surfaces import SurfaceMesh
 from .voxel_lines import VoxelLines
 from .voxels import VoxelGrid
@@ -12,7 +12,6 @@ from .voxels import VoxelGrid
 __all__ = [
     "Encoding",
     "GaussianCloud",
-    "Matter",
     "Network",
     "NeuralField",
     "SurfaceMesh",
