@@ -11,13 +11,13 @@ import pytest
 
 from holosplat.bench.case import FOLDER, Case, case_names, load_case
 from holosplat.bench.declaration import declared_names
-from holosplat.bench.tables import merged
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.materials import DeltaBeta, parse_material
 from holosplat.scan import Exposures
 from holosplat.specimens.phantoms import Ball
 from holosplat.specimens.scene import MeshScene
+from holosplat.tables import merged
 from holosplat.workflows.settings import MaterialPrior
 
 SLOW = ("crowded12",)

@@ -20,7 +20,8 @@ Files = dict[str, str]
 """Path below src/holosplat → source text."""
 
 TIERS = (
-    ("units", "version", "checks", "native", "backends", "memory", "geometry", "scan", "volume", "mesh", "matter"),
+    ("units", "version", "checks", "tables", "native", "backends", "memory")
+    + ("geometry", "scan", "volume", "mesh", "matter"),
     ("materials", "optics", "metrics", "projectors", "preprocess"),
     ("specimens", "representations", "model"),
     ("io",),
