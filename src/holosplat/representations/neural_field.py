@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
@@ -19,6 +19,7 @@ from ..backends import device
 from ..checks import at_least, require
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
+from ..tables import from_table, to_table
 from ..volume import LineIntegrals, Volume
 from .encodings import Encoding
 from .voxel_lines import resampling
@@ -143,7 +144,7 @@ class NeuralField:
             "mask": self.mask,
             "voxel_size": list(self.grid.voxel_size),
             "origin": list(self.grid.origin),
-            "network": asdict(self.network),
+            "network": to_table(self.network),
             "upper": self.upper,
             "constants": self._constants,
             "matter": self.matter.as_dict(),
@@ -154,8 +155,7 @@ class NeuralField:
         """The field that `state` described."""
         size, origin = (tuple(float(v) for v in state[name]) for name in ("voxel_size", "origin"))
         grid = Grid(tuple(state["mask"].shape), size, origin)  # type: ignore[arg-type]
-        options = dict(state["network"])
-        network = Network(**options | {"encoding": Encoding(**options["encoding"])})
+        network = from_table(Network, state["network"], "network")
         field = cls(grid, Matter.from_dict(state["matter"]), network, state["mask"], upper=float(state["upper"]))
         field._constants = dict(state["constants"])
         return field.with_parameters(state["weights"])
