@@ -21,7 +21,7 @@ from holosplat.io.gaussians import read_gaussians, write_gaussians
 from holosplat.io.json import read_json
 from holosplat.io.nxtomo import write_scan
 from holosplat.materials import Compound, DeltaBeta
-from holosplat.model.instrument import Instrument, measure
+from holosplat.model import Instrument, measure
 from holosplat.representations import GaussianCloud, VoxelLines, approximate, cloud_from_two
 from holosplat.representations.gaussians import raw_of
 from holosplat.scan import Exposures, Scan

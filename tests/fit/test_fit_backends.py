@@ -18,7 +18,7 @@ from holosplat.fit.loop import Fit, FitOptions
 from holosplat.fit.objective import Objective
 from holosplat.fit.schedule import Schedule
 from holosplat.geometry import Views
-from holosplat.model.instrument import measure
+from holosplat.model import measure
 from holosplat.representations import GaussianCloud, random_cloud
 from holosplat.scan import Exposures, Scan
 

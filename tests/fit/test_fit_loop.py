@@ -20,7 +20,7 @@ from holosplat.fit.objective import Objective
 from holosplat.fit.total_variation import total_variation
 from holosplat.fit.trainable import Trainable
 from holosplat.geometry import Grid
-from holosplat.model.instrument import Instrument
+from holosplat.model import Instrument
 from holosplat.optics.detector import poisson
 from holosplat.optics.noise import noise_share
 from holosplat.representations import GaussianCloud, random_cloud

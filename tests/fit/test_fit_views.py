@@ -18,7 +18,7 @@ from holosplat.fit.objective import Objective
 from holosplat.fit.schedule import Schedule
 from holosplat.fit.trainable import Trainable
 from holosplat.geometry import Views
-from holosplat.model.instrument import Instrument
+from holosplat.model import Instrument
 from holosplat.representations import GaussianCloud
 from holosplat.scan import Exposures, Scan
 

@@ -13,7 +13,7 @@ from helpers.waves import DOUBLE, LAMBDA, PITCH, SHAPE, Bump, K, at, exposures, 
 from holosplat.beamline.simulate import SIMULATED_FRINGE_SAMPLES, simulate
 from holosplat.materials import DeltaBeta
 from holosplat.mesh import TriangleMesh
-from holosplat.model.instrument import Instrument, measure
+from holosplat.model import Instrument, measure
 from holosplat.optics import (
     bin_pixels,
 )

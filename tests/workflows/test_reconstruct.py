@@ -18,7 +18,7 @@ from holosplat.fit.loop import FitOptions
 from holosplat.fit.objective import Objective
 from holosplat.fit.schedule import Schedule
 from holosplat.geometry import Grid, Views
-from holosplat.model.instrument import measure
+from holosplat.model import measure
 from holosplat.representations import GaussianCloud
 from holosplat.representations.gaussians import raw_of
 from holosplat.volume import Volume

@@ -21,7 +21,7 @@ from holosplat.fit.loop import FitOptions
 from holosplat.fit.schedule import Schedule
 from holosplat.fit.trainable import Trainable
 from holosplat.materials import DeltaBeta
-from holosplat.model.instrument import Instrument
+from holosplat.model import Instrument
 from holosplat.representations.gaussians import PARAMETERS
 from holosplat.workflows.evaluate import evaluate
 from holosplat.workflows.provenance import scan_hash

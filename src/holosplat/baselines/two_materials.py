@@ -21,7 +21,7 @@ from torch.nn.functional import avg_pool3d
 
 from ..geometry import Grid
 from ..matter import LEAST_CONTRAST, DeltaBeta
-from ..model.instrument import Instrument
+from ..model import Instrument
 from ..optics.sampling import resolving_oversample
 from ..projectors.voxels import voxel_line_integrals
 from ..representations.voxel_lines import VoxelLines

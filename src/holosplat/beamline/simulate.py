@@ -11,7 +11,7 @@ import torch
 
 from ..checks import in_range, require
 from ..memory import memory_kept
-from ..model.instrument import Instrument
+from ..model import Instrument
 from ..optics.detector import poisson
 from ..optics.noise import PHOTON_RANGE
 from ..optics.sampling import resolving_oversample

@@ -13,7 +13,7 @@ from ..geometry import Grid
 from ..materials import DeltaBeta
 from ..metrics import ImageScores, VolumeScores, image_scores, intensity_range, volume_scores
 from ..metrics.images import json_number
-from ..model.instrument import Instrument
+from ..model import Instrument
 from ..representations import GaussianCloud
 from ..scan import Exposures, Scan
 from ..volume import Object, Volume
