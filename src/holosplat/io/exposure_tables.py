@@ -48,7 +48,8 @@ def read_exposures(beam: Table, frames: Sequence[Table], shape: tuple[int, int])
     pixel_size = beam.number("pixel_size_m")
     try:
         views = Views(np.array(rotations), np.array(shifts), shape, pixel_size)
-        return Exposures(views, *(np.array(v) for v in values))
+        energy, distance, psf_sigma, time = (np.array(v) for v in values)
+        return Exposures(views, energy, distance, psf_sigma, time)
     except InputError as error:
         raise InputError(f"{beam.path}: {error}") from None
 
@@ -72,7 +73,7 @@ def _per_frame(beam: Table, frame: Table, name: str, default: float | None) -> f
         return frame.number(name)
     if name in beam:
         return beam.number(name)
-    return beam.number(name) if default is None else default
+    return frame.number(name) if default is None else default
 
 
 def _rotation(frame: Table) -> np.ndarray:

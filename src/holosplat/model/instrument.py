@@ -54,12 +54,11 @@ class Instrument:
         )
         ratio = far_from_edges(exposures.energy_kev, exposures.reference_energy) if dispersion is None else dispersion
         self._factors = wavenumber(exposures.energy_kev)[:, None, None] * ratio.reshape(len(exposures), -1, 2)
-        self._table = torch.from_numpy(self._factors).to(self.device)
         my, mx = (m * self.oversample for m in self.margin)
         self.path = optical_path(
             self.views.shape,
             self.views.pixel_size,
-            float(exposures.energy_kev[0]) if exposures.has_one_energy else exposures.energy_kev,
+            exposures.one_energy("the wave optics"),
             exposures.distance,
             exposures.psf_sigma_px * self.oversample,
             (exposures.views.shape, (my, mx), self.oversample),
@@ -68,20 +67,14 @@ class Instrument:
 
     def frames(self, lines: LineIntegrals, index: np.ndarray | Tensor | None = None) -> Tensor:
         """Frames [V, H, W] from line integrals on `self.views` (or its views `index`), in the instrument's type."""
-        refraction = self._refraction(lines.materials, index)
+        refraction = self._refraction(lines.materials)
         path = self.path if index is None else self.path[torch.as_tensor(index, device=self.device)]
         return hologram(lines.channels.to(self.device, self.dtype), refraction, path, self.backend)
 
-    def _refraction(
-        self, materials: Sequence[tuple[float, float]], index: np.ndarray | Tensor | None
-    ) -> list[tuple[float, float]] | Tensor:
-        """(k δ, k β) of each channel, [C, 2] where all frames have one energy, else [V, C, 2] float64 on the device."""
+    def _refraction(self, materials: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+        """(k δ, k β) of each channel at the frames' energy, [C, 2]."""
         channels = [min(c, self._factors.shape[1] - 1) for c in range(len(materials))]
-        if self.exposures.has_one_energy:
-            return [(f[0] * m[0], f[1] * m[1]) for f, m in zip(self._factors[0, channels].tolist(), materials)]
-        pairs = [(self._table[:, c], m) for c, m in zip(channels, materials)]
-        table = torch.stack([torch.stack((f[:, 0] * m[0], f[:, 1] * m[1]), dim=-1) for f, m in pairs], dim=1)
-        return table if index is None else table[torch.as_tensor(index, device=self.device)]
+        return [(f[0] * m[0], f[1] * m[1]) for f, m in zip(self._factors[0, channels].tolist(), materials)]
 
     def image(self, B: Tensor, D: Tensor, index: np.ndarray | None = None) -> Tensor:
         """Frames [V, H, W] from line integrals B, D [V, H', W'] in metres on `self.views` (or its views `index`)."""
