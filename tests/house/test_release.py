@@ -46,7 +46,7 @@ def changelog_complaints(text: str) -> list[str]:
 
 
 def citation_complaints(cff: Any) -> list[str]:
-    """Where the file leaves the schema of the Citation File Format 1.2.0: keys that must be, and types of those used."""
+    """Where the file leaves the schema of the Citation File Format 1.2.0: missing keys, wrong types, unknown keys."""
     complaints = [f"{key} is missing" for key in ("cff-version", "message", "title", "authors") if key not in cff]
     texts = ("cff-version", "message", "title", "type", "abstract", "version", "license")
     complaints += [f"{key} is not text" for key in texts if key in cff and not isinstance(cff[key], str)]
