@@ -113,13 +113,14 @@ def _random(task: Task, options: GaussianOptions) -> GaussianCloud:
     """The thesis' start; amplitudes are in units of the known material, or else of water."""
     task.on_progress("random start", 0.0)
     scan, prior = task.scan, task.prior
-    material = WATER.delta_beta(float(np.mean(scan.exposures.energy_kev)))
+    material = WATER.delta_beta(scan.exposures.reference_energy)
     if prior.materials:
         material = prior.materials[0]
     elif isinstance(prior, KnownRatio):
         material = DeltaBeta(material.delta, material.delta / prior.ratio)
     frames, pitch = torch.from_numpy(scan.frames), scan.views.pixel_size
-    retrieved = retrieve_thickness(frames, pitch, scan.exposures.distance, scan.exposures.energy_kev, *material)
+    refraction = scan.exposures.refraction(*material)
+    retrieved = retrieve_thickness(frames, pitch, scan.exposures.distance, scan.exposures.energy_kev, *refraction)
     h, w = scan.views.shape
     disc = np.pi / 4 * min(h, w) ** 2 / (h * w)
     thickness = max(float(retrieved.mean()) / disc, 0.1 * pitch)
