@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..backends import device, resolve
 from ..checks import require
-from ..optics.hologram import hologram, optical_path
+from ..optics.hologram import Refraction, hologram, optical_path
 from ..optics.sampling import padding
 from ..scan import Exposures
 from ..units import wavenumber
@@ -47,6 +49,7 @@ class Instrument:
             f"the waves of {len(self.views)} views would need {rows} × {columns} samples each, more than memory holds; "
             "use fewer or smaller frames.",
         )
+        self._wavenumber = _wavenumber(exposures.energy_kev, self.device)
         my, mx = (m * self.oversample for m in self.margin)
         self.path = optical_path(
             self.views.shape,
@@ -60,10 +63,21 @@ class Instrument:
 
     def frames(self, lines: LineIntegrals, index: np.ndarray | Tensor | None = None) -> Tensor:
         """Frames [V, H, W] from line integrals on `self.views` (or its views `index`), in the instrument's type."""
-        k = wavenumber(self.exposures.energy_kev)
-        refraction = [(k * delta, k * beta) for delta, beta in lines.materials]
-        path = self.path if index is None else self.path[torch.as_tensor(index, device=self.device)]
+        at = None if index is None else torch.as_tensor(index, device=self.device)
+        path = self.path if at is None else self.path[at]
+        refraction = self.refraction(lines.materials, at)
         return hologram(lines.channels.to(self.device, self.dtype), refraction, path, self.backend)
+
+    def refraction(self, materials: Sequence[tuple[float, float]], index: Tensor | None = None) -> Refraction:
+        """`(k δ, k β)` of each channel, as `hologram` takes it: [C, 2], or [V, C, 2] where energies differ.
+
+        materials: (δ, β) of each channel, the same at all energies; index: views [V] on the instrument's device.
+        """
+        k = self._wavenumber
+        if not isinstance(k, Tensor):
+            return [(k * delta, k * beta) for delta, beta in materials]
+        k = k if index is None else k.index_select(0, index)
+        return torch.stack([torch.stack((k * delta, k * beta), dim=1) for delta, beta in materials], dim=1)
 
     def image(self, B: Tensor, D: Tensor, index: np.ndarray | None = None) -> Tensor:
         """Frames [V, H, W] from line integrals B, D [V, H', W'] in metres on `self.views` (or its views `index`)."""
@@ -83,6 +97,14 @@ class Instrument:
             frames = frames if len(frames) else part.new_empty((len(index), *part.shape[1:]))
             frames[at] = part
         return frames
+
+
+def _wavenumber(energy_kev: float | np.ndarray, device: torch.device) -> float | Tensor:
+    """k [rad/m]: a number if all energies are equal, else [V] float64 on `device`."""
+    energies = np.unique(energy_kev)
+    if len(energies) == 1:
+        return wavenumber(float(energies[0]))
+    return torch.from_numpy(wavenumber(np.asarray(energy_kev, dtype=np.float64))).to(device)
 
 
 def measure(obj: Object, exposures: Exposures, oversample: int = 1, dtype: torch.dtype = torch.float32) -> Tensor:
