@@ -27,8 +27,8 @@ METHODS: dict[str, Method] = {
 
 __all__ = [
     "METHODS",
-    "Extraction",
     "ExtraTerm",
+    "Extraction",
     "FitOptions",
     "GaussianRates",
     "Gaussians",

@@ -12,7 +12,7 @@ from torch import Tensor
 from ..backends import device, resolve
 from ..checks import require
 from ..geometry import Poses
-from ..optics.hologram import OpticalPath, hologram, optical_path
+from ..optics.hologram import OpticalPath, Refraction, hologram, optical_path
 from ..optics.sampling import padding
 from ..scan import Exposures, far_from_edges
 from ..units import wavenumber
@@ -55,7 +55,11 @@ class Instrument:
             "use fewer or smaller frames.",
         )
         ratio = far_from_edges(exposures.energy_kev, exposures.reference_energy) if dispersion is None else dispersion
-        self._factors = wavenumber(exposures.energy_kev)[:, None, None] * ratio.reshape(len(exposures), -1, 2)
+        factors = wavenumber(exposures.energy_kev)[:, None, None] * ratio.reshape(len(exposures), -1, 2)
+        self._factors = torch.from_numpy(factors).to(self.device)
+        self._alike: list[tuple[float, float]] | None = None
+        if len(factors) == 0 or bool((factors == factors[:1]).all()):
+            self._alike = [(float(of_delta), float(of_beta)) for of_delta, of_beta in factors[:1].reshape(-1, 2)]
         self.path = self._path(None, None, None)
 
     @cached_property
@@ -80,13 +84,24 @@ class Instrument:
         distance, psf_sigma_px: other distances [V] [m] and point-spread functions [V] [pixels] than those of the
         exposures, float64, with gradients if they require them.
         """
-        refraction = self._refraction(lines.materials)
         chosen = None if index is None else torch.as_tensor(index, device=self.device)
         if distance is None and psf_sigma_px is None:
             path = self.path if chosen is None else self.path[chosen]
         else:
             path = self._path(chosen, distance, psf_sigma_px)
+        refraction = self.refraction(lines.materials, chosen)
         return hologram(lines.channels.to(self.device, self.dtype), refraction, path, self.backend)
+
+    def refraction(self, materials: Sequence[tuple[float, float]], index: Tensor | None = None) -> Refraction:
+        """`(k δ, k β)` of each channel, as `hologram` takes it: [C, 2], or [V, C, 2] where energies differ.
+
+        materials: (δ, β) of each channel at the reference energy; index: views [V] on the instrument's device.
+        """
+        channels = [min(c, self._factors.shape[1] - 1) for c in range(len(materials))]
+        if self._alike is not None:
+            return [(self._alike[c][0] * delta, self._alike[c][1] * beta) for c, (delta, beta) in zip(channels, materials)]
+        factors = self._factors if index is None else self._factors.index_select(0, index)
+        return factors[:, channels] * torch.tensor(materials, dtype=torch.float64, device=self.device)
 
     def _path(self, index: Tensor | None, distance: Tensor | None, psf_sigma_px: Tensor | None) -> OpticalPath:
         """The path of the views `index` at other distances, or through other point-spread functions."""
@@ -96,17 +111,12 @@ class Instrument:
         return optical_path(
             self.views.shape,
             self.views.pixel_size,
-            taken.one_energy("the wave optics"),
+            taken.energy_kev,
             taken.distance if distance is None else distance,
             sigma * self.oversample,
             (taken.views.shape, (my, mx), self.oversample),
             self.dtype,
         ).to(self.device)
-
-    def _refraction(self, materials: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-        """(k δ, k β) of each channel at the frames' energy, [C, 2]."""
-        channels = [min(c, self._factors.shape[1] - 1) for c in range(len(materials))]
-        return [(f[0] * m[0], f[1] * m[1]) for f, m in zip(self._factors[0, channels].tolist(), materials)]
 
     def image(self, B: Tensor, D: Tensor, index: np.ndarray | None = None) -> Tensor:
         """Frames [V, H, W] from line integrals B, D [V, H', W'] in metres on `self.views` (or its views `index`)."""
