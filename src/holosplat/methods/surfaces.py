@@ -203,7 +203,8 @@ def _bending(train: Scan, start: SurfaceMesh, objective: Objective) -> list[Term
     away = csr_array(eye_array(count) - neighbour_mean(start.faces.numpy(), count))
     twice = csr_array(away @ away)
     arrays = (torch.from_numpy(a.astype(kind)) for a, kind in ((twice.indptr, np.int64), (twice.indices, np.int64)))
-    return [Bending(weight, torch.sparse_csr_tensor(*arrays, torch.from_numpy(twice.data), twice.shape))]
+    operator = torch.sparse_csr_tensor(*arrays, torch.from_numpy(twice.data), twice.shape, check_invariants=True)
+    return [Bending(weight, operator)]
 
 
 def _membrane(start: SurfaceMesh, stiffness: float) -> Callable[[Tensor], Tensor]:

@@ -33,11 +33,11 @@ class SpectralMisfit:
     def __init__(self, train: Scan, instrument: Instrument, matter: Matter, floor: float) -> None:
         require(matter.delta > 0, f"a spectral misfit needs a material with δ > 0, but δ is {matter.delta:g}.")
         on, exposures = instrument.device, train.exposures
-        unit = wavenumber(exposures.energy_kev) * train.views.pixel_size * matter.delta
-        self._unit = torch.as_tensor(np.broadcast_to(unit, len(train)), dtype=torch.float32)[:, None, None].to(on)
+        unit = wavenumber(exposures.energy_kev) * exposures.refraction(matter.delta, 0.0)[0] * train.views.pixel_size
+        self._unit = torch.from_numpy(unit).float()[:, None, None].to(on)
         self._amplitudes = torch.from_numpy(train.frames).clamp_min(0).sqrt().to(on)
         response = linear_response(exposures, matter.beta / matter.delta)
-        self.noise = noise_level(self._amplitudes) / float(np.mean(unit))
+        self.noise = noise_level(self._amplitudes) / float(unit.mean())
         """Standard deviation of r that the noise of the measured frames gives [pixels of thickness]."""
         self._weights = (1 / (response**2 + (floor + NOISE_FLOOR * self.noise) ** 2)).float().to(on)
 
@@ -53,10 +53,12 @@ class SpectralMisfit:
 
 
 def linear_response(exposures: Exposures, absorption: float) -> Tensor:
-    """|H| [V, H, W//2 + 1] for `rfft2`, float64, of a thin object with β/δ = `absorption`; 1 beyond its maximum."""
+    """|H| [V, H, W//2 + 1] for `rfft2`, float64, of a thin object with β/δ = `absorption` at the reference energy;
+    1 beyond its maximum."""
     views = exposures.views
     fy, fx = np.fft.fftfreq(views.shape[0], views.pixel_size), np.fft.rfftfreq(views.shape[1], views.pixel_size)
-    reach = wavelength(exposures.energy_kev) * exposures.distance[:, None, None]
+    reach = (wavelength(exposures.energy_kev) * exposures.distance)[:, None, None]
     chi = np.pi * reach * (fy[:, None] ** 2 + fx**2)
-    response = np.abs(np.sin(chi) + absorption * np.cos(chi))
+    delta, beta = (values[:, None, None] for values in exposures.refraction(1.0, absorption))
+    response = np.abs(np.sin(chi) + beta / delta * np.cos(chi))
     return torch.from_numpy(np.where(chi < 0.5 * np.pi, response, 1.0))
