@@ -77,7 +77,7 @@ class SourceOptions:
         from ..beamline.polychromatic import polychromatic_frames, refilled
         from ..beamline.simulate import simulated_frames
 
-        light = self.light(exposures.energy_kev)
+        light = self.light(exposures.one_energy("a simulation"))
         if light is None:
             return simulated_frames(matter, exposures, how)
         return polychromatic_frames(lambda energy: refilled(matter, filling, energy), light, exposures, how)
