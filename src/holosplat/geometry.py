@@ -200,3 +200,16 @@ class Grid:
         """The part of `shape` voxels whose first one is voxel `start` (z, y, x) of this grid."""
         origin = [o + d * i for o, d, i in zip(self.origin, self.voxel_size, start[::-1])]
         return Grid(shape, self.voxel_size, (origin[0], origin[1], origin[2]))
+
+    def divided(self, factors: tuple[int, int, int]) -> Grid:
+        """The same extent with each voxel divided by `factors` `(fx, fy, fz)`; the grid itself where all are 1.
+
+        Errors: `InputError` for a factor below 1.
+        """
+        require(min(factors) >= 1, f"factors of a division must be at least 1, but they are {factors}.")
+        if max(factors) == 1:
+            return self
+        (z, y, x), (fx, fy, fz) = self.shape, factors
+        size = [d / f for d, f in zip(self.voxel_size, factors)]
+        low = [o - 0.5 * (f - 1) * s for o, f, s in zip(self.origin, factors, size)]
+        return Grid((z * fz, y * fy, x * fx), (size[0], size[1], size[2]), (low[0], low[1], low[2]))
