@@ -138,6 +138,19 @@ class Poses:
         rotations, shifts = (torch.from_numpy(a).to(device) for a in arrays)
         return cls(rotations, shifts, views.shape, views.pixel_size)
 
+    def __len__(self) -> int:
+        return len(self.rotations)
+
+    @property
+    def requires_grad(self) -> bool:
+        """Whether gradients of the rotations or of the shifts are asked for."""
+        return self.rotations.requires_grad or self.shifts.requires_grad
+
+    def views(self) -> Views:
+        """The same poses as `Views`, without gradients."""
+        rotations, shifts = (array.detach().cpu().numpy() for array in (self.rotations, self.shifts))
+        return Views(rotations, shifts, self.shape, self.pixel_size)
+
     def __getitem__(self, index: torch.Tensor) -> Poses:
         """The poses `index` [K], an integer tensor on the same device."""
         return replace(self, rotations=self.rotations.index_select(0, index), shifts=self.shifts.index_select(0, index))
