@@ -88,7 +88,7 @@ class Alignment:
             distance, sigma = self.distance(planned), self.psf_sigma_px(planned)
         return replace(
             planned,
-            views=Views.of_poses(poses),
+            views=poses.views(),
             distance=planned.distance if distance is None else distance.numpy(),
             psf_sigma_px=planned.psf_sigma_px if sigma is None else sigma.numpy(),
         )

@@ -99,7 +99,7 @@ class Model:
         planned = self.instrument.poses
         if self.alignment is not None:
             aligned = self.alignment.poses(planned, self.instrument.exposures.views.pixel_size, index)
-            return aligned if isinstance(matter, Component) else Views.of_poses(aligned)
+            return aligned if isinstance(matter, Component) else aligned.views()
         if isinstance(matter, Component):
             return planned if index is None else planned[index]
         return self.instrument.views if index is None else self.instrument.views[index.cpu().numpy()]

@@ -81,12 +81,14 @@ class VoxelGrid:
         return self
 
     def project(self, views: Views | Poses) -> LineIntegrals:
-        """Line integrals (B, D), differentiable in the values (see `VoxelLines`)."""
+        """Line integrals (B, D), differentiable in the values and in unknown poses (see `VoxelLines`)."""
         return LineIntegrals(self._lines(views)(self.values), self.matter.channels)
 
     def _lines(self, views: Views | Poses) -> VoxelLines:
-        """The projector of `views`, made once."""
-        seen = views if isinstance(views, Views) else Views.of_poses(views)
+        """The projector of `views`: made once, or anew where the poses are unknown and move."""
+        if isinstance(views, Poses) and views.requires_grad:
+            return VoxelLines(self.grid, views)
+        seen = views if isinstance(views, Views) else views.views()
         key = seen.fingerprint()
         if key not in self._projectors:
             self._projectors[key] = VoxelLines(self.grid, seen)
