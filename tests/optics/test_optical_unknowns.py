@@ -156,7 +156,9 @@ def test_a_width_of_zero_has_no_gradient_and_a_small_one_a_proportional_one(back
     setup.unknowns["psf"] = torch.tensor([0.0, 0.02, 0.04], dtype=DOUBLE)
     setup.unknowns["distance"][:] = 2.0
     for name in ("lines", "weights"):
-        same = (setup.unknowns[name] if name == "lines" else setup.weights)[:1].expand(3, -1, -1, *(-1,) * (name == "lines"))
+        same = (setup.unknowns[name] if name == "lines" else setup.weights)[:1].expand(
+            3, -1, -1, *(-1,) * (name == "lines")
+        )
         if name == "lines":
             setup.unknowns[name] = same.clone()
         else:
@@ -166,7 +168,9 @@ def test_a_width_of_zero_has_no_gradient_and_a_small_one_a_proportional_one(back
     assert float(slope[2] / slope[1]) == pytest.approx(2, rel=0.02)
 
 
-@pytest.mark.parametrize(("asked", "transforms"), [((), 2), (("distance",), 3), (("psf",), 3), (("distance", "psf"), 4)])
+@pytest.mark.parametrize(
+    ("asked", "transforms"), [((), 2), (("distance",), 3), (("psf",), 3), (("distance", "psf"), 4)]
+)
 def test_a_gradient_costs_one_transform_and_none_where_it_is_not_asked_for(asked, transforms, monkeypatch):
     setup, done, forward = Setup("blurred", "one"), [], cpu._forward
     monkeypatch.setattr(cpu, "_forward", lambda wave: done.append(1) or forward(wave))
@@ -182,7 +186,10 @@ def test_tensors_make_the_path_that_arrays_make():
     common = (setup.raster, PITCH / setup.factor, ENERGY)
     fixed = optical_path(*common, z.numpy(), sigma.numpy(), (setup.frame, corner, setup.factor))
     other = optical_path(*common, 2 * z.numpy(), np.zeros(3), (setup.frame, corner, setup.factor))
-    for path in (setup.path(setup.unknowns["distance"], setup.unknowns["psf"], torch.float32), other.corrected(z, sigma)):
+    for path in (
+        setup.path(setup.unknowns["distance"], setup.unknowns["psf"], torch.float32),
+        other.corrected(z, sigma),
+    ):
         assert all(torch.equal(a, b) for a, b in zip(path._arrays, fixed._arrays))
         assert (path.alike, path.shape, path.margin, path.factor) == (False, fixed.shape, fixed.margin, fixed.factor)
 
@@ -240,7 +247,9 @@ def test_an_instrument_takes_energies_per_exposure():
 
 def test_nothing_waits_for_the_device(gpu):
     setup = Setup("oversampled and blurred", "two", gpu)
-    leaves = {n: v.to(gpu, v.dtype if n != "lines" else torch.float32).requires_grad_() for n, v in setup.unknowns.items()}
+    leaves = {
+        n: v.to(gpu, v.dtype if n != "lines" else torch.float32).requires_grad_() for n, v in setup.unknowns.items()
+    }
     table = torch.tensor([setup.matter] * 3, dtype=DOUBLE, device=gpu)
     planned, index = setup.path(leaves["distance"].detach(), None, torch.float32), torch.tensor([2, 0, 1], device=gpu)
     with Watch():

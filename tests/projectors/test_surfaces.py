@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from holosplat.fit.surfaces import SurfaceFit, fit_surfaces
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
-from holosplat.fit.surfaces import SurfaceFit, fit_surfaces
 from holosplat.geometry import Grid, Poses, Views
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.mesh import TriangleMesh

@@ -13,6 +13,9 @@ from ..fit.schedule import Schedule
 from ..fit.terms import Objective
 from .ground import ExtraTerm
 
+Backend = Literal["auto", "cpu", "cuda", "reference"]
+"""What may be asked to compute a fit."""
+
 
 @dataclass(frozen=True)
 class GaussianRates:
@@ -52,7 +55,7 @@ class FitOptions:
     density: DensityControl = field(default_factory=DensityControl)
     terms: tuple[ExtraTerm, ...] = ()
     """Further terms by name."""
-    backend: Literal["auto", "cpu", "cuda", "reference"] = "auto"
+    backend: Backend = "auto"
     """What computes the fit."""
 
 

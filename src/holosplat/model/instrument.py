@@ -99,7 +99,9 @@ class Instrument:
         """
         channels = [min(c, self._factors.shape[1] - 1) for c in range(len(materials))]
         if self._alike is not None:
-            return [(self._alike[c][0] * delta, self._alike[c][1] * beta) for c, (delta, beta) in zip(channels, materials)]
+            return [
+                (self._alike[c][0] * delta, self._alike[c][1] * beta) for c, (delta, beta) in zip(channels, materials)
+            ]
         factors = self._factors if index is None else self._factors.index_select(0, index)
         return factors[:, channels] * torch.tensor(materials, dtype=torch.float64, device=self.device)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -33,7 +33,7 @@ class GaussianCloud:
     Errors: `InputError` if the arrays do not fit together, or not to the matter.
     """
 
-    kind = "gaussians"
+    kind: ClassVar[str] = "gaussians"
     """The name of this kind of Object in files."""
 
     def __init__(self, parameters: Iterable[Tensor], unit_length: float, matter: Matter) -> None:
@@ -108,13 +108,7 @@ class GaussianCloud:
 
     def enclosing_grid(self, most_voxels: int) -> Grid:
         """A grid around all centres, of `unit_length` a voxel, or coarser where those would be over `most_voxels`."""
-        centres = self.centres.detach().double().cpu().numpy()
-        low, high = centres.min(0) - 2, centres.max(0) + 2
-        pitch = max(1.0, float((np.prod(high - low) / most_voxels) ** (1 / 3)))
-        x, y, z = (int(n) for n in np.ceil((high - low) / pitch))
-        origin = (0.5 * (low + high) - 0.5 * (np.array([x, y, z]) - 1) * pitch) * self.unit_length
-        edge = pitch * self.unit_length
-        return Grid((z, y, x), (edge, edge, edge), (origin[0], origin[1], origin[2]))
+        return Grid.around(self.centres.detach().double().cpu().numpy(), self.unit_length, most_voxels)
 
     def at(self, time: float) -> GaussianCloud:
         """The cloud itself: it does not move."""
