@@ -92,7 +92,9 @@ def test_gradients_of_the_reference_are_differences(matter, case):
                 moved = setup.unknowns[name].clone()
                 moved[view] += step
                 ends.append(setup.score("reference", {**setup.unknowns, name: moved}))
-            assert float(found[name][view]) == pytest.approx(float(ends[0] - ends[1]) / 2e-5, rel=1e-6), name
+            slack = 1e-8 * float(found[name].abs().max())
+            difference = float(ends[0] - ends[1]) / 2e-5
+            assert float(found[name][view]) == pytest.approx(difference, rel=1e-6, abs=slack), name
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -153,20 +155,17 @@ def test_one_unknown_alone_gets_the_same_gradient(name, backend, gpu):
 def test_a_width_of_zero_has_no_gradient_and_a_small_one_a_proportional_one(backend):
     """Frames depend on σ²: the slope at σ is twice that at σ/2 for small widths."""
     setup = Setup("blurred", "one")
+    setup.weights = setup.weights[[0, 0, 0]]
+    setup.unknowns = {name: value[[0, 0, 0]] for name, value in setup.unknowns.items()}
     setup.unknowns["psf"] = torch.tensor([0.0, 0.02, 0.04], dtype=DOUBLE)
-    setup.unknowns["distance"][:] = 2.0
-    for name in ("lines", "weights"):
-        same = (setup.unknowns[name] if name == "lines" else setup.weights)[:1].expand(3, -1, -1, *(-1,) * (name == "lines"))
-        if name == "lines":
-            setup.unknowns[name] = same.clone()
-        else:
-            setup.weights = same.clone()
     slope = setup.gradients(backend)["psf"]
     assert float(slope[0]) == 0
     assert float(slope[2] / slope[1]) == pytest.approx(2, rel=0.02)
 
 
-@pytest.mark.parametrize(("asked", "transforms"), [((), 2), (("distance",), 3), (("psf",), 3), (("distance", "psf"), 4)])
+@pytest.mark.parametrize(
+    ("asked", "transforms"), [((), 2), (("distance",), 3), (("psf",), 3), (("distance", "psf"), 4)]
+)
 def test_a_gradient_costs_one_transform_and_none_where_it_is_not_asked_for(asked, transforms, monkeypatch):
     setup, done, forward = Setup("blurred", "one"), [], cpu._forward
     monkeypatch.setattr(cpu, "_forward", lambda wave: done.append(1) or forward(wave))
@@ -182,7 +181,10 @@ def test_tensors_make_the_path_that_arrays_make():
     common = (setup.raster, PITCH / setup.factor, ENERGY)
     fixed = optical_path(*common, z.numpy(), sigma.numpy(), (setup.frame, corner, setup.factor))
     other = optical_path(*common, 2 * z.numpy(), np.zeros(3), (setup.frame, corner, setup.factor))
-    for path in (setup.path(setup.unknowns["distance"], setup.unknowns["psf"], torch.float32), other.corrected(z, sigma)):
+    for path in (
+        setup.path(setup.unknowns["distance"], setup.unknowns["psf"], torch.float32),
+        other.corrected(z, sigma),
+    ):
         assert all(torch.equal(a, b) for a, b in zip(path._arrays, fixed._arrays))
         assert (path.alike, path.shape, path.margin, path.factor) == (False, fixed.shape, fixed.margin, fixed.factor)
 
@@ -214,33 +216,32 @@ def test_views_of_unequal_energies_are_those_of_single_ones(channels, backend, s
 
 
 def test_an_instrument_takes_energies_per_exposure():
-    views = Views.evenly_spaced(3, (9, 14), PITCH)
-    energies, z = np.array([17.0, 20.0, 24.5]), UNIT * np.array([1.3, 2.0, 4.0])
-
-    def exposures(at: slice, energy: float | np.ndarray) -> Exposures:
-        made = Exposures(views[np.arange(3)[at]], 20.0, z[at], np.full(len(z[at]), 0.7), np.zeros(len(z[at])))
-        object.__setattr__(made, "energy_kev", energy)
-        return made
-
-    beams = Instrument(exposures(slice(0, 3), energies))
+    """As instruments of one energy each, at distances of fringes that reach equally far; equal ones change nothing."""
+    views, energies = Views.evenly_spaced(3, (9, 14), PITCH), np.array([17.0, 20.0, 24.5])
+    z = UNIT * np.array([2.3, 2.35, 2.4]) * energies / ENERGY
     draw = torch.Generator().manual_seed(3)
-    B, D = (1e-12 * torch.rand(3, *beams.views.shape, generator=draw) for _ in range(2))
-    found = beams.image(B, 1e3 * D)
-    assert torch.equal(beams.image(B[[2, 0]], 1e3 * D[[2, 0]], np.array([2, 0])), found[[2, 0]])
+
+    def instrument(at: list[int], energy: float | np.ndarray) -> Instrument:
+        made = Exposures(views[np.array(at)], ENERGY, z[at], np.full(len(at), 0.7), np.zeros(len(at)))
+        object.__setattr__(made, "energy_kev", energy)
+        return Instrument(made)
+
+    beams = instrument([0, 1, 2], energies)
+    D = 1e-9 * torch.rand(3, *beams.views.shape, generator=draw)
+    B, found = 1e-3 * D, beams.image(1e-3 * D, D)
+    assert torch.allclose(beams.image(B[[2, 0]], D[[2, 0]], np.array([2, 0])), found[[2, 0]], atol=1e-6)
     for v, energy in enumerate(energies):
-        alone = Instrument(exposures(slice(v, v + 1), float(energy)))
-        (my, mx), (oy, ox) = alone.margin, beams.margin
-        if (my, mx) == (oy, ox):
-            assert torch.allclose(alone.image(B[[v]], 1e3 * D[[v]])[0], found[v], atol=1e-6)
-    equal = Instrument(exposures(slice(0, 3), np.full(3, 20.0)))
-    plain = Instrument(exposures(slice(0, 3), 20.0))
-    B, D = (1e-12 * torch.rand(3, *plain.views.shape, generator=draw) for _ in range(2))
-    assert torch.equal(equal.image(B, 1e3 * D), plain.image(B, 1e3 * D))
+        assert torch.allclose(instrument([v], float(energy)).image(B[[v]], D[[v]])[0], found[v], atol=1e-6)
+    plain = instrument([0, 1, 2], ENERGY).image(B, D)
+    assert torch.equal(instrument([0, 1, 2], np.full(3, ENERGY)).image(B, D), plain)
+    assert float((plain - found).abs().max()) > 1e-3
 
 
 def test_nothing_waits_for_the_device(gpu):
     setup = Setup("oversampled and blurred", "two", gpu)
-    leaves = {n: v.to(gpu, v.dtype if n != "lines" else torch.float32).requires_grad_() for n, v in setup.unknowns.items()}
+    leaves = {
+        n: v.to(gpu, v.dtype if n != "lines" else torch.float32).requires_grad_() for n, v in setup.unknowns.items()
+    }
     table = torch.tensor([setup.matter] * 3, dtype=DOUBLE, device=gpu)
     planned, index = setup.path(leaves["distance"].detach(), None, torch.float32), torch.tensor([2, 0, 1], device=gpu)
     with Watch():
