@@ -65,5 +65,5 @@ $(TOOLS)/bin/cibuildwheel:
 	$(TOOLS)/bin/python -m pip install build "cibuildwheel>=3.1"
 
 clean: ## remove everything that was made here
-	rm -rf $(VENV) build dist demo .pytest_cache .ruff_cache
+	rm -rf $(VENV) build dist demo .pytest_cache .ruff_cache .hypothesis
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +

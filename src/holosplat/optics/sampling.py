@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from ..scan import Exposures
 from ..units import wavelength
 from .propagation import fresnel_reach_px
@@ -24,7 +22,7 @@ def padding(exposures: Exposures, oversample: int) -> tuple[int, int]:
     propagator (see `fresnel_transfer`).
     """
     pitch = exposures.views.pixel_size
-    optics = zip(exposures.distance, np.broadcast_to(exposures.energy_kev, exposures.distance.shape))
+    optics = zip(exposures.distance, exposures.energy_kev)
     reach = max(fresnel_reach_px(pitch / oversample, z, float(energy)) for z, energy in optics)
     blur_px = math.ceil(4 * float(exposures.psf_sigma_px.max()))
     margin = math.ceil(reach / oversample) + blur_px + GUARD_PX
@@ -43,8 +41,7 @@ def resolving_oversample(exposures: Exposures, samples_per_fringe: float, at_lea
     At most `2 samples_per_fringe`, or 8: fringes far narrower than a pixel hardly change a pixel's mean (with 16,
     cells of 64 µm on 3.2 µm pixels stay right to 1.5 % of their contrast however short the distance).
     """
-    lam_z = wavelength(np.asarray(exposures.energy_kev)) * exposures.distance
-    fringe = math.sqrt(float(lam_z.min()))
+    fringe = math.sqrt((wavelength(exposures.energy_kev) * exposures.distance).min())
     wanted = math.ceil(exposures.views.pixel_size * samples_per_fringe / fringe)
     return max(at_least, min(wanted, max(8, math.ceil(2 * samples_per_fringe))))
 
