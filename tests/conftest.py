@@ -11,6 +11,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # threads that spin starve 
 import pytest
 import torch
 
+pytest.register_assert_rewrite("helpers")  # failures there say as much as in the tests
+
 TRITON = importlib.util.find_spec("triton") is not None
 GPU = TRITON and torch.cuda.is_available()
 KERNELS = ("projectors.splat", "optics.hologram", "fit.fidelity", "fit.adam")

@@ -183,8 +183,8 @@ def test_material_of_falls_back_or_says_so():
     ("name", "text", "said"),
     [
         ("t.json", "{not json", "valid JSON"),
-        ("t.toml", "a = = 1", "valid JSON"),
-        ("t.json", "[1, 2]", "map mesh file names"),
+        ("t.toml", "a = = 1", "valid TOML"),
+        ("t.json", "[1, 2]", "must hold a table, but it holds list"),
         ("t.json", "{}", "map mesh file names"),
         ("t.json", '{"rbc*": 3}', r"rbc\*"),
         ("t.json", '{"rbc*": {"density": 3}}', r"rbc\*"),

@@ -8,9 +8,7 @@ Densities are in g/cm³, the unit chemists and tables use; energies in keV.
 
 from __future__ import annotations
 
-import json
 import math
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
@@ -21,6 +19,7 @@ from typing import Any, NamedTuple
 import xraydb
 
 from .checks import InputError, in_range, require
+from .tables import read_table
 
 ENERGY_RANGE_KEV = (0.1, 400.0)
 """Where Chantler's tables hold both f1 and f2 [keV]."""
@@ -229,15 +228,8 @@ def material_of(name: str, table: Mapping[str, Material], default: Material | No
 
 
 def _read_table(path: Path) -> dict[str, Any]:
-    try:
-        text = path.read_text(encoding="utf-8")
-        table = tomllib.loads(text) if path.suffix.lower() == ".toml" else json.loads(text)
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} must be a readable JSON or TOML file, but reading it failed: {error}.") from None
-    except ValueError as error:  # both decoders' errors
-        raise InputError(f"{path} must be valid JSON (or TOML, named .toml), but {error}.") from None
-    if not isinstance(table, dict) or not table:
-        raise InputError(f'{path} must map mesh file names to materials, like {{"cell*.vtk": "red cell"}}.')
+    table = read_table(path)
+    require(bool(table), f'{path} must map mesh file names to materials, like {{"cell*.vtk": "red cell"}}.')
     return table
 
 

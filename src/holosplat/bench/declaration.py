@@ -18,9 +18,9 @@ from ..materials import DeltaBeta, parse_material
 from ..optics.noise import PHOTON_RANGE
 from ..scan import Exposures, interleaved_split
 from ..specimens.scene import MeshScene
+from ..tables import from_table, merged, read_table
 from ..workflows.settings import MaterialPrior
 from .specimens import Bodies, Specimen
-from .tables import from_table, merged, read_toml
 
 MOST_PIXELS = 4096
 
@@ -193,7 +193,7 @@ class Declaration:
 
 def declared_names(path: Path) -> list[str]:
     """The cases of a file: its variants, or, without any, one by the file's own name."""
-    return list(_variants(path, read_toml(path))) or [path.stem]
+    return list(_variants(path, read_table(path))) or [path.stem]
 
 
 def read_declaration(path: Path, name: str, with_snapshots: bool = False) -> Declaration:
@@ -201,7 +201,7 @@ def read_declaration(path: Path, name: str, with_snapshots: bool = False) -> Dec
 
     with_snapshots: whether simulated cells are at hand, such that the file's `[with_snapshots]` applies.
     """
-    tables = read_toml(path)
+    tables = read_table(path)
     variants = _variants(path, tables)
     known = ", ".join(variants) or path.stem
     require(

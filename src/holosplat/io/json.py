@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from ..checks import InputError, require
+from ..tables import read_table
 from .atomic import atomic_path
 
 
@@ -19,9 +19,4 @@ def write_json(path: Path, values: dict[str, Any]) -> None:
 
 def read_json(path: Path) -> dict[str, Any]:
     """A JSON table; `InputError` if the file is missing or damaged."""
-    try:
-        values = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} must be a readable JSON file, but it is not: {error}.") from error
-    require(isinstance(values, dict), f"{path} must hold a table, but it holds {type(values).__name__}.")
-    return values
+    return read_table(path)

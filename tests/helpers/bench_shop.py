@@ -1,0 +1,68 @@
+"""A benchmark of one's own: a case, and a method that keeps what it was given."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+import holosplat as hs
+from holosplat.bench.case import Case
+from holosplat.bench.method import Method
+from holosplat.bench.run import Suite
+from holosplat.representations.voxels import VoxelGrid
+from holosplat.specimens.red_cells import icosphere
+
+MATERIAL = hs.DeltaBeta(2e-7, 2e-10)
+PITCH = 1e-6
+RADIUS = 5.0
+SHAPES = {"round": (24, 24), "wide": (21, 31)}
+
+
+def make_case(name: str, seed: int) -> Case:
+    """A ball in four training frames and two held out; the seed moves it."""
+    vertices, faces = icosphere(3)
+    ball = hs.TriangleMesh(PITCH * (RADIUS * vertices + [0.3 * (seed % 7), 1.0, -2.0]), faces)
+    exposures = hs.Exposures.of(hs.Views.evenly_spaced(6, SHAPES[name], PITCH), 20.0, 0.02)
+    scene = hs.MeshScene.of_one_material([ball], MATERIAL)
+    return Case(name, seed, scene, exposures, np.arange(6) % 3 == 2, hs.MaterialPrior.known(MATERIAL))
+
+
+def voxels(scan: hs.Scan, value: float = 1.0) -> VoxelGrid:
+    """A cube of `value` in the middle."""
+    grid = hs.Grid.of_views(scan.views)
+    values = torch.zeros(1, *grid.shape)
+    z, y, x = (n // 2 for n in grid.shape)
+    values[0, z - 5 : z + 3, y - 3 : y + 5, x - 4 : x + 4] = value
+    return VoxelGrid(values, grid, MATERIAL.delta, MATERIAL.beta)
+
+
+class Recorder:
+    """Methods that keep what they were given."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[str, hs.Scan, hs.MaterialPrior, int]] = []
+
+    def method(self, name: str, act: Callable[[hs.Scan], hs.Object] = voxels) -> Method:
+        def run(scan, prior, seed, on_progress):
+            on_progress("thinking", 0.5)
+            self.calls.append((name, scan, prior, seed))
+            return act(scan)
+
+        return Method(name, "fakes", f"a fake called {name}", run)
+
+    @property
+    def names(self) -> list[str]:
+        return [name for name, *_ in self.calls]
+
+
+def suite(methods: list[Method], cases=("round",), seeds=(3,), load=make_case) -> Suite:
+    return Suite(cases, seeds, {method.name: method for method in methods}, {}, load)
+
+
+def fail(error: BaseException) -> Callable[[hs.Scan], hs.Object]:
+    def act(scan):
+        raise error
+
+    return act

@@ -1,0 +1,75 @@
+"""Balls, their scan, and small fits of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from holosplat.beamline.simulate import simulate
+from holosplat.fit.density import DensityControl
+from holosplat.fit.loop import Fit, FitOptions
+from holosplat.fit.objective import Objective
+from holosplat.fit.schedule import Schedule
+from holosplat.geometry import Views
+from holosplat.representations import GaussianCloud, random_cloud
+from holosplat.scan import Exposures, Scan
+
+PIXEL = 2e-6
+MATERIAL = (7e-7, 2.6e-10)
+SHAPE = (20, 24)
+BALLS = np.array([[-5.0, -3.0, 2.0, 4.0], [4.0, 4.0, -3.0, 3.0], [3.0, -5.0, -1.0, 3.5]]) * PIXEL
+"""Centre (x, y, z) and radius of each ball [m]."""
+
+
+class Balls:
+    """Balls of the material; their line integrals are chords (no numerics shared with the Gaussians)."""
+
+    def at(self, time: float) -> Balls:
+        return self
+
+    def project(self, views: Views) -> tuple[Tensor, Tensor]:
+        h, w = views.shape
+        x = (np.arange(w) + 0.5 - w / 2) * views.pixel_size
+        y = (np.arange(h) + 0.5 - h / 2) * views.pixel_size
+        chords = np.zeros((len(views), h, w))
+        for v, (rotation, shift) in enumerate(zip(views.rotations, views.shifts)):
+            for *centre, radius in BALLS:
+                cx, cy, _ = rotation @ centre
+                square = (x + shift[0] - cx)[None] ** 2 + (y + shift[1] - cy)[:, None] ** 2
+                chords[v] += 2 * np.sqrt(np.clip(radius**2 - square, 0, None))
+        return torch.from_numpy(chords * MATERIAL[1]), torch.from_numpy(chords * MATERIAL[0])
+
+
+def a_scan(train: int = 6, test: int = 2) -> Scan:
+    """Noise-free frames of the balls; the test frames stand last."""
+    count = train + test
+    views = Views.from_angles(np.arange(count) * 180.0 / count, SHAPE, PIXEL)
+    is_test = np.arange(count) >= train
+    return simulate(Balls(), Exposures.of(views, 20.0, 0.05, 0.3), is_test=is_test)
+
+
+def a_cloud(count: int = 100, seed: int = 0) -> GaussianCloud:
+    return random_cloud(count, Views.evenly_spaced(1, SHAPE, PIXEL), MATERIAL, 1, 4e-6, seed)
+
+
+def fit_of(scan: Scan, *, objective=None, density=None, seed=0, cloud=None, **schedule) -> Fit:
+    """A fit of a small random cloud; `schedule` are fields of `Schedule`."""
+    options = FitOptions(objective or Objective(), Schedule(**schedule), density or DensityControl(), "cpu")
+    return Fit(scan, cloud or a_cloud(), options, seed)
+
+
+def run(fit: Fit, until: int | None = None) -> list[dict[str, float]]:
+    """Advance the fit; returns its records without the clock."""
+    records: list[dict[str, float]] = []
+    fit.run(records.append, until)
+    return [{name: value for name, value in record.items() if name != "seconds"} for record in records]
+
+
+def equal(a: GaussianCloud, b: GaussianCloud) -> bool:
+    """Whether two clouds are bit for bit the same."""
+    return all(torch.equal(p, q) for p, q in zip(a.parameters, b.parameters))
+
+
+HASTY = {"rate_position": 3.0, "rate_scale": 0.5, "rate_amplitude": 2.0, "decay": 1.0}
+"""Rates at which the fit soon gets worse on views it does not see."""

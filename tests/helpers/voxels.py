@@ -1,0 +1,34 @@
+"""Voxel grids, views and random values."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from holosplat.geometry import Grid, Views
+
+DOUBLE = torch.float64
+ROWS = Grid((11, 7, 9), (1.1, 1.0, 0.9), (-4.0, -3.0, -3.7))
+"""Rows along y are those of a detector of 7 rows of pitch 1."""
+
+
+def around(count: int, shape: tuple[int, int], shift: float = 0.0) -> Views:
+    """Views about y at odd angles and both axes' own, with a detector shift of their own along x."""
+    angles = np.concatenate([[0.0, 90.0], np.linspace(13, 167, count)])[:count]
+    shifts = np.stack([shift * np.arange(count), np.zeros(count)], 1)
+    return replace(Views.from_angles(angles, shape, 1.0), shifts=shifts)
+
+
+def anyhow(count: int, shape: tuple[int, int], seed: int = 0) -> Views:
+    """Views from all directions, with shifts along both axes."""
+    shifts = np.random.default_rng(seed).uniform(-1, 1, (count, 2))
+    return Views(Rotation.random(count, rng=seed).as_matrix(), shifts, shape, 1.0)
+
+
+def randoms(*shape: int, seed: int = 0, dtype: torch.dtype = DOUBLE) -> Tensor:
+    """Normal random numbers."""
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)

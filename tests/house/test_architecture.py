@@ -1,0 +1,341 @@
+"""The house rules of docs/design/architecture.md, read from the syntax trees of every file in src/holosplat.
+
+Each rule maps files to complaints. It is held on the real files, and on small bad examples, so that a rule
+that has gone blind fails too.
+"""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from fnmatch import fnmatch
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+Files = dict[str, str]
+"""Path below src/holosplat → source text."""
+
+TIERS = (
+    ("units", "version", "checks", "tables", "native", "backends", "memory")
+    + ("geometry", "scan", "volume", "mesh", "matter"),
+    ("materials", "optics", "metrics", "projectors", "preprocess"),
+    ("specimens", "representations", "model"),
+    ("io",),
+    ("fit", "baselines"),
+    ("methods",),
+    ("workflows", "beamline", "planning"),
+    ("report",),
+    ("bench",),
+    ("thesis",),
+    ("cli",),
+)
+"""Rooms, lowest first. A room imports rooms of lower tiers."""
+
+SAME_TIER = dict.fromkeys(TIERS[0], TIERS[0])
+"""Rooms of their own tier that a room may import (the nouns among themselves: without cycles)."""
+
+BACKENDS = ("*/cpu.py", "*/cuda.py", "*/reference.py")
+BACKEND_IMPORTS = {"projectors/mesh/reference.py": ("geometry",), "optics/hologram/reference.py": ("optics",)}
+"""What a backend file may import of ours, beside its own folder and `native`."""
+
+HEAVY: dict[str, tuple[str, ...]] = {
+    "vtk": (),
+    "vtkmodules": (),
+    "trimesh": (),
+    "skimage": (),
+    "matplotlib": ("report", "bench/pages", "thesis/pages"),
+    "jinja2": ("report",),
+    "tyro": ("cli",),
+}
+"""Packages slow to import, and the rooms or parts of rooms that do so at module level (others inside a function)."""
+
+MOST_LINES = 400
+MOST_ARGUMENTS = 7
+MANY_ARGUMENTS = {
+    "projectors/splat/cpu.py:splat": "all arguments of the package's splat, checked, by position",
+    "projectors/splat/cuda.py:splat": "all arguments of the package's splat, checked, by position",
+    "projectors/splat/reference.py:splat": "all arguments of the package's splat, checked, by position",
+}
+"""Public functions with more arguments by position, each with its reason."""
+
+SOURCE = Path(__file__).resolve().parents[2] / "src" / "holosplat"
+TESTS = Path(__file__).resolve().parents[1]
+BESIDE_THE_ROOMS = ("house", "helpers")
+"""Folders of tests that are not of one room: the house as a whole, and what test files share."""
+
+
+@pytest.fixture(scope="module")
+def files() -> Files:
+    """Every Python file of the package."""
+    found = {str(p.relative_to(SOURCE).as_posix()): p.read_text(encoding="utf-8") for p in SOURCE.rglob("*.py")}
+    assert len(found) > 20
+    return found
+
+
+# --- reading ------------------------------------------------------------------------------------------------
+
+
+def _room(path: str) -> str:
+    """`optics/detector.py` → `optics`, `scan.py` → `scan`, the package's own `__init__.py` → empty."""
+    first = path.split("/")[0].removesuffix(".py")
+    return "" if first == "__init__" else first
+
+
+def _imports(files: Files, path: str) -> Iterator[tuple[str, str, bool]]:
+    """(our file or empty, full dotted name, whether at module level) of each import but the version's."""
+    tree = ast.parse(files[path])
+    inside = {
+        id(n) for f in ast.walk(tree) if isinstance(f, ast.FunctionDef | ast.AsyncFunctionDef) for n in ast.walk(f)
+    }
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            package = ("holosplat/" + path).split("/")[: -node.level] if node.level else []
+            base = ".".join([*package, *filter(None, [node.module])])
+            names = [f"{base}.{alias.name}" for alias in node.names]
+        else:
+            continue
+        for name in set(names):
+            yield _file_of(files, name), name, id(node) not in inside
+
+
+def _file_of(files: Files, name: str) -> str:
+    """The file that holds the dotted `name`: itself a module, or a name in one; empty if it is not ours."""
+    parts = name.split(".")
+    if parts[0] != "holosplat":
+        return ""
+    for depth in range(len(parts), 1, -1):
+        stem = "/".join(parts[1:depth])
+        for candidate in (f"{stem}.py", f"{stem}/__init__.py"):
+            if candidate in files:
+                return candidate
+    return "__init__.py"
+
+
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+
+def _public(files: Files) -> Iterator[tuple[str, ast.ClassDef | Function, bool]]:
+    """(path:name, node, whether a method) of public classes and functions; `__init__` counts as public."""
+
+    def walk(body: list[ast.stmt], name: str, method: bool) -> Iterator[tuple[str, ast.ClassDef | Function, bool]]:
+        for node in body:
+            if not isinstance(node, ast.ClassDef | Function):
+                continue
+            if node.name.startswith("_") and node.name != "__init__":
+                continue
+            yield f"{name}{node.name}", node, method
+            if isinstance(node, ast.ClassDef):
+                yield from walk(node.body, f"{name}{node.name}.", True)
+
+    for path, text in files.items():
+        yield from walk(ast.parse(text).body, f"{path}:", False)
+
+
+# --- rules --------------------------------------------------------------------------------------------------
+
+
+def every_room_is_on_the_plan(files: Files) -> list[str]:
+    """A new room needs its place in `TIERS` and in docs/design/architecture.md."""
+    known = {"", *(room for tier in TIERS for room in tier)}
+    return [path for path in files if _room(path) not in known]
+
+
+def imports_run_downwards(files: Files) -> list[str]:
+    """A room imports its own files, rooms of lower tiers, what `SAME_TIER` adds, and the root's version."""
+    tier_of = {room: t for t, tier in enumerate(TIERS) for room in tier}
+    complaints = []
+    for path in files:
+        room = _room(path)
+        for target, name, _ in _imports(files, path):
+            there = _room(target)
+            if not room or not target or there == room:
+                continue
+            lower = tier_of.get(there, len(TIERS)) < tier_of.get(room, -1)
+            if not lower and there not in SAME_TIER.get(room, ()):
+                complaints.append(f"{path} imports {name}")
+    return complaints
+
+
+def no_cycles(files: Files) -> list[str]:
+    """No file imports itself by way of others, wherever in the file the imports stand."""
+    graph = {path: {t for t, _, _ in _imports(files, path) if t and t != path} for path in files}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        return [" → ".join(error.args[1])]
+    return []
+
+
+def backends_stand_alone(files: Files) -> list[str]:
+    """A backend file imports its own folder, `native`, and what `BACKEND_IMPORTS` adds."""
+    complaints = []
+    for path in files:
+        if not any(fnmatch(path, pattern) for pattern in BACKENDS):
+            continue
+        for target, name, _ in _imports(files, path):
+            own = target.startswith(path.rsplit("/", 1)[0] + "/") or target == "native.py"
+            if target and not own and _room(target) not in BACKEND_IMPORTS.get(path, ()):
+                complaints.append(f"{path} imports {name}")
+    return complaints
+
+
+def heavy_packages_wait(files: Files) -> list[str]:
+    """Packages in `HEAVY` are imported at module level in their own rooms only."""
+    return [
+        f"{path} imports {name} at module level"
+        for path in files
+        for _, name, top in _imports(files, path)
+        if top and not path.startswith(HEAVY.get(name.split(".")[0], ("",)))
+    ]
+
+
+def files_are_short(files: Files) -> list[str]:
+    """No file is longer than `MOST_LINES`."""
+    lengths = {path: text.count("\n") for path, text in files.items()}
+    return [f"{path}: {n} lines" for path, n in lengths.items() if n > MOST_LINES]
+
+
+def everything_public_is_described(files: Files) -> list[str]:
+    """Modules, public classes, functions and methods have docstrings (the class describes `__init__`)."""
+    bare = [path for path, text in files.items() if text.strip() and not ast.get_docstring(ast.parse(text))]
+    named = [(name, node) for name, node, _ in _public(files) if node.name != "__init__"]
+    return bare + [name for name, node in named if not ast.get_docstring(node)]
+
+
+def arguments_are_few(files: Files) -> list[str]:
+    """Public functions take no `**kwargs`, and at most `MOST_ARGUMENTS` by position beside self or cls."""
+    complaints = []
+    for name, node, method in _public(files):
+        if isinstance(node, ast.ClassDef):
+            continue
+        if node.args.kwarg:
+            complaints.append(f"{name} takes **{node.args.kwarg.arg}")
+        static = any(isinstance(d, ast.Name) and d.id == "staticmethod" for d in node.decorator_list)
+        count = len(node.args.posonlyargs) + len(node.args.args) - (method and not static)
+        if count > MOST_ARGUMENTS and name not in MANY_ARGUMENTS:
+            complaints.append(f"{name} takes {count} arguments by position")
+    return complaints
+
+
+RULES: tuple[Callable[[Files], list[str]], ...] = (
+    every_room_is_on_the_plan,
+    imports_run_downwards,
+    no_cycles,
+    backends_stand_alone,
+    heavy_packages_wait,
+    files_are_short,
+    everything_public_is_described,
+    arguments_are_few,
+)
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.__name__)
+def test_the_rule_holds(rule, files):
+    complaints = rule(files)
+    assert not complaints, f"{rule.__doc__}\n" + "\n".join(complaints)
+
+
+def test_the_tests_mirror_the_rooms_in_short_files(files):
+    """A test file lies in the folder of its room (at the root for a room that is one file); names are unique."""
+    found = {path.relative_to(TESTS).as_posix(): path.read_text(encoding="utf-8") for path in TESTS.rglob("*.py")}
+    folders = {path.split("/")[0] for path in found if "/" in path}
+    assert folders <= {path.split("/")[0] for path in files if "/" in path} | set(BESIDE_THE_ROOMS)
+    names = [path.rsplit("/", 1)[-1] for path in found if "/test_" in path]
+    assert sorted(set(names)) == sorted(names)
+    assert not files_are_short(found)
+
+
+def test_the_exceptions_are_still_needed(files):
+    """An exception that nothing uses any more is taken off the list."""
+    many = {name for name, node, _ in _public(files) if isinstance(node, Function)}
+    assert set(MANY_ARGUMENTS) <= many
+    assert all(path in files for path in BACKEND_IMPORTS)
+
+
+# --- the rules see what they should -------------------------------------------------------------------------
+
+GOOD: Files = {
+    "__init__.py": '"""Root."""\n',
+    "version.py": '"""The version."""\n__version__ = "1"\n',
+    "units.py": '"""Constants."""\nimport math\n',
+    "geometry.py": '"""Views."""\nfrom .units import x\n',
+    "optics/__init__.py": '"""Waves."""\nfrom .wave import y\n',
+    "optics/wave.py": '"""A wave."""\nfrom ..units import x\n\n\ndef _draw():\n    import matplotlib\n',
+    "projectors/__init__.py": '"""Lines."""\n',
+    "native.py": '"""Kernels."""\n',
+    "projectors/mesh/__init__.py": '"""Meshes."""\nfrom . import reference\nfrom ...geometry import Views\n',
+    "projectors/mesh/reference.py": '"""Twin."""\nfrom ... import native\nfrom ...geometry import Views\n',
+    "io/__init__.py": '"""Files."""\nfrom ..version import __version__\nfrom ..optics import y\n',
+    "report/__init__.py": '"""Pages."""\nimport matplotlib.pyplot\n',
+    "cli.py": '"""Commands."""\nimport tyro\nfrom . import report\nfrom holosplat.optics.wave import y\n',
+}
+"""A house that keeps every rule."""
+
+METHOD = '"""M."""\n\n\nclass A:\n    """A."""\n\n    def {signature}:\n        {body}\n'
+EIGHT = "(self, a, b, c, d, e, f, g, h)"
+BAD: tuple[tuple[Callable[[Files], list[str]], str, str], ...] = (
+    (every_room_is_on_the_plan, "attic.py", '"""A."""\n'),
+    (every_room_is_on_the_plan, "attic/box.py", '"""A."""\n'),
+    (imports_run_downwards, "units.py", "from .optics.wave import y\n"),
+    (imports_run_downwards, "units.py", "from . import optics\n"),
+    (imports_run_downwards, "units.py", "import holosplat.optics.wave\n"),
+    (imports_run_downwards, "units.py", "from holosplat import cli\n"),
+    (imports_run_downwards, "optics/wave.py", "from ..projectors import mesh\n"),
+    (imports_run_downwards, "optics/wave.py", "def late():\n    from .. import io\n"),
+    (imports_run_downwards, "report/__init__.py", "from ..cli import main\n"),
+    (imports_run_downwards, "io/more.py", "from .. import other\n"),
+    (no_cycles, "units.py", "from .geometry import Views\n"),
+    (no_cycles, "optics/wave.py", "def late():\n    from . import y\n"),
+    (backends_stand_alone, "projectors/splat/cpu.py", "from ...geometry import Views\n"),
+    (backends_stand_alone, "projectors/splat/cpu.py", "from ..mesh.reference import rays\n"),
+    (backends_stand_alone, "projectors/mesh/reference.py", "from ...checks import require\n"),
+    (heavy_packages_wait, "io/vtk.py", "import vtk\n"),
+    (heavy_packages_wait, "io/vtk.py", "try:\n    from vtkmodules import a\nexcept OSError:\n    pass\n"),
+    (heavy_packages_wait, "report/__init__.py", "import tyro as t\n"),
+    (files_are_short, "units.py", "x = 1\n" * (MOST_LINES + 1)),
+    (everything_public_is_described, "units.py", "x = 1\n"),
+    (everything_public_is_described, "units.py", '"""U."""\n\n\ndef f():\n    return 1\n'),
+    (everything_public_is_described, "units.py", METHOD.format(signature="f(self)", body="return")),
+    (everything_public_is_described, "units.py", '"""U."""\n\n\nclass A:\n    b = 1\n'),
+    (arguments_are_few, "units.py", 'def f(**options):\n    """F."""\n'),
+    (arguments_are_few, "units.py", 'def f(a, b, c, d, /, e, f, g, h):\n    """F."""\n'),
+    (arguments_are_few, "units.py", METHOD.format(signature="method" + EIGHT, body='"""F."""')),
+    (arguments_are_few, "units.py", METHOD.format(signature="__init__" + EIGHT, body="return")),
+)  # fmt: skip
+"""Rule, file and contents that break it when added to the good house."""
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.__name__)
+def test_the_rule_accepts_a_good_house(rule):
+    seven = {"projectors/splat/cpu.py": 'def _f(a, b, c, d, e, f, g, h):\n    """F."""\n'}
+    assert rule(GOOD) == []
+    assert arguments_are_few(seven) == []
+    assert any(bad is rule for bad, _, _ in BAD), "the rule has no bad example"
+
+
+@pytest.mark.parametrize(("rule", "path", "text"), BAD, ids=lambda value: getattr(value, "__name__", None))
+def test_the_rule_refuses_a_bad_house(rule, path, text):
+    assert len(rule(GOOD | {path: text})) == 1
+
+
+# --- measured -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("everything", [False, True], ids=["holosplat", "all but the readers"])
+def test_imports_are_light(everything, files):
+    """No package of `HEAVY` is loaded by `import holosplat`, nor by what does not draw or talk; triton neither."""
+    readers = ("cli", "report/", "bench/pages/", "thesis/pages", "__init__")
+    low = [p for p in files if everything and not p.startswith(readers)]
+    low = [p for p in low if not fnmatch(p, "*/cuda.py") and not fnmatch(p, "*/triton_*.py")]
+    modules = ["holosplat", *("holosplat." + p.removesuffix(".py").replace("/", ".") for p in low)]
+    code = f"import importlib, sys\nfor m in {modules}: importlib.import_module(m.removesuffix('.__init__'))\n"
+    code += f"print(*(m for m in {[*HEAVY, 'triton']} if m in sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == []

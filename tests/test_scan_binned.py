@@ -1,0 +1,43 @@
+"""Binned scans: where the pixels are, and what is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.holographic import CELL, PIXEL, SHAPE, cells, scan_of
+from holosplat.checks import InputError
+from holosplat.geometry import Views, rotation_y
+from holosplat.representations import GaussianCloud
+from holosplat.representations.gaussians import raw_of
+from holosplat.scan import Exposures, Scan
+
+
+@pytest.mark.parametrize("factor", [2, 3])
+@pytest.mark.parametrize("shape", [(36, 42), (37, 41), (38, 43), (41, 37)])
+def test_binned_pixels_are_where_they_say(shape, factor):
+    """A known Gaussian: its lines, binned, are its lines on the binned scan's own views."""
+    centre, sigma = torch.tensor([[3.3, -2.2, 1.4]]), torch.full((1, 3), np.log(4.0))
+    one = GaussianCloud(
+        (centre, sigma, torch.tensor([[1.0, 0, 0, 0]]), raw_of(torch.tensor([[0.7]]))), PIXEL, 1e-6, 1e-9
+    )
+    shifts = PIXEL * np.array([[0, 0], [1.3, -0.6], [-0.4, 2.1]])
+    views = Views(rotation_y([0, 40, 110]), shifts, shape, PIXEL)
+    frames = one.project(views)[1].numpy() / 1e-6
+    exposures = Exposures.of(views, 20.0, 0.1, 0.6)
+    small = Scan(frames, exposures, np.array([False, True, False]), {"from": "here"}).binned(factor)
+    assert small.frames.shape[1:] == small.views.shape == (shape[0] // factor, shape[1] // factor)
+    assert small.views.pixel_size == pytest.approx(factor * PIXEL)
+    wanted = one.project(small.views)[1].numpy() / 1e-6
+    np.testing.assert_allclose(small.frames, wanted, rtol=0, atol=0.01 * wanted.max())
+    np.testing.assert_allclose(small.exposures.psf_sigma_px, 0.6 / factor)
+    np.testing.assert_array_equal(small.exposures.distance, exposures.distance)
+    assert (small.is_test.tolist(), small.provenance) == ([False, True, False], {"from": "here"})
+
+
+def test_binning_by_one_changes_nothing_and_by_too_much_is_refused():
+    cell_scan = scan_of(cells(CELL), Views.evenly_spaced(8, SHAPE, PIXEL))
+    assert cell_scan.binned(1) is cell_scan
+    with pytest.raises(InputError, match="binned by 37"):
+        cell_scan.binned(37)

@@ -1,0 +1,100 @@
+"""Beams on one detector: resampling and joining."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers.imaging import PIXEL, SHAPE, cells, rms, taken
+from holosplat.beamline.simulate import simulate
+from holosplat.checks import InputError
+from holosplat.io.nxtomo import read_scan, write_scan
+from holosplat.optics.resampling import Resampling
+from holosplat.scan import Scan
+from holosplat.workflows.join import join
+
+
+def test_resampled_frames_are_those_of_the_coarser_pixel():
+    """Against simulations on the other raster: by 1.6, and by 2 exactly; blurred, so that pixels resolve all."""
+    scene = cells()
+    fine = simulate(scene, taken((100, 120), 2e-6, 1.5), oversample=4).frames
+    for shape, pixel in (((60, 72), 3.2e-6), ((50, 60), 4e-6)):
+        wanted = simulate(scene, taken(shape, pixel, 1.5 * 2e-6 / pixel), oversample=6).frames
+        found = np.stack([Resampling((100, 120), 2e-6, shape, pixel)(frame) for frame in fine])
+        inside = (slice(None), slice(3, -3), slice(3, -3))
+        assert rms((found - wanted)[inside]) < 0.01 * wanted.std()
+
+
+def test_resampling_keeps_even_light_and_tells_its_blur():
+    down = Resampling((20, 31), 2e-6, (9, 14), 4.3e-6)
+    assert down(np.full((20, 31), 1.7)) == pytest.approx(np.full((9, 14), 1.7))
+    assert down.extra_blur == 0
+    up = Resampling((20, 31), 2e-6, (40, 62), 1e-6)
+    assert up.extra_blur == pytest.approx(1e-6 * 0.5)
+    x = np.arange(31) + 0.5
+    wave = np.cos(np.pi * 4 * x / 31)[None] * np.ones((20, 1))
+    assert up(wave)[7] == pytest.approx(np.cos(np.pi * 4 * (np.arange(62) + 0.5) / 62))
+    same = Resampling((20, 31), 2e-6, (20, 31), 2e-6)
+    noise = np.random.default_rng(0).normal(size=(20, 31))
+    assert same(noise) == pytest.approx(noise)
+
+
+def beams(folder: Path) -> tuple[Path, Path]:
+    """Two files of the same cells: other pixels, fields, distances and points of view; the second is reversed."""
+    a = simulate(cells(), taken(psf=0.9), oversample=4)
+    tilted = replace(taken((80, 96), 2.5e-6, 1.2, 2), distance=np.full(2, 0.15))
+    b = simulate(cells(), tilted, oversample=4, is_test=np.array([True, False]))
+    paths = folder / "a.nxs", folder / "b.nxs"
+    write_scan(paths[0], a)
+    write_scan(paths[1], replace(b, frames=b.frames[:, :, ::-1]))
+    return paths
+
+
+def test_beams_are_joined_on_the_coarsest_pixels_of_the_common_field(tmp_path):
+    paths = beams(tmp_path)
+    join(paths, tmp_path / "scan.nxs", flips=("none", "columns"))
+    found = read_scan(tmp_path / "scan.nxs")
+    assert (found.views.shape, found.views.pixel_size) == ((62, 75), PIXEL)
+    assert found.exposures.distance.tolist() == [0.1] * 4 + [0.15] * 2
+    assert found.exposures.psf_sigma_px == pytest.approx([0.9] * 4 + [1.2 * 2.5 / 3.2] * 2)
+    assert found.is_test.tolist() == [False, False, False, True, True, False]
+    assert found.exposures.time == pytest.approx([0, 1e-6, 2e-6, 3e-6, 0, 1e-6])
+    wanted = simulate(cells(), found.exposures, oversample=6).frames
+    inside = (slice(None), slice(4, -4), slice(4, -4))
+    for part in (slice(0, 4), slice(4, 6)):
+        assert rms((found.frames - wanted)[part][inside]) < 0.02 * wanted.std()
+
+
+def test_a_finer_raster_keeps_the_coarse_pixels_blur(tmp_path):
+    paths = beams(tmp_path)
+    join(paths, tmp_path / "scan.nxs", 2e-6, ("none", "columns"))
+    found = read_scan(tmp_path / "scan.nxs")
+    extra = np.sqrt((PIXEL**2 - 4e-12) / 12) / 2e-6
+    assert found.exposures.psf_sigma_px[0] == pytest.approx(np.hypot(0.9 * 1.6, extra))
+    wanted = simulate(cells(), found.exposures, oversample=4).frames
+    inside = (slice(None), slice(6, -6), slice(6, -6))
+    assert rms((found.frames - wanted)[:4][inside]) < 0.08 * wanted.std()
+
+
+def test_what_cannot_be_joined(tmp_path):
+    paths = beams(tmp_path)
+    other = tmp_path / "other.nxs"
+    exposures = replace(taken(), energy_kev=17.0)
+    write_scan(other, Scan(np.ones((4, *SHAPE)), exposures, np.zeros(4, bool)))
+    out = tmp_path / "scan.nxs"
+    with pytest.raises(InputError, match=r"other\.nxs has 17 keV, but .*a\.nxs has 20 keV: a scan has one energy"):
+        join((paths[0], other), out)
+    with pytest.raises(InputError, match=r"a\.nxs is read or written already"):
+        join(paths, paths[0])
+    with pytest.raises(InputError, match="needs at least two"):
+        join(paths[:1], out)
+    with pytest.raises(InputError, match=r"--flip must say one of .* for each of the 2 files, but it says 1"):
+        join(paths, out, flips=("none",))
+    with pytest.raises(InputError, match=r"would be .* pixels"):
+        join(paths, out, 1e-4)
+    with pytest.raises(InputError, match="--pixel-size must lie between"):
+        join(paths, out, 3.2)
+    assert not out.exists()
