@@ -10,11 +10,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from helpers.splats import cloud, error, poses
+from helpers.watch import Watch
 from holosplat import native
 from holosplat.checks import InputError
 from holosplat.projectors.splat import splat
-from test_splat import cloud, error, poses
-from test_triton_splat import Watch
 
 SHAPE = (23, 34)
 TOLERANCE = 2e-5
