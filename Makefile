@@ -4,12 +4,15 @@
 PYTHON ?= python3
 VENV := .venv
 STAMP := $(VENV)/.installed
+DOCS := $(VENV)/.docs-installed
+GALLERY := build/gallery
 NATIVE := $(wildcard native/*.cpp native/*.hpp native/*.cmake native/CMakeLists.txt)
+SOURCES := $(shell find src -name '*.py')
 TOOLS := build/tools
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test check wheel wheels clean
+.PHONY: help setup demo test check docs wheel wheels clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -36,6 +39,18 @@ check: setup ## lint, formatting and types
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/pyright
 
+docs: $(GALLERY)/.built ## run the examples and build the documentation site, into build/site; warnings are errors
+	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/python -m mkdocs build --strict
+
+$(GALLERY)/.built: $(DOCS) docs/site/gallery.py $(wildcard examples/*.py) $(SOURCES)
+	rm -rf $(GALLERY)
+	$(VENV)/bin/python docs/site/gallery.py $(GALLERY)
+	touch $@
+
+$(DOCS): $(STAMP)
+	$(VENV)/bin/python -m pip install -c constraints.txt -e ".[dev,docs]"
+	touch $@
+
 wheel: $(TOOLS)/bin/cibuildwheel ## make a wheel for this machine, into dist/
 	$(TOOLS)/bin/python -m pip wheel . --no-deps --wheel-dir dist
 
@@ -50,5 +65,5 @@ $(TOOLS)/bin/cibuildwheel:
 	$(TOOLS)/bin/python -m pip install build "cibuildwheel>=3.1"
 
 clean: ## remove everything that was made here
-	rm -rf $(VENV) build dist demo .pytest_cache .ruff_cache
+	rm -rf $(VENV) build dist demo .pytest_cache .ruff_cache .hypothesis
 	find src tests -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -10,6 +10,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # threads that spin starve 
 
 import pytest
 import torch
+from hypothesis import HealthCheck, settings
 
 pytest.register_assert_rewrite("helpers")  # failures there say as much as in the tests
 
@@ -17,6 +18,16 @@ TRITON = importlib.util.find_spec("triton") is not None
 GPU = TRITON and torch.cuda.is_available()
 KERNELS = ("projectors.splat", "optics.hologram", "fit.fidelity", "fit.adam")
 """Packages with Triton kernels."""
+
+settings.register_profile(
+    "repeatable",  # the same examples at every run, on every machine, however slow it is
+    derandomize=True,
+    database=None,
+    deadline=None,
+    max_examples=60,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+)
+settings.load_profile("repeatable")
 
 
 def _bind_kernels_to_the_interpreter() -> None:

@@ -142,7 +142,7 @@ def absorption(
     linearised a few times): refraction moves light about, only absorption takes it away.
     """
     instrument, lines = _lines(scan, values, grid, backend)
-    fringe = np.sqrt(wavelength(scan.exposures.energy_kev) * scan.exposures.distance.max()) / scan.views.pixel_size
+    fringe = np.sqrt((wavelength(scan.exposures.energy_kev) * scan.exposures.distance).max()) / scan.views.pixel_size
 
     def blurred(frames: Tensor) -> np.ndarray:
         return gaussian_filter(frames.numpy().astype(np.float64), (0, BLUR * fringe, BLUR * fringe)).ravel()

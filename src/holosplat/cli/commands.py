@@ -66,7 +66,7 @@ def reconstruct(
     settings = how.settings()
     require(seed >= 0, f"--seed must be 0 or more, but it is {seed}.")
     measured = at_time(read_scan(scan), time_frame)
-    prior = matter.prior(measured.exposures.energy_kev)
+    prior = matter.prior(measured.exposures.reference_energy)
     folder = RunFolder(out)
     with ProgressBar() as bar:
         result = fit(measured, prior, settings, seed, folder=folder, resume=resume, on_progress=bar.show)

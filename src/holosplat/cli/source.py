@@ -67,7 +67,7 @@ class SourceOptions:
         self, matter: MeshScene | MeshSeries, filling: Filling, exposures: Exposures, how: Simulation
     ) -> Iterator[np.ndarray]:
         """Frames [H, W] of `matter`, one after another."""
-        light = self.light(exposures.energy_kev)
+        light = self.light(exposures.one_energy("a simulation"))
         if light is None:
             return simulated_frames(matter, exposures, how)
         return polychromatic_frames(lambda energy: refilled(matter, filling, energy), light, exposures, how)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -10,7 +12,7 @@ from ..backends import device, resolve
 from ..checks import require
 from ..optics.hologram import hologram, optical_path
 from ..optics.sampling import padding
-from ..scan import Exposures
+from ..scan import Exposures, far_from_edges
 from ..units import wavenumber
 from ..volume import LineIntegrals, Object
 
@@ -24,6 +26,8 @@ class Instrument:
     The line integrals live on `views`: the detector's raster, padded by the fringes' reach so that nothing
     wraps around, and `oversample` times finer than the detector. `backend`: `cpu`, `cuda`, `reference` or
     `auto` (see `backends`); float64 (`dtype`) is what only `reference` computes in, and stands for it.
+    `dispersion`: factors [V, 2], or of each channel of matter [V, C, 2], of δ and β at the frames' energies over those
+    at the reference energy (`materials.dispersion`; default: `scan.far_from_edges`, 1 where all energies are one).
     """
 
     def __init__(
@@ -32,6 +36,7 @@ class Instrument:
         oversample: int = 1,
         dtype: torch.dtype = torch.float32,
         backend: str = "cpu",
+        dispersion: np.ndarray | None = None,
     ) -> None:
         require(oversample >= 1, f"oversample must be at least 1, but it is {oversample}.")
         known = dtype in (torch.float32, torch.float64)
@@ -47,11 +52,13 @@ class Instrument:
             f"the waves of {len(self.views)} views would need {rows} × {columns} samples each, more than memory holds; "
             "use fewer or smaller frames.",
         )
+        ratio = far_from_edges(exposures.energy_kev, exposures.reference_energy) if dispersion is None else dispersion
+        self._factors = wavenumber(exposures.energy_kev)[:, None, None] * ratio.reshape(len(exposures), -1, 2)
         my, mx = (m * self.oversample for m in self.margin)
         self.path = optical_path(
             self.views.shape,
             self.views.pixel_size,
-            exposures.energy_kev,
+            exposures.one_energy("the wave optics"),
             exposures.distance,
             exposures.psf_sigma_px * self.oversample,
             (exposures.views.shape, (my, mx), self.oversample),
@@ -60,10 +67,14 @@ class Instrument:
 
     def frames(self, lines: LineIntegrals, index: np.ndarray | Tensor | None = None) -> Tensor:
         """Frames [V, H, W] from line integrals on `self.views` (or its views `index`), in the instrument's type."""
-        k = wavenumber(self.exposures.energy_kev)
-        refraction = [(k * delta, k * beta) for delta, beta in lines.materials]
+        refraction = self._refraction(lines.materials)
         path = self.path if index is None else self.path[torch.as_tensor(index, device=self.device)]
         return hologram(lines.channels.to(self.device, self.dtype), refraction, path, self.backend)
+
+    def _refraction(self, materials: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+        """(k δ, k β) of each channel at the frames' energy, [C, 2]."""
+        channels = [min(c, self._factors.shape[1] - 1) for c in range(len(materials))]
+        return [(f[0] * m[0], f[1] * m[1]) for f, m in zip(self._factors[0, channels].tolist(), materials)]
 
     def image(self, B: Tensor, D: Tensor, index: np.ndarray | None = None) -> Tensor:
         """Frames [V, H, W] from line integrals B, D [V, H', W'] in metres on `self.views` (or its views `index`)."""

@@ -19,7 +19,8 @@ def padding(exposures: Exposures, oversample: int) -> tuple[int, int]:
     propagator (see `fresnel_transfer`).
     """
     pitch = exposures.views.pixel_size
-    reach = max(fresnel_reach_px(pitch / oversample, z, exposures.energy_kev) for z in exposures.distance)
+    optics = zip(exposures.distance, exposures.energy_kev)
+    reach = max(fresnel_reach_px(pitch / oversample, z, float(energy)) for z, energy in optics)
     blur_px = math.ceil(4 * float(exposures.psf_sigma_px.max()))
     margin = math.ceil(reach / oversample) + blur_px + GUARD_PX
     h, w = exposures.views.shape
@@ -32,7 +33,7 @@ def resolving_oversample(exposures: Exposures, samples_per_fringe: float, at_lea
     At most `2 samples_per_fringe`, or 8: fringes far narrower than a pixel hardly change a pixel's mean (with 16,
     cells of 64 µm on 3.2 µm pixels stay right to 1.5 % of their contrast however short the distance).
     """
-    fringe = math.sqrt(wavelength(exposures.energy_kev) * float(exposures.distance.min()))
+    fringe = math.sqrt((wavelength(exposures.energy_kev) * exposures.distance).min())
     wanted = math.ceil(exposures.views.pixel_size * samples_per_fringe / fringe)
     return max(at_least, min(wanted, max(8, math.ceil(2 * samples_per_fringe))))
 

@@ -1,0 +1,148 @@
+"""The pages that the site has beside docs/: of the repository's root, the API reference, the gallery; and all links.
+
+Links in Markdown files are written for the repository. Here they are turned into links of the site: `docs/method.md` in
+README.md becomes `method.md`, `examples/01_….py` becomes the example's page in the gallery.
+"""
+
+from __future__ import annotations
+
+import ast
+import posixpath
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+SOURCE = ROOT / "src" / "holosplat"
+GALLERY = ROOT / "build" / "gallery"
+FROM_ROOT = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
+"""Pages that lie in the repository's root, and where the site has them."""
+
+Pages = dict[str, str]
+"""Path on the site → Markdown."""
+
+LINK = re.compile(r"(?<=\]\()([^)#\s]+)(#[^)\s]*)?(?=\))")
+LOADED = re.compile(r'<(?:script|link|img|iframe)\b[^>]*?\b(?:src|href)="((?:https?:)?//[^"]+)"')
+"""What a browser loads from elsewhere when it shows a page."""
+
+
+# --- links --------------------------------------------------------------------------------------------------
+
+
+def site_path(path: str) -> str | None:
+    """Where the site has a file of the repository (`docs/method.md` → `method.md`), or None if it has not."""
+    if path in FROM_ROOT:
+        return FROM_ROOT[path]
+    if path.startswith("docs/"):
+        return path.removeprefix("docs/")
+    if path.startswith("examples/") and path.endswith(".py"):
+        return f"gallery/{Path(path).stem}.md"
+    return None
+
+
+def linked(markdown: str, page: str) -> str:
+    """The text of the site's page `page`, with the links that it has in the repository turned into the site's."""
+    origin = {site: path for path, site in FROM_ROOT.items()}.get(page, f"docs/{page}")
+
+    def turned(match: re.Match[str]) -> str:
+        target, anchor = match[1], match[2] or ""
+        if re.match(r"[a-z]+:", target):
+            return match[0]
+        there = site_path(posixpath.normpath(posixpath.join(posixpath.dirname(origin), target)))
+        return match[0] if there is None else posixpath.relpath(there, posixpath.dirname(page) or ".") + anchor
+
+    return LINK.sub(turned, markdown)
+
+
+def loads_from_elsewhere(html: str) -> list[str]:
+    """Addresses of scripts, styles and pictures on other machines, which a page without a network must not need."""
+    return LOADED.findall(html)
+
+
+def root_pages() -> Pages:
+    """The pages that lie in the repository's root."""
+    return {site: (ROOT / path).read_text(encoding="utf-8") for path, site in FROM_ROOT.items()}
+
+
+# --- the API reference --------------------------------------------------------------------------------------
+
+
+def modules(source: Path) -> dict[str, list[str]]:
+    """Room → its public modules by dotted name; rooms of one file are under `holosplat`.
+
+    Modules whose name begins with an underscore, `__main__` and backend files are left out.
+    """
+    rooms: dict[str, list[str]] = {}
+    for path in sorted(source.rglob("*.py")):
+        parts = path.relative_to(source).with_suffix("").parts
+        name = parts[-1]
+        backend = name in ("cpu", "cuda") or name.startswith("triton_")
+        if backend or name == "__main__" or (name.startswith("_") and name != "__init__"):
+            continue
+        room = parts[0] if len(parts) > 1 else "holosplat"
+        if parts == ("__init__",):
+            continue
+        dotted = ".".join(["holosplat", *(p for p in parts if p != "__init__")])
+        rooms.setdefault(room, []).append(dotted)
+    return rooms
+
+
+def _summary(source: Path, dotted: str) -> str:
+    """The first paragraph of a module's docstring."""
+    stem = source.parent.joinpath(*dotted.split("."))
+    path = stem / "__init__.py" if stem.is_dir() else stem.with_suffix(".py")
+    text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+    return " ".join(text.split("\n\n")[0].split())
+
+
+def api_pages(source: Path = SOURCE) -> Pages:
+    """A page a room, with everything public in it, and the list of rooms."""
+    pages = {}
+    rows = ["# API reference", "", "Everything public, room by room. `import holosplat as hs` gives:", ""]
+    rows += [f"- {line}" for line in _top_level()]
+    rows += ["", "| room | what is in it |", "| --- | --- |"]
+    for room, names in sorted(modules(source).items()):
+        title = "holosplat" if room == "holosplat" else f"holosplat.{room}"
+        summary = "The nouns, and what every room uses." if room == "holosplat" else _summary(source, names[0])
+        rows.append(f"| [{title}]({room}.md) | {summary} |")
+        blocks = [f"# {title}", summary, *(f"::: {name}" for name in names)]
+        pages[f"api/{room}.md"] = "\n\n".join(blocks) + "\n"
+    return {"api/index.md": "\n".join(rows) + "\n", **pages}
+
+
+def _top_level() -> Iterator[str]:
+    """The names of the package itself, each linked to its description, with the first line of it."""
+    import holosplat
+
+    for name in holosplat.__all__:
+        thing = getattr(holosplat, name)
+        module, own = getattr(thing, "__module__", None), getattr(thing, "__qualname__", None)
+        if module is None or own is None:
+            yield f"`{name}`"
+            continue
+        first = (thing.__doc__ or "").strip().split("\n")[0]
+        yield f"[`{name}`][{module}.{own}]: {first}"
+
+
+# --- the gallery --------------------------------------------------------------------------------------------
+
+
+def gallery_pages(folder: Path = GALLERY) -> Pages:
+    """The pages that docs/site/gallery.py wrote, and the list of them."""
+    found = sorted(folder.glob("*.md"))
+    if not found:
+        raise FileNotFoundError(f"{folder} holds no pages: run `python docs/site/gallery.py {folder}` first.")
+    pages = {f"gallery/{path.name}": path.read_text(encoding="utf-8") for path in found}
+    rows = ["# Gallery", "", "The files in `examples/`, run when the site was built.", ""]
+    for name, text in pages.items():
+        title, rest = text.removeprefix("# ").split("\n", 1)
+        first = rest.strip().split("\n\n")[0].replace("\n", " ")
+        rows += [f"## [{title}]({posixpath.basename(name)})", "", *([first] if "```" not in first else []), ""]
+        picture = re.search(r"!\[.*", text)
+        rows += [picture[0], ""] if picture else []
+    return {"gallery/index.md": "\n".join(rows), **pages}
+
+
+def gallery_pictures(folder: Path = GALLERY) -> Iterator[Path]:
+    """The pictures of all examples."""
+    return (path for path in sorted(folder.glob("*/out/*.png")))

@@ -1,0 +1,169 @@
+"""The documentation: its links lead somewhere in the repository and on the site, and its pages are made as they should.
+
+`make docs` builds the site itself, where every warning is an error.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
+
+
+def module(name: str) -> ModuleType:
+    """A file of docs/site, which is no package."""
+    spec = importlib.util.spec_from_file_location(f"docs_site_{name}", ROOT / "docs" / "site" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    loaded = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = loaded
+    spec.loader.exec_module(loaded)
+    return loaded
+
+
+site = module("pages")
+gallery = module("gallery")
+
+
+# --- links --------------------------------------------------------------------------------------------------
+
+
+def anchors(text: str) -> set[str]:
+    """The anchors of a page's headings: lower case, no punctuation, hyphens for blanks."""
+    titles = re.findall(r"^#{1,6} (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-") for title in titles}
+
+
+def broken_links(page: Path, text: str) -> list[str]:
+    """Links of a Markdown page in the repository that lead to no file, or to no heading of it."""
+    broken = []
+    for target, anchor in re.findall(r"\]\(([^)#\s]*)(?:#([^)\s]*))?\)", re.sub(r"`[^`]*`", "", text)):
+        if re.match(r"[a-z]+:", target):
+            continue
+        there = (page.parent / target).resolve() if target else page
+        found = there.exists() and (
+            not anchor or anchor in anchors(text if there == page else there.read_text("utf-8"))
+        )
+        if not found:
+            broken.append(f"{target}#{anchor}" if anchor else target)
+    return broken
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_links_lead_somewhere(page):
+    assert broken_links(page, page.read_text(encoding="utf-8")) == []
+
+
+def test_broken_links_are_seen():
+    page = ROOT / "README.md"
+    assert broken_links(page, "[a](docs/no.md) [b](docs/method.md#no) [c](docs/method.md#the-start)") == [
+        "docs/no.md",
+        "docs/method.md#no",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("page", "link", "turned"),
+    [
+        ("index.md", "docs/method.md#two-materials", "method.md#two-materials"),
+        ("index.md", "docs/images/hero.png", "images/hero.png"),
+        ("index.md", "CONTRIBUTING.md", "contributing.md"),
+        ("index.md", "examples/01_a.py", "gallery/01_a.md"),
+        ("simulation.md", "../README.md", "index.md"),
+        ("simulation.md", "conventions.md", "conventions.md"),
+        ("design/architecture.md", "../conventions.md", "../conventions.md"),
+        ("design/architecture.md", "../../README.md", "../index.md"),
+        ("index.md", "https://example.org/a.md", "https://example.org/a.md"),
+    ],
+)
+def test_links_fit_the_site(page, link, turned):
+    assert site.linked(f"See [this]({link}), please.", page) == f"See [this]({turned}), please."
+
+
+# --- pages --------------------------------------------------------------------------------------------------
+
+
+def test_the_api_lists_every_public_module_once():
+    rooms = site.modules(ROOT / "src" / "holosplat")
+    names = [name for room in rooms.values() for name in room]
+    assert len(names) == len(set(names)) > 100
+    assert {"holosplat.geometry", "holosplat.scan"} <= set(rooms["holosplat"])
+    assert {"holosplat.optics", "holosplat.optics.camera", "holosplat.optics.hologram"} <= set(rooms["optics"])
+    assert not [name for name in names if re.search(r"\.(cpu|cuda|triton_\w+|__\w+__)$", name)]
+
+
+def test_the_api_describes_the_top_level_names():
+    index = site.api_pages()["api/index.md"]
+    assert "[`Views`][holosplat.geometry.Views]: V parallel-beam views on one detector raster." in index
+    assert "[holosplat.optics](optics.md)" in index
+
+
+@pytest.mark.parametrize(
+    ("html", "addresses"),
+    [
+        ('<a href="https://example.org">a</a><script src="assets/a.js"></script>', []),
+        ('<script defer src="https://example.org/a.js"></script>', ["https://example.org/a.js"]),
+        ('<link rel="stylesheet" href="//example.org/a.css">', ["//example.org/a.css"]),
+    ],
+)
+def test_what_a_page_loads_from_elsewhere_is_seen(html, addresses):
+    assert site.loads_from_elsewhere(html) == addresses
+
+
+def test_docstrings_become_markdown():
+    pytest.importorskip("griffe", reason="the extra `docs` is not installed")
+    text = "Weights [N] [m], *not* a*b, `[x]`.\n\nfirst, second [px]: one;\n    goes on.\nthird: `a_b` a_b.\n\nEnd."
+    assert module("docstrings").markdown(text) == (
+        "Weights \\[N\\] \\[m\\], *not* a\\*b, `[x]`.\n\n\n"
+        "- **first, second \\[px\\]**: one;\n    goes on.\n- **third**: `a_b` a\\_b.\n\nEnd."
+    )
+
+
+# --- the gallery --------------------------------------------------------------------------------------------
+
+GOOD = '''"""A title: `python a.py [folder]`.
+
+A text.
+"""
+
+import sys
+from pathlib import Path
+
+out = Path(sys.argv[1])
+out.mkdir()
+(out / "a_picture.png").write_bytes(b"")
+print("score 1.0 in", out.resolve())
+'''
+
+
+def test_an_example_becomes_a_page(tmp_path):
+    (tmp_path / "01_a.py").write_text(GOOD)
+    pages = gallery.build(tmp_path, tmp_path / "gallery")
+    assert [page.name for page in pages] == ["01_a.md"]
+    text = pages[0].read_text(encoding="utf-8")
+    assert text.startswith("# A title\n\nA text.\n\n```python\nimport sys\n")
+    assert "```text\nscore 1.0 in out\n```" in text
+    assert "![A picture](01_a/out/a_picture.png)" in text
+    made = site.gallery_pages(tmp_path / "gallery")
+    assert list(made) == ["gallery/index.md", "gallery/01_a.md"]
+    assert "## [A title](01_a.md)\n\nA text." in made["gallery/index.md"]
+    assert [path.name for path in site.gallery_pictures(tmp_path / "gallery")] == ["a_picture.png"]
+
+
+@pytest.mark.parametrize("fault", ["raise SystemExit(3)", "sys.stderr.write('warning')"])
+def test_an_example_that_fails_or_warns_fails_the_build(tmp_path, fault):
+    (tmp_path / "01_a.py").write_text(GOOD + fault + "\n")
+    with pytest.raises(RuntimeError, match="01_a"):
+        gallery.build(tmp_path, tmp_path / "gallery")
+
+
+def test_a_gallery_that_was_not_built_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="holds no pages"):
+        site.gallery_pages(tmp_path)
