@@ -17,7 +17,7 @@ from pathlib import Path
 
 from .checks import MissingError
 
-ABI = 5
+ABI = 6
 ISAS = ("sse2", "avx2", "avx512")
 """Builds for x86-64, slowest first. Other processors have one build, `generic`."""
 
