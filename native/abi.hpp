@@ -138,8 +138,8 @@ HOLO_EXPORT int64_t holosplat_surface_poses(const HoloSurface*, const HoloRaster
                                             int64_t threads);
 
 // Wave optics, between the Fourier transforms that the caller does. Complex arrays are float pairs (re, im).
-// wave [V, H, W] <- exp(-loss - i phase) - 1 with phase = sum over channels of refraction[c][0] lines[c], and loss of
-// refraction[c][1]; refraction [C, 2], lines [V, C, H, W]
+// wave [V, H, W] <- exp(-loss - i phase) - 1 with phase = sum over channels of refraction[v][c][0] lines[v][c], and loss
+// of refraction[v][c][1]; refraction [V, C, 2], lines [V, C, H, W]
 HOLO_EXPORT int64_t holosplat_exit_wave(const HoloRaster*, const double* refraction, const float* lines, float* wave,
                                         int64_t threads);
 HOLO_EXPORT int64_t holosplat_exit_wave_backward(const HoloRaster*, const double* refraction, const float* lines,
