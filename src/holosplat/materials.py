@@ -16,9 +16,11 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import xraydb
 
 from .checks import InputError, in_range, require
+from .scan import far_from_edges
 from .tables import read_table
 
 ENERGY_RANGE_KEV = (0.1, 400.0)
@@ -133,6 +135,27 @@ class Mixture:
 
 
 Material = Compound | Mixture
+
+
+def dispersion(
+    energy_kev: np.ndarray, reference_kev: float, material: Material | None = None, medium: Material | None = None
+) -> np.ndarray:
+    """Factors [N, 2] of δ and β at photon energies [N] over those at a reference energy [keV].
+
+    The one rule for matter in frames of several energies. Of a `material` (against a `medium`, if there is one) they
+    are those of its own δ and β; of matter without a formula, those of `scan.far_from_edges`. A factor of what is
+    zero at the reference energy is 1.
+    """
+    if material is None:
+        return far_from_edges(energy_kev, reference_kev)
+
+    def contrast(energy: float) -> DeltaBeta:
+        inside = material.delta_beta(energy)
+        return inside if medium is None else inside.against(medium.delta_beta(energy))
+
+    reference = np.array(contrast(reference_kev))
+    found = np.array([contrast(float(energy)) for energy in np.asarray(energy_kev, dtype=np.float64)]).reshape(-1, 2)
+    return np.where(reference == 0, 1.0, found / np.where(reference == 0, 1.0, reference))
 
 
 def solution(solute: Compound, concentration_g_ml: float, solvent: Compound) -> Mixture:

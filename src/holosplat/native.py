@@ -17,7 +17,7 @@ from pathlib import Path
 
 from .checks import MissingError
 
-ABI = 4
+ABI = 5
 ISAS = ("sse2", "avx2", "avx512")
 """Builds for x86-64, slowest first. Other processors have one build, `generic`."""
 
@@ -60,14 +60,14 @@ class Grid(ctypes.Structure):
 
 
 class Lattice(ctypes.Structure):
-    """Counts of voxels along z, y, x; x, y, z of the first voxel's centre; voxel edge."""
+    """Counts of voxels along z, y, x; x, y, z of the first voxel's centre; voxel edges along x, y, z."""
 
     _fields_ = [
         ("depth", c_int64),
         ("height", c_int64),
         ("width", c_int64),
         ("origin", c_double * 3),
-        ("pitch", c_double),
+        ("pitch", c_double * 3),
     ]
 
 
@@ -139,7 +139,9 @@ _FUNCTIONS = {
     ),
     "holosplat_lattice_project": (POINTER(Lattice), POINTER(Views), c_void_p, c_void_p, c_int64),
     "holosplat_lattice_backproject": (POINTER(Lattice), POINTER(Views), c_void_p, c_void_p, c_int64),
+    "holosplat_lattice_poses": (POINTER(Lattice), POINTER(Views), *(c_void_p,) * 4, c_int64),
     "holosplat_surface": (POINTER(Surface), POINTER(Raster), c_int64, c_void_p, c_int64),
+    "holosplat_surface_poses": (POINTER(Surface), POINTER(Raster), *(c_void_p,) * 4, c_int64),
     "holosplat_exit_wave": (POINTER(Raster), *(c_void_p,) * 3, c_int64),
     "holosplat_exit_wave_backward": (POINTER(Raster), *(c_void_p,) * 4, c_int64),
     "holosplat_transfer": (POINTER(Raster), *(c_void_p,) * 2, c_double, c_int64, c_void_p, c_int64),

@@ -18,24 +18,27 @@ DISTANCE_RANGE_M = (1e-9, 1e4)
 class Exposures:
     """How each of N frames was taken: poses and raster (`views`), and the physics of its beam and detector.
 
-    energy_kev: one photon energy [keV] for all frames; distance: [N] effective propagation distances [m];
+    energy_kev: [N] photon energies [keV]; distance: [N] effective propagation distances [m];
     psf_sigma_px: [N] standard deviations of the Gaussian point-spread function [detector pixels];
-    time: [N] seconds since the first frame.
+    time: [N] seconds since the first frame. A number stands for N equal ones.
+    reference_kev: the energy [keV] at which δ and β of matter are said (None: that of the first frame).
     """
 
     views: Views
-    energy_kev: float
+    energy_kev: np.ndarray
     distance: np.ndarray
     psf_sigma_px: np.ndarray
     time: np.ndarray
+    reference_kev: float | None = None
 
     def __post_init__(self) -> None:
         count = len(self.views)
-        in_range("energy", self.energy_kev, *ENERGY_RANGE_KEV, unit="keV")
         in_range("pixel size", self.views.pixel_size, *PIXEL_RANGE_M, unit="metres")
-        for name in ("distance", "psf_sigma_px", "time"):
+        for name in ("energy_kev", "distance", "psf_sigma_px", "time"):
             array = np.broadcast_to(np.asarray(getattr(self, name), dtype=np.float64), (count,))
             object.__setattr__(self, name, array.copy())
+        for energy in (*self.energy_kev, *([] if self.reference_kev is None else [self.reference_kev])):
+            in_range("energy", float(energy), *ENERGY_RANGE_KEV, unit="keV")
         for z in self.distance:
             in_range("propagation distance", float(z), *DISTANCE_RANGE_M, unit="metres")
         finite("psf_sigma_px", self.psf_sigma_px)
@@ -46,7 +49,7 @@ class Exposures:
     def of(cls, views: Views, energy_kev: float, distance: float, psf_sigma_px: float = 0.0) -> Exposures:
         """Exposures that share one distance [m] and one point-spread function, all at time 0."""
         n = len(views)
-        return cls(views, energy_kev, np.full(n, distance), np.full(n, psf_sigma_px), np.zeros(n))
+        return cls(views, np.full(n, energy_kev), np.full(n, distance), np.full(n, psf_sigma_px), np.zeros(n))
 
     def __len__(self) -> int:
         return len(self.views)
@@ -55,16 +58,57 @@ class Exposures:
         return replace(
             self,
             views=self.views[index],
+            energy_kev=self.energy_kev[index],
             distance=self.distance[index],
             psf_sigma_px=self.psf_sigma_px[index],
             time=self.time[index],
+            reference_kev=self.reference_kev if self.has_one_energy else self.reference_energy,
         )
+
+    @property
+    def has_one_energy(self) -> bool:
+        """Whether all frames have the same photon energy."""
+        return bool((self.energy_kev == self.energy_kev[:1]).all())
+
+    @property
+    def reference_energy(self) -> float:
+        """The energy [keV] at which δ and β of matter are said: `reference_kev`, or else that of the first frame."""
+        return float(self.energy_kev[0]) if self.reference_kev is None else float(self.reference_kev)
+
+    def one_energy(self, user: str) -> float:
+        """The photon energy [keV] of all frames; `InputError` says that `user` ("the report") needs one energy."""
+        low, high = self.energy_kev.min(), self.energy_kev.max()
+        require(
+            self.has_one_energy,
+            f"{user} needs frames of one photon energy, but theirs go from {low:g} to {high:g} keV; "
+            "choose those of one energy.",
+        )
+        return float(self.energy_kev[0])
+
+    def refraction(self, delta: float, beta: float) -> tuple[np.ndarray, np.ndarray]:
+        """δ [N] and β [N] at the frames' energies of matter that has `delta` and `beta` at the reference energy.
+
+        Far from absorption edges (`far_from_edges`).
+        """
+        factors = far_from_edges(self.energy_kev, self.reference_energy)
+        return delta * factors[:, 0], beta * factors[:, 1]
 
     def repeated(self, times: np.ndarray) -> Exposures:
         """All N exposures at each of `times` [T] seconds: frame `t · N + v` is exposure v at `times[t]`."""
         times = np.asarray(times, dtype=np.float64).reshape(-1)
         index = np.tile(np.arange(len(self)), len(times))
         return replace(self[index], time=np.repeat(times, len(self)))
+
+
+def far_from_edges(energy_kev: np.ndarray, reference_kev: float) -> np.ndarray:
+    """Factors [N, 2] of δ and β at energies [N] over those at a reference energy [keV]: δ ∝ E⁻², β ∝ E⁻⁴.
+
+    δ is that of free electrons, and photoabsorption falls as E⁻³ per atom, with μ = 2kβ (Als-Nielsen & McMorrow 2011,
+    *Elements of Modern X-ray Physics*, chapters 1 and 3). It holds far above all absorption edges of the matter, over
+    a narrow range of energies; where the formula is known, `materials.dispersion` has the tables' own values.
+    """
+    ratio = np.asarray(energy_kev, dtype=np.float64) / reference_kev
+    return np.stack((ratio**-2, ratio**-4), axis=-1)
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+from typing import TypeVar
 
-from .checks import InputError, positive
+import numpy as np
+
+from .checks import InputError, finite, positive, require
 
 PLANCK_TIMES_C_KEV_M = 1.2398419843320026e-9
 """h·c in keV·m (CODATA 2018, exact)."""
@@ -45,11 +48,19 @@ def unit_factor(field: str, unit: str, table: dict[str, float]) -> float:
         raise InputError(f"{field} has the unknown unit {unit!r}; use one of {known}.") from None
 
 
-def wavelength(energy_kev: float) -> float:
+Energy = TypeVar("Energy", float, np.ndarray)
+"""One photon energy, or an array of any shape."""
+
+
+def wavelength(energy_kev: Energy) -> Energy:
     """Wavelength [m] of photons of `energy_kev` [keV]: λ = hc/E."""
+    if isinstance(energy_kev, np.ndarray):
+        energies = finite("energy_kev", energy_kev)
+        require(bool((energies > 0).all()), "energy_kev must hold positive numbers of keV; correct those that are not.")
+        return PLANCK_TIMES_C_KEV_M / energies
     return PLANCK_TIMES_C_KEV_M / positive("energy_kev", energy_kev, "keV")
 
 
-def wavenumber(energy_kev: float) -> float:
+def wavenumber(energy_kev: Energy) -> Energy:
     """Wavenumber k = 2π/λ [rad/m] of photons of `energy_kev` [keV]."""
     return 2 * math.pi / wavelength(energy_kev)

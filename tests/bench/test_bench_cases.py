@@ -255,7 +255,7 @@ def test_a_file_of_ones_own(tmp_path):
     assert load_case(str(path)).name == case.name == "mine"
     assert case.seed == 5
     assert case.exposures.views.shape == (17, 23)
-    assert case.exposures.energy_kev == 15.0
+    assert case.exposures.one_energy("it") == 15.0
     assert case.is_test.tolist() == [False, False, True]
     assert case.photons is None
     contrast = parse_material("C5H8O2", 1.18).delta_beta(15.0).against(parse_material("water").delta_beta(15.0))

@@ -157,7 +157,7 @@ def test_folders_of_others_need_what_they_do_not_say(scan, tmp_path):
         outcome = convert(folder, tmp_path / f"{to}.nxs", "--to", "nxtomo", *all_of_it)
         assert outcome.code == 0, outcome.err
         found = read_scan(tmp_path / f"{to}.nxs")
-        assert (found.exposures.energy_kev, found.views.pixel_size) == (12, 1e-6)
+        assert (found.exposures.one_energy("it"), found.views.pixel_size) == (12, 1e-6)
         assert len(found) == (N - 1 if to == "nerf-synthetic" else N)
     stray = convert(tmp_path / "r2-gaussian", tmp_path / "x.nxs", "--to", "nxtomo", "--distance", 1)
     assert "--distance: not for a source in r2-gaussian" in stray.said

@@ -16,6 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import torch
 import triton
 from torch import Tensor
@@ -108,9 +109,10 @@ def operations() -> list[Callable[[], None]]:
     def hologram(channels: int, blurred: bool) -> None:
         blurs = (torch.ones(1, 12), torch.ones(1, 14)) if blurred else (None, None)
         factors = (torch.ones(1, n, dtype=torch.complex64) for n in (12, 14))
-        path = OpticalPath(*factors, *blurs, True, (4, 5), (2, 2), 2)
+        path = OpticalPath(*factors, *blurs, torch.ones(1, dtype=torch.float64), True, (4, 5), (2, 2), 2, 1e-6)
         lines = torch.ones(1, channels, 12, 14, requires_grad=True)
-        waves.hologram(lines, [(0.5, 0.1)] * channels, path).sum().backward()
+        for refraction in (np.ones((channels, 2)), torch.ones(1, channels, 2, dtype=torch.float64)):
+            waves.hologram(lines, refraction, path).sum().backward()
 
     calls: list[Callable[[], None]] = [
         compare, move, lambda: wide(splat, triton_pixels), lambda: wide(voxelise, triton_boxes)

@@ -43,7 +43,7 @@ def same_exposures(a: Scan, b: Scan) -> None:
     assert np.array_equal(a.views.rotations, b.views.rotations)
     assert np.array_equal(a.views.shifts, b.views.shifts)
     assert (a.views.shape, a.views.pixel_size) == (b.views.shape, b.views.pixel_size)
-    assert a.exposures.energy_kev == b.exposures.energy_kev
+    np.testing.assert_array_equal(a.exposures.energy_kev, b.exposures.energy_kev)
     for name in ("distance", "psf_sigma_px", "time"):
         assert np.array_equal(getattr(a.exposures, name), getattr(b.exposures, name))
     assert np.array_equal(a.is_test, b.is_test)

@@ -79,14 +79,20 @@ def test_a_finer_raster_keeps_the_coarse_pixels_blur(tmp_path):
     assert rms((found.frames - wanted)[:4][inside]) < 0.08 * wanted.std()
 
 
-def test_what_cannot_be_joined(tmp_path):
+def test_beams_of_different_energies_keep_their_own(tmp_path):
     paths = beams(tmp_path)
     other = tmp_path / "other.nxs"
     exposures = replace(taken(), energy_kev=17.0)
     write_scan(other, Scan(np.ones((4, *SHAPE)), exposures, np.zeros(4, bool)))
+    join((paths[0], other), tmp_path / "scan.nxs")
+    found = read_scan(tmp_path / "scan.nxs").exposures
+    assert found.energy_kev.tolist() == [20.0] * 4 + [17.0] * 4
+    assert found.reference_energy == 20.0
+
+
+def test_what_cannot_be_joined(tmp_path):
+    paths = beams(tmp_path)
     out = tmp_path / "scan.nxs"
-    with pytest.raises(InputError, match=r"other\.nxs has 17 keV, but .*a\.nxs has 20 keV: a scan has one energy"):
-        join((paths[0], other), out)
     with pytest.raises(InputError, match=r"a\.nxs is read or written already"):
         join(paths, paths[0])
     with pytest.raises(InputError, match="needs at least two"):

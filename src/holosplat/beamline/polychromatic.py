@@ -29,7 +29,7 @@ def polychromatic_frames(
     """
     quiet = replace(how, photons_per_pixel=None, oversample=how.samples(exposures))
     parts = [
-        simulated_frames(matter_at(energy), replace(exposures, energy_kev=energy), quiet)
+        simulated_frames(matter_at(energy), replace(exposures, energy_kev=energy, reference_kev=None), quiet)
         for energy in map(float, spectrum.energies_kev)
     ]
     noise = np.random.default_rng(how.seed)
@@ -37,6 +37,22 @@ def polychromatic_frames(
         frame = np.tensordot(spectrum.weights, np.stack(of_energies), 1)
         photons = how.photons_per_pixel
         yield (frame if photons is None else poisson(frame, photons, noise)).astype(np.float32)
+
+
+def frames_by_energy(
+    matter_at: Callable[[float], Object], exposures: Exposures, how: Simulation
+) -> Iterator[np.ndarray]:
+    """Frames [H, W] float32 as `simulate.simulated_frames`, of exposures of several energies.
+
+    `matter_at(energy_kev)` is the object with its δ and β at that energy: each frame sees those of its own.
+    """
+    quiet = replace(how, photons_per_pixel=None, oversample=how.samples(exposures))
+    noise = np.random.default_rng(how.seed)
+    for i, energy in enumerate(exposures.energy_kev.tolist()):
+        own = replace(exposures[[i]], reference_kev=None)
+        (frame,) = simulated_frames(matter_at(energy), own, quiet)
+        photons = how.photons_per_pixel
+        yield frame if photons is None else poisson(frame, photons, noise).astype(np.float32)
 
 
 def refilled(matter: MeshScene | MeshSeries, filling: Filling, energy_kev: float) -> MeshScene | MeshSeries:

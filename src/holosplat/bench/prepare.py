@@ -51,7 +51,8 @@ def fingerprint(case: Case) -> str:
     digest = hashlib.sha256()
     for array in _arrays(case):
         digest.update(np.ascontiguousarray(array).tobytes())
-    numbers = (views.shape, views.pixel_size, exposures.energy_kev, case.photons, case.prior.as_dict(), case.seed)
+    energy = exposures.one_energy("a case of the benchmark")
+    numbers = (views.shape, views.pixel_size, energy, case.photons, case.prior.as_dict(), case.seed)
     digest.update(repr((numbers, [tuple(material) for material in case.scene.materials])).encode())
     return digest.hexdigest()[:16]
 
@@ -74,7 +75,7 @@ def described(case: Case) -> dict[str, Any]:
         "specimen": case.specimen,
         "detector": list(views.shape),
         "pixel_size_m": views.pixel_size,
-        "energy_kev": exposures.energy_kev,
+        "energy_kev": exposures.one_energy("a case of the benchmark"),
         "distance_m": [float(exposures.distance.min()), float(exposures.distance.max())],
         "psf_sigma_px": [float(exposures.psf_sigma_px.min()), float(exposures.psf_sigma_px.max())],
         "training_frames": int(np.count_nonzero(~np.asarray(case.is_test))),

@@ -98,7 +98,7 @@ def convert(
     require_new(out)
     said = writing.for_format(to)
     scan = _read(source, foreign.given())
-    prior = matter.prior(scan.exposures.energy_kev)
+    prior = matter.prior(scan.exposures.reference_energy)
     require(prior.kind == "free" or to in GOES_WITH["material"], f"a material is not needed with --to {to}; leave it.")
     require(len(prior.materials) < 2, f"--to {to} takes one material; leave --second-material.")
     if to == "nxtomo":
@@ -154,8 +154,9 @@ def _retrieved(scan: Scan, prior: MaterialPrior) -> tuple[np.ndarray, float]:
     """
     exposures, views = scan.exposures, scan.views
     delta, beta = (prior.delta, prior.beta) if prior.kind == "known" else (1.0, 1.0 / prior.ratio)
+    refraction = exposures.refraction(delta, beta)
     found = retrieve_thickness(
-        torch.from_numpy(scan.frames), views.pixel_size, exposures.distance, exposures.energy_kev, delta, beta
+        torch.from_numpy(scan.frames), views.pixel_size, exposures.distance, exposures.energy_kev, *refraction
     ).numpy()
     if prior.kind == "known":
         return found, delta

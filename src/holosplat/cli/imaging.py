@@ -69,7 +69,7 @@ def join(
     """Join scans of several beams, one file each, on one raster.
 
     Args:
-        scans: Scan files (NXtomo) of the same photon energy.
+        scans: Scan files (NXtomo); their photon energies may differ.
         out: Scan file to write.
         pixel_size: Pixel of the result [m] (default: the coarsest of the files).
         flip: What each detector saw reversed, one word a file (default: what the files say themselves).

@@ -42,7 +42,7 @@ class WaveMisfit:
         needed = resolving_oversample(train.exposures, FEWEST_SAMPLES, at_least=1)
         self.instrument = Instrument(train.exposures, max(needed, oversample), backend=backend)
         on = self.instrument.device
-        self.unit = wavenumber(train.exposures.energy_kev) * train.views.pixel_size * delta
+        self.unit = wavenumber(train.exposures.reference_energy) * train.views.pixel_size * delta
         self._amplitudes = torch.from_numpy(train.frames).clamp_min(0).sqrt().to(on)
         response = linear_response(train.exposures, beta / delta)
         self.noise = noise_level(self._amplitudes) / self.unit
@@ -62,10 +62,12 @@ class WaveMisfit:
 
 
 def linear_response(exposures: Exposures, absorption: float) -> Tensor:
-    """|H| [V, H, W//2 + 1] for `rfft2`, float64, of a thin object with β/δ = `absorption`; 1 beyond its maximum."""
+    """|H| [V, H, W//2 + 1] for `rfft2`, float64, of a thin object with β/δ = `absorption` at the reference energy;
+    1 beyond its maximum."""
     views = exposures.views
     fy, fx = np.fft.fftfreq(views.shape[0], views.pixel_size), np.fft.rfftfreq(views.shape[1], views.pixel_size)
-    reach = wavelength(exposures.energy_kev) * exposures.distance[:, None, None]
+    reach = (wavelength(exposures.energy_kev) * exposures.distance)[:, None, None]
     chi = np.pi * reach * (fy[:, None] ** 2 + fx**2)
-    response = np.abs(np.sin(chi) + absorption * np.cos(chi))
+    delta, beta = (values[:, None, None] for values in exposures.refraction(1.0, absorption))
+    response = np.abs(np.sin(chi) + beta / delta * np.cos(chi))
     return torch.from_numpy(np.where(chi < 0.5 * np.pi, response, 1.0))

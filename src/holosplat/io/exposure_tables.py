@@ -14,18 +14,20 @@ from .table import Table
 
 
 def beam_table(scan: Scan) -> dict[str, Any]:
-    """What all frames share: `pixel_size_m`, `energy_kev`, and the texts of `provenance`."""
-    views = scan.views
-    return {
-        "pixel_size_m": views.pixel_size,
-        "energy_kev": float(scan.exposures.energy_kev),
-        "provenance": dict(scan.provenance),
-    }
+    """What all frames share: `pixel_size_m`, the texts of `provenance`, and `energy_kev` if they do."""
+    views, exposures = scan.views, scan.exposures
+    energy = {"energy_kev": float(exposures.energy_kev[0])} if exposures.has_one_energy else {}
+    return {"pixel_size_m": views.pixel_size, **energy, "provenance": dict(scan.provenance)}
 
 
 def exposure_table(exposures: Exposures, n: int) -> dict[str, Any]:
-    """Frame `n`: `rotation` [3, 3], `shift_m` [2], `distance_m`, `psf_sigma_px`, `time_s`; floats are kept exactly."""
+    """Frame `n`: `rotation` [3, 3], `shift_m` [2], `distance_m`, `psf_sigma_px`, `time_s`; floats are kept exactly.
+
+    `energy_kev` too, where frames have several energies.
+    """
+    energy = {} if exposures.has_one_energy else {"energy_kev": float(exposures.energy_kev[n])}
     return {
+        **energy,
         "rotation": exposures.views.rotations[n].tolist(),
         "shift_m": exposures.views.shifts[n].tolist(),
         "distance_m": float(exposures.distance[n]),
@@ -37,16 +39,17 @@ def exposure_table(exposures: Exposures, n: int) -> dict[str, Any]:
 def read_exposures(beam: Table, frames: Sequence[Table], shape: tuple[int, int]) -> Exposures:
     """Exposures of frames of `shape` (H, W) from what `beam_table` and `exposure_table` wrote.
 
-    Written by hand, a frame may have `angle_deg` instead of `rotation`; `distance_m` and `psf_sigma_px` may stand in
-    the beam's table, for all frames; shift, blur and time are 0 where they are left out.
+    Written by hand, a frame may have `angle_deg` instead of `rotation`; `energy_kev`, `distance_m` and `psf_sigma_px`
+    may stand in the beam's table, for all frames; shift, blur and time are 0 where they are left out.
     """
     values = [[_per_frame(beam, f, name, default) for f in frames] for name, default in _NUMBERS]
     shifts = [f.numbers("shift_m", (2,)) if "shift_m" in f else np.zeros(2) for f in frames]
     rotations = [_rotation(f) for f in frames]
-    pixel_size, energy_kev = beam.number("pixel_size_m"), beam.number("energy_kev")
+    pixel_size = beam.number("pixel_size_m")
     try:
         views = Views(np.array(rotations), np.array(shifts), shape, pixel_size)
-        return Exposures(views, energy_kev, *(np.array(v) for v in values))
+        energy, distance, psf_sigma, time = (np.array(v) for v in values)
+        return Exposures(views, energy, distance, psf_sigma, time)
     except InputError as error:
         raise InputError(f"{beam.path}: {error}") from None
 
@@ -61,7 +64,7 @@ def in_order(head: Table, entries: Sequence[Table]) -> np.ndarray:
     return np.argsort(found)
 
 
-_NUMBERS = (("distance_m", None), ("psf_sigma_px", 0.0), ("time_s", 0.0))
+_NUMBERS = (("energy_kev", None), ("distance_m", None), ("psf_sigma_px", 0.0), ("time_s", 0.0))
 """Numbers of a frame, in the order of `Exposures`, with what is meant where they are left out."""
 
 

@@ -142,7 +142,8 @@ def _put(group: h5py.Group, name: str, value: np.ndarray | float, units: str) ->
 def _write_instrument(instrument: h5py.Group, exposures: Exposures, raw: RawLayout | None) -> h5py.Dataset:
     source = _group(instrument, "source", "NXsource")
     source["probe"] = "x-ray"
-    _put(_group(instrument, "beam", "NXbeam"), "incident_energy", float(exposures.energy_kev), "keV")
+    energy = float(exposures.energy_kev[0]) if exposures.has_one_energy else exposures.energy_kev
+    _put(_group(instrument, "beam", "NXbeam"), "incident_energy", energy, "keV")
     detector = _group(instrument, "detector", "NXdetector")
     shape = (len(exposures), *exposures.views.shape)
     data = detector.create_dataset("data", shape, np.uint16 if raw else np.float32)

@@ -248,7 +248,7 @@ def _absorber(
     lines: np.ndarray, exposures: Exposures, is_test: np.ndarray, unit: float, provenance: dict[str, str]
 ) -> Scan:
     """The transmission `exp(-p)` of line integrals p, and what a density of one is: μ = 1 / unit, β = μ / 2k."""
-    beta = 1 / (2 * wavenumber(exposures.energy_kev) * unit)
+    beta = 1 / (2 * wavenumber(exposures.one_energy("an absorber's scan")) * unit)
     told = {
         "converted_from": "R2-Gaussian",
         "frames": "exp(-p) of line integrals p",

@@ -98,7 +98,7 @@ def open_scan(path: str | Path) -> Iterator[ScanFile]:
         views = _views(fields, kinds, fields.dataset(DATA).shape[1:])
         psf_sigma = _optional(fields, kinds, PSF_SIGMA, PIXEL_UNITS, "px")
         time = _optional(fields, kinds, TIME, TIME_UNITS, "s")
-        energy, distance = _energy(fields, kinds), _distances(fields, kinds)
+        energy, distance = _energies(fields, kinds), _distances(fields, kinds)
         is_test = _split(fields, kinds)
         require(bool((psf_sigma >= 0).all()), f"{fields.label(PSF_SIGMA)} must not be negative; correct it.")
         exposures = Exposures(views, energy, distance, psf_sigma, time)
@@ -211,15 +211,14 @@ def _pixel_size(fields: Fields) -> float:
     return sizes[0]
 
 
-def _energy(fields: Fields, kinds: np.ndarray) -> float:
+def _energies(fields: Fields, kinds: np.ndarray) -> np.ndarray:
+    """Photon energies [n] of the projections in keV; those that are but rounded differently become one."""
     name = fields.need(*ENERGIES)
     energies = _per_frame(fields, kinds, name) * fields.unit(name, ENERGY_UNITS, "keV")
-    if not np.allclose(energies, energies[0], rtol=1e-6, atol=0):
-        raise InputError(
-            f"{fields.label(name)} must be the same for all frames, but it goes from {energies.min():g} to "
-            f"{energies.max():g} keV; split the scan by energy."
-        )
-    return in_range(fields.label(name), float(energies[0]), *ENERGY_RANGE_KEV, unit="keV")
+    for energy in (energies.min(), energies.max()):
+        in_range(fields.label(name), float(energy), *ENERGY_RANGE_KEV, unit="keV")
+    same = np.allclose(energies, energies[0], rtol=1e-6, atol=0)
+    return np.full(len(energies), energies[0]) if same else energies
 
 
 def _distances(fields: Fields, kinds: np.ndarray) -> np.ndarray:

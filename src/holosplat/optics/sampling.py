@@ -8,6 +8,9 @@ from ..scan import Exposures
 from ..units import wavelength
 from .propagation import fresnel_reach_px
 
+FRINGE_SAMPLES = 1.5
+"""Wave samples on the first fringe's width √(λz) in reconstructions, and where they are judged: with fewer, the fringes
+at the edges of cells are lost (docs/method.md); more cost memory and time as their square."""
 GUARD_PX = 5
 """Detector pixels of margin beyond the fringes' reach: room for the point-spread function and faint tails."""
 
@@ -19,11 +22,17 @@ def padding(exposures: Exposures, oversample: int) -> tuple[int, int]:
     propagator (see `fresnel_transfer`).
     """
     pitch = exposures.views.pixel_size
-    reach = max(fresnel_reach_px(pitch / oversample, z, exposures.energy_kev) for z in exposures.distance)
+    optics = zip(exposures.distance, exposures.energy_kev)
+    reach = max(fresnel_reach_px(pitch / oversample, z, float(energy)) for z, energy in optics)
     blur_px = math.ceil(4 * float(exposures.psf_sigma_px.max()))
     margin = math.ceil(reach / oversample) + blur_px + GUARD_PX
     h, w = exposures.views.shape
     return smooth_margin(h, min(margin, h + GUARD_PX)), smooth_margin(w, min(margin, w + GUARD_PX))
+
+
+def fringe_sampling(exposures: Exposures, extra: int = 0) -> int:
+    """Samples per detector pixel that fits and what judges them work with; extra: further ones, for safety."""
+    return resolving_oversample(exposures, FRINGE_SAMPLES, at_least=1) + extra
 
 
 def resolving_oversample(exposures: Exposures, samples_per_fringe: float, at_least: int) -> int:
@@ -32,7 +41,7 @@ def resolving_oversample(exposures: Exposures, samples_per_fringe: float, at_lea
     At most `2 samples_per_fringe`, or 8: fringes far narrower than a pixel hardly change a pixel's mean (with 16,
     cells of 64 µm on 3.2 µm pixels stay right to 1.5 % of their contrast however short the distance).
     """
-    fringe = math.sqrt(wavelength(exposures.energy_kev) * float(exposures.distance.min()))
+    fringe = math.sqrt((wavelength(exposures.energy_kev) * exposures.distance).min())
     wanted = math.ceil(exposures.views.pixel_size * samples_per_fringe / fringe)
     return max(at_least, min(wanted, max(8, math.ceil(2 * samples_per_fringe))))
 

@@ -71,7 +71,7 @@ class ReportContent:
 
     - title: what was reconstructed; summary: a sentence or two on the experiment, plain text
     - reconstruction, truth: volumes on one grid
-    - energy_kev [keV]; pixel_size: of the frames [m]
+    - energy_kev: at which δ and β are said [keV]; pixel_size: of the frames [m]
     - held_out: test views; projections: line integrals of a few views; volume_scores: against the truth
     - material_delta: the material's δ, for surfaces and masks; None: the robust maximum of the truth, or else
       of the reconstruction

@@ -43,7 +43,7 @@ def report_run(
         summary=_summary(reconstruction, scan),
         reconstruction=cloud.voxelise(grid),
         truth=truth,
-        energy_kev=scan.exposures.energy_kev,
+        energy_kev=scan.exposures.reference_energy,
         pixel_size=scan.views.pixel_size,
         held_out=held_out,
         projections=_projections(reconstruction, scan.views, truth),
@@ -71,10 +71,12 @@ def _summary(reconstruction: Reconstruction, scan: Scan) -> str:
     h, w = views.shape
     low, high = 100 * exposures.distance.min(), 100 * exposures.distance.max()
     distance = f"{low:.4g} cm" if low == high else f"{low:.4g} to {high:.4g} cm"
+    energies = exposures.energy_kev.min(), exposures.energy_kev.max()
+    energy = f"{energies[0]:g}" if exposures.has_one_energy else f"{energies[0]:g} to {energies[1]:g}"
     state = "" if reconstruction.finished else " The fit was interrupted before its end."
     return (
         f"{len(scan.train())} training and {len(scan.test())} held-out frames of {h} × {w} pixels of "
-        f"{1e6 * views.pixel_size:.4g} µm, {exposures.energy_kev:g} keV, {distance} behind the sample; "
+        f"{1e6 * views.pixel_size:.4g} µm, {energy} keV, {distance} behind the sample; "
         f"{len(reconstruction.cloud)} Gaussians.{state}"
     )
 

@@ -266,7 +266,8 @@ def run_configuration(
     name, train = configuration.name, measured.scan.train()
     options = pace.options(configuration, train.views.shape[1])
     folder.write_config(name, {"configuration": asdict(configuration), "seed": seed, "fit": asdict(options)})
-    cloud = random_start(configuration, train.views, train.exposures.energy_kev, seed)
+    energy = train.exposures.one_energy("the thesis' study")
+    cloud = random_start(configuration, train.views, energy, seed)
     fit, looks, diverged = Fit(train, cloud, options, seed), [], None
     looks.append(_look(fit, measured))
     try:

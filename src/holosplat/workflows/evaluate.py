@@ -172,10 +172,10 @@ def _as_dict(delta: float, ratio: float) -> dict[str, float | None]:
 
 
 def _require_energy(reconstruction: Reconstruction, exposures: Exposures) -> None:
-    energy = reconstruction.energy_kev
+    energy, found = reconstruction.energy_kev, exposures.reference_energy
     require(
-        abs(exposures.energy_kev / energy - 1) < 1e-3,
-        f"the run's δ and β are those at {energy:g} keV, but the scan's energy is {exposures.energy_kev:g} keV.",
+        abs(found / energy - 1) < 1e-3,
+        f"the run's δ and β are those at {energy:g} keV, but the scan's energy is {found:g} keV.",
     )
 
 

@@ -33,7 +33,7 @@ def join(
     Each frame is brought to pixels of `pixel_size` [m] (default: the coarsest of all), over the field that every
     detector has, about its own centre; distances, poses, shifts and times stay its own, its point-spread function is
     carried along. `flips`: for each file, what its detector saw reversed and the file does not say itself. Raw files
-    are corrected plainly. `InputError` for energies that differ, which no reconstruction here can use together.
+    are corrected plainly, and frames keep the photon energy of their beam.
     """
     require_writable(out)
     require_apart(out, *sources)
@@ -48,7 +48,7 @@ def join(
             parts.append(file.exposures)
             is_test.append(file.is_test)
             texts.append(file.provenance())
-    pitch = _common_pixel(sources, parts, pixel_size)
+    pitch = _common_pixel(parts, pixel_size)
     shape = _common_shape(parts, pitch)
     joined, resamplings = _joined(parts, shape, pitch)
     described = {"joined": "; ".join(path.name for path in sources), **_shared(texts)}
@@ -63,15 +63,8 @@ def join(
     return joined
 
 
-def _common_pixel(sources: Sequence[Path], parts: list[Exposures], pixel_size: float | None) -> float:
-    """The pixel size of the result [m]; checks that the beams can be joined."""
-    energies = [part.energy_kev for part in parts]
-    for source, energy in zip(sources, energies):
-        require(
-            math.isclose(energy, energies[0], rel_tol=1e-6),
-            f"{source} has {energy:g} keV, but {sources[0]} has {energies[0]:g} keV: a scan has one energy; join beams "
-            "of the same energy only.",
-        )
+def _common_pixel(parts: list[Exposures], pixel_size: float | None) -> float:
+    """The pixel size of the result [m]."""
     coarsest = max(part.views.pixel_size for part in parts)
     return coarsest if pixel_size is None else in_range("--pixel-size", pixel_size, *PIXEL_RANGE_M, unit="metres")
 
@@ -104,8 +97,10 @@ def _joined(parts: list[Exposures], shape: tuple[int, int], pitch: float) -> tup
         shape,
         pitch,
     )
-    distance, time = (np.concatenate([getattr(part, name) for part in parts]) for name in ("distance", "time"))
-    joined = Exposures(views, parts[0].energy_kev, distance, np.concatenate(blurs), time)
+    energy, distance, time = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("energy_kev", "distance", "time")
+    )
+    joined = Exposures(views, energy, distance, np.concatenate(blurs), time)
     return joined, resamplings
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from ..backends import device_name
-from ..scan import Scan
+from ..scan import Exposures, Scan
 from ..version import __version__
 
 
@@ -30,8 +30,14 @@ def scan_hash(scan: Scan) -> str:
     )
     for array in parts:
         digest.update(np.ascontiguousarray(array).tobytes())
-    digest.update(repr((scan.views.pixel_size, exposures.energy_kev)).encode())
+    digest.update(repr((scan.views.pixel_size, _energies(exposures))).encode())
     return digest.hexdigest()[:16]
+
+
+def _energies(exposures: Exposures) -> float | list[float]:
+    """The frames' energies [keV]; one number if they are the same, as all scans had before."""
+    energies = exposures.energy_kev.tolist()
+    return energies[0] if exposures.has_one_energy else energies
 
 
 def environment(backend: str) -> dict[str, dict[str, str]]:

@@ -43,7 +43,7 @@ Progress = Callable[[str, float, Record], None]
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """A fitted cloud, the energy [keV] and wave sampling it was fitted at, and how long each stage took [s]."""
+    """A fitted cloud, the energy [keV] of its δ and β, its fit's wave sampling, and how long each stage took [s]."""
 
     cloud: GaussianCloud
     energy_kev: float
@@ -168,7 +168,7 @@ class _Journal:
         """Save everything once more, with the result."""
         self._timing["fit"] = self._fit.seconds
         fit = self._fit
-        energy, oversample = fit.train.exposures.energy_kev, fit.instrument.oversample
+        energy, oversample = fit.train.exposures.reference_energy, fit.instrument.oversample
         done = Reconstruction(fit.result(), energy, oversample, dict(self._timing), fit.finished)
         if self._folder is not None:
             self._save()
@@ -189,7 +189,7 @@ class _Journal:
             "gaussians": len(cloud),
             "oversample": done.oversample,
             "detector": {"rows": h, "columns": w, "pixel_size_m": pitch},
-            "energy_kev": fit.train.exposures.energy_kev,
+            "energy_kev": fit.train.exposures.reference_energy,
             "material": {"delta": cloud.delta, "beta": cloud.beta, "single": cloud.single_material},
             "second_material": cloud.second and {"delta": cloud.second[0], "beta": cloud.second[1]},
             "timing_s": done.timing,

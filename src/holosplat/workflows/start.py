@@ -122,13 +122,14 @@ def assumed_material(scan: Scan, prior: MaterialPrior, on_progress: Progress, ba
 def _random(scan: Scan, prior: MaterialPrior, settings: Settings, seed: int, on_progress: Progress) -> GaussianCloud:
     """The thesis' start; amplitudes are in units of the known material, or else of water."""
     on_progress("random start", 0.0)
-    material = WATER.delta_beta(scan.exposures.energy_kev)
+    material = WATER.delta_beta(scan.exposures.reference_energy)
     if prior.kind == "known":
         material = DeltaBeta(prior.delta, prior.beta)
     elif prior.kind == "ratio":
         material = DeltaBeta(material.delta, material.delta / prior.ratio)
     frames, pitch = torch.from_numpy(scan.frames), scan.views.pixel_size
-    retrieved = retrieve_thickness(frames, pitch, scan.exposures.distance, scan.exposures.energy_kev, *material)
+    refraction = scan.exposures.refraction(*material)
+    retrieved = retrieve_thickness(frames, pitch, scan.exposures.distance, scan.exposures.energy_kev, *refraction)
     h, w = scan.views.shape
     disc = np.pi / 4 * min(h, w) ** 2 / (h * w)
     thickness = max(float(retrieved.mean()) / disc, 0.1 * pitch)

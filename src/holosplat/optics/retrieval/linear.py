@@ -17,7 +17,9 @@ from ...units import wavelength, wavenumber
 from .spectra import (
     Prior,
     Raster,
+    absorption,
     checked,
+    column,
     detector_transfer,
     filtered,
     fresnel_phase,
@@ -72,16 +74,16 @@ def paganin(
     checked(frames, exposures, delta)
     on_progress(0.0)
     if options.noise == 0:
-        physics = (exposures.views.pixel_size, exposures.distance, exposures.energy_kev, delta, beta)
-        return retrieve_thickness(frames, *physics)
+        physics = (exposures.views.pixel_size, exposures.distance, exposures.energy_kev)
+        return retrieve_thickness(frames, *physics, *exposures.refraction(delta, beta))
     contrast, crop = surrounded(frames, exposures)
     raster = Raster((contrast.shape[-2], contrast.shape[-1]), exposures.views.pixel_size)
-    ratio = beta / delta
+    ratio = absorption(exposures, beta / delta)
     h = 2 * (ratio + fresnel_phase(exposures, raster)) * detector_transfer(exposures, raster)
     known = spectra(frames, exposures, h, raster, options.noise, options.model_error, options.prior)
     contact = 1 + 2 * ratio * filtered(contrast, known.inverse)
-    thickness = -torch.log(contact.clamp_min(1e-6)) / (2 * wavenumber(exposures.energy_kev) * beta)
-    return thickness[crop].to(frames.dtype)
+    mu = column(2 * wavenumber(exposures.energy_kev) * exposures.refraction(delta, beta)[1])
+    return (-torch.log(contact.clamp_min(1e-6)) / mu)[crop].to(frames.dtype)
 
 
 def contrast_transfer(
@@ -108,28 +110,36 @@ def contrast_transfer(
     return (-filtered(contrast, known.inverse) * radian(exposures, delta))[crop].to(frames.dtype)
 
 
+PerView = float | np.ndarray
+"""One number for all views, or one for each [V]."""
+
+
 def retrieve_thickness(
-    frames: Tensor, pitch: float, distance: np.ndarray, energy_kev: float, delta: float, beta: float
+    frames: Tensor, pitch: float, distance: np.ndarray, energy_kev: PerView, delta: PerView, beta: PerView
 ) -> Tensor:
     """Projected thickness [V, H, W] in metres of a single material (δ, β) from frames [V, H, W] at distances [V].
+
+    energy_kev, delta, beta: of all views, or of each [V].
 
     Paganin et al. (2002), eq. 12: `T = -ln(F⁻¹[F[I] / (1 + πλz (δ/β) f²)]) / 2kβ`. A contrast with β ≤ 0 (cells
     in plasma) has no such filter and is solved in the linear limit (`invert_contrast`). Frames are continued by
     their edge values; pitch: pixel size [m]; δ must be positive.
     """
-    require(delta > 0, f"phase retrieval needs a material with δ > 0, but δ is {delta:g}.")
-    if beta < WEAKEST_ABSORPTION * delta:
+    z, energy, d, b = _per_view(distance, energy_kev, delta, beta)
+    require(bool((d > 0).all()), f"phase retrieval needs a material with δ > 0, but δ is {d.min():g}.")
+    if (b < WEAKEST_ABSORPTION * d).any():
         return invert_contrast(frames - 1, pitch, distance, energy_kev, delta, beta)
-    padded, crop = _continued(frames, pitch, distance, energy_kev, delta, beta, "replicate")
+    lam_z = wavelength(energy) * z
+    padded, crop = _continued(frames, pitch, lam_z, d, b, "replicate")
     f2 = _squared_frequency(padded.shape, pitch)
-    lam_z = wavelength(energy_kev) * np.asarray(distance, dtype=np.float64)[:, None, None]
-    low_pass = torch.from_numpy(1 / (1 + np.pi * lam_z * (delta / beta) * f2))
+    low_pass = torch.from_numpy(1 / (1 + np.pi * lam_z * (d / b) * f2))
     contact = torch.fft.irfft2(torch.fft.rfft2(padded) * low_pass, s=padded.shape[-2:])
-    return (-torch.log(contact.clamp_min(1e-6)) / (2 * wavenumber(energy_kev) * beta))[crop].to(frames.dtype)
+    mu = torch.from_numpy(2 * wavenumber(energy) * b)
+    return (-torch.log(contact.clamp_min(1e-6)) / mu)[crop].to(frames.dtype)
 
 
 def invert_contrast(
-    contrast: Tensor, pitch: float, distance: np.ndarray, energy_kev: float, delta: float, beta: float
+    contrast: Tensor, pitch: float, distance: np.ndarray, energy_kev: PerView, delta: PerView, beta: PerView
 ) -> Tensor:
     """Thickness (change) [V, H, W] in metres of a single material that explains an intensity change [V, H, W].
 
@@ -137,32 +147,39 @@ def invert_contrast(
     (Cloetens et al. 1999, eq. 3, for φ and absorption of one material). It is inverted as `H / (H² + α²)` with
     α small up to the first maximum (χ = π/2) and a third of the peak response beyond, where zeros follow.
     Beyond the frame the contrast is taken as zero: a residual continued by its edge values would be blown up.
+    energy_kev, delta, beta: of all views, or of each [V].
     """
-    padded, crop = _continued(contrast, pitch, distance, energy_kev, delta, beta, "constant")
-    lam_z = wavelength(energy_kev) * np.asarray(distance, dtype=np.float64)[:, None, None]
+    z, energy, d, b = _per_view(distance, energy_kev, delta, beta)
+    lam_z = wavelength(energy) * z
+    padded, crop = _continued(contrast, pitch, lam_z, d, b, "constant")
     chi = np.pi * lam_z * _squared_frequency(padded.shape, pitch)
-    k2 = 2 * wavenumber(energy_kev)
-    response = k2 * (beta * np.cos(chi) + delta * np.sin(chi))
-    floor = k2 * np.where(chi < 0.5 * np.pi, WEAKEST_ABSORPTION * delta, 0.3 * delta)
-    if beta < WEAKEST_ABSORPTION * delta:  # the lowest frequencies say next to nothing, or change their sign
-        floor = np.maximum(floor, k2 * max(abs(beta), FEEBLE_FLOOR * delta))
+    k2 = 2 * wavenumber(energy)
+    response = k2 * (b * np.cos(chi) + d * np.sin(chi))
+    floor = k2 * np.where(chi < 0.5 * np.pi, WEAKEST_ABSORPTION * d, 0.3 * d)
+    # Where absorption is feeble, the lowest frequencies say next to nothing, or change their sign.
+    feeble = np.maximum(floor, k2 * np.maximum(abs(b), FEEBLE_FLOOR * d))
+    floor = np.where(b < WEAKEST_ABSORPTION * d, feeble, floor)
     inverse = torch.from_numpy(-response / (response**2 + floor**2))
     solved = torch.fft.irfft2(torch.fft.rfft2(padded) * inverse, s=padded.shape[-2:])
     return solved[crop].to(contrast.dtype)
 
 
+def _per_view(distance: np.ndarray, *values: PerView) -> tuple[np.ndarray, ...]:
+    """Distances [V] and numbers of all views or of each, as float64 [V, 1, 1] to go with images."""
+    count = np.size(distance)
+    arrays = (np.broadcast_to(np.asarray(v, dtype=np.float64).reshape(-1), (count,)) for v in (distance, *values))
+    return tuple(np.ascontiguousarray(array)[:, None, None] for array in arrays)
+
+
 def _continued(
-    frames: Tensor,
-    pitch: float,
-    distance: np.ndarray,
-    energy_kev: float,
-    delta: float,
-    beta: float,
-    mode: str,
+    frames: Tensor, pitch: float, lam_z: np.ndarray, delta: np.ndarray, beta: np.ndarray, mode: str
 ) -> tuple[Tensor, tuple[slice, slice, slice]]:
-    """Frames in float64, continued by twice the filter's length (torch's `mode`), and the slices that undo it."""
-    absorption = max(abs(beta), WEAKEST_ABSORPTION * delta)
-    reach = math.sqrt(wavelength(energy_kev) * float(np.max(distance)) * delta / absorption / math.pi)
+    """Frames in float64, continued by twice the filter's length (torch's `mode`), and the slices that undo it.
+
+    lam_z [m²], delta, beta: [V, 1, 1].
+    """
+    weakest = np.maximum(abs(beta), WEAKEST_ABSORPTION * delta)
+    reach = math.sqrt((lam_z * delta / weakest).max() / math.pi)
     h, w = frames.shape[-2:]
     my, mx = (min(n - 1, math.ceil(2 * reach / pitch)) for n in (h, w))
     padded = pad(frames[None].double(), (mx, mx, my, my), mode=mode)[0]

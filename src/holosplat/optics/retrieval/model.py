@@ -15,11 +15,10 @@ from ...checks import at_least, require
 from ...scan import Exposures
 from ...units import wavelength
 from ..hologram import hologram, optical_path
-from ..sampling import padding, resolving_oversample
+from ..sampling import fringe_sampling, padding
 from .bounded import MODEL_ERROR, PRIOR, Estimate, bounded_estimate
-from .spectra import Raster, checked, filtered, radian, response, spectra, squared_frequency
+from .spectra import Raster, absorption, checked, filtered, radian, response, spectra, squared_frequency
 
-SAMPLES_PER_FRINGE = 1.5
 MOST_SAMPLES = 4_000_000
 """Samples of the waves worked on at once; more views follow in turn."""
 DARKEST = 1e-3
@@ -52,18 +51,20 @@ class WaveModel:
 
     That is the frame padded by the fringes' reach, `oversample` times finer; `support` [V, H, W] says where on it
     matter may be: where the estimate has it, and beyond the frame's border where it touches that. float32 frames are
-    computed by `backend`, float64 ones by `reference`. `phase` is the estimate to start from.
+    computed by `backend`, float64 ones by `reference`. `phase` is the estimate to start from, `ratio` the matter's β/δ
+    at the frames' energy, which is one.
     """
 
     def __init__(
         self, frames: Tensor, exposures: Exposures, ratio: float, noise: float | None, backend: str = "cpu"
     ) -> None:
         estimate = bounded_estimate(frames, exposures, ratio, noise)
-        self.exposures, self.ratio = exposures, ratio
+        energy = exposures.one_energy("the wave model of a phase retrieval")
+        self.exposures, self.ratio = exposures, float(absorption(exposures, ratio)[0])
         self.backend = resolve("reference" if frames.dtype == torch.float64 else backend)
         self.frames = frames.detach().to(device(self.backend))
         self.amplitude = self.frames.clamp_min(0).sqrt()
-        self.oversample = resolving_oversample(exposures, SAMPLES_PER_FRINGE, at_least=1)
+        self.oversample = fringe_sampling(exposures)
         self.margin = padding(exposures, self.oversample)
         views = exposures.views.padded(self.margin).refined(self.oversample)
         self.raster = Raster(views.shape, views.pixel_size)
@@ -71,7 +72,7 @@ class WaveModel:
         self.path = optical_path(
             views.shape,
             views.pixel_size,
-            exposures.energy_kev,
+            energy,
             exposures.distance,
             exposures.psf_sigma_px * self.oversample,
             (exposures.views.shape, (my, mx), self.oversample),
@@ -108,7 +109,8 @@ class WaveModel:
         """Means over the frame's pixels [V, h, w], in metres."""
         (my, mx), s, (h, w) = self.margin, self.oversample, self.exposures.views.shape
         inside = phase[:, my * s : (my + h) * s, mx * s : (mx + w) * s]
-        return (avg_pool2d(inside[None], s)[0] if s > 1 else inside) * radian(self.exposures, delta)
+        radians = radian(self.exposures, delta).to(inside.device, inside.dtype)
+        return (avg_pool2d(inside[None], s)[0] if s > 1 else inside) * radians
 
     def image(self, phase: Tensor) -> Tensor:
         """Frames [V, h, w]; differentiable once."""
@@ -164,12 +166,12 @@ def view_by_view(
 
 
 def _batches(exposures: Exposures) -> Iterator[np.ndarray]:
-    """Indices of views that share distance and point-spread function, and so a raster, few enough for memory."""
-    optics = np.stack((exposures.distance, exposures.psf_sigma_px), axis=1)
+    """Indices of views that share distance, blur and energy, and so a raster, few enough for memory."""
+    optics = np.stack((exposures.distance, exposures.psf_sigma_px, exposures.energy_kev), axis=1)
     for one in np.unique(optics, axis=0):
         alike = np.flatnonzero((optics == one).all(axis=1))
         sample = exposures[alike[:1]]
-        oversample = resolving_oversample(sample, SAMPLES_PER_FRINGE, at_least=1)
+        oversample = fringe_sampling(sample)
         rows, columns = sample.views.padded(padding(sample, oversample)).refined(oversample).shape
         at_once = max(1, MOST_SAMPLES // (rows * columns))
         yield from (alike[i : i + at_once] for i in range(0, len(alike), at_once))

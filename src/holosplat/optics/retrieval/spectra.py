@@ -51,9 +51,20 @@ def checked(frames: Tensor, exposures: Exposures, delta: float) -> Tensor:
     return frames
 
 
-def radian(exposures: Exposures, delta: float) -> float:
-    """The thickness [m] of matter that delays the wave by one radian, 1/kδ."""
-    return 1 / (wavenumber(exposures.energy_kev) * delta)
+def column(values: np.ndarray) -> Tensor:
+    """Numbers of views [V] as float64 [V, 1, 1], to go with their images."""
+    return torch.from_numpy(np.asarray(values, dtype=np.float64))[:, None, None]
+
+
+def radian(exposures: Exposures, delta: float) -> Tensor:
+    """The thickness [V, 1, 1] in metres of matter that delays each view's wave by one radian, 1/kδ, float64."""
+    return column(1 / (wavenumber(exposures.energy_kev) * exposures.refraction(delta, 0.0)[0]))
+
+
+def absorption(exposures: Exposures, ratio: float) -> Tensor:
+    """β/δ [V, 1, 1] at each view's energy of matter that has `ratio` at the reference energy, float64."""
+    delta, beta = exposures.refraction(1.0, ratio)
+    return column(beta / delta)
 
 
 @dataclass(frozen=True)
@@ -95,9 +106,9 @@ def detector_transfer(exposures: Exposures, raster: Raster) -> Tensor:
 
 
 def response(exposures: Exposures, ratio: float, raster: Raster) -> Tensor:
-    """`H` [V, H, W//2 + 1] of a material with β/δ = `ratio`, float64."""
+    """`H` [V, H, W//2 + 1] of a material with β/δ = `ratio` at the reference energy, float64."""
     chi = fresnel_phase(exposures, raster)
-    return 2 * (ratio * torch.cos(chi) + torch.sin(chi)) * detector_transfer(exposures, raster)
+    return 2 * (absorption(exposures, ratio) * torch.cos(chi) + torch.sin(chi)) * detector_transfer(exposures, raster)
 
 
 def contrast_level(frames: Tensor) -> Tensor:
