@@ -86,8 +86,9 @@ def operations() -> list[Callable[[], None]]:
     def cloud(channels: int) -> list[Tensor]:
         return [torch.ones(5, width, requires_grad=True) for width in (3, 3, 4, channels)]
 
-    def splat(channels: int) -> None:
+    def splat(channels: int, of_poses: bool = False) -> None:
         poses = (torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 2, dtype=torch.float64))
+        poses[0].requires_grad_(of_poses)
         splats.splat(*cloud(channels), *poses, (8, 9), 4.0, 1 / 12).sum().backward()
 
     def voxelise(channels: int) -> None:
@@ -118,7 +119,8 @@ def operations() -> list[Callable[[], None]]:
         compare, move, lambda: wide(splat, triton_pixels), lambda: wide(voxelise, triton_boxes)
     ]  # fmt: skip
     for c in (1, 2):
-        calls += [lambda c=c: splat(c), lambda c=c: voxelise(c), lambda c=c: hologram(c, c == 1)]
+        calls += [lambda c=c: splat(c), lambda c=c: splat(c, True)]
+        calls += [lambda c=c: voxelise(c), lambda c=c: hologram(c, c == 1)]
     return calls
 
 
