@@ -127,7 +127,7 @@ class Poses:
     """V views made ready for kernels: tensors that stay on a device, picked by index without waiting for it.
 
     rotations: [V, 3, 3] float64; shifts: [V, 2] float64, detector shifts `(sx, sy)` [m]; shape: `(H, W)` pixels;
-    pixel_size [m].
+    pixel_size [m]. Rotations and shifts may require gradients, which projections then give them.
     """
 
     rotations: torch.Tensor
