@@ -27,7 +27,7 @@ def main(out: Path) -> None:
 
     # 64 × 64 pixels of 0.5 µm show a field of 32 µm; a mesh that leaves it would be cut off in some views.
     views = hs.Views.evenly_spaced(12, shape=(64, 64), pixel_size=0.5e-6)
-    print(f"{len(scene.meshes)} meshes, {scene.missing_field(views):.1%} of the field too large")
+    print(f"{len(scene.meshes)} meshes, with {-1e6 * scene.missing_field(views):.1f} µm of free field around them")
     hs.write_scan(out / "scan.nxs", hs.simulate(scene, hs.Exposures.of(views, ENERGY_KEV, distance=0.1)))
 
     # From here on as with a measured scan: the file (NXtomo) and the material are all that the reconstruction gets.
