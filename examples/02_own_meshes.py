@@ -40,11 +40,11 @@ def main(out: Path) -> None:
 
     _, axes = plt.subplots(1, 3, figsize=(9, 3.4), layout="constrained")
     axes[0].imshow(scan.frames[0], cmap="gray")
-    for axis, volume, title in ((axes[1], truth, "true δ"), (axes[2], found, "reconstructed δ")):
-        axis.imshow(volume.delta[:, 32], cmap="magma", vmin=0, vmax=prior.delta)
+    for axis, volume, title in ((axes[1], truth, "true δ, largest along z"), (axes[2], found, "reconstructed δ")):
+        axis.imshow(volume.delta.max(axis=0), cmap="magma", vmin=0, vmax=prior.delta)
         axis.set_title(title)
     axes[0].set_title("hologram of the first view")
-    plt.savefig(out / "hologram_and_slices.png", dpi=100)
+    plt.savefig(out / "hologram_and_volumes.png", dpi=100)
 
 
 if __name__ == "__main__":

@@ -42,9 +42,9 @@ def main(out: Path) -> None:
             f"{name}: found δ = {found.delta:.3e}, δ/β = {found.ratio:.0f}; Dice {numbers['dice']:.3f}, "
             f"error of δ {numbers['relative_error_delta']:.3f}, SSIM of held-out frames {numbers['ssim']:.3f}"
         )
-        axis.imshow(result.cloud.voxelise(grid).delta[32], cmap="magma", vmin=0, vmax=1.2 * material.delta)
+        axis.imshow(result.cloud.voxelise(grid).delta.max(axis=0), cmap="magma", vmin=0, vmax=1.2 * material.delta)
         axis.set_title(name)
-    plt.savefig(out / "slices_of_delta.png", dpi=100)
+    plt.savefig(out / "largest_delta_along_z.png", dpi=100)
 
 
 if __name__ == "__main__":

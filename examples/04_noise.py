@@ -36,11 +36,11 @@ def main(out: Path) -> None:
             f"Dice {numbers['dice']:.3f}, error of δ {numbers['relative_error_delta']:.3f}"
         )
         column[0].imshow(scan.frames[1], cmap="gray", vmin=clean.frames.min(), vmax=clean.frames.max())
-        column[1].imshow(result.cloud.voxelise(grid).delta[32], cmap="magma", vmin=0, vmax=1.2 * material.delta)
+        column[1].imshow(result.cloud.voxelise(grid).delta.max(axis=0), cmap="magma", vmin=0, vmax=1.2 * material.delta)
         column[0].set_title(light)
     axes[0, 0].set_ylabel("a training frame")
-    axes[1, 0].set_ylabel("a slice of δ")
-    plt.savefig(out / "frames_and_slices.png", dpi=100)
+    axes[1, 0].set_ylabel("largest δ along z")
+    plt.savefig(out / "frames_and_volumes.png", dpi=100)
 
 
 if __name__ == "__main__":

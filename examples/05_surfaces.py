@@ -1,7 +1,7 @@
 """Surfaces: `python 05_surfaces.py [folder]`.
 
-Where matter comes in closed bodies, their surfaces are cut out of the Gaussians and fitted to the same frames. They know
-that matter has an edge, so the volume becomes sharper, and the bodies are triangle meshes for other programs.
+If the matter consists of closed bodies, their surfaces are extracted from the Gaussians and fitted to the same frames.
+Surfaces have sharp edges, so the volume becomes sharper; and the bodies are triangle meshes for other programs.
 """
 
 import sys
@@ -31,9 +31,9 @@ def main(out: Path) -> None:
         delta = thing.voxelise(grid).delta
         error = float(((delta - truth) ** 2).sum() ** 0.5 / (truth**2).sum() ** 0.5)
         print(f"{name}: relative error of δ {error:.3f}")
-        axis.imshow(delta[32], cmap="magma", vmin=0, vmax=1.2 * material.delta)
+        axis.imshow(delta.max(axis=0), cmap="magma", vmin=0, vmax=1.2 * material.delta)
         axis.set_title(name)
-    plt.savefig(out / "slices_of_delta.png", dpi=100)
+    plt.savefig(out / "largest_delta_along_z.png", dpi=100)
 
     bodies = surfaces.mesh()
     hs.write_mesh(out / "bodies.vtk", bodies, length_unit="um")

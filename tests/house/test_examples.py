@@ -77,7 +77,7 @@ def test_own_meshes(tmp_path):
         "cell1.vtk",
         "cell2.vtk",
         "scan.nxs",
-        "hologram_and_slices.png",
+        "hologram_and_volumes.png",
     }
 
 
