@@ -56,7 +56,7 @@ def join(
     with scan_writer(out, joined, np.concatenate(is_test), described) as add:
         for n, (source, resampling) in enumerate(zip(sources, resamplings)):
             rows, columns = FLIPS[flips[n]] if flips else (False, False)
-            for frame in read_scan(source).frames:
+            for frame in (frame for block in read_scan(source).blocks() for frame in block):
                 add(resampling(frame[:: -1 if rows else 1, :: -1 if columns else 1]))
                 done += 1
                 on_progress(done / len(joined))
