@@ -30,7 +30,7 @@ from holosplat.bench.case import Case, load_case
 from holosplat.bench.methods import holographic_voxels
 from holosplat.fit.neural import NeuralFit, fit_neural
 from holosplat.fit.voxels import VoxelFit, fit_voxels
-from holosplat.optics.sampling import resolving_oversample
+from holosplat.optics.sampling import fringe_sampling
 from holosplat.representations import Encoding, Matter, Network, VoxelGrid
 from holosplat.volume import Object
 from holosplat.workflows.evaluate import score_object
@@ -98,7 +98,7 @@ def scored(case: Case, methods: Sequence[str], varied: Sequence[str]) -> list[di
         raise SystemExit(f"{case.name} tells nothing of its material; choose cases of a known one.")
     scan, truth = case.scan(), case.truth()
     start = holographic_voxels(scan.train(), case.prior, preset("default").volume, lambda stage, fraction: None)
-    oversample, rows = resolving_oversample(scan.exposures, 1.5, at_least=1), []
+    oversample, rows = fringe_sampling(scan.exposures), []
     runs = fits(case, start)
     for name in methods:
         options, fit = runs[name]

@@ -31,7 +31,7 @@ from holosplat.baselines.tomography import TOMOGRAPHIES, TotalVariation, total_v
 from holosplat.bench.svmbir import Mbir, svmbir_volume
 from holosplat.metrics import image_scores, intensity_range, volume_scores
 from holosplat.optics.retrieval import RETRIEVALS
-from holosplat.optics.sampling import resolving_oversample
+from holosplat.optics.sampling import fringe_sampling
 from holosplat.representations.voxels import VoxelGrid
 
 HAEMOGLOBIN = hs.HAEMOGLOBIN.delta_beta(20.0)
@@ -123,7 +123,7 @@ def row(job: Job, method: Callable[..., torch.Tensor], held_out: bool) -> str:
     if not held_out:
         return cells
     test = job.scan.test()
-    oversample = resolving_oversample(train.exposures, 1.5, at_least=1)
+    oversample = fringe_sampling(train.exposures)
     with torch.no_grad():
         predicted = hs.measure(voxels, test.exposures, oversample).numpy()
     mean = image_scores(predicted, test.frames, intensity_range(train.frames)).mean

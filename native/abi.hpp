@@ -33,6 +33,11 @@ struct HoloViews {
   const double* shifts;     // [V, 2] detector shift (sx, sy)
 };
 
+struct HoloViewGradients {  // of a scalar with respect to the arrays of a HoloViews, in their shapes
+  double* rotations;  // as if all nine numbers of a matrix were free
+  double* shifts;
+};
+
 struct HoloGrid {
   int64_t depth, height, width;  // Z, Y, X
 };
@@ -54,19 +59,19 @@ struct HoloTarget {  // measured frames, compared after the affine map that take
   double low, span;
 };
 
-struct HoloAdam {  // up to 4 arrays under optimisation
+struct HoloAdam {  // K arrays under optimisation; each member but the count points to K entries
   int64_t count;
-  int64_t lengths[4];
-  float* parameters[4];
-  const float* gradients[4];
-  float* first[4];   // running means of the gradient
-  float* second[4];  // and of its square
+  const int64_t* lengths;
+  float* const* parameters;
+  const float* const* gradients;
+  float* const* first;   // running means of the gradient
+  float* const* second;  // and of its square
 };
 
 struct HoloLattice {
   int64_t depth, height, width;  // Z, Y, X
   double origin[3];              // x, y, z of voxel [0, 0, 0]
-  double pitch;                  // voxel edge
+  double pitch[3];               // voxel edges along x, y, z
 };
 
 struct HoloSurface {  // triangles seen in V views
@@ -88,8 +93,10 @@ HOLO_EXPORT int64_t holosplat_best_isa();
 
 // image [V, C, H, W]
 HOLO_EXPORT int64_t holosplat_splat(const HoloCloud*, const HoloViews*, const HoloOptions*, float* image);
+// Gradients of the views are left out if the last pointer is null.
 HOLO_EXPORT int64_t holosplat_splat_backward(const HoloCloud*, const HoloViews*, const HoloOptions*,
-                                             const float* image_gradient, const HoloGradients*);
+                                             const float* image_gradient, const HoloGradients*,
+                                             const HoloViewGradients*);
 // volume [C, Z, Y, X]
 HOLO_EXPORT int64_t holosplat_voxelise(const HoloCloud*, const HoloGrid*, const HoloOptions*, float* volume);
 HOLO_EXPORT int64_t holosplat_voxelise_backward(const HoloCloud*, const HoloGrid*, const HoloOptions*,
@@ -113,15 +120,26 @@ HOLO_EXPORT int64_t holosplat_lattice_project(const HoloLattice*, const HoloView
                                               int64_t threads);
 HOLO_EXPORT int64_t holosplat_lattice_backproject(const HoloLattice*, const HoloViews*, const float* image,
                                                   float* volume, int64_t threads);
+// Derivatives of the scalar whose derivative by the image is `image_gradient`: by the first two rows of each rotation,
+// rotations [V, 2, 3], and by the shifts [V, 2]. Where a voxel lies on a pixel's centre (within 1e-6), whose hats have
+// a kink there, the mean of both sides' derivatives.
+HOLO_EXPORT int64_t holosplat_lattice_poses(const HoloLattice*, const HoloViews*, const float* volume,
+                                            const float* image_gradient, double* rotations, double* shifts,
+                                            int64_t threads);
 
 // Thickness of what closed surfaces enclose, image [V, H, W]: along rows the mean over each pixel, across them the mean
 // over `lines` lines of it.
 HOLO_EXPORT int64_t holosplat_surface(const HoloSurface*, const HoloRaster*, int64_t lines, double* image,
                                       int64_t threads);
+// Derivatives of the scalar whose derivative by the image is `image_gradient` [V, H, W], linear between pixels: by each
+// view's rotation, rotations [V, 3, 3], and by its shift, shifts [V, 2]; vertices [P, 3] in the object frame.
+HOLO_EXPORT int64_t holosplat_surface_poses(const HoloSurface*, const HoloRaster*, const double* vertices,
+                                            const double* image_gradient, double* rotations, double* shifts,
+                                            int64_t threads);
 
 // Wave optics, between the Fourier transforms that the caller does. Complex arrays are float pairs (re, im).
-// wave [V, H, W] <- exp(-loss - i phase) - 1 with phase = sum over channels of refraction[c][0] lines[c], and loss of
-// refraction[c][1]; refraction [C, 2], lines [V, C, H, W]
+// wave [V, H, W] <- exp(-loss - i phase) - 1 with phase = sum over channels of refraction[v][c][0] lines[v][c], and loss
+// of refraction[v][c][1]; refraction [V, C, 2], lines [V, C, H, W]
 HOLO_EXPORT int64_t holosplat_exit_wave(const HoloRaster*, const double* refraction, const float* lines, float* wave,
                                         int64_t threads);
 HOLO_EXPORT int64_t holosplat_exit_wave_backward(const HoloRaster*, const double* refraction, const float* lines,

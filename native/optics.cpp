@@ -40,11 +40,13 @@ struct Refraction {  // of each channel: phase k delta and loss k beta per unit 
   float phase[2], loss[2];
 };
 
-Refraction refraction_of(const HoloRaster& raster, const double* given) {
-  Refraction r = {};
-  for (int64_t c = 0; c < raster.channels; ++c)
-    r.phase[c] = static_cast<float>(given[2 * c]), r.loss[c] = static_cast<float>(given[2 * c + 1]);
-  return r;
+// Of each view, from [V, C, 2].
+std::vector<Refraction> refraction_of(const HoloRaster& raster, const double* given) {
+  std::vector<Refraction> all(static_cast<size_t>(raster.count));
+  for (Refraction& r : all)
+    for (int64_t c = 0; c < raster.channels; ++c, given += 2)
+      r.phase[c] = static_cast<float>(given[0]), r.loss[c] = static_cast<float>(given[1]);
+  return all;
 }
 
 // U - 1 of the exit wave U = exp(-loss - i phase).
@@ -59,21 +61,24 @@ HOLO_INLINE Wave<kWidest> scattered(const float* lines, int64_t plane, const Ref
 }
 
 template <int C>
-void exit_wave(const HoloRaster& raster, const Refraction& r, const float* lines, float* wave, int64_t threads) {
+void exit_wave(const HoloRaster& raster, const double* refraction, const float* lines, float* wave, int64_t threads) {
   const int64_t plane = raster.height * raster.width;
+  const std::vector<Refraction> matter = refraction_of(raster, refraction);
   each_vector(raster.count, plane, threads, [&](int64_t view, int64_t i, int64_t count) {
-    const Wave<kWidest> u = scattered<C>(lines + view * C * plane + i, plane, r, count);
+    const Wave<kWidest> u = scattered<C>(lines + view * C * plane + i, plane, matter[view], count);
     store_some_waves(wave + 2 * (view * plane + i), u, count);
   });
 }
 
 // For a gradient g (of the real and of the imaginary part): Re(conj(dU/dT) g), dU/dT = -(loss + i phase) U.
 template <int C>
-void exit_wave_backward(const HoloRaster& raster, const Refraction& r, const float* lines, const float* wave_gradient,
-                        float* lines_gradient, int64_t threads) {
+void exit_wave_backward(const HoloRaster& raster, const double* refraction, const float* lines,
+                        const float* wave_gradient, float* lines_gradient, int64_t threads) {
   const int64_t plane = raster.height * raster.width;
+  const std::vector<Refraction> matter = refraction_of(raster, refraction);
   each_vector(raster.count, plane, threads, [&](int64_t view, int64_t i, int64_t count) {
     const int64_t at = view * C * plane + i;
+    const Refraction& r = matter[view];
     Wave<kWidest> u = scattered<C>(lines + at, plane, r, count);
     u.re += 1.0f;
     const Wave<kWidest> g = load_some_waves<kWidest>(wave_gradient + 2 * (view * plane + i), count);
@@ -179,15 +184,13 @@ using namespace holo;
 int64_t holosplat_exit_wave(const HoloRaster* raster, const double* refraction, const float* lines, float* wave,
                             int64_t threads) {
   const auto run = raster->channels == 1 ? exit_wave<1> : exit_wave<2>;
-  return guarded([&] { run(*raster, refraction_of(*raster, refraction), lines, wave, threads); });
+  return guarded([&] { run(*raster, refraction, lines, wave, threads); });
 }
 
 int64_t holosplat_exit_wave_backward(const HoloRaster* raster, const double* refraction, const float* lines,
                                      const float* wave_gradient, float* lines_gradient, int64_t threads) {
   const auto run = raster->channels == 1 ? exit_wave_backward<1> : exit_wave_backward<2>;
-  return guarded([&] {
-    run(*raster, refraction_of(*raster, refraction), lines, wave_gradient, lines_gradient, threads);
-  });
+  return guarded([&] { run(*raster, refraction, lines, wave_gradient, lines_gradient, threads); });
 }
 
 int64_t holosplat_transfer(const HoloRaster* raster, const float* rows, const float* columns, double scale,

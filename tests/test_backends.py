@@ -108,7 +108,7 @@ def test_the_documented_table_is_the_table():
 
 def test_the_command_line_lists_and_refuses(monkeypatch, capsys, tmp_path):
     """`holosplat backends` has every name and reason; a backend that cannot be used stops before anything is read."""
-    monkeypatch.setattr(commands, "missing", lambda name: GONE if name == "cuda" else "")
+    monkeypatch.setattr(backends, "missing", lambda name: GONE if name == "cuda" else "")
     commands.backends()
     shown = capsys.readouterr().out
     assert f"not usable here: {GONE}" in shown

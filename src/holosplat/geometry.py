@@ -123,7 +123,7 @@ class Poses:
     """V views made ready for kernels: tensors that stay on a device, picked by index without waiting for it.
 
     rotations: [V, 3, 3] float64; shifts: [V, 2] float64, detector shifts `(sx, sy)` [m]; shape: `(H, W)` pixels;
-    pixel_size [m].
+    pixel_size [m]. Rotations and shifts may require gradients, which projections then give them.
     """
 
     rotations: torch.Tensor
@@ -137,6 +137,19 @@ class Poses:
         arrays = (np.ascontiguousarray(a) for a in (views.rotations, views.shifts))
         rotations, shifts = (torch.from_numpy(a).to(device) for a in arrays)
         return cls(rotations, shifts, views.shape, views.pixel_size)
+
+    def __len__(self) -> int:
+        return len(self.rotations)
+
+    @property
+    def requires_grad(self) -> bool:
+        """Whether gradients of the rotations or of the shifts are asked for."""
+        return self.rotations.requires_grad or self.shifts.requires_grad
+
+    def views(self) -> Views:
+        """The same poses as `Views`, without gradients."""
+        rotations, shifts = (array.detach().cpu().numpy() for array in (self.rotations, self.shifts))
+        return Views(rotations, shifts, self.shape, self.pixel_size)
 
     def __getitem__(self, index: torch.Tensor) -> Poses:
         """The poses `index` [K], an integer tensor on the same device."""
@@ -200,3 +213,16 @@ class Grid:
         """The part of `shape` voxels whose first one is voxel `start` (z, y, x) of this grid."""
         origin = [o + d * i for o, d, i in zip(self.origin, self.voxel_size, start[::-1])]
         return Grid(shape, self.voxel_size, (origin[0], origin[1], origin[2]))
+
+    def divided(self, factors: tuple[int, int, int]) -> Grid:
+        """The same extent with each voxel divided by `factors` `(fx, fy, fz)`; the grid itself where all are 1.
+
+        Errors: `InputError` for a factor below 1.
+        """
+        require(min(factors) >= 1, f"factors of a division must be at least 1, but they are {factors}.")
+        if max(factors) == 1:
+            return self
+        (z, y, x), (fx, fy, fz) = self.shape, factors
+        size = [d / f for d, f in zip(self.voxel_size, factors)]
+        low = [o - 0.5 * (f - 1) * s for o, f, s in zip(self.origin, factors, size)]
+        return Grid((z * fz, y * fy, x * fx), (size[0], size[1], size[2]), (low[0], low[1], low[2]))

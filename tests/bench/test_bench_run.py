@@ -22,7 +22,7 @@ from holosplat.bench.references import REFERENCES
 from holosplat.bench.rows import Row, read_row, write_row
 from holosplat.bench.run import Suite, run_suite
 from holosplat.bench.sizes import contrast_by_size
-from holosplat.optics.sampling import resolving_oversample
+from holosplat.optics.sampling import fringe_sampling
 from holosplat.representations.voxels import VoxelGrid
 from holosplat.specimens.phantoms import star_of_balls
 from holosplat.workflows.evaluate import score_object
@@ -64,7 +64,7 @@ def test_a_row_holds_the_scores(recorder, tmp_path):
     (row,) = folder.read_rows()
     case = make_case("wide", 3)
     scan, truth = prepared(case, folder.case("wide", 3))
-    scores = score_object(voxels(scan), scan, truth, resolving_oversample(scan.exposures, 1.5, at_least=1))
+    scores = score_object(voxels(scan), scan, truth, fringe_sampling(scan.exposures))
     assert row.test == pytest.approx(scores.test.mean)
     assert row.train == pytest.approx(scores.train.mean)
     assert row.volume["dice"] == scores.volume.dice

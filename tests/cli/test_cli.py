@@ -13,8 +13,7 @@ from pathlib import Path
 
 import pytest
 
-import holosplat.cli.commands as commands
-import holosplat.cli.options as cli_options
+import holosplat.workflows.demo as demo
 from helpers.cli import (
     BEAM,
     COLUMNS,
@@ -82,11 +81,9 @@ def test_the_whole_chain_as_processes(shop, tmp_path):
 
 def test_the_demo_runs_the_chain_and_shows_its_commands(shop, tmp_path, monkeypatch):
     """Here on the two small cells."""
-    monkeypatch.setattr(commands, "DETECTOR", (ROWS, COLUMNS))
-    monkeypatch.setattr(
-        commands, "write_demo_meshes", lambda folder: [Path(shutil.copy(c, folder)) for c in shop.cells]
-    )
-    monkeypatch.setattr(cli_options, "preset", lambda name: QUICK)
+    monkeypatch.setattr(demo, "DETECTOR", (ROWS, COLUMNS))
+    monkeypatch.setattr(demo, "write_demo_meshes", lambda folder: [Path(shutil.copy(c, folder)) for c in shop.cells])
+    monkeypatch.setattr("holosplat.workflows.settings.preset", lambda name: QUICK)
     outcome = worked(holosplat("demo", "--out", tmp_path / "demo"))
     found = {path.name for path in (tmp_path / "demo").iterdir()}
     assert found == {"meshes", "scan.nxs", "truth.h5", "run"}

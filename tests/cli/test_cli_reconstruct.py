@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import holosplat.cli.commands as commands
 from helpers.cli import COLUMNS, PIXEL, PROGRAM, QUICK, ROWS, holosplat, known, refused, worked
 from holosplat.fit.schedule import Schedule
 from holosplat.geometry import Grid
@@ -157,7 +156,7 @@ def test_ctrl_c_during_the_start_leaves_nothing(shop, tmp_path, monkeypatch):
     def pressed(*arguments: object, **options: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(commands, "fit", pressed)
+    monkeypatch.setattr("holosplat.workflows.reconstruct.reconstruct", pressed)
     outcome = holosplat("reconstruct", shop.scan, "--out", tmp_path / "run", *known(shop))
     assert outcome.code == 130
     assert outcome.err.strip().splitlines()[-1] == "holosplat: interrupted"

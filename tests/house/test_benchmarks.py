@@ -76,6 +76,7 @@ def test_what_the_kernels_report(scripts):
     work = kernels.Workload(2, 32, 40, (1.0, 2.0), 3.0)
     assert kernels.splat_pairs(work) > 40
     seconds = kernels.minima({"ours": kernels.calls(work), "torch": kernels.torch_calls(work, "index_add_")}, 1)
+    seconds |= kernels.minima({"poses": kernels.calls(work, of_poses=True)}, 1)
     assert all(0 < value < 60 for pair in seconds.values() for value in pair)
 
 

@@ -289,7 +289,5 @@ def test_the_fastest_projector_that_fits_is_taken():
 def test_bad_input_is_named():
     with pytest.raises(InputError, match="values must have the shape"):
         voxel_line_integrals(torch.zeros(1, 7, 11, 9), UNEVEN, anyhow(1, (5, 7)))
-    with pytest.raises(InputError, match="needs cubic voxels"):
-        LatticeProjector(UNEVEN, anyhow(1, (5, 7)))
     with pytest.raises(InputError, match="step must be positive"):
         voxel_line_integrals(torch.zeros(1, *UNEVEN.shape), UNEVEN, anyhow(1, (5, 7)), step=0.0)

@@ -370,7 +370,7 @@ def test_the_command_runs_and_reports(measured, tmp_path, monkeypatch, small, ca
     def interrupt(*wanted):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(command, "run_study", interrupt)
+    monkeypatch.setattr("holosplat.thesis.study.run_study", interrupt)
     with pytest.raises(SystemExit) as left:
         command.thesis(tmp_path / "study", seed=5)
     assert left.value.code == 130

@@ -26,7 +26,7 @@ from ..optics.noise import noise_share
 from ..optics.retrieval import Tikhonov, tikhonov
 from ..optics.retrieval.bounded import MODEL_ERROR, PRIOR
 from ..optics.retrieval.spectra import Raster, filtered, radian, response, spectra, surrounded
-from ..optics.sampling import resolving_oversample
+from ..optics.sampling import fringe_sampling
 from ..projectors.voxels import projector_for
 from ..scan import Scan
 from ..volume import LineIntegrals
@@ -115,7 +115,7 @@ def _agree(
     """
     frames, pitch, views = torch.from_numpy(scan.frames), scan.views.pixel_size, _in_pixels(scan.views)
     correction = Correction(scan, material)
-    finer = math.ceil(resolving_oversample(scan.exposures, 1.5, at_least=1) / refine)
+    finer = math.ceil(fringe_sampling(scan.exposures) / refine)
     instrument = Instrument(scan.exposures, refine * finer, backend=options.backend)
     grid = Grid.of_views(views, refine)
     projector = projector_for(grid, views.refined(refine), options.backend)
@@ -158,7 +158,7 @@ class Correction:
 
 def _working_resolution(scan: Scan, options: HolographicTV) -> tuple[Scan, int]:
     """The scan, binned if its voxels would be too many, and the voxels along a pixel's edge."""
-    refine = options.refine or resolving_oversample(scan.exposures, 1.5, at_least=1)
+    refine = options.refine or fringe_sampling(scan.exposures)
     h, w = scan.views.shape
     while refine > 1 and w * w * h * refine**3 > options.max_voxels:
         refine -= 1

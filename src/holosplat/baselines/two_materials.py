@@ -22,7 +22,7 @@ from torch.nn.functional import avg_pool3d
 from ..geometry import Grid
 from ..materials import DeltaBeta
 from ..model.instrument import Instrument
-from ..optics.sampling import resolving_oversample
+from ..optics.sampling import fringe_sampling
 from ..projectors.voxels import voxel_line_integrals
 from ..representations.voxel_lines import VoxelLines
 from ..scan import Scan
@@ -167,7 +167,7 @@ def at_one_ratio(scan: Scan, shares: Shares, ratio: float, backend: Backend = "c
 
 def _lines(scan: Scan, values: Tensor, grid: Grid, backend: Backend) -> tuple[Instrument, Tensor]:
     """The instrument of a scan, and the line integrals [V, C, H, W] in metres that it wants of `values`."""
-    instrument = Instrument(scan.exposures, resolving_oversample(scan.exposures, 1.5, at_least=1), backend=backend)
+    instrument = Instrument(scan.exposures, fringe_sampling(scan.exposures), backend=backend)
     if backend == "reference":
         return instrument, voxel_line_integrals(values, grid, instrument.views, step=1.0).transpose(0, 1)
     return instrument, VoxelLines(grid, instrument.views)(values)

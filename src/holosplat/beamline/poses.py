@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from ..checks import require
-from ..geometry import Views, rotation_tilted
+
+if TYPE_CHECKING:
+    from ..geometry import Views
 
 Geometry = Literal["thesis16", "xmpi_2beam", "xmpi_3beam"]
 
@@ -34,6 +36,8 @@ class Directions:
 
     def on(self, shape: tuple[int, int], pixel_size: float) -> Views:
         """The views on a detector of `shape` pixels of `pixel_size` [m]; `InputError` unless one way is named."""
+        from ..geometry import Views, rotation_tilted  # torch is slow to import; the command line needs the names alone
+
         angles = GEOMETRIES[self.geometry] if self.geometry else self.angles_deg
         given = (self.views is not None) + bool(self.angles_deg) + (self.rotations is not None) + bool(self.geometry)
         require(given == 1, "give exactly one of --views, --angles-deg, --rotations and --geometry.")

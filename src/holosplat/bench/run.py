@@ -12,7 +12,7 @@ from typing import Protocol, runtime_checkable
 from ..backends import resolve
 from ..checks import InputError, require
 from ..metrics import resolution
-from ..optics.sampling import resolving_oversample
+from ..optics.sampling import fringe_sampling
 from ..scan import Scan
 from ..volume import Object, Volume
 from ..workflows.evaluate import Scores, score_object
@@ -30,8 +30,6 @@ from .sizes import contrast_by_size
 TRUTH_THRESHOLD = 0.5
 """Shell correlation with a noise-free truth at which the resolution is read: 0.143 between two halves of the data
 corresponds to it (Rosenthal & Henderson 2003, J. Mol. Biol. 333, 721)."""
-FRINGE_SAMPLES = 1.5
-"""Wave samples on the first fringe's width when a result is imaged, as in reconstructions."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +159,7 @@ class _Bench:
         return replace(row, when=datetime.now(UTC).isoformat(timespec="seconds")), picture
 
     def _judged(self, found: Object) -> tuple[Scores, Arrays]:
-        oversample = resolving_oversample(self.scan.exposures, FRINGE_SAMPLES, at_least=1)
+        oversample = fringe_sampling(self.scan.exposures)
         scores = score_object(found, self.scan, self.truth, oversample)
         volume = found.voxelise(self.truth.grid)
         picture = method_picture(volume, scores, self.picture)

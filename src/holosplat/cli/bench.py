@@ -6,15 +6,16 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg, subcommand
 
-from ..bench.folder import BenchFolder
-from ..bench.method import Method
-from ..bench.rows import Row
 from .progress import INTERRUPTED, ProgressBar
 from .thesis import thesis
+
+if TYPE_CHECKING:
+    from ..bench.method import Method
+    from ..bench.rows import Row
 
 FIRST_SEED = 101
 """Options were tuned on scenes of seeds below 100."""
@@ -40,7 +41,8 @@ def run(
         retry: Run again what failed.
         list_only: Only list cases and methods.
     """
-    from ..bench.case import Case, case_names, load_case  # these reach every method
+    from ..bench.case import Case, case_names, load_case
+    from ..bench.folder import BenchFolder
     from ..bench.methods import METHODS
     from ..bench.references import REFERENCES
     from ..bench.run import Suite, chosen, run_suite
@@ -74,7 +76,8 @@ def report(folder: Positional[Path] = Path("bench")) -> None:
     Args:
         folder: Folder of the benchmark, which may be unfinished.
     """
-    from ..bench.pages.report import write_bench_report  # matplotlib is slow to import
+    from ..bench.folder import BenchFolder
+    from ..bench.pages.report import write_bench_report
 
     for path in write_bench_report(BenchFolder(folder)):
         _say(f"wrote {path}")

@@ -4,42 +4,18 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
-import tyro
-from tyro.conf import OmitArgPrefixes, Positional, arg
+from tyro.conf import Positional, arg
 
-from ..backends import DESCRIPTIONS, device_name, missing, resolve, support_table
 from ..checks import InputError, in_range, require
-from ..geometry import Grid
-from ..io.atomic import require_writable
-from ..io.json import read_json, write_json
-from ..io.nxtomo import read_scan, write_scan
-from ..io.volumes import read_volume, write_voxels
-from ..report.run import report_run
-from ..scan import PIXEL_RANGE_M, Scan
-from ..version import __version__
-from ..workflows.demo import DETECTOR, write_demo_meshes
-from ..workflows.evaluate import Evaluation
-from ..workflows.evaluate import evaluate as score
-from ..workflows.evaluate import render as predict
-from ..workflows.provenance import scan_hash
-from ..workflows.reconstruct import load_reconstruction
-from ..workflows.reconstruct import reconstruct as fit
-from ..workflows.run_folder import RunFolder
-from .bench import bench
-from .convert import convert
-from .grow import grow
-from .imaging import correct, join, record
 from .options import BeamlineOptions, PriorOptions, SettingsOptions, TruthOptions
-from .plan import plan
 from .progress import INTERRUPTED, ProgressBar
-from .scans import at_time, scan_for
-from .simulate import simulate
-from .surface import surface
+
+if TYPE_CHECKING:
+    from ..workflows.evaluate import Evaluation
 
 MOST_VOXELS = 2**31
 """The largest volume that `export` writes: 16 GB for δ and β."""
@@ -63,6 +39,14 @@ def reconstruct(
         resume: Go on with an interrupted run.
         time_frame: Of a time-resolved scan: the time to reconstruct, counted from 0, or all if nothing moved.
     """
+    from ..io.json import write_json
+    from ..io.nxtomo import read_scan
+    from ..report.run import report_run
+    from ..workflows.evaluate import evaluate as score
+    from ..workflows.reconstruct import reconstruct as fit
+    from ..workflows.run_folder import RunFolder
+    from .scans import at_time
+
     settings = how.settings()
     require(seed >= 0, f"--seed must be 0 or more, but it is {seed}.")
     measured = at_time(read_scan(scan), time_frame)
@@ -89,6 +73,14 @@ def render(run: Positional[Path], scan: Path, out: Path, split: Literal["test", 
         out: Scan file to write: the predicted frames, in the scan's order.
         split: Which frames.
     """
+    from ..io.atomic import require_writable
+    from ..io.nxtomo import write_scan
+    from ..scan import Scan
+    from ..workflows.evaluate import render as predict
+    from ..workflows.reconstruct import load_reconstruction
+    from ..workflows.run_folder import RunFolder
+    from .scans import scan_for
+
     require_writable(out)
     result, wanted = load_reconstruction(RunFolder(run)), scan_for(RunFolder(run), scan)
     chosen = {"test": wanted.test, "train": wanted.train, "all": lambda: wanted}[split]()
@@ -112,6 +104,14 @@ def export(
         shape: Voxels along z, y, x (default: the scan's field of view, Z = X = W, Y = H).
         voxel_size: Edge of a voxel [m] (default: the pixel size).
     """
+    from ..geometry import Grid
+    from ..io.atomic import require_writable
+    from ..io.json import read_json
+    from ..io.volumes import write_voxels
+    from ..scan import PIXEL_RANGE_M
+    from ..workflows.reconstruct import load_reconstruction
+    from ..workflows.run_folder import RunFolder
+
     require_writable(volume)
     folder = RunFolder(run)
     result = load_reconstruction(folder)
@@ -139,6 +139,14 @@ def evaluate(
         truth: Volume file of the truth.
         as_json: Print JSON instead of a table.
     """
+    from ..io.volumes import read_volume
+    from ..report.run import report_run
+    from ..workflows.evaluate import evaluate as score
+    from ..workflows.provenance import scan_hash
+    from ..workflows.reconstruct import load_reconstruction
+    from ..workflows.run_folder import RunFolder
+    from .scans import scan_for
+
     folder = RunFolder(run)
     result = load_reconstruction(folder)
     measured, true_volume = scan_for(folder, scan or folder.source_scan()), read_volume(truth) if truth else None
@@ -159,6 +167,10 @@ def demo(out: Path = Path("demo")) -> None:
     Args:
         out: Folder to make.
     """
+    from ..workflows.demo import DETECTOR, write_demo_meshes
+    from ..workflows.run_folder import RunFolder
+    from .simulate import simulate
+
     RunFolder(out).require_new()
     meshes, scan, truth, run = out / "meshes", out / "scan.nxs", out / "truth.h5", out / "run"
     meshes.mkdir(parents=True)
@@ -177,6 +189,8 @@ def demo(out: Path = Path("demo")) -> None:
 
 def backends() -> None:
     """Say which backends can be used here, and what each of them offers."""
+    from ..backends import DESCRIPTIONS, device_name, missing, support_table
+
     for name, description in DESCRIPTIONS.items():
         reason = missing(name)
         state = f"not usable here: {reason}" if reason else f"usable ({device_name(name)})"
@@ -187,6 +201,8 @@ def backends() -> None:
 
 
 def _auto() -> str:
+    from ..backends import resolve
+
     try:
         return f"would take {resolve('auto')}"
     except InputError:
@@ -200,45 +216,3 @@ def _print_scores(evaluation: Evaluation) -> None:
 
 def _say(text: str) -> None:
     print(text, file=sys.stderr)
-
-
-COMMANDS = {
-    "plan": plan,
-    "grow": grow,
-    "simulate": simulate,
-    "record": record,
-    "correct": correct,
-    "join": join,
-    "reconstruct": reconstruct,
-    "render": render,
-    "export": export,
-    "surface": surface,
-    "convert": convert,
-    "evaluate": evaluate,
-    "demo": demo,
-    "bench": bench,
-    "backends": backends,
-}
-
-
-def main() -> None:
-    """Run a command; bad input prints one sentence and exits with 2, Ctrl-C exits with 130."""
-    if sys.argv[1:] == ["--version"]:
-        print(f"holosplat {__version__}")
-        return
-    try:
-        tyro.extras.subcommand_cli_from_dict(
-            COMMANDS,
-            prog="holosplat",
-            description="Quantitative 3D maps from a handful of X-ray phase-contrast images.",
-            config=(OmitArgPrefixes,),
-        )
-    except InputError as error:
-        _say(f"holosplat: {error}")
-        raise SystemExit(2) from None
-    except KeyboardInterrupt:
-        _say("holosplat: interrupted")
-        raise SystemExit(INTERRUPTED) from None
-    except BrokenPipeError:  # the reader, such as `head`, has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise SystemExit(1) from None

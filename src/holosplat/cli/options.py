@@ -4,21 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-import numpy as np
-
-from ..backends import resolve
-from ..beamline.misalignment import Misalignment
 from ..beamline.poses import Directions, Geometry
-from ..beamline.scenes import Filling
-from ..beamline.series import SeriesFiles, Timing
-from ..beamline.simulate import Shutter, Simulation
 from ..checks import require
-from ..io.atomic import require_writable
-from ..materials import DeltaBeta, parse_material, read_material_table
-from ..scan import Exposures, interleaved_split
-from ..workflows.settings import MaterialPrior, Settings, preset, read_settings
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ..beamline.misalignment import Misalignment
+    from ..beamline.scenes import Filling
+    from ..beamline.series import SeriesFiles, Timing
+    from ..beamline.simulate import Shutter, Simulation
+    from ..materials import DeltaBeta
+    from ..scan import Exposures
+    from ..workflows.settings import MaterialPrior, Settings
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,8 @@ class MeshOptions:
 
     def series(self) -> SeriesFiles:
         """How the files of a series are read."""
+        from ..beamline.series import SeriesFiles
+
         return SeriesFiles(self.length_unit, self.origin, self.snapshot_interval, self.time_unit, self.period)
 
     def require_static(self) -> None:
@@ -63,6 +65,9 @@ class MaterialOptions:
 
     def filling(self) -> Filling:
         """The materials that the options name."""
+        from ..beamline.scenes import Filling
+        from ..materials import parse_material, read_material_table
+
         require(self.medium is not None or self.medium_density is None, "--medium-density needs --medium.")
         table = read_material_table(self.materials) if self.materials else {}
         named = self.material or (None if table else "haemoglobin")
@@ -103,12 +108,16 @@ class BeamlineOptions:
 
     def exposures(self) -> Exposures:
         """How each frame is taken."""
+        from ..scan import Exposures
+
         directions = Directions(self.views, self.angles_deg, self.tilts_deg, self.rotations, self.geometry)
         views = directions.on(self.detector, self.pixel_size)
         return Exposures.of(views, self.energy_kev, self.distance, self.psf_sigma_px)
 
     def split(self, count: int) -> np.ndarray:
         """[count] bool: the frames that are held out."""
+        from ..scan import interleaved_split
+
         every = self.test_every
         require(every == 0 or every > 1, f"--test-every must be 0 (hold out none) or at least 2, but it is {every}.")
         return interleaved_split(count, self.test_every)
@@ -123,8 +132,10 @@ class NoiseOptions:
     seed: int = 0
     """Seed of the noise."""
 
-    def simulation(self, shutter: Shutter = Shutter()) -> Simulation:
+    def simulation(self, shutter: Shutter) -> Simulation:
         """How frames are simulated."""
+        from ..beamline.simulate import Simulation
+
         return Simulation(self.photons_per_pixel, self.seed, shutter=shutter)
 
 
@@ -147,10 +158,14 @@ class MotionOptions:
 
     def shutter(self) -> Shutter:
         """The motion blur."""
+        from ..beamline.simulate import Shutter
+
         return Shutter(self.exposure, self.pulses)
 
     def timing(self) -> Timing | None:
         """When frames are taken; None for meshes that do not move."""
+        from ..beamline.series import Timing
+
         if self.frame_rate is not None:
             return Timing(self.frame_rate, self.frames, self.start, self.shutter())
         for name, default in vars(MotionOptions()).items():
@@ -173,6 +188,8 @@ class MisalignmentOptions:
 
     def errors(self) -> Misalignment:
         """The errors that the options name."""
+        from ..beamline.misalignment import Misalignment
+
         return Misalignment(self.misalign_shift, self.misalign_rotation, self.misalign_distance, self.misalign_seed)
 
     def facts(self) -> dict[str, str]:
@@ -193,6 +210,8 @@ class TruthOptions:
 
     def require_usable(self, out: Path) -> None:
         """`InputError` unless all files, `out` among them, can be written, and are different ones."""
+        from ..io.atomic import require_writable
+
         require(self.truth is not None or not self.truth_frames, "--truth-frames needs --truth.")
         paths = [path for path in (out, self.truth, self.true_exposures) if path]
         for path in paths:
@@ -226,6 +245,9 @@ class SettingsOptions:
 
     def settings(self) -> Settings:
         """The settings that the options name; `InputError` if their backend cannot be used here."""
+        from ..backends import resolve
+        from ..workflows.settings import preset, read_settings
+
         require(self.config is None or self.preset is None, "give --config or --preset, not both.")
         chosen = read_settings(self.config) if self.config else preset(self.preset or "default")
         if self.backend:
@@ -256,6 +278,8 @@ class PriorOptions:
 
     def prior(self, energy_kev: float) -> MaterialPrior:
         """The prior at `energy_kev` [keV]."""
+        from ..workflows.settings import MaterialPrior
+
         require(self.material is None or self.delta_beta is None, "give --material or --delta-beta, not both.")
         if self.material is None:
             belongs = ("density", "second_material", "second_density", "medium", "medium_density")

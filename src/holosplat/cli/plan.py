@@ -9,24 +9,18 @@ import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 from tyro.conf import arg
 
 from ..checks import in_range, require
-from ..io.atomic import atomic_path, require_writable
-from ..io.vtk import read_meshes
-from ..mesh import TriangleMesh
-from ..planning.contrast import Setup, Subject
-from ..planning.plan import Plan, Recording, Survey, survey
-from ..planning.plan import plan as make_plan
-from ..scan import DISTANCE_RANGE_M, ENERGY_RANGE_KEV
-from ..specimens.red_cells import evans_fung_cell, icosphere
-from ..specimens.repair import closed
 from .options import MaterialOptions
-from .plan_text import plan_lines, survey_lines
 from .progress import ProgressBar
+
+if TYPE_CHECKING:
+    from ..mesh import TriangleMesh
+    from ..planning.contrast import Setup, Subject
+    from ..planning.plan import Plan, Recording, Survey
 
 CELL_DIAMETER = 8e-6
 LEVEL = 4
@@ -60,11 +54,18 @@ class ObjectOptions:
 
     def subject(self) -> Subject:
         """The object that the options name."""
+        from ..planning.contrast import Subject
+
         filling = MaterialOptions(self.material, self.density, self.medium, self.medium_density).filling()
         assert filling.material is not None
         return Subject(self._shape(), filling.material, filling.medium).tilted(self.tilt_deg)
 
     def _shape(self) -> TriangleMesh:
+        from ..io.vtk import read_meshes
+        from ..mesh import TriangleMesh
+        from ..specimens.red_cells import evans_fung_cell, icosphere
+        from ..specimens.repair import closed
+
         given = sum(option is not None for option in (self.diameter, self.ball, self.mesh))
         require(given <= 1, "give only one of --diameter, --ball and --mesh.")
         if self.mesh is not None:
@@ -130,6 +131,8 @@ class RecordingOptions:
 
     def recording(self) -> Recording:
         """What the options say."""
+        from ..planning.plan import Recording
+
         return Recording(**asdict(self))
 
 
@@ -153,6 +156,9 @@ class RangeOptions:
 
     def check(self) -> None:
         """`InputError` unless ranges and files go together."""
+        from ..io.atomic import require_writable
+        from ..scan import DISTANCE_RANGE_M, ENERGY_RANGE_KEV
+
         if not self.wanted:
             require(self.out is None, "--out needs --distance-range or --energy-range, or both.")
             return
@@ -173,6 +179,10 @@ class RangeOptions:
 
     def run(self, subject: Subject, setup: Setup, photons: float, on_progress: Callable[[float], None]) -> Survey:
         """The survey of the ranges: distances in equal ratios, energies in equal steps."""
+        import numpy as np
+
+        from ..planning.plan import survey
+
         distances, energies = [setup.distance], [setup.energy_kev]
         if self.distance_range is not None:
             distances = np.geomspace(*self.distance_range, self.points[0])
@@ -193,6 +203,10 @@ def plan(
     Args:
         as_json: Print JSON instead of a table.
     """
+    from ..planning.contrast import Setup
+    from ..planning.plan import plan as make_plan
+    from .plan_text import plan_lines, survey_lines
+
     ranges.check()
     subject, setup, recording = what.subject(), Setup(**asdict(beam)), record.recording()
     planned = make_plan(subject, setup, recording)
@@ -237,7 +251,8 @@ def _as_dict(name: str, setup: Setup, recording: Recording, planned: Plan, surve
 
 def _write(path: Path, surveyed: Survey) -> None:
     """The picture and the table of a survey."""
-    from ..report.plan import survey_figure  # matplotlib is slow to import, and most plans need none
+    from ..io.atomic import atomic_path
+    from ..report.plan import survey_figure  # matplotlib, which most plans need not
 
     text = io.StringIO()
     rows = surveyed.table()

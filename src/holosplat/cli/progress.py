@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import sys
 from types import TracebackType
+from typing import TYPE_CHECKING
 
-from tqdm import tqdm
+if TYPE_CHECKING:
+    from tqdm import tqdm
 
 INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
@@ -26,6 +28,8 @@ class ProgressBar:
 
     def show(self, stage: str, fraction: float, record: dict[str, float]) -> None:
         """Stage `stage` is done to `fraction`; the fit's last `record` adds loss, count and steps a second."""
+        from tqdm import tqdm
+
         if stage != self._stage:
             self._close()
             self._stage = stage

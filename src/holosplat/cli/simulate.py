@@ -8,20 +8,11 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
 from tyro.conf import Positional
 
-from ..beamline.scenes import Filling, read_scene
-from ..beamline.series import Timing, held_out, read_series
 from ..checks import require
-from ..geometry import Grid, Views
-from ..io.nxtomo import scan_writer
-from ..io.snapshots import COLLECTION, seeming_snapshots
-from ..io.volumes import write_voxels
-from ..scan import Exposures
-from ..specimens.mesh_series import MeshSeries
-from ..specimens.scene import MeshScene
 from .options import (
     BeamlineOptions,
     MaterialOptions,
@@ -33,6 +24,16 @@ from .options import (
 )
 from .progress import ProgressBar
 from .source import SourceOptions
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ..beamline.scenes import Filling
+    from ..beamline.series import Timing
+    from ..geometry import Views
+    from ..scan import Exposures
+    from ..specimens.mesh_series import MeshSeries
+    from ..specimens.scene import MeshScene
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,8 @@ def simulate(
             --frame-rate: numbered snapshots (cell00_000.vtk, cell00_001.vtk …), or one collection (.pvd).
         out: Scan file to write (NXtomo).
     """
+    from ..beamline.series import held_out
+
     require(len(meshes) > 0, "simulate needs at least one mesh file.")
     truth.require_usable(out)
     motion, source = experiment.motion, experiment.source
@@ -107,6 +110,12 @@ def _specimen(
     bar: ProgressBar,
 ) -> _Specimen:
     """The bodies of `meshes`: moving, where there is a `timing`."""
+    import numpy as np
+
+    from ..beamline.scenes import read_scene
+    from ..beamline.series import read_series
+    from ..io.snapshots import COLLECTION, seeming_snapshots
+
     if timing is None:
         files.require_static()
         collection = next((path for path in meshes if path.suffix.lower() == COLLECTION), None)
@@ -147,6 +156,8 @@ def _write_frames(
     bar: ProgressBar,
 ) -> None:
     """Every frame to all `targets`, as it comes."""
+    from ..io.nxtomo import scan_writer
+
     with ExitStack() as stack:
         writers = [stack.enter_context(scan_writer(path, e, is_test, facts)) for path, e, facts in targets]
         for n, frame in enumerate(frames):
@@ -156,6 +167,9 @@ def _write_frames(
 
 
 def _write_truth(path: Path, matter: MeshScene, views: Views) -> None:
+    from ..geometry import Grid
+    from ..io.volumes import write_voxels
+
     with ProgressBar() as bar:
         write_voxels(path, matter, Grid.of_views(views), partial(bar.show, "voxels", record={}))
 

@@ -5,18 +5,20 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numpy as np
-
-from ..beamline.polychromatic import polychromatic_frames, read_spectrum, refilled
-from ..beamline.scenes import Filling
-from ..beamline.simulate import Simulation, simulated_frames
 from ..checks import require
-from ..optics.coherence import Spectrum, effective_geometry, joined_blur_px, source_blur
-from ..scan import Exposures
-from ..specimens.mesh_series import MeshSeries
-from ..specimens.scene import MeshScene
 from .options import BeamlineOptions
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ..beamline.scenes import Filling
+    from ..beamline.simulate import Simulation
+    from ..optics.coherence import Spectrum
+    from ..scan import Exposures
+    from ..specimens.mesh_series import MeshSeries
+    from ..specimens.scene import MeshScene
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,9 @@ class SourceOptions:
 
     def light(self, energy_kev: float) -> Spectrum | None:
         """The spectrum about `energy_kev` [keV]; None for one energy."""
+        from ..beamline.polychromatic import read_spectrum
+        from ..optics.coherence import Spectrum
+
         require(self.bandwidth is None or self.spectrum is None, "give --bandwidth or --spectrum, not both.")
         if self.spectrum is not None:
             return read_spectrum(self.spectrum)
@@ -45,6 +50,8 @@ class SourceOptions:
 
     def applied(self, beamline: BeamlineOptions) -> BeamlineOptions:
         """The beamline in effective terms: a parallel beam's pixel and distance, the source's blur, the mean energy."""
+        from ..optics.coherence import effective_geometry, joined_blur_px, source_blur
+
         for name in ("source_size", "cone"):
             told = self.source_distance is not None or not getattr(self, name)
             require(told, f"--{name.replace('_', '-')} needs --source-distance.")
@@ -67,6 +74,9 @@ class SourceOptions:
         self, matter: MeshScene | MeshSeries, filling: Filling, exposures: Exposures, how: Simulation
     ) -> Iterator[np.ndarray]:
         """Frames [H, W] of `matter`, one after another."""
+        from ..beamline.polychromatic import polychromatic_frames, refilled
+        from ..beamline.simulate import simulated_frames
+
         light = self.light(exposures.one_energy("a simulation"))
         if light is None:
             return simulated_frames(matter, exposures, how)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from ..thesis.study import PACES, Measured, StudyFolder, load_study, run_study
-from ..thesis.study import configurations as named
 from .progress import INTERRUPTED, ProgressBar
+
+if TYPE_CHECKING:
+    from ..thesis.study import StudyFolder
 
 CASE = "thesis16"
 
@@ -31,7 +32,9 @@ def thesis(
         snapshots: Folder of simulated cells (VTK files), of which the seed takes one; without, cells are generated.
         seed: Seed of the scene and of the random start.
     """
-    from ..bench.case import load_case  # reaches every specimen, other commands need none
+    from ..bench.case import load_case
+    from ..thesis.study import PACES, Measured, StudyFolder, run_study
+    from ..thesis.study import configurations as named
 
     chosen, folder, interrupted = named(configurations), StudyFolder(out), False
     try:
@@ -49,7 +52,8 @@ def thesis(
 
 
 def _report(folder: StudyFolder) -> None:
-    from ..thesis.pages import write_study  # matplotlib is slow to import
+    from ..thesis.pages import write_study
+    from ..thesis.study import load_study
 
     for path in write_study(load_study(folder), folder.path):
         _say(f"wrote {path}")

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..backends import device, resolve
 from ..checks import require
-from ..optics.hologram import hologram, optical_path
+from ..optics.hologram import Refraction, hologram, optical_path
 from ..optics.sampling import padding
 from ..scan import Exposures, far_from_edges
 from ..units import wavenumber
@@ -53,12 +53,12 @@ class Instrument:
             "use fewer or smaller frames.",
         )
         ratio = far_from_edges(exposures.energy_kev, exposures.reference_energy) if dispersion is None else dispersion
-        self._factors = wavenumber(exposures.energy_kev)[:, None, None] * ratio.reshape(len(exposures), -1, 2)
+        self._factors = _factors(wavenumber(exposures.energy_kev), ratio, self.device)
         my, mx = (m * self.oversample for m in self.margin)
         self.path = optical_path(
             self.views.shape,
             self.views.pixel_size,
-            exposures.one_energy("the wave optics"),
+            exposures.energy_kev,
             exposures.distance,
             exposures.psf_sigma_px * self.oversample,
             (exposures.views.shape, (my, mx), self.oversample),
@@ -67,14 +67,22 @@ class Instrument:
 
     def frames(self, lines: LineIntegrals, index: np.ndarray | Tensor | None = None) -> Tensor:
         """Frames [V, H, W] from line integrals on `self.views` (or its views `index`), in the instrument's type."""
-        refraction = self._refraction(lines.materials)
-        path = self.path if index is None else self.path[torch.as_tensor(index, device=self.device)]
+        at = None if index is None else torch.as_tensor(index, device=self.device)
+        path = self.path if at is None else self.path[at]
+        refraction = self.refraction(lines.materials, at)
         return hologram(lines.channels.to(self.device, self.dtype), refraction, path, self.backend)
 
-    def _refraction(self, materials: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-        """(k δ, k β) of each channel at the frames' energy, [C, 2]."""
+    def refraction(self, materials: Sequence[tuple[float, float]], index: Tensor | None = None) -> Refraction:
+        """`(k δ, k β)` of each channel as `hologram` takes them: [C, 2], or [K, C, 2] where they differ between views.
+
+        materials: (δ, β) of each channel at the reference energy; index: views [K] on the instrument's device.
+        """
         channels = [min(c, self._factors.shape[1] - 1) for c in range(len(materials))]
-        return [(f[0] * m[0], f[1] * m[1]) for f, m in zip(self._factors[0, channels].tolist(), materials)]
+        if isinstance(self._factors, np.ndarray):
+            return [(f[0] * m[0], f[1] * m[1]) for f, m in zip(self._factors[0, channels].tolist(), materials)]
+        factors = self._factors if index is None else self._factors.index_select(0, index)
+        pairs = [factors[:, c].unbind(1) for c in channels]
+        return torch.stack([torch.stack((f * d, g * b), dim=1) for (f, g), (d, b) in zip(pairs, materials)], dim=1)
 
     def image(self, B: Tensor, D: Tensor, index: np.ndarray | None = None) -> Tensor:
         """Frames [V, H, W] from line integrals B, D [V, H', W'] in metres on `self.views` (or its views `index`)."""
@@ -94,6 +102,15 @@ class Instrument:
             frames = frames if len(frames) else part.new_empty((len(index), *part.shape[1:]))
             frames[at] = part
         return frames
+
+
+def _factors(wavenumbers: np.ndarray, dispersion: np.ndarray, device: torch.device) -> np.ndarray | Tensor:
+    """k [V] times the dispersion [V, 2] or [V, C, 2] of δ and β: [1, C, 2] if that is the same in all views.
+
+    Else a tensor [V, C, 2] on `device`. C is 1 where all channels are alike.
+    """
+    factors = wavenumbers[:, None, None] * dispersion.reshape(len(wavenumbers), -1, 2)
+    return factors[:1] if (factors == factors[:1]).all() else torch.from_numpy(factors).to(device)
 
 
 def measure(obj: Object, exposures: Exposures, oversample: int = 1, dtype: torch.dtype = torch.float32) -> Tensor:

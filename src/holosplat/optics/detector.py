@@ -19,17 +19,20 @@ def bin_pixels(image: Tensor, factor: int) -> Tensor:
 
 def gaussian_transfer(shape: tuple[int, int], sigma_px: np.ndarray, dtype: torch.dtype) -> Tensor:
     """Fourier transform of Gaussian point-spread functions, [V, H, W//2 + 1] (for `rfft2`); see `gaussian_factors`."""
-    rows, columns = gaussian_factors(shape, sigma_px, torch.float64)
+    sigma = torch.from_numpy(np.asarray(sigma_px, dtype=np.float64))
+    rows, columns = gaussian_factors(shape, sigma, torch.float64)
     return (rows[:, :, None] * columns[:, None, : shape[1] // 2 + 1]).to(dtype)
 
 
-def gaussian_factors(shape: tuple[int, int], sigma_px: np.ndarray, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+def gaussian_factors(shape: tuple[int, int], sigma_px: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     """The factors `exp(-2π²σ²fy²)` [V, H] and `exp(-2π²σ²fx²)` [V, W] of Gaussian point-spread functions' transforms.
 
-    sigma_px: [V] standard deviations in samples of the raster `shape`.
+    sigma_px: [V] standard deviations in samples of the raster `shape`, float64, whose gradient the factors pass on.
+    They depend on σ², so the gradient is zero at σ = 0 exactly.
     """
-    factor = -2 * math.pi**2 * np.asarray(sigma_px, dtype=np.float64).reshape(-1, 1) ** 2
-    rows, columns = (torch.from_numpy(np.exp(factor * np.fft.fftfreq(n) ** 2)).to(dtype) for n in shape)
+    exponent, on = -2 * math.pi**2 * sigma_px.reshape(-1, 1) ** 2, sigma_px.device
+    frequencies = (torch.fft.fftfreq(n, dtype=torch.float64, device=on) for n in shape)
+    rows, columns = (torch.exp(exponent * f**2).to(dtype) for f in frequencies)
     return rows, columns
 
 

@@ -36,27 +36,31 @@ def exit_wave(B: Tensor, D: Tensor, energy_kev: float) -> Tensor:
 def fresnel_transfer(
     shape: tuple[int, int], pitch: float, distance: np.ndarray, energy_kev: float, dtype: torch.dtype
 ) -> Tensor:
-    """Fresnel transfer functions `exp(-iπλz(fx² + fy²))`, complex [V, H, W]; see `fresnel_factors`."""
-    rows, columns = fresnel_factors(shape, pitch, distance, energy_kev, torch.complex128)
+    """Fresnel transfer functions `exp(-iπλz(fx² + fy²))`, complex [V, H, W], at distances [V] [m].
+
+    See `fresnel_factors`.
+    """
+    lam_z = wavelength(energy_kev) * np.asarray(distance, dtype=np.float64).reshape(-1)
+    rows, columns = fresnel_factors(shape, pitch, torch.from_numpy(lam_z), torch.complex128)
     return (rows[:, :, None] * columns[:, None]).to(dtype)
 
 
 def fresnel_factors(
-    shape: tuple[int, int], pitch: float, distance: np.ndarray, energy_kev: float, dtype: torch.dtype
+    shape: tuple[int, int], pitch: float, wavelengths_distances: Tensor, dtype: torch.dtype
 ) -> tuple[Tensor, Tensor]:
     """The factors `exp(-iπλz fy²)` [V, H] and `exp(-iπλz fx²)` [V, W] of the transfer functions, complex.
 
-    Goodman (2005), *Introduction to Fourier Optics*, eq. 4-20, without the constant `exp(ikz)`; distances [V] and
-    `pitch` in metres. The phase is built in float64 whatever `dtype` (complex64 or complex128) is asked for.
-    Frequencies that would travel further than half the raster (`|λ z f| > N p / 2`) are cut, since they could only
-    alias (Matsushima & Shimobaba 2009, eq. 13); a raster padded by `fresnel_reach_px` loses none.
+    Goodman (2005), *Introduction to Fourier Optics*, eq. 4-20, without the constant `exp(ikz)`. pitch: of the samples
+    [m]; wavelengths_distances: [V] products λz [m²], float64, whose gradient the factors pass on. The phase is built
+    in float64 whatever `dtype` (complex64 or complex128) is asked for. Frequencies that would travel further than half
+    the raster (`|λ z f| > N p / 2`) are cut, since they could only alias (Matsushima & Shimobaba 2009, eq. 13); a
+    raster padded by `fresnel_reach_px` loses none. The gradient takes the cut as it is.
     """
-    lam_z = wavelength(energy_kev) * np.asarray(distance, dtype=np.float64).reshape(-1, 1)
-    factors = []
+    lam_z, factors = wavelengths_distances.reshape(-1, 1), []
     for n in shape:
-        f = np.fft.fftfreq(n, pitch)
-        kept = np.abs(lam_z * f) <= 0.5 * n * pitch * (1 + 1e-9)
-        factors.append(torch.from_numpy(np.exp(-1j * np.pi * lam_z * f**2) * kept).to(dtype))
+        f = torch.fft.fftfreq(n, pitch, dtype=torch.float64, device=lam_z.device)
+        kept = (lam_z * f).abs() <= 0.5 * n * pitch * (1 + 1e-9)
+        factors.append((torch.exp(-1j * math.pi * lam_z * f**2) * kept).to(dtype))
     return factors[0], factors[1]
 
 

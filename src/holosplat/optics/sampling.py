@@ -8,6 +8,9 @@ from ..scan import Exposures
 from ..units import wavelength
 from .propagation import fresnel_reach_px
 
+FRINGE_SAMPLES = 1.5
+"""Wave samples on the first fringe's width √(λz) in reconstructions, and where they are judged: with fewer, the fringes
+at the edges of cells are lost (docs/method.md); more cost memory and time as their square."""
 GUARD_PX = 5
 """Detector pixels of margin beyond the fringes' reach: room for the point-spread function and faint tails."""
 
@@ -25,6 +28,11 @@ def padding(exposures: Exposures, oversample: int) -> tuple[int, int]:
     margin = math.ceil(reach / oversample) + blur_px + GUARD_PX
     h, w = exposures.views.shape
     return smooth_margin(h, min(margin, h + GUARD_PX)), smooth_margin(w, min(margin, w + GUARD_PX))
+
+
+def fringe_sampling(exposures: Exposures, extra: int = 0) -> int:
+    """Samples per detector pixel that fits and what judges them work with; extra: further ones, for safety."""
+    return resolving_oversample(exposures, FRINGE_SAMPLES, at_least=1) + extra
 
 
 def resolving_oversample(exposures: Exposures, samples_per_fringe: float, at_least: int) -> int:

@@ -81,8 +81,7 @@ def _lookup(table: Tensor, cells: Tensor, n: int) -> Tensor:
     if table.ndim == 4:
         points = (2 / (n - 1) * cells - 1)[None, None, None]
         return grid_sample(table[None], points, padding_mode="border", align_corners=True)[0, :, 0, 0].T
-    with torch.no_grad():
-        index, weight = _hashed_corners(cells, table.shape[1])
+    index, weight = _hashed_corners(cells, table.shape[1])
     return embedding_bag(index, table.T.contiguous(), mode="sum", per_sample_weights=weight)
 
 

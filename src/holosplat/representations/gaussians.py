@@ -112,7 +112,8 @@ class GaussianCloud:
     def thickness(self, views: Views | Poses) -> Tensor:
         """Line integrals [V, C, H, W] of the amplitudes, in units of `unit_length`.
 
-        Views are checked, Poses (on the cloud's device) are taken as they are, without waiting for a GPU.
+        Views are checked, Poses (on the cloud's device) are taken as they are, without waiting for a GPU. Gradients
+        reach the cloud's parameters, and the rotations and shifts of Poses that require them.
         """
         poses = Poses.of(views, self.centres.device) if isinstance(views, Views) else views
         scale = self.unit_length / poses.pixel_size
@@ -123,11 +124,11 @@ class GaussianCloud:
             shifts=poses.shifts / poses.pixel_size,
             shape=poses.shape,
             backend=self.backend,
-            checked=not isinstance(views, Views),
+            trusted=not isinstance(views, Views),
         )
 
     def project(self, views: Views | Poses) -> LineIntegrals:
-        """Line integrals (B, D), differentiable in the parameters."""
+        """Line integrals (B, D), differentiable in the parameters and in Poses, as `thickness` is."""
         scale = self.unit_length
         materials = tuple((delta * scale, beta * scale) for delta, beta in self.materials)
         return LineIntegrals(self.thickness(views), materials)
@@ -137,18 +138,18 @@ class GaussianCloud:
         pitch = grid.voxel_size[0]
         require(np.allclose(grid.voxel_size, pitch), "Gaussians are voxelised on cubic voxels only.")
         middle = torch.as_tensor(grid.centre, dtype=torch.float64, device=self.centres.device)
-        return self.density_around(middle, grid.shape, pitch, checked=False)
+        return self.density_around(middle, grid.shape, pitch, trusted=False)
 
-    def density_around(self, middle: Tensor, shape: tuple[int, int, int], pitch: float, checked: bool = True) -> Tensor:
+    def density_around(self, middle: Tensor, shape: tuple[int, int, int], pitch: float, trusted: bool = True) -> Tensor:
         """As `density`, on `shape` voxels of `pitch` [m] around `middle` [3] `(x, y, z)` [m], float64, on the device.
 
-        By default the cloud's values are taken as they are, without waiting for a GPU.
+        `trusted`: the cloud's values are taken as they are, without waiting for a GPU; else they are checked.
         """
         scale = self.unit_length / pitch
         centres, scales, quaternions = self._scaled(scale)
         offset = (middle / pitch).to(centres.dtype)
         arrays = (centres - offset, scales, quaternions, self.amplitudes)
-        return voxelise(*arrays, shape, backend=self.backend, checked=checked)
+        return voxelise(*arrays, shape, backend=self.backend, trusted=trusted)
 
     def _scaled(self, scale: float) -> tuple[Tensor, Tensor, Tensor]:
         """Centres, scales and quaternions in pixels of which `unit_length` holds `scale`."""

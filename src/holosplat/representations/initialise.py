@@ -96,11 +96,10 @@ def at_pitch(volume: Tensor, grid: Grid, pitch: float) -> tuple[Tensor, Grid]:
     factor = round(grid.voxel_size[0] / pitch)
     if factor <= 1:
         return volume, grid
-    shape = (grid.shape[0] * factor, grid.shape[1] * factor, grid.shape[2] * factor)
+    finer = grid.divided((factor, factor, factor))
     channels = volume.reshape(1, -1, *volume.shape[-3:])
-    fine = interpolate(channels, size=shape, mode="trilinear", align_corners=False).reshape(*volume.shape[:-3], *shape)
-    x, y, z = (o - 0.5 * (factor - 1) * pitch for o in grid.origin)
-    return fine, Grid(shape, (pitch, pitch, pitch), (x, y, z))
+    fine = interpolate(channels, size=finer.shape, mode="trilinear", align_corners=False)
+    return fine.reshape(*volume.shape[:-3], *finer.shape), finer
 
 
 def approximate(

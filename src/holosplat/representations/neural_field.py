@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 import torch
@@ -13,13 +14,15 @@ from torch import Tensor, nn
 from torch.nn.functional import max_pool3d, softplus
 
 from ..checks import at_least, require
-from ..geometry import Grid, Views
+from ..geometry import Grid, Poses, Views
 from ..volume import LineIntegrals, Volume
 from .encodings import Encoding
 from .voxel_lines import resampling
 
 CHUNK = 1 << 18
 """Positions evaluated at once where no gradient is needed."""
+AnyViews = TypeVar("AnyViews", bound=Views | Poses)
+
 FIRST_VALUE = 0.05
 """What a field starts from, roughly, everywhere."""
 
@@ -121,19 +124,23 @@ class NeuralField(nn.Module):
         """The field itself: it does not move."""
         return self
 
-    def raster(self, views: Views) -> Views:
+    def raster(self, views: AnyViews) -> AnyViews:
         """The same views on pixels of a voxel edge, a whole number of them where `views` hold one."""
         ratio = views.pixel_size / self.pitch
         h, w = (max(1, math.ceil(n * ratio - 1e-6)) for n in views.shape)
-        return Views(views.rotations, views.shifts, (h, w), self.pitch)
+        return replace(views, shape=(h, w), pixel_size=self.pitch)
 
-    def project(self, views: Views) -> LineIntegrals:
-        """Line integrals (B, D), differentiable in the parameters."""
+    def project(self, views: Views | Poses) -> LineIntegrals:
+        """Line integrals (B, D), differentiable in the parameters and in the rotations and shifts of `Poses`.
+
+        The gradient of poses is that of the samples as they move through the field; it leaves out what a sample adds or
+        takes where it enters or leaves the mask.
+        """
         rays = self.raster(views)
         images = torch.stack([self.thickness(rays, v, self.samples(rays, v)) for v in range(len(views))])
         return LineIntegrals(spread(images, rays, views) * self.pitch, self.materials)
 
-    def thickness(self, rays: Views, v: int, samples: Samples, jitter: Tensor | None = None) -> Tensor:
+    def thickness(self, rays: Views | Poses, v: int, samples: Samples, jitter: Tensor | None = None) -> Tensor:
         """Line integrals [C, H, W] in voxel edges along the rays of view `v`, on pixels of a voxel edge.
 
         jitter: [S] in [0, 1), where in its depth step each sample lies; in its middle for None.
@@ -146,7 +153,7 @@ class NeuralField(nn.Module):
         return image.reshape(-1, *rays.shape)
 
     @torch.no_grad()
-    def samples(self, rays: Views, v: int, chosen: Tensor | None = None) -> Samples:
+    def samples(self, rays: Views | Poses, v: int, chosen: Tensor | None = None) -> Samples:
         """Samples on rays of view `v` (its flat pixels `chosen`, ascending), in depth steps the mask has."""
         mask = self.get_buffer("mask")
         every = torch.arange(rays.shape[0] * rays.shape[1], device=mask.device) if chosen is None else chosen
@@ -168,16 +175,14 @@ class NeuralField(nn.Module):
         """Depth steps from the box's centre to beyond its corners."""
         return math.ceil(0.5 * math.hypot(*self.grid.shape)) + 1
 
-    def _positions(self, rays: Views, v: int, pixel: Tensor, depth: Tensor) -> Tensor:
+    def _positions(self, rays: Views | Poses, v: int, pixel: Tensor, depth: Tensor) -> Tensor:
         """Positions [N, 3] in voxel edges from the box's corner, of depth steps [N] on the rays of pixels [N]."""
         like = self.output.weight
-        (h, w), rotation = rays.shape, torch.as_tensor(rays.rotations[v])
-        shift_x, shift_y = rays.shifts[v] / self.pitch
+        (h, w), rotation = rays.shape, torch.as_tensor(rays.rotations[v]).cpu()
+        shift_x, shift_y = torch.as_tensor(rays.shifts[v]).cpu() / self.pitch
         centre = torch.as_tensor(self.grid.centre / self.pitch)
         # x_obj = Rᵀ x_lab is affine in (column, row, depth)
-        first = torch.tensor(
-            [0.5 - 0.5 * w + shift_x, 0.5 - 0.5 * h + shift_y, float(rotation[2] @ centre) - self._reach()]
-        )
+        first = torch.stack([0.5 - 0.5 * w + shift_x, 0.5 - 0.5 * h + shift_y, rotation[2] @ centre - self._reach()])
         origin = rotation.T @ first - self.get_buffer("corner").cpu().double()
         axes = rotation.to(like)
         lab = torch.stack((pixel % w, pixel // w, depth.to(like)), dim=1).to(like)
@@ -203,9 +208,8 @@ class NeuralField(nn.Module):
 
     def voxelise(self, grid: Grid) -> Volume:
         """δ and β on `grid`: means of samples no further apart than a voxel edge of the field."""
-        factors = [max(1, round(size / self.pitch)) for size in grid.voxel_size]
-        fine = _divided(grid, factors)
-        fx, fy, fz = factors
+        fx, fy, fz = (max(1, round(size / self.pitch)) for size in grid.voxel_size)
+        fine = grid.divided((fx, fy, fz))
         z, y, x = grid.shape
         values = self.values(fine).reshape(-1, z, fz, y, fy, x, fx).mean(dim=(2, 4, 6)).float().cpu().numpy()
         return Volume(values[0] * self.matter.delta, values[-1] * self.matter.beta, grid)
@@ -221,7 +225,7 @@ class NeuralField(nn.Module):
             self.get_buffer("mask").copy_(kept)
 
 
-def spread(images: Tensor, rays: Views, views: Views) -> Tensor:
+def spread(images: Tensor, rays: Views | Poses, views: Views | Poses) -> Tensor:
     """Images [V, C, h, w] on `rays` brought to the pixels of `views`: linear on finer ones, means on larger ones."""
     if (rays.shape, rays.pixel_size) == (views.shape, views.pixel_size):
         return images
@@ -236,14 +240,6 @@ def spread(images: Tensor, rays: Views, views: Views) -> Tensor:
 def grown(mask: Tensor, by: int) -> Tensor:
     """A mask [Z, Y, X] grown by `by` voxels along every axis and diagonal."""
     return max_pool3d(mask[None, None].float(), 2 * by + 1, stride=1, padding=by)[0, 0] > 0
-
-
-def _divided(grid: Grid, factors: list[int]) -> Grid:
-    """The grid with each voxel divided by `factors` `(x, y, z)`."""
-    (z, y, x), (fx, fy, fz) = grid.shape, factors
-    size = [d / f for d, f in zip(grid.voxel_size, factors)]
-    low = [o - 0.5 * (f - 1) * s for o, f, s in zip(grid.origin, factors, size)]
-    return Grid((z * fz, y * fy, x * fx), (size[0], size[1], size[2]), (low[0], low[1], low[2]))
 
 
 def _chunks(count: int, length: int) -> Iterator[slice]:

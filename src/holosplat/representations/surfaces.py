@@ -44,7 +44,7 @@ class SurfaceMesh:
         return self
 
     def project(self, views: Views | Poses) -> LineIntegrals:
-        """Line integrals (B, D), float64, differentiable in the vertices."""
+        """Line integrals (B, D), float64, differentiable in the vertices and in the rotations and shifts of `Poses`."""
         poses = Poses.of(views) if isinstance(views, Views) else views
         pitch = poses.pixel_size
         thickness = surface_thickness(

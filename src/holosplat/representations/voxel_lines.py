@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,31 +11,33 @@ from torch import Tensor
 from torch.nn.functional import avg_pool3d, pad
 
 from ..checks import require
-from ..geometry import Grid, Views
+from ..geometry import Grid, Poses, Views
 from ..projectors.voxels import LatticeProjector, SliceProjector
 
 Axis = tuple[int, float, float]
 """A row of cells: their count, their size [m], and the centre of the first one [m]."""
 
 
-class _Linear(Protocol):
-    def project(self, array: Tensor, /) -> Tensor: ...
-
-    def backproject(self, lines: Tensor, /) -> Tensor: ...
-
-
 class VoxelLines:
-    """Line integrals of voxels in `views`, differentiable in their values; float32, on the CPU.
+    """Line integrals of voxels in `views`, differentiable in their values and in unknown poses; float32, on the CPU.
 
     Views about the y axis: across the axis exact strip integrals over the pixels asked for (`SliceProjector`), along
     it linear between the rows of voxels. Any other poses: hats of a voxel's size (`LatticeProjector`) from the voxels
     and from the corners between them, half the mass each. That body-centred lattice halves the ripple that a simple
     one leaves on rotated rasters. Voxels larger than the pixels asked for are interpolated to their size first.
+
+    `Poses` are unknown where gradients of their rotations or shifts are asked for. They are taken as they are now: make
+    new lines when they change. They always go through the lattice, be they about the y axis or not, because strip
+    integrals cannot say what a turn out of the axis does; values there differ from the strips' by the ripple.
     """
 
-    def __init__(self, grid: Grid, views: Views) -> None:
-        self.grid, self.views = grid, views
-        self._lines = _AboutAxis(grid, views) if views.shares_axis else _AnyPose(grid, views)
+    def __init__(self, grid: Grid, views: Views | Poses) -> None:
+        self.grid = grid
+        known = views.views() if isinstance(views, Poses) and not views.requires_grad else views
+        if isinstance(known, Views) and known.shares_axis:
+            self._lines = _AboutAxis(grid, known)
+        else:
+            self._lines = _AnyPose(grid, known)
 
     def __call__(self, values: Tensor) -> Tensor:
         """Line integrals [V, C, H, W] in metres × value of `values` [C, Z, Y, X]."""
@@ -68,43 +70,28 @@ class _AboutAxis:
     def __call__(self, values: Tensor) -> Tensor:
         array = values.transpose(1, 2)
         array = array.contiguous() if self._rows is None else array @ self._rows
-        return pad(_apply(self._projector, array), self._outside).transpose(1, 2)
+        lines = _Strips.apply(array, self._projector)
+        assert isinstance(lines, Tensor)
+        return pad(lines, self._outside).transpose(1, 2)
 
 
 class _AnyPose:
     """[Z, Y, X] → [V, H, W] for poses of any kind."""
 
-    def __init__(self, grid: Grid, views: Views) -> None:
-        dx, dy, dz = grid.voxel_size
-        require(
-            math.isclose(dx, dy, rel_tol=1e-6) and math.isclose(dx, dz, rel_tol=1e-6),
-            f"views without a common axis need cubic voxels, but the voxel size is {grid.voxel_size}; resample them.",
-        )
-        fine = refined(grid, math.ceil(dx / views.pixel_size - 1e-6))
+    def __init__(self, grid: Grid, views: Views | Poses) -> None:
+        fx, fy, fz = (max(1, math.ceil(d / views.pixel_size - 1e-6)) for d in grid.voxel_size)
+        fine = grid.divided((fx, fy, fz))
         self._matrices = None if fine is grid else axis_matrices(grid, fine)
-        (nz, ny, nx), (x, y, z), half = fine.shape, fine.origin, 0.5 * fine.voxel_size[0]
-        between = Grid((nz + 1, ny + 1, nx + 1), fine.voxel_size, (x - half, y - half, z - half))
+        (nz, ny, nx), (x, y, z) = fine.shape, (o - 0.5 * d for o, d in zip(fine.origin, fine.voxel_size))
+        between = Grid((nz + 1, ny + 1, nx + 1), fine.voxel_size, (x, y, z))
         self._projectors = (LatticeProjector(fine, views), LatticeProjector(between, views))
 
     def __call__(self, values: Tensor) -> Tensor:
         if self._matrices is not None:
             values = along_axes(values, self._matrices)
         corners = avg_pool3d(pad(values, (1, 1, 1, 1, 1, 1))[None, None], 2, stride=1)[0, 0]
-        parts = [_apply(projector, a) for projector, a in zip(self._projectors, (values, corners))]
+        parts = [projector.lines(a) for projector, a in zip(self._projectors, (values, corners))]
         return 0.5 * (parts[0] + parts[1])
-
-
-def refined(grid: Grid, factor: int) -> Grid:
-    """The same extent on voxels `factor` times finer; the grid itself for 1 or less."""
-    if factor <= 1:
-        return grid
-    (nz, ny, nx), (dx, dy, dz), (x, y, z) = grid.shape, grid.voxel_size, grid.origin
-    back = 0.5 * (1 / factor - 1)
-    return Grid(
-        (nz * factor, ny * factor, nx * factor),
-        (dx / factor, dy / factor, dz / factor),
-        (x + back * dx, y + back * dy, z + back * dz),
-    )
 
 
 def axis_matrices(grid: Grid, target: Grid) -> tuple[Tensor, Tensor, Tensor]:
@@ -142,17 +129,11 @@ def resampling(source: Axis, target: Axis) -> Tensor:
     return torch.from_numpy(weights).float()
 
 
-def _apply(projector: _Linear, array: Tensor) -> Tensor:
-    lines = _Apply.apply(array, projector)
-    assert isinstance(lines, Tensor)
-    return lines
-
-
-class _Apply(torch.autograd.Function):
-    """A linear projector, whose gradient is its adjoint."""
+class _Strips(torch.autograd.Function):
+    """Line integrals by slice matrices, whose gradient is their adjoint."""
 
     @staticmethod
-    def forward(ctx: Any, array: Tensor, projector: _Linear) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, array: Tensor, projector: SliceProjector) -> Tensor:  # type: ignore[override]
         ctx.projector = projector
         return projector.project(array.detach().contiguous())
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from ..checks import require
-from ..geometry import Grid, Views
+from ..geometry import Grid, Poses, Views
 from ..volume import LineIntegrals, Volume
 from .voxel_lines import VoxelLines, along_axes, axis_matrices
 
@@ -43,8 +43,8 @@ class VoxelGrid:
         """The grid itself: it does not move."""
         return self
 
-    def project(self, views: Views) -> LineIntegrals:
-        """Line integrals (B, D), differentiable in the values (see `VoxelLines`)."""
+    def project(self, views: Views | Poses) -> LineIntegrals:
+        """Line integrals (B, D), differentiable in the values and in unknown poses (see `VoxelLines`)."""
         return LineIntegrals(VoxelLines(self.grid, views)(self.values), self.materials)
 
     def voxelise(self, grid: Grid) -> Volume:

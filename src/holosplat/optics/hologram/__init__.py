@@ -2,13 +2,14 @@
 
 Backends: `cpu` (C++ between MKL's or scipy's transforms, float32), `cuda` (Triton and torch's transforms, float32) and
 `reference` (plain torch, any float type and device), which is the specification of the others. All give gradients
-of the line integrals, and of nothing else; those of `cpu` and `cuda` are written by hand.
+of the line integrals and, where they are asked for, of the distances and of the widths of the point-spread functions;
+those of `cpu` and `cuda` are written by hand.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -16,8 +17,12 @@ from torch import Tensor
 
 from ...backends import implementation
 from ...checks import require
+from ...units import wavelength
 from ..detector import gaussian_factors
 from ..propagation import fresnel_factors
+
+Refraction = Sequence[tuple[float, float]] | np.ndarray | Tensor
+"""`(k δ, k β)` of each channel of matter per unit of its line integral: [C, 2] for all views, or [V, C, 2]."""
 
 
 @dataclass(frozen=True)
@@ -26,18 +31,23 @@ class OpticalPath:
 
     rows [V, H], columns [V, W]: complex factors of the Fresnel transfer functions; blur_rows [V, H],
     blur_columns [V, W]: real factors of the point-spread functions' transforms, None where there are none;
-    alike: whether one point-spread function serves all views; shape: rows and columns (h, w) of a frame;
-    margin: samples (y, x) between the raster's border and the frame's; factor: samples along a pixel's edge.
+    wavelength: [V] [m], float64; alike: whether one point-spread function serves all views; shape: rows and columns
+    (h, w) of a frame; margin: samples (y, x) between the raster's border and the frame's; factor: samples along a
+    pixel's edge; pitch: of the samples [m].
+
+    The factors may come from distances and widths that want gradients (`optical_path`, `corrected`).
     """
 
     rows: Tensor
     columns: Tensor
     blur_rows: Tensor | None
     blur_columns: Tensor | None
+    wavelength: Tensor
     alike: bool
     shape: tuple[int, int]
     margin: tuple[int, int]
     factor: int
+    pitch: float
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -45,12 +55,34 @@ class OpticalPath:
     def __getitem__(self, index: Tensor) -> OpticalPath:
         """The path of the views `index` [K], an integer tensor on the path's device."""
         picked = [None if a is None else a.index_select(0, index) for a in self._arrays]
-        return OpticalPath(*picked, self.alike, self.shape, self.margin, self.factor)  # type: ignore[arg-type]
+        return self._of(picked)
 
     def to(self, device: torch.device | str) -> OpticalPath:
         """The same path with its factors on `device`."""
-        moved = [None if a is None else a.to(device) for a in self._arrays]
-        return OpticalPath(*moved, self.alike, self.shape, self.margin, self.factor)  # type: ignore[arg-type]
+        return self._of([None if a is None else a.to(device) for a in self._arrays])
+
+    def corrected(self, distance: Tensor | None = None, psf_sigma: Tensor | None = None) -> OpticalPath:
+        """The same path at other distances [V] [m] and with other widths [V] of the point-spread function [samples].
+
+        Float64 tensors on the path's device, whose gradients the frames give; None: as they are. A width's gradient is
+        zero at 0 exactly, since frames depend on its square: start a fit of widths above 0. Nothing waits for the
+        device. Errors: `InputError` if there is not one number a view.
+        """
+        path, wanted = self, (len(self),)
+        for name, given in (("distance", distance), ("psf_sigma", psf_sigma)):
+            good = given is None or (tuple(given.shape) == wanted and given.dtype == torch.float64)
+            require(
+                good,
+                f"{name} must be a float64 tensor with one number for each of the path's {wanted[0]} views, but it is "
+                f"{None if given is None else (given.dtype, tuple(given.shape))}.",
+            )
+        if distance is not None:
+            rows, columns = fresnel_factors(self.raster, self.pitch, self.wavelength * distance, self.rows.dtype)
+            path = replace(path, rows=rows, columns=columns)
+        if psf_sigma is not None:
+            rows, columns = gaussian_factors(self.raster, psf_sigma, self.rows.dtype.to_real())
+            path = replace(path, blur_rows=rows, blur_columns=columns, alike=False)
+        return path
 
     @property
     def raster(self) -> tuple[int, int]:
@@ -59,38 +91,62 @@ class OpticalPath:
 
     @property
     def _arrays(self) -> tuple[Tensor | None, ...]:
-        return self.rows, self.columns, self.blur_rows, self.blur_columns
+        return self.rows, self.columns, self.blur_rows, self.blur_columns, self.wavelength
+
+    def _of(self, arrays: list[Tensor | None]) -> OpticalPath:
+        return OpticalPath(*arrays, self.alike, self.shape, self.margin, self.factor, self.pitch)  # type: ignore[arg-type]
 
 
 def optical_path(
     raster: tuple[int, int],
     pitch: float,
-    energy_kev: float,
-    distance: np.ndarray,
-    psf_sigma: np.ndarray,
+    energy_kev: float | np.ndarray,
+    distance: np.ndarray | Tensor,
+    psf_sigma: np.ndarray | Tensor,
     frame: tuple[tuple[int, int], tuple[int, int], int],
     dtype: torch.dtype = torch.float32,
 ) -> OpticalPath:
     """The path of V exposures: distance [V] in metres, psf_sigma [V] in samples of `pitch` [m], on `raster` [H, W].
 
-    frame: (rows, columns) of the frame, its margin (y, x) in samples, and the samples along a pixel's edge.
+    energy_kev: photon energy [keV], one or [V]; frame: (rows, columns) of the frame, its margin (y, x) in samples, and
+    the samples along a pixel's edge. Distances and widths that are tensors (float64, on the device where the path is
+    wanted) pass gradients on, as `OpticalPath.corrected` says. Widths in an array that are all zero make a path
+    without blur.
     """
+    tensors = [x for x in (distance, psf_sigma) if isinstance(x, Tensor)]
+    on = tensors[0].device if tensors else torch.device("cpu")
+    z, energies = _numbers(distance, on), np.asarray(energy_kev, dtype=np.float64)
+    require(
+        energies.shape in ((), (len(z),)),
+        f"energy_kev must be one number, or one for each of {len(z)} distances, but it has the shape {energies.shape}.",
+    )
+    lam = torch.as_tensor(wavelength(energies), dtype=torch.float64, device=on).expand(len(z)).contiguous()
     complex_dtype = torch.complex128 if dtype == torch.float64 else torch.complex64
-    rows, columns = fresnel_factors(raster, pitch, distance, energy_kev, complex_dtype)
-    sigma = np.asarray(psf_sigma, dtype=np.float64)
-    blurs = gaussian_factors(raster, sigma, dtype) if np.any(sigma > 0) else (None, None)
-    return OpticalPath(rows, columns, *blurs, bool(np.all(sigma == sigma.reshape(-1)[:1])), *frame)
+    rows, columns = fresnel_factors(raster, pitch, lam * z, complex_dtype)
+    sigma, fixed = _numbers(psf_sigma, on), not isinstance(psf_sigma, Tensor)
+    blurs = (None, None) if fixed and not bool((sigma > 0).any()) else gaussian_factors(raster, sigma, dtype)
+    alike = fixed and bool((sigma == sigma[:1]).all())
+    return OpticalPath(rows, columns, *blurs, lam, alike, *frame, pitch)
 
 
-def hologram(lines: Tensor, refraction: Sequence[tuple[float, float]], path: OpticalPath, backend: str) -> Tensor:
+def _numbers(given: np.ndarray | Tensor, on: torch.device) -> Tensor:
+    """[V] float64 on a device."""
+    array = given if isinstance(given, Tensor) else np.asarray(given, dtype=np.float64)
+    return torch.as_tensor(array, dtype=torch.float64, device=on).reshape(-1)
+
+
+def hologram(lines: Tensor, refraction: Refraction, path: OpticalPath, backend: str) -> Tensor:
     """Frames [V, h, w] (relative intensity) from line integrals [V, C, H, W], C = 1 or 2 channels of matter.
 
     refraction: for each channel `(k δ, k β)` per unit of its line integral, so that the wave behind the object is
-    `exp(-Σ (kβ + i kδ) T)`. Errors: `InputError` for shapes, types or devices that do not fit, or an unknown backend.
+    `exp(-Σ (kβ + i kδ) T)`: [C, 2] for all views, or, where energies differ, [V, C, 2] (on a GPU best a tensor there:
+    nothing waits for the device then). Gradients: of `lines`, and of distances and widths that `path` was made from.
+    Errors: `InputError` for shapes, types or devices that do not fit, or an unknown backend.
     """
-    wanted = (len(path), len(refraction), *path.raster)
+    table = _table(refraction, path)
+    wanted = (len(path), table.shape[-2], *path.raster)
     require(
-        tuple(lines.shape) == wanted and len(refraction) in (1, 2),
+        tuple(lines.shape) == wanted and table.shape[-2] in (1, 2),
         f"line integrals must have the shape (views, channels, rows, columns) = {wanted} with 1 or 2 channels, "
         f"but they have {tuple(lines.shape)}.",
     )
@@ -100,4 +156,20 @@ def hologram(lines: Tensor, refraction: Sequence[tuple[float, float]], path: Opt
         f"line integrals must be float32, beside a path of complex64, for the {backend} backend, but they are "
         f"{lines.dtype} on {lines.device}, beside {path.rows.dtype} on {path.rows.device}.",
     )
-    return implementation(__name__, backend).hologram(lines, refraction, path)
+    return implementation(__name__, backend).hologram(lines, table, path)
+
+
+def _table(refraction: Refraction, path: OpticalPath) -> np.ndarray | Tensor:
+    """[C, 2] as an array, or [V, C, 2] as a tensor on the path's device, float64."""
+    table = refraction if isinstance(refraction, Tensor) else np.asarray(refraction, dtype=np.float64)
+    shape = tuple(table.shape)
+    require(
+        shape[-1:] == (2,) and (len(shape) == 2 or (len(shape) == 3 and shape[0] == len(path))),
+        f"refraction must have the shape (channels, 2), or (views, channels, 2) of the path's {len(path)} views, but "
+        f"it has {shape}.",
+    )
+    if isinstance(table, np.ndarray) and table.ndim == 2:
+        return table
+    per_view = torch.as_tensor(table, dtype=torch.float64, device=path.rows.device)
+    require(not per_view.requires_grad, "refraction has no gradient, but it is a tensor that wants one; detach it.")
+    return per_view.expand(len(path), -1, -1)

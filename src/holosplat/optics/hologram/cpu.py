@@ -5,11 +5,12 @@ pass, which uses it up.
 
 Adjoint: with `ψ = 1 + F⁻¹ H F (U - 1)` and `I = |ψ|²`, a gradient G of I becomes `2 G ψ` (of real and imaginary
 part), then `F⁻¹ H* F (2 G ψ)`, then `Re(conj(-(kβ + i kδ) U) ·)` of the line integrals. The blur is its own adjoint.
+Where the path's factors want gradients (of distance, of blur), each pair costs one more transform: `factors.py`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from ctypes import c_void_p
 from typing import TYPE_CHECKING, Any
 
@@ -20,65 +21,103 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from ... import native
+from .factors import factor_gradients
 
 if TYPE_CHECKING:
     from . import OpticalPath
 
 
-def hologram(lines: Tensor, refraction: Sequence[tuple[float, float]], path: OpticalPath) -> Tensor:
+def hologram(lines: Tensor, refraction: np.ndarray | Tensor, path: OpticalPath) -> Tensor:
     """Frames [V, h, w]; arguments as the package's `hologram`, already checked."""
-    return _Hologram.apply(lines, np.array(refraction, dtype=np.float64), path)  # type: ignore[no-any-return]
+    table = torch.as_tensor(refraction).expand(len(path), -1, -1).contiguous()
+    factors = (path.rows, path.columns, path.blur_rows, path.blur_columns)
+    return _Hologram.apply(lines, table, path, *factors)  # type: ignore[no-any-return]
 
 
 class _Hologram(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, lines: Tensor, refraction: np.ndarray, path: OpticalPath) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, lines: Tensor, table: Tensor, path: OpticalPath, *_: Tensor | None) -> Tensor:  # type: ignore[override]
         lines = lines.contiguous()
-        views, _, height, width = lines.shape
-        wave = torch.empty(views, height, width, dtype=torch.complex64)
-        _call("exit_wave", _raster(lines), c_void_p(refraction.ctypes.data), lines, wave)
-        wave = _filter(wave, path.rows, path.columns)
-        frames = torch.empty(views, *path.shape)
+        wave = _filter(_exit_wave(lines, table), path.rows, path.columns)
+        frames = torch.empty(len(lines), *path.shape)
         if path.blur_rows is None:
             _call("intensity", _detector(path), wave, frames)
         else:
-            images = _images(path)
-            _call("contrast", _detector(path), wave, images)
-            images = _blur(images, path)
+            images = _filter(_contrast(wave, path), *_blur(path))
             _call("bin", _detector(path), images, frames)
         ctx.save_for_backward(lines)
-        ctx.refraction, ctx.path, ctx.wave = refraction, path, wave
+        ctx.table, ctx.path, ctx.wave = table, path, wave
         return frames
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         (lines,), path, wave, gradient = ctx.saved_tensors, ctx.path, ctx.wave, gradient.contiguous()
         if wave is None:
             raise RuntimeError("the hologram's gradient can be taken once only; compute the frames anew.")
         ctx.wave = None
-        if path.blur_rows is None:
-            _call("intensity_backward", _detector(path), gradient, wave)
-        else:
-            images = _images(path)
-            _call("bin_backward", _detector(path), gradient, images)
-            images = _blur(images, path)
-            _call("contrast_backward", _detector(path), images, wave)
-        wave = _filter(wave, path.rows, path.columns, conjugate=True)
-        out = torch.empty_like(lines)
-        _call("exit_wave_backward", _raster(lines), c_void_p(ctx.refraction.ctypes.data), lines, wave, out)
-        return out, None, None
+        of_lines, of_path, of_blur = _asked(ctx.needs_input_grad)
+        path_gradients: tuple[Tensor | None, Tensor | None] = (None, None)
+        wave, blur_gradients = _detected_backward(gradient, wave, path, of_blur)
+        spectrum = _forward(wave)
+        if of_path:
+            passed = _forward(_exit_wave(lines, ctx.table))
+            path_gradients = factor_gradients(spectrum, passed, path.rows, path.columns)
+        if not of_lines:
+            return None, None, None, *path_gradients, *blur_gradients
+        wave, out = _inverse(_transfer(spectrum, path.rows, path.columns, conjugate=True)), torch.empty_like(lines)
+        _call("exit_wave_backward", _raster(lines), ctx.table, lines, wave, out)
+        return out, None, None, *path_gradients, *blur_gradients
 
 
-def _filter(wave: Tensor, rows: Tensor, columns: Tensor, conjugate: bool = False) -> Tensor:
-    """`wave` [K, H, W] with its Fourier transform times rows [K, H] and columns [K, W] (or their conjugates)."""
-    count, height, width = wave.shape
+def _asked(needs: tuple[bool, ...]) -> tuple[bool, bool, bool]:
+    """Whether gradients of the line integrals, of the transfer functions, of the point-spread functions are wanted."""
+    return needs[0], any(needs[3:5]), any(needs[5:])
+
+
+def _detected_backward(
+    gradient: Tensor, wave: Tensor, path: OpticalPath, of_blur: bool
+) -> tuple[Tensor, tuple[Tensor | None, Tensor | None]]:
+    """The gradient of the wave in the detector plane, in its memory, and those of the blur's factors if wanted."""
+    if path.blur_rows is None or path.blur_columns is None:
+        _call("intensity_backward", _detector(path), gradient, wave)
+        return wave, (None, None)
+    images, gradients = _images(path), (None, None)
+    _call("bin_backward", _detector(path), gradient, images)
+    spectrum, blur = _forward(images), _blur(path)
+    if of_blur:
+        gradients = factor_gradients(spectrum, _forward(_contrast(wave, path)), path.blur_rows, path.blur_columns)
+    _call("contrast_backward", _detector(path), _inverse(_transfer(spectrum, *blur)), wave)
+    return wave, gradients
+
+
+def _exit_wave(lines: Tensor, table: Tensor) -> Tensor:
+    """The wave behind the object, less one, complex64 [V, H, W]; table: refraction [V, C, 2]."""
+    wave = torch.empty(len(lines), *lines.shape[2:], dtype=torch.complex64)
+    _call("exit_wave", _raster(lines), table, lines, wave)
+    return wave
+
+
+def _contrast(wave: Tensor, path: OpticalPath) -> Tensor:
+    """`|1 + wave|² - 1` in complex images, as the blur takes them."""
+    images = _images(path)
+    _call("contrast", _detector(path), wave, images)
+    return images
+
+
+def _filter(wave: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    """`wave` [K, H, W] with its Fourier transform times rows [K, H] and columns [K, W]; may use up its argument."""
+    return _inverse(_transfer(_forward(wave), rows, columns))
+
+
+def _transfer(spectrum: Tensor, rows: Tensor, columns: Tensor, conjugate: bool = False) -> Tensor:
+    """`spectrum` [K, H, W] times rows [K, H] and columns [K, W] (or their conjugates) over H·W, in place."""
+    count, height, width = spectrum.shape
     raster, scale = native.Raster(count, 1, height, width), 1 / (height * width)
-    spectrum = _forward(wave)
     factors = (c_void_p(rows.data_ptr()), c_void_p(columns.data_ptr()))
     threads = torch.get_num_threads()
     native.call("holosplat_transfer", raster, *factors, scale, int(conjugate), c_void_p(spectrum.data_ptr()), threads)
-    return _inverse(spectrum)
+    return spectrum
 
 
 def _forward(wave: Tensor) -> Tensor:
@@ -104,13 +143,12 @@ def _images(path: OpticalPath) -> Tensor:
     return torch.empty((len(path) + _lanes(path) - 1) // _lanes(path), *path.raster, dtype=torch.complex64)
 
 
-def _blur(images: Tensor, path: OpticalPath) -> Tensor:
+def _blur(path: OpticalPath) -> tuple[Tensor, Tensor]:
+    """The blur's factors for the images of `_images`: a real filter acts on real and imaginary part alike."""
     assert path.blur_rows is not None
     assert path.blur_columns is not None
-    lanes = _lanes(path)
-    # A real filter acts on real and imaginary part alike, so two images pass as one complex one.
-    rows, columns = (f[::lanes].to(torch.complex64).contiguous() for f in (path.blur_rows, path.blur_columns))
-    return _filter(images, rows, columns)
+    rows, columns = (f[:: _lanes(path)].to(torch.complex64).contiguous() for f in (path.blur_rows, path.blur_columns))
+    return rows, columns
 
 
 def _lanes(path: OpticalPath) -> int:
@@ -125,6 +163,6 @@ def _detector(path: OpticalPath) -> native.Detector:
     return native.Detector(len(path), *path.raster, *path.shape, *path.margin, path.factor, _lanes(path))
 
 
-def _call(name: str, structure: native.Raster | native.Detector, *arrays: Tensor | c_void_p) -> None:
-    pointers = [a if isinstance(a, c_void_p) else c_void_p(a.data_ptr()) for a in arrays]
+def _call(name: str, structure: native.Raster | native.Detector, *arrays: Tensor) -> None:
+    pointers = [c_void_p(a.data_ptr()) for a in arrays]
     native.call(f"holosplat_{name}", structure, *pointers, torch.get_num_threads())

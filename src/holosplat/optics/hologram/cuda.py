@@ -7,74 +7,112 @@ the kernels and plans the transforms).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from . import triton_waves
+from .factors import factor_gradients
 
 if TYPE_CHECKING:
     from . import OpticalPath
 
 
-def hologram(lines: Tensor, refraction: Sequence[tuple[float, float]], path: OpticalPath) -> Tensor:
+def hologram(lines: Tensor, refraction: np.ndarray | Tensor, path: OpticalPath) -> Tensor:
     """Frames [V, h, w]; arguments as the package's `hologram`, already checked."""
-    matter = tuple((float(phase), float(loss)) for phase, loss in refraction)
-    return _Hologram.apply(lines, matter, path)  # type: ignore[no-any-return]
+    matter = refraction.float() if isinstance(refraction, Tensor) else refraction.tolist()
+    factors = (path.rows, path.columns, path.blur_rows, path.blur_columns)
+    return _Hologram.apply(lines, matter, path, *factors)  # type: ignore[no-any-return]
 
 
 class _Hologram(torch.autograd.Function):
     @staticmethod
     def forward(  # type: ignore[override]
-        ctx: Any, lines: Tensor, refraction: tuple[tuple[float, float], ...], path: OpticalPath
+        ctx: Any, lines: Tensor, matter: triton_waves.Refraction, path: OpticalPath, *_: Tensor | None
     ) -> Tensor:
         lines, crop = lines.contiguous(), (path.margin, path.factor)
         with _on(lines):
-            wave = triton_waves.exit_wave(lines, refraction)
-            wave = _filter(wave, path.rows, path.columns)
+            wave = triton_waves.exit_wave(lines, matter)
+            wave = _inverse(_transfer(_forward(wave), path))
             if path.blur_rows is None:
                 frames = triton_waves.intensity(wave, path.shape, *crop)
             else:
-                frames = triton_waves.bin_samples(_blur(triton_waves.contrast(wave), path), path.shape, *crop)
+                samples = _blurred(_real_spectrum(triton_waves.contrast(wave)), path)
+                frames = triton_waves.bin_samples(samples, path.shape, *crop)
         ctx.save_for_backward(lines)
-        ctx.refraction, ctx.path, ctx.wave = refraction, path, wave
+        ctx.matter, ctx.path, ctx.wave = matter, path, wave
         return frames
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         (lines,), path, wave, gradient = ctx.saved_tensors, ctx.path, ctx.wave, gradient.contiguous()
         if wave is None:
             raise RuntimeError("the hologram's gradient can be taken once only; compute the frames anew.")
-        ctx.wave, crop = None, (path.margin, path.factor)
+        ctx.wave, needs = None, ctx.needs_input_grad
+        path_gradients: tuple[Tensor | None, Tensor | None] = (None, None)
         with _on(lines):
-            if path.blur_rows is None:
-                triton_waves.intensity_backward(gradient, wave, *crop)
-            else:
-                samples = triton_waves.bin_samples_backward(gradient, path.raster, *crop)
-                triton_waves.contrast_backward(_blur(samples, path), wave)
-            wave = _filter(wave, path.rows, path.columns, conjugate=True)
-            return triton_waves.exit_wave_backward(lines, ctx.refraction, wave), None, None
+            blur_gradients = _detected_backward(gradient, wave, path, any(needs[5:]))
+            spectrum = _forward(wave)
+            if any(needs[3:5]):
+                passed = _forward(triton_waves.exit_wave(lines, ctx.matter))
+                path_gradients = factor_gradients(spectrum, passed, path.rows, path.columns)
+            if not needs[0]:
+                return None, None, None, *path_gradients, *blur_gradients
+            wave = _inverse(_transfer(spectrum, path, conjugate=True))
+            out = triton_waves.exit_wave_backward(lines, ctx.matter, wave)
+        return out, None, None, *path_gradients, *blur_gradients
 
 
-def _filter(wave: Tensor, rows: Tensor, columns: Tensor, conjugate: bool = False) -> Tensor:
-    """`wave` [V, H, W] with its Fourier transform times rows [V, H] and columns [V, W] (or their conjugates)."""
-    spectrum = torch.fft.fft2(wave).contiguous()  # torch promises no order in memory; the kernels need one
-    triton_waves.transfer(spectrum, rows.contiguous(), columns.contiguous(), conjugate)
+def _detected_backward(
+    gradient: Tensor, wave: Tensor, path: OpticalPath, of_blur: bool
+) -> tuple[Tensor | None, Tensor | None]:
+    """`wave` in the detector plane becomes its gradient; returned are those of the blur's factors, if wanted."""
+    gradients, crop = (None, None), (path.margin, path.factor)
+    if path.blur_rows is None or path.blur_columns is None:
+        triton_waves.intensity_backward(gradient, wave, *crop)
+        return gradients
+    spectrum = _real_spectrum(triton_waves.bin_samples_backward(gradient, path.raster, *crop))
+    if of_blur:
+        passed = _real_spectrum(triton_waves.contrast(wave))
+        gradients = factor_gradients(spectrum, passed, path.blur_rows, path.blur_columns)
+    triton_waves.contrast_backward(_blurred(spectrum, path), wave)
+    return gradients
+
+
+def _forward(wave: Tensor) -> Tensor:
+    """The spectrum of `wave` [V, H, W]; torch promises no order in memory, but the kernels need one."""
+    return torch.fft.fft2(wave).contiguous()
+
+
+def _transfer(spectrum: Tensor, path: OpticalPath, conjugate: bool = False) -> Tensor:
+    """`spectrum` [V, H, W] times the path's transfer functions (or their conjugates) over H·W, in place."""
+    triton_waves.transfer(spectrum, path.rows.contiguous(), path.columns.contiguous(), conjugate)
+    return spectrum
+
+
+def _inverse(spectrum: Tensor) -> Tensor:
+    """The way back, not divided by the number of samples."""
     return torch.fft.ifft2(spectrum, norm="forward").contiguous()
 
 
-def _blur(samples: Tensor, path: OpticalPath) -> Tensor:
-    """Real images [V, H, W] blurred (periodically) by the path's point-spread functions; its own adjoint."""
+def _real_spectrum(samples: Tensor) -> Tensor:
+    """The spectrum [V, H, W // 2 + 1] of real images [V, H, W]."""
+    return torch.fft.rfft2(samples).contiguous()
+
+
+def _blurred(spectrum: Tensor, path: OpticalPath) -> Tensor:
+    """Real images blurred (periodically) by the path's point-spread functions, from their spectrum, which it uses up.
+
+    The blur is its own adjoint."""
     assert path.blur_rows is not None
     assert path.blur_columns is not None
-    spectrum = torch.fft.rfft2(samples).contiguous()
     triton_waves.attenuate(spectrum, path.blur_rows.contiguous(), path.blur_columns.contiguous())
-    return torch.fft.irfft2(spectrum, s=samples.shape[1:], norm="forward")
+    return torch.fft.irfft2(spectrum, s=path.raster, norm="forward")
 
 
 def _on(array: Tensor) -> AbstractContextManager[Any]:

@@ -6,9 +6,9 @@ its transfer function's factors (Goodman 2005, eq. 4-20); its intensity is blurr
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from torch import Tensor
 
 from ..detector import bin_pixels, blur
@@ -18,10 +18,11 @@ if TYPE_CHECKING:
     from . import OpticalPath
 
 
-def hologram(lines: Tensor, refraction: Sequence[tuple[float, float]], path: OpticalPath) -> Tensor:
+def hologram(lines: Tensor, refraction: np.ndarray | Tensor, path: OpticalPath) -> Tensor:
     """Frames [V, h, w]; arguments as the package's `hologram`, already checked."""
-    phase = sum(k_delta * line for (k_delta, _), line in zip(refraction, lines.unbind(1)))
-    loss = sum(k_beta * line for (_, k_beta), line in zip(refraction, lines.unbind(1)))
+    pairs = _of_channels(refraction, lines)
+    phase = sum(k_delta * line for (k_delta, _), line in zip(pairs, lines.unbind(1)))
+    loss = sum(k_beta * line for (_, k_beta), line in zip(pairs, lines.unbind(1)))
     assert isinstance(phase, Tensor)
     assert isinstance(loss, Tensor)
     wave = fresnel_propagate(exit_wave_of(loss, phase), path.rows[:, :, None] * path.columns[:, None])
@@ -31,3 +32,10 @@ def hologram(lines: Tensor, refraction: Sequence[tuple[float, float]], path: Opt
         contrast = blur(contrast, path.blur_rows[:, :, None] * half)
     (my, mx), (h, w), s = path.margin, path.shape, path.factor
     return 1 + bin_pixels(contrast[:, my : my + h * s, mx : mx + w * s], s)
+
+
+def _of_channels(refraction: np.ndarray | Tensor, lines: Tensor) -> Any:
+    """For each channel `(k δ, k β)`: numbers from [C, 2], or tensors [V, 1, 1] from [V, C, 2]."""
+    if isinstance(refraction, np.ndarray):
+        return refraction.tolist()
+    return refraction.to(lines.dtype).permute(1, 2, 0)[..., None, None]

@@ -17,8 +17,8 @@ from torch import Tensor
 BLOCK, WARPS = 512, 4
 """Samples of a program, and its warps."""
 
-Refraction = tuple[tuple[float, float], ...]
-"""(phase, loss) per unit of line integral, for each channel."""
+Refraction = list[list[float]] | Tensor
+"""(phase, loss) per unit of line integral: for each channel, or a float32 tensor [V, C, 2] on the device."""
 
 # --- launches -----------------------------------------------------------------------------------------------
 
@@ -28,8 +28,8 @@ def exit_wave(lines: Tensor, refraction: Refraction) -> Tensor:
     v, c, h, w = lines.shape
     wave = torch.empty(v, h, w, dtype=torch.complex64, device=lines.device)
     if wave.numel():
-        _exit_wave[_grid(v * h, w)](lines, torch.view_as_real(wave), *_numbers(refraction), h, w, c, BLOCK,
-                                    num_warps=WARPS)  # fmt: skip
+        pairs, (matter, per_view) = torch.view_as_real(wave), _matter(refraction, lines)
+        _exit_wave[_grid(v * h, w)](lines, pairs, *matter, h, w, c, per_view, BLOCK, num_warps=WARPS)
     return wave
 
 
@@ -38,9 +38,8 @@ def exit_wave_backward(lines: Tensor, refraction: Refraction, gradient: Tensor) 
     v, c, h, w = lines.shape
     out = torch.empty_like(lines)
     if out.numel():
-        pairs = torch.view_as_real(gradient.contiguous())
-        _exit_wave_backward[_grid(v * h, w)](lines, pairs, out, *_numbers(refraction), h, w, c, BLOCK,
-                                             num_warps=WARPS)  # fmt: skip
+        pairs, (matter, per_view) = torch.view_as_real(gradient.contiguous()), _matter(refraction, lines)
+        _exit_wave_backward[_grid(v * h, w)](lines, pairs, out, *matter, h, w, c, per_view, BLOCK, num_warps=WARPS)
     return out
 
 
@@ -123,10 +122,12 @@ def _flat(array: Tensor) -> tuple[int, ...]:
     return (triton.cdiv(array.numel(), BLOCK),)
 
 
-def _numbers(refraction: Refraction) -> tuple[float, ...]:
-    """Phase and loss of two channels, the second zero where there is one."""
-    (p0, l0), (p1, l1) = refraction[0], (refraction[1:] or ((0.0, 0.0),))[0]
-    return p0, l0, p1, l1
+def _matter(refraction: Refraction, lines: Tensor) -> tuple[tuple[Tensor | float, ...], bool]:
+    """What kernels take: a table, then phase and loss of two channels; and whether the table holds (else: these)."""
+    if isinstance(refraction, Tensor):
+        return (refraction.contiguous(), 0.0, 0.0, 0.0, 0.0), True
+    numbers = [number for pair in refraction for number in pair]
+    return (lines, *numbers, *[0.0] * (4 - len(numbers))), False
 
 
 # --- kernels ------------------------------------------------------------------------------------------------
@@ -189,6 +190,16 @@ def _expm1(x):
 
 
 @triton.jit
+def _of_view(table, view, phase0, loss0, phase1, loss1, C: tl.constexpr, PER_VIEW: tl.constexpr):
+    # Phase and loss of two channels in a view: from the table [V, C, 2], or as they are.
+    if PER_VIEW:
+        phase0, loss0 = tl.load(table + 2 * C * view), tl.load(table + 2 * C * view + 1)
+        if C == 2:
+            phase1, loss1 = tl.load(table + 2 * C * view + 2), tl.load(table + 2 * C * view + 3)
+    return phase0, loss0, phase1, loss1
+
+
+@triton.jit
 def _scattered(lines, row, x, there, H, W, phase0, loss0, phase1, loss1, C: tl.constexpr):
     # U - 1 behind the object, as `exit_wave_of`: real part expm1(-loss) - 2 e^-loss sin²(phase / 2).
     view = row // H
@@ -206,18 +217,24 @@ def _scattered(lines, row, x, there, H, W, phase0, loss0, phase1, loss1, C: tl.c
 
 
 @triton.jit(do_not_specialize=SIZES)
-def _exit_wave(lines, wave, phase0, loss0, phase1, loss1, H, W, C: tl.constexpr, BLOCK: tl.constexpr):
+def _exit_wave(
+    lines, wave, table, phase0, loss0, phase1, loss1, H, W, C: tl.constexpr, PER_VIEW: tl.constexpr,
+    BLOCK: tl.constexpr,
+):  # fmt: skip
     row, first, x, there = _piece(W, BLOCK)
+    phase0, loss0, phase1, loss1 = _of_view(table, row // H, phase0, loss0, phase1, loss1, C, PER_VIEW)
     re, im, _ = _scattered(lines, row, x, there, H, W, phase0, loss0, phase1, loss1, C)
     _store_pairs(wave, row * W + first, row * W + W, re, im, BLOCK)
 
 
 @triton.jit(do_not_specialize=SIZES)
 def _exit_wave_backward(
-    lines, gradient, out, phase0, loss0, phase1, loss1, H, W, C: tl.constexpr, BLOCK: tl.constexpr
+    lines, gradient, out, table, phase0, loss0, phase1, loss1, H, W, C: tl.constexpr, PER_VIEW: tl.constexpr,
+    BLOCK: tl.constexpr,
 ):  # fmt: skip
     # Re(conj(dU/dT) g) with dU/dT = -(loss + i phase) U, for a gradient g of real and imaginary part
     row, first, x, there = _piece(W, BLOCK)
+    phase0, loss0, phase1, loss1 = _of_view(table, row // H, phase0, loss0, phase1, loss1, C, PER_VIEW)
     re, im, at = _scattered(lines, row, x, there, H, W, phase0, loss0, phase1, loss1, C)
     re += 1.0
     u, v = _load_pairs(gradient, row * W + first, row * W + W, BLOCK)

@@ -15,11 +15,10 @@ from ...checks import at_least, require
 from ...scan import Exposures
 from ...units import wavelength
 from ..hologram import hologram, optical_path
-from ..sampling import padding, resolving_oversample
+from ..sampling import fringe_sampling, padding
 from .bounded import MODEL_ERROR, PRIOR, Estimate, bounded_estimate
 from .spectra import Raster, absorption, checked, filtered, radian, response, spectra, squared_frequency
 
-SAMPLES_PER_FRINGE = 1.5
 MOST_SAMPLES = 4_000_000
 """Samples of the waves worked on at once; more views follow in turn."""
 DARKEST = 1e-3
@@ -65,7 +64,7 @@ class WaveModel:
         self.backend = resolve("reference" if frames.dtype == torch.float64 else backend)
         self.frames = frames.detach().to(device(self.backend))
         self.amplitude = self.frames.clamp_min(0).sqrt()
-        self.oversample = resolving_oversample(exposures, SAMPLES_PER_FRINGE, at_least=1)
+        self.oversample = fringe_sampling(exposures)
         self.margin = padding(exposures, self.oversample)
         views = exposures.views.padded(self.margin).refined(self.oversample)
         self.raster = Raster(views.shape, views.pixel_size)
@@ -172,7 +171,7 @@ def _batches(exposures: Exposures) -> Iterator[np.ndarray]:
     for one in np.unique(optics, axis=0):
         alike = np.flatnonzero((optics == one).all(axis=1))
         sample = exposures[alike[:1]]
-        oversample = resolving_oversample(sample, SAMPLES_PER_FRINGE, at_least=1)
+        oversample = fringe_sampling(sample)
         rows, columns = sample.views.padded(padding(sample, oversample)).refined(oversample).shape
         at_once = max(1, MOST_SAMPLES // (rows * columns))
         yield from (alike[i : i + at_once] for i in range(0, len(alike), at_once))

@@ -1,4 +1,4 @@
-"""Thickness of deformable closed surfaces in parallel beams, with gradients of their vertices.
+"""Thickness of deformable closed surfaces in parallel beams, with gradients of their vertices and of the poses.
 
 Not the projector that simulations use (`projectors.mesh`), nor its arithmetic: there rays are cast through points,
 here lines are integrated over pixels.
@@ -8,9 +8,10 @@ over `lines` lines a pixel. Backward: for an image G of derivatives, `d/dv ∫ G
 of `G λ_v n` over the surface, λ_v the vertex' barycentric hat and n the outward normal (Reynolds' transport theorem, or
 Hadamard's formula: Delfour & Zolésio 2011, "Shapes and Geometries", chapter 9). It is finite where the surface is seen
 edge-on, and the derivative of T is not. G is linear between pixels, so it is the derivative of the thickness
-averaged under a hat of one pixel's reach: both agree to second order in the pixel.
+averaged under a hat of one pixel's reach: both agree to second order in the pixel. A pose moves the surface in the lab
+frame, `p = R v - s`: its gradient is the same integral, over the motion that the pose gives each vertex.
 
-Backends of the forward part: `cpu` (C++) and `reference` (plain torch), both in float64.
+Backends: `cpu` (C++) and `reference` (plain torch), both in float64; the gradient of the vertices is torch's in both.
 """
 
 from __future__ import annotations
@@ -20,16 +21,12 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
-from torch.nn.functional import grid_sample
 
 from ...backends import implementation
 from ...checks import require
-from .reference import occupancy
+from .reference import QUADRATURE, occupancy, sampled
 
 __all__ = ["surface_occupancy", "surface_thickness"]
-
-QUADRATURE = ((2 / 3, 1 / 6, 1 / 6), (1 / 6, 2 / 3, 1 / 6), (1 / 6, 1 / 6, 2 / 3))
-"""Barycentric points of equal weight, exact to second degree (Strang & Fix 1973, p. 184)."""
 
 
 def surface_thickness(
@@ -45,13 +42,14 @@ def surface_thickness(
 
     vertices: [P, 3] float64 `(x, y, z)`, object frame; faces: [F, 3] int64, counter-clockwise seen from outside (a
     cavity's from within it); rotations [V, 3, 3], shifts [V, 2] `(sx, sy)`, float64: as for `projectors.splat`;
-    lines: rows integrated in a pixel. Overlapping bodies add up. Gradients: of the vertices.
+    lines: rows integrated in a pixel. Overlapping bodies add up. Gradients: of the vertices, the rotations (all nine
+    numbers, as of any matrix) and the shifts; those that are not asked for cost nothing.
     Errors: `InputError` for other shapes and types, and vertices that are not finite.
     """
     _check(vertices, faces)
     require(lines >= 1, f"lines must be at least 1, but it is {lines}.")
     poses = (rotations.to(vertices), shifts.to(vertices))
-    return _Thickness.apply(vertices, faces.contiguous(), poses, shape, lines, backend)  # type: ignore[no-any-return]
+    return _Thickness.apply(vertices, *poses, faces.contiguous(), shape, lines, backend)  # type: ignore[no-any-return]
 
 
 def surface_occupancy(vertices: Tensor, faces: Tensor, shape: tuple[int, int, int], lines: int = 4) -> Tensor:
@@ -74,9 +72,8 @@ def _check(vertices: Tensor, faces: Tensor) -> None:
     require(bool(vertices.detach().isfinite().all()), "vertices must be finite numbers.")
 
 
-def _on_raster(vertices: Tensor, poses: tuple[Tensor, Tensor], shape: tuple[int, int]) -> Tensor:
+def _on_raster(vertices: Tensor, rotations: Tensor, shifts: Tensor, shape: tuple[int, int]) -> Tensor:
     """Points [V, P, 3] `(column, row, depth)` of vertices [P, 3]; pixel (i, j) has its centre at row i, column j."""
-    rotations, shifts = poses
     h, w = shape
     offset = torch.zeros(len(shifts), 1, 3).to(vertices)
     offset[:, 0, :2] = 0.5 * torch.tensor([w - 1, h - 1]).to(vertices) - shifts
@@ -88,30 +85,35 @@ class _Thickness(torch.autograd.Function):
     def forward(  # type: ignore[override]
         ctx: Any,
         vertices: Tensor,
+        rotations: Tensor,
+        shifts: Tensor,
         faces: Tensor,
-        poses: tuple[Tensor, Tensor],
         shape: tuple[int, int],
         lines: int,
         backend: str,
     ) -> Tensor:
-        points = _on_raster(vertices, poses, shape)
+        points = _on_raster(vertices, rotations, shifts, shape)
         ctx.save_for_backward(vertices, faces, points)
-        ctx.shape = shape
+        ctx.backend = backend
         return implementation(__name__, backend).thickness(points, faces, shape, lines)  # type: ignore[no-any-return]
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         vertices, faces, points = ctx.saved_tensors
-        h, w = ctx.shape
-        corners = points[:, faces.reshape(-1), :2].reshape(len(points), *faces.shape, 2)
-        weights = torch.tensor(QUADRATURE, dtype=vertices.dtype)
-        samples = torch.einsum("qc,vfcx->vfqx", weights, corners)
-        # grid_sample has its first and last pixel at -1 and 1; a single row or column has no such scale.
-        samples = samples * (2 / torch.tensor([max(w - 1, 1), max(h - 1, 1)]).to(vertices)) - 1
-        found = grid_sample(gradient[:, None].to(vertices), samples, padding_mode="zeros", align_corners=True)
-        a, b, c = vertices[faces].unbind(1)
-        normals = torch.linalg.cross(b - a, c - a) / 6  # vector area, shared by the three points
-        shares = (found[:, 0].sum(0) @ weights)[..., None] * normals[:, None]
-        out = torch.zeros_like(vertices).index_add_(0, faces.reshape(-1), shares.reshape(-1, 3))
-        return out, None, None, None, None, None
+        gradient = gradient.to(vertices)
+        of_vertices = _of_vertices(vertices, faces, points, gradient) if ctx.needs_input_grad[0] else None
+        poses: tuple[Tensor | None, Tensor | None] = (None, None)
+        if any(ctx.needs_input_grad[1:3]):
+            poses = implementation(__name__, ctx.backend).pose_gradients(points, vertices, faces, gradient)
+        return of_vertices, *poses, None, None, None, None
+
+
+def _of_vertices(vertices: Tensor, faces: Tensor, points: Tensor, gradient: Tensor) -> Tensor:
+    """The gradient [P, 3] of the vertices, of the image's [V, H, W]."""
+    found = sampled(points, faces, gradient)
+    weights = torch.tensor(QUADRATURE, dtype=vertices.dtype)
+    a, b, c = vertices[faces].unbind(1)
+    normals = torch.linalg.cross(b - a, c - a) / 6  # vector area, shared by the three points
+    shares = (found.sum(0) @ weights)[..., None] * normals[:, None]
+    return torch.zeros_like(vertices).index_add_(0, faces.reshape(-1), shares.reshape(-1, 3))

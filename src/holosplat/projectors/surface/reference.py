@@ -9,6 +9,10 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
+from torch.nn.functional import grid_sample
+
+QUADRATURE = ((2 / 3, 1 / 6, 1 / 6), (1 / 6, 2 / 3, 1 / 6), (1 / 6, 1 / 6, 2 / 3))
+"""Barycentric points of equal weight, exact to second degree (Strang & Fix 1973, p. 184)."""
 
 
 def thickness(points: Tensor, faces: Tensor, shape: tuple[int, int], lines: int) -> Tensor:
@@ -19,6 +23,31 @@ def thickness(points: Tensor, faces: Tensor, shape: tuple[int, int], lines: int)
         pixel, width, depth = pieces(view, faces, shape, lines)
         images.append(view.new_zeros(h * w).index_add_(0, pixel, width * depth).reshape(h, w))
     return torch.stack(images) if images else points.new_zeros(0, h, w)
+
+
+def pose_gradients(points: Tensor, vertices: Tensor, faces: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradients of rotations [V, 3, 3] and shifts [V, 2], of the image's [V, H, W]; float64, lengths in pixels.
+
+    points: [V, P, 3] as above; vertices: [P, 3], the same in the object frame.
+    """
+    shares = sampled(points, faces, gradient) @ torch.tensor(QUADRATURE, dtype=points.dtype)
+    a, b, c = points[:, faces].unbind(2)
+    normals = torch.linalg.cross(b - a, c - a) / 6  # vector area, shared by the three points
+    pull = torch.einsum("vfc,vfx->vfcx", shares, normals)  # on each corner, in the lab frame
+    return torch.einsum("vfcx,fcy->vxy", pull, vertices[faces]), -pull.sum((1, 2))[:, :2]
+
+
+def sampled(points: Tensor, faces: Tensor, gradient: Tensor) -> Tensor:
+    """The image's gradient [V, H, W] at the points of `QUADRATURE` on each face: [V, F, 3].
+
+    It is linear between pixels, and falls to zero over a pixel beyond them. A single row or column stands for all.
+    """
+    h, w = gradient.shape[1:]
+    corners = points[:, faces.reshape(-1), :2].reshape(len(points), *faces.shape, 2)
+    samples = torch.einsum("qc,vfcx->vfqx", torch.tensor(QUADRATURE, dtype=points.dtype), corners)
+    # grid_sample has its first and last pixel at -1 and 1; a single row or column has no such scale.
+    samples = samples * (2 / torch.tensor([max(w - 1, 1), max(h - 1, 1)]).to(points)) - 1
+    return grid_sample(gradient[:, None], samples, padding_mode="zeros", align_corners=True)[:, 0]
 
 
 def occupancy(vertices: Tensor, faces: Tensor, shape: tuple[int, int, int], lines: int) -> Tensor:

@@ -1,40 +1,52 @@
-"""Voxel-driven projection for any pose: fast, with an exact adjoint, for iterative tomography."""
+"""Voxel-driven projection for any pose: fast, with an exact adjoint and pose gradients, for iterative tomography."""
 
 from __future__ import annotations
 
-import numpy as np
+import math
+from typing import Any
+
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from ... import native
 from ...checks import require
-from ...geometry import Grid, Views
+from ...geometry import Grid, Poses, Views
+
+KINK = 1e-6
+"""Pixels from a pixel's centre within which a voxel counts as lying on it."""
 
 
 class LatticeProjector:
     """Each voxel casts a bilinear hat of its mass on the detector; forward and exact adjoint, float32.
 
-    Backends: `cpu` (compiled) and `reference` (`lattice_reference`, and its adjoint by autograd).
+    Backends: `cpu` (compiled) and `reference` (`lattice_reference`, and its derivatives by autograd).
 
     The hat's variance, 1/6 px², is that of a pixel-sized cube's shadow (1/12) seen by a pixel (1/12), so voxels
     should be about as large as the raster's pixels. Single pixels carry a ripple of a few per cent where the
-    lattice and the raster beat; their means do not. Arrays are volumes [Z, Y, X] and images [V, H, W]; grids
-    of cubic voxels. Voxels at the very rim of the detector, with a pixel of their hat outside, are left out.
+    lattice and the raster beat; their means do not. Arrays are volumes [Z, Y, X] and images [V, H, W].
+    Voxels at the very rim of the detector, with a pixel of their hat outside, are left out.
+
+    Poses are taken as they are when the projector is made. Gradients of them are exact but for what enters or leaves at
+    the detector's rim, and but for voxels on a pixel's centre, where hats have a kink: there the mean of both sides'.
     """
 
-    def __init__(self, grid: Grid, views: Views, backend: str = "cpu") -> None:
-        require(np.allclose(grid.voxel_size, grid.voxel_size[0]), "the lattice projector needs cubic voxels.")
+    def __init__(self, grid: Grid, views: Views | Poses, backend: str = "cpu") -> None:
         self.grid, self.views, self.backend = grid, views, backend
         self.array_shape = grid.shape
+        self._poses = Poses.of(views) if isinstance(views, Views) else _checked(views)
         pixel = views.pixel_size
-        self._rotations = np.ascontiguousarray(views.rotations)
-        self._shifts = np.ascontiguousarray(views.shifts / pixel)
-        rotations, shifts = (native.c_void_p(a.ctypes.data) for a in (self._rotations, self._shifts))
-        self._views = native.Views(len(views), *views.shape, rotations, shifts)
-        origin = (native.c_double * 3)(*(o / pixel for o in grid.origin))
-        self._lattice = native.Lattice(*grid.shape, origin, grid.voxel_size[0] / pixel)
-        self._mass = grid.voxel_size[0] ** 3 / pixel**2
-        """Path length [m] that a voxel of value one adds to the pixels of its hat, in sum."""
+        self._arrays = (self._poses.rotations.detach().clone(), self._poses.shifts.detach() / pixel)
+        self._native = native.Views(len(views), *views.shape, *(a.data_ptr() for a in self._arrays))
+        origin, pitch = ((native.c_double * 3)(*(a / pixel for a in ends)) for ends in (grid.origin, grid.voxel_size))
+        self._lattice = native.Lattice(*grid.shape, origin, pitch)
+        self._mass = _mass(grid, pixel)
+
+    def lines(self, array: Tensor) -> Tensor:
+        """As `project`, differentiable: in `array`, and in the poses that ask for gradients."""
+        if self.backend == "reference":
+            return lattice_reference(array, self.grid, self._poses)
+        return _Lines.apply(array, self._poses.rotations, self._poses.shifts, self)  # type: ignore[no-any-return]
 
     def project(self, array: Tensor) -> Tensor:
         """Line integrals [V, H, W] in metres × value of `array` [Z, Y, X]."""
@@ -55,6 +67,18 @@ class LatticeProjector:
         self._call("holosplat_lattice_backproject", lines, volume)
         return volume.mul_(self._mass)
 
+    def pose_gradients(self, array: Tensor, upstream: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradients of rotations [V, 3, 3] and shifts [V, 2] [1/m], of the lines' gradient `upstream` [V, H, W].
+
+        float64; the rotations' last rows, which move voxels along the beam, are zero. By the compiled kernel.
+        """
+        rotations = torch.zeros(len(self.views), 2, 3, dtype=torch.float64)
+        shifts = torch.zeros(len(self.views), 2, dtype=torch.float64)
+        if min(self.views.shape) > 1:
+            self._call("holosplat_lattice_poses", array, upstream, rotations, shifts)
+        last = torch.zeros(len(self.views), 1, 3, dtype=torch.float64)
+        return torch.cat((rotations, last), 1).mul_(self._mass), shifts.mul_(self._mass / self.views.pixel_size)
+
     def volume_in(self, volume: Tensor) -> Tensor:
         """The volume as it is: this projector's order is [Z, Y, X]."""
         return volume
@@ -67,10 +91,42 @@ class LatticeProjector:
 
     lines_out = lines_in
 
-    def _call(self, function: str, source: Tensor, target: Tensor) -> None:
+    def _call(self, function: str, source: Tensor, *others: Tensor) -> None:
         source = source.detach().float().contiguous()
-        pointers = [native.c_void_p(array.data_ptr()) for array in (source, target)]
-        native.call(function, self._lattice, self._views, *pointers, torch.get_num_threads())
+        pointers = [native.c_void_p(array.data_ptr()) for array in (source, *others)]
+        native.call(function, self._lattice, self._native, *pointers, torch.get_num_threads())
+
+
+class _Lines(torch.autograd.Function):
+    """The compiled projector, whose gradient is its adjoint; of the poses, `pose_gradients`."""
+
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any, array: Tensor, rotations: Tensor, shifts: Tensor, projector: LatticeProjector
+    ) -> Tensor:
+        ctx.projector = projector
+        ctx.save_for_backward(array if any(ctx.needs_input_grad[1:3]) else None)
+        return projector.project(array)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+        (array,), upstream = ctx.saved_tensors, upstream.float().contiguous()
+        of_array = ctx.projector.backproject(upstream) if ctx.needs_input_grad[0] else None
+        poses = (None, None) if array is None else ctx.projector.pose_gradients(array, upstream)
+        return of_array, *poses, None
+
+
+def _checked(poses: Poses) -> Poses:
+    fits = poses.rotations.ndim == 3 and poses.rotations.shape[1:] == (3, 3)
+    fits = fits and tuple(poses.shifts.shape) == (len(poses), 2)
+    held = [(a.dtype, a.device.type) for a in (poses.rotations, poses.shifts)]
+    require(
+        fits and set(held) == {(torch.float64, "cpu")},
+        "poses of voxels must be float64 tensors on the CPU, rotations (V, 3, 3) and shifts (V, 2), but they are "
+        f"{tuple(poses.rotations.shape)} and {tuple(poses.shifts.shape)}, {held}.",
+    )
+    return poses
 
 
 def _check_shape(name: str, array: Tensor, wanted: tuple[int, ...]) -> None:
@@ -78,23 +134,32 @@ def _check_shape(name: str, array: Tensor, wanted: tuple[int, ...]) -> None:
     require(shape == wanted, f"the {name} must have the shape {wanted} of this projector, but the shape is {shape}.")
 
 
-def lattice_reference(volume: Tensor, grid: Grid, views: Views) -> Tensor:
-    """The plain form of `LatticeProjector.project`, any float type: [Z, Y, X] → [V, H, W]."""
-    pixel, (h, w) = views.pixel_size, views.shape
+def _mass(grid: Grid, pixel: float) -> float:
+    """Path length [m] that a voxel of value one adds to the pixels of its hat, in sum."""
+    return math.prod(grid.voxel_size) / pixel**2
+
+
+def lattice_reference(volume: Tensor, grid: Grid, views: Views | Poses) -> Tensor:
+    """The plain form of `LatticeProjector.lines`, any float type: [Z, Y, X] → [V, H, W]."""
+    poses = Poses.of(views) if isinstance(views, Views) else views
+    pixel, (h, w) = poses.pixel_size, poses.shape
     x, y, z = (torch.as_tensor(axis / pixel, dtype=volume.dtype) for axis in grid.axes())
     zz, yy, xx = torch.meshgrid(z, y, x, indexing="ij")
     points = torch.stack([xx, yy, zz]).reshape(3, -1)
+    # On either side of a kink the values are the same, and the derivatives are not.
+    sides = (KINK, -KINK) if poses.requires_grad else (0.0,)
     images = []
-    for rotation, shift in zip(views.rotations, views.shifts / pixel):
-        lab = torch.as_tensor(rotation, dtype=volume.dtype)[:2] @ points
+    for rotation, shift in zip(poses.rotations, poses.shifts / pixel):
+        lab = rotation.to(volume.dtype)[:2] @ points
         column, row = lab[0] - shift[0] + 0.5 * w - 0.5, lab[1] - shift[1] + 0.5 * h - 0.5
         slack = 1e-6
         kept = (column >= -slack) & (column <= w - 1 + slack) & (row >= -slack) & (row <= h - 1 + slack)
-        j, i = column.floor().long().clamp(0, w - 2), row.floor().long().clamp(0, h - 2)
-        a, b, value = (column - j)[kept], (row - i)[kept], volume.reshape(-1)[kept]
-        at = (i * w + j)[kept]
+        column, row, value = column[kept], row[kept], volume.reshape(-1)[kept] / len(sides)
         image = torch.zeros(h * w, dtype=volume.dtype)
-        for offset, weight in ((0, (1 - a) * (1 - b)), (1, a * (1 - b)), (w, (1 - a) * b), (w + 1, a * b)):
-            image = image.index_add(0, at + offset, value * weight)
+        for side in sides:
+            j, i = (column + side).floor().long().clamp(0, w - 2), (row + side).floor().long().clamp(0, h - 2)
+            a, b, at = column - j, row - i, i * w + j
+            for offset, weight in ((0, (1 - a) * (1 - b)), (1, a * (1 - b)), (w, (1 - a) * b), (w + 1, a * b)):
+                image = image.index_add(0, at + offset, value * weight)
         images.append(image.reshape(h, w))
-    return torch.stack(images) * (grid.voxel_size[0] ** 3 / pixel**2)
+    return torch.stack(images) * _mass(grid, pixel)

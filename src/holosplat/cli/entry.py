@@ -1,0 +1,102 @@
+"""The commands by name, and `main`, which loads the module of one command only: the others need torch, VTK or figures.
+
+The overview (`holosplat --help`) comes from the table alone. A command's module imports what its options need, and
+each function imports its work where it starts, so that `holosplat COMMAND --help` is fast, too.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from importlib import import_module
+
+import tyro
+from tyro.conf import OmitArgPrefixes
+
+from ..checks import InputError
+from ..version import __version__
+from .progress import INTERRUPTED
+
+COMMANDS: dict[str, tuple[str, str]] = {
+    "plan": (
+        "plan",
+        "Say what an experiment would see, resolve and store, and where its best distance and energy lie.",
+    ),
+    "grow": ("grow", "Let red cells flow through a channel, and write their meshes (VTK, µm) at every snapshot."),
+    "simulate": (
+        "simulate",
+        "Simulate the holograms of closed triangle meshes; with --frame-rate, of moving ones, many times over.",
+    ),
+    "record": (
+        "imaging",
+        "Record a noise-free scan as raw counts: pulses of a free-electron laser, a camera, flats and darks.",
+    ),
+    "correct": ("imaging", "Correct raw counts by dark and flat fields into a scan of relative intensities."),
+    "join": ("imaging", "Join scans of several beams, one file each, on one raster."),
+    "reconstruct": ("commands", "Reconstruct a scan as Gaussians; the run folder holds the result and its report."),
+    "render": ("commands", "Predict the frames of a scan from a run."),
+    "export": ("commands", "Write δ and β of a run as a volume file."),
+    "surface": (
+        "surface",
+        "Cut the bodies of a run out as closed surfaces, fit these to the frames, and write them as VTK files (µm).",
+    ),
+    "convert": ("convert", "Bring a scan into another format; what SOURCE is, its content says."),
+    "evaluate": (
+        "commands",
+        "Score a run on held-out frames and against the true volume, which then joins its report.",
+    ),
+    "demo": ("commands", "Run the whole chain on generated red cells: simulate, reconstruct, evaluate, report."),
+    "bench": (
+        "bench",
+        "Compare methods on cases, under one physics and one set of scores (run, report); rerun the thesis' study.",
+    ),
+    "backends": ("commands", "Say which backends can be used here, and what each of them offers."),
+}
+"""Name → (module of this package that has a function of that name, first paragraph of the function's docstring)."""
+
+
+def main() -> None:
+    """Run a command; bad input prints one sentence and exits with 2, Ctrl-C exits with 130."""
+    if sys.argv[1:] == ["--version"]:
+        print(f"holosplat {__version__}")
+        return
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            _functions(sys.argv[1:]),
+            prog="holosplat",
+            description="Quantitative 3D maps from a handful of X-ray phase-contrast images.",
+            config=(OmitArgPrefixes,),
+        )
+    except InputError as error:
+        print(f"holosplat: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        print("holosplat: interrupted", file=sys.stderr)
+        raise SystemExit(INTERRUPTED) from None
+    except BrokenPipeError:  # the reader, such as `head`, has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(1) from None
+
+
+def command(name: str) -> Callable[..., None]:
+    """The function of the command `name`, a key of `COMMANDS`; imports its module."""
+    return getattr(import_module(f".{COMMANDS[name][0]}", __package__), name)
+
+
+def _functions(arguments: list[str]) -> dict[str, Callable[..., None]]:
+    """A function for each command: the real one for that which the first argument names, summaries for the others."""
+    return {
+        name: command(name) if arguments[:1] == [name] else _summarised(summary)
+        for name, (_, summary) in COMMANDS.items()
+    }
+
+
+def _summarised(summary: str) -> Callable[..., None]:
+    """A function that the parser shows with `summary`; it is never called."""
+
+    def unloaded() -> None:
+        pass
+
+    unloaded.__doc__ = summary
+    return unloaded

@@ -1,0 +1,24 @@
+"""The gradient of a separable filter's factors: how the fast backends come by those of distance and blur."""
+
+from __future__ import annotations
+
+from torch import Tensor
+from torch.nn.functional import pad
+
+
+def factor_gradients(arrived: Tensor, passed: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
+    """Gradients of the factors rows r [V, H] and columns c [V, W] of a filter `out = F⁻¹(r c F(in))` of images.
+
+    passed: the spectrum F(in), not scaled, [V, H, W], or as `rfft2` gives it, [V, H, W // 2 + 1]; arrived: likewise,
+    that of the gradient of `out`. With N samples, `∂L/∂r_y = Σ_x a conj(p c) / N` and likewise for c; gradients of
+    complex numbers are those of real and imaginary part, those of real factors real.
+    """
+    height, width, kept = rows.shape[1], columns.shape[1], passed.shape[2]
+    product = arrived * passed.conj() / (height * width)
+    if kept < width:  # each frequency within stands for its mirror image as well
+        product[:, :, 1 : (width + 1) // 2] *= 2
+    of_rows = (product * columns[:, None, :kept].conj()).sum(2)
+    of_columns = pad((product * rows[:, :, None].conj()).sum(1), (0, width - kept))
+    if rows.is_complex():
+        return of_rows, of_columns
+    return of_rows.real, of_columns.real

@@ -1,0 +1,68 @@
+"""The command line starts at once: the overview loads nothing heavy, a command's help no other command's modules."""
+
+from __future__ import annotations
+
+import inspect
+import subprocess
+import sys
+
+import pytest
+
+from helpers.cli import holosplat, worked
+from holosplat.cli.entry import COMMANDS, command
+
+HEAVY = ("torch", "scipy", "h5py", "xraydb", "vtk", "vtkmodules", "matplotlib", "jinja2", "tifffile", "PIL", "triton")
+LIGHT = (
+    *([], ["plan"], ["simulate"], ["reconstruct"], ["render"], ["export"], ["evaluate"], ["demo"], ["backends"]),
+    *(["bench"], ["bench", "run"], ["bench", "report"], ["bench", "thesis"]),
+)
+
+
+def loaded(arguments: list[str]) -> tuple[str, list[str]]:
+    """What `holosplat ARGUMENTS --help` says in a process of its own, and which of `HEAVY` it loads."""
+    code = "import sys\nsys.argv = ['holosplat', *sys.argv[1:]]\nfrom holosplat.cli import main\n"
+    code += f"try: main()\nfinally: print('loaded', *(m for m in {HEAVY} if m in sys.modules))"
+    command = [sys.executable, "-c", code, *arguments, "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    said, _, names = done.stdout.rpartition("loaded")
+    return said, names.split()
+
+
+@pytest.mark.parametrize("arguments", LIGHT, ids=" ".join)
+def test_help_loads_nothing_heavy(arguments):
+    said, heavy = loaded(arguments)
+    assert heavy == []
+    assert f"holosplat {' '.join(arguments)}".strip() in said
+
+
+def test_the_check_sees_what_is_loaded(tmp_path, monkeypatch):
+    """A module that loads h5py, put in the place of a command's, is noticed."""
+    (tmp_path / "sitecustomize.py").write_text("import h5py\n")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    assert "h5py" in loaded([])[1]
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_table_says_what_the_docstring_says(name):
+    first = inspect.cleandoc(command(name).__doc__ or "").split("\n\n")[0]
+    assert COMMANDS[name][1] == " ".join(first.split())
+
+
+def test_the_overview_names_every_command():
+    said = " ".join(worked(holosplat("--help")).out.replace("│", " ").split())
+    for name, (_, summary) in COMMANDS.items():
+        assert f"• {name} {summary}" in said
+
+
+def test_every_public_function_of_a_command_module_is_a_command():
+    """A new command that is not in the table would be unreachable."""
+    modules = {inspect.getmodule(command(name)) for name in COMMANDS}
+    inner = {"run", "report"}  # of `bench`
+    for module in filter(None, modules):
+        functions = {
+            name
+            for name, value in vars(module).items()
+            if inspect.isfunction(value) and value.__module__ == module.__name__ and not name.startswith("_")
+        }
+        assert functions - set(COMMANDS) <= inner, module.__name__
