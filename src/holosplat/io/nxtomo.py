@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +17,7 @@ from ..scan import Exposures, Scan
 from ..version import __version__
 from .atomic import atomic_path
 from .hdf5 import Fields, open_hdf5
+from .loader import Loader
 from .scan_file import (
     ANGLE,
     DARK,
@@ -245,3 +246,14 @@ def _escaped(key: str) -> str:
     """A provenance name as an HDF5 name, in which "/" and a lone "." have a meaning of their own."""
     escaped = key.replace("%", "%25").replace("/", "%2F")
     return escaped.replace(".", "%2E") if set(escaped) == {"."} else escaped
+
+
+def _recognises(path: Path) -> bool:
+    return path.is_file() and h5py.is_hdf5(path)
+
+
+def _read(path: Path, given: Mapping[str, float]) -> Scan:
+    return read_scan(path)
+
+
+LOADER = Loader("nxtomo", "an HDF5 file", _recognises, _read)
