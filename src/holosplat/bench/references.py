@@ -40,8 +40,8 @@ def tv_of_true_lines(case: Case, truth: Volume, on_progress: Progress) -> VoxelG
     known = case.prior.kind == "known"
     require(known, "the true thickness is that of one known material, but the methods are told of none here.")
     views = case.exposures.views[np.flatnonzero(~case.is_test)]
-    _, dephasing = case.scene.project(views)
-    lines = (dephasing / case.prior.delta).float()
+    _, projected_delta = case.scene.project(views)
+    lines = (projected_delta / case.prior.delta).float()
     grid = Grid.of_views(views)
     values = TOMOGRAPHIES["tv"](lines, views, grid, 1.0, lambda fraction: on_progress("tomography", fraction))
     return VoxelGrid(values[None], grid, case.prior.delta, case.prior.beta)

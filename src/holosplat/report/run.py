@@ -90,13 +90,14 @@ def _projections(reconstruction: Reconstruction, views: Views, truth: Volume | N
     first, other = 0, int(abs(views.rotations[:, 2] @ views.rotations[0, 2]).argmin())
     chosen = views[[first, other] if other != first else [first]]
     with torch.no_grad():
-        absorption, dephasing = (line.numpy() for line in reconstruction.cloud.project(chosen))
+        beta, delta = (line.numpy() for line in reconstruction.cloud.project(chosen))
         if truth is None:
-            return ProjectedMaps(absorption, dephasing, view_labels(chosen))
-        true_absorption, true_dephasing = (line.numpy() for line in _project_volume(truth, chosen))
-    return ProjectedMaps(absorption, dephasing, view_labels(chosen), true_absorption, true_dephasing)
+            return ProjectedMaps(beta, delta, view_labels(chosen))
+        true_beta, true_delta = (line.numpy() for line in _project_volume(truth, chosen).unbind(1))
+    return ProjectedMaps(beta, delta, view_labels(chosen), true_beta, true_delta)
 
 
 def _project_volume(truth: Volume, views: Views) -> torch.Tensor:
+    """Line integrals [V, 2, H, W] of β and δ [m]."""
     values = torch.from_numpy(truth.beta), torch.from_numpy(truth.delta)
     return voxel_line_integrals(torch.stack(values), truth.grid, views, step=0.5)
