@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from holosplat.workflows.settings import MaterialPrior
 
 from holosplat.bench.case import FOLDER, Case, case_names, load_case
 from holosplat.bench.declaration import declared_names
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.materials import DeltaBeta, parse_material
+from holosplat.matter import MaterialPrior
 from holosplat.scan import Exposures
 from holosplat.specimens.phantoms import Ball
 from holosplat.specimens.scene import MeshScene
@@ -148,7 +148,7 @@ def test_matter_of_plasma_shells_and_capsules():
     assert core.delta + outer.delta == near(oil.delta)
     assert core.beta + outer.beta == near(oil.beta)
     assert oil.ratio > 5 * outer.ratio
-    assert capsules.prior == MaterialPrior()
+    assert capsules.prior == MaterialPrior.unknown()
 
 
 def test_views_lie_as_declared():
@@ -367,6 +367,6 @@ def test_a_case_has_frames_of_both_kinds():
     exposures = Exposures.of(Views.evenly_spaced(3, (9, 9), 1e-6), 20.0, 0.1)
     for is_test in (np.zeros(3, dtype=bool), np.ones(3, dtype=bool)):
         with pytest.raises(InputError, match="frames for training and held-out ones"):
-            Case("x", 0, scene, exposures, is_test, MaterialPrior())
+            Case("x", 0, scene, exposures, is_test, MaterialPrior.unknown())
     with pytest.raises(InputError, match="is_test must have the shape"):
-        Case("x", 0, scene, exposures, np.zeros(2, dtype=bool), MaterialPrior())
+        Case("x", 0, scene, exposures, np.zeros(2, dtype=bool), MaterialPrior.unknown())

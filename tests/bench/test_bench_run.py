@@ -215,7 +215,7 @@ def test_a_case_that_has_changed_is_not_mixed_with_its_past(tmp_path, part):
         "material": replace(case, scene=replace(case.scene, materials=(hs.DeltaBeta(2e-7, 1e-10),))),
         "split": replace(case, is_test=np.arange(6) == 1),
         "distance": replace(case, exposures=replace(case.exposures, distance=0.03)),
-        "prior": replace(case, prior=hs.MaterialPrior()),
+        "prior": replace(case, prior=hs.MaterialPrior.unknown()),
         "photons": replace(case, photons=1e4),
     }[part]
     assert fingerprint(make_case("round", 1)) == fingerprint(case) != fingerprint(changed)
@@ -301,4 +301,4 @@ def test_true_lines_are_the_true_thickness(monkeypatch):
     volume = case.scene.meshes[0].volume
     assert given["lines"].sum(dim=(1, 2)).numpy() * PITCH**2 == pytest.approx(volume, rel=0.01)
     with pytest.raises(hs.InputError, match="known material"):
-        references.tv_of_true_lines(replace(case, prior=hs.MaterialPrior()), case.truth(), lambda s, f: None)
+        references.tv_of_true_lines(replace(case, prior=hs.MaterialPrior.unknown()), case.truth(), lambda s, f: None)
