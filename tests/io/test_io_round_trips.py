@@ -16,15 +16,16 @@ from hypothesis.extra.numpy import arrays
 
 from helpers.strategies import NAMES, VIEWS, clouds, images, numbers, scans, vectors
 from holosplat.geometry import Grid, Views
-from holosplat.io.gaussians import read_gaussians, write_gaussians
 from holosplat.io.json import read_json, write_json
 from holosplat.io.nerf_synthetic import NerfOptions, grey_range, read_nerf_synthetic, write_nerf_synthetic
 from holosplat.io.nxtomo import read_scan, write_scan
+from holosplat.io.objects import read_object, write_object
 from holosplat.io.png import LEVELS, read_png, write_png
 from holosplat.io.r2_gaussian import R2Options, read_r2_gaussian, write_r2_gaussian
 from holosplat.io.tiff import read_tiff, write_tiff
 from holosplat.io.volumes import read_volume, write_volume
 from holosplat.io.vtk import read_meshes, write_mesh
+from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
 from holosplat.representations import GaussianCloud
 from holosplat.scan import Scan
@@ -152,13 +153,15 @@ def test_a_volume_comes_back(volume, place):
 )
 def test_gaussians_come_back(cloud, unit, materials, two, place):
     arrays_ = [cloud[0], torch.log(cloud[1]), *cloud[2:]]
-    second = tuple(materials[1].tolist()) if two and cloud[3].shape[1] == 2 else None
-    written = GaussianCloud(arrays_, unit, *materials[0].tolist(), second)
-    path = place() / "gaussians.h5"
-    write_gaussians(path, written)
-    found = read_gaussians(path)
-    assert all(torch.equal(a, b) for a, b in zip(found.parameters, written.parameters))
-    assert (found.unit_length, found.materials) == (written.unit_length, written.materials)
+    first, second = (tuple(material.tolist()) for material in materials)
+    matter = Matter.one(*first) if cloud[3].shape[1] == 1 else Matter.two(first, second) if two else Matter.free(*first)
+    written = GaussianCloud(arrays_, unit, matter)
+    path = place() / "object.h5"
+    write_object(path, written)
+    found = read_object(path)
+    assert isinstance(found, GaussianCloud)
+    assert all(torch.equal(found.parameters()[name], array) for name, array in written.parameters().items())
+    assert (found.unit_length, found.matter) == (written.unit_length, written.matter)
 
 
 @given(

@@ -19,6 +19,7 @@ from holosplat.geometry import Grid, Views
 from holosplat.materials import HAEMOGLOBIN, WATER
 from holosplat.matter import MaterialPrior
 from holosplat.mesh import TriangleMesh
+from holosplat.methods import gaussian_fit
 from holosplat.methods.presets import preset
 from holosplat.scan import Exposures, interleaved_split
 from holosplat.specimens.red_cells import icosphere
