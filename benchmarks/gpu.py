@@ -58,7 +58,7 @@ def draw(arrays: list[Tensor], poses: tuple[Tensor, Tensor], sizes: Sizes, backe
     """The splat of one case."""
     from holosplat.projectors.splat import splat
 
-    options = {"cutoff": CUTOFF, "pixel_variance": VARIANCE, "checked": True}
+    options = {"cutoff": CUTOFF, "pixel_variance": VARIANCE, "trusted": True}
     return splat(*arrays, *poses, (sizes.side, sizes.side), backend=backend, **options)
 
 
@@ -114,6 +114,9 @@ def measure(sizes: Sizes, device: str, time: Callable[[Callable[[], Any], int], 
     image = draw(leaves, poses, sizes, "cuda")
     weights = torch.randn_like(image)
     backward = time(lambda: torch.autograd.grad(image, leaves, weights, retain_graph=True), sizes.repeats)
+    moved = [a.clone().requires_grad_() for a in poses]
+    image = draw(leaves, (moved[0], moved[1]), sizes, "cuda")
+    of_all = time(lambda: torch.autograd.grad(image, [*leaves, *moved], weights, retain_graph=True), sizes.repeats)
     return {
         "gaussians": sizes.count,
         "views": sizes.views,
@@ -123,6 +126,7 @@ def measure(sizes: Sizes, device: str, time: Callable[[Callable[[], Any], int], 
         "pairs": work,
         "forward_ms": forward * 1e3,
         "backward_ms": backward * 1e3,
+        "backward_with_poses_ms": of_all * 1e3,
         "forward_pairs_per_s": work / forward,
         "backward_pairs_per_s": work / backward,
         "errors": errors([a.detach() for a in leaves], poses, sizes),

@@ -107,8 +107,8 @@ class Calls:
     backward: Callable[[], Any]
 
 
-def calls(work: Workload, threads: int = 1) -> Calls:
-    """The compiled kernels on a workload: a splat, or a voxeliser if it has no views."""
+def calls(work: Workload, threads: int = 1, of_poses: bool = False) -> Calls:
+    """The compiled kernels on a workload: a splat (`of_poses`: with their gradients), or without views a voxeliser."""
     arrays, options = work.cloud(), native.Options(work.cutoff, VARIANCE, threads)
     out = [torch.empty_like(a) for a in arrays]
     poses, shape = work.poses(), (work.size,) * (2 if work.views else 3)
@@ -116,13 +116,17 @@ def calls(work: Workload, threads: int = 1) -> Calls:
     gradient = torch.randn(value.shape, generator=torch.Generator().manual_seed(SEED))
     name = "holosplat_splat" if work.views else "holosplat_voxelise"
     raster = cpu._views(poses, shape) if work.views else native.Grid(*shape)
-    cloud, gradients, keep = cpu._cloud(arrays), cpu._gradients(out), (arrays, out, poses, value, gradient)
+    moved = [torch.empty_like(a) for a in poses]
+    outputs: list[Any] = [cpu._gradients(out)]
+    if work.views:
+        outputs.append(native.ViewGradients(*(a.data_ptr() for a in moved)) if of_poses else None)
+    cloud, keep = cpu._cloud(arrays), (arrays, out, poses, moved, value, gradient)
 
     def forward(kept: Any = keep) -> None:
         native.call(name, cloud, raster, options, cpu._at(value))
 
     def backward(kept: Any = keep) -> None:
-        native.call(f"{name}_backward", cloud, raster, options, cpu._at(gradient), gradients)
+        native.call(f"{name}_backward", cloud, raster, options, cpu._at(gradient), *outputs)
 
     return Calls(forward, backward)
 
@@ -258,6 +262,16 @@ def rates(repetitions: int) -> dict[str, dict[str, Any]]:
     return found
 
 
+def pose_costs(repetitions: int) -> dict[str, dict[str, float]]:
+    """Milliseconds of the backward pass of every splat on one thread, without and with gradients of its poses."""
+    found = {}
+    for name, work in SPLATS.items():
+        say(f"{name}: gradients of poses")
+        seconds = minima({"without": calls(work), "with": calls(work, of_poses=True)}, repetitions)
+        found[name] = {key: 1e3 * backward for key, (_, backward) in seconds.items()}
+    return found
+
+
 def measure(repetitions: int) -> dict[str, Any]:
     """Everything, as one flat object with a table of rates in it."""
     torch.set_num_threads(1)
@@ -291,6 +305,7 @@ def measure(repetitions: int) -> dict[str, Any]:
         **errors(),
         "memory_mb_244k": memory_mb(),
         "workloads": table,
+        "backward_ms_of_poses": pose_costs(repetitions),
     }
 
 
@@ -303,6 +318,9 @@ def as_table(report: dict[str, Any]) -> str:
             two = " / ".join(f"{gain:.2f}" for gain in row["two_threads"].values()) if isa == best else ""
             lines.append(f"| {name} | {isa} | {rate['forward']:.2f} | {rate['backward']:.2f} | {two} |")
     lines.append(f"| {MAIN} | torch | {report['torch_forward']:.3f} | {report['torch_backward']:.3f} | |")
+    lines += ["", "| backward, ms | without gradients of poses | with them |", "|" + " --- |" * 3]
+    for name, cost in report["backward_ms_of_poses"].items():
+        lines.append(f"| {name} | {cost['without']:.1f} | {cost['with']:.1f} |")
     keys = (
         "forward_ratio",
         "backward_ratio",

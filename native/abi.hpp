@@ -33,6 +33,11 @@ struct HoloViews {
   const double* shifts;     // [V, 2] detector shift (sx, sy)
 };
 
+struct HoloViewGradients {  // of a scalar with respect to the arrays of a HoloViews, in their shapes
+  double* rotations;  // as if all nine numbers of a matrix were free
+  double* shifts;
+};
+
 struct HoloGrid {
   int64_t depth, height, width;  // Z, Y, X
 };
@@ -54,13 +59,13 @@ struct HoloTarget {  // measured frames, compared after the affine map that take
   double low, span;
 };
 
-struct HoloAdam {  // up to 4 arrays under optimisation
+struct HoloAdam {  // K arrays under optimisation; each member but the count points to K entries
   int64_t count;
-  int64_t lengths[4];
-  float* parameters[4];
-  const float* gradients[4];
-  float* first[4];   // running means of the gradient
-  float* second[4];  // and of its square
+  const int64_t* lengths;
+  float* const* parameters;
+  const float* const* gradients;
+  float* const* first;   // running means of the gradient
+  float* const* second;  // and of its square
 };
 
 struct HoloLattice {
@@ -88,8 +93,10 @@ HOLO_EXPORT int64_t holosplat_best_isa();
 
 // image [V, C, H, W]
 HOLO_EXPORT int64_t holosplat_splat(const HoloCloud*, const HoloViews*, const HoloOptions*, float* image);
+// Gradients of the views are left out if the last pointer is null.
 HOLO_EXPORT int64_t holosplat_splat_backward(const HoloCloud*, const HoloViews*, const HoloOptions*,
-                                             const float* image_gradient, const HoloGradients*);
+                                             const float* image_gradient, const HoloGradients*,
+                                             const HoloViewGradients*);
 // volume [C, Z, Y, X]
 HOLO_EXPORT int64_t holosplat_voxelise(const HoloCloud*, const HoloGrid*, const HoloOptions*, float* volume);
 HOLO_EXPORT int64_t holosplat_voxelise_backward(const HoloCloud*, const HoloGrid*, const HoloOptions*,

@@ -2,9 +2,12 @@
 //
 // Forward: a task is a band of rows of one view; it adds every Gaussian in one order (order.hpp), so no two tasks share
 // a pixel and no result depends on the number of threads. Backward: a task is a run of Gaussians; each gathers its
-// moments from all views in order, so nothing is shared either.
+// moments from all views in order, so nothing is shared either. Gradients of the views, if wanted, are sums over runs
+// of a length that does not depend on the number of threads, added up in order at the end.
 
+#include <array>
 #include <numeric>
+#include <optional>
 #include <vector>
 
 #include "order.hpp"
@@ -16,6 +19,7 @@ namespace {
 
 constexpr double kSqrtTwoPi = 2.5066282746310002;
 constexpr int64_t kRunBlocks = 64;  // 1024 Gaussians gather from one view before the next: it stays in the cache
+constexpr int64_t kViewRuns = 128;  // runs of a small cloud when views have gradients: enough for many threads
 constexpr int kTurned = 1;        // most scans turn about y
 
 struct View {
@@ -137,11 +141,44 @@ void splat(const HoloCloud& cloud, const HoloViews& views, const HoloOptions& op
   });
 }
 
-// From a patch's moments to the gradients of mean and covariance in the image plane, and on to 3D.
+// Sums over blocks for one view, lane by lane: ∂L of the first two rows of R, and of the mean.
+struct alignas(64) ViewGradient {
+  double across[3][kBlock] = {}, down[3][kBlock] = {};
+  double mean[2][kBlock] = {};
+};
+
+// The gradients of mean and covariance of one Gaussian in the image plane.
+struct PlaneGradient {
+  double x, y;        // ∂L/∂mean
+  double xx, xy, yy;  // ∂L/∂Σ₂' as a full symmetric matrix
+};
+
+// With A the first two rows of R, mean = A c - shift and Σ₂' = A Σ Aᵀ + variance: ∂L/∂A = ∂L/∂mean cᵀ + 2 ∂L/∂Σ₂' A Σ.
+HOLO_INLINE void add_view(const Block& g, int k, const View& v, const PlaneGradient& plane, bool drawn,
+                          ViewGradient& out) {
+  constexpr int kRow[3][3] = {{XX, XY, XZ}, {XY, YY, YZ}, {XZ, YZ, ZZ}};
+  for (int i = 0; i < 3; ++i) {
+    double p = 0, q = 0;
+    for (int j = 0; j < 3; ++j) {
+      const double sigma = g.covariance[kRow[i][j]][k];
+      p += sigma * v.across[j], q += sigma * v.down[j];
+    }
+    const double across = plane.x * g.centre[i][k] + 2 * (plane.xx * p + plane.xy * q);
+    const double down = plane.y * g.centre[i][k] + 2 * (plane.xy * p + plane.yy * q);
+    out.across[i][k] += drawn ? across : 0.0;
+    out.down[i][k] += drawn ? down : 0.0;
+  }
+  out.mean[0][k] += drawn ? plane.x : 0.0;
+  out.mean[1][k] += drawn ? plane.y : 0.0;
+}
+
+// From a patch's moments to the gradients of mean and covariance in the image plane, and on to 3D; with kViews, also
+// to those of the view, from the Gaussians that were drawn.
 // With p = Σ₂'⁻¹ d: ∂L/∂mean = Σ p, ∂L/∂Σ₂' = ½ (Σ p pᵀ - S₀ Σ₂'⁻¹), sums over pixels weighted with what they gave.
-template <int C>
+template <int C, bool kViews>
 void pull_back(const Block& __restrict g, const View& view, const Projection& __restrict projection,
-               const float (*__restrict moments)[kMoments], BlockGradient& __restrict out) {
+               const float (*__restrict moments)[kMoments], const int* __restrict drawn,
+               BlockGradient& __restrict out, ViewGradient* __restrict view_out) {
   const Spread& s = projection.spread;
   const View v = view;
   const double *p = v.across, *q = v.down;
@@ -178,12 +215,13 @@ void pull_back(const Block& __restrict g, const View& view, const Projection& __
     out.covariance[ZZ][k] += gxx * across.zz + gxy * 2 * mixed.zz + gyy * down.zz;
     out.log_root[k] += all;
     for (int c = 0; c < C; ++c) out.amplitude[c][k] += weight * m[FIRST + c];
+    if constexpr (kViews) add_view(g, k, v, {px, py, gxx, gxy, gyy}, drawn[k] != 0, *view_out);
   }
 }
 
 template <int C>
 void gather_block(const Block& g, const View& view, const HoloOptions& options, const Raster& raster,
-                  BlockGradient& out) {
+                  BlockGradient& out, ViewGradient* view_out) {
   Projection projection;
   Patches<C> patches;
   project(g, view, options, 1, projection);
@@ -191,12 +229,46 @@ void gather_block(const Block& g, const View& view, const HoloOptions& options, 
   alignas(64) float found[kBlock][kMoments], moments[kBlock][kMoments] = {};
   gather(patches.batch, found);
   for (int k = 0; k < patches.batch.count; ++k) std::copy_n(found[k], kMoments, moments[patches.gaussian[k]]);
-  pull_back<C>(g, view, projection, moments, out);
+  if (!view_out) return pull_back<C, false>(g, view, projection, moments, nullptr, out, nullptr);
+  int drawn[kBlock] = {};
+  for (int k = 0; k < patches.batch.count; ++k) drawn[patches.gaussian[k]] = 1;
+  pull_back<C, true>(g, view, projection, moments, drawn, out, view_out);
 }
+
+// The gradients of all views as sums over runs of Gaussians, each kept until all are there.
+class ViewSums {
+ public:
+  ViewSums(int64_t runs, int64_t views) : runs_(runs), views_(views), sums_(runs * views) {}
+
+  void keep(int64_t run, int64_t view, const ViewGradient& g) {
+    Sum& sum = sums_[run * views_ + view];
+    for (int k = 0; k < kBlock; ++k) {
+      for (int i = 0; i < 3; ++i) sum[i] += g.across[i][k], sum[3 + i] += g.down[i][k];
+      for (int i = 0; i < 2; ++i) sum[6 + i] += g.mean[i][k];
+    }
+  }
+
+  // The third row of R plays no part: beams are parallel. A shift of the detector moves the mean the other way.
+  void write(const HoloViewGradients& out) const {
+    std::fill_n(out.rotations, 9 * views_, 0.0);
+    std::fill_n(out.shifts, 2 * views_, 0.0);
+    for (int64_t run = 0; run < runs_; ++run)
+      for (int64_t v = 0; v < views_; ++v) {
+        const Sum& sum = sums_[run * views_ + v];
+        for (int i = 0; i < 6; ++i) out.rotations[9 * v + i] += sum[i];
+        for (int i = 0; i < 2; ++i) out.shifts[2 * v + i] -= sum[6 + i];
+      }
+  }
+
+ private:
+  using Sum = std::array<double, 8>;
+  int64_t runs_, views_;
+  std::vector<Sum> sums_;  // [runs, views], zero at first
+};
 
 template <int C>
 void splat_backward(const HoloCloud& cloud, const HoloViews& views, const HoloOptions& options, const float* gradient,
-                    const HoloGradients& out) {
+                    const HoloGradients& out, const HoloViewGradients* views_out) {
   const int64_t stride = row_stride(views.width, C), plane = views.height * views.width;
   const auto order = drawing_order(cloud, kTurned, options.threads);
   const Buffer memory(views.count * views.height * C * stride);
@@ -206,17 +278,26 @@ void splat_backward(const HoloCloud& cloud, const HoloViews& views, const HoloOp
   parallel(views.count, options.threads, [&](int64_t v) {
     pad_rows(gradient + v * C * plane, plane, C, views.height, views.width, raster_of(v));
   });
-  parallel_runs(blocks(cloud.count), kRunBlocks, options.threads, [&](int64_t first, int64_t last) {
+  const int64_t count = blocks(cloud.count), length = std::clamp<int64_t>(count / kViewRuns, 1, kRunBlocks);
+  ViewSums sums(views_out ? (count + length - 1) / length : 0, views.count);
+  const auto gather_run = [&](int64_t first, int64_t last) {
     const int64_t size = last - first;
     std::vector<Block> all(size);
     std::vector<BlockGradient> gradients(size, BlockGradient{});
     for (int64_t b = 0; b < size; ++b) load_block(cloud, order.get(), (first + b) * kBlock, all[b]);
     for (int64_t v = 0; v < views.count; ++v) {
       const View view = view_of(views, v);
-      for (int64_t b = 0; b < size; ++b) gather_block<C>(all[b], view, options, raster_of(v), gradients[b]);
+      std::optional<ViewGradient> found;
+      if (views_out) found.emplace();
+      ViewGradient* const wanted = found ? &*found : nullptr;
+      for (int64_t b = 0; b < size; ++b) gather_block<C>(all[b], view, options, raster_of(v), gradients[b], wanted);
+      if (found) sums.keep(first / length, v, *found);
     }
     for (int64_t b = 0; b < size; ++b) write_gradient(cloud, order.get(), (first + b) * kBlock, gradients[b], out);
-  });
+  };
+  if (!views_out) return parallel_runs(count, kRunBlocks, options.threads, gather_run);
+  parallel_equal_runs(count, length, options.threads, gather_run);
+  sums.write(*views_out);
 }
 
 }  // namespace
@@ -228,7 +309,8 @@ int64_t holosplat_splat(const HoloCloud* cloud, const HoloViews* views, const Ho
 }
 
 int64_t holosplat_splat_backward(const HoloCloud* cloud, const HoloViews* views, const HoloOptions* options,
-                                 const float* image_gradient, const HoloGradients* out) {
+                                 const float* image_gradient, const HoloGradients* out,
+                                 const HoloViewGradients* views_out) {
   const auto backward = cloud->channels == 1 ? holo::splat_backward<1> : holo::splat_backward<2>;
-  return holo::guarded([&] { backward(*cloud, *views, *options, image_gradient, *out); });
+  return holo::guarded([&] { backward(*cloud, *views, *options, image_gradient, *out, views_out); });
 }

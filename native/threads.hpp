@@ -47,14 +47,19 @@ void parallel(int64_t tasks, int64_t threads, const Work& work) {
   if (failure) std::rethrow_exception(failure);
 }
 
-// As `parallel`, over the numbers 0 … count - 1 in runs [first, last) of at most `longest`: short enough to keep all
-// threads busy to the end, long enough to share what a run's numbers have in common.
+// As `parallel`, over the numbers 0 … count - 1 in runs [first, last) of `length`, but for the last.
 template <class Work>
-void parallel_runs(int64_t count, int64_t longest, int64_t threads, const Work& work) {
-  const int64_t length = std::clamp<int64_t>(count / (8 * threads), 1, longest);
+void parallel_equal_runs(int64_t count, int64_t length, int64_t threads, const Work& work) {
   parallel((count + length - 1) / length, threads, [&](int64_t run) {
     work(run * length, std::min(count, (run + 1) * length));
   });
+}
+
+// The same, in runs of at most `longest`: short enough to keep all threads busy to the end, long enough to share what
+// a run's numbers have in common.
+template <class Work>
+void parallel_runs(int64_t count, int64_t longest, int64_t threads, const Work& work) {
+  parallel_equal_runs(count, std::clamp<int64_t>(count / (8 * threads), 1, longest), threads, work);
 }
 
 // Runs `work` for a C caller, to whom no exception may pass: 0, or 1 if it failed (only memory can run out).

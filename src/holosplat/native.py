@@ -17,7 +17,7 @@ from pathlib import Path
 
 from .checks import MissingError
 
-ABI = 5
+ABI = 6
 ISAS = ("sse2", "avx2", "avx512")
 """Builds for x86-64, slowest first. Other processors have one build, `generic`."""
 
@@ -39,6 +39,12 @@ class Gradients(ctypes.Structure):
     """Where the gradients of a cloud's four arrays go."""
 
     _fields_ = [(name, c_void_p) for name in ("centres", "scales", "quaternions", "amplitudes")]
+
+
+class ViewGradients(ctypes.Structure):
+    """Where the gradients of the views' two arrays go, float64."""
+
+    _fields_ = [(name, c_void_p) for name in ("rotations", "shifts")]
 
 
 class Views(ctypes.Structure):
@@ -101,12 +107,11 @@ class Target(ctypes.Structure):
 
 
 class Adam(ctypes.Structure):
-    """Up to four arrays under optimisation: how many, their lengths, and pointers to float32 arrays."""
+    """K arrays under optimisation: how many; pointers to K int64 lengths, and to K pointers to float32 arrays each."""
 
     _fields_ = [
         ("count", c_int64),
-        ("lengths", c_int64 * 4),
-        *((name, c_void_p * 4) for name in ("parameters", "gradients", "first", "second")),
+        *((name, c_void_p) for name in ("lengths", "parameters", "gradients", "first", "second")),
     ]
 
 
@@ -130,6 +135,7 @@ _FUNCTIONS = {
         *(POINTER(t) for t in (Cloud, Views, Options)),
         c_void_p,
         POINTER(Gradients),
+        POINTER(ViewGradients),
     ),
     "holosplat_voxelise": (POINTER(Cloud), POINTER(Grid), POINTER(Options), c_void_p),
     "holosplat_voxelise_backward": (
@@ -160,8 +166,8 @@ _FUNCTIONS = {
 }
 
 
-def call(function: str, *arguments: ctypes.Structure | c_void_p | c_int64 | float) -> None:
-    """Call a kernel by name with structures (passed by reference) and pointers.
+def call(function: str, *arguments: ctypes.Structure | c_void_p | c_int64 | float | None) -> None:
+    """Call a kernel by name with structures (passed by reference) and pointers; None is a null pointer.
 
     Errors: `MissingError` if the library is missing, `MemoryError` if memory ran out.
     """

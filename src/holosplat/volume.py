@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol, Self, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -65,7 +65,7 @@ class Object(Protocol):
         """The object as it is at `time` [s]; a static one returns itself."""
         ...
 
-    def project(self, views: Views) -> LineIntegrals | tuple[torch.Tensor, torch.Tensor]:
+    def project(self, views: Views, /) -> LineIntegrals | tuple[torch.Tensor, torch.Tensor]:
         """Line integrals `(B, D)` of β and δ along the beam, each [V, H, W] in metres, or what unpacks to them."""
         ...
 
@@ -82,7 +82,7 @@ class Component(Protocol):
         """The tensors that can be fitted, by name."""
         ...
 
-    def with_parameters(self, parameters: Mapping[str, torch.Tensor]) -> Self:
+    def with_parameters(self, parameters: Mapping[str, torch.Tensor]) -> Component:
         """The same part with other tensors in the place of those named; the others stay."""
         ...
 
@@ -91,6 +91,10 @@ class Component(Protocol):
 class TrainableObject(Object, Component, Protocol):
     """An Object whose numbers can be fitted; it projects poses without waiting for a device."""
 
-    def project(self, views: Views | Poses) -> LineIntegrals | tuple[torch.Tensor, torch.Tensor]:
+    def with_parameters(self, parameters: Mapping[str, torch.Tensor]) -> TrainableObject:
+        """The same object with other tensors in the place of those named."""
+        ...
+
+    def project(self, views: Views | Poses, /) -> LineIntegrals | tuple[torch.Tensor, torch.Tensor]:
         """Line integrals as of `Object`, differentiable in the parameters."""
         ...

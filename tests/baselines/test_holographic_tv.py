@@ -141,7 +141,7 @@ class Voxels:
         return self
 
     def project(self, views: Views) -> tuple[torch.Tensor, torch.Tensor]:
-        lines = voxel_line_integrals(self.volume[None], self.grid, views)[0]
+        lines = voxel_line_integrals(self.volume[None], self.grid, views)[:, 0]
         return lines * self.material.beta, lines * self.material.delta
 
 

@@ -78,15 +78,15 @@ def test_fidelity_takes_no_views_and_no_gradient(gpu):
     assert torch.autograd.grad(parts[0].sum() + parts[1].sum(), leaf)[0].shape == (0, 20, 20)
 
 
-@pytest.mark.parametrize("count", [1, 2, 3, 4])
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 5, 8, 11])
 def test_adam_is_that_of_the_reference(count, gpu):
     generator = torch.Generator().manual_seed(count)
-    sizes = [(700, 3), (1024, 1), (1, 4), (0, 2)][:count]
+    sizes = [(700, 3), (1024, 1), (1, 4), (0, 2), (33, 5), (2, 2), (0, 1), (5, 1), (64, 4), (9, 3), (1, 1)][:count]
     arrays = [[torch.randn(s, generator=generator).to(gpu) for s in sizes] for _ in range(3)]
     arrays.append([torch.rand(s, generator=generator).to(gpu) for s in sizes])
     arrays[1][0] = arrays[1][0].T.contiguous().T  # gradients may lie anyhow
     exact = [[a.double() for a in group] for group in arrays]
-    factors = adam.factors([0.01, 0.1, 1.0, 0.5][:count], 7, 1e-12).to(gpu)
+    factors = adam.factors([0.01 * 1.7**k for k in range(count)], 7, 1e-12).to(gpu)
     for _ in range(3):
         adam.step(*arrays, factors, backend="cuda")
         adam.step(*exact, factors.double(), backend="reference")
@@ -94,12 +94,30 @@ def test_adam_is_that_of_the_reference(count, gpu):
         assert all(torch.allclose(a.double(), b, rtol=2e-6, atol=2e-6) for a, b in zip(found, true))
 
 
+@pytest.mark.parametrize(("count", "launches"), [(0, 0), (1, 1), (4, 1), (5, 2), (12, 3)])
+def test_one_launch_moves_up_to_four_arrays(count, launches, gpu, monkeypatch):
+    from holosplat.fit.adam import triton_adam
+
+    sizes, usual = [], triton_adam._launch
+
+    def noted(arrays, factors):
+        sizes.append(len(arrays))
+        usual(arrays, factors)
+
+    monkeypatch.setattr(triton_adam, "_launch", noted)
+    arrays = [[torch.ones(3, device=gpu) for _ in range(count)] for _ in range(4)]
+    adam.step(*arrays, adam.factors([0.1] * count, 1, 1e-12).to(gpu), backend="cuda")
+    assert len(sizes) == launches
+    assert sum(sizes) == count
+
+
 def test_nothing_waits_for_the_device(gpu):
     measured, predicted = (a.to(gpu) for a in frames_of((2, 20, 20), 0.1))
     target = fidelity.Target(measured, LOW, SPAN, "cuda")
     leaf, moments = predicted.clone().requires_grad_(), [torch.zeros_like(predicted) for _ in range(2)]
-    factors, index = adam.factors([0.1], 1, 1e-12).to(gpu), torch.tensor([1, 0], device=gpu)
+    many = [[a.clone() for _ in range(5)] for a in (leaf.detach(), *moments)]
+    factors, index = adam.factors([0.1] * 5, 1, 1e-12).to(gpu), torch.tensor([1, 0], device=gpu)
     with Watch():
         sum(part.sum() for part in fidelity.l1_and_ssim(leaf, target[index])).backward()
-        adam.step([leaf.detach()], [leaf.grad], *([m] for m in moments), factors, backend="cuda")
-    assert not torch.equal(leaf.detach(), predicted)
+        adam.step(many[0], [leaf.grad] * 5, *many[1:], factors, backend="cuda")
+    assert not any(torch.equal(p, predicted) for p in many[0])

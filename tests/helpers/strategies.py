@@ -12,8 +12,10 @@ from torch import Tensor
 from holosplat.geometry import Views
 from holosplat.scan import Exposures, Scan
 
-NAMES = st.text(st.characters(exclude_categories=["Cs", "Cc"]), min_size=1, max_size=12)
-"""Texts with letters of any script, without control characters."""
+LETTERS = st.characters(exclude_categories=["Cs", "Cc"])
+ESCAPES = st.sampled_from(["%2F", "%25", "%", "/", ".", "a"])
+NAMES = st.text(LETTERS, min_size=1, max_size=12) | st.lists(ESCAPES, min_size=1, max_size=3).map("".join)
+"""Texts with letters of any script, without control characters; often of what escapes and paths are made of."""
 
 
 def numbers(low: float, high: float, width: int = 64) -> st.SearchStrategy[float]:
@@ -48,10 +50,14 @@ def views(draw: st.DrawFn, most: int = 4, shift_px: float = 3.0) -> Views:
     return Views(draw(rotations(count)), shifts, shape, pixel)
 
 
+VIEWS = views()
+"""What `scans` draws its poses from, where nothing else is asked."""
+
+
 @st.composite
-def scans(draw: st.DrawFn, poses: st.SearchStrategy[Views] | None = None) -> Scan:
+def scans(draw: st.DrawFn, poses: st.SearchStrategy[Views] = VIEWS) -> Scan:
     """A scan of frames of any finite values: distances, blurs, times and texts are drawn frame by frame."""
-    seen = draw(poses or views())
+    seen = draw(poses)
     count = len(seen)
     several = (draw(vectors(*bounds, count)) for bounds in ((1e-6, 100.0), (0.0, 4.0), (0.0, 1e3)))
     exposures = Exposures(seen, draw(numbers(0.2, 500.0)), *several)

@@ -16,6 +16,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import numpy as np
 import torch
 import triton
 from torch import Tensor
@@ -85,8 +86,9 @@ def operations() -> list[Callable[[], None]]:
     def cloud(channels: int) -> list[Tensor]:
         return [torch.ones(5, width, requires_grad=True) for width in (3, 3, 4, channels)]
 
-    def splat(channels: int) -> None:
+    def splat(channels: int, of_poses: bool = False) -> None:
         poses = (torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 2, dtype=torch.float64))
+        poses[0].requires_grad_(of_poses)
         splats.splat(*cloud(channels), *poses, (8, 9), 4.0, 1 / 12).sum().backward()
 
     def voxelise(channels: int) -> None:
@@ -108,15 +110,17 @@ def operations() -> list[Callable[[], None]]:
     def hologram(channels: int, blurred: bool) -> None:
         blurs = (torch.ones(1, 12), torch.ones(1, 14)) if blurred else (None, None)
         factors = (torch.ones(1, n, dtype=torch.complex64) for n in (12, 14))
-        path = OpticalPath(*factors, *blurs, True, (4, 5), (2, 2), 2)
+        path = OpticalPath(*factors, *blurs, torch.ones(1, dtype=torch.float64), True, (4, 5), (2, 2), 2, 1e-6)
         lines = torch.ones(1, channels, 12, 14, requires_grad=True)
-        waves.hologram(lines, [(0.5, 0.1)] * channels, path).sum().backward()
+        for refraction in (np.ones((channels, 2)), torch.ones(1, channels, 2, dtype=torch.float64)):
+            waves.hologram(lines, refraction, path).sum().backward()
 
     calls: list[Callable[[], None]] = [
         compare, move, lambda: wide(splat, triton_pixels), lambda: wide(voxelise, triton_boxes)
     ]  # fmt: skip
     for c in (1, 2):
-        calls += [lambda c=c: splat(c), lambda c=c: voxelise(c), lambda c=c: hologram(c, c == 1)]
+        calls += [lambda c=c: splat(c), lambda c=c: splat(c, True)]
+        calls += [lambda c=c: voxelise(c), lambda c=c: hologram(c, c == 1)]
     return calls
 
 

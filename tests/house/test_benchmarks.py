@@ -10,12 +10,12 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
+from holosplat.fit.objective import Objective
+from holosplat.workflows.settings import preset
 
 from holosplat.fit.loop import FitOptions
-from holosplat.fit.objective import Objective
 from holosplat.fit.schedule import Schedule
 from holosplat.projectors.splat import splat
-from holosplat.workflows.settings import preset
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
@@ -76,6 +76,7 @@ def test_what_the_kernels_report(scripts):
     work = kernels.Workload(2, 32, 40, (1.0, 2.0), 3.0)
     assert kernels.splat_pairs(work) > 40
     seconds = kernels.minima({"ours": kernels.calls(work), "torch": kernels.torch_calls(work, "index_add_")}, 1)
+    seconds |= kernels.minima({"poses": kernels.calls(work, of_poses=True)}, 1)
     assert all(0 < value < 60 for pair in seconds.values() for value in pair)
 
 

@@ -67,8 +67,8 @@ def test_larger_volumes_are_those_of_the_reference(channels, scales):
 def test_a_cloud_large_enough_for_all_programs_at_once():
     """Against the sum of its quarters: many records, and few of a launch's edges in common."""
     arrays, poses = scattered(100_000, 500, 1.0, 4.0), views(4)
-    whole = splat(*arrays, *poses, (512, 512), backend="cuda", checked=True)
-    parts = [splat(*(a[k::4] for a in arrays), *poses, (512, 512), backend="cuda", checked=True) for k in range(4)]
+    whole = splat(*arrays, *poses, (512, 512), backend="cuda", trusted=True)
+    parts = [splat(*(a[k::4] for a in arrays), *poses, (512, 512), backend="cuda", trusted=True) for k in range(4)]
     assert error(whole, torch.stack(parts).double().sum(0)) < FORWARD_TOLERANCE
 
 
@@ -87,10 +87,10 @@ class Step:
         self.factors = adam.factors([1e-3, 1e-3, 1e-3, 1e-4], 10, 1e-12).cuda()
 
     def __call__(self) -> Tensor:
-        lines = splat(*self.leaves, *self.poses, self.path.raster, backend="cuda", checked=True)
+        lines = splat(*self.leaves, *self.poses, self.path.raster, backend="cuda", trusted=True)
         predicted = hologram(lines, MATTER, self.path, "cuda")
         l1, ssim = fidelity.l1_and_ssim(predicted, self.target)
-        density = voxelise(*self.leaves, (40, 40, 40), backend="cuda", checked=True)
+        density = voxelise(*self.leaves, (40, 40, 40), backend="cuda", trusted=True)
         loss = (0.8 * l1 + 0.2 * ssim).mean() + 1e-3 * density.square().mean()
         gradients = torch.autograd.grad(loss, self.leaves)
         adam.step([p.data for p in self.leaves], list(gradients), *self.moments, self.factors, backend="cuda")

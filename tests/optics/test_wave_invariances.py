@@ -116,7 +116,8 @@ def test_free_space_keeps_energy_and_leads_back(image, share):
 @given(RASTERS, numbers(1.0, 40.0))
 def test_a_longer_way_only_cuts(raster, share):
     """Transfer functions are phases, or nothing where the frequency would leave the raster; never at frequency 0."""
-    for factor in fresnel_factors(raster, PITCH, at(raster, share), ENERGY, torch.complex128):
+    lam_z = torch.from_numpy(wavelength(ENERGY) * at(raster, share))
+    for factor in fresnel_factors(raster, PITCH, lam_z, torch.complex128):
         size = factor.abs()[0]
         assert bool((((size - 1).abs() < 1e-12) | (size == 0)).all())
         assert complex(factor[0, 0]) == 1
@@ -124,7 +125,7 @@ def test_a_longer_way_only_cuts(raster, share):
 
 @given(RASTERS, numbers(0.0, 3.0), numbers(0.0, 3.0))
 def test_blurs_add_in_squares(raster, first, second):
-    sigmas = np.array([first, second, np.hypot(first, second)])
+    sigmas = torch.tensor([first, second, np.hypot(first, second)], dtype=torch.float64)
     for factors in gaussian_factors(raster, sigmas, torch.float64):
         assert torch.allclose(factors[0] * factors[1], factors[2], rtol=0, atol=1e-12)
         assert factors[:, 0].tolist() == [1.0, 1.0, 1.0]

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from helpers.poses import asking, gradients, relative
 from helpers.voxels import anyhow, around, randoms
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Poses, Views
@@ -17,23 +18,6 @@ from holosplat.projectors.voxels.lattice import lattice_reference
 UNEVEN = Grid((11, 7, 9), (1.1, 0.8, 0.9), (-4.0, -2.9, -3.7))
 ALIGNED = Grid((8, 6, 10), (1.0, 1.0, 1.0), (-4.5, -2.5, -3.5))
 """Its rows are rows of pixels of a raster (10, 13), whatever the angle about y; at 0° its columns are columns."""
-
-
-def asking(views: Views) -> Poses:
-    """Poses that ask for gradients."""
-    poses = Poses.of(views)
-    leaves = [a.clone().requires_grad_() for a in (poses.rotations, poses.shifts)]
-    return Poses(leaves[0], leaves[1], views.shape, views.pixel_size)
-
-
-def gradients(poses: Poses) -> tuple[Tensor, Tensor]:
-    assert poses.rotations.grad is not None
-    assert poses.shifts.grad is not None
-    return poses.rotations.grad, poses.shifts.grad
-
-
-def relative(found: Tensor, wanted: Tensor) -> float:
-    return float((found - wanted).norm() / wanted.norm())
 
 
 def scaled(grid: Grid, views: Views, metre: float) -> tuple[Grid, Views]:

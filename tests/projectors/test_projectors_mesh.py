@@ -64,7 +64,7 @@ def joined(*meshes: TriangleMesh) -> tuple[np.ndarray, np.ndarray]:
 
 def image(mesh: TriangleMesh, views: Views, rays: int = 1) -> np.ndarray:
     """Thickness [V, H, W] of one mesh."""
-    return mesh_line_integrals(mesh.vertices, mesh.faces, np.ones((1, len(mesh.faces))), views, rays)[0].numpy()
+    return mesh_line_integrals(mesh.vertices, mesh.faces, np.ones((1, len(mesh.faces))), views, rays)[:, 0].numpy()
 
 
 def poses(count: int, shape: tuple[int, int] = SHAPE, seed: int = 0) -> Views:
@@ -194,8 +194,8 @@ def test_bodies_have_values_and_cavities():
         box_chords(views, (0, 0, 0), (9, 7, 5)),
     )
     assert got.dtype == np.float64
-    assert np.abs(got[0] - (2 * shell - 0.5 * solid)).max() < 3e-5
-    assert np.abs(got[1] - 3 * solid).max() < 3e-5
+    assert np.abs(got[:, 0] - (2 * shell - 0.5 * solid)).max() < 3e-5
+    assert np.abs(got[:, 1] - 3 * solid).max() < 3e-5
     order = np.random.default_rng(0).permutation(len(faces))
     mixed = mesh_line_integrals(vertices, faces[order], values[:, order], views, rays=1).numpy()
     assert np.abs(got - mixed).max() < 1e-12
@@ -303,7 +303,7 @@ def test_voxels_approach_the_mesh():
         fine, grid = views.refined(factor), Grid.of_views(views, factor)
         truth = image(body, fine, rays=4)
         voxels = torch.from_numpy(occupied(body, grid))
-        by_rays = voxel_line_integrals(voxels[None], grid, fine)[0].numpy()
+        by_rays = voxel_line_integrals(voxels[None], grid, fine)[:, 0].numpy()
         slices = SliceProjector(grid, fine)
         by_slices = slices.lines_out(slices.project(slices.volume_in(voxels.float()))).numpy()
         for name, lines in (("rays", by_rays), ("slices", by_slices)):

@@ -108,7 +108,7 @@ def test_path_through_a_slab(angle):
     slab[13:18] = 1  # 5 voxels: 3.5 thick
     views = Views.from_angles([angle], (5, 3), 1.0)
     truth = 61 * 0.9 if angle == 90 else 3.5 / abs(np.cos(np.deg2rad(angle)))
-    rays = voxel_line_integrals(slab[None], grid, views, step=0.25)[0]
+    rays = voxel_line_integrals(slab[None], grid, views, step=0.25)[:, 0]
     assert torch.allclose(slices_of(slab, grid, views), torch.full_like(rays, truth), rtol=1e-5)
     assert torch.allclose(rays, torch.full_like(rays, truth), rtol=3e-3)
 
@@ -136,7 +136,7 @@ def test_mass_is_kept():
     views = around(7, (7, 21), 0.3)
     assert np.allclose(slices_of(volume, ROWS, views).sum((1, 2)), mass, rtol=1e-6)
     wide = anyhow(4, (25, 27))
-    fine = voxel_line_integrals(volume[None], ROWS, wide, step=0.25, rays=4)[0]
+    fine = voxel_line_integrals(volume[None], ROWS, wide, step=0.25, rays=4)[:, 0]
     assert np.allclose(fine.sum((1, 2)), mass, rtol=2e-3)
     lattice = LatticeProjector(CUBIC, wide).project(volume.float())
     assert np.allclose(lattice.sum((1, 2)), float(volume.sum()) * 0.9**3, rtol=1e-5)
@@ -178,7 +178,7 @@ def test_rays_converge_to_gaussians_in_any_pose():
         shape, size = (27 * n, 25 * n, 29 * n), (0.8 / n, 0.9 / n, 0.85 / n)
         low = tuple(-0.5 * (count - 1) * edge for count, edge in zip(shape[::-1], size))
         grid = Grid(shape, size, low)
-        lines = voxel_line_integrals(gaussian_voxels(grid)[None], grid, views)[0]
+        lines = voxel_line_integrals(gaussian_voxels(grid)[None], grid, views)[:, 0]
         errors.append(float((lines - truth).abs().max() / truth.max()))
     assert np.all(np.abs(orders(errors) - 2) < 0.2), errors
     assert errors[-1] < 6e-3
@@ -230,7 +230,7 @@ def test_order_of_convergence_in_the_step():
 
 def test_a_detector_shift_moves_the_object_back():
     views, volume = anyhow(3, (7, 12)), randoms(1, *UNEVEN.shape)
-    seen = voxel_line_integrals(volume, UNEVEN, views)[0]
+    seen = voxel_line_integrals(volume, UNEVEN, views)[:, 0]
     assert float(seen.abs().max()) > 1
     for v, (rotation, shift) in enumerate(zip(views.rotations, views.shifts)):
         origin = np.array(UNEVEN.origin) - rotation.T @ [*shift, 0]
@@ -242,7 +242,7 @@ def test_a_detector_shift_moves_the_object_back():
 def test_whole_pixels_of_shift_roll_the_frame():
     views, volume = around(4, (7, 16)), randoms(*ROWS.shape)
     moved = replace(views, shifts=views.shifts + [2.0, 0.0])
-    for cast in (slices_of, lambda u, grid, v: voxel_line_integrals(u[None], grid, v)[0]):
+    for cast in (slices_of, lambda u, grid, v: voxel_line_integrals(u[None], grid, v)[:, 0]):
         here, there = (cast(volume, ROWS, v) for v in (views, moved))
         assert torch.allclose(there[..., :-2], here[..., 2:], atol=1e-5)
 
@@ -254,7 +254,7 @@ def test_turning_the_object_is_turning_the_view():
     turned = volume.transpose(0, 2).flip(0)  # turned[z, y, x] = volume[x, y, -z]
     for angle in (0.0, 23.0):
         here, there = Views.from_angles([angle + 90], (7, 13), 1.0), Views.from_angles([angle], (7, 13), 1.0)
-        for cast in (slices_of, lambda u, g, v: voxel_line_integrals(u[None], g, v)[0]):
+        for cast in (slices_of, lambda u, g, v: voxel_line_integrals(u[None], g, v)[:, 0]):
             assert torch.allclose(cast(volume, grid, here), cast(turned, grid, there), atol=1e-5)
 
 

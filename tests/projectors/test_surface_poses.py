@@ -8,6 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from helpers.poses import asking, gradients, relative
 from holosplat.geometry import Poses, Views
 from holosplat.projectors.surface import cpu, surface_thickness
 from holosplat.representations import SurfaceMesh
@@ -27,36 +28,24 @@ def anyhow(count: int, shape: tuple[int, int], pixel: float = 1.0, seed: int = 0
     return Views(Rotation.random(count, rng=seed).as_matrix(), shifts, shape, pixel)
 
 
-def leaves(views: Views) -> tuple[Tensor, Tensor]:
-    """Rotations, and shifts in pixels, that ask for gradients."""
-    poses = Poses.of(views)
-    return poses.rotations.clone().requires_grad_(), (poses.shifts / views.pixel_size).requires_grad_()
-
-
 def noise(*shape: int) -> Tensor:
     return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
 
 
-def gradients(views: Views, image: Tensor, backend: str = "cpu") -> tuple[Tensor, Tensor]:
+def of_a_ball(views: Views, image: Tensor, backend: str = "cpu") -> tuple[Tensor, Tensor]:
     """Of rotations and shifts, of Σ image · thickness of a ball that is partly outside."""
-    rotations, shifts = leaves(views)
+    poses = asking(views)
     vertices, faces = ball(2, 12.0, (20.0, -9.0, 40.0))
-    found = surface_thickness(vertices, faces, rotations, shifts, views.shape, backend=backend)
+    found = surface_thickness(vertices, faces, poses.rotations, poses.shifts, views.shape, backend=backend)
     (found * image).sum().backward()
-    assert rotations.grad is not None
-    assert shifts.grad is not None
-    return rotations.grad, shifts.grad
-
-
-def relative(found: Tensor, wanted: Tensor) -> float:
-    return float((found - wanted).norm() / wanted.norm())
+    return gradients(poses)
 
 
 @pytest.mark.parametrize("shape", [(33, 46), (47, 30), (1, 45), (40, 1)])
 def test_the_compiled_gradient_is_the_plain_one(shape):
     views = anyhow(4, shape)
     image = noise(4, *shape)
-    for found, wanted in zip(*(gradients(views, image, backend) for backend in ("cpu", "reference"))):
+    for found, wanted in zip(*(of_a_ball(views, image, backend) for backend in ("cpu", "reference"))):
         assert float(wanted.abs().max()) > 1
         assert relative(found, wanted) < 1e-11
 
@@ -68,16 +57,14 @@ def test_a_pose_and_the_vertices_have_one_gradient(backend):
     image = noise(1, 35, 42)
     for seed in range(3):
         views = anyhow(1, (35, 42), seed=seed)
-        rotations, shifts = leaves(views)
+        poses = asking(views)
         moved = vertices.clone().requires_grad_()
-        found = surface_thickness(moved, faces, rotations, shifts, views.shape, backend=backend)
+        found = surface_thickness(moved, faces, poses.rotations, poses.shifts, views.shape, backend=backend)
         (found * image).sum().backward()
-        assert rotations.grad is not None
-        assert shifts.grad is not None
         assert moved.grad is not None
-        rotation = rotations.detach()[0]
-        assert relative(rotation.T @ rotations.grad[0], moved.grad.T @ vertices) < 1e-10
-        assert relative(shifts.grad[0], -(rotation @ moved.grad.sum(0))[:2]) < 1e-10
+        rotation, (by_rotation, by_shift) = poses.rotations.detach()[0], gradients(poses)
+        assert relative(rotation.T @ by_rotation[0], moved.grad.T @ vertices) < 1e-10
+        assert relative(by_shift[0], -(rotation @ moved.grad.sum(0))[:2]) < 1e-10
 
 
 def weights(views: Views) -> Tensor:
@@ -108,14 +95,12 @@ def test_the_gradient_predicts_the_image_to_second_order_in_the_pixel(move, axis
     for factor in (1, 2, 4):
         views = anyhow(4, (41, 46)).refined(factor)
         ahead, back = (move(views, axis, sign * step) for sign in (1, -1))
-        rotations, shifts = (a.clone().requires_grad_() for a in (Poses.of(views).rotations, Poses.of(views).shifts))
-        summed(mesh, Poses(rotations, shifts, views.shape, views.pixel_size)).sum().backward()
+        poses = asking(views)
+        summed(mesh, poses).sum().backward()
         wanted = (summed(mesh, ahead) - summed(mesh, back)) / (2 * step)
-        assert rotations.grad is not None
-        assert shifts.grad is not None
-        by_turn = rotations.grad * torch.from_numpy(ahead.rotations - back.rotations) / (2 * step)
-        by_shift = shifts.grad * torch.from_numpy(ahead.shifts - back.shifts) / (2 * step)
-        gaps.append(relative(by_turn.sum((1, 2)) + by_shift.sum(1), wanted))
+        ends = ((ahead.rotations, back.rotations), (ahead.shifts, back.shifts))
+        parts = [g * torch.from_numpy(a - b) / (2 * step) for g, (a, b) in zip(gradients(poses), ends)]
+        gaps.append(relative(parts[0].sum((1, 2)) + parts[1].sum(1), wanted))
     assert gaps[0] < 5e-3
     assert gaps[1] < gaps[0] / 2
     assert gaps[2] < gaps[1] / 3
@@ -132,7 +117,7 @@ def test_any_number_of_threads_gives_the_same_bits():
     found = []
     for threads in (1, 2, 5):
         torch.set_num_threads(threads)
-        found.append(gradients(views, image))
+        found.append(of_a_ball(views, image))
     torch.set_num_threads(1)
     assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0], other))
 
@@ -140,9 +125,9 @@ def test_any_number_of_threads_gives_the_same_bits():
 def test_nothing_is_computed_that_is_not_asked_for(monkeypatch):
     vertices, faces = ball(1, 9.0)
     views = anyhow(2, (33, 46))
-    rotations, shifts = leaves(views)
-    plain = surface_thickness(vertices, faces, rotations.detach(), shifts.detach(), views.shape)
-    asked = surface_thickness(vertices, faces, rotations, shifts, views.shape)
+    poses, known = asking(views), Poses.of(views)
+    plain = surface_thickness(vertices, faces, known.rotations, known.shifts, views.shape)
+    asked = surface_thickness(vertices, faces, poses.rotations, poses.shifts, views.shape)
     assert torch.equal(plain, asked)
     assert asked.requires_grad
     assert not plain.requires_grad
@@ -152,7 +137,7 @@ def test_nothing_is_computed_that_is_not_asked_for(monkeypatch):
 
     monkeypatch.setattr(cpu, "pose_gradients", refuse)
     leaf = vertices.clone().requires_grad_()
-    surface_thickness(leaf, faces, rotations.detach(), shifts.detach(), views.shape).sum().backward()
+    surface_thickness(leaf, faces, known.rotations, known.shifts, views.shape).sum().backward()
     assert leaf.grad is not None
     with pytest.raises(AssertionError, match="were computed"):
         asked.sum().backward()
@@ -163,13 +148,10 @@ def test_gradients_of_a_scan_in_metres_scale():
     vertices, faces = ball(2, 9.0)
     found = []
     for pixel in (1.0, 2.5e-7):
-        views = anyhow(2, (33, 46), pixel)
-        poses = Poses.of(views)
-        rotations, shifts = (a.clone().requires_grad_() for a in (poses.rotations, poses.shifts))
-        lines = SurfaceMesh(vertices, faces, pixel, 1.0, 0.5).project(Poses(rotations, shifts, views.shape, pixel))
+        poses = asking(anyhow(2, (33, 46), pixel))
+        lines = SurfaceMesh(vertices, faces, pixel, 1.0, 0.5).project(poses)
         (lines[1] * noise(2, 33, 46)).sum().backward()
-        assert rotations.grad is not None
-        assert shifts.grad is not None
-        found.append((rotations.grad / pixel, shifts.grad))
+        by_rotation, by_shift = gradients(poses)
+        found.append((by_rotation / pixel, by_shift))
     for pixels, metres in zip(*found):
         assert relative(metres, pixels) < 1e-9

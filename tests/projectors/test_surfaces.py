@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from holosplat.fit.surfaces import SurfaceFit, fit_surfaces
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
-from holosplat.fit.surfaces import SurfaceFit, fit_surfaces
 from holosplat.geometry import Grid, Poses, Views
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.mesh import TriangleMesh
@@ -108,7 +108,7 @@ def test_it_agrees_with_the_other_projector_to_second_order_in_the_pixel():
     errors = []
     for factor in (1, 2, 4):
         views = poses(3).refined(factor)
-        exact = mesh_line_integrals(mesh.vertices, mesh.faces, np.ones((1, len(mesh.faces))), views, 16 // factor)[0]
+        exact = mesh_line_integrals(mesh.vertices, mesh.faces, np.ones((1, len(mesh.faces))), views, 16 // factor)[:, 0]
         errors.append(float((thickness(*tensors(mesh), views) - exact).abs().mean()))
     assert errors[0] < 0.01 * 2 * 12
     assert errors[0] / errors[1] > 2.5  # the rims, where the slope is infinite, fall with the power 3/2 and their area
@@ -164,7 +164,7 @@ def test_the_gradient_converges_to_finite_differences(projector):
             if projector == "this":
                 return thickness(x, faces, views) * weights(views)
             ones = np.ones((1, len(faces)))
-            return mesh_line_integrals(x.numpy(), mesh.faces, ones, views, 8 // factor)[0] * weights(views)
+            return mesh_line_integrals(x.numpy(), mesh.faces, ones, views, 8 // factor)[:, 0] * weights(views)
 
         step = 0.05
         wanted = (value(vertices + step * along) - value(vertices - step * along)).sum() * area / (2 * step)

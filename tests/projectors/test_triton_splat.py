@@ -135,7 +135,7 @@ def test_no_views(gpu):
 @pytest.mark.parametrize("array", range(4))
 def test_what_is_no_number_is_left_out(array, draw, gpu):
     """A Gaussian with a NaN or an infinite parameter touches no pixel, has no gradient, and spoils no other's."""
-    arrays, checked = cloud("ordinary", 2, 20), {"checked": True}
+    arrays, trusted = cloud("ordinary", 2, 20), {"trusted": True}
     spoiled = [a.clone() for a in arrays]
     spoiled[array][3], spoiled[array][5, 1] = math.nan, math.inf
     for a in arrays:
@@ -143,7 +143,7 @@ def test_what_is_no_number_is_left_out(array, draw, gpu):
     arrays[1][[3, 5]], views = 1.0, [a.to(gpu) for a in poses(3)]
 
     def drawn(a, b):
-        return splat(*a, *views, DETECTOR, backend=b, **checked) if draw is draw_views else draw(a, b, **checked)
+        return splat(*a, *views, DETECTOR, backend=b, **trusted) if draw is draw_views else draw(a, b, **trusted)
 
     value, gradients = value_and_gradients(drawn, spoiled, "cuda", gpu)
     wanted, wanted_gradients = value_and_gradients(drawn, arrays, "reference", gpu)
@@ -177,9 +177,9 @@ def test_nothing_waits_for_the_device(draw, gpu):
     views = [a.to(gpu) for a in poses(3)]
     with Watch():
         if draw is draw_views:
-            value = splat(*leaves, *views, DETECTOR, backend="cuda", checked=True)
+            value = splat(*leaves, *views, DETECTOR, backend="cuda", trusted=True)
         else:
-            value = voxelise(*leaves, VOLUME, backend="cuda", checked=True)
+            value = voxelise(*leaves, VOLUME, backend="cuda", trusted=True)
         value.sum().backward()
     assert leaves[0].grad is not None
 

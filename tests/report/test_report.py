@@ -54,9 +54,9 @@ def content(**changes):
     """A full report of a small scene; `changes` replace fields."""
     truth, found = scene()
     views = Views.from_angles([10.0, 80.0], (20, 28), PITCH)
-    dephasing = [np.stack([v.delta.sum(axis=0)] * 2) * PITCH for v in (found, truth)]
-    absorption = [np.stack([v.beta.sum(axis=0)] * 2) * PITCH for v in (found, truth)]
-    predicted, measured = (1 + 2e10 * np.stack([gaussian_laplace(d, 1.5) for d in maps]) for maps in dephasing)
+    projected_delta = [np.stack([v.delta.sum(axis=0)] * 2) * PITCH for v in (found, truth)]
+    projected_beta = [np.stack([v.beta.sum(axis=0)] * 2) * PITCH for v in (found, truth)]
+    predicted, measured = (1 + 2e10 * np.stack([gaussian_laplace(d, 1.5) for d in maps]) for maps in projected_delta)
     scores = image_scores(predicted, measured, intensity_range(measured))
     labels = view_labels(views)
     steps = np.arange(0, 100, 10)
@@ -67,7 +67,9 @@ def content(**changes):
         "energy_kev": 11.0,
         "pixel_size": PITCH,
         "held_out": HeldOutViews(measured, predicted, labels, scores),
-        "projections": ProjectedMaps(absorption[0], dephasing[0], labels, absorption[1], dephasing[1]),
+        "projections": ProjectedMaps(
+            projected_beta[0], projected_delta[0], labels, projected_beta[1], projected_delta[1]
+        ),
         "volume_scores": volume_scores(found, truth),
         "history": {
             "step": steps,
@@ -189,7 +191,7 @@ def test_bare_report_says_what_is_absent(bare_page):
 def test_any_part_may_be_absent(changes, figures):
     if changes.get("truth", 1) is None and "projections" not in changes:
         maps = content().projections
-        changes = changes | {"projections": ProjectedMaps(maps.absorption, maps.dephasing, maps.labels)}
+        changes = changes | {"projections": ProjectedMaps(maps.projected_beta, maps.projected_delta, maps.labels)}
     assert len(Page(render_page(content(**changes))).sources) == figures
 
 
@@ -244,7 +246,7 @@ def test_mismatched_content_is_refused():
         HeldOutViews(held.measured, held.predicted, held.labels[:1], held.scores)
     maps = content().projections
     with pytest.raises(InputError, match="or neither"):
-        ProjectedMaps(maps.absorption, maps.dephasing, maps.labels, true_dephasing=maps.dephasing)
+        ProjectedMaps(maps.projected_beta, maps.projected_delta, maps.labels, true_projected_delta=maps.projected_delta)
 
 
 def test_banner_has_its_size():

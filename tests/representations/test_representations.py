@@ -71,8 +71,8 @@ def test_projections_are_the_line_integrals_of_the_clouds_own_density(channels):
         lines = voxel_line_integrals(density, grid, views, rays=3)
         B, D = cloud.project(views)
     assert B.shape == D.shape == (4, *SHAPE)
-    assert largest_difference(D, lines[0] * DELTA) < 0.01
-    assert largest_difference(B, lines[-1] * BETA) < 0.01
+    assert largest_difference(D, lines[:, 0] * DELTA) < 0.01
+    assert largest_difference(B, lines[:, -1] * BETA) < 0.01
 
 
 def test_line_integrals_are_in_metres():

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 from torch.nn.functional import avg_pool3d, pad
 
+from helpers.poses import asking, gradients, relative
 from holosplat.geometry import Grid, Poses, Views
 from holosplat.projectors.voxels.lattice import lattice_reference
 from holosplat.representations import Encoding, Matter, Network, NeuralField, VoxelGrid, VoxelLines
@@ -30,24 +31,6 @@ def any_pose(count: int = 3, shape: tuple[int, int] = (21, 27)) -> Views:
 
 
 POSES = {"axis": about_axis, "any": any_pose}
-
-
-def asking(views: Views) -> Poses:
-    """Poses that ask for gradients."""
-    poses = Poses.of(views)
-    return replace(
-        poses, rotations=poses.rotations.clone().requires_grad_(), shifts=poses.shifts.clone().requires_grad_()
-    )
-
-
-def gradients(poses: Poses) -> tuple[Tensor, Tensor]:
-    assert poses.rotations.grad is not None
-    assert poses.shifts.grad is not None
-    return poses.rotations.grad, poses.shifts.grad
-
-
-def relative(found: Tensor, wanted: Tensor) -> float:
-    return float((found - wanted).detach().norm() / wanted.detach().norm())
 
 
 def numbers(*shape: int, seed: int = 0) -> Tensor:

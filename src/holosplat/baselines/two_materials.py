@@ -188,7 +188,7 @@ def _lines(scan: Scan, values: Tensor, grid: Grid, backend: Backend) -> tuple[In
     """The instrument of a scan, and the line integrals [V, C, H, W] in metres that it wants of `values`."""
     instrument = Instrument(scan.exposures, fringe_sampling(scan.exposures), backend=backend)
     if backend == "reference":
-        return instrument, voxel_line_integrals(values, grid, instrument.views, step=1.0).transpose(0, 1)
+        return instrument, voxel_line_integrals(values, grid, instrument.views, step=1.0)
     return instrument, VoxelLines(grid, instrument.views)(values)
 
 

@@ -144,7 +144,7 @@ class Fit:
         return self.stopped_early or self.schedule.share(self.step, self.seconds) >= 1
 
     def result(self) -> Model:
-        """The best model by the validation frames or by the optimiser, or else the last one; it carries no gradients."""
+        """The best model by the validation frames or the optimiser, or else the last one; it carries no gradients."""
         found = self.trainable.optimiser.best()
         if found is None:
             judged = self.plan.judge is not None and self._best.step > 0

@@ -50,7 +50,7 @@ class Problem:
     free: tuple[str, ...] | None = None
 
     def loss(self, model: Model, batch: Batch) -> tuple[Tensor, Tensor, list[str]]:
-        """The loss of `model`, with its gradient; the values [1 + K] of the loss and its parts, detached; their names."""
+        """The loss of `model`; the values [1 + K] of the loss and its parts, detached; and their names."""
         parts = [part for term in self.terms for part in term(model, batch)]
         first, *others = [part.weight * part.value for part in parts if part.weight is not None]
         loss = sum(others, start=first)

@@ -24,7 +24,7 @@ class ProjectedGradient:
 
     Birgin, Martínez & Raydan (2000), section 2, along the projection arc: the value may rise for a while, but not
     above the last few. Step lengths of Barzilai & Borwein (1988), eqs. 5 and 6 in turn (Dai & Fletcher 2005). After a
-    step, the leaf is the next point to be tried; `best` has the best one so far. upper: the bound, which may be infinite;
+    step, the leaf is the next point to be tried; `best` has the best one so far. upper: the bound, or infinity;
     scale: units of the parameter in which steps are equally long, broadcast to its shape.
     """
 
@@ -51,6 +51,7 @@ class ProjectedGradient:
     def apply(self, loss: Tensor) -> None:
         """Judge the leaf by its loss, accept or shorten the step, and make the leaf the next point to be tried."""
         leaf, value = self._leaves[self._name], float(loss)
+        assert leaf.grad is not None
         trial, slope = leaf.detach() / self._scale, leaf.grad * self._scale
         leaf.grad = None
         if self._point is None:

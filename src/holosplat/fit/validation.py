@@ -30,9 +30,7 @@ class Judge:
         with torch.no_grad():
             predicted = replace(model, instrument=self._instrument, alignment=None, light=None).frames().cpu()
         a, b = ((f - self._low) / self._span for f in (predicted, torch.from_numpy(self.scan.frames)))
-        ssim, frcm = (
-            1 - float(term(a, b).mean()) for term in (comparisons.one_minus_ssim, comparisons.one_minus_frcm)
-        )
+        ssim, frcm = (1 - float(term(a, b).mean()) for term in (comparisons.one_minus_ssim, comparisons.one_minus_frcm))
         columns = {"val_l1": float(comparisons.l1(a, b).mean()), "val_ssim": ssim, "val_frcm": frcm}
         return 1 - 0.5 * (ssim + frcm), columns
 

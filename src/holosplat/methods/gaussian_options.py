@@ -15,6 +15,9 @@ from ..fit.schedule import Schedule
 from ..fit.terms import Objective
 from .ground import ExtraTerm
 
+Backend = Literal["auto", "cpu", "cuda", "reference"]
+"""What may be asked to compute a fit."""
+
 
 @dataclass(frozen=True)
 class GaussianRates:
@@ -54,7 +57,7 @@ class FitOptions:
     density: DensityControl = field(default_factory=DensityControl)
     terms: tuple[ExtraTerm, ...] = ()
     """Further terms by name."""
-    backend: Literal["auto", "cpu", "cuda", "reference"] = "auto"
+    backend: Backend = "auto"
     """What computes the fit."""
 
 

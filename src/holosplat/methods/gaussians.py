@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 
@@ -18,10 +18,9 @@ from ..fit.validation import split_validation
 from ..geometry import Grid
 from ..matter import MaterialPrior, Matter
 from ..optics.noise import noise_share
-from ..representations import GaussianCloud
+from ..representations import GaussianCloud, Stored
 from ..scan import Scan
-from ..volume import Object
-from .gaussian_options import FitOptions, GaussianOptions
+from .gaussian_options import Backend, FitOptions, GaussianOptions
 from .ground import Ground, ground
 from .method import Stage, Task
 from .start import starting_cloud
@@ -37,7 +36,7 @@ class Gaussians(GaussianOptions):
         """One: the start, and the fit."""
         return (GaussianStage(self),)
 
-    def on_backend(self, backend: Literal["auto", "cpu", "cuda", "reference"]) -> Gaussians:
+    def on_backend(self, backend: Backend) -> Gaussians:
         """The same method computed by `backend`; the start runs on the CPU, or in plain torch."""
         volume = replace(self.volume, backend="reference" if backend == "reference" else "cpu")
         return replace(self, fit=replace(self.fit, backend=backend), volume=volume)
@@ -56,14 +55,14 @@ class GaussianStage:
     options: Gaussians
     name: str = "fit"
 
-    def start(self, task: Task, before: Object | None) -> Object:
+    def start(self, task: Task, before: Stored | None) -> GaussianCloud:
         """The starting cloud."""
         if resolve(self.options.fit.backend) == "cuda":
             resolve("cpu")  # the start and the judging run there
         train, _ = split_validation(task.scan, self.options.fit.schedule.validation_views)
         return starting_cloud(replace(task, scan=train), self.options)
 
-    def fit(self, task: Task, start: Object) -> Fit:
+    def fit(self, task: Task, start: Stored) -> Fit:
         """The fit of the cloud to the training frames."""
         assert isinstance(start, GaussianCloud)
         return gaussian_fit(task.scan, start, resolved(self.options.fit, task.prior, start.matter), task.seed)

@@ -30,7 +30,9 @@ class ExtraTerm:
     def __post_init__(self) -> None:
         if self.name not in TERMS:
             raise InputError(f"a term must be one of {', '.join(TERMS)}, but it is {self.name!r}.")
-        require(self.weight >= 0, f"the weight of the term {self.name} must not be negative, but it is {self.weight:g}.")
+        require(
+            self.weight >= 0, f"the weight of the term {self.name} must not be negative, but it is {self.weight:g}."
+        )
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,8 @@ from typing import ClassVar, Protocol, runtime_checkable
 
 from ..fit.loop import Fit
 from ..matter import MaterialPrior
+from ..representations import KINDS, Stored
 from ..scan import Scan
-from ..volume import Object
 
 Progress = Callable[[str, float], None]
 """Called with (stage, fraction done of it)."""
@@ -40,14 +40,16 @@ class Task:
 class Stage(Protocol):
     """A piece of a reconstruction: an Object is made, and then perhaps fitted."""
 
-    name: str
-    """For progress and summaries."""
+    @property
+    def name(self) -> str:
+        """For progress and summaries."""
+        ...
 
-    def start(self, task: Task, before: Object | None) -> Object:
+    def start(self, task: Task, before: Stored | None) -> Stored:
         """The Object that this stage begins with; before: what the stage before ended with. It cannot be resumed."""
         ...
 
-    def fit(self, task: Task, start: Object) -> Fit | None:
+    def fit(self, task: Task, start: Stored) -> Fit | None:
         """The fit of `start`, made ready, or None where nothing is fitted."""
         ...
 
@@ -63,22 +65,26 @@ class Method(Protocol):
         ...
 
 
-def finished(fit: Fit) -> Object:
+def finished(fit: Fit) -> Stored:
     """The object that a fit ended with, in main memory."""
     found = fit.result().object
-    move = getattr(found, "on", None)
-    return move("reference" if fit.backend == "reference" else "cpu") if move else found
+    assert isinstance(found, tuple(KINDS.values()))
+    return found.on("reference" if fit.backend == "reference" else "cpu")
 
 
-def solve(method: Method, task: Task) -> Object:
+def run_quietly(fit: Fit, report: Callable[[float], None]) -> Stored:
+    """Run a fit to its end without keeping records; what it ended with. Ctrl-C is passed on."""
+    fit.run(lambda record: report(min(1.0, fit.schedule.share(fit.step, fit.seconds))))
+    return finished(fit)
+
+
+def solve(method: Method, task: Task) -> Stored:
     """Run all stages of `method` in memory, without a folder; Ctrl-C is passed on."""
-    found: Object | None = None
+    found: Stored | None = None
     for stage in method.stages():
         found = stage.start(task, found)
         fit = stage.fit(task, found)
         if fit is not None:
-            report, share = task.report(stage.name), fit.schedule.share
-            fit.run(lambda record, fit=fit: report(min(1.0, share(fit.step, fit.seconds))))
-            found = finished(fit)
+            found = run_quietly(fit, task.report(stage.name))
     assert found is not None
     return found

@@ -25,12 +25,11 @@ from ..fit.trainable import Trainable
 from ..geometry import Grid, Views
 from ..matter import Matter
 from ..model import Model
-from ..representations import NeuralField, VoxelGrid
+from ..representations import NeuralField, Stored, VoxelGrid
 from ..representations.neural_field import Network, grown
 from ..scan import Scan
-from ..volume import Object
 from .ground import ExtraTerm, ground
-from .method import Stage, Task
+from .method import Stage, Task, run_quietly
 from .voxels import HolographicStage
 
 WARM_UP, THROUGH_WAVES = "field for the retrieved thickness", "field through the waves"
@@ -86,7 +85,9 @@ class NeuralFit:
     """Further terms by name, through the waves."""
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "warmup_steps", "shrinkage", "weight", "noise_weight", "hull", "prune_every", "empty", "margin")
+        at_least(
+            self, 0, "warmup_steps", "shrinkage", "weight", "noise_weight", "hull", "prune_every", "empty", "margin"
+        )
         at_least(self, 1, "warmup_rays", "probes")
         require(self.rate > 0, f"rate must be positive, but it is {self.rate:g}.")
         steps = self.warmup_steps + self.schedule.steps
@@ -120,14 +121,14 @@ class NeuralStage:
     options: NeuralFit
     name: str = THROUGH_WAVES
 
-    def start(self, task: Task, before: Object | None) -> NeuralField:
+    def start(self, task: Task, before: Stored | None) -> NeuralField:
         """The field after its warm-up, in the visual hull of what came before."""
         assert isinstance(before, VoxelGrid)
         matter = before.matter if task.prior.fixes_ratio or not before.matter.single else before.matter.freed()
         thickness = before.project(task.scan.views).channels[:, 0].detach()
         return warmed_up(task, matter, thickness, self.options)
 
-    def fit(self, task: Task, start: Object) -> Fit | None:
+    def fit(self, task: Task, start: Stored) -> Fit | None:
         """The fit to the frames, or None for no steps."""
         assert isinstance(start, NeuralField)
         return waves_fit(task.scan, start, self.options, task.seed) if self.options.schedule.steps else None
@@ -149,9 +150,7 @@ def warmed_up(task: Task, matter: Matter, thickness: Tensor, options: NeuralFit)
     if options.warmup_steps == 0:
         return field
     fit = _warm_up(task.scan, field, (thickness / field.pitch).float(), options, task.seed)
-    report = task.report(WARM_UP)
-    fit.run(lambda record: report(min(1.0, fit.schedule.share(fit.step, fit.seconds))))
-    found = fit.result().object
+    found = run_quietly(fit, task.report(WARM_UP))
     assert isinstance(found, NeuralField)
     return found
 

@@ -12,8 +12,7 @@ from ..checks import InputError
 from ..geometry import Grid
 from ..matter import Matter
 from ..optics.retrieval import RETRIEVALS
-from ..representations import VoxelGrid
-from ..volume import Object
+from ..representations import Stored, VoxelGrid
 from .method import Stage, Task
 from .start import assumed_material
 from .svmbir import svmbir_volume
@@ -55,7 +54,7 @@ class PerViewStage:
     options: PerView
     name: str = "tomography"
 
-    def start(self, task: Task, before: Object | None) -> VoxelGrid:
+    def start(self, task: Task, before: Stored | None) -> VoxelGrid:
         """Occupancies of the known material, or of the one that the frames suggest."""
         scan, how = task.scan, self.options
         material = assumed_material(scan, task.prior, task.on_progress)
@@ -70,5 +69,5 @@ class PerViewStage:
             values = TOMOGRAPHIES[how.tomography](thickness, scan.views, grid, upper, report)
         return VoxelGrid(values[None], grid, Matter.one(*material))
 
-    def fit(self, task: Task, start: Object) -> None:
+    def fit(self, task: Task, start: Stored) -> None:
         """Nothing is fitted."""

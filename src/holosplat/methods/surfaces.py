@@ -23,13 +23,13 @@ from ..geometry import Grid
 from ..matter import MaterialPrior
 from ..optics.noise import noise_share
 from ..optics.sampling import fringe_sampling
-from ..representations import GaussianCloud, SurfaceMesh, isosurface
+from ..representations import GaussianCloud, Stored, SurfaceMesh, isosurface
 from ..representations.isosurface import adjacency, neighbour_mean
 from ..scan import Scan
-from ..volume import Object
+from .gaussian_options import Backend
 from .gaussians import Gaussians
 from .ground import ExtraTerm, ground
-from .method import Progress, Stage, Task, finished, quiet
+from .method import Progress, Stage, Task, quiet, run_quietly
 
 STAGE = "surfaces"
 VERTICES = "object.vertices"
@@ -104,12 +104,14 @@ class Surfaces(SurfaceOptions):
         """Those of the Gaussians, and the surfaces."""
         return (*self.gaussians.stages(), SurfaceStage(self))
 
+    def on_backend(self, backend: Backend) -> Surfaces:
+        """The same method whose Gaussians are computed by `backend`; surfaces are fitted on the CPU."""
+        return replace(self, gaussians=self.gaussians.on_backend(backend))
+
     def with_effort(self, effort: float) -> Surfaces:
         """The same method with `effort` times the steps, at least one."""
         schedule = replace(self.fit.schedule, steps=max(1, round(effort * self.fit.schedule.steps)))
-        return replace(
-            self, gaussians=self.gaussians.with_effort(effort), fit=replace(self.fit, schedule=schedule)
-        )
+        return replace(self, gaussians=self.gaussians.with_effort(effort), fit=replace(self.fit, schedule=schedule))
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,7 @@ class SurfaceStage:
     options: SurfaceOptions
     name: str = STAGE
 
-    def start(self, task: Task, before: Object | None) -> SurfaceMesh:
+    def start(self, task: Task, before: Stored | None) -> SurfaceMesh:
         """The surfaces cut out of Gaussians."""
         task.on_progress(f"{STAGE}: extraction", 0.0)
         require(
@@ -129,7 +131,7 @@ class SurfaceStage:
         assert isinstance(before, GaussianCloud)
         return extract_surfaces(before, task.scan, self.options.extraction)
 
-    def fit(self, task: Task, start: Object) -> Fit:
+    def fit(self, task: Task, start: Stored) -> Fit:
         """The fit of the surfaces to the training frames."""
         assert isinstance(start, SurfaceMesh)
         return surface_fit(task.scan, start, self.options.fit, task.seed)
@@ -155,7 +157,7 @@ def extract_surfaces(cloud: GaussianCloud, scan: Scan, options: Extraction = Ext
 
 
 def refine_surfaces(
-    cloud: GaussianCloud,
+    cloud: Stored,
     scan: Scan,
     options: SurfaceOptions = SurfaceOptions(),
     on_progress: Progress = quiet,
@@ -163,8 +165,7 @@ def refine_surfaces(
     """Surfaces cut out of `cloud` and fitted to the training frames of `scan`; errors: of both parts."""
     stage, task = SurfaceStage(options), Task(scan.train(), MaterialPrior.unknown(), 0, on_progress)
     fit = stage.fit(task, stage.start(task, cloud))
-    fit.run(lambda record: on_progress(STAGE, fit.schedule.share(fit.step, fit.seconds)))
-    found = finished(fit)
+    found = run_quietly(fit, task.report(STAGE))
     assert isinstance(found, SurfaceMesh)
     return found
 
@@ -202,8 +203,9 @@ def _bending(train: Scan, start: SurfaceMesh, objective: Objective) -> list[Term
     count = len(start.vertices)
     away = csr_array(eye_array(count) - neighbour_mean(start.faces.numpy(), count))
     twice = csr_array(away @ away)
-    arrays = (torch.from_numpy(a.astype(kind)) for a, kind in ((twice.indptr, np.int64), (twice.indices, np.int64)))
-    operator = torch.sparse_csr_tensor(*arrays, torch.from_numpy(twice.data), twice.shape, check_invariants=True)
+    starts, columns = (torch.from_numpy(a.astype(np.int64)) for a in (twice.indptr, twice.indices))
+    values = torch.from_numpy(twice.data)
+    operator = torch.sparse_csr_tensor(starts, columns, values, twice.shape, check_invariants=True)
     return [Bending(weight, operator)]
 
 

@@ -20,9 +20,8 @@ from ..fit.terms.object import VoxelVariation
 from ..geometry import Grid
 from ..matter import Matter
 from ..optics.sampling import fringe_sampling
-from ..representations import VoxelGrid
+from ..representations import Stored, VoxelGrid
 from ..scan import Scan
-from ..volume import Object
 from .ground import ExtraTerm, ground
 from .method import Stage, Task
 from .start import assumed_material
@@ -52,14 +51,14 @@ class HolographicStage:
     options: HolographicTV
     name: str = "holographic total variation"
 
-    def start(self, task: Task, before: Object | None) -> VoxelGrid:
+    def start(self, task: Task, before: Stored | None) -> VoxelGrid:
         """Occupancies of the one material that all matter is taken for."""
         material = assumed_material(task.scan, task.prior, task.on_progress, self.options.backend)
         bounded = replace(self.options, upper=task.prior.bound(1.0))
         values, grid = holographic_tv(task.scan, material, bounded, task.on_progress)
         return VoxelGrid(values[None], grid, Matter.one(*material))
 
-    def fit(self, task: Task, start: Object) -> None:
+    def fit(self, task: Task, start: Stored) -> None:
         """Nothing is fitted."""
 
 
@@ -100,7 +99,7 @@ class VoxelFit:
         require(self.smoothing > 0, f"smoothing must be positive, but it is {self.smoothing}.")
         require(
             self.schedule.views_per_step == 0,
-            f"voxels look at all frames in every step, but views_per_step is {self.schedule.views_per_step}; leave it 0.",
+            f"voxels need views_per_step = 0, all frames in every step, but it is {self.schedule.views_per_step}.",
         )
 
 
@@ -135,7 +134,7 @@ class VoxelStage:
         """For progress and summaries."""
         return "voxels through the waves" + (", coarse" if self.coarse else "")
 
-    def start(self, task: Task, before: Object | None) -> VoxelGrid:
+    def start(self, task: Task, before: Stored | None) -> VoxelGrid:
         """What came before on the voxels of this stage, with δ and β apart where nothing is known."""
         assert isinstance(before, VoxelGrid)
         free = before.matter.single and not task.prior.fixes_ratio
@@ -143,7 +142,7 @@ class VoxelStage:
         grid = (before.freed() if free else before).resampled(Grid.of_views(task.scan.views, refine))
         return grid.with_parameters({"values": grid.values.detach().float()})
 
-    def fit(self, task: Task, start: Object) -> Fit:
+    def fit(self, task: Task, start: Stored) -> Fit:
         """The fit of the voxels to the training frames."""
         assert isinstance(start, VoxelGrid)
         options = replace(self.options, upper=task.prior.bound(self.options.upper) if start.matter.single else 0.0)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..checks import require
-from ..geometry import Poses, Views
+from ..geometry import Poses
 from ..scan import Exposures
 
 WIDTHS: dict[str, tuple[int, ...]] = {"turns": (3,), "shifts": (2,), "stretches": (), "blurs": ()}
@@ -23,7 +23,7 @@ class Alignment:
     turns: [V, 3] rotation vectors ω [rad] about the lab axes; shifts: [V, 2] of the detector (x, y) [pixels];
     stretches: [V] of the propagation distance, as a share of it; blurs: [V] of the point-spread function's width
     [pixels]. The exposures become `R' = exp([ω]×) R`, `s' = s + p e`, `z' = z (1 + ε)`, `σ' = |σ + b|`, as
-    `beamline.misalignment` has them. What is None costs nothing. Errors: `InputError` if the shapes do not fit together.
+    `beamline.misalignment` has them. What is None costs nothing. Errors: `InputError` for shapes that do not fit.
     """
 
     turns: Tensor | None = None

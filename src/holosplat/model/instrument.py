@@ -55,11 +55,7 @@ class Instrument:
             "use fewer or smaller frames.",
         )
         ratio = far_from_edges(exposures.energy_kev, exposures.reference_energy) if dispersion is None else dispersion
-        factors = wavenumber(exposures.energy_kev)[:, None, None] * ratio.reshape(len(exposures), -1, 2)
-        self._factors = torch.from_numpy(factors).to(self.device)
-        self._alike: list[tuple[float, float]] | None = None
-        if len(factors) == 0 or bool((factors == factors[:1]).all()):
-            self._alike = [(float(of_delta), float(of_beta)) for of_delta, of_beta in factors[:1].reshape(-1, 2)]
+        self._factors = _factors(wavenumber(exposures.energy_kev), ratio, self.device)
         self.path = self._path(None, None, None)
 
     @cached_property
@@ -93,15 +89,16 @@ class Instrument:
         return hologram(lines.channels.to(self.device, self.dtype), refraction, path, self.backend)
 
     def refraction(self, materials: Sequence[tuple[float, float]], index: Tensor | None = None) -> Refraction:
-        """`(k δ, k β)` of each channel, as `hologram` takes it: [C, 2], or [V, C, 2] where energies differ.
+        """`(k δ, k β)` of each channel as `hologram` takes them: [C, 2], or [K, C, 2] where they differ between views.
 
-        materials: (δ, β) of each channel at the reference energy; index: views [V] on the instrument's device.
+        materials: (δ, β) of each channel at the reference energy; index: views [K] on the instrument's device.
         """
         channels = [min(c, self._factors.shape[1] - 1) for c in range(len(materials))]
-        if self._alike is not None:
-            return [(self._alike[c][0] * delta, self._alike[c][1] * beta) for c, (delta, beta) in zip(channels, materials)]
+        if isinstance(self._factors, np.ndarray):
+            return [(f[0] * m[0], f[1] * m[1]) for f, m in zip(self._factors[0, channels].tolist(), materials)]
         factors = self._factors if index is None else self._factors.index_select(0, index)
-        return factors[:, channels] * torch.tensor(materials, dtype=torch.float64, device=self.device)
+        pairs = [factors[:, c].unbind(1) for c in channels]
+        return torch.stack([torch.stack((f * d, g * b), dim=1) for (f, g), (d, b) in zip(pairs, materials)], dim=1)
 
     def _path(self, index: Tensor | None, distance: Tensor | None, psf_sigma_px: Tensor | None) -> OpticalPath:
         """The path of the views `index` at other distances, or through other point-spread functions."""
@@ -121,3 +118,12 @@ class Instrument:
     def image(self, B: Tensor, D: Tensor, index: np.ndarray | None = None) -> Tensor:
         """Frames [V, H, W] from line integrals B, D [V, H', W'] in metres on `self.views` (or its views `index`)."""
         return self.frames(LineIntegrals.of(B, D), index)
+
+
+def _factors(wavenumbers: np.ndarray, dispersion: np.ndarray, device: torch.device) -> np.ndarray | Tensor:
+    """k [V] times the dispersion [V, 2] or [V, C, 2] of δ and β: [1, C, 2] if that is the same in all views.
+
+    Else a tensor [V, C, 2] on `device`. C is 1 where all channels are alike.
+    """
+    factors = wavenumbers[:, None, None] * dispersion.reshape(len(wavenumbers), -1, 2)
+    return factors[:1] if (factors == factors[:1]).all() else torch.from_numpy(factors).to(device)

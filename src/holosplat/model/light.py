@@ -25,7 +25,8 @@ class LightField:
         fits = self.coefficients.ndim == 2 and self.modes.ndim == 3
         require(
             fits and self.coefficients.shape[1] == len(self.modes),
-            f"a light field needs coefficients (V, K) and modes (K, h, w), but got {tuple(self.coefficients.shape)} and "
+            f"a light field needs coefficients (V, K) and modes (K, h, w), but "
+            f"has {tuple(self.coefficients.shape)} and "
             f"{tuple(self.modes.shape)}.",
         )
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from ..checks import require
 from ..geometry import Poses, Views
 from ..scan import Exposures
-from ..volume import Component, LineIntegrals, Object
+from ..volume import Component, LineIntegrals, Object, TrainableObject
 from .alignment import Alignment
 from .instrument import Instrument
 from .light import LightField
@@ -41,7 +41,7 @@ class Model:
         for name, part in (("alignment", self.alignment), ("light", self.light and self.light.coefficients)):
             require(
                 part is None or len(part) == count,
-                f"the {name} of a model must be of its {count} exposures, but it is of {0 if part is None else len(part)}.",
+                f"the {name} of a model must be of all its {count} exposures; make it anew for them.",
             )
 
     def parameters(self) -> dict[str, Tensor]:
@@ -70,13 +70,16 @@ class Model:
         delay: how long after each exposure's time [s] the matter is looked at.
         """
         times = self.instrument.times
-        images = self._seen(times[0] + delay, index) if len(times) == 1 else self._of_several_times(index, delay)
+        images = self._seen(float(times[0]) + delay, index) if len(times) == 1 else self._of_several_times(index, delay)
         return images if self.light is None else images * self.light.factor(index)
 
     def lines(self, time: float, index: Tensor | None = None) -> LineIntegrals:
         """Line integrals of the matter at `time` [s] on the instrument's raster, in the exposures `index`."""
         matter = self.object.at(float(time))
-        return LineIntegrals.of_any(matter.project(self._directions(matter, index)))
+        if isinstance(matter, Component):  # it takes poses, which cost no time to make
+            assert isinstance(matter, TrainableObject)
+            return LineIntegrals.of_any(matter.project(self._poses(index)))
+        return LineIntegrals.of_any(matter.project(self._views(index)))
 
     def _seen(self, time: float, index: Tensor | None) -> Tensor:
         lines, planned, alignment = self.lines(time, index), self.instrument.exposures, self.alignment
@@ -91,17 +94,18 @@ class Model:
         of = self.instrument.exposures.time[chosen]
         places = [np.flatnonzero(of == time) for time in np.unique(of)]
         device = self.instrument.device
-        parts = [self._seen(of[at[0]] + delay, torch.from_numpy(chosen[at]).to(device)) for at in places]
+        parts = [self._seen(float(of[at[0]]) + delay, torch.from_numpy(chosen[at]).to(device)) for at in places]
         return torch.cat(parts)[torch.from_numpy(np.argsort(np.concatenate(places))).to(device)]
 
-    def _directions(self, matter: Object, index: Tensor | None) -> Views | Poses:
-        """Poses for matter that can be fitted, which take no time to make; checked views for any other."""
-        planned = self.instrument.poses
+    def _poses(self, index: Tensor | None) -> Poses:
+        planned, pixel = self.instrument.poses, self.instrument.exposures.views.pixel_size
         if self.alignment is not None:
-            aligned = self.alignment.poses(planned, self.instrument.exposures.views.pixel_size, index)
-            return aligned if isinstance(matter, Component) else aligned.views()
-        if isinstance(matter, Component):
-            return planned if index is None else planned[index]
+            return self.alignment.poses(planned, pixel, index)
+        return planned if index is None else planned[index]
+
+    def _views(self, index: Tensor | None) -> Views:
+        if self.alignment is not None:
+            return self._poses(index).views()
         return self.instrument.views if index is None else self.instrument.views[index.cpu().numpy()]
 
 

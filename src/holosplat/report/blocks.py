@@ -108,9 +108,9 @@ def _projections(content: ReportContent) -> Block:
         f"Phase φ = −kD with D = ∫δ dz, and absorption 2kB with B = ∫β dz, at {content.energy_kev:g} keV, "
         f"{' and '.join(maps.labels[:2])}. "
     )
-    phase = -wavenumber(content.energy_kev) * np.asarray(maps.dephasing[:2])
+    phase = -wavenumber(content.energy_kev) * np.asarray(maps.projected_delta[:2])
     text += f"The reconstruction's phase runs from {phase.min():.3g} to {phase.max():.3g} rad. ".replace("-", "−")
-    if maps.true_dephasing is None:
+    if maps.true_projected_delta is None:
         text += "The truth is not known."
     else:
         text += "Truth and reconstruction share one colour scale; differences are reconstruction − truth."

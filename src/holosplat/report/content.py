@@ -42,27 +42,27 @@ class HeldOutViews:
 class ProjectedMaps:
     """Line integrals of the reconstruction, and of the truth where it is known, for a few views.
 
-    absorption, dephasing: B = ∫β dz and D = ∫δ dz, [V, H, W] [m]; true_absorption, true_dephasing: likewise
-    or None; labels: V texts, from `view_labels`.
+    projected_beta, projected_delta: B = ∫β dz and D = ∫δ dz, [V, H, W] [m]; true_projected_beta,
+    true_projected_delta: likewise, or None; labels: V texts, from `view_labels`.
     """
 
-    absorption: np.ndarray
-    dephasing: np.ndarray
+    projected_beta: np.ndarray
+    projected_delta: np.ndarray
     labels: tuple[str, ...]
-    true_absorption: np.ndarray | None = None
-    true_dephasing: np.ndarray | None = None
+    true_projected_beta: np.ndarray | None = None
+    true_projected_delta: np.ndarray | None = None
 
     def __post_init__(self) -> None:
-        shape = shaped("projected δ", np.asarray(self.dephasing), (None, None, None)).shape
-        shaped("projected β", np.asarray(self.absorption), shape)
+        shape = shaped("projected δ", np.asarray(self.projected_delta), (None, None, None)).shape
+        shaped("projected β", np.asarray(self.projected_beta), shape)
         require(len(self.labels) == shape[0], "projected maps need one label a view; correct the labels.")
         require(
-            (self.true_absorption is None) == (self.true_dephasing is None),
+            (self.true_projected_beta is None) == (self.true_projected_delta is None),
             "give both true projections, of β and of δ, or neither.",
         )
-        if self.true_absorption is not None and self.true_dephasing is not None:
-            shaped("true projected β", np.asarray(self.true_absorption), shape)
-            shaped("true projected δ", np.asarray(self.true_dephasing), shape)
+        if self.true_projected_beta is not None and self.true_projected_delta is not None:
+            shaped("true projected β", np.asarray(self.true_projected_beta), shape)
+            shaped("true projected δ", np.asarray(self.true_projected_delta), shape)
 
 
 @dataclass(frozen=True)

@@ -163,18 +163,20 @@ def projections_figure(maps: ProjectedMaps, energy_kev: float, pixel_size: float
     energy_kev [keV]; pixel_size [m].
     """
     k, views = wavenumber(energy_kev), min(len(maps.labels), 2)
-    height, width = maps.dephasing.shape[1:]
+    height, width = maps.projected_delta.shape[1:]
     pairs = [(phase, i) for i in range(views) for phase in (True, False)]
-    if maps.true_dephasing is None or maps.true_absorption is None:
+    if maps.true_projected_delta is None or maps.true_projected_beta is None:
         panels = PanelGrid(views, [width] * 2, [height] * 2, (0, 1), 0.8 * WIDTH)
         for index, (phase, i) in enumerate(pairs):
-            found = -k * maps.dephasing[i] if phase else 2 * k * maps.absorption[i]
+            found = -k * maps.projected_delta[i] if phase else 2 * k * maps.projected_beta[i]
             _projected(panels, divmod(index, 2), [found], phase, maps.labels[i], pixel_size)
         return panels.figure
     panels = PanelGrid(2 * views, [width] * 3, [height] * 3, (1, 2))
     for row, (phase, i) in enumerate(pairs):
         factor, true, found = (
-            (-k, maps.true_dephasing, maps.dephasing) if phase else (2 * k, maps.true_absorption, maps.absorption)
+            (-k, maps.true_projected_delta, maps.projected_delta)
+            if phase
+            else (2 * k, maps.true_projected_beta, maps.projected_beta)
         )
         shown = [factor * np.asarray(true[i]), factor * np.asarray(found[i])]
         _projected(panels, (row, 0), shown, phase, maps.labels[i], pixel_size)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -33,7 +33,7 @@ class GaussianCloud:
     Errors: `InputError` if the arrays do not fit together, or not to the matter.
     """
 
-    kind = "gaussians"
+    kind: ClassVar[str] = "gaussians"
     """The name of this kind of Object in files."""
 
     def __init__(self, parameters: Iterable[Tensor], unit_length: float, matter: Matter) -> None:
@@ -108,13 +108,7 @@ class GaussianCloud:
 
     def enclosing_grid(self, most_voxels: int) -> Grid:
         """A grid around all centres, of `unit_length` a voxel, or coarser where those would be over `most_voxels`."""
-        centres = self.centres.detach().double().cpu().numpy()
-        low, high = centres.min(0) - 2, centres.max(0) + 2
-        pitch = max(1.0, float((np.prod(high - low) / most_voxels) ** (1 / 3)))
-        x, y, z = (int(n) for n in np.ceil((high - low) / pitch))
-        origin = (0.5 * (low + high) - 0.5 * (np.array([x, y, z]) - 1) * pitch) * self.unit_length
-        edge = pitch * self.unit_length
-        return Grid((z, y, x), (edge, edge, edge), (origin[0], origin[1], origin[2]))
+        return Grid.around(self.centres.detach().double().cpu().numpy(), self.unit_length, most_voxels)
 
     def at(self, time: float) -> GaussianCloud:
         """The cloud itself: it does not move."""
@@ -123,7 +117,8 @@ class GaussianCloud:
     def thickness(self, views: Views | Poses) -> Tensor:
         """Line integrals [V, C, H, W] of the amplitudes, in units of `unit_length`.
 
-        Views are checked, Poses (on the cloud's device) are taken as they are, without waiting for a GPU.
+        Views are checked, Poses (on the cloud's device) are taken as they are, without waiting for a GPU. Gradients
+        reach the cloud's parameters, and the rotations and shifts of Poses that require them.
         """
         poses = Poses.of(views, self.centres.device) if isinstance(views, Views) else views
         scale = self.unit_length / poses.pixel_size
@@ -134,11 +129,11 @@ class GaussianCloud:
             shifts=poses.shifts / poses.pixel_size,
             shape=poses.shape,
             backend=self.backend,
-            checked=not isinstance(views, Views),
+            trusted=not isinstance(views, Views),
         )
 
     def project(self, views: Views | Poses) -> LineIntegrals:
-        """Line integrals (B, D), differentiable in the parameters."""
+        """Line integrals (B, D), differentiable in the parameters and in Poses, as `thickness` is."""
         return LineIntegrals(self.thickness(views), self.matter.in_lengths(self.unit_length))
 
     def density(self, grid: Grid) -> Tensor:
@@ -146,18 +141,18 @@ class GaussianCloud:
         pitch = grid.voxel_size[0]
         require(np.allclose(grid.voxel_size, pitch), "Gaussians are voxelised on cubic voxels only.")
         middle = torch.as_tensor(grid.centre, dtype=torch.float64, device=self.centres.device)
-        return self.density_around(middle, grid.shape, pitch, checked=False)
+        return self.density_around(middle, grid.shape, pitch, trusted=False)
 
-    def density_around(self, middle: Tensor, shape: tuple[int, int, int], pitch: float, checked: bool = True) -> Tensor:
+    def density_around(self, middle: Tensor, shape: tuple[int, int, int], pitch: float, trusted: bool = True) -> Tensor:
         """As `density`, on `shape` voxels of `pitch` [m] around `middle` [3] `(x, y, z)` [m], float64, on the device.
 
-        By default the cloud's values are taken as they are, without waiting for a GPU.
+        `trusted`: the cloud's values are taken as they are, without waiting for a GPU; else they are checked.
         """
         scale = self.unit_length / pitch
         centres, scales, quaternions = self._scaled(scale)
         offset = (middle / pitch).to(centres.dtype)
         arrays = (centres - offset, scales, quaternions, self.amplitudes)
-        return voxelise(*arrays, shape, backend=self.backend, checked=checked)
+        return voxelise(*arrays, shape, backend=self.backend, trusted=trusted)
 
     def _scaled(self, scale: float) -> tuple[Tensor, Tensor, Tensor]:
         """Centres, scales and quaternions in pixels of which `unit_length` holds `scale`."""

@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
@@ -87,13 +87,13 @@ class Perceptron(nn.Module):
 class NeuralField:
     """A field of matter on the box of `grid` (cubic voxels), zero where `mask` [Z, Y, X] says that nothing is.
 
-    upper: the largest occupancy of a single material, `upper · sigmoid` of the network's output (0: its softplus, without
-    a bound); two channels have no bound. Line integrals are sums over samples a voxel edge apart, on rays a voxel edge
-    apart; linear between rays on finer rasters. Works in any float type, on any device. jitter: a generator draws
-    where in its depth step each sample lies while gradients are taken (None: in the middle, as without gradients).
+    upper: the largest occupancy of a single material, `upper · sigmoid` of the network's output (0: its softplus,
+    without a bound); two channels have no bound. Line integrals are sums over samples a voxel edge apart, on rays a
+    voxel edge apart; linear between rays on finer rasters. Works in any float type, on any device. jitter: a generator
+    that draws where in its depth step each sample lies while gradients are taken (None: in the middle).
     """
 
-    kind = "neural-field"
+    kind: ClassVar[str] = "neural-field"
     """The name of this kind of Object in files."""
 
     def __init__(
@@ -109,7 +109,7 @@ class NeuralField:
         self.jitter: torch.Generator | None = None
         self._net = Perceptron(network, float(max(grid.shape)), len(matter), seed)
         self._weights = {name: weight.detach() for name, weight in self._net.named_parameters()}
-        self._constants = {name: buffer for name, buffer in self._net.named_buffers()}
+        self._constants = dict(self._net.named_buffers())
         self.corner = torch.tensor([o - 0.5 * self.pitch for o in grid.origin], dtype=torch.float64) / self.pitch
         self.mask = mask.bool().clone()
         self._samples: dict[bytes, Samples] = {}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -26,7 +26,7 @@ class SurfaceMesh:
     `InputError` if the arrays do not fit, or for more than one material.
     """
 
-    kind = "surfaces"
+    kind: ClassVar[str] = "surfaces"
     """The name of this kind of Object in files."""
 
     def __init__(self, vertices: Tensor, faces: Tensor, unit_length: float, matter: Matter, lines: int = 2) -> None:
@@ -73,6 +73,10 @@ class SurfaceMesh:
     def stored_bytes(self) -> int:
         """Size of vertices as float32 and faces as int32."""
         return 4 * (self.vertices.numel() + self.faces.numel())
+
+    def enclosing_grid(self, most_voxels: int) -> Grid:
+        """A grid around all vertices, of `unit_length` a voxel, or coarser where those would be over `most_voxels`."""
+        return Grid.around(self.vertices.detach().numpy(), self.unit_length, most_voxels)
 
     def at(self, time: float) -> SurfaceMesh:
         """The surfaces themselves: they do not move."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 from torch import Tensor
 
@@ -24,7 +24,7 @@ class VoxelGrid:
     values: [C, Z, Y, X] float32, of the channels of `matter`. Errors: `InputError` if the shapes do not fit.
     """
 
-    kind = "voxels"
+    kind: ClassVar[str] = "voxels"
     """The name of this kind of Object in files."""
 
     def __init__(self, values: Tensor, grid: Grid, matter: Matter) -> None:

@@ -48,7 +48,7 @@ class MeshScene:
     def project(self, views: Views) -> LineIntegrals:
         """Line integrals of each material, or of δ and β where there are more than two; float64, 2 × 2 rays a pixel."""
         vertices, faces, values, kinds = self._soup()
-        return LineIntegrals(mesh_line_integrals(vertices, faces, values, views).swapaxes(0, 1), kinds)
+        return LineIntegrals(mesh_line_integrals(vertices, faces, values, views), kinds)
 
     def voxelise(self, grid: Grid) -> Volume:
         """δ and β averaged over voxels (partial occupancy at surfaces)."""

@@ -1,4 +1,4 @@
-"""Adam (Kingma & Ba 2015) with β = 0.9, 0.999: one step over a few arrays at once, each at its own rate.
+"""Adam (Kingma & Ba 2015) with β = 0.9, 0.999: one step over any number of arrays, each at its own rate.
 
 Backends: `cpu` (C++, float32), `cuda` (Triton, float32) and `reference` (plain torch, any float type), which is the
 specification of the others.
@@ -17,8 +17,6 @@ from ...checks import require
 
 BETAS = (0.9, 0.999)
 """Decay of the running means of the gradient and of its square."""
-
-MOST_ARRAYS = 4
 
 
 def factors(rates: Sequence[float], count: int, epsilon: float) -> Tensor:
@@ -39,14 +37,13 @@ def step(
     factors: Tensor,
     backend: str = "cpu",
 ) -> None:
-    """One step on up to 4 arrays, in place: `parameter -= factors[k] · first / (√second + factors[-1])`.
+    """One step on K arrays, in place: `parameter -= factors[k] · first / (√second + factors[-1])`.
 
     Before that, `first` and `second`, the running means, move towards the gradient (by 0.1 of the way) and its square
     (by 0.001). The arrays of one k have one shape, and are contiguous but for the gradients; factors: [K + 1], of
     the function of that name. Errors: `InputError` if the arrays do not fit together, or the backend.
     """
     groups = (parameters, gradients, first, second)
-    require(len(parameters) <= MOST_ARRAYS, f"Adam moves up to {MOST_ARRAYS} arrays at once, not {len(parameters)}.")
     counts = [len(factors) - 1, *(len(arrays) for arrays in groups)]
     require(len(set(counts)) == 1, f"Adam needs one of each for every parameter, but there are {counts}.")
     for p, *others in zip(*groups):

@@ -5,7 +5,7 @@ Bitwise the same for every number of threads (torch's: `torch.set_num_threads`) 
 
 from __future__ import annotations
 
-from ctypes import c_int64, c_void_p
+from ctypes import addressof, c_int64, c_void_p
 
 import torch
 from torch import Tensor
@@ -17,8 +17,8 @@ def step(
     parameters: list[Tensor], gradients: list[Tensor], first: list[Tensor], second: list[Tensor], factors: Tensor
 ) -> None:
     """One step in place; as the package's `step`, already checked."""
-    held = [g.contiguous() for g in gradients]
-    lengths = (c_int64 * 4)(*(p.numel() for p in parameters))
-    pointers = [(c_void_p * 4)(*(a.data_ptr() for a in arrays)) for arrays in (parameters, held, first, second)]
-    adam = native.Adam(len(parameters), lengths, *pointers)
+    held, count = [g.contiguous() for g in gradients], len(parameters)
+    lengths = (c_int64 * count)(*(p.numel() for p in parameters))
+    groups = [(c_void_p * count)(*(a.data_ptr() for a in arrays)) for arrays in (parameters, held, first, second)]
+    adam = native.Adam(count, *(addressof(table) for table in (lengths, *groups)))
     native.call("holosplat_adam", adam, c_void_p(factors.data_ptr()), torch.get_num_threads())

@@ -1,4 +1,4 @@
-"""Adam on the GPU: one Triton launch for up to four arrays."""
+"""Adam on the GPU: one Triton launch for every four arrays."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from . import triton_adam
 def step(
     parameters: list[Tensor], gradients: list[Tensor], first: list[Tensor], second: list[Tensor], factors: Tensor
 ) -> None:
-    """One step of Adam on up to 4 float32 arrays, in place; arguments as the package's `step`, already checked.
+    """One step of Adam on K float32 arrays, in place; arguments as the package's `step`, already checked.
 
     `parameter -= factors[k] · first / (√second + factors[-1])`, after `first` and `second` have moved towards the
     gradient (by 0.1) and its square (by 0.001). factors: float32, on the device; nothing waits for it.

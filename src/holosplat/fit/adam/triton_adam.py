@@ -10,17 +10,22 @@ from torch import Tensor
 
 BLOCK = 1024
 MOST = 4
+"""Arrays of one launch."""
 
 
 def step(
     parameters: list[Tensor], gradients: list[Tensor], first: list[Tensor], second: list[Tensor], factors: Tensor
 ) -> None:
-    """One step on up to 4 contiguous arrays; see `cuda.step`."""
+    """One step on contiguous arrays, `MOST` in a launch; see `cuda.step`."""
     arrays = list(zip(parameters, gradients, first, second))
-    if not arrays:
-        return
-    sizes = [p.numel() for p in parameters] + [0] * (MOST - len(arrays))
-    arrays += [arrays[0]] * (MOST - len(arrays))  # no program reads those
+    for start in range(0, len(arrays), MOST):
+        _launch(arrays[start : start + MOST], factors[start:])
+
+
+def _launch(arrays: list[tuple[Tensor, ...]], factors: Tensor) -> None:
+    """One launch for up to `MOST` arrays, whose factors come first; the last of all is the divisor's."""
+    sizes = [parameter.numel() for parameter, *_ in arrays] + [0] * (MOST - len(arrays))
+    arrays = arrays + [arrays[0]] * (MOST - len(arrays))  # no program reads those
     ends = [sum(triton.cdiv(n, BLOCK) for n in sizes[: k + 1]) for k in range(MOST)]
     if ends[-1]:
         pointers = [array for group in arrays for array in group]

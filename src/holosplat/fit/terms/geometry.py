@@ -36,7 +36,7 @@ EXPECTED = {
     "alignment.blurs": 0.5,
     "light.coefficients": 0.02,
 }
-"""Standard deviations where nobody says otherwise: half a degree, a pixel, two per cent, half a pixel; two per cent of light."""
+"""Standard deviations where nobody says otherwise: [rad], [pixels], share of the distance, [pixels], share of light."""
 
 
 def alignment_prior(weight: float, model: Model, train: Scan) -> Term:

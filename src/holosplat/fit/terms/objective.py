@@ -59,7 +59,7 @@ class Objective:
     noise_gain: float = 0.0
     """What the weights of `two_levels` and `bending` grow by, times the share of the frames' contrast that is noise."""
     bending: float = 0.0
-    """Surfaces: Σ |L² x|² over the pixels of a frame, x the vertices and L x their distance from their neighbours' mean."""
+    """Surfaces: Σ |L² x|² over the pixels of a frame, L x the distance of vertices x from their neighbours' mean."""
 
     def __post_init__(self) -> None:
         at_least(self, 0, *vars(self))

@@ -79,7 +79,7 @@ def _detected_backward(
     gradient: Tensor, wave: Tensor, path: OpticalPath, of_blur: bool
 ) -> tuple[Tensor, tuple[Tensor | None, Tensor | None]]:
     """The gradient of the wave in the detector plane, in its memory, and those of the blur's factors if wanted."""
-    if path.blur_rows is None:
+    if path.blur_rows is None or path.blur_columns is None:
         _call("intensity_backward", _detector(path), gradient, wave)
         return wave, (None, None)
     images, gradients = _images(path), (None, None)

@@ -19,7 +19,7 @@ __all__ = ["mesh_line_integrals", "voxelise_meshes"]
 def mesh_line_integrals(
     vertices: np.ndarray, faces: np.ndarray, face_values: np.ndarray, views: Views, rays: int = 2
 ) -> Tensor:
-    """Line integrals [C, V, H, W] in metres × value, float64, of closed meshes with piecewise constant values.
+    """Line integrals [V, C, H, W] in metres × value, float64, of closed meshes with piecewise constant values.
 
     vertices: [P, 3] object frame [m]; faces: [F, 3] outward-oriented; face_values: [C, F], the value (δ, β, 1 …)
     inside the closed surface that each face belongs to. A pixel is the mean over `rays × rays` parallel rays
@@ -27,11 +27,11 @@ def mesh_line_integrals(
     `Σ sign(n·z) z_hit` over the faces it crosses.
     """
     _check(vertices, faces, face_values, rays)
-    out = np.empty((len(face_values), len(views), *views.shape))
+    out = np.empty((len(views), len(face_values), *views.shape))
     for v in range(len(views)):
         lab = vertices @ views.rotations[v].T
         lab[:, :2] -= views.shifts[v]
-        out[:, v] = mean_depths(lab, faces, face_values, views.shape, views.pixel_size, rays)
+        out[v] = mean_depths(lab, faces, face_values, views.shape, views.pixel_size, rays)
     return torch.from_numpy(out)
 
 

@@ -10,7 +10,7 @@ A cloud of N Gaussians has, with every length in PIXELS (someone else scales fro
 
 Backends: `cpu` (C++, float32), `cuda` (Triton, float32, tensors on the GPU) and `reference` (plain torch, any float
 type and device, slow), which is the specification of the others. All give gradients of the four arrays above, and of
-nothing else.
+the views' rotations and shifts where those are tensors that require them.
 """
 
 from __future__ import annotations
@@ -37,26 +37,27 @@ def splat(
     backend: str = "cpu",
     cutoff: float = 4.0,
     pixel_variance: float = 1 / 12,
-    checked: bool = False,
+    trusted: bool = False,
 ) -> Tensor:
     """Line integrals [V, C, H, W] of a Gaussian cloud along the beam (amplitude × pixels), for V views.
 
     The cloud is described at the top of this module. rotations [V, 3, 3]: `x_lab = R x_obj`, the beam along
-    +z_lab; shifts [V, 2]: detector shifts `(sx, sy)` [px]; neither carries gradients. Pixel `(i, j)` of
-    `shape = (H, W)` has its centre at `x = (j + ½ - W/2) + sx`, `y = (i + ½ - H/2) + sy`.
+    +z_lab; shifts [V, 2]: detector shifts `(sx, sy)` [px]. Pixel `(i, j)` of `shape = (H, W)` has its centre at
+    `x = (j + ½ - W/2) + sx`, `y = (i + ½ - H/2) + sy`. A gradient of the rotations treats their nine numbers as
+    free (that of the third row is zero: it moves matter along the beam), and costs nothing where none is required.
 
     `pixel_variance` [px²] is added to the projected covariance, mass conserved: the pixel's own, 1/12, stands
     for integration over its area (within 0.3 % for σ ≥ 1 px). The sum over pixels is the mass within 0.3 %
     for σ ≥ 0.5 px; thinner Gaussians keep it only on average over positions in the pixel (±7 % at 0.3 px).
     Each Gaussian adds to the pixels of the rectangle that holds its `cutoff`-σ ellipse, and to no other.
-    `checked`: the caller vouches for types, shapes and values (rotations and shifts being float64 tensors on the
-    cloud's device); for inner loops, where a look at the values would wait for a GPU.
+    `trusted`: arguments are taken as they are, and nothing is checked. Types, shapes and values must be right, and
+    rotations and shifts float64 tensors on the cloud's device. For inner loops: a look at values waits for a GPU.
     Errors: `InputError` for input of the wrong shape, type or range; `RuntimeError` if the backend's library is
     missing.
     """
     run = implementation(__name__, backend).splat
     cloud = (centres, scales, quaternions, amplitudes)
-    if not checked:
+    if not trusted:
         _check_cloud(backend, *cloud)
         _check_raster("detector shape", shape, "two positive counts (rows, columns)", 2)
         _check_spread(cutoff, "pixel_variance", pixel_variance)
@@ -74,18 +75,18 @@ def voxelise(
     backend: str = "cpu",
     cutoff: float = 4.0,
     voxel_variance: float = 1 / 12,
-    checked: bool = False,
+    trusted: bool = False,
 ) -> Tensor:
     """A Gaussian cloud on a voxel raster, [C, Z, Y, X]: nearly its mean over each voxel.
 
     The cloud is described at the top of this module, with the voxel pitch as the pixel. Voxel `[z, y, x]` of
     `shape = (Z, Y, X)` has its centre at `(x + ½ - X/2, y + ½ - Y/2, z + ½ - Z/2)`. `voxel_variance` [voxel²]
     is added to the covariance as `pixel_variance` is in `splat`, with the mass conserved. Each Gaussian adds
-    to the voxels of the cuboid that holds its `cutoff`-σ ellipsoid. `checked` and errors: as `splat`.
+    to the voxels of the cuboid that holds its `cutoff`-σ ellipsoid. `trusted` and errors: as `splat`.
     """
     run = implementation(__name__, backend).voxelise
     cloud = (centres, scales, quaternions, amplitudes)
-    if not checked:
+    if not trusted:
         _check_cloud(backend, *cloud)
         _check_raster("volume shape", shape, "three positive counts (Z, Y, X)", 3)
         _check_spread(cutoff, "voxel_variance", voxel_variance)
@@ -137,14 +138,15 @@ def _check_type(backend: str, name: str, array: Tensor, centres: Tensor) -> None
 
 
 def _check_views(rotations: Tensor | np.ndarray, shifts: Tensor | np.ndarray) -> tuple[Tensor, Tensor]:
-    """Rotations [V, 3, 3] and shifts [V, 2] as float64 CPU tensors; `InputError` if they are no views."""
-    turns, moves = (_numbers(torch.as_tensor(array)).astype(np.float64) for array in (rotations, shifts))
+    """Rotations [V, 3, 3] and shifts [V, 2] as float64 tensors, with gradients; `InputError` if they are no views."""
+    rotations, shifts = torch.as_tensor(rotations), torch.as_tensor(shifts)
+    turns, moves = (_numbers(array).astype(np.float64) for array in (rotations, shifts))
     finite("rotations", shaped("rotations", turns, (None, 3, 3)))
     finite("shifts", shaped("shifts", moves, (len(turns), 2)))
     proper = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max(initial=0) < 1e-4
     proper = bool(proper and np.all(np.linalg.det(turns) > 0))
     require(proper, "rotations must hold proper rotation matrices (R Rᵀ = 1, det R = 1).")
-    return torch.from_numpy(turns), torch.from_numpy(moves)
+    return rotations.double(), shifts.double()
 
 
 def _check_raster(field: str, shape: tuple[int, ...], wanted: str, dimensions: int) -> None:

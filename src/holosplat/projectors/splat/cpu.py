@@ -29,7 +29,7 @@ def splat(
     """Line integrals [V, C, H, W]; arguments and units as the package's `splat`, already checked."""
     options = native.Options(cutoff, pixel_variance, torch.get_num_threads())
     poses = (rotations.contiguous(), shifts.contiguous())
-    return _Splat.apply(centres, scales, quaternions, amplitudes, poses, shape, options)  # type: ignore[no-any-return]
+    return _Splat.apply(centres, scales, quaternions, amplitudes, *poses, shape, options)  # type: ignore[no-any-return]
 
 
 def voxelise(
@@ -54,25 +54,28 @@ class _Splat(torch.autograd.Function):
         scales: Tensor,
         quaternions: Tensor,
         amplitudes: Tensor,
-        poses: tuple[Tensor, Tensor],
+        rotations: Tensor,
+        shifts: Tensor,
         shape: tuple[int, ...],
         options: native.Options,
     ) -> Tensor:
         arrays = [a.contiguous() for a in (centres, scales, quaternions, amplitudes)]
-        ctx.save_for_backward(*arrays)
-        ctx.poses, ctx.shape, ctx.options = poses, shape, options
-        image = torch.empty(len(poses[0]), amplitudes.shape[1], *shape)
-        native.call("holosplat_splat", _cloud(arrays), _views(poses, shape), options, _at(image))
+        ctx.save_for_backward(*arrays, rotations, shifts)
+        ctx.shape, ctx.options = shape, options
+        image = torch.empty(len(rotations), amplitudes.shape[1], *shape)
+        native.call("holosplat_splat", _cloud(arrays), _views((rotations, shifts), shape), options, _at(image))
         return image
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        arrays = ctx.saved_tensors
+        arrays, poses = ctx.saved_tensors[:4], ctx.saved_tensors[4:]
         out = [torch.empty_like(a) for a in arrays]
-        views, gradient = _views(ctx.poses, ctx.shape), gradient.contiguous()
-        native.call("holosplat_splat_backward", _cloud(arrays), views, ctx.options, _at(gradient), _gradients(out))
-        return *out, None, None, None
+        moved = [torch.empty_like(a) for a in poses] if any(ctx.needs_input_grad[4:6]) else []
+        outputs = (_gradients(out), native.ViewGradients(*(a.data_ptr() for a in moved)) if moved else None)
+        views, gradient = _views(poses, ctx.shape), gradient.contiguous()
+        native.call("holosplat_splat_backward", _cloud(arrays), views, ctx.options, _at(gradient), *outputs)
+        return *out, *(moved or (None, None)), None, None
 
 
 class _Voxelise(torch.autograd.Function):
@@ -115,5 +118,5 @@ def _gradients(arrays: list[Tensor]) -> native.Gradients:
     return native.Gradients(*(a.data_ptr() for a in arrays))
 
 
-def _views(poses: tuple[Tensor, Tensor], shape: tuple[int, ...]) -> native.Views:
+def _views(poses: tuple[Tensor, ...], shape: tuple[int, ...]) -> native.Views:
     return native.Views(len(poses[0]), *shape, *(a.data_ptr() for a in poses))

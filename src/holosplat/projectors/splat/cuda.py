@@ -34,7 +34,7 @@ def splat(
     """
     poses = tuple(a.to(centres.device, torch.float64).contiguous() for a in (rotations, shifts))
     options = (cutoff, pixel_variance)
-    return _Splat.apply(centres, scales, quaternions, amplitudes, poses, shape, options)  # type: ignore[no-any-return]
+    return _Splat.apply(centres, scales, quaternions, amplitudes, *poses, shape, options)  # type: ignore[no-any-return]
 
 
 def voxelise(
@@ -59,24 +59,26 @@ class _Splat(torch.autograd.Function):
         scales: Tensor,
         quaternions: Tensor,
         amplitudes: Tensor,
-        poses: tuple[Tensor, Tensor],
+        rotations: Tensor,
+        shifts: Tensor,
         shape: tuple[int, ...],
         options: tuple[float, float],
     ) -> Tensor:
         cloud = tuple(a.contiguous() for a in (centres, scales, quaternions, amplitudes))
         with _on(centres):
-            image, records = triton_splat.draw(cloud, poses, shape, *options)
-        ctx.save_for_backward(*cloud, *poses, *records)
+            image, records = triton_splat.draw(cloud, (rotations, shifts), shape, *options)
+        ctx.save_for_backward(*cloud, rotations, shifts, *records)
         ctx.variance = options[1]
         return image
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        saved = ctx.saved_tensors
+        saved, of_poses = ctx.saved_tensors, any(ctx.needs_input_grad[4:6])
+        inputs = (saved[:4], saved[4:6], saved[6:], gradient.contiguous())
         with _on(gradient):
-            out = triton_splat.gather(saved[:4], saved[4:6], saved[6:], gradient.contiguous(), ctx.variance)
-        return *out, None, None, None
+            out, moved = triton_splat.gather(*inputs, ctx.variance, of_poses)
+        return *out, *(moved or (None, None)), None, None
 
 
 class _Voxelise(torch.autograd.Function):

@@ -3,7 +3,8 @@
 1. `_project`: for every view and Gaussian, once, in float64: the integer box and a record of float32 numbers.
 2. `triton_pixels.draw`: every record adds its Gaussian to its box of pixels.
 3. `triton_pixels.gather`: sums (moments) of the image's gradient under every record, without atomics.
-4. `_pull_back`: for every Gaussian, in float64, the views' moments in order become the gradients of its parameters.
+4. `_pull_back`: for every Gaussian, in float64, the views' moments in order become the gradients of its parameters;
+   and, where poses require gradients, each program's sums for every view, which torch then adds up.
 
 Launches depend on shapes alone: nothing waits for the device. Gradients are bitwise the same in every run, for equal
 gradients of the image; images are so up to the order of additions.
@@ -38,6 +39,8 @@ from .triton_cloud import (
 from .triton_pixels import FLOATS, INTEGERS, MOMENTS
 
 SQRT_TWO_PI = tl.constexpr(2.5066282746310002)
+VIEW_SUMS = tl.constexpr(8)
+"""Sums over Gaussians for a view: gradients of the first two rows of its rotation, and of the mean (x, y)."""
 SIZES = ["N", "V", "H", "W", "LARGE"]
 
 
@@ -65,15 +68,36 @@ def draw(
 
 
 def gather(
-    cloud: tuple[Tensor, ...], poses: tuple[Tensor, Tensor], records: Records, gradient: Tensor, variance: float
-) -> list[Tensor]:
-    """Gradients of the four arrays of `cloud`, from that of the image, [V, C, H, W], float32 and contiguous."""
-    out, (n, c) = [torch.empty_like(a) for a in cloud], cloud[3].shape
+    cloud: tuple[Tensor, ...],
+    poses: tuple[Tensor, Tensor],
+    records: Records,
+    gradient: Tensor,
+    variance: float,
+    of_poses: bool = False,
+) -> tuple[list[Tensor], list[Tensor]]:
+    """Gradients of the four arrays of `cloud`, from that of the image, [V, C, H, W], float32 and contiguous.
+
+    Then those of the poses' two arrays in float64, or none unless `of_poses`.
+    """
+    out, (n, c), v = [torch.empty_like(a) for a in cloud], cloud[3].shape, len(gradient)
+    programs = triton.cdiv(n, VECTOR)
+    sums = poses[0].new_empty(programs, v, VIEW_SUMS.value) if of_poses else None
     if n:
         moments = triton_pixels.gather(gradient, records, n)
-        grid, sizes = (triton.cdiv(n, VECTOR),), (n, len(gradient), c, variance)
-        _pull_back[grid](*cloud, *poses, moments, *out, *sizes, VECTOR, num_warps=VECTOR_WARPS)
-    return out
+        outputs = (*out, moments if sums is None else sums)  # moments only stand in: nothing is stored there
+        sizes = (n, v, c, variance, of_poses)
+        _pull_back[(programs,)](*cloud, *poses, moments, *outputs, *sizes, VECTOR, num_warps=VECTOR_WARPS)
+    return out, [] if sums is None else _of_poses(sums.sum(0))
+
+
+def _of_poses(sums: Tensor) -> list[Tensor]:
+    """Gradients of rotations [V, 3, 3] and shifts [V, 2] from those of each view's first two rows and of its mean.
+
+    The third row plays no part, as beams are parallel; a shift of the detector moves the mean the other way.
+    """
+    rotations = sums.new_zeros(len(sums), 3, 3)
+    rotations[:, :2] = sums[:, :6].view(-1, 2, 3)
+    return [rotations, -sums[:, 6:]]
 
 
 @triton.jit
@@ -161,14 +185,41 @@ def _project(
     tl.store(large + 1 + slot, r, mask=is_large)
 
 
+@triton.jit
+def _store_view(
+    to, centres, n, drawn, gx, gy, hxx, hxy, hyy,
+    p0, p1, p2, q0, q1, q2, xx, xy, xz, yy, yz, zz,
+):  # fmt: skip
+    # With A the first two rows of R, mean = A c - shift and Σ₂' = A Σ Aᵀ + variance: ∂L/∂A = g cᵀ + 2 H A Σ, from
+    # g = ∂L/∂mean and H = ∂L/∂Σ₂'. Stores its sums over the program's Gaussians, and those of g.
+    x, y, z = load3(centres, n, drawn)
+    drawn = drawn & is_finite(x, y, z)
+    sp0, sp1, sp2 = xx * p0 + xy * p1 + xz * p2, xy * p0 + yy * p1 + yz * p2, xz * p0 + yz * p1 + zz * p2
+    sq0, sq1, sq2 = xx * q0 + xy * q1 + xz * q2, xy * q0 + yy * q1 + yz * q2, xz * q0 + yz * q1 + zz * q2
+    _store_lanes(to, drawn, gx * x + 2 * (hxx * sp0 + hxy * sq0))
+    _store_lanes(to + 1, drawn, gx * y + 2 * (hxx * sp1 + hxy * sq1))
+    _store_lanes(to + 2, drawn, gx * z + 2 * (hxx * sp2 + hxy * sq2))
+    _store_lanes(to + 3, drawn, gy * x + 2 * (hxy * sp0 + hyy * sq0))
+    _store_lanes(to + 4, drawn, gy * y + 2 * (hxy * sp1 + hyy * sq1))
+    _store_lanes(to + 5, drawn, gy * z + 2 * (hxy * sp2 + hyy * sq2))
+    _store_lanes(to + 6, drawn, gx)
+    _store_lanes(to + 7, drawn, gy)
+
+
+@triton.jit
+def _store_lanes(at, wanted, values):
+    tl.store(at, tl.sum(tl.where(wanted, values, 0.0), axis=0))
+
+
 @triton.jit(do_not_specialize=SIZES)
 def _pull_back(
     centres, scales, quaternions, amplitudes, rotations, shifts, moments,
-    d_centres, d_scales, d_quaternions, d_amplitudes, N, V,
-    C: tl.constexpr, VARIANCE: tl.constexpr, BLOCK: tl.constexpr,
+    d_centres, d_scales, d_quaternions, d_amplitudes, view_sums, N, V,
+    C: tl.constexpr, VARIANCE: tl.constexpr, OF_VIEWS: tl.constexpr, BLOCK: tl.constexpr,
 ):  # fmt: skip
     # From the views' moments to the gradients of mean and covariance in the image plane, and on to 3D. With
     # p = Σ₂'⁻¹ d: ∂L/∂mean = Σ p, ∂L/∂Σ₂' = ½ (Σ p pᵀ - S₀ Σ₂'⁻¹), sums over pixels weighted with what they gave.
+    # view_sums [programs, V, 8]: a program's sums for every view, if OF_VIEWS.
     n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     there = n < N
     xx, xy, xz, yy, yz, zz, root = load_covariance(scales, quaternions, n, there)
@@ -212,6 +263,12 @@ def _pull_back(
         gyy += hxx * (p1 * p1) + hxy * (2 * p1 * q1) + hyy * (q1 * q1)
         gyz += hxx * (p1 * p2) + hxy * (p1 * q2 + p2 * q1) + hyy * (q1 * q2)
         gzz += hxx * (p2 * p2) + hxy * (2 * p2 * q2) + hyy * (q2 * q2)
+        if OF_VIEWS:
+            drawn = there & is_finite(weight, slope, a0) & is_finite(ix, iy, a1) & is_finite(sxx, sxy, syy)
+            _store_view(
+                view_sums + (tl.program_id(0).to(tl.int64) * V + v) * VIEW_SUMS, centres, n, drawn,
+                px, py, hxx, hxy, hyy, p0, p1, p2, q0, q1, q2, xx, xy, xz, yy, yz, zz,
+            )  # fmt: skip
     store3(d_centres, n, there, gx, gy, gz)
     store_amplitude(d_amplitudes + C * n, there, d0)
     if C == 2:

@@ -12,7 +12,7 @@ from ...geometry import Grid, Views
 
 
 def voxel_line_integrals(values: Tensor, grid: Grid, views: Views, *, step: float = 0.5, rays: int = 1) -> Tensor:
-    """Line integrals [C, V, H, W] in metres × value of `values` [C, Z, Y, X] on `grid`; differentiable in `values`.
+    """Line integrals [V, C, H, W] in metres × value of `values` [C, Z, Y, X] on `grid`; differentiable in `values`.
 
     step: sampling distance along the ray, in units of the smallest voxel edge; rays: `rays × rays` parallel rays
     a pixel are averaged. Outside the grid the values are zero.
@@ -20,8 +20,7 @@ def voxel_line_integrals(values: Tensor, grid: Grid, views: Views, *, step: floa
     require(values.ndim == 4 and tuple(values.shape[1:]) == grid.shape, "values must have the shape (C, Z, Y, X).")
     require(step > 0 and rays >= 1, f"step must be positive and rays at least 1, but they are {step} and {rays}.")
     fine = views.refined(rays)
-    images = [avg_pool2d(_cast(values, grid, fine, v, step), rays) for v in range(len(views))]
-    return torch.stack(images, dim=1)
+    return torch.stack([avg_pool2d(_cast(values, grid, fine, v, step), rays) for v in range(len(views))])
 
 
 def _cast(values: Tensor, grid: Grid, views: Views, v: int, step: float) -> Tensor:
