@@ -9,10 +9,10 @@ import tyro
 from tyro.conf import OmitArgPrefixes
 
 from holosplat.checks import InputError
-from holosplat.cli.method_options import MethodOptions
+from holosplat.cli.options import MethodOptions
 from holosplat.methods import METHODS, Gaussians
-from holosplat.methods.settings import as_config, preset
-from holosplat.tables import overridden
+from holosplat.methods.presets import preset
+from holosplat.tables import overridden, to_table
 
 
 def chosen(*arguments: object):
@@ -41,7 +41,7 @@ def test_single_fields_are_set_one_after_another():
 
 def test_a_file_and_a_change_of_it(tmp_path):
     path = tmp_path / "config.json"
-    path.write_text(json.dumps(as_config(preset("fast"))))
+    path.write_text(json.dumps({"schema_version": 2, "method": to_table(preset("fast"))}))
     assert chosen("--config", path) == preset("fast")
     assert chosen("--config", path, "--set", "steps=3").fit.schedule.steps == 3
 
@@ -55,9 +55,12 @@ def test_the_backend_is_that_of_fit_and_start():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--preset", "fast", "--config", "a.json"], "give only one of --preset and --config"),
-        (["--preset", "fast", "--method", "voxels"], "give only one of --method and --preset"),
-        (["--method", "magic"], "base must be one of default, .*voxels.*but it is 'magic'"),
+        (
+            ["--preset", "fast", "--config", "a.json"],
+            "give one of --method, .*but there are --preset and --config",
+        ),
+        (["--preset", "fast", "--method", "voxels"], "but there are --method and --preset"),
+        (["--method", "magic"], "method must be one of gaussians, .*voxels.*but it is 'magic'"),
         (["--preset", "magic"], "preset must be one of default, fast, random, thesis, but it is 'magic'"),
         (
             ["--set", "fit.schedule.stepz=3"],
@@ -66,7 +69,7 @@ def test_the_backend_is_that_of_fit_and_start():
         (["--set", "steps=-1"], r"fit\.schedule: steps must not be negative, but it is -1"),
         (["--set", "steps"], "a setting must read PATH=VALUE"),
         (["--method", "voxels", "--set", "start=phase"], "the setting start is not known"),
-        (["--method", "paganin-tv", "--backend", "cpu"], "the method per-view has no choice of backends"),
+        (["--method", "paganin-tv", "--backend", "cpu"], "the method per-view runs on the CPU only"),
     ],
 )
 def test_what_cannot_be_is_said(arguments, message):

@@ -11,7 +11,7 @@ import pytest
 
 from holosplat.checks import InputError
 from holosplat.methods import METHODS, Gaussians, Surfaces, Voxels
-from holosplat.methods.settings import FOLDER, SCHEMA, as_config, base, method_of, preset, presets, read_method
+from holosplat.methods.presets import FOLDER, SCHEMA, method_called, method_of, preset, preset_names, read_method
 from holosplat.tables import overridden, paths, to_table
 
 DATA = Path(__file__).parent / "data"
@@ -31,7 +31,7 @@ def leaves(table: dict, before: str = "") -> dict[str, object]:
 
 
 def test_the_presets_are_those():
-    assert presets() == NAMES
+    assert preset_names() == NAMES
 
 
 def test_a_method_without_options_is_the_default_preset():
@@ -101,28 +101,30 @@ def test_a_file_of_another_method_changes_that_ones_defaults(tmp_path):
 
 @pytest.mark.parametrize("name", METHODS)
 def test_methods_go_round_through_config_json(name, tmp_path):
-    config = json.dumps(as_config(METHODS[name]) | {"seed": 3, "scan_hash": "x"}, allow_nan=False)
+    config = json.dumps(
+        {"schema_version": SCHEMA, "method": to_table(METHODS[name])} | {"seed": 3, "scan_hash": "x"}, allow_nan=False
+    )
     assert read_method(written(tmp_path, config, "config.json")) == METHODS[name]
-    assert base(name) == METHODS[name]
+    assert method_called(name) is METHODS[name]
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("speed = 3", "settings.speed is not known; remove it, or use one of start, spacing_px"),
-        ("[fit.schedule]\nstepz = 3", r"settings\.fit\.schedule\.stepz is not known"),
-        ('[fit.schedule]\nsteps = "many"', r"settings\.fit\.schedule\.steps must be a whole number, but it is 'many'"),
-        ('start = "guess"', r"settings\.start must be one of phase, random, but it is 'guess'"),
-        ("volume = 4", r"settings\.volume must be a table, but it is 4"),
+        ("speed = 3", "options.speed is not known; remove it, or use one of start, spacing_px"),
+        ("[fit.schedule]\nstepz = 3", r"options\.fit\.schedule\.stepz is not known"),
+        ('[fit.schedule]\nsteps = "many"', r"options\.fit\.schedule\.steps must be a whole number, but it is 'many'"),
+        ('start = "guess"', r"options\.start must be one of phase, random, but it is 'guess'"),
+        ("volume = 4", r"options\.volume must be a table, but it is 4"),
         ("[fit.schedule]\nsteps = -1", "steps must not be negative"),
         ("[fit.schedule]\ndecay = 0.0", "decay must lie in"),
         ("[volume]\niterations = 0", "iterations must be at least 1"),
         ("spacing_px = 0", "spacing_px must be positive"),
-        ('kind = "mesh"', r"settings\.kind must be one of gaussians, surfaces, voxels"),
+        ('kind = "mesh"', r"options\.kind must be one of gaussians, surfaces, voxels"),
         ('base = "quick"', "base must be one of default, fast, random, thesis, gaussians, surfaces.*'quick'"),
-        ("base = 3", r"settings\.base must be a name, but it is 3"),
+        ("base = 3", r"options\.base must be a name, but it is 3"),
         ('base = "fast"\nkind = "voxels"', "the base fast is of the kind gaussians, not voxels"),
-        ("method = 3", "must hold a table of settings, but it holds 3"),
+        ("method = 3", "must hold a table of options, but it holds 3"),
         ("schema_version = 3\n[method]\n", rf"has the schema version 3, but this version reads 1 to {SCHEMA}"),
         ('schema_version = "2"\n[method]\n', "has the schema version '2'"),
     ],
@@ -152,5 +154,5 @@ def test_rates_of_version_0_1_0_find_their_place():
     rates = found.fit.rates
     assert (rates.centres, rates.log_scales, rates.quaternions, rates.raw_amplitudes) == (1, 2, 3, 4)
     assert json.dumps(table) == before, "the table that is read must stay as it is"
-    with pytest.raises(InputError, match=r"settings\.fit\.rates\.centres must be a number"):
+    with pytest.raises(InputError, match=r"options\.fit\.rates\.centres must be a number"):
         method_of({"fit": {"schedule": {"rate_position": "fast"}}})
