@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import pytest
 from holosplat.geometry import Grid
 from holosplat.io.nxtomo import read_scan
 from holosplat.io.volumes import read_volume
+from holosplat.io.vtk import read_meshes
 from holosplat.workflows.run_folder import RunFolder
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
@@ -21,7 +23,8 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 def run_example(name: str, *arguments: str, cwd: Path) -> str:
     """What the example prints; it must end well and say nothing on stderr."""
     command = [sys.executable, str(EXAMPLES / name), *arguments]
-    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=200)
+    quiet = os.environ | {"MPLBACKEND": "Agg"}
+    done = subprocess.run(command, cwd=cwd, env=quiet, capture_output=True, text=True, timeout=400)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     return done.stdout
@@ -29,7 +32,13 @@ def run_example(name: str, *arguments: str, cwd: Path) -> str:
 
 def test_every_example_is_tested_and_short():
     found = sorted(path.name for path in EXAMPLES.glob("*.py"))
-    assert found == ["01_simulate_and_reconstruct.py"]
+    assert found == [
+        "01_simulate_and_reconstruct.py",
+        "02_own_meshes.py",
+        "03_unknown_material.py",
+        "04_noise.py",
+        "05_surfaces.py",
+    ]
     for name in found:
         assert (EXAMPLES / name).read_text(encoding="utf-8").count("\n") <= 60
 
@@ -51,3 +60,50 @@ def test_simulate_and_reconstruct(tmp_path):
     prior = RunFolder(out / "run").read_config()["prior"]
     assert prior["kind"] == "known"
     assert np.median(volume.delta[volume.delta > prior["delta"] / 2]) == pytest.approx(prior["delta"], rel=0.1, abs=0)
+
+
+def numbers(pattern: str, printed: str) -> list[float]:
+    """The numbers at the group of `pattern`, in the order in which they are printed."""
+    return [float(value) for value in re.findall(pattern, printed)]
+
+
+def test_own_meshes(tmp_path):
+    """Meshes of other programs become a scan file and a volume with their three bodies."""
+    printed = run_example("02_own_meshes.py", "out", cwd=tmp_path)
+    assert "3 meshes" in printed
+    assert numbers(r"volume: Dice ([\d.]+)", printed)[0] > 0.97
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        "cell0.vtk",
+        "cell1.vtk",
+        "cell2.vtk",
+        "scan.nxs",
+        "hologram_and_volumes.png",
+    }
+
+
+def test_unknown_material(tmp_path):
+    """The known material gives the best volume; with nothing known the ratio is within a fifth of the true one."""
+    printed = run_example("03_unknown_material.py", "out", cwd=tmp_path)
+    errors = numbers(r"error of δ ([\d.]+)", printed)
+    assert errors[0] == min(errors) < 0.09
+    assert errors[2] < 0.1
+    true, *_, found = numbers(r"δ/β = (\d+)", printed)
+    assert found == pytest.approx(true, rel=0.2, abs=0)
+
+
+def test_noise(tmp_path):
+    """Scores fall with the photons, and cells are still found in the fewest."""
+    printed = run_example("04_noise.py", "out", cwd=tmp_path)
+    scores = numbers(r"SSIM ([\d.]+)", printed)
+    assert scores == sorted(scores, reverse=True)
+    assert numbers(r"Dice ([\d.]+)", printed)[2] > 0.8
+
+
+def test_surfaces(tmp_path):
+    """Surfaces halve the error of the Gaussians, and are written as closed bodies."""
+    printed = run_example("05_surfaces.py", "out", cwd=tmp_path)
+    truth, gaussians, surfaces = numbers(r"relative error of δ ([\d.]+)", printed)
+    assert truth == 0
+    assert surfaces < 0.6 * gaussians
+    (bodies,) = read_meshes([tmp_path / "out/bodies.vtk"], "um")
+    assert f"{len(bodies.vertices)} vertices" in printed

@@ -203,6 +203,7 @@ def _bending(train: Scan, start: SurfaceMesh, objective: Objective) -> list[Term
     count = len(start.vertices)
     away = csr_array(eye_array(count) - neighbour_mean(start.faces.numpy(), count))
     twice = csr_array(away @ away)
+    twice.sort_indices()
     starts, columns = (torch.from_numpy(a.astype(np.int64)) for a in (twice.indptr, twice.indices))
     values = torch.from_numpy(twice.data)
     operator = torch.sparse_csr_tensor(starts, columns, values, twice.shape, check_invariants=True)
