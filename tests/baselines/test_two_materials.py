@@ -15,15 +15,7 @@ from scipy.ndimage import gaussian_filter
 from helpers.cli import holosplat, refused, worked
 from holosplat import native
 from holosplat.baselines import HolographicTV
-from holosplat.baselines.two_materials import (
-    Levels,
-    Shares,
-    TwoMaterials,
-    absorption,
-    at_one_ratio,
-    told_apart,
-    two_levels,
-)
+from holosplat.baselines.two_materials import Levels, Shares, absorption, at_one_ratio, told_apart, two_levels
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.fit import objective as terms
@@ -114,7 +106,6 @@ def test_two_materials_need_all_four_signs_of_them():
     """Levels apart, near to all values, the lower one more than a rim, and level."""
     two = Levels(high=2.0, low=1.0, spread=0.25, share=0.5, deviation=0.15)
     assert two.are_two()
-    assert not two.are_two(TwoMaterials(least_share=0.6))
     for sign in ({"low": 1.5}, {"spread": 0.6}, {"share": 0.05}, {"deviation": 0.5}):
         assert not replace(two, **sign).are_two()
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from holosplat.baselines.material import MaterialEstimate, estimate_ratio
-from holosplat.baselines.two_materials import TwoMaterials, told_apart
+from holosplat.baselines.two_materials import Levels, TwoMaterials, told_apart
 from holosplat.checks import InputError
 from holosplat.geometry import Grid
 from holosplat.methods import Gaussians
@@ -44,6 +44,14 @@ def test_slivers_are_left_out_below_the_asked_occupancy():
     levels = (1.0, 0.01)
     assert told_apart(slab, levels, 1)[0].sum() > 0
     assert told_apart(slab, levels, 1, TwoMaterials(sliver=0.2))[0].sum() == 0
+
+
+def test_how_much_makes_two_materials_is_an_option():
+    found = Levels(high=2.0, low=1.0, spread=0.25, share=0.5, deviation=0.15)
+    assert found.are_two()
+    assert not found.are_two(TwoMaterials(least_share=0.6))
+    assert not found.are_two(TwoMaterials(largest_spread=0.2))
+    assert not found.are_two(TwoMaterials(largest_deviation=0.1))
 
 
 def test_as_many_ratios_are_tried_as_are_asked_for(monkeypatch):
