@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .checks import finite, in_range, require, shaped
+from .frames import Binned, Frames, binned, blocks, picked
 from .geometry import Views
 
 ENERGY_RANGE_KEV = (0.1, 1000.0)
@@ -112,31 +115,70 @@ def far_from_edges(energy_kev: np.ndarray, reference_kev: float) -> np.ndarray:
     return np.stack((ratio**-2, ratio**-4), axis=-1)
 
 
-@dataclass(frozen=True)
+class _FramesInMemory:
+    """The attribute `Scan.frames`: an array or `Frames` goes in, the array comes out, read once at first use."""
+
+    def __get__(self, scan: Scan | None, owner: type[Scan] | None = None) -> np.ndarray:
+        if scan is None:
+            raise AttributeError("frames has no default")  # which a dataclass asks the class for
+        if isinstance(scan.source, Frames):
+            object.__setattr__(scan, "source", np.asarray(scan.source))
+        return np.asarray(scan.source)
+
+    def __set__(self, scan: Scan, frames: np.ndarray | Frames) -> None:
+        object.__setattr__(scan, "source", frames)
+
+
+@dataclass(frozen=True, repr=False, eq=False)
 class Scan:
     """Frames and how they were taken.
 
-    frames: [N, H, W] float32 intensity relative to the flat field; is_test: [N] bool, frames held out of the fit;
+    frames: [N, H, W] float32 intensity relative to the flat field; given as `Frames`, they are read into memory when
+    `scan.frames` is first used. `scan.source`, `scan[index]`, `blocks` and scans made from them do not read all frames.
+    is_test: [N] bool, frames held out of the fit.
     provenance: origin of the scan, as flat text entries.
     """
 
-    frames: np.ndarray
+    if TYPE_CHECKING:
+        frames: np.ndarray
+    else:
+        frames: np.ndarray = _FramesInMemory()
     exposures: Exposures
     is_test: np.ndarray
     provenance: dict[str, str] = field(default_factory=dict)
+    source: np.ndarray | Frames = field(init=False)
 
     def __post_init__(self) -> None:
-        frames = np.ascontiguousarray(self.frames, dtype=np.float32)
-        shaped("frames", frames, (len(self.exposures), *self.exposures.views.shape))
-        is_test = shaped("split", np.asarray(self.is_test, dtype=bool), (len(frames),))
-        object.__setattr__(self, "frames", finite("frames", frames))
+        wanted = (len(self.exposures), *self.exposures.views.shape)
+        if isinstance(self.source, Frames):
+            require(self.source.shape == wanted, f"frames must have the shape {wanted}, but it is {self.source.shape}.")
+        else:
+            frames = shaped("frames", np.ascontiguousarray(self.source, dtype=np.float32), wanted)
+            object.__setattr__(self, "source", finite("frames", frames))
+        is_test = shaped("split", np.asarray(self.is_test, dtype=bool), wanted[:1])
         object.__setattr__(self, "is_test", is_test)
 
+    @classmethod
+    def of(
+        cls, frames: np.ndarray | Frames, exposures: Exposures, is_test: np.ndarray, provenance: dict[str, str]
+    ) -> Scan:
+        """A scan of frames [N, H, W], an array or such as are read when they are asked for."""
+        return cls(frames, exposures, is_test, provenance)  # type: ignore[arg-type]  # `_FramesInMemory` takes both
+
     def __len__(self) -> int:
-        return len(self.frames)
+        return len(self.source)
+
+    def __repr__(self) -> str:
+        h, w = self.views.shape
+        return f"Scan({len(self)} frames of {h} × {w} pixels, {int(self.is_test.sum())} of them held out)"
 
     def __getitem__(self, index: np.ndarray | list[int] | slice) -> Scan:
-        return replace(self, frames=self.frames[index], exposures=self.exposures[index], is_test=self.is_test[index])
+        frames = picked(self.source, index)
+        return Scan.of(frames, self.exposures[index], self.is_test[index], self.provenance)
+
+    def blocks(self) -> Iterator[np.ndarray]:
+        """All frames in turn, some at once, [K, H, W] float32: a few of a long series are in memory at a time."""
+        return blocks(self.source)
 
     @property
     def views(self) -> Views:
@@ -167,16 +209,15 @@ class Scan:
 
     def as_static(self) -> Scan:
         """All frames as if taken at the same time, 0."""
-        return replace(self, exposures=replace(self.exposures, time=np.zeros(len(self))))
+        exposures = replace(self.exposures, time=np.zeros(len(self)))
+        return Scan.of(self.source, exposures, self.is_test, self.provenance)
 
     def binned(self, factor: int) -> Scan:
         """The scan on pixels `factor` times larger (means of `factor × factor`); odd rows and columns are cut."""
         if factor == 1:
             return self
-        h, w = (n // factor for n in self.views.shape)
-        require(min(h, w) > 0, f"frames of {self.views.shape} pixels cannot be binned by {factor}.")
-        top, left = ((n - m * factor) // 2 for n, m in zip(self.views.shape, (h, w)))
-        cut = self.frames[:, top : top + h * factor, left : left + w * factor]
+        frames = Binned(self.source, factor) if isinstance(self.source, Frames) else binned(self.source, factor)
+        (h, w), (top, left) = frames.shape[1:], ((n % factor) // 2 for n in self.views.shape)
         odd = np.array([self.views.shape[1] - w * factor - 2 * left, self.views.shape[0] - h * factor - 2 * top])
         views = replace(
             self.views,
@@ -185,7 +226,7 @@ class Scan:
             shifts=self.views.shifts - 0.5 * odd * self.views.pixel_size,
         )
         exposures = replace(self.exposures, views=views, psf_sigma_px=self.exposures.psf_sigma_px / factor)
-        return replace(self, frames=cut.reshape(len(self), h, factor, w, factor).mean((2, 4)), exposures=exposures)
+        return Scan.of(frames, exposures, self.is_test, self.provenance)
 
     def train(self) -> Scan:
         """The training frames only; `InputError` when there are none."""

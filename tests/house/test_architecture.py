@@ -21,7 +21,7 @@ Files = dict[str, str]
 
 TIERS = (
     ("units", "version", "checks", "tables", "native", "backends", "memory")
-    + ("geometry", "scan", "volume", "mesh", "matter"),
+    + ("geometry", "frames", "scan", "volume", "mesh", "matter"),
     ("materials", "optics", "metrics", "projectors", "preprocess"),
     ("specimens", "representations", "model"),
     ("io",),

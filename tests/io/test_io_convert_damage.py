@@ -17,9 +17,7 @@ from PIL import Image
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.io.folder import atomic_folder
-from holosplat.io.formats import format_of
 from holosplat.io.nerf_synthetic import GivenOptics, NerfOptions, read_nerf_synthetic, write_nerf_synthetic
-from holosplat.io.nxtomo import write_scan
 from holosplat.io.ply import write_ply
 from holosplat.io.r2_gaussian import R2Options, read_r2_gaussian, write_r2_gaussian
 from holosplat.io.tiff import read_tiff, write_tiff
@@ -337,27 +335,3 @@ def test_points_that_are_none_are_refused(tmp_path):
     for points, message in ((np.zeros((3, 2)), "shape"), (np.full((3, 3), np.nan), "NaN")):
         with pytest.raises(InputError, match=message):
             write_ply(tmp_path / "points.ply", points)
-
-
-# --- which format -------------------------------------------------------------------------------------------
-
-
-def test_the_format_is_told_from_the_content(folders, tmp_path):
-    write_scan(tmp_path / "scan.bin", small_scan())
-    assert format_of(tmp_path / "scan.bin") == "nxtomo"
-    kinds = {"nerf": "nerf-synthetic", "stack": "tiff", "files": "tiff", "r2": "r2-gaussian"}
-    assert {name: format_of(folders / name) for name in kinds} == kinds
-
-
-def test_what_is_no_scan_is_told_what_was_looked_for(folders, tmp_path):
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "text.nxs").write_text("no HDF5")
-    shutil.copy(folders / "r2/meta_data.json", folders / "nerf")
-    for path, message in (
-        (tmp_path / "none", "no such file or folder"),
-        (tmp_path / "text.nxs", "HDF5 file"),
-        (tmp_path / "empty", r"transforms_train.json \(nerf-synthetic\), scan.json \(tiff\), meta_data.json .* none"),
-        (folders / "nerf", "ambiguous, with those of nerf-synthetic and r2-gaussian"),
-    ):
-        with pytest.raises(InputError, match=message):
-            format_of(path)

@@ -11,14 +11,15 @@ import numpy as np
 
 from ..checks import at_least, in_range, require
 from ..io.atomic import atomic_path, require_apart, require_writable
+from ..io.formats import loader_of, read
 from ..io.nxtomo import RawLayout, scan_writer
-from ..io.scan_file import DARK, FLAT, PROJECTION, ScanFile, open_scan
+from ..io.scan_file import DARK, FLAT, PROJECTION, open_scan
 from ..optics.camera import Camera, Sensor
 from ..optics.coherence import joined_blur_px
 from ..optics.illumination import Illumination, PulseModel, Pulses
 from ..optics.noise import PHOTON_RANGE
 from ..optics.resampling import FLIPS, Flip
-from ..scan import Exposures
+from ..scan import Exposures, Scan
 
 DEAD_BIT, HOT_BIT = 1 << 1, 1 << 3
 """Bits of NeXus' `pixel_mask`: dead, over-responding."""
@@ -72,15 +73,15 @@ class _Bench:
     rng: np.random.Generator
 
     @classmethod
-    def drawn(cls, file: ScanFile, options: RecordingOptions, camera: Camera, light: Illumination) -> _Bench:
-        shape = file.exposures.views.shape
+    def drawn(cls, scan: Scan, options: RecordingOptions, camera: Camera, light: Illumination) -> _Bench:
+        shape = scan.views.shape
         of_sensor, of_model, of_flats, of_projections, rest = np.random.default_rng(options.seed).spawn(5)
         model = PulseModel.drawn(light, shape, of_model)
         return cls(
             Sensor.drawn(camera, shape, options.photons_per_pixel, of_sensor),
             model,
             model.pulses(options.flats, of_flats),
-            model.pulses(len(file.exposures), of_projections),
+            model.pulses(len(scan), of_projections),
             rest,
         )
 
@@ -94,7 +95,7 @@ def record(
     truth: Path | None = None,
     on_progress: Callable[[float], None] = lambda fraction: None,
 ) -> Recorded:
-    """Record the noise-free scan file `source` as raw counts into `out`: darks, flats, then one pulse a projection.
+    """Record the noise-free scan `source` as raw counts into `out`: darks, flats, then one pulse a projection.
 
     The file is NXtomo with `image_key`, uint16, frame by frame. `truth` gets the values that a reconstruction must not
     know: the light's mean, components and weights, pulse energies, and the sensor's maps (HDF5). `InputError` when the
@@ -104,24 +105,25 @@ def record(
         require_writable(path)
     require_apart(out, source, *([truth] if truth else []))
     require_apart(truth or out, source)
-    with open_scan(source) as file:
-        _require_clean(source, file)
-        bench = _Bench.drawn(file, options, camera, light)
-        upright = RawLayout(_kinds(options, len(file.exposures)), _mask(bench.sensor))
-        layout = replace(upright, mask=_flipped(upright.mask, options.flip), flips=FLIPS[options.flip])
-        exposures, is_test = _all_frames(file, options, camera)
-        provenance = file.provenance() | _provenance(options, camera, light)
-        saturated = 0
-        with scan_writer(out, exposures, is_test, provenance, layout) as add:
-            for number, kind in enumerate(layout.kinds):
-                counts = bench.sensor.read_out(_photons(bench, file, options, number), bench.rng)
-                if kind == PROJECTION:
-                    saturated += int((counts[~bench.sensor.defects] == camera.most).sum())
-                add(_flipped(counts, options.flip))
-                on_progress((number + 1) / len(layout.kinds))
-        if truth is not None:
-            _write_truth(truth, bench, options)
-        good = len(file.exposures) * int((~bench.sensor.defects).sum())
+    _require_corrected(source)
+    scan = read(source)
+    _require_noise_free(source, scan)
+    bench = _Bench.drawn(scan, options, camera, light)
+    upright = RawLayout(_kinds(options, len(scan)), _mask(bench.sensor))
+    layout = replace(upright, mask=_flipped(upright.mask, options.flip), flips=FLIPS[options.flip])
+    exposures, is_test = _all_frames(scan, options, camera)
+    provenance = scan.provenance | _provenance(options, camera, light)
+    saturated = 0
+    with scan_writer(out, exposures, is_test, provenance, layout) as add:
+        for number, kind in enumerate(layout.kinds):
+            counts = bench.sensor.read_out(_photons(bench, scan, options, number), bench.rng)
+            if kind == PROJECTION:
+                saturated += int((counts[~bench.sensor.defects] == camera.most).sum())
+            add(_flipped(counts, options.flip))
+            on_progress((number + 1) / len(layout.kinds))
+    if truth is not None:
+        _write_truth(truth, bench, options)
+    good = len(scan) * int((~bench.sensor.defects).sum())
     defects = int(bench.sensor.defects.sum())
     gain = camera.gain_for(options.photons_per_pixel)
     return Recorded(
@@ -129,26 +131,33 @@ def record(
     )
 
 
-def _require_clean(source: Path, file: ScanFile) -> None:
-    """`InputError` unless the frames are noise-free relative intensities."""
-    only = bool((file.kinds == PROJECTION).all())
+def _require_corrected(source: Path) -> None:
+    """`InputError` for a file with other frames than projections, which are counts."""
+    if loader_of(source).name != "nxtomo":
+        return
+    with open_scan(source) as file:
+        only = bool((file.kinds == PROJECTION).all())
     require(only, f"{source} must hold projections only, but it has flats, darks or invalid frames: it is raw already.")
-    photons = file.provenance().get("photons_per_pixel", "none")
+
+
+def _require_noise_free(source: Path, scan: Scan) -> None:
+    """`InputError` for frames with photon noise."""
+    photons = scan.provenance.get("photons_per_pixel", "none")
     require(
         photons == "none",
         f"{source} must be noise-free, but it has the noise of {photons} photons; simulate it without.",
     )
 
 
-def _photons(bench: _Bench, file: ScanFile, options: RecordingOptions, number: int) -> np.ndarray:
+def _photons(bench: _Bench, scan: Scan, options: RecordingOptions, number: int) -> np.ndarray:
     """Photons [H, W] expected in frame `number` of all: darks first, then flats, then projections."""
-    shape = file.exposures.views.shape
+    shape = scan.views.shape
     flat, projection = number - options.darks, number - options.darks - options.flats
     if flat < 0:
         return np.zeros(shape)
     if projection < 0:
         return options.photons_per_pixel * bench.model.light(bench.flats, flat)
-    relative = np.clip(file.frame(projection), 0, None)
+    relative = np.clip(scan.source[projection].astype(np.float64), 0, None)
     return options.photons_per_pixel * bench.model.light(bench.projections, projection) * relative
 
 
@@ -156,12 +165,12 @@ def _kinds(options: RecordingOptions, projections: int) -> np.ndarray:
     return np.repeat([DARK, FLAT, PROJECTION], [options.darks, options.flats, projections])
 
 
-def _all_frames(file: ScanFile, options: RecordingOptions, camera: Camera) -> tuple[Exposures, np.ndarray]:
+def _all_frames(scan: Scan, options: RecordingOptions, camera: Camera) -> tuple[Exposures, np.ndarray]:
     """Exposures and split of all frames; darks and flats, which have no pose, repeat those of the first projection."""
-    before, exposures = options.darks + options.flats, file.exposures
+    before, exposures = options.darks + options.flats, scan.exposures
     blurred = joined_blur_px(exposures.psf_sigma_px, camera.scintillator_px, 1.0)
     index = np.concatenate([np.zeros(before, dtype=int), np.arange(len(exposures))])
-    is_test = np.concatenate([np.zeros(before, dtype=bool), file.is_test])
+    is_test = np.concatenate([np.zeros(before, dtype=bool), scan.is_test])
     return replace(exposures, psf_sigma_px=blurred)[index], is_test
 
 

@@ -33,23 +33,23 @@ def reconstruct(
     """Reconstruct a scan as Gaussians; the run folder holds the result and its report.
 
     Args:
-        scan: Scan file (NXtomo).
+        scan: Scan: a file (NXtomo), or a folder (tiff, nerf-synthetic, r2-gaussian, or another run's).
         out: Run folder to make.
         seed: Seed of everything random.
         resume: Go on with an interrupted run.
         time_frame: Of a time-resolved scan: the time to reconstruct, counted from 0, or all if nothing moved.
     """
+    from ..io.formats import read
     from ..io.json import write_json
-    from ..io.nxtomo import read_scan
+    from ..io.run_scan import at_time
     from ..report.run import report_run
     from ..workflows.evaluate import evaluate as score
     from ..workflows.reconstruct import reconstruct as fit
     from ..workflows.run_folder import RunFolder
-    from .scans import at_time
 
     settings = how.settings()
     require(seed >= 0, f"--seed must be 0 or more, but it is {seed}.")
-    measured = at_time(read_scan(scan), time_frame)
+    measured = at_time(read(scan), time_frame)
     prior = matter.prior(measured.exposures.reference_energy)
     folder = RunFolder(out)
     with ProgressBar() as bar:
@@ -69,7 +69,7 @@ def render(run: Positional[Path], scan: Path, out: Path, split: Literal["test", 
 
     Args:
         run: Run folder.
-        scan: Scan file whose poses and optics are rendered.
+        scan: Scan whose poses and optics are rendered.
         out: Scan file to write: the predicted frames, in the scan's order.
         split: Which frames.
     """
@@ -135,7 +135,7 @@ def evaluate(
 
     Args:
         run: Run folder.
-        scan: Scan file (default: the one that was reconstructed).
+        scan: Scan (default: the one that was reconstructed).
         truth: Volume file of the truth.
         as_json: Print JSON instead of a table.
     """

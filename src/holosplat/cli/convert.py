@@ -13,12 +13,12 @@ from tyro.conf import Positional, arg
 
 from ..checks import InputError, require
 from ..io.folder import require_new
-from ..io.formats import ScanFormat, format_of
-from ..io.nerf_synthetic import GivenOptics, NerfOptions, grey_range, read_nerf_synthetic, write_nerf_synthetic
-from ..io.nxtomo import read_scan, write_scan
+from ..io.formats import ScanFormat, loader_of, read
+from ..io.nerf_synthetic import NerfOptions, grey_range, write_nerf_synthetic
+from ..io.nxtomo import write_scan
 from ..io.png import PngKind
-from ..io.r2_gaussian import R2Options, read_r2_gaussian, write_r2_gaussian
-from ..io.tiff import TiffLayout, read_tiff, write_tiff
+from ..io.r2_gaussian import R2Options, write_r2_gaussian
+from ..io.tiff import TiffLayout, write_tiff
 from ..io.volumes import read_volume
 from ..optics import retrieve_thickness
 from ..scan import Scan
@@ -91,7 +91,7 @@ def convert(
     """Bring a scan into another format; what SOURCE is, its content says.
 
     Args:
-        source: Scan file (NXtomo), or folder (nerf-synthetic, tiff, r2-gaussian).
+        source: Scan, a file (NXtomo) or folder (nerf-synthetic, tiff, r2-gaussian, a run's).
         out: File (nxtomo) or folder to make.
         to: Format to write; r2-gaussian needs a material or δ/β, for which its line integrals are retrieved.
     """
@@ -124,27 +124,11 @@ def convert(
 
 def _read(source: Path, given: dict[str, float]) -> Scan:
     """The scan at `source`, with what is `given` for a folder of another program."""
-    kind = format_of(source)
-    if kind == "r2-gaussian":
-        _only(kind, given, ("energy_kev", "pixel_size"))
-        scan = read_r2_gaussian(source, **given)
-        beta = scan.provenance["beta_of_density_1"]
-        _say(f"{source} has no phase: transmission exp(-p) in contact, where a density of 1 has beta {beta}; "
-             "reconstruct it with --delta-beta 1, and read beta")  # fmt: skip
-        return scan
-    if kind == "nerf-synthetic":
-        if not given:
-            return read_nerf_synthetic(source)
-        for name in ("energy_kev", "distance", "pixel_size"):
-            require(name in given, f"--{name.replace('_', '-')} must be given too, for folders of other programs.")
-        return read_nerf_synthetic(source, GivenOptics(**given))
-    _only(kind, given, ())
-    return {"nxtomo": read_scan, "tiff": read_tiff}[kind](source)
-
-
-def _only(kind: ScanFormat, given: dict[str, float], allowed: tuple[str, ...]) -> None:
-    stray = [f"--{name.replace('_', '-')}" for name in given if name not in allowed]
-    require(not stray, f"{', '.join(stray)}: not for a source in {kind}; leave it away.")
+    scan = read(source, given)
+    if loader_of(source).name == "r2-gaussian":
+        _say(f"{source} has no phase: transmission exp(-p) in contact, where a density of 1 has beta "
+             f"{scan.provenance['beta_of_density_1']}; reconstruct it with --delta-beta 1, and read beta")  # fmt: skip
+    return scan
 
 
 def _retrieved(scan: Scan, prior: MaterialPrior) -> tuple[np.ndarray, float]:

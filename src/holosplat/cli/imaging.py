@@ -29,7 +29,7 @@ def record(
     """Record a noise-free scan as raw counts: pulses of a free-electron laser, a camera, flats and darks.
 
     Args:
-        scan: Scan file (NXtomo) of relative intensities without noise, such as `holosplat simulate` writes.
+        scan: Scan of relative intensities without noise, such as `holosplat simulate` writes.
         out: File of raw counts to write (NXtomo with image_key).
         truth: Also write what the frames do not say: light, pulse energies, gains and defects (HDF5).
     """
@@ -69,7 +69,7 @@ def join(
     """Join scans of several beams, one file each, on one raster.
 
     Args:
-        scans: Scan files (NXtomo); their photon energies may differ.
+        scans: Scans, one a beam; their photon energies may differ.
         out: Scan file to write.
         pixel_size: Pixel of the result [m] (default: the coarsest of the files).
         flip: What each detector saw reversed, one word a file (default: what the files say themselves).

@@ -40,7 +40,7 @@ def surface(
     Args:
         run: Run folder, of a reconstruction as one material: any but those that fit δ and β apart.
         out: Folder to make: body000.vtk …, the largest first, each with its cavities, and summary.json.
-        scan: Scan file (default: the one that was reconstructed).
+        scan: Scan (default: the one that was reconstructed).
         truth: Volume file of the truth, to score both against.
     """
     require_new(out)

@@ -1,37 +1,51 @@
-"""Which format a path holds, told from its content."""
+"""Scans of every format that the project knows: `read` tells it from what a path holds."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
-import h5py
-
 from ..checks import InputError, require
-from . import nerf_synthetic, r2_gaussian, tiff
+from ..scan import Scan
+from . import nerf_synthetic, nxtomo, r2_gaussian, run_scan, tiff
+from .loader import Loader
 
 ScanFormat = Literal["nxtomo", "nerf-synthetic", "tiff", "r2-gaussian"]
+"""Formats that scans are written in."""
 
-MARKS: dict[str, ScanFormat] = {
-    nerf_synthetic.TRAIN: "nerf-synthetic",
-    tiff.SCAN: "tiff",
-    r2_gaussian.META: "r2-gaussian",
-}
-"""The file that makes a folder one of a format."""
+LOADERS: tuple[Loader, ...] = (
+    nxtomo.LOADER,
+    tiff.LOADER,
+    nerf_synthetic.LOADER,
+    r2_gaussian.LOADER,
+    run_scan.loader(lambda path: read(path)),
+)
+"""Every format that scans are read from; a new one is a file and a line here (docs/adding.md)."""
 
 
-def format_of(path: str | Path) -> ScanFormat:
-    """The format of `path`: NXtomo is an HDF5 file, the others are folders with a file of a certain name."""
+def read(path: str | Path, given: Mapping[str, float] | None = None) -> Scan:
+    """The scan at `path`, a file or folder of any format in `LOADERS`.
+
+    given: what folders of other programs do not say, by name (`Loader.takes`): energy_kev [keV], distance [m],
+    pixel_size [m], black and white [relative intensity]. Errors: `InputError` for a path that is not there, holds no
+    scan that is known or one that is damaged, and for what is `given` and does not belong to its format.
+    """
+    loader, given = loader_of(path), given or {}
+    stray = [name for name in given if name not in loader.takes]
+    require(not stray, f"{', '.join(stray)}: not for a source in {loader.name}; leave it away.")
+    return loader.read(Path(path), given)
+
+
+def loader_of(path: str | Path) -> Loader:
+    """What reads `path`; `InputError` for a path that none knows, or more than one."""
     found = Path(path)
     require(found.exists(), f"{path} must be a scan, but there is no such file or folder; check the path.")
-    marks = ", ".join(f"{name} ({kind})" for name, kind in MARKS.items())
-    if found.is_file():
-        require(
-            h5py.is_hdf5(found), f"{path} must be an HDF5 file (nxtomo), or a folder with {marks}, but it is neither."
-        )
-        return "nxtomo"
-    kinds: list[ScanFormat] = [kind for name, kind in MARKS.items() if (found / name).is_file()]
-    if len(kinds) != 1:
-        what = f"it is ambiguous, with those of {' and '.join(kinds)}" if kinds else "it holds none of them"
-        raise InputError(f"{path} must hold one of the files {marks}, but {what}.")
-    return kinds[0]
+    loaders = [loader for loader in LOADERS if loader.recognises(found)]
+    if len(loaders) == 1:
+        return loaders[0]
+    if loaders:
+        kinds = " and ".join(loader.name for loader in loaders)
+        raise InputError(f"{path} must be a scan of one format, but it is ambiguous: {kinds}; keep the files of one.")
+    known = "; ".join(f"{loader.mark} ({loader.name})" for loader in LOADERS)
+    raise InputError(f"{path} must be a scan, but it is none of what is known: {known}.")

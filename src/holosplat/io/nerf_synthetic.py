@@ -7,6 +7,7 @@ intensities, optics, times); other programs ignore them. docs/formats.md has the
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from ..scan import DISTANCE_RANGE_M, ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures,
 from .exposure_tables import beam_table, exposure_table, in_order, read_exposures
 from .folder import atomic_folder
 from .json import write_json
+from .loader import Loader, folder_with
 from .ply import write_ply
 from .png import LEVELS, PngKind, read_png, write_png
 from .seeds import hull_points, uniform_points
@@ -246,3 +248,17 @@ def _foreign_scan(folder: Path, splits: list[Table], content: _Content, given: G
     exposures = Exposures.of(Views(rotations, shifts, (h, w), given.pixel_size), given.energy_kev, given.distance)
     origin = {"converted_from": f"NeRF-synthetic folder {folder.name}"}
     return Scan(content.intensities(given.black, given.white), exposures, content.is_test, origin)
+
+
+TAKES = ("energy_kev", "distance", "pixel_size", "black", "white")
+
+
+def _read(path: Path, given: Mapping[str, float]) -> Scan:
+    if not given:
+        return read_nerf_synthetic(path)
+    for name in TAKES[:3]:
+        require(name in given, f"{name} must be given too, for folders of other programs.")
+    return read_nerf_synthetic(path, GivenOptics(**given))
+
+
+LOADER = Loader("nerf-synthetic", f"a folder with {TRAIN}", folder_with(TRAIN), _read, TAKES)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,11 +11,27 @@ import h5py
 import numpy as np
 
 from ..checks import InputError, finite, require, shaped
+from ..frames import Frames
 from ..preprocess.flat_field import relative_intensity, unlit
 from ..scan import Exposures, Scan
 from ..version import __version__
 from .atomic import atomic_path
-from .scan_file import ANGLE, DARK, DATA, FLAT, FLIPS, IMAGE_KEY, MASK, PROJECTION, SPLIT, ScanFile, open_scan
+from .hdf5 import Fields, open_hdf5
+from .loader import Loader
+from .scan_file import (
+    ANGLE,
+    DARK,
+    DATA,
+    FLAT,
+    FLIPS,
+    IMAGE_KEY,
+    MASK,
+    PROJECTION,
+    SPLIT,
+    ScanFile,
+    open_scan,
+    upright,
+)
 
 
 @dataclass(frozen=True)
@@ -31,42 +47,90 @@ class RawLayout:
     flips: tuple[bool, bool] = (False, False)
 
 
+@dataclass(frozen=True)
+class StoredFrames(Frames):
+    """The projections of an NXtomo file, flat-field corrected when they are read.
+
+    numbers: [N] of the projections among the file's frames; dark, light: [H, W] mean dark field and mean flat field
+    less that, light None where the file is corrected already; stamp: of the file when it was opened. The file is
+    opened anew for each reading. Errors: `InputError` for a file that is gone or changed, or values not finite.
+    """
+
+    path: Path
+    label: str
+    dataset: str
+    flips: tuple[bool, bool]
+    numbers: np.ndarray
+    dark: np.ndarray
+    light: np.ndarray | None
+    shape: tuple[int, int, int]
+    stamp: tuple[int, ...]
+
+    @classmethod
+    def of(cls, file: ScanFile) -> StoredFrames:
+        """Those of an open file, whose dark and flat frames are read for their means."""
+        fields, shape, numbers = file.fields, file.exposures.views.shape, file.numbers(PROJECTION)
+        dark, light = _fields_of_light(file)
+        path, name = fields.path.resolve(), str(fields.dataset(DATA).name)
+        whole = (len(numbers), *shape)
+        return cls(path, fields.label(DATA), name, file.flips, numbers, dark, light, whole, _stamp(path))
+
+    def read(self, numbers: np.ndarray) -> np.ndarray:
+        """See `Frames.read`."""
+        gone = f"{self.path} must be the file that was opened, but it is gone; put it back, or open another."
+        require(self.path.is_file(), gone)
+        changed = f"{self.path} must be the file that was opened, but it has changed since; open it again."
+        require(_stamp(self.path) == self.stamp, changed)
+        frames = np.empty((len(numbers), *self.shape[1:]), dtype=np.float32)
+        with open_hdf5(self.path) as file:
+            data = Fields(self.path, file).dataset(self.dataset)
+            for i, n in enumerate(self.numbers[numbers]):  # one by one: raw frames are wider, and there may be many
+                raw = upright(data, int(n), slice(0, self.shape[1]), self.flips)
+                frames[i] = raw if self.light is None else relative_intensity(raw, self.dark, self.light)
+        return finite(self.label, frames)
+
+
 def read_scan(path: str | Path) -> Scan:
     """The projections of an NXtomo file, flat-field corrected, and how they were taken.
 
     Frames marked flat and dark correct the others: (frame - mean dark) / (mean flat - mean dark); frames
-    marked invalid are dropped. `InputError` as of `open_scan`.
+    marked invalid are dropped. The projections are read when they are asked for (`StoredFrames`). `InputError` as of
+    `open_scan`.
     """
     with open_scan(path) as file:
-        return Scan(_corrected_frames(file), file.exposures, file.is_test, file.provenance())
+        return Scan.of(StoredFrames.of(file), file.exposures, file.is_test, file.provenance())
 
 
-def _corrected_frames(file: ScanFile) -> np.ndarray:
-    """The projections [n, H, W] float32, relative to the flat field where the file has one."""
-    label, shape = file.fields.label, file.exposures.views.shape
-    flats, darks = file.numbers(FLAT), file.numbers(DARK)
+def _stamp(path: Path) -> tuple[int, ...]:
+    """What changes when a file is written anew."""
+    found = path.stat()
+    return found.st_mtime_ns, found.st_size, found.st_ino
+
+
+def _fields_of_light(file: ScanFile) -> tuple[np.ndarray, np.ndarray | None]:
+    """The mean dark field [H, W], and the mean flat field less that, None where the file has no flats."""
+    label, flats, darks = file.fields.label, file.numbers(FLAT), file.numbers(DARK)
     if len(darks) and not len(flats):
         raise InputError(f"{label(IMAGE_KEY)} must mark flats (1) beside the dark ones (2), but it marks none.")
     dark = file.mean(DARK)
-    light = file.mean(FLAT) - dark if len(flats) else np.ones(shape)
+    if not len(flats):
+        return dark, None
+    light = file.mean(FLAT) - dark
     bad = int(unlit(light).sum())
     require(
         bad == 0,
         f"{label(DATA)} must have flat frames brighter than dark ones everywhere, but in {bad} of {light.size} pixels "
         "they are not; `holosplat correct` repairs such pixels.",
     )
-    selected = file.numbers(PROJECTION)
-    frames = np.empty((len(selected), *shape), dtype=np.float32)
-    for i, n in enumerate(selected):  # one by one: the raw file may be larger than memory
-        frames[i] = relative_intensity(file.frame(n), dark, light) if len(flats) else file.frame(n)
-    return finite(label(DATA), frames)
+    return dark, light
 
 
 def write_scan(path: str | Path, scan: Scan) -> None:
     """Write `scan` as NXtomo (docs/conventions.md), replacing `path` only once all is written."""
     with scan_writer(path, scan.exposures, scan.is_test, scan.provenance) as add:
-        for frame in scan.frames:
-            add(frame)
+        for block in scan.blocks():
+            for frame in block:
+                add(frame)
 
 
 @contextmanager
@@ -182,3 +246,14 @@ def _escaped(key: str) -> str:
     """A provenance name as an HDF5 name, in which "/" and a lone "." have a meaning of their own."""
     escaped = key.replace("%", "%25").replace("/", "%2F")
     return escaped.replace(".", "%2E") if set(escaped) == {"."} else escaped
+
+
+def _recognises(path: Path) -> bool:
+    return path.is_file() and h5py.is_hdf5(path)
+
+
+def _read(path: Path, given: Mapping[str, float]) -> Scan:
+    return read_scan(path)
+
+
+LOADER = Loader("nxtomo", "an HDF5 file", _recognises, _read)

@@ -8,6 +8,7 @@ them.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from ..volume import Volume
 from .exposure_tables import beam_table, exposure_table, in_order, read_exposures
 from .folder import atomic_folder
 from .json import write_json
+from .loader import Loader, folder_with
 from .seeds import hull_points
 from .table import Table
 
@@ -256,3 +258,13 @@ def _absorber(
         "beta_of_density_1": f"{beta:.6g}",
     }
     return Scan(np.exp(-lines), exposures, is_test, {**provenance, **told})
+
+
+TAKES = ("energy_kev", "pixel_size")
+
+
+def _read(path: Path, given: Mapping[str, float]) -> Scan:
+    return read_r2_gaussian(path, *(given.get(name) for name in TAKES))
+
+
+LOADER = Loader("r2-gaussian", f"a folder with {META}", folder_with(META), _read, TAKES)

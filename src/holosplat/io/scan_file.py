@@ -62,11 +62,7 @@ class ScanFile:
 
     def rows(self, number: int, rows: slice) -> np.ndarray:
         """The rows `rows` (from start to stop) of frame `number`, float64, turned upright."""
-        upside_down, mirrored = self.flips
-        height = self.exposures.views.shape[0]
-        stored = slice(height - rows.stop, height - rows.start) if upside_down else rows
-        found = self.fields.dataset(DATA)[number, stored].astype(np.float64)
-        return found[:: -1 if upside_down else 1, :: -1 if mirrored else 1]
+        return upright(self.fields.dataset(DATA), number, rows, self.flips)
 
     def mean(self, kind: int) -> np.ndarray:
         """The mean [H, W] of the frames of `kind`; zeros where there are none."""
@@ -83,6 +79,18 @@ class ScanFile:
     def provenance(self) -> dict[str, str]:
         """The provenance of the scan."""
         return _read_provenance(self.fields)
+
+
+def upright(data: h5py.Dataset, number: int, rows: slice, flips: tuple[bool, bool]) -> np.ndarray:
+    """The rows `rows` (from start to stop) of frame `number` of `data` [N, H, W], float64, turned upright.
+
+    flips: whether the stored frames are upside down, and mirrored left to right.
+    """
+    upside_down, mirrored = flips
+    height = data.shape[1]
+    stored = slice(height - rows.stop, height - rows.start) if upside_down else rows
+    found = data[number, stored].astype(np.float64)
+    return found[:: -1 if upside_down else 1, :: -1 if mirrored else 1]
 
 
 @contextmanager

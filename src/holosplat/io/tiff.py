@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -12,6 +13,7 @@ from ..scan import Scan
 from .exposure_tables import beam_table, exposure_table, read_exposures
 from .folder import atomic_folder
 from .json import write_json
+from .loader import Loader
 from .table import Table
 
 FORMAT = "holosplat TIFF 1"
@@ -73,3 +75,20 @@ def _pages(file: Path, count: int) -> list[np.ndarray]:
         grey = page.ndim == 2 and page.dtype.kind in "iuf"
         require(grey, f"{file} must hold grey images of numbers, but one is {page.dtype} of the shape {page.shape}.")
     return pages
+
+
+def _recognises(path: Path) -> bool:
+    """The folder, or in it scan.json or an image."""
+    named = path.name == SCAN or path.suffix.lower() in (".tif", ".tiff")
+    return (_folder(path) / SCAN).is_file() and (path.is_dir() or named)
+
+
+def _folder(path: Path) -> Path:
+    return path if path.is_dir() else path.parent
+
+
+def _read(path: Path, given: Mapping[str, float]) -> Scan:
+    return read_tiff(_folder(path))
+
+
+LOADER = Loader("tiff", f"a folder with {SCAN}, or an image in it", _recognises, _read)

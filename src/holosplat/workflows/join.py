@@ -11,8 +11,8 @@ import numpy as np
 from ..checks import in_range, require
 from ..geometry import Views
 from ..io.atomic import require_apart, require_writable
-from ..io.nxtomo import read_scan, scan_writer
-from ..io.scan_file import open_scan
+from ..io.formats import read
+from ..io.nxtomo import scan_writer
 from ..optics.coherence import joined_blur_px
 from ..optics.resampling import FLIPS, Flip, Resampling
 from ..scan import PIXEL_RANGE_M, Exposures
@@ -28,7 +28,7 @@ def join(
     flips: Sequence[Flip] = (),
     on_progress: Callable[[float], None] = lambda fraction: None,
 ) -> Exposures:
-    """One scan file `out` of all frames of the scan files `sources`, one file a beam, in their order.
+    """One scan file `out` of all frames of the scans `sources`, one a beam, in their order.
 
     Each frame is brought to pixels of `pixel_size` [m] (default: the coarsest of all), over the field that every
     detector has, about its own centre; distances, poses, shifts and times stay its own, its point-spread function is
@@ -42,21 +42,18 @@ def join(
         len(flips) in (0, len(sources)),
         f"--flip must say one of {', '.join(FLIPS)} for each of the {len(sources)} files, but it says {len(flips)}.",
     )
-    parts, is_test, texts = [], [], []
-    for source in sources:
-        with open_scan(source) as file:
-            parts.append(file.exposures)
-            is_test.append(file.is_test)
-            texts.append(file.provenance())
+    scans = [read(source) for source in sources]
+    parts = [scan.exposures for scan in scans]
     pitch = _common_pixel(parts, pixel_size)
     shape = _common_shape(parts, pitch)
     joined, resamplings = _joined(parts, shape, pitch)
-    described = {"joined": "; ".join(path.name for path in sources), **_shared(texts)}
+    described = {"joined": "; ".join(path.name for path in sources), **_shared([scan.provenance for scan in scans])}
     done = 0
-    with scan_writer(out, joined, np.concatenate(is_test), described) as add:
-        for n, (source, resampling) in enumerate(zip(sources, resamplings)):
+    is_test = np.concatenate([scan.is_test for scan in scans])
+    with scan_writer(out, joined, is_test, described) as add:
+        for n, (scan, resampling) in enumerate(zip(scans, resamplings)):
             rows, columns = FLIPS[flips[n]] if flips else (False, False)
-            for frame in read_scan(source).frames:
+            for frame in (frame for block in scan.blocks() for frame in block):
                 add(resampling(frame[:: -1 if rows else 1, :: -1 if columns else 1]))
                 done += 1
                 on_progress(done / len(joined))

@@ -19,8 +19,9 @@ def scan_hash(scan: Scan) -> str:
     """A short fingerprint (SHA-256) of the frames and how they were taken."""
     digest = hashlib.sha256()
     exposures = scan.exposures
+    for block in scan.blocks():
+        digest.update(np.ascontiguousarray(block).tobytes())
     parts = (
-        scan.frames,
         scan.is_test,
         scan.views.rotations,
         scan.views.shifts,

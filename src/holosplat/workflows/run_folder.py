@@ -56,7 +56,7 @@ class RunFolder:
         """The scan file that was reconstructed; `InputError` if it is not known, or no longer there."""
         require(self.source.is_file(), f"{self.path} does not say which scan it is of; name it with --scan.")
         path = Path(str(read_json(self.source).get("scan", "")))
-        require(path.is_file(), f"the scan {path} of this run is no longer there; name it with --scan.")
+        require(path.exists(), f"the scan {path} of this run is no longer there; name it with --scan.")
         return path
 
     def start_metrics(self, columns: Iterable[str], keep_until: int = 0) -> None:

@@ -1,0 +1,32 @@
+"""What a format of scans says of itself, to stand in the table of `formats`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ..scan import Scan
+
+
+@dataclass(frozen=True)
+class Loader:
+    """One format of scans, told from what a path holds.
+
+    name: of the format, as messages say it; mark: what a path of that format is ("a folder with scan.json");
+    recognises: whether a path is one, by its content; read: the scan at such a path, with what it does not say itself;
+    takes: names of what that may be (energy_kev [keV], distance [m], pixel_size [m], black, white).
+    """
+
+    name: str
+    mark: str
+    recognises: Callable[[Path], bool]
+    read: Callable[[Path, Mapping[str, float]], Scan]
+    takes: tuple[str, ...] = ()
+
+
+def folder_with(*names: str) -> Callable[[Path], bool]:
+    """Whether a path is a folder that holds all the files `names`."""
+    return lambda path: path.is_dir() and all((path / name).is_file() for name in names)
