@@ -60,8 +60,8 @@ class Everything:
 
 
 RATES = st.builds(Rates, FLOATS, st.none() | FLOATS, st.lists(FLOATS, max_size=3).map(tuple))
-METHODS = st.builds(Plain, st.integers(), NAMES.map(Path)) | st.builds(Fine, st.tuples(st.integers(), NAMES), RATES)
-ALL = st.builds(Everything, NAMES, st.booleans(), st.sampled_from(["left", "right"]), RATES, METHODS, st.none() | RATES)
+MEMBERS = st.builds(Plain, st.integers(), NAMES.map(Path)) | st.builds(Fine, st.tuples(st.integers(), NAMES), RATES)
+ALL = st.builds(Everything, NAMES, st.booleans(), st.sampled_from(["left", "right"]), RATES, MEMBERS, st.none() | RATES)
 
 
 @given(ALL)
