@@ -90,7 +90,7 @@ def test_the_scene_is_matter_on_a_raster(case):
     truth = case.truth()
     assert truth.grid.shape[1:] == case.exposures.views.shape
     if case.prior.kind == "known":
-        assert truth.delta.max() == near(case.prior.delta, rel=1e-5)
+        assert truth.delta.max() == near(case.prior.materials[0].delta, rel=1e-5)
     assert truth.delta.min() >= -1e-6 * truth.delta.max()
     share = np.mean(truth.delta > 0.5 * truth.delta.max())
     assert 0.002 < share < 0.4
@@ -138,7 +138,7 @@ def test_main12_with_seed_0_is_the_demonstration(loaded):
 def test_matter_of_plasma_shells_and_capsules():
     plasma, shells, capsules = (load_case(name) for name in ("plasma8-1e4", "shells8", "two_materials8"))
     assert plasma.prior.kind == "known"
-    assert plasma.prior.delta > 0 > plasma.prior.beta
+    assert plasma.prior.materials[0].delta > 0 > plasma.prior.materials[0].beta
     assert plasma.photons == 1e4
     outer, core = shells.scene.materials[0], shells.scene.materials[-1]
     assert core == (-outer.delta, -outer.beta)

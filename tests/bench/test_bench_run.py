@@ -86,7 +86,7 @@ def test_the_size_of_a_result_is_what_it_says_or_unknown(recorder, tmp_path):
 
     def sized(scan):
         v = voxels(scan)
-        return Sized(v.values, v.grid, v.delta, v.beta)
+        return Sized(v.values, v.grid, v.matter)
 
     class Plain:
         def __init__(self, obj: hs.Object) -> None:
@@ -295,7 +295,7 @@ def test_true_lines_are_the_true_thickness(monkeypatch):
     monkeypatch.setitem(references.TOMOGRAPHIES, "tv", tomography)
     case = make_case("wide", 3)
     found = references.tv_of_true_lines(case, case.truth(), lambda stage, fraction: None)
-    assert (found.delta, found.beta) == (MATERIAL.delta, MATERIAL.beta)
+    assert found.matter == hs.Matter.one(*MATERIAL)
     assert len(given["views"]) == 4
     assert given["upper"] == 1
     volume = case.scene.meshes[0].volume

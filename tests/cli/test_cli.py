@@ -26,7 +26,7 @@ from helpers.cli import (
     worked,
 )
 from holosplat.cli import main
-from holosplat.methods.presets import preset
+from holosplat.methods.presets import SCHEMA, preset
 from holosplat.tables import to_table
 
 
@@ -75,6 +75,7 @@ def test_the_whole_chain_as_processes(shop, tmp_path):
     assert {path.name for path in (tmp_path / "RUN").iterdir()} == names
     assert "</html>" in (tmp_path / "RUN/report.html").read_text()
     config = json.loads((tmp_path / "RUN/config.json").read_text())
+    assert config["schema_version"] == SCHEMA
     assert config["method"] == to_table(preset("fast"))
     assert config["seed"] == 4
 
