@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from holosplat.baselines import HolographicTV
+from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.cli import main
 from holosplat.fit import terms
@@ -21,14 +22,13 @@ from holosplat.geometry import Grid, Views
 from holosplat.io.nxtomo import write_scan
 from holosplat.io.objects import read_object
 from holosplat.materials import HAEMOGLOBIN
-from holosplat.matter import Matter, MaterialPrior
+from holosplat.matter import MaterialPrior, Matter
 from holosplat.methods import METHODS, ExtraTerm, PerView, Task, VoxelFit, Voxels, solve
 from holosplat.model import Instrument, Model
 from holosplat.representations import VoxelGrid
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
-from holosplat.beamline.simulate import simulate
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "adding.md"
 PIXEL = 3.2e-6
@@ -108,7 +108,7 @@ def test_a_term_is_one_file_and_one_line(tmp_path, monkeypatch, scan):
     monkeypatch.setitem(terms.TERMS, name, build)
     quick = HolographicTV(iterations=30, corrections=1, inner=8, refine=1)
     plain = Voxels(volume=quick, fit=VoxelFit(steps=5, refine=1))
-    sparse = replace(plain, fit=replace(plain.fit, terms=(ExtraTerm(name, 30.0),)))
+    sparse = replace(plain, fit=replace(plain.fit, terms=(ExtraTerm(name, 3000.0),)))
     without, with_it = (solve(method, Task(scan.train(), KNOWN)).values.sum() for method in (plain, sparse))
     assert 0 < with_it < 0.9 * without
 
@@ -119,10 +119,11 @@ def test_the_term_of_the_page_is_right(tmp_path, monkeypatch, scan):
     _, build = entry(line, loaded(monkeypatch, tmp_path, "fit.terms", "sparsity", code))
     grid = Grid.of_views(scan.views)
     values = torch.randn((1, *grid.shape), dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    batch = Batch(None, torch.zeros(3, dtype=torch.float64), torch.tensor(0.0), volume=0)
     model = Model(VoxelGrid(values, grid, Matter.one(*CELL)), Instrument(scan.exposures))
 
     def loss(at: torch.Tensor) -> torch.Tensor:
-        (part,) = build(2.0, model, scan)(model.with_parameters({"object.values": at}), Batch())
+        (part,) = build(2.0, model, scan)(model.with_parameters({"object.values": at}), batch)
         return part.weight * part.value
 
     free = values.clone().requires_grad_()
