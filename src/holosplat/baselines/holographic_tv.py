@@ -8,7 +8,6 @@ frequencies that only consistency between views can mend.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal
@@ -27,6 +26,7 @@ from ..optics.retrieval import Tikhonov, tikhonov
 from ..optics.retrieval.bounded import MODEL_ERROR, PRIOR
 from ..optics.retrieval.spectra import Raster, filtered, radian, response, spectra, surrounded
 from ..optics.sampling import fringe_sampling
+from ..progress import Progress
 from ..projectors.voxels import projector_for
 from ..scan import Scan
 from ..volume import LineIntegrals
@@ -38,9 +38,6 @@ FEW_VIEWS = 8
 """With fewer, total variation has more to fill in, and its steps take longer to do so."""
 SETTLING = 2
 """Rounds of agreement after which misfits are compared."""
-
-Progress = Callable[[str, float], None]
-"""Called with (stage, fraction done of it)."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
@@ -13,6 +12,7 @@ from ..checks import require
 from ..geometry import Grid
 from ..memory import memory_kept
 from ..optics.retrieval import paganin
+from ..progress import Progress
 from ..scan import Scan
 from .rays import rays_of
 from .tomography import TotalVariation, tv_solver
@@ -24,7 +24,6 @@ TRIAL_DELTA = 1e-6
 WORKING_WIDTH = 64
 """Frames are binned to about this width for estimates; the ratio acts on the lowest frequencies only."""
 
-Progress = Callable[[str, float], None]
 Backend = Literal["cpu", "reference"]
 
 

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from ..progress import Progress
 from ..scan import Scan
 from ..volume import Object
 from ..workflows.settings import MaterialPrior
-
-Progress = Callable[[str, float], None]
-"""Called with (stage, fraction done of it)."""
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,10 @@ import torch
 from ..baselines import TOMOGRAPHIES
 from ..checks import require
 from ..geometry import Grid
+from ..progress import Progress
 from ..representations.voxels import VoxelGrid
 from ..volume import Object, Volume
 from .case import Case
-from .method import Progress
 
 
 @dataclass(frozen=True)
