@@ -23,6 +23,7 @@ from typing import Any
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
+from holosplat.workflows.start import starting_cloud
 from machine import commit
 
 import holosplat as hs
@@ -30,7 +31,6 @@ from holosplat.bench.case import Case, case_names, load_case
 from holosplat.fit.loop import Fit
 from holosplat.workflows.evaluate import score_object
 from holosplat.workflows.reconstruct import fit_options
-from holosplat.workflows.start import starting_cloud
 
 AS_IT_IS = "as it is"
 Settings = hs.Settings

@@ -21,12 +21,12 @@ from typing import Any
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
+from holosplat.fit.surfaces import oversampling
 from machine import commit
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from holosplat.bench.declaration import Between
-from holosplat.fit.surfaces import oversampling
 from holosplat.workflows.evaluate import Scores, score_object
 from holosplat.workflows.provenance import environment
 

@@ -26,13 +26,13 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 import numpy as np
 import torch
 from eager_step import EagerStep
+from holosplat.fit.objective import Objective
 from machine import commit, memory_megabytes
 
 import holosplat as hs
 from holosplat.backends import device_name, resolve
 from holosplat.fit.fidelity import Target, l1_and_ssim
 from holosplat.fit.loop import Fit, FitOptions
-from holosplat.fit.objective import Objective
 from holosplat.fit.schedule import Schedule
 from holosplat.geometry import Poses
 from holosplat.representations.gaussians import raw_of

@@ -22,15 +22,15 @@ from typing import Any
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import torch
+from holosplat.fit.surfaces import SurfaceFit, fit_surfaces, oversampling
+from holosplat.workflows.surfaces import Extraction, extract_surfaces
 from machine import commit
 
 import holosplat as hs
 from holosplat.bench.case import load_case
-from holosplat.fit.surfaces import SurfaceFit, fit_surfaces, oversampling
 from holosplat.representations import SurfaceMesh
 from holosplat.workflows.evaluate import Scores, score_object
 from holosplat.workflows.provenance import environment
-from holosplat.workflows.surfaces import Extraction, extract_surfaces
 
 CASES = ("main12", "main4", "noise12-2000", "shells8")
 VARIANTS: dict[str, dict[str, Any]] = {

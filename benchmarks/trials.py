@@ -22,6 +22,9 @@ from typing import Any
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import torch
+from holosplat.fit.misfit import Draw, NarrowingBlur
+from holosplat.fit.waves import linear_response
+from holosplat.workflows.start import starting_cloud
 from machine import commit
 from torch import Tensor
 from torch.nn.functional import softplus
@@ -31,14 +34,11 @@ from holosplat.bench.case import load_case
 from holosplat.fit.density import _pair
 from holosplat.fit.fidelity import Target
 from holosplat.fit.loop import Fit, FitOptions
-from holosplat.fit.misfit import Draw, NarrowingBlur
-from holosplat.fit.waves import linear_response
 from holosplat.geometry import Poses
 from holosplat.optics.noise import sure_noise
 from holosplat.representations.gaussians import GaussianCloud, raw_of
 from holosplat.workflows.evaluate import score_object
 from holosplat.workflows.reconstruct import fit_options
-from holosplat.workflows.start import starting_cloud
 
 CASES, SEEDS = ["cells8", "noise12-2000", "thesis16", "foam12"], [12]
 """Narrow fringes, noise, coarse pixels, much surface."""

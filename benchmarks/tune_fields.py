@@ -24,17 +24,17 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
 import torch
+from holosplat.fit.neural import NeuralFit, fit_neural
+from holosplat.fit.voxels import VoxelFit, fit_voxels
+from holosplat.workflows.settings import preset
 from machine import commit
 
 from holosplat.bench.case import Case, load_case
 from holosplat.bench.methods import holographic_voxels
-from holosplat.fit.neural import NeuralFit, fit_neural
-from holosplat.fit.voxels import VoxelFit, fit_voxels
 from holosplat.optics.sampling import fringe_sampling
 from holosplat.representations import Encoding, Matter, Network, VoxelGrid
 from holosplat.volume import Object
 from holosplat.workflows.evaluate import score_object
-from holosplat.workflows.settings import preset
 
 CASES, SEEDS = ["cells8", "noise12-2000", "thesis16"], [11]
 """Narrow fringes, noise, and coarse pixels, all of known material."""

@@ -22,13 +22,13 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
 import torch
+from holosplat.bench.svmbir import Mbir, svmbir_volume
 from machine import commit
 
 import holosplat as hs
 from holosplat.baselines.algebraic import Algebraic, art, sirt
 from holosplat.baselines.filtered_backprojection import Ramp, filtered_backprojection
 from holosplat.baselines.tomography import TOMOGRAPHIES, TotalVariation, total_variation
-from holosplat.bench.svmbir import Mbir, svmbir_volume
 from holosplat.metrics import image_scores, intensity_range, volume_scores
 from holosplat.optics.retrieval import RETRIEVALS
 from holosplat.optics.sampling import fringe_sampling

@@ -16,13 +16,13 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
+from holosplat.workflows.settings import MaterialPrior, preset
+from holosplat.workflows.start import assumed_material
 from machine import commit
 
 from holosplat.baselines import holographic_tv
 from holosplat.baselines.two_materials import Levels, best_levels
 from holosplat.bench.case import Case, case_names, load_case
-from holosplat.workflows.settings import MaterialPrior, preset
-from holosplat.workflows.start import assumed_material
 
 
 def levels_of(case: Case) -> Levels:

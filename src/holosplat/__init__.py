@@ -17,11 +17,11 @@ _WHERE = {
     "scan": ("Exposures", "Scan", "interleaved_split"),
     "volume": ("LineIntegrals", "Object", "Volume"),
     "mesh": ("TriangleMesh",),
-    "materials": ("HAEMOGLOBIN", "PLASMA", "RED_CELL", "WATER", "Compound", "DeltaBeta", "Mixture", "parse_material"),
+    "materials": ("HAEMOGLOBIN", "PLASMA", "RED_CELL", "WATER", "Compound", "Mixture", "parse_material"),
     "optics.camera": ("Camera",),
     "optics.coherence": ("Spectrum", "effective_geometry", "source_blur"),
     "optics.illumination": ("Illumination",),
-    "model.instrument": ("Instrument", "measure"),
+    "model": ("Alignment", "Instrument", "LightField", "Model", "measure"),
     "beamline.simulate": ("Shutter", "Simulation", "simulate", "simulated_frames"),
     "specimens.scene": ("MeshScene",),
     "specimens.mesh_series": ("MeshSeries",),
@@ -40,7 +40,9 @@ _WHERE = {
     "planning.contrast": ("Setup", "Subject"),
     "beamline.grow": ("Growth", "grow"),
     "planning.plan": ("Recording", "plan", "survey"),
-    "workflows.settings": ("MaterialPrior", "Settings", "preset"),
+    "matter": ("DeltaBeta", "MaterialPrior", "Matter"),
+    "methods": ("METHODS", "Gaussians", "NeuralFields", "PerView", "Surfaces", "Voxels", "refine_surfaces"),
+    "methods.presets": ("preset",),
     "beamline.scenes": ("Filling", "read_scene"),
     "beamline.record": ("RecordingOptions", "record"),
     "workflows.correct": ("CorrectionOptions", "correct"),
@@ -50,7 +52,6 @@ _WHERE = {
     "workflows.run_folder": ("RunFolder",),
     "workflows.reconstruct": ("Reconstruction", "load_reconstruction", "reconstruct"),
     "workflows.evaluate": ("Evaluation", "evaluate", "render"),
-    "workflows.surfaces": ("SurfaceSettings", "refine_surfaces"),
 }
 _MODULE_OF = {name: module for module, names in _WHERE.items() for name in names}
 
@@ -100,12 +101,25 @@ if TYPE_CHECKING:
     from .materials import RED_CELL as RED_CELL
     from .materials import WATER as WATER
     from .materials import Compound as Compound
-    from .materials import DeltaBeta as DeltaBeta
     from .materials import Mixture as Mixture
     from .materials import parse_material as parse_material
+    from .matter import DeltaBeta as DeltaBeta
+    from .matter import MaterialPrior as MaterialPrior
+    from .matter import Matter as Matter
     from .mesh import TriangleMesh as TriangleMesh
-    from .model.instrument import Instrument as Instrument
-    from .model.instrument import measure as measure
+    from .methods import METHODS as METHODS
+    from .methods import Gaussians as Gaussians
+    from .methods import NeuralFields as NeuralFields
+    from .methods import PerView as PerView
+    from .methods import Surfaces as Surfaces
+    from .methods import Voxels as Voxels
+    from .methods import refine_surfaces as refine_surfaces
+    from .methods.presets import preset as preset
+    from .model import Alignment as Alignment
+    from .model import Instrument as Instrument
+    from .model import LightField as LightField
+    from .model import Model as Model
+    from .model import measure as measure
     from .optics.camera import Camera as Camera
     from .optics.coherence import Spectrum as Spectrum
     from .optics.coherence import effective_geometry as effective_geometry
@@ -145,8 +159,3 @@ if TYPE_CHECKING:
     from .workflows.reconstruct import load_reconstruction as load_reconstruction
     from .workflows.reconstruct import reconstruct as reconstruct
     from .workflows.run_folder import RunFolder as RunFolder
-    from .workflows.settings import MaterialPrior as MaterialPrior
-    from .workflows.settings import Settings as Settings
-    from .workflows.settings import preset as preset
-    from .workflows.surfaces import SurfaceSettings as SurfaceSettings
-    from .workflows.surfaces import refine_surfaces as refine_surfaces

@@ -88,6 +88,10 @@ class Views:
     def __len__(self) -> int:
         return len(self.rotations)
 
+    def fingerprint(self) -> bytes:
+        """Equal for equal views, different for different ones."""
+        return self.rotations.tobytes() + self.shifts.tobytes() + repr((self.shape, self.pixel_size)).encode()
+
     def __getitem__(self, index: np.ndarray | list[int] | slice) -> Views:
         return replace(self, rotations=self.rotations[index], shifts=self.shifts[index])
 
@@ -198,6 +202,19 @@ class Grid:
             return grid
         x, y, z = (float(o + c) for o, c in zip(grid.origin, centre))
         return replace(grid, origin=(x, y, z))
+
+    @classmethod
+    def around(cls, points: np.ndarray, unit: float, most_voxels: int) -> Grid:
+        """A grid around `points` [N, 3] `(x, y, z)` [units of `unit` metres] and two units more on every side.
+
+        Voxels are cubes of one unit, or larger where those would be more than `most_voxels`.
+        """
+        low, high = points.min(0) - 2, points.max(0) + 2
+        pitch = max(1.0, float((np.prod(high - low) / most_voxels) ** (1 / 3)))
+        x, y, z = (int(n) for n in np.ceil((high - low) / pitch))
+        origin = (0.5 * (low + high) - 0.5 * (np.array([x, y, z]) - 1) * pitch) * unit
+        edge = pitch * unit
+        return cls((z, y, x), (edge, edge, edge), (origin[0], origin[1], origin[2]))
 
     def axes(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Voxel-centre coordinates `(x [X], y [Y], z [Z])` [m]."""

@@ -8,18 +8,18 @@ Densities are in g/cm³, the unit chemists and tables use; energies in keV.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import xraydb
 
 from .checks import InputError, in_range, require
+from .matter import DeltaBeta as DeltaBeta
 from .scan import far_from_edges
 from .tables import read_table
 
@@ -27,24 +27,6 @@ ENERGY_RANGE_KEV = (0.1, 400.0)
 """Where Chantler's tables hold both f1 and f2 [keV]."""
 MAX_DENSITY_G_CM3 = 30.0
 """Above osmium (22.6 g/cm³), the densest element: what is denser is a unit mixed up."""
-
-
-class DeltaBeta(NamedTuple):
-    """Refractive index n = 1 - delta + i·beta, dimensionless; of a difference, either may be negative."""
-
-    delta: float
-    beta: float
-
-    def against(self, medium: DeltaBeta) -> DeltaBeta:
-        """What an object in `medium` adds to it: `(δ - δ_medium, β - β_medium)`."""
-        return DeltaBeta(self.delta - medium.delta, self.beta - medium.beta)
-
-    @property
-    def ratio(self) -> float:
-        """δ/β; infinite (with δ's sign) for β = 0, negative where the two differ in sign, NaN for vacuum."""
-        if self.beta == 0:
-            return math.copysign(math.inf, self.delta) if self.delta else math.nan
-        return self.delta / self.beta
 
 
 def _density(name: str, value: Any) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -9,7 +10,7 @@ import numpy as np
 import torch
 
 from .checks import finite, shaped
-from .geometry import Grid, Views
+from .geometry import Grid, Poses, Views
 
 
 @dataclass(frozen=True)
@@ -64,10 +65,36 @@ class Object(Protocol):
         """The object as it is at `time` [s]; a static one returns itself."""
         ...
 
-    def project(self, views: Views) -> LineIntegrals | tuple[torch.Tensor, torch.Tensor]:
+    def project(self, views: Views, /) -> LineIntegrals | tuple[torch.Tensor, torch.Tensor]:
         """Line integrals `(B, D)` of β and δ along the beam, each [V, H, W] in metres, or what unpacks to them."""
         ...
 
     def voxelise(self, grid: Grid) -> Volume:
         """δ and β averaged over (or sampled on) the voxels of `grid`."""
+        ...
+
+
+@runtime_checkable
+class Component(Protocol):
+    """A part of a model whose numbers can be fitted: they have names, and other ones can take their place."""
+
+    def parameters(self) -> Mapping[str, torch.Tensor]:
+        """The tensors that can be fitted, by name."""
+        ...
+
+    def with_parameters(self, parameters: Mapping[str, torch.Tensor]) -> Component:
+        """The same part with other tensors in the place of those named; the others stay."""
+        ...
+
+
+@runtime_checkable
+class TrainableObject(Object, Component, Protocol):
+    """An Object whose numbers can be fitted; it projects poses without waiting for a device."""
+
+    def with_parameters(self, parameters: Mapping[str, torch.Tensor]) -> TrainableObject:
+        """The same object with other tensors in the place of those named."""
+        ...
+
+    def project(self, views: Views | Poses, /) -> LineIntegrals | tuple[torch.Tensor, torch.Tensor]:
+        """Line integrals as of `Object`, differentiable in the parameters."""
         ...

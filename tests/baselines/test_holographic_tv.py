@@ -19,7 +19,7 @@ from holosplat.geometry import Grid, Views, rotation_y
 from holosplat.materials import PLASMA, RED_CELL, DeltaBeta
 from holosplat.mesh import TriangleMesh
 from holosplat.metrics import dice
-from holosplat.model.instrument import measure
+from holosplat.model import measure
 from holosplat.optics.detector import poisson
 from holosplat.projectors.voxels import LatticeProjector, SliceProjector, projector_for, voxel_line_integrals
 from holosplat.projectors.voxels.lattice import lattice_reference

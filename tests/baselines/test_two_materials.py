@@ -7,6 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from holosplat.workflows.settings import MaterialPrior, Settings, preset
+from holosplat.workflows.start import starting_cloud
+from holosplat.workflows.surfaces import extract_surfaces
 from scipy.ndimage import gaussian_filter
 
 from helpers.cli import holosplat, refused, worked
@@ -21,7 +24,7 @@ from holosplat.io.gaussians import read_gaussians, write_gaussians
 from holosplat.io.json import read_json
 from holosplat.io.nxtomo import write_scan
 from holosplat.materials import Compound, DeltaBeta
-from holosplat.model.instrument import Instrument, measure
+from holosplat.model import Instrument, measure
 from holosplat.representations import GaussianCloud, VoxelLines, approximate, cloud_from_two
 from holosplat.representations.gaussians import raw_of
 from holosplat.scan import Exposures, Scan
@@ -32,9 +35,6 @@ from holosplat.volume import LineIntegrals
 from holosplat.workflows.evaluate import evaluate
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
-from holosplat.workflows.settings import MaterialPrior, Settings, preset
-from holosplat.workflows.start import starting_cloud
-from holosplat.workflows.surfaces import extract_surfaces
 
 PIXEL = 1e-6
 ROWS, COLUMNS = 43, 51

@@ -21,7 +21,7 @@ from holosplat.io.nxtomo import read_scan, scan_writer, write_scan
 from holosplat.io.volumes import read_volume, write_voxels
 from holosplat.materials import DeltaBeta
 from holosplat.mesh import TriangleMesh
-from holosplat.model.instrument import measure
+from holosplat.model import measure
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.mesh_series import MeshSeries
 from holosplat.specimens.red_cells import icosphere

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from holosplat.workflows.settings import MaterialPrior
 
 from holosplat.bench.case import FOLDER, Case, case_names, load_case
 from holosplat.bench.declaration import declared_names
@@ -18,7 +19,6 @@ from holosplat.scan import Exposures
 from holosplat.specimens.phantoms import Ball
 from holosplat.specimens.scene import MeshScene
 from holosplat.tables import merged
-from holosplat.workflows.settings import MaterialPrior
 
 SLOW = ("crowded12",)
 """Scenes that take seconds to make: that they follow their seed is tested on smaller ones (test_specimens_phantoms)."""

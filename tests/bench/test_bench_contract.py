@@ -12,7 +12,7 @@ import torch
 import holosplat as hs
 from holosplat.bench.method import Method
 from holosplat.bench.methods import METHODS, methods
-from holosplat.model.instrument import Instrument
+from holosplat.model import Instrument
 from holosplat.specimens.red_cells import icosphere
 
 MATERIAL = hs.DeltaBeta(2e-7, 2e-10)

@@ -12,6 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
+from holosplat.workflows.settings import preset
 
 import holosplat.workflows.demo as demo
 from helpers.cli import (
@@ -27,7 +28,6 @@ from helpers.cli import (
     worked,
 )
 from holosplat.cli import main
-from holosplat.workflows.settings import preset
 
 
 def test_the_installed_command_is_main():

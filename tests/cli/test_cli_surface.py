@@ -10,13 +10,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from holosplat.fit.objective import Objective
+from holosplat.workflows.settings import MaterialPrior, Settings
+from holosplat.workflows.surfaces import extract_surfaces
 
 from helpers.cli import Outcome, holosplat, worked
 from holosplat.baselines import HolographicTV
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.fit.loop import FitOptions
-from holosplat.fit.objective import Objective
 from holosplat.fit.schedule import Schedule
 from holosplat.geometry import Grid, Views
 from holosplat.io.gaussians import write_gaussians
@@ -32,8 +34,6 @@ from holosplat.specimens.repair import closed
 from holosplat.specimens.scene import MeshScene
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
-from holosplat.workflows.settings import MaterialPrior, Settings
-from holosplat.workflows.surfaces import extract_surfaces
 
 PIXEL = 1e-6
 ROWS, COLUMNS = 25, 29

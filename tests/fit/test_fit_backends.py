@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from holosplat.fit.objective import Objective
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -15,10 +16,9 @@ from holosplat import native
 from holosplat.checks import InputError, MissingError
 from holosplat.fit.density import DensityControl
 from holosplat.fit.loop import Fit, FitOptions
-from holosplat.fit.objective import Objective
 from holosplat.fit.schedule import Schedule
 from holosplat.geometry import Views
-from holosplat.model.instrument import measure
+from holosplat.model import measure
 from holosplat.representations import GaussianCloud, random_cloud
 from holosplat.scan import Exposures, Scan
 

@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-
-from holosplat.checks import InputError
 from holosplat.fit.neural import NeuralFit, fit_neural, visual_hull
-from holosplat.fit.projected_gradient import spectral_projected_gradient
 from holosplat.fit.voxels import VoxelFit, fit_voxels
 from holosplat.fit.waves import WaveMisfit, linear_response
+
+from holosplat.checks import InputError
+from holosplat.fit.projected_gradient import spectral_projected_gradient
 from holosplat.geometry import Grid, Views
-from holosplat.model.instrument import Instrument
+from holosplat.model import Instrument
 from holosplat.optics.noise import noise_level
 from holosplat.representations import Encoding, Matter, Network, VoxelGrid
 from holosplat.scan import Exposures, Scan

@@ -9,18 +9,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from holosplat.fit.misfit import photon_noise
+from holosplat.fit.objective import Objective
 from scipy.ndimage import fourier_gaussian
 
 from helpers.fit_balls import HASTY, MATERIAL, a_cloud, equal, fit_of, run
 from holosplat.checks import InputError
 from holosplat.fit import objective as terms
 from holosplat.fit.density import DensityControl
-from holosplat.fit.misfit import photon_noise
-from holosplat.fit.objective import Objective
 from holosplat.fit.total_variation import total_variation
 from holosplat.fit.trainable import Trainable
 from holosplat.geometry import Grid
-from holosplat.model.instrument import Instrument
+from holosplat.model import Instrument
 from holosplat.optics.detector import poisson
 from holosplat.optics.noise import noise_share
 from holosplat.representations import GaussianCloud, random_cloud

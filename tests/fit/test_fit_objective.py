@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from holosplat.fit.objective import THESIS, Objective
 from skimage.metrics import structural_similarity as skimage_similarity
 
 from holosplat.checks import InputError
 from holosplat.fit import objective as terms
-from holosplat.fit.objective import THESIS, Objective
 from holosplat.fit.total_variation import total_variation
 from holosplat.metrics import image_scores
 

@@ -9,16 +9,16 @@ from itertools import chain
 import numpy as np
 import pytest
 import torch
+from holosplat.fit.objective import Objective
 
 from helpers.fit_balls import HASTY, PIXEL, SHAPE, a_cloud, a_scan, equal, fit_of, run
 from holosplat.checks import InputError
 from holosplat.fit import objective as terms
 from holosplat.fit.loop import Fit, split_validation
-from holosplat.fit.objective import Objective
 from holosplat.fit.schedule import Schedule
 from holosplat.fit.trainable import Trainable
 from holosplat.geometry import Views
-from holosplat.model.instrument import Instrument
+from holosplat.model import Instrument
 from holosplat.representations import GaussianCloud
 from holosplat.scan import Exposures, Scan
 

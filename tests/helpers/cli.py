@@ -13,13 +13,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
+from holosplat.fit.objective import Objective
+from holosplat.workflows.settings import Settings
 
 from holosplat.baselines import HolographicTV
 from holosplat.cli import main
 from holosplat.fit.loop import FitOptions
-from holosplat.fit.objective import Objective
 from holosplat.fit.schedule import Schedule
-from holosplat.workflows.settings import Settings
 
 PIXEL = 3.2e-6
 ROWS, COLUMNS = 24, 28

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from holosplat.fit.objective import Objective
 from torch import Tensor
 
 from holosplat.beamline.simulate import simulate
 from holosplat.fit.density import DensityControl
 from holosplat.fit.loop import Fit, FitOptions
-from holosplat.fit.objective import Objective
 from holosplat.fit.schedule import Schedule
 from holosplat.geometry import Views
 from holosplat.representations import GaussianCloud, random_cloud

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from holosplat.geometry import Views
-from holosplat.model.instrument import Instrument
+from holosplat.model import Instrument
 from holosplat.scan import Exposures
 from holosplat.units import wavelength, wavenumber
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from holosplat.fit.objective import Objective
+from holosplat.workflows.settings import MaterialPrior, Settings
+
 from holosplat.baselines import HolographicTV
 from holosplat.fit.density import DensityControl
 from holosplat.fit.loop import FitOptions
-from holosplat.fit.objective import Objective
 from holosplat.fit.schedule import Schedule
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
-from holosplat.workflows.settings import MaterialPrior, Settings
 
 PIXEL = 3.2e-6
 SHAPE = (40, 48)

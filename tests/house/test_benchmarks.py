@@ -10,12 +10,12 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
+from holosplat.fit.objective import Objective
+from holosplat.workflows.settings import preset
 
 from holosplat.fit.loop import FitOptions
-from holosplat.fit.objective import Objective
 from holosplat.fit.schedule import Schedule
 from holosplat.projectors.splat import splat
-from holosplat.workflows.settings import preset
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 

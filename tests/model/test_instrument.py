@@ -13,11 +13,11 @@ from helpers.waves import DOUBLE, LAMBDA, PITCH, SHAPE, Bump, K, at, exposures, 
 from holosplat.beamline.simulate import SIMULATED_FRINGE_SAMPLES, simulate
 from holosplat.materials import DeltaBeta
 from holosplat.mesh import TriangleMesh
-from holosplat.model.instrument import Instrument, measure
+from holosplat.model import Instrument, measure
 from holosplat.optics import (
     bin_pixels,
 )
-from holosplat.optics.sampling import GUARD_PX, padding, resolving_oversample
+from holosplat.optics.sampling import GUARD_PX, fringe_sampling, padding, resolving_oversample
 from holosplat.specimens.red_cells import icosphere
 from holosplat.specimens.scene import MeshScene
 from holosplat.volume import Object
@@ -146,6 +146,7 @@ def test_oversample_from_the_fringe_width():
     assert resolving_oversample(taken, 5.0, 1) == 10  # not 15
     assert resolving_oversample(taken[[0]], 4.0, 1) == 2
     assert resolving_oversample(taken[[0]], 4.0, 5) == 5
+    assert (fringe_sampling(taken), fringe_sampling(taken[[0]]), fringe_sampling(taken, extra=1)) == (5, 1, 6)
 
 
 def test_simulate():

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from holosplat.geometry import Grid, Views
-from holosplat.model.instrument import measure
+from holosplat.model import measure
 from holosplat.optics.retrieval import Linear, contrast_transfer, paganin, retrieve_thickness
 from holosplat.scan import Exposures
 from holosplat.units import wavelength, wavenumber

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from helpers.waves import COMPLEX, DOUBLE, ENERGY, PITCH, SHAPE, Bump, K, at, exposures
 from holosplat.checks import InputError
-from holosplat.model.instrument import Instrument
+from holosplat.model import Instrument
 from holosplat.optics import (
     bin_pixels,
     blur,

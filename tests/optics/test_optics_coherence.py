@@ -8,7 +8,7 @@ import torch
 
 from holosplat.checks import InputError
 from holosplat.geometry import Views
-from holosplat.model.instrument import Instrument
+from holosplat.model import Instrument
 from holosplat.optics.coherence import FWHM, Spectrum, effective_geometry, joined_blur_px, source_blur
 from holosplat.scan import Exposures
 from holosplat.units import wavelength, wavenumber

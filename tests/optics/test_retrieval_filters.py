@@ -27,7 +27,7 @@ from helpers.retrieval import (
     taken,
 )
 from holosplat.geometry import Views
-from holosplat.model.instrument import Instrument
+from holosplat.model import Instrument
 from holosplat.optics.noise import wavelet_noise
 from holosplat.optics.retrieval import (
     Linear,

@@ -12,7 +12,7 @@ import torch
 from helpers.planned import CELL, ellipsoid
 from holosplat.geometry import Views
 from holosplat.materials import HAEMOGLOBIN, PLASMA, RED_CELL, WATER, Compound, DeltaBeta
-from holosplat.model.instrument import measure
+from holosplat.model import measure
 from holosplat.planning.contrast import Setup, Subject, signal_to_noise_squared, visibility
 from holosplat.planning.plan import Recording, crowther_limit, plan, survey
 from holosplat.report.plan import survey_figure

@@ -8,16 +8,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from holosplat.fit.surfaces import SurfaceFit, fit_surfaces
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
-from holosplat.fit.surfaces import SurfaceFit, fit_surfaces
 from holosplat.geometry import Grid, Poses, Views
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.mesh import TriangleMesh
-from holosplat.model.instrument import measure
+from holosplat.model import measure
 from holosplat.projectors.mesh import mesh_line_integrals, voxelise_meshes
 from holosplat.projectors.surface import surface_occupancy, surface_thickness
 from holosplat.representations import SurfaceMesh, isosurface

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from holosplat.workflows.settings import MaterialPrior, preset
 
 from holosplat.bench import case as bench_case
 from holosplat.bench.case import Case
@@ -48,7 +49,6 @@ from holosplat.thesis.study import (
     run_study,
 )
 from holosplat.volume import Volume
-from holosplat.workflows.settings import MaterialPrior, preset
 
 PIXEL = 1e-6
 SHAPE = (15, 22)

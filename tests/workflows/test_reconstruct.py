@@ -9,24 +9,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from holosplat.fit.objective import Objective
+from holosplat.workflows.settings import MaterialPrior, preset
+from holosplat.workflows.start import starting_cloud
 
 from helpers.runs import CELL, KNOWN, PIXEL, RANDOM, SHAPE, SMALL, Interruption, scene
 from holosplat import native
 from holosplat.baselines import HolographicTV
 from holosplat.checks import InputError
 from holosplat.fit.loop import FitOptions
-from holosplat.fit.objective import Objective
 from holosplat.fit.schedule import Schedule
 from holosplat.geometry import Grid, Views
-from holosplat.model.instrument import measure
+from holosplat.model import measure
 from holosplat.representations import GaussianCloud
 from holosplat.representations.gaussians import raw_of
 from holosplat.volume import Volume
 from holosplat.workflows.evaluate import evaluate, material_found, render
 from holosplat.workflows.reconstruct import Reconstruction, load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
-from holosplat.workflows.settings import MaterialPrior, preset
-from holosplat.workflows.start import starting_cloud
 
 
 @pytest.fixture(scope="module")

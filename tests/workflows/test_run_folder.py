@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 import pytest
 import torch
+from holosplat.workflows.settings import MaterialPrior, Settings, from_plain, preset, presets, read_settings
 
 import holosplat.workflows.reconstruct as module
 from helpers.runs import CELL, KNOWN, PIXEL, RANDOM, SMALL, STEPS, Interruption
@@ -21,13 +22,12 @@ from holosplat.fit.loop import FitOptions
 from holosplat.fit.schedule import Schedule
 from holosplat.fit.trainable import Trainable
 from holosplat.materials import DeltaBeta
-from holosplat.model.instrument import Instrument
+from holosplat.model import Instrument
 from holosplat.representations.gaussians import PARAMETERS
 from holosplat.workflows.evaluate import evaluate
 from holosplat.workflows.provenance import scan_hash
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
-from holosplat.workflows.settings import MaterialPrior, Settings, from_plain, preset, presets, read_settings
 
 
 def contents(folder: RunFolder) -> dict[str, str]:

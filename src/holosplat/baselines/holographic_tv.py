@@ -20,7 +20,7 @@ from ..checks import at_least
 from ..geometry import Grid, Views
 from ..materials import DeltaBeta
 from ..memory import memory_kept
-from ..model.instrument import Instrument
+from ..model import Instrument
 from ..optics.noise import noise_share
 from ..optics.retrieval import Tikhonov, tikhonov
 from ..optics.retrieval.bounded import MODEL_ERROR, PRIOR

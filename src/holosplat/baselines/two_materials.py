@@ -20,8 +20,8 @@ from torch import Tensor
 from torch.nn.functional import avg_pool3d
 
 from ..geometry import Grid
-from ..materials import DeltaBeta
-from ..model.instrument import Instrument
+from ..matter import LEAST_CONTRAST, DeltaBeta
+from ..model import Instrument
 from ..optics.sampling import fringe_sampling
 from ..projectors.voxels import voxel_line_integrals
 from ..representations.voxel_lines import VoxelLines
@@ -32,8 +32,6 @@ from .material import Backend, plateau
 
 FAINT = 0.3
 """Below this share of the level that most matter has, there are halos rather than matter."""
-LEAST_CONTRAST = 1.6
-"""Levels nearer to each other than this factor pass for one."""
 LARGEST_SPREAD = 0.4
 """Share of the spread that two levels leave where there are two (both kinds of scenes: `benchmarks/two_levels.py`)."""
 LEAST_SHARE = 0.1

@@ -11,13 +11,13 @@ import torch
 
 from ..checks import in_range, require
 from ..memory import memory_kept
-from ..model.instrument import Instrument
+from ..model import Instrument, Model
 from ..optics.detector import poisson
 from ..optics.noise import PHOTON_RANGE
 from ..optics.sampling import resolving_oversample
 from ..progress import Advance
 from ..scan import Exposures, Scan, interleaved_split
-from ..volume import LineIntegrals, Object
+from ..volume import Object
 
 SIMULATED_FRINGE_SAMPLES = 8
 """Samples on the first fringe in simulations: frames of rounded bodies are then right to 0.5 % of their contrast
@@ -97,12 +97,12 @@ def simulated_frames(obj: Object, exposures: Exposures, how: Simulation = Simula
     """
     fine, noise = how.samples(exposures), np.random.default_rng(how.seed)
     with memory_kept():
-        for i, time in enumerate(exposures.time):
+        for i in range(len(exposures)):
             instrument = Instrument(exposures[[i]], fine, torch.float32, "reference")
+            model = Model(obj, instrument)
             frame = np.zeros(exposures.views.shape)
             for offset in how.shutter.offsets:
-                lines = obj.at(float(time + offset)).project(instrument.views)
-                frame += instrument.frames(LineIntegrals.of_any(lines))[0].numpy()
+                frame += model.frames(delay=float(offset))[0].numpy()
             frame /= how.shutter.pulses
             photons = how.photons_per_pixel
             yield (frame if photons is None else poisson(frame, photons, noise)).astype(np.float32)

@@ -12,12 +12,12 @@ import numpy as np
 from ..beamline.simulate import simulate
 from ..checks import InputError, require, shaped
 from ..geometry import Grid
+from ..matter import MaterialPrior
 from ..optics.detector import poisson
 from ..scan import Exposures, Scan
 from ..specimens.phantoms import Ball
 from ..specimens.scene import MeshScene
 from ..volume import Volume
-from ..workflows.settings import MaterialPrior
 from .declaration import declared_names, read_declaration
 
 FOLDER = Path(__file__).with_name("cases")

@@ -15,11 +15,11 @@ import numpy as np
 from ..checks import InputError, in_range, require
 from ..geometry import Views, rotation_tilted, rotation_y
 from ..materials import DeltaBeta, parse_material
+from ..matter import MaterialPrior
 from ..optics.noise import PHOTON_RANGE
 from ..scan import Exposures, interleaved_split
 from ..specimens.scene import MeshScene
 from ..tables import from_table, merged, read_table
-from ..workflows.settings import MaterialPrior
 from .specimens import Bodies, Specimen
 
 MOST_PIXELS = 4096
@@ -176,7 +176,7 @@ class Declaration:
         contrast = self._delta_beta(self.matter.material).against(self._delta_beta(self.matter.medium))
         if self.prior == "known":
             return MaterialPrior.known(contrast)
-        return MaterialPrior.of_ratio(contrast.ratio) if self.prior == "ratio" else MaterialPrior()
+        return MaterialPrior.of_ratio(contrast.ratio) if self.prior == "ratio" else MaterialPrior.unknown()
 
     def scene(self, seed: int, snapshots: Path | None) -> tuple[MeshScene, Bodies]:
         """The filled bodies that `seed` gives: a core adds what it is filled with, less the material around it."""

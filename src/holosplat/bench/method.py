@@ -1,22 +1,27 @@
-"""A method of the benchmark: training frames and what is known of the matter in, an Object out."""
+"""A method of the benchmark: options of the library's own methods, with a name and a heading for the tables."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
+from ..matter import MaterialPrior
+from ..methods import Method as Options
+from ..methods import Task, solve
 from ..progress import Progress
 from ..scan import Scan
 from ..volume import Object
-from ..workflows.settings import MaterialPrior
 
 
 @dataclass(frozen=True)
 class Method:
     """name: for the command line and the table; family: its heading in the table; summary: one line of what it does;
-    run: (training frames, prior, seed, on_progress) → Object, `InputError` with the reason where it cannot run."""
+    options: of the library's method that runs."""
 
     name: str
     family: str
     summary: str
-    run: Callable[[Scan, MaterialPrior, int, Progress], Object]
+    options: Options
+
+    def run(self, scan: Scan, prior: MaterialPrior, seed: int, on_progress: Progress) -> Object:
+        """The Object that the method makes of the training frames `scan`; `InputError` where it cannot."""
+        return solve(self.options, Task(scan, prior, seed, on_progress))

@@ -11,6 +11,7 @@ import torch
 from ..baselines import TOMOGRAPHIES
 from ..checks import require
 from ..geometry import Grid
+from ..matter import Matter
 from ..progress import Progress
 from ..representations.voxels import VoxelGrid
 from ..volume import Object, Volume
@@ -32,19 +33,22 @@ def truth_on_voxels(case: Case, truth: Volume, on_progress: Progress) -> VoxelGr
     on_progress("truth on voxels", 0.0)
     scales = [float(np.abs(values).max()) for values in (truth.delta, truth.beta)]
     channels = [values / (scale or 1.0) for values, scale in zip((truth.delta, truth.beta), scales)]
-    return VoxelGrid(torch.from_numpy(np.stack(channels)), truth.grid, *scales)
+    return VoxelGrid(torch.from_numpy(np.stack(channels)), truth.grid, Matter.free(*scales))
 
 
 def tv_of_true_lines(case: Case, truth: Volume, on_progress: Progress) -> VoxelGrid:
     """Total-variation tomography from the true thickness in the training views: phase retrieval without error."""
-    known = case.prior.kind == "known"
-    require(known, "the true thickness is that of one known material, but the methods are told of none here.")
+    require(
+        case.prior.fixes_level,
+        "the true thickness needs a known material, but methods are told of none here.",
+    )
     views = case.exposures.views[np.flatnonzero(~case.is_test)]
+    material = case.prior.materials[0]
     _, projected_delta = case.scene.project(views)
-    lines = (projected_delta / case.prior.delta).float()
+    lines = (projected_delta / material.delta).float()
     grid = Grid.of_views(views)
     values = TOMOGRAPHIES["tv"](lines, views, grid, 1.0, lambda fraction: on_progress("tomography", fraction))
-    return VoxelGrid(values[None], grid, case.prior.delta, case.prior.beta)
+    return VoxelGrid(values[None], grid, Matter.one(*material))
 
 
 REFERENCES = {

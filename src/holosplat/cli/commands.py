@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from ..checks import InputError, in_range, require
-from .options import BeamlineOptions, PriorOptions, SettingsOptions, TruthOptions
+from .options import BeamlineOptions, MethodOptions, PriorOptions, TruthOptions
 from .progress import INTERRUPTED, ProgressBar
 
 if TYPE_CHECKING:
@@ -25,12 +25,12 @@ def reconstruct(
     scan: Positional[Path],
     out: Path,
     matter: PriorOptions = PriorOptions(),
-    how: SettingsOptions = SettingsOptions(),
+    how: MethodOptions = MethodOptions(),
     seed: int = 0,
     resume: bool = False,
     time_frame: int | Literal["all"] | None = None,
 ) -> None:
-    """Reconstruct a scan as Gaussians; the run folder holds the result and its report.
+    """Reconstruct a scan by Gaussians, or by another method, into a run folder.
 
     Args:
         scan: Scan: a file (NXtomo), or a folder (tiff, nerf-synthetic, r2-gaussian, or another run's).
@@ -47,18 +47,18 @@ def reconstruct(
     from ..workflows.reconstruct import reconstruct as fit
     from ..workflows.run_folder import RunFolder
 
-    settings = how.settings()
+    method = how.chosen()
     require(seed >= 0, f"--seed must be 0 or more, but it is {seed}.")
     measured = at_time(read(scan), time_frame).in_memory()
     prior = matter.prior(measured.exposures.reference_energy)
     folder = RunFolder(out)
     with ProgressBar() as bar:
-        result = fit(measured, prior, settings, seed, folder=folder, resume=resume, on_progress=bar.show)
+        result = fit(measured, prior, method, seed, folder=folder, resume=resume, on_progress=bar.show)
     write_json(folder.source, {"scan": str(scan.resolve()), "time_frame": time_frame})
     evaluation = score(result, measured, None)
     report = report_run(folder, result, measured, evaluation, None)
     _print_scores(evaluation)
-    _say(f"{sum(result.timing.values()):.1f} s, {len(result.cloud)} Gaussians; report: {report}")
+    _say(f"{sum(result.timing.values()):.1f} s, {result.object.described}; report: {report}")
     if not result.finished:
         _say(f"interrupted, but {out} is usable; go on with --resume")
         raise SystemExit(INTERRUPTED)
@@ -121,7 +121,7 @@ def export(
     grid = Grid.centred(shape or (columns, rows, columns), in_range("voxel size", edge, *PIXEL_RANGE_M, unit="metres"))
     count = math.prod(grid.shape)
     require(count <= MOST_VOXELS, f"shape must have at most {MOST_VOXELS:.0e} voxels, but it has {count:.0e}.")
-    write_voxels(volume, result.cloud, grid)
+    write_voxels(volume, result.object, grid)
     _say(f"wrote {volume}: {' × '.join(map(str, grid.shape))} voxels of {1e6 * grid.voxel_size[0]:.4g} µm")
 
 

@@ -20,9 +20,9 @@ from ..io.png import PngKind
 from ..io.r2_gaussian import R2Options, write_r2_gaussian
 from ..io.tiff import TiffLayout, write_tiff
 from ..io.volumes import read_volume
+from ..matter import KnownRatio, MaterialPrior
 from ..optics import retrieve_thickness
 from ..scan import Scan
-from ..workflows.settings import MaterialPrior
 from .options import PriorOptions
 
 
@@ -99,7 +99,7 @@ def convert(
     said = writing.for_format(to)
     scan = _read(source, foreign.given())
     prior = matter.prior(scan.exposures.reference_energy)
-    require(prior.kind == "free" or to in GOES_WITH["material"], f"a material is not needed with --to {to}; leave it.")
+    require(not prior.fixes_ratio or to in GOES_WITH["material"], f"a material is not needed with --to {to}; leave it.")
     require(len(prior.materials) < 2, f"--to {to} takes one material; leave --second-material.")
     if to == "nxtomo":
         require(not out.is_dir(), f"{out} must be a file to write, but it is a folder; add a file name.")
@@ -107,13 +107,11 @@ def convert(
     elif to == "tiff":
         write_tiff(out, scan, writing.tiff or "stack")
     elif to == "nerf-synthetic":
-        thickness = None if prior.kind == "free" else _retrieved(scan, prior)[0]
+        thickness = _retrieved(scan, prior)[0] if prior.fixes_ratio else None
         write_nerf_synthetic(out, scan, replace(NerfOptions(), **said), thickness)
         _say_what_is_cut(scan)
     else:
-        require(
-            prior.kind != "free", "--to r2-gaussian needs --material or --delta-beta: it takes retrieved thickness."
-        )
+        require(prior.fixes_ratio, "--to r2-gaussian needs --material or --delta-beta: it takes retrieved thickness.")
         if writing.truth:
             said["truth"] = read_volume(writing.truth)
         write_r2_gaussian(out, scan, *_retrieved(scan, prior), replace(R2Options(), **said))
@@ -137,12 +135,12 @@ def _retrieved(scan: Scan, prior: MaterialPrior) -> tuple[np.ndarray, float]:
     Where only δ/β is known, δ is such that the greatest thickness is half the field's longer side.
     """
     exposures, views = scan.exposures, scan.views
-    delta, beta = (prior.delta, prior.beta) if prior.kind == "known" else (1.0, 1.0 / prior.ratio)
+    delta, beta = (1.0, 1.0 / prior.ratio) if isinstance(prior, KnownRatio) else prior.materials[0]
     refraction = exposures.refraction(delta, beta)
     found = retrieve_thickness(
         torch.from_numpy(scan.frames), views.pixel_size, exposures.distance, exposures.energy_kev, *refraction
     ).numpy()
-    if prior.kind == "known":
+    if prior.fixes_level:
         return found, delta
     scale = float(found.max()) / (0.5 * max(views.width, views.height))
     if not scale > 0:

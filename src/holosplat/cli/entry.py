@@ -34,7 +34,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "correct": ("imaging", "Correct raw counts by dark and flat fields into a scan of relative intensities."),
     "join": ("imaging", "Join scans of several beams, one file each, on one raster."),
-    "reconstruct": ("commands", "Reconstruct a scan as Gaussians; the run folder holds the result and its report."),
+    "reconstruct": (
+        "commands",
+        "Reconstruct a scan by Gaussians, or by another method, into a run folder.",
+    ),
     "render": ("commands", "Predict the frames of a scan from a run."),
     "export": ("commands", "Write δ and β of a run as a volume file."),
     "surface": (

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from ..beamline.poses import Directions, Geometry
-from ..checks import require
+from ..checks import InputError, require
 
 if TYPE_CHECKING:
     import numpy as np
@@ -17,8 +17,9 @@ if TYPE_CHECKING:
     from ..beamline.series import SeriesFiles, Timing
     from ..beamline.simulate import Shutter, Simulation
     from ..materials import DeltaBeta
+    from ..matter import MaterialPrior
+    from ..methods import Method
     from ..scan import Exposures
-    from ..workflows.settings import MaterialPrior, Settings
 
 
 @dataclass(frozen=True)
@@ -233,28 +234,34 @@ class TruthOptions:
 
 
 @dataclass(frozen=True)
-class SettingsOptions:
+class MethodOptions:
     """How the reconstruction proceeds."""
 
+    method: str | None = None
+    """Name of the method: gaussians (what you get without), surfaces, voxels, neural-field, holographic-tv, tikhonov-tv
+    and other pairs of phase retrieval and tomography."""
     preset: str | None = None
-    """Named settings: default (what you get without), fast, random, thesis."""
+    """Named options of Gaussians: default (what you get without), fast, random, thesis."""
     config: Path | None = None
-    """Or: a JSON file of settings, such as the config.json of another run."""
+    """Or: a JSON or TOML file of options, such as the config.json of another run."""
     backend: Literal["auto", "cpu", "cuda", "reference"] | None = None
-    """What computes the fit (default: as the settings say, auto); `holosplat backends` lists what there is."""
+    """What computes the fit (default: as the options say, auto); `holosplat backends` lists what there is."""
 
-    def settings(self) -> Settings:
-        """The settings that the options name; `InputError` if their backend cannot be used here."""
+    def chosen(self) -> Method:
+        """The method that the options name; `InputError` if its backend cannot be used here."""
         from ..backends import resolve
-        from ..workflows.settings import preset, read_settings
+        from ..methods.presets import chosen_method
 
-        require(self.config is None or self.preset is None, "give --config or --preset, not both.")
-        chosen = read_settings(self.config) if self.config else preset(self.preset or "default")
+        given = [f"--{name}" for name in ("method", "preset", "config") if getattr(self, name) is not None]
+        require(len(given) < 2, f"give one of --method, --preset and --config, but there are {' and '.join(given)}.")
+        method = chosen_method(self.method, self.preset, self.config)
         if self.backend:
-            start = replace(chosen.volume, backend="reference" if self.backend == "reference" else "cpu")
-            chosen = replace(chosen, fit=replace(chosen.fit, backend=self.backend), volume=start)
-        resolve(chosen.fit.backend)  # before the start, which takes its time
-        return chosen
+            move = getattr(method, "on_backend", None)
+            if move is None:
+                raise InputError(f"the method {method.kind} runs on the CPU only; leave --backend.")
+            method = move(self.backend)
+        resolve(self.backend or "auto")  # before the start, which takes its time
+        return method
 
 
 @dataclass(frozen=True)
@@ -278,7 +285,7 @@ class PriorOptions:
 
     def prior(self, energy_kev: float) -> MaterialPrior:
         """The prior at `energy_kev` [keV]."""
-        from ..workflows.settings import MaterialPrior
+        from ..matter import MaterialPrior
 
         require(self.material is None or self.delta_beta is None, "give --material or --delta-beta, not both.")
         if self.material is None:
@@ -286,7 +293,7 @@ class PriorOptions:
             stray = [f"--{name.replace('_', '-')}" for name in belongs if getattr(self, name) is not None]
             beside = " rather than --delta-beta" if self.delta_beta is not None else ""
             require(not stray, f"{', '.join(stray)} can only go with --material{beside}; add it, or leave them.")
-            return MaterialPrior() if self.delta_beta is None else MaterialPrior.of_ratio(self.delta_beta)
+            return MaterialPrior.unknown() if self.delta_beta is None else MaterialPrior.of_ratio(self.delta_beta)
         first = self._known(self.material, self.density, energy_kev)
         if self.second_material is None:
             require(self.second_density is None, "--second-density needs --second-material.")

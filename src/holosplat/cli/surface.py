@@ -10,18 +10,17 @@ from typing import Any
 
 from tyro.conf import Positional
 
-from ..fit.surfaces import oversampling
 from ..io.folder import atomic_folder, require_new
 from ..io.json import write_json
 from ..io.volumes import read_volume
 from ..io.vtk import write_mesh
+from ..methods.surfaces import SurfaceOptions, oversampling, refine_surfaces
 from ..representations import SurfaceMesh
 from ..workflows.evaluate import Scores, score_object
 from ..workflows.evaluate import evaluate as score
 from ..workflows.provenance import scan_hash
 from ..workflows.reconstruct import load_reconstruction
 from ..workflows.run_folder import RunFolder
-from ..workflows.surfaces import SurfaceSettings, refine_surfaces
 from .progress import ProgressBar
 from .scans import scan_for
 
@@ -33,7 +32,7 @@ def surface(
     out: Path,
     scan: Path | None = None,
     truth: Path | None = None,
-    how: SurfaceSettings = SurfaceSettings(),
+    how: SurfaceOptions = SurfaceOptions(),
 ) -> None:
     """Cut the bodies of a run out as closed surfaces, fit these to the frames, and write them as VTK files (µm).
 
@@ -54,7 +53,7 @@ def surface(
     before = score(result, measured, volume)
     began = time.perf_counter()
     with ProgressBar() as bar:
-        found = refine_surfaces(result.cloud, measured, how, lambda *now: bar.show(now[0], now[1], {}))
+        found = refine_surfaces(result.object, measured, how, lambda *now: bar.show(now[0], now[1], {}))
     seconds = time.perf_counter() - began
     after = score_object(found, measured, volume, oversampling(measured.train(), how.fit))
     count = _write(out, found, {"seconds": seconds, "settings": asdict(how), "gaussians": before.as_dict()}, after)
@@ -72,7 +71,7 @@ def _write(out: Path, found: SurfaceMesh, summary: dict[str, Any], after: Scores
         about = {
             "bodies": {body.name: {"triangles": len(body.faces), "volume_m3": body.volume} for body in bodies},
             "length_unit": LENGTH_UNIT,
-            "material": {"delta": found.delta, "beta": found.beta},
+            "material": {"delta": found.matter.delta, "beta": found.matter.beta},
         }
         write_json(temporary / "summary.json", about | summary | {"surfaces": after.as_dict()})
     return len(bodies)

@@ -8,9 +8,9 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from .misfit import Draw
+from .batch import Batch
 
-Work = Callable[[Draw], Tensor]
+Work = Callable[[Batch], Tensor]
 """One step: forward, backward and update of the parameters in place; returns the values [K] of its terms."""
 
 WARM_UP = 3
@@ -20,14 +20,14 @@ WARM_UP = 3
 class CapturedStep:
     """Runs `work`, at first eagerly and then as CUDA graphs, one for each kind of step (with and without the volume).
 
-    A graph reads the draw's tensors, and whatever else `work` uses, at the addresses of its capture; `forget` must be
+    A graph reads the batch's tensors, and whatever else `work` uses, at the addresses of its capture; `forget` must be
     called before any of them moves (when Gaussians come or go).
     """
 
     def __init__(self, work: Work) -> None:
         self._work = work
         self._stream = torch.cuda.Stream()
-        self._inputs: dict[int, Draw] = {}
+        self._inputs: dict[int, Batch] = {}
         self._eager: dict[int, int] = {}
         self._graphs: dict[int, tuple[torch.cuda.CUDAGraph, Tensor]] = {}
 
@@ -35,10 +35,10 @@ class CapturedStep:
         """Drop all graphs; the next steps warm up anew."""
         self._eager, self._graphs = {}, {}
 
-    def __call__(self, draw: Draw) -> Tensor:
+    def __call__(self, batch: Batch) -> Tensor:
         """The values of one step, in an array of their own."""
-        kind = draw.volume
-        inputs = self._held(draw)
+        kind = batch.volume
+        inputs = self._held(batch)
         if kind not in self._graphs and self._eager.get(kind, 0) >= WARM_UP:
             self._graphs[kind] = self._capture(inputs)
         if kind in self._graphs:
@@ -48,20 +48,20 @@ class CapturedStep:
         self._eager[kind] = self._eager.get(kind, 0) + 1
         return self._on_stream(inputs)
 
-    def _held(self, draw: Draw) -> Draw:
-        """The draw's values in the tensors that the graph of its kind reads."""
-        if draw.volume not in self._inputs:
-            index = None if draw.index is None else draw.index.clone()
-            self._inputs[draw.volume] = replace(
-                draw, index=index, middle=draw.middle.clone(), progress=draw.progress.clone()
+    def _held(self, batch: Batch) -> Batch:
+        """The batch's values in the tensors that the graph of its kind reads."""
+        if batch.volume not in self._inputs:
+            index = None if batch.index is None else batch.index.clone()
+            self._inputs[batch.volume] = replace(
+                batch, index=index, middle=batch.middle.clone(), progress=batch.progress.clone()
             )
-        held = self._inputs[draw.volume]
-        for old, new in ((held.index, draw.index), (held.middle, draw.middle), (held.progress, draw.progress)):
+        held = self._inputs[batch.volume]
+        for old, new in ((held.index, batch.index), (held.middle, batch.middle), (held.progress, batch.progress)):
             if old is not None and new is not None:
                 old.copy_(new, non_blocking=True)
         return held
 
-    def _on_stream(self, inputs: Draw) -> Tensor:
+    def _on_stream(self, inputs: Batch) -> Tensor:
         # Autograd ties gradients to the stream they first appear on, so warm-up and capture share one.
         current = torch.cuda.current_stream()
         self._stream.wait_stream(current)
@@ -70,7 +70,7 @@ class CapturedStep:
         current.wait_stream(self._stream)
         return values
 
-    def _capture(self, inputs: Draw) -> tuple[torch.cuda.CUDAGraph, Tensor]:
+    def _capture(self, inputs: Batch) -> tuple[torch.cuda.CUDAGraph, Tensor]:
         torch.cuda.synchronize()
         graph = torch.cuda.CUDAGraph()
         with torch.cuda.graph(graph, stream=self._stream):

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from ..geometry import Views
-from ..representations.gaussians import GaussianCloud, raw_of, unit_quaternions
+from ..model import Model
+from ..representations.gaussians import PARAMETERS, GaussianCloud, raw_of, unit_quaternions
+from .optimiser import Leaves
 from .trainable import Trainable
+
+CENTRES = "object.centres"
 
 
 @dataclass(frozen=True)
@@ -40,71 +45,92 @@ class DensityControl:
         return self.every > 0 and inside and (step + 1) % self.every == 0
 
 
-class GradientRecord:
-    """The mean position gradient of each Gaussian since the last event."""
+class DensityEvent:
+    """An event of a fit of Gaussians: adds and removes some of them, where the options say so.
 
-    def __init__(self) -> None:
+    views: whose fields of view bound the volume.
+    """
+
+    def __init__(self, options: DensityControl, views: Views) -> None:
+        self._options, self._views = options, views
         self.total: Tensor | None = None
+        """The position gradients [N] of each Gaussian since the last event, added up."""
 
-    def add(self, gradient: Tensor) -> None:
-        """Take in the position gradients [N, 3] of one step."""
-        size = gradient.norm(dim=1)
-        self.total = size if self.total is None else self.total.add_(size)
+    def on_gradients(self, leaves: Leaves) -> None:
+        """Take in the position gradients of one step."""
+        if self._options.every == 0:
+            return
+        gradient = leaves[CENTRES].grad
+        size = leaves[CENTRES].new_zeros(len(leaves[CENTRES])) if gradient is None else gradient.norm(dim=1)
+        self.total = size if self.total is None else self.total.to(size.device).add_(size)
 
-    def clear(self) -> None:
-        """Forget everything."""
+    def after_step(self, trainable: Trainable, step: int, steps: int, generator: torch.Generator) -> bool:
+        """Clone or split where the position gradient is largest, then prune, when it is due."""
+        if not self._options.due(step, steps):
+            return False
+        self.control(trainable, generator)
+        return True
+
+    def control(self, trainable: Trainable, generator: torch.Generator) -> tuple[int, int]:
+        """One event, due or not; returns (added, removed)."""
+        before = len(_cloud(trainable))
+        added = _grow(trainable, self.total, self._options, generator)
+        cloud = _cloud(trainable)
+        keep = torch.nonzero(~doomed(cloud, self._views, self._options))[:, 0]
+        if 0 < len(keep) < len(cloud):
+            trainable.resize("object", keep)
         self.total = None
+        return added, before + added - len(_cloud(trainable))
+
+    def columns(self, model: Model) -> dict[str, float]:
+        """The number of Gaussians."""
+        assert isinstance(model.object, GaussianCloud)
+        return {"count": len(model.object)}
+
+    def state_dict(self) -> dict[str, Any]:
+        """The gradients of the steps since the last event."""
+        return {"total": None if self.total is None else self.total.cpu().clone()}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Go back to a saved state."""
+        self.total = state["total"]
 
 
-def control_density(
-    trainable: Trainable,
-    record: GradientRecord,
-    views: Views,
-    options: DensityControl,
-    generator: torch.Generator,
-) -> tuple[int, int]:
-    """One event: clone or split where the position gradient is largest, then prune; returns (added, removed)."""
-    before = len(trainable.cloud)
-    added = _grow(trainable, record, options, generator)
-    keep = torch.nonzero(~doomed(trainable.cloud, views, options))[:, 0]
-    removed = len(trainable.cloud) - len(keep)
-    if 0 < removed < len(trainable.cloud):
-        trainable.resize(keep)
-    record.clear()
-    return added, before + added - len(trainable.cloud)
+def _cloud(trainable: Trainable) -> GaussianCloud:
+    cloud = trainable.model.object
+    assert isinstance(cloud, GaussianCloud)
+    return cloud
 
 
-def _grow(trainable: Trainable, record: GradientRecord, options: DensityControl, generator: torch.Generator) -> int:
-    cloud = trainable.cloud
+def _grow(trainable: Trainable, total: Tensor | None, options: DensityControl, generator: torch.Generator) -> int:
+    cloud = _cloud(trainable)
     count = min(int(options.grow_fraction * len(cloud)), options.max_count - len(cloud))
-    if record.total is None or count <= 0:
+    if total is None or count <= 0:
         return 0
-    chosen = torch.topk(record.total, count).indices.sort().values
+    chosen = torch.topk(total.to(cloud.centres.device), count).indices.sort().values
     large = cloud.scales.detach()[chosen].amax(dim=1) > options.split_scale_px
     clones, splits = chosen[~large], chosen[large]
     keep = torch.ones(len(cloud), dtype=torch.bool, device=chosen.device)
     keep[chosen] = False
     children = [_pair(cloud, clones, generator, shrink=1.0), _pair(cloud, splits, generator, shrink=1.6)]
-    trainable.resize(torch.nonzero(keep)[:, 0], tuple(torch.cat(parts) for parts in zip(*children)))
+    added = {name: torch.cat([pair[name] for pair in children]) for name in PARAMETERS}
+    trainable.resize("object", torch.nonzero(keep)[:, 0], added)
     return count
 
 
-def _pair(
-    cloud: GaussianCloud, index: Tensor, generator: torch.Generator, shrink: float
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _pair(cloud: GaussianCloud, index: Tensor, generator: torch.Generator, shrink: float) -> dict[str, Tensor]:
     """Two children of each Gaussian of `index`, that share its mass, half a deviation to either side of it."""
-    centres, log_scales, quaternions, _ = (p.detach()[index] for p in cloud.parameters)
+    centres, log_scales, quaternions = (p.detach()[index] for p in (cloud.centres, cloud.log_scales, cloud.quaternions))
     scales = torch.exp(log_scales)
     axis = torch.randn(centres.shape, generator=generator).to(centres.device)
     offset = rotate(quaternions, 0.5 * scales * axis / axis.norm(dim=1, keepdim=True).clamp_min(1e-6))
     amplitude = cloud.amplitudes.detach()[index] * 0.5 * shrink**3
-    children = (
-        torch.cat([centres + offset, centres - offset]),
-        torch.cat([log_scales, log_scales]) - math.log(shrink),
-        torch.cat([quaternions, quaternions]),
-        torch.cat([raw_of(amplitude)] * 2),
-    )
-    return children
+    return {
+        "centres": torch.cat([centres + offset, centres - offset]),
+        "log_scales": torch.cat([log_scales, log_scales]) - math.log(shrink),
+        "quaternions": torch.cat([quaternions, quaternions]),
+        "raw_amplitudes": torch.cat([raw_of(amplitude)] * 2),
+    }
 
 
 def rotate(quaternions: Tensor, vectors: Tensor) -> Tensor:
@@ -121,7 +147,7 @@ def doomed(cloud: GaussianCloud, views: Views, options: DensityControl) -> Tenso
         scales = cloud.scales
         longest, shortest = scales.amax(dim=1), scales.amin(dim=1)
         faint = cloud.amplitudes.amax(dim=1) < options.faint
-        finite = torch.stack([torch.isfinite(p).all(dim=1) for p in cloud.parameters]).all(dim=0)
+        finite = torch.stack([torch.isfinite(p).all(dim=1) for p in cloud.parameters().values()]).all(dim=0)
         needle = longest > options.needle * shortest
         return faint | (longest > options.huge_px) | needle | outside(cloud, views) | ~finite
 

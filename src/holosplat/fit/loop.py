@@ -1,33 +1,33 @@
-"""The optimisation loop: holograms in, a fitted cloud out, in steps that can be stopped and resumed."""
+"""The one optimisation loop: a problem in, a fitted model out, in steps that can be stopped and resumed.
+
+It knows frames, parameters by name and optimisers, and no representation: what a method does beside the steps (density
+control, pruning) comes as events.
+"""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from ..backends import resolve
-from ..checks import InputError, require
-from ..geometry import Grid, Poses
+from ..checks import InputError
+from ..geometry import Grid
 from ..memory import memory_kept
-from ..model.instrument import Instrument
-from ..optics.sampling import resolving_oversample
-from ..representations.gaussians import GaussianCloud
-from ..scan import Scan
-from . import objective as terms
+from ..model import Model
+from .batch import Batch
+from .batches import Batches
 from .capture import CapturedStep
-from .density import DensityControl, GradientRecord, control_density
 from .interrupt import interrupts_held
-from .misfit import IMAGE_TERMS, OBJECT_TERMS, Draw, Misfit
-from .objective import Objective
+from .optimiser import Leaves, Optimiser
+from .problem import Problem
 from .schedule import Schedule
 from .trainable import Trainable
+from .validation import Judge
 
 UNREAD_STEPS = 20
 """Steps on a GPU between looks at their values, each of which waits for it."""
@@ -41,78 +41,130 @@ class DivergedError(InputError):
 
     def __init__(self, step: int) -> None:
         super().__init__(
-            f"the fit diverged at step {step}: its parameters are no longer finite; "
-            "lower the rates of the schedule (rate_position, rate_scale, rate_rotation, rate_amplitude)."
+            f"the fit diverged at step {step}: its parameters are no longer finite; lower the rates of the method."
         )
         self.step = step
 
 
-@dataclass(frozen=True)
-class FitOptions:
-    """What is minimised, how, where Gaussians come and go, and which backend does it (see `backends`)."""
+class Event(Protocol):
+    """What a method does beside the steps."""
 
-    objective: Objective = field(default_factory=Objective)
-    schedule: Schedule = field(default_factory=Schedule)
-    density: DensityControl = field(default_factory=DensityControl)
-    backend: str = "auto"
+    def on_gradients(self, leaves: Leaves) -> None:
+        """After the backward pass of every step, on the device alone."""
+        ...
+
+    def after_step(self, trainable: Trainable, step: int, steps: int, generator: torch.Generator) -> bool:
+        """After each step (counted from 0); whether tensors moved, so that a captured step must be captured anew."""
+        ...
+
+    def columns(self, model: Model) -> Record:
+        """What joins the record of a step."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """The state, in main memory."""
+        ...
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Go back to a saved state."""
+        ...
+
+
+def _no_rates(factor: float, step: int) -> Mapping[str, float]:
+    return {}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Everything that a fit needs.
+
+    problem, schedule: what is minimised, and how long. optimiser: makes the optimiser of the free parameters. rates:
+    (what is left of them, step) → the rate of each parameter. events: what the method does beside the steps. judge:
+    of the validation frames, None without any. grid: the volume that terms look at in blocks, None without such terms.
+    generator: everything random, None for one made of the seed.
+    """
+
+    problem: Problem
+    schedule: Schedule
+    optimiser: Callable[[Leaves], Optimiser]
+    rates: Callable[[float, int], Mapping[str, float]] = _no_rates
+    events: Sequence[Event] = ()
+    judge: Judge | None = None
+    grid: Grid | None = None
+    generator: torch.Generator | None = None
+
+
+@dataclass
+class _Best:
+    """The best state by the validation frames."""
+
+    leaves: Leaves
+    score: float = float("inf")
+    step: int = 0
+
+
+@dataclass
+class _Unread:
+    """Values of a step that were not read from the device yet."""
+
+    record: Record
+    names: list[str]
+    values: Tensor = field(repr=False)
 
 
 class Fit:
     """A fit in progress. `run` advances it; `state_dict` and `load` make it resumable (on a CPU bit for bit)."""
 
-    def __init__(self, scan: Scan, cloud: GaussianCloud, options: FitOptions, seed: int = 0) -> None:
-        self.options, self.seed = options, seed
-        self.backend = resolve(options.backend)
-        schedule = options.schedule
-        self.train, self.validation = split_validation(scan.train(), schedule.validation_views)
-        oversample = schedule.oversample or resolving_oversample(self.train.exposures, 1.5, at_least=1)
-        self.instrument = Instrument(self.train.exposures, oversample, backend=self.backend)
-        looks = len(self.validation) > 0
-        self._judge = Instrument(self.validation.exposures, oversample, backend=self.backend) if looks else None
-        require(np.ptp(self.train.frames) > 0, "all training frames are constant, so there is nothing to fit.")
-        self._grid = Grid.of_views(scan.views)
-        block = self._grid.block((0, 0, 0), self._block_shape())
-        depth = self._grid.shape[0]
-        self._misfit = Misfit(self.train, self.instrument, options.objective, schedule.detach_worst, block, depth)
-        self.trainable = Trainable(cloud.on(self.backend), self.backend)
-        self.gradients = GradientRecord()
-        self.step, self.seconds = 0, 0.0
-        self._unread: list[tuple[Record, list[str], Tensor]] = []
-        self._capture = CapturedStep(self._work) if self.instrument.device.type == "cuda" else None
-        self._generator = torch.Generator().manual_seed(seed)
-        self._order: list[int] = []
-        self.best_score, self.best_step, self._best = float("inf"), 0, self.cloud.detached()
-        self.stopped_early = False
+    def __init__(self, plan: Plan, seed: int = 0) -> None:
+        self.plan, self.schedule, self.seed = plan, plan.schedule, seed
+        instrument = plan.problem.model.instrument
+        self.backend, self._device = instrument.backend, instrument.device
+        self.trainable = Trainable(plan.problem, plan.optimiser)
+        generator = plan.generator or torch.Generator().manual_seed(seed)
+        self._batches = Batches(len(instrument.views), plan.schedule, self._device, generator, plan.grid)
+        self.step, self.seconds, self.stopped_early = 0, 0.0, False
+        self._names: dict[int, list[str]] = {}
+        self._unread: list[_Unread] = []
+        self._capture = CapturedStep(self._work) if self._device.type == "cuda" else None
+        self._best = _Best(self.trainable.snapshot())
 
     @property
-    def cloud(self) -> GaussianCloud:
-        """The cloud as it is now."""
-        return self.trainable.cloud
+    def model(self) -> Model:
+        """The model as it is now."""
+        return self.trainable.model
+
+    @property
+    def best_step(self) -> int:
+        """The step of the best state by the validation frames; 0 without any."""
+        return self._best.step
 
     @property
     def finished(self) -> bool:
         """Whether the schedule is done, or the fit stopped early."""
-        return self.stopped_early or self.step >= self.options.schedule.steps
+        return self.stopped_early or self.schedule.share(self.step, self.seconds) >= 1
 
-    def result(self) -> GaussianCloud:
-        """The best cloud by the validation views, or the last one where there are none; in main memory."""
-        best = self._best if self._judge is not None and self.best_step > 0 else self.cloud.detached()
-        return best.on("cpu" if self.backend == "cuda" else self.backend)
+    def result(self) -> Model:
+        """The best model by the validation frames or the optimiser, or else the last one; it carries no gradients."""
+        found = self.trainable.optimiser.best()
+        if found is None:
+            judged = self.plan.judge is not None and self._best.step > 0
+            found = self._best.leaves if judged else self.trainable.snapshot()
+        return self.plan.problem.model.with_parameters(found)
 
     def columns(self) -> list[str]:
         """Names of everything that a record may hold, in the order of metrics.csv."""
-        w = self.options.objective
-        weights = {name: getattr(w, name) for name in (*IMAGE_TERMS, *OBJECT_TERMS)}
-        used = [name for name, weight in weights.items() if weight > 0]
-        judged = ["val_l1", "val_ssim", "val_frcm"] if self._judge is not None else []
-        return ["step", "seconds", "loss", *used, "count", *judged]
+        names = [name for term in self.plan.problem.terms for name in term.names]
+        own = [name for event in self.plan.events for name in event.columns(self.model)]
+        return ["step", "seconds", "loss", *names, *own, *(Judge.COLUMNS if self.plan.judge else ())]
 
     def run(self, on_record: Callable[[Record], None], until: int | None = None) -> None:
-        """Advance to the end (or to step `until`); `on_record` receives one record a step, on a GPU in batches."""
-        end = self.options.schedule.steps if until is None else min(until, self.options.schedule.steps)
-        try:
-            with memory_kept(), interrupts_held() as release:
-                while self.step < end and not self.stopped_early:
+        """Advance to the end (or to step `until`); `on_record` receives one record a step, on a GPU in batches.
+
+        Ctrl-C is held back until a step is complete, then `KeyboardInterrupt` is raised from here.
+        """
+        with memory_kept(), interrupts_held() as release:
+            try:
+                while not self.finished and (until is None or self.step < until):
                     started = time.perf_counter()
                     self._advance()
                     if self._capture is None or len(self._unread) >= UNREAD_STEPS:
@@ -120,140 +172,80 @@ class Fit:
                     else:
                         self.seconds += time.perf_counter() - started
                     release()
-        finally:
-            self._deliver(on_record, time.perf_counter())
+            finally:
+                self._deliver(on_record, time.perf_counter())
 
     def _deliver(self, on_record: Callable[[Record], None], started: float) -> None:
         """Read the steps that were not read yet, count the time since `started`, and hand out their records."""
         unread, self._unread = self._unread, []
-        rows = [values.tolist() for _, _, values in unread]  # waits for the device
+        rows = [one.values.tolist() for one in unread]  # waits for the device
         self.seconds += time.perf_counter() - started
-        for (record, names, _), row in zip(unread, rows):
-            self._check_sound(record, row)
-            on_record({"seconds": self.seconds, **record, **dict(zip(names, row))})
+        for one, row in zip(unread, rows):
+            if not math.isfinite(row[0] + row[-1]):
+                raise DivergedError(int(one.record["step"]))
+            on_record({"seconds": self.seconds, **one.record, **dict(zip(one.names, row))})
 
     def _advance(self) -> None:
-        schedule, density = self.options.schedule, self.options.density
-        draw = self._draw()
-        self.trainable.prepare(schedule.rates(self.step))
-        values = self._work(draw) if self._capture is None else self._capture(draw)
-        if density.due(self.step, schedule.steps):
-            control_density(self.trainable, self.gradients, self.train.views, density, self._generator)
-            if self._capture is not None:
+        schedule = self.schedule
+        share = min(1.0, schedule.share(self.step, self.seconds))
+        batch = self._batches.draw(self.step, share)
+        self.trainable.optimiser.prepare(self.plan.rates(schedule.factor(self.step, self.seconds), self.step))
+        values = self._work(batch) if self._capture is None else self._capture(batch)
+        for event in self.plan.events:
+            moved = event.after_step(self.trainable, self.step, schedule.steps, self._batches.generator)
+            if moved and self._capture is not None:
                 self._capture.forget()
         self.step += 1
-        record: Record = {"step": self.step, "count": len(self.cloud)}
-        self._unread.append((record, self._misfit.names(self.cloud, draw), values))
-        if self._judge is not None and (self.step % schedule.validate_every == 0 or self.step == schedule.steps):
-            record |= self._validate()
+        record: Record = {"step": self.step}
+        for event in self.plan.events:
+            record |= event.columns(self.model)
+        if self.plan.judge and (self.step % schedule.validate_every == 0 or self.step == schedule.steps):
+            record |= self._validate(self.plan.judge)
+        self._unread.append(_Unread(record, self._names[batch.volume], values))
 
-    def _work(self, draw: Draw) -> Tensor:
-        """One step on the device: gradients, what density control wants of them, Adam. Waits for nothing."""
-        loss, values = self._misfit(self.cloud, draw)
+    def _work(self, batch: Batch) -> Tensor:
+        """One step on the device: gradients, what events want of them, the optimiser. Waits for nothing."""
+        loss, values, self._names[batch.volume] = self.plan.problem.loss(self.model, batch)
         loss.backward()
-        if self.options.density.every > 0:
-            self.gradients.add(_gradient(self.cloud.centres))
-        self.trainable.apply()
-        sound = torch.stack([p.detach().sum() for p in self.cloud.parameters]).sum()[None]
+        for event in self.plan.events:
+            event.on_gradients(self.trainable.leaves)
+        self.trainable.optimiser.apply(loss.detach())
+        sums = [leaf.detach().sum() for leaf in self.trainable.leaves.values()]
+        sound = torch.stack([s.to(values.dtype) for s in sums]).sum()[None]
         return torch.cat([values, sound])
 
-    def _check_sound(self, record: Record, row: list[float]) -> None:
-        """`DivergedError` if loss (first) or parameters (their sum, last) are no longer numbers."""
-        if not math.isfinite(row[0] + row[-1]):
-            raise DivergedError(int(record["step"]))
-
-    def _draw(self) -> Draw:
-        """What the next step looks at, by the schedule and the generator."""
-        schedule, w, on = self.options.schedule, self.options.objective, self.instrument.device
-        views = self._draw_views()
-        whole = len(views) == len(self.train)
-        volume = schedule.volume_every if w.uses_volume and self.step % schedule.volume_every == 0 else 0
-        middle = self._volume_block().centre if volume else np.zeros(3)
-        return Draw(
-            None if whole else torch.from_numpy(views).to(on, non_blocking=True),
-            torch.from_numpy(middle).to(on, non_blocking=True),
-            torch.tensor(self.step / schedule.steps).to(on, non_blocking=True),
-            volume,
-        )
-
-    def _draw_views(self) -> np.ndarray:
-        """The views of this step: all, or the next ones of a shuffled order without replacement."""
-        count = self.options.schedule.views_per_step
-        if count <= 0 or count >= len(self.train):
-            return np.arange(len(self.train))
-        if len(self._order) < count:  # those left over from the last round come first, and not again in this step
-            fresh: list[int] = torch.randperm(len(self.train), generator=self._generator).tolist()
-            left = set(self._order)
-            self._order += [v for v in fresh if v not in left] + [v for v in fresh if v in left]
-        drawn, self._order = self._order[:count], self._order[count:]
-        return np.array(sorted(drawn))
-
-    def _volume_block(self) -> Grid:
-        """Where this step looks at the volume: all of it, or a random block where it is large."""
-        shape = self._block_shape()
-        free = [n - m for n, m in zip(self._grid.shape, shape)]
-        start = [int(torch.randint(f + 1, (1,), generator=self._generator)) for f in free]
-        return self._grid.block((start[0], start[1], start[2]), shape)
-
-    def _block_shape(self) -> tuple[int, int, int]:
-        z, y, x = (min(n, self.options.schedule.volume_edge) for n in self._grid.shape)
-        return z, y, x
-
-    def _validate(self) -> Record:
-        """Look at the validation views; keeps the best cloud, and stops the fit when patience is over."""
-        assert self._judge is not None
-        with torch.no_grad():
-            lines = self.cloud.project(Poses.of(self._judge.views, self._judge.device))
-            predicted = self._judge.frames(lines).cpu()
-        frames, low, span = torch.from_numpy(self.validation.frames), self._misfit.low, self._misfit.span
-        a, b = (predicted - low) / span, (frames - low) / span
-        ssim, frcm = (1 - float(term(a, b).mean()) for term in (terms.one_minus_ssim, terms.one_minus_frcm))
-        score = 1 - 0.5 * (ssim + frcm)  # not L1, which prefers a blurred object to one with its fringes misplaced
-        if score < self.best_score:
-            self.best_score, self.best_step, self._best = score, self.step, self.cloud.detached()
-        schedule = self.options.schedule
-        overdue = self.step - self.best_step >= schedule.patience * schedule.validate_every
-        self.stopped_early = schedule.patience > 0 and overdue
-        return {"val_l1": float(terms.l1(a, b).mean()), "val_ssim": ssim, "val_frcm": frcm}
+    def _validate(self, judge: Judge) -> Record:
+        """Look at the validation frames; keeps the best state, and stops the fit when patience is over."""
+        score, columns = judge(self.model)
+        if score < self._best.score:
+            self._best = _Best(self.trainable.snapshot(), score, self.step)
+        overdue = self.step - self._best.step >= self.schedule.patience * self.schedule.validate_every
+        self.stopped_early = self.schedule.patience > 0 and overdue
+        return columns
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that `load` needs to go on as if nothing had happened."""
+        best = self._best
         return {
             "trainable": self.trainable.state_dict(),
-            "gradients": None if self.gradients.total is None else self.gradients.total.cpu().clone(),
+            "events": [event.state_dict() for event in self.plan.events],
             "step": self.step,
             "seconds": self.seconds,
-            "generator": self._generator.get_state(),
-            "order": self._order,
-            "best": (self.best_score, self.best_step, [p.cpu().clone() for p in self._best.parameters]),
+            "generator": self._batches.generator.get_state(),
+            "order": self._batches.order,
+            "best": (best.score, best.step, {name: leaf.cpu().clone() for name, leaf in best.leaves.items()}),
             "stopped_early": self.stopped_early,
         }
 
     def load(self, state: dict[str, Any]) -> None:
         """Go back to a saved state."""
         self.trainable.load(state["trainable"])
-        total = state["gradients"]
-        self.gradients.total = None if total is None else total.to(self.instrument.device).clone()
+        for event, saved in zip(self.plan.events, state["events"]):
+            event.load(saved)
         self.step, self.seconds, self.stopped_early = state["step"], state["seconds"], state["stopped_early"]
-        self._generator.set_state(state["generator"])
-        self._order = list(state["order"])
-        self.best_score, self.best_step, parameters = state["best"]
-        self._best = self._best.replaced(p.to(self.instrument.device) for p in parameters)
+        self._batches.generator.set_state(state["generator"])
+        self._batches.order = list(state["order"])
+        score, step, leaves = state["best"]
+        self._best = _Best({name: leaf.to(self._device) for name, leaf in leaves.items()}, score, step)
         if self._capture is not None:
             self._capture.forget()
-
-
-def split_validation(train: Scan, count: int) -> tuple[Scan, Scan]:
-    """Training frames without, and only, `count` evenly spread validation frames; `InputError` if none is left."""
-    require(
-        count < len(train),
-        f"validation_views must leave a training frame: {count} of {len(train)} are asked for.",
-    )
-    chosen = np.zeros(len(train), dtype=bool)
-    if count > 0:
-        chosen[((np.arange(count) + 0.5) * len(train) / count).astype(int)] = True
-    return train[np.flatnonzero(~chosen)], train[np.flatnonzero(chosen)]
-
-
-def _gradient(parameter: Tensor) -> Tensor:
-    return torch.zeros_like(parameter) if parameter.grad is None else parameter.grad

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -10,11 +11,12 @@ from torch import Tensor
 
 from ..backends import device, resolve
 from ..checks import require
-from ..optics.hologram import Refraction, hologram, optical_path
+from ..geometry import Poses
+from ..optics.hologram import OpticalPath, Refraction, hologram, optical_path
 from ..optics.sampling import padding
 from ..scan import Exposures, far_from_edges
 from ..units import wavenumber
-from ..volume import LineIntegrals, Object
+from ..volume import LineIntegrals
 
 MOST_SAMPLES = 1_000_000_000
 """Samples of all waves held at once, at most (16 GB as complex128)."""
@@ -54,22 +56,36 @@ class Instrument:
         )
         ratio = far_from_edges(exposures.energy_kev, exposures.reference_energy) if dispersion is None else dispersion
         self._factors = _factors(wavenumber(exposures.energy_kev), ratio, self.device)
-        my, mx = (m * self.oversample for m in self.margin)
-        self.path = optical_path(
-            self.views.shape,
-            self.views.pixel_size,
-            exposures.energy_kev,
-            exposures.distance,
-            exposures.psf_sigma_px * self.oversample,
-            (exposures.views.shape, (my, mx), self.oversample),
-            dtype,
-        ).to(self.device)
+        self.path = self._path(None, None, None)
 
-    def frames(self, lines: LineIntegrals, index: np.ndarray | Tensor | None = None) -> Tensor:
-        """Frames [V, H, W] from line integrals on `self.views` (or its views `index`), in the instrument's type."""
-        at = None if index is None else torch.as_tensor(index, device=self.device)
-        path = self.path if at is None else self.path[at]
-        refraction = self.refraction(lines.materials, at)
+    @cached_property
+    def poses(self) -> Poses:
+        """The views, ready for kernels on the instrument's device."""
+        return Poses.of(self.views, self.device)
+
+    @cached_property
+    def times(self) -> np.ndarray:
+        """The distinct times of the exposures [s], in order."""
+        return np.unique(self.exposures.time)
+
+    def frames(
+        self,
+        lines: LineIntegrals,
+        index: np.ndarray | Tensor | None = None,
+        distance: Tensor | None = None,
+        psf_sigma_px: Tensor | None = None,
+    ) -> Tensor:
+        """Frames [V, H, W] from line integrals on `self.views` (or its views `index`), in the instrument's type.
+
+        distance, psf_sigma_px: other distances [V] [m] and point-spread functions [V] [pixels] than those of the
+        exposures, float64, with gradients if they require them.
+        """
+        chosen = None if index is None else torch.as_tensor(index, device=self.device)
+        if distance is None and psf_sigma_px is None:
+            path = self.path if chosen is None else self.path[chosen]
+        else:
+            path = self._path(chosen, distance, psf_sigma_px)
+        refraction = self.refraction(lines.materials, chosen)
         return hologram(lines.channels.to(self.device, self.dtype), refraction, path, self.backend)
 
     def refraction(self, materials: Sequence[tuple[float, float]], index: Tensor | None = None) -> Refraction:
@@ -84,24 +100,24 @@ class Instrument:
         pairs = [factors[:, c].unbind(1) for c in channels]
         return torch.stack([torch.stack((f * d, g * b), dim=1) for (f, g), (d, b) in zip(pairs, materials)], dim=1)
 
+    def _path(self, index: Tensor | None, distance: Tensor | None, psf_sigma_px: Tensor | None) -> OpticalPath:
+        """The path of the views `index` at other distances, or through other point-spread functions."""
+        taken = self.exposures if index is None else self.exposures[index.cpu().numpy()]
+        my, mx = (m * self.oversample for m in self.margin)
+        sigma = taken.psf_sigma_px if psf_sigma_px is None else psf_sigma_px
+        return optical_path(
+            self.views.shape,
+            self.views.pixel_size,
+            taken.energy_kev,
+            taken.distance if distance is None else distance,
+            sigma * self.oversample,
+            (taken.views.shape, (my, mx), self.oversample),
+            self.dtype,
+        ).to(self.device)
+
     def image(self, B: Tensor, D: Tensor, index: np.ndarray | None = None) -> Tensor:
         """Frames [V, H, W] from line integrals B, D [V, H', W'] in metres on `self.views` (or its views `index`)."""
         return self.frames(LineIntegrals.of(B, D), index)
-
-    def measure(self, obj: Object, index: np.ndarray | None = None) -> Tensor:
-        """Frames [V, H, W] that `obj` would give in the exposures `index` (default: all)."""
-        index = np.arange(len(self.views)) if index is None else np.asarray(index)
-        times = self.exposures.time[index]
-        frames = torch.empty(0)
-        for time in np.unique(times):
-            at = np.flatnonzero(times == time)
-            lines = obj.at(float(time)).project(self.views[index[at]])
-            part = self.frames(LineIntegrals.of_any(lines), index[at])
-            if len(at) == len(index):
-                return part
-            frames = frames if len(frames) else part.new_empty((len(index), *part.shape[1:]))
-            frames[at] = part
-        return frames
 
 
 def _factors(wavenumbers: np.ndarray, dispersion: np.ndarray, device: torch.device) -> np.ndarray | Tensor:
@@ -111,8 +127,3 @@ def _factors(wavenumbers: np.ndarray, dispersion: np.ndarray, device: torch.devi
     """
     factors = wavenumbers[:, None, None] * dispersion.reshape(len(wavenumbers), -1, 2)
     return factors[:1] if (factors == factors[:1]).all() else torch.from_numpy(factors).to(device)
-
-
-def measure(obj: Object, exposures: Exposures, oversample: int = 1, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Frames [N, H, W] (relative intensity) that `obj` gives in `exposures`, on waves `oversample` times finer."""
-    return Instrument(exposures, oversample, dtype).measure(obj)

@@ -17,7 +17,7 @@ from ..checks import finite, in_range, require
 from ..geometry import Views
 from ..materials import ENERGY_RANGE_KEV, DeltaBeta, Material
 from ..mesh import TriangleMesh
-from ..model.instrument import Instrument
+from ..model import Instrument
 from ..scan import DISTANCE_RANGE_M, PIXEL_RANGE_M, Exposures
 from ..specimens.scene import MeshScene
 from ..units import wavelength, wavenumber

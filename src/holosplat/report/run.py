@@ -10,7 +10,6 @@ import torch
 
 from ..geometry import Grid, Views
 from ..projectors.voxels import voxel_line_integrals
-from ..representations import GaussianCloud
 from ..scan import Scan
 from ..volume import Volume
 from ..workflows.evaluate import Evaluation
@@ -32,26 +31,26 @@ def report_run(
 ) -> Path:
     """Write `report.html` of a run; returns its path."""
     config = folder.read_config()
-    cloud = reconstruction.cloud
+    found = reconstruction.object
     grid = truth.grid if truth is not None else _drawn_grid(scan.views)
     held_out = None
     if evaluation.test is not None and evaluation.predicted is not None:
         test = scan.test()
         held_out = HeldOutViews(test.frames, evaluation.predicted, view_labels(test.views), evaluation.test)
     content = ReportContent(
-        title=_title(config, cloud),
+        title=_title(config, reconstruction),
         summary=_summary(reconstruction, scan),
-        reconstruction=cloud.voxelise(grid),
+        reconstruction=found.voxelise(grid),
         truth=truth,
         energy_kev=scan.exposures.reference_energy,
         pixel_size=scan.views.pixel_size,
         held_out=held_out,
         projections=_projections(reconstruction, scan.views, truth),
         volume_scores=evaluation.volume,
-        material_delta=cloud.delta if cloud.single_material else None,
+        material_delta=found.matter.delta if found.matter.single else None,
         history=folder.history(),
         seconds=sum(reconstruction.timing.values()),
-        settings={"seed": config["seed"], "prior": config["prior"], **config["settings"]},
+        settings={"seed": config["seed"], "prior": config["prior"], **config.get("method", config.get("settings", {}))},
         versions=config["versions"],
         machine=config["machine"],
         timing={stage: f"{seconds:.1f} s" for stage, seconds in reconstruction.timing.items()},
@@ -60,10 +59,20 @@ def report_run(
     return write_report(content, folder.report)
 
 
-def _title(config: Mapping[str, Any], cloud: GaussianCloud) -> str:
-    count = "two materials" if cloud.second else "one material" if cloud.single_material else "δ and β free"
-    said = {"known": ", known", "ratio": " of known δ/β", "free": ", found" if cloud.occupancies else ""}
-    return f"Gaussian reconstruction, {count}{said[config['prior']['kind']]}"
+NAMES = {
+    "gaussians": "Gaussian reconstruction",
+    "surfaces": "Reconstruction as closed surfaces",
+    "voxels": "Voxel reconstruction",
+    "neural-field": "Reconstruction as a neural field",
+}
+"""What a report is called, by the kind of object."""
+
+
+def _title(config: Mapping[str, Any], reconstruction: Reconstruction) -> str:
+    matter = reconstruction.object.matter
+    count = "two materials" if matter.second else "one material" if matter.single else "δ and β free"
+    said = {"known": ", known", "ratio": " of known δ/β", "free": ", found" if matter.occupancies else ""}
+    return f"{NAMES[reconstruction.object.kind]}, {count}{said[config['prior']['kind']]}"
 
 
 def _summary(reconstruction: Reconstruction, scan: Scan) -> str:
@@ -77,7 +86,7 @@ def _summary(reconstruction: Reconstruction, scan: Scan) -> str:
     return (
         f"{len(scan.train())} training and {len(scan.test())} held-out frames of {h} × {w} pixels of "
         f"{1e6 * views.pixel_size:.4g} µm, {energy} keV, {distance} behind the sample; "
-        f"{len(reconstruction.cloud)} Gaussians.{state}"
+        f"{reconstruction.object.described}.{state}"
     )
 
 
@@ -90,7 +99,7 @@ def _projections(reconstruction: Reconstruction, views: Views, truth: Volume | N
     first, other = 0, int(abs(views.rotations[:, 2] @ views.rotations[0, 2]).argmin())
     chosen = views[[first, other] if other != first else [first]]
     with torch.no_grad():
-        beta, delta = (line.numpy() for line in reconstruction.cloud.project(chosen))
+        beta, delta = (line.numpy() for line in reconstruction.object.project(chosen))
         if truth is None:
             return ProjectedMaps(beta, delta, view_labels(chosen))
         true_beta, true_delta = (line.numpy() for line in _project_volume(truth, chosen).unbind(1))

@@ -1,20 +1,79 @@
 """Trainable Objects, and how they are initialised."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, Protocol
+
+from torch import Tensor
+
+from ..geometry import Grid, Poses, Views
+from ..matter import Matter
+from ..volume import LineIntegrals, TrainableObject
 from .encodings import Encoding
 from .gaussians import GaussianCloud
 from .initialise import approximate, at_pitch, cloud_from_two, cloud_from_volume, freed, random_cloud
 from .isosurface import isosurface
-from .neural_field import Matter, Network, NeuralField
+from .neural_field import Network, NeuralField
 from .surfaces import SurfaceMesh
 from .voxel_lines import VoxelLines
 from .voxels import VoxelGrid
 
+
+class Stored(TrainableObject, Protocol):
+    """What a reconstruction can be: an Object that can be fitted, and that files hold."""
+
+    kind: ClassVar[str]
+    """Its name in files."""
+    matter: Matter
+    backend: str
+
+    @property
+    def described(self) -> str:
+        """How large it is, in words."""
+        ...
+
+    @property
+    def stored_bytes(self) -> int:
+        """Size of what has to be stored of it."""
+        ...
+
+    def with_parameters(self, parameters: Mapping[str, Tensor]) -> Stored:
+        """The same object with other tensors in the place of those named."""
+        ...
+
+    def project(self, views: Views | Poses, /) -> LineIntegrals:
+        """Line integrals, differentiable in the parameters and, where poses ask for it, in these."""
+        ...
+
+    def state(self) -> dict[str, Any]:
+        """Tensors, plain values, and dictionaries of them."""
+        ...
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> Stored:
+        """The object that `state` described."""
+        ...
+
+    def on(self, backend: str) -> Stored:
+        """The object for another backend (resolved)."""
+        ...
+
+    def enclosing_grid(self, most_voxels: int) -> Grid:
+        """A grid that holds all of its matter."""
+        ...
+
+
+KINDS: dict[str, type[Stored]] = {kind.kind: kind for kind in (GaussianCloud, VoxelGrid, SurfaceMesh, NeuralField)}
+"""Every kind of Object that files hold, by name."""
+
 __all__ = [
+    "KINDS",
     "Encoding",
     "GaussianCloud",
-    "Matter",
     "Network",
     "NeuralField",
+    "Stored",
     "SurfaceMesh",
     "VoxelGrid",
     "VoxelLines",

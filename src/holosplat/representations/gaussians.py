@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -12,11 +13,12 @@ from torch.nn.functional import normalize, softplus
 from ..backends import device
 from ..checks import require
 from ..geometry import Grid, Poses, Views
+from ..matter import Matter
 from ..projectors.splat import splat, voxelise
 from ..volume import LineIntegrals, Volume
 
 PARAMETERS = ("centres", "log_scales", "quaternions", "raw_amplitudes")
-"""The trainable tensors, in the order of `GaussianCloud.parameters`."""
+"""The names of the trainable tensors."""
 
 
 class GaussianCloud:
@@ -27,52 +29,36 @@ class GaussianCloud:
     centres [N, 3] `(x, y, z)`; log_scales [N, 3], natural logarithms of the standard deviations;
     quaternions [N, 4] `(w, x, y, z)`, normalised on use; raw_amplitudes [N, C], peak values through softplus.
 
-    With C = 1 the amplitude is an *occupancy*, the density of one material: δ = a·delta, β = a·beta (β may be
-    negative). With C = 2 it is `(δ/delta, β/beta)`, both free and non-negative, in the units `delta`, `beta`; or,
-    with `second` the (δ, β) of another material, the occupancies of the two: δ = a₁·delta + a₂·second[0].
+    The peak values are those of the channels of `matter`: occupancies of its materials, or δ and β in its units.
+    Errors: `InputError` if the arrays do not fit together, or not to the matter.
     """
 
-    def __init__(
-        self,
-        parameters: Iterable[Tensor],
-        unit_length: float,
-        delta: float,
-        beta: float,
-        second: tuple[float, float] | None = None,
-    ) -> None:
+    kind: ClassVar[str] = "gaussians"
+    """The name of this kind of Object in files."""
+
+    def __init__(self, parameters: Iterable[Tensor], unit_length: float, matter: Matter) -> None:
         self.centres, self.log_scales, self.quaternions, self.raw_amplitudes = parameters
-        self.unit_length, self.delta, self.beta = float(unit_length), float(delta), float(beta)
-        self.second = None if second is None else (float(second[0]), float(second[1]))
-        n = len(self.centres)
-        shapes = [tuple(p.shape) for p in self.parameters]
-        fits = shapes[:3] == [(n, 3), (n, 3), (n, 4)] and shapes[3] in ((n, 1), (n, 2))
-        require(fits, f"a Gaussian cloud needs shapes (N, 3), (N, 3), (N, 4), (N, 1 or 2), but got {shapes}.")
+        self.unit_length, self.matter = float(unit_length), matter
+        n, channels = len(self.centres), len(matter)
+        shapes = [tuple(p.shape) for p in self.parameters().values()]
+        wanted = [(n, 3), (n, 3), (n, 4), (n, channels)]
+        require(
+            shapes == wanted,
+            f"a Gaussian cloud of {channels} channels of matter needs shapes (N, 3), (N, 3), (N, 4), (N, {channels}), "
+            f"but got {shapes}.",
+        )
         self.backend = "cpu"
 
     def __len__(self) -> int:
         return len(self.centres)
 
-    @property
-    def parameters(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """The four trainable tensors, in the order of `PARAMETERS`."""
-        return self.centres, self.log_scales, self.quaternions, self.raw_amplitudes
+    def parameters(self) -> dict[str, Tensor]:
+        """The trainable tensors by name."""
+        return {name: getattr(self, name) for name in PARAMETERS}
 
-    @property
-    def single_material(self) -> bool:
-        """Whether one density carries both δ and β."""
-        return self.raw_amplitudes.shape[1] == 1
-
-    @property
-    def materials(self) -> tuple[tuple[float, float], ...]:
-        """(δ, β) of amplitude one in each channel."""
-        if self.single_material:
-            return ((self.delta, self.beta),)
-        return ((self.delta, self.beta), self.second) if self.second else ((self.delta, 0.0), (0.0, self.beta))
-
-    @property
-    def occupancies(self) -> bool:
-        """Whether amplitudes are shares of materials, which cannot add up to more than one."""
-        return self.single_material or self.second is not None
+    def with_parameters(self, parameters: Mapping[str, Tensor]) -> GaussianCloud:
+        """The cloud with other tensors in the place of those named."""
+        return self.replaced(parameters.get(name, mine) for name, mine in self.parameters().items())
 
     @property
     def scales(self) -> Tensor:
@@ -85,25 +71,44 @@ class GaussianCloud:
         return softplus(self.raw_amplitudes)
 
     @property
+    def described(self) -> str:
+        """How large the cloud is, in words."""
+        return f"{len(self)} Gaussians"
+
+    @property
     def stored_bytes(self) -> int:
         """Size of the parameters as a run folder stores them, float32."""
-        return 4 * sum(p.numel() for p in self.parameters)
+        return 4 * sum(p.numel() for p in self.parameters().values())
 
-    def replaced(self, parameters: Iterable[Tensor]) -> GaussianCloud:
-        """A cloud of other parameters in the same units."""
-        cloud = GaussianCloud(parameters, self.unit_length, self.delta, self.beta, self.second)
+    def replaced(self, parameters: Iterable[Tensor], matter: Matter | None = None) -> GaussianCloud:
+        """A cloud of other tensors in the same units, of the same matter or another."""
+        cloud = GaussianCloud(parameters, self.unit_length, matter or self.matter)
         cloud.backend = self.backend
         return cloud
 
     def detached(self) -> GaussianCloud:
         """A copy that carries no gradients."""
-        return self.replaced(p.detach().clone() for p in self.parameters)
+        return self.replaced(p.detach().clone() for p in self.parameters().values())
 
     def on(self, backend: str) -> GaussianCloud:
         """The cloud for another backend (resolved: `cpu`, `cuda`, `reference`), on that backend's device."""
-        cloud = self.replaced(p.to(device(backend)) for p in self.parameters)
+        cloud = self.replaced(p.to(device(backend)) for p in self.parameters().values())
         cloud.backend = backend
         return cloud
+
+    def state(self) -> dict[str, Any]:
+        """Tensors and plain values that `from_state` makes the same cloud of."""
+        return {**self.parameters(), "unit_length": self.unit_length, "matter": self.matter.as_dict()}
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> GaussianCloud:
+        """The cloud that `state` described."""
+        matter = Matter.from_dict(state["matter"])
+        return cls([state[name] for name in PARAMETERS], float(state["unit_length"]), matter)
+
+    def enclosing_grid(self, most_voxels: int) -> Grid:
+        """A grid around all centres, of `unit_length` a voxel, or coarser where those would be over `most_voxels`."""
+        return Grid.around(self.centres.detach().double().cpu().numpy(), self.unit_length, most_voxels)
 
     def at(self, time: float) -> GaussianCloud:
         """The cloud itself: it does not move."""
@@ -129,9 +134,7 @@ class GaussianCloud:
 
     def project(self, views: Views | Poses) -> LineIntegrals:
         """Line integrals (B, D), differentiable in the parameters and in Poses, as `thickness` is."""
-        scale = self.unit_length
-        materials = tuple((delta * scale, beta * scale) for delta, beta in self.materials)
-        return LineIntegrals(self.thickness(views), materials)
+        return LineIntegrals(self.thickness(views), self.matter.in_lengths(self.unit_length))
 
     def density(self, grid: Grid) -> Tensor:
         """Amplitudes [C, Z, Y, X] on `grid` (cubic voxels), averaged over voxels; differentiable."""
@@ -160,9 +163,7 @@ class GaussianCloud:
     def voxelise(self, grid: Grid) -> Volume:
         """δ and β on `grid`."""
         with torch.no_grad():
-            density = self.density(grid).cpu().numpy()
-        delta, beta = np.tensordot(np.array(self.materials, dtype=np.float32).T, density, axes=1)
-        return Volume(delta, beta, grid)
+            return self.matter.volume(self.density(grid).cpu().numpy(), grid)
 
     def masses(self) -> Tensor:
         """Integrals [N, C] of each Gaussian, in units of `unit_length³` × amplitude: `a (2π)^{3/2} s₁s₂s₃`."""

@@ -11,6 +11,7 @@ from torch.nn.functional import avg_pool3d, interpolate, pad
 
 from ..checks import require
 from ..geometry import Grid, Views
+from ..matter import Matter
 from ..memory import memory_kept
 from .gaussians import GaussianCloud, raw_of
 
@@ -60,7 +61,7 @@ def cloud_from_volume(
     return GaussianCloud(
         (position / unit_length, log_scales, _identity(len(mass)), raw_of(peak.clamp_min(SMALLEST))[:, None]),
         unit_length,
-        *material,
+        Matter.one(*material),
     )
 
 
@@ -87,8 +88,8 @@ def cloud_from_two(
         one = cloud_from_volume(occupancy, grid, material, spacing, unit_length, max_count // 2)
         raw = raw_of(torch.full((len(one), 2), NEXT_TO_NOTHING))
         raw[:, channel] = one.raw_amplitudes[:, 0]
-        parts.append((*one.parameters[:3], raw))
-    return GaussianCloud([torch.cat(arrays) for arrays in zip(*parts)], unit_length, *materials[0], second=materials[1])
+        parts.append((one.centres, one.log_scales, one.quaternions, raw))
+    return GaussianCloud([torch.cat(arrays) for arrays in zip(*parts)], unit_length, Matter.two(*materials))
 
 
 def at_pitch(volume: Tensor, grid: Grid, pitch: float) -> tuple[Tensor, Grid]:
@@ -110,7 +111,7 @@ def approximate(
     occupancy: [Z, Y, X], or [C, Z, Y, X] of each of the cloud's channels. It starts a hologram fit where the classical
     reconstruction ended. `on_progress(stage, fraction)`.
     """
-    leaves = [p.detach().clone().requires_grad_() for p in cloud.parameters]
+    leaves = [p.detach().clone().requires_grad_() for p in cloud.parameters().values()]
     cloud = cloud.replaced(leaves)
     optimiser = torch.optim.Adam([{"params": [leaf]} for leaf in leaves], lr=0.0, eps=1e-12, fused=True)
     power = float(occupancy.square().sum())
@@ -127,20 +128,11 @@ def approximate(
     return cloud.detached()
 
 
-def random_cloud(
-    count: int,
-    views: Views,
-    material: tuple[float, float],
-    channels: int,
-    thickness: float,
-    seed: int,
-    second: tuple[float, float] | None = None,
-) -> GaussianCloud:
+def random_cloud(count: int, views: Views, matter: Matter, thickness: float, seed: int) -> GaussianCloud:
     """`count` Gaussians, uniform in the ball that every view sees, as the thesis starts.
 
     Their size is the mean distance between neighbours and their summed mass that of a slab of `thickness` [m]
-    of material over the ball's cross-section. material: (δ, β) of amplitude one; channels: 1 or 2; second: (δ, β) of
-    the material of the second channel, None where the two are δ and β apart.
+    of each channel of `matter` over the ball's cross-section.
     """
     require(count > 0, f"the number of Gaussians must be positive, but it is {count}.")
     generator = torch.Generator().manual_seed(seed)
@@ -150,15 +142,15 @@ def random_cloud(
     centres = distance * direction / direction.norm(dim=1, keepdim=True)
     sigma = 0.5 * radius * (4.19 / count) ** (1 / 3)
     mass = np.pi * radius**2 * thickness / views.pixel_size / count
-    peak = torch.full((count, channels), mass / ((2 * np.pi) ** 1.5 * sigma**3))
+    peak = torch.full((count, len(matter)), mass / ((2 * np.pi) ** 1.5 * sigma**3))
     log_scales = torch.full((count, 3), float(np.log(sigma)))
-    return GaussianCloud((centres, log_scales, _identity(count), raw_of(peak)), views.pixel_size, *material, second)
+    return GaussianCloud((centres, log_scales, _identity(count), raw_of(peak)), views.pixel_size, matter)
 
 
 def freed(cloud: GaussianCloud) -> GaussianCloud:
     """The same single-material cloud with δ and β free: its amplitude in both channels."""
-    centres, log_scales, quaternions, raw = (p.detach().clone() for p in cloud.parameters)
-    return cloud.replaced((centres, log_scales, quaternions, raw[:, :1].repeat(1, 2)))
+    centres, log_scales, quaternions, raw = (p.detach().clone() for p in cloud.parameters().values())
+    return cloud.replaced((centres, log_scales, quaternions, raw[:, :1].repeat(1, 2)), cloud.matter.freed())
 
 
 def _block_moments(occupancy: Tensor, edge: int) -> tuple[Tensor, Tensor]:

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import copy
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
-from typing import TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call
 from torch.nn.functional import max_pool3d, softplus
 
+from ..backends import device
 from ..checks import at_least, require
 from ..geometry import Grid, Poses, Views
+from ..matter import Matter
+from ..tables import from_table, to_table
 from ..volume import LineIntegrals, Volume
 from .encodings import Encoding
 from .voxel_lines import resampling
@@ -25,22 +30,6 @@ AnyViews = TypeVar("AnyViews", bound=Views | Poses)
 
 FIRST_VALUE = 0.05
 """What a field starts from, roughly, everywhere."""
-
-
-@dataclass(frozen=True)
-class Matter:
-    """What a field's values mean. delta, beta: as of `GaussianCloud`; channels: 1 (one occupancy) or 2 (δ, β free);
-    upper: largest occupancy (0: none)."""
-
-    delta: float
-    beta: float
-    channels: int = 1
-    upper: float = 1.0
-
-    def __post_init__(self) -> None:
-        require(self.channels in (1, 2), f"channels must be 1 or 2, but they are {self.channels}.")
-        require(self.delta > 0, f"delta must be positive, but it is {self.delta:g}.")
-        at_least(self, 0, "upper")
 
 
 @dataclass(frozen=True)
@@ -63,30 +52,17 @@ class Samples:
     depth: Tensor
 
 
-class NeuralField(nn.Module):
-    """A field of δ and β on the box of `grid` (cubic voxels), zero where `mask` [Z, Y, X] says that nothing is.
+class Perceptron(nn.Module):
+    """The network behind a field: an encoding of positions, hidden layers (ReLU), and a linear output."""
 
-    One channel is an occupancy, `upper · sigmoid` of the network's output, or its softplus without a bound; two are
-    `(δ/delta, β/beta)`, both through softplus. Line integrals are sums over samples a voxel edge apart, on rays a
-    voxel edge apart; linear between rays on finer rasters. Works in any float type, on any device.
-    """
-
-    def __init__(self, grid: Grid, matter: Matter, network: Network, mask: Tensor, seed: int = 0) -> None:
+    def __init__(self, options: Network, extent: float, channels: int, seed: int) -> None:
         super().__init__()
-        require(np.allclose(grid.voxel_size, grid.voxel_size[0]), "a neural field needs a grid of cubic voxels.")
-        shape = tuple(mask.shape)
-        require(shape == grid.shape, f"the mask must have the grid's shape {grid.shape}, but it has {shape}.")
-        self.grid, self.matter, self.network = grid, matter, network
-        self.pitch = grid.voxel_size[0]
         generator = torch.Generator().manual_seed(seed)
-        self.encoding = network.encoding.build(float(max(grid.shape)), generator)
-        widths = [self.encoding.width, *[network.hidden] * network.layers]
+        self.encoding = options.encoding.build(extent, generator)
+        widths = [self.encoding.width, *[options.hidden] * options.layers]
         self.hidden = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths))
-        self.output = nn.Linear(network.hidden, matter.channels)
+        self.output = nn.Linear(options.hidden, channels)
         self._start(generator)
-        corner = torch.tensor([o - 0.5 * self.pitch for o in grid.origin], dtype=torch.float64)
-        self.register_buffer("corner", corner / self.pitch)
-        self.register_buffer("mask", mask.bool().clone())
 
     def _start(self, generator: torch.Generator) -> None:
         """Weights after He et al. (2015), drawn from `generator`; an output that is small everywhere."""
@@ -100,25 +76,115 @@ class NeuralField(nn.Module):
             self.output.weight.copy_(torch.randn(self.output.weight.shape, generator=generator) * 0.1)
             self.output.bias.fill_(math.log(FIRST_VALUE))
 
-    @property
-    def stored_bytes(self) -> int:
-        """Size of the parameters as float16, and of the mask in bits."""
-        return 2 * sum(p.numel() for p in self.parameters()) + self.get_buffer("mask").numel() // 8
-
-    @property
-    def materials(self) -> tuple[tuple[float, float], ...]:
-        """(δ, β) of a value of one, for each channel."""
-        m = self.matter
-        return ((m.delta, m.beta),) if m.channels == 1 else ((m.delta, 0.0), (0.0, m.beta))
-
     def forward(self, positions: Tensor) -> Tensor:
-        """Values [N, C] at positions [N, 3] `(x, y, z)` in voxel edges from the box's corner, mask or not."""
+        """Numbers [N, C] at positions [N, 3] `(x, y, z)` in voxel edges from the box's corner."""
         found = self.encoding(positions)
         for layer in self.hidden:
             found = torch.relu(layer(found))
-        raw = self.output(found)
-        bounded = self.matter.channels == 1 and self.matter.upper > 0
-        return self.matter.upper * torch.sigmoid(raw) if bounded else softplus(raw)
+        return self.output(found)
+
+
+class NeuralField:
+    """A field of matter on the box of `grid` (cubic voxels), zero where `mask` [Z, Y, X] says that nothing is.
+
+    upper: the largest occupancy of a single material, `upper · sigmoid` of the network's output (0: its softplus,
+    without a bound); two channels have no bound. Line integrals are sums over samples a voxel edge apart, on rays a
+    voxel edge apart; linear between rays on finer rasters. Works in any float type, on any device. jitter: a generator
+    that draws where in its depth step each sample lies while gradients are taken (None: in the middle).
+    """
+
+    kind: ClassVar[str] = "neural-field"
+    """The name of this kind of Object in files."""
+
+    def __init__(
+        self, grid: Grid, matter: Matter, network: Network, mask: Tensor, seed: int = 0, upper: float = 1.0
+    ) -> None:
+        require(np.allclose(grid.voxel_size, grid.voxel_size[0]), "a neural field needs a grid of cubic voxels.")
+        shape = tuple(mask.shape)
+        require(shape == grid.shape, f"the mask must have the grid's shape {grid.shape}, but it has {shape}.")
+        require(matter.delta > 0, f"a neural field needs matter of positive δ, but it is {matter.delta:g}.")
+        require(upper >= 0, f"upper must not be negative, but it is {upper:g}.")
+        self.grid, self.matter, self.network, self.upper = grid, matter, network, float(upper)
+        self.pitch, self.backend = grid.voxel_size[0], "cpu"
+        self.jitter: torch.Generator | None = None
+        self._net = Perceptron(network, float(max(grid.shape)), len(matter), seed)
+        self._weights = {name: weight.detach() for name, weight in self._net.named_parameters()}
+        self._constants = dict(self._net.named_buffers())
+        self.corner = torch.tensor([o - 0.5 * self.pitch for o in grid.origin], dtype=torch.float64) / self.pitch
+        self.mask = mask.bool().clone()
+        self._samples: dict[bytes, Samples] = {}
+
+    def parameters(self) -> dict[str, Tensor]:
+        """The weights of the network by name."""
+        return dict(self._weights)
+
+    def with_parameters(self, parameters: Mapping[str, Tensor]) -> NeuralField:
+        """The same field with other weights; it shares the mask and the samples that are ready."""
+        field = copy.copy(self)
+        field._weights = {name: parameters.get(name, mine) for name, mine in self._weights.items()}
+        return field
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> NeuralField:
+        """The field on another device, or in another float type, with a mask of its own."""
+        field = copy.copy(self)
+        for name in ("_weights", "_constants"):
+            setattr(field, name, {key: value.to(device, dtype) for key, value in getattr(self, name).items()})
+        field.corner, field.mask = self.corner.to(device), self.mask.to(device).clone()
+        field._samples = {}
+        return field
+
+    def on(self, backend: str) -> NeuralField:
+        """The field for another backend (resolved), on that backend's device."""
+        field = self.to(device(backend))
+        field.backend = backend
+        return field
+
+    def state(self) -> dict[str, Any]:
+        """Tensors and plain values that `from_state` makes the same field of."""
+        return {
+            "weights": self.parameters(),
+            "mask": self.mask,
+            "voxel_size": list(self.grid.voxel_size),
+            "origin": list(self.grid.origin),
+            "network": to_table(self.network),
+            "upper": self.upper,
+            "constants": self._constants,
+            "matter": self.matter.as_dict(),
+        }
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> NeuralField:
+        """The field that `state` described."""
+        size, origin = (tuple(float(v) for v in state[name]) for name in ("voxel_size", "origin"))
+        grid = Grid(tuple(state["mask"].shape), size, origin)  # type: ignore[arg-type]
+        network = from_table(Network, state["network"], "network")
+        field = cls(grid, Matter.from_dict(state["matter"]), network, state["mask"], upper=float(state["upper"]))
+        field._constants = dict(state["constants"])
+        return field.with_parameters(state["weights"])
+
+    @property
+    def described(self) -> str:
+        """How large the field is, in words."""
+        return f"a field of {sum(p.numel() for p in self._weights.values())} weights"
+
+    @property
+    def stored_bytes(self) -> int:
+        """Size of the weights as float16, and of the mask in bits."""
+        return 2 * sum(p.numel() for p in self._weights.values()) + self.mask.numel() // 8
+
+    def enclosing_grid(self, most_voxels: int) -> Grid:
+        """The grid of the field, whatever its size."""
+        return self.grid
+
+    @property
+    def _like(self) -> Tensor:
+        """A weight: the float type and the device of the field."""
+        return self._weights["output.weight"]
+
+    def __call__(self, positions: Tensor) -> Tensor:
+        """Values [N, C] at positions [N, 3] `(x, y, z)` in voxel edges from the box's corner, mask or not."""
+        raw = functional_call(self._net, {**self._weights, **self._constants}, (positions,))
+        return self.upper * torch.sigmoid(raw) if self.matter.single and self.upper > 0 else softplus(raw)
 
     def at(self, time: float) -> NeuralField:
         """The field itself: it does not move."""
@@ -136,16 +202,29 @@ class NeuralField(nn.Module):
         The gradient of poses is that of the samples as they move through the field; it leaves out what a sample adds or
         takes where it enters or leaves the mask.
         """
-        rays = self.raster(views)
-        images = torch.stack([self.thickness(rays, v, self.samples(rays, v)) for v in range(len(views))])
-        return LineIntegrals(spread(images, rays, views) * self.pitch, self.materials)
+        unknown = isinstance(views, Poses) and views.requires_grad
+        rays = self.raster(views if unknown or isinstance(views, Views) else views.views())
+        images = torch.stack([self._image(rays, v) for v in range(len(views))])
+        return LineIntegrals(spread(images, rays, views) * self.pitch, self.matter.channels)
+
+    def _image(self, rays: Views | Poses, v: int) -> Tensor:
+        samples = self.kept_samples(rays, v) if isinstance(rays, Views) else self.samples(rays, v)
+        drawn = self.jitter if torch.is_grad_enabled() else None
+        return self.thickness(rays, v, samples, None if drawn is None else uniform(drawn, len(samples.pixel)))
+
+    def kept_samples(self, rays: Views, v: int) -> Samples:
+        """All samples of view `v`, found once; `prune` forgets them."""
+        key = rays[[v]].fingerprint()
+        if key not in self._samples:
+            self._samples[key] = self.samples(rays, v)
+        return self._samples[key]
 
     def thickness(self, rays: Views | Poses, v: int, samples: Samples, jitter: Tensor | None = None) -> Tensor:
         """Line integrals [C, H, W] in voxel edges along the rays of view `v`, on pixels of a voxel edge.
 
         jitter: [S] in [0, 1), where in its depth step each sample lies; in its middle for None.
         """
-        image = self.output.weight.new_zeros(self.matter.channels, rays.shape[0] * rays.shape[1])
+        image = self._like.new_zeros(len(self.matter), rays.shape[0] * rays.shape[1])
         for part in _chunks(len(samples.pixel), CHUNK if not torch.is_grad_enabled() else len(samples.pixel)):
             offset = 0.5 if jitter is None else jitter[part]
             values = self(self._positions(rays, v, samples.pixel[part], samples.depth[part] + offset))
@@ -155,7 +234,7 @@ class NeuralField(nn.Module):
     @torch.no_grad()
     def samples(self, rays: Views | Poses, v: int, chosen: Tensor | None = None) -> Samples:
         """Samples on rays of view `v` (its flat pixels `chosen`, ascending), in depth steps the mask has."""
-        mask = self.get_buffer("mask")
+        mask = self.mask
         every = torch.arange(rays.shape[0] * rays.shape[1], device=mask.device) if chosen is None else chosen
         steps = torch.arange(2 * self._reach(), device=mask.device)
         limits = torch.tensor(self.grid.shape[::-1], device=mask.device)
@@ -177,13 +256,13 @@ class NeuralField(nn.Module):
 
     def _positions(self, rays: Views | Poses, v: int, pixel: Tensor, depth: Tensor) -> Tensor:
         """Positions [N, 3] in voxel edges from the box's corner, of depth steps [N] on the rays of pixels [N]."""
-        like = self.output.weight
+        like = self._like
         (h, w), rotation = rays.shape, torch.as_tensor(rays.rotations[v]).cpu()
         shift_x, shift_y = torch.as_tensor(rays.shifts[v]).cpu() / self.pitch
         centre = torch.as_tensor(self.grid.centre / self.pitch)
         # x_obj = Rᵀ x_lab is affine in (column, row, depth)
         first = torch.stack([0.5 - 0.5 * w + shift_x, 0.5 - 0.5 * h + shift_y, rotation[2] @ centre - self._reach()])
-        origin = rotation.T @ first - self.get_buffer("corner").cpu().double()
+        origin = rotation.T @ first - self.corner.cpu().double()
         axes = rotation.to(like)
         lab = torch.stack((pixel % w, pixel // w, depth.to(like)), dim=1).to(like)
         return torch.addmm(origin.to(like), lab, axes)
@@ -191,10 +270,10 @@ class NeuralField(nn.Module):
     @torch.no_grad()
     def values(self, grid: Grid) -> Tensor:
         """Values [C, Z, Y, X] at the centres of the voxels of `grid`, zero outside the box and the mask."""
-        like, mask = self.output.weight, self.get_buffer("mask")
-        corner, shape = self.get_buffer("corner"), torch.tensor(self.grid.shape[::-1], device=like.device)
+        like, mask = self._like, self.mask
+        corner, shape = self.corner, torch.tensor(self.grid.shape[::-1], device=like.device)
         x, y, z = (torch.as_tensor(a / self.pitch, device=like.device) - c for a, c in zip(grid.axes(), corner))
-        found = like.new_zeros(math.prod(grid.shape), self.matter.channels)
+        found = like.new_zeros(math.prod(grid.shape), len(self.matter))
         for part in _chunks(len(found), CHUNK):
             flat = torch.arange(part.start, part.stop, device=like.device)
             i, j, k = flat // (len(x) * len(y)), flat // len(x) % len(y), flat % len(x)
@@ -212,7 +291,7 @@ class NeuralField(nn.Module):
         fine = grid.divided((fx, fy, fz))
         z, y, x = grid.shape
         values = self.values(fine).reshape(-1, z, fz, y, fy, x, fx).mean(dim=(2, 4, 6)).float().cpu().numpy()
-        return Volume(values[0] * self.matter.delta, values[-1] * self.matter.beta, grid)
+        return self.matter.volume(values, grid)
 
     @torch.no_grad()
     def prune(self, threshold: float, grow: int, within: Tensor) -> None:
@@ -222,7 +301,13 @@ class NeuralField(nn.Module):
         """
         kept = grown(self.values(self.grid)[0] > threshold, grow) & within
         if bool(kept.any()):
-            self.get_buffer("mask").copy_(kept)
+            self.mask.copy_(kept)
+            self._samples.clear()
+
+
+def uniform(generator: torch.Generator, *shape: int) -> Tensor:
+    """Numbers in [0, 1) of `shape` on the generator's device."""
+    return torch.rand(*shape, generator=generator, device=generator.device)
 
 
 def spread(images: Tensor, rays: Views | Poses, views: Views | Poses) -> Tensor:

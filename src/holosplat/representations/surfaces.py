@@ -2,42 +2,81 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..checks import InputError, require
 from ..geometry import Grid, Poses, Views
+from ..matter import Matter
 from ..mesh import TriangleMesh, shell_labels, winding_number
 from ..projectors.surface import surface_occupancy, surface_thickness
 from ..volume import LineIntegrals, Volume
 
 
 class SurfaceMesh:
-    """Closed triangle surfaces, filled with a material of `delta` and `beta`; the vertices are trainable.
+    """Closed triangle surfaces, filled with one material; the vertices are trainable.
 
     vertices: [P, 3] float64 `(x, y, z)` in units of `unit_length` [m], the scan's pixel size; faces: [F, 3] int64,
     counter-clockwise seen from the side without matter, so that an inner shell bounds a cavity. Bodies that overlap
-    add up. lines: rows that are integrated in a pixel of a projection. Errors: `InputError` if the arrays do not fit.
+    add up. matter: the one material inside. lines: rows that are integrated in a pixel of a projection. Errors:
+    `InputError` if the arrays do not fit, or for more than one material.
     """
 
-    def __init__(
-        self, vertices: Tensor, faces: Tensor, unit_length: float, delta: float, beta: float, lines: int = 2
-    ) -> None:
+    kind: ClassVar[str] = "surfaces"
+    """The name of this kind of Object in files."""
+
+    def __init__(self, vertices: Tensor, faces: Tensor, unit_length: float, matter: Matter, lines: int = 2) -> None:
         shapes = [tuple(vertices.shape), tuple(faces.shape)]
         fits = all(len(shape) == 2 and shape[1] == 3 for shape in shapes) and shapes[1][0] > 0
         require(fits, f"a surface needs vertices (P, 3) and at least one face (F, 3), but got {shapes}.")
+        require(matter.single, "surfaces are filled with one material, but two channels of matter are given.")
         self.vertices, self.faces, self.lines = vertices, faces, lines
-        self.unit_length, self.delta, self.beta = float(unit_length), float(delta), float(beta)
+        self.unit_length, self.matter, self.backend = float(unit_length), matter, "cpu"
+
+    def parameters(self) -> dict[str, Tensor]:
+        """The trainable tensor, by name."""
+        return {"vertices": self.vertices}
+
+    def with_parameters(self, parameters: Mapping[str, Tensor]) -> SurfaceMesh:
+        """The same triangles with other vertices."""
+        vertices = parameters.get("vertices", self.vertices)
+        return SurfaceMesh(vertices, self.faces, self.unit_length, self.matter, self.lines)
+
+    def state(self) -> dict[str, Any]:
+        """Tensors and plain values that `from_state` makes the same surfaces of."""
+        arrays = {"vertices": self.vertices, "faces": self.faces}
+        return {**arrays, "unit_length": self.unit_length, "lines": self.lines, "matter": self.matter.as_dict()}
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> SurfaceMesh:
+        """The surfaces that `state` described."""
+        matter = Matter.from_dict(state["matter"])
+        faces = state["faces"].long()
+        return cls(state["vertices"], faces, float(state["unit_length"]), matter, int(state["lines"]))
+
+    @property
+    def described(self) -> str:
+        """How large the surfaces are, in words."""
+        return f"surfaces of {len(self.faces)} triangles"
+
+    def on(self, backend: str) -> SurfaceMesh:
+        """The surfaces for another backend (resolved); their projector runs on the CPU."""
+        surfaces = self.with_parameters({})
+        surfaces.backend = backend
+        return surfaces
 
     @property
     def stored_bytes(self) -> int:
         """Size of vertices as float32 and faces as int32."""
         return 4 * (self.vertices.numel() + self.faces.numel())
 
-    def replaced(self, vertices: Tensor) -> SurfaceMesh:
-        """The same surfaces with other vertices."""
-        return SurfaceMesh(vertices, self.faces, self.unit_length, self.delta, self.beta, self.lines)
+    def enclosing_grid(self, most_voxels: int) -> Grid:
+        """A grid around all vertices, of `unit_length` a voxel, or coarser where those would be over `most_voxels`."""
+        return Grid.around(self.vertices.detach().numpy(), self.unit_length, most_voxels)
 
     def at(self, time: float) -> SurfaceMesh:
         """The surfaces themselves: they do not move."""
@@ -55,7 +94,7 @@ class SurfaceMesh:
             poses.shape,
             self.lines,
         )
-        return LineIntegrals(thickness[:, None], ((self.delta * pitch, self.beta * pitch),))
+        return LineIntegrals(thickness[:, None], self.matter.in_lengths(pitch))
 
     def voxelise(self, grid: Grid) -> Volume:
         """δ and β on `grid`, averaged over voxels."""
@@ -63,7 +102,7 @@ class SurfaceMesh:
         offset = torch.tensor(grid.origin, dtype=torch.float64)
         vertices = (self.vertices.detach() * self.unit_length - offset) / voxel
         occupancy = surface_occupancy(vertices, self.faces, grid.shape).numpy()
-        return Volume(occupancy * self.delta, occupancy * self.beta, grid)
+        return self.matter.volume(occupancy[None], grid)
 
     def mesh(self, name: str = "surfaces") -> TriangleMesh:
         """All surfaces as one mesh [m]."""

@@ -20,19 +20,21 @@ from ..backends import resolve
 from ..bench.case import Case
 from ..bench.record import source_commit
 from ..checks import InputError, require
-from ..fit.loop import DivergedError, Fit, FitOptions
+from ..fit.loop import DivergedError, Fit
 from ..geometry import Grid, Views
 from ..io.atomic import atomic_path
 from ..io.folder import require_new
 from ..io.json import read_json, write_json
 from ..materials import WATER
+from ..matter import Matter
+from ..methods import FitOptions, finished, gaussian_fit
+from ..methods.presets import preset
 from ..progress import FitProgress
 from ..representations.gaussians import GaussianCloud, raw_of
 from ..scan import Scan
 from ..volume import Volume
 from ..workflows.evaluate import score_object
 from ..workflows.provenance import environment, scan_hash
-from ..workflows.settings import preset
 
 START_DENSITY = 0.01
 """Density of the random start, in units of water: about what 16 cells fill of their channel."""
@@ -106,14 +108,17 @@ class Pace:
             steps=max(1, thesis.schedule.steps // self.shortened),
             warmup_steps=thesis.schedule.warmup_steps // self.shortened,
             views_per_step=configuration.views,
-            rate_position=configuration.position_rate * 0.5 * width_px,
-            rate_scale=configuration.shape_rate,
-            rate_rotation=configuration.shape_rate,
             detach_worst=thesis.schedule.detach_worst and not configuration.all_learn,
             validation_views=0,
         )
+        rates = replace(
+            thesis.rates,
+            centres=configuration.position_rate * 0.5 * width_px,
+            log_scales=configuration.shape_rate,
+            quaternions=configuration.shape_rate,
+        )
         density = replace(thesis.density, every=max(1, thesis.density.every // self.shortened))
-        return replace(thesis, schedule=schedule, density=density)
+        return replace(thesis, schedule=schedule, rates=rates, density=density)
 
 
 PACES = {pace.name: pace for pace in (Pace("full", 1), Pace("short", 10))}
@@ -265,7 +270,7 @@ def run_configuration(
     folder.write_config(name, {"configuration": asdict(configuration), "seed": seed, "fit": asdict(options)})
     energy = train.exposures.one_energy("the thesis' study")
     cloud = random_start(configuration, train.views, energy, seed)
-    fit, looks, diverged = Fit(train, cloud, options, seed), [], None
+    fit, looks, diverged = gaussian_fit(train, cloud, options, seed), [], None
     looks.append(_look(fit, measured))
     try:
         while not fit.finished:
@@ -300,9 +305,8 @@ def random_start(configuration: Configuration, views: Views, energy_kev: float, 
         raw_of(torch.full((count, 2), peak)),
     )
     water = WATER.delta_beta(energy_kev)
-    return GaussianCloud(
-        parameters, views.pixel_size, water.delta, water.delta if configuration.one_unit else water.beta
-    )
+    matter = Matter.free(water.delta, water.delta if configuration.one_unit else water.beta)
+    return GaussianCloud(parameters, views.pixel_size, matter)
 
 
 def mean_inside(volume: Volume, truth: Volume) -> tuple[float, float]:
@@ -313,8 +317,9 @@ def mean_inside(volume: Volume, truth: Volume) -> tuple[float, float]:
 
 def _look(fit: Fit, measured: Measured) -> dict[str, float]:
     """All scores of the cloud as it is now."""
-    cloud = fit.result()
-    scores = score_object(cloud, measured.scan, measured.truth, fit.instrument.oversample)
+    cloud = finished(fit)
+    assert isinstance(cloud, GaussianCloud)
+    scores = score_object(cloud, measured.scan, measured.truth, fit.model.instrument.oversample)
     assert scores.test is not None
     assert scores.train is not None
     assert scores.volume is not None

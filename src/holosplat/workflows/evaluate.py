@@ -9,12 +9,11 @@ import numpy as np
 import torch
 
 from ..checks import require
-from ..geometry import Grid
-from ..materials import DeltaBeta
+from ..matter import DeltaBeta
 from ..metrics import ImageScores, VolumeScores, image_scores, intensity_range, volume_scores
 from ..metrics.images import json_number
-from ..model.instrument import Instrument
-from ..representations import GaussianCloud
+from ..model import Instrument, Model
+from ..representations import Stored
 from ..scan import Exposures, Scan
 from ..volume import Object, Volume
 from .reconstruct import Reconstruction
@@ -25,8 +24,8 @@ MOST_VOXELS = 8_000_000
 
 @dataclass(frozen=True)
 class MaterialFound:
-    """What the cloud says about the matter: mass-weighted medians of δ over its volume, and of δ/β in the matter; or
-    those of the one material, or the two (`second`: the lighter one's), that it is made of."""
+    """What a reconstruction says about the matter: mass-weighted medians of δ over its volume, and of δ/β in the
+    matter; or those of the one material, or the two (`second`: the lighter one's), that it is made of."""
 
     delta: float
     ratio: float
@@ -104,8 +103,8 @@ class Evaluation(Scores):
 def render(reconstruction: Reconstruction, exposures: Exposures) -> np.ndarray:
     """Frames [N, H, W] float32 that the reconstruction predicts."""
     _require_energy(reconstruction, exposures)
-    cloud = reconstruction.cloud
-    return render_object(cloud, exposures, reconstruction.oversample, cloud.backend)
+    found = reconstruction.object
+    return render_object(found, exposures, reconstruction.oversample, found.backend)
 
 
 def render_object(obj: Object, exposures: Exposures, oversample: int, backend: str = "cpu") -> np.ndarray:
@@ -117,7 +116,7 @@ def render_object(obj: Object, exposures: Exposures, oversample: int, backend: s
     with torch.no_grad():
         for i in range(len(exposures)):
             instrument = Instrument(exposures[[i]], oversample, backend=backend)
-            frames[i] = instrument.measure(obj)[0].cpu().numpy()
+            frames[i] = Model(obj, instrument).frames()[0].cpu().numpy()
     return frames
 
 
@@ -126,11 +125,11 @@ def evaluate(reconstruction: Reconstruction, scan: Scan | None, truth: Volume | 
 
     The data range is that of the scan's training frames.
     """
-    cloud = reconstruction.cloud
+    found = reconstruction.object
     if scan is not None:
         _require_energy(reconstruction, scan.exposures)
-    scores = score_object(cloud, scan, truth, reconstruction.oversample, cloud.backend)
-    return Evaluation(scores.test, scores.train, scores.volume, scores.predicted, material_found(cloud))
+    scores = score_object(found, scan, truth, reconstruction.oversample, found.backend)
+    return Evaluation(scores.test, scores.train, scores.volume, scores.predicted, material_found(found))
 
 
 def score_object(obj: Object, scan: Scan | None, truth: Volume | None, oversample: int, backend: str = "cpu") -> Scores:
@@ -150,12 +149,12 @@ def score_object(obj: Object, scan: Scan | None, truth: Volume | None, oversampl
     return Scores(test, train, volume, predicted)
 
 
-def material_found(cloud: GaussianCloud) -> MaterialFound:
-    """What the cloud, where δ and β are free, says about the matter; what it is made of for one material or two."""
-    if cloud.occupancies:
-        second = None if cloud.second is None else DeltaBeta(*cloud.second)
-        return MaterialFound(cloud.delta, DeltaBeta(cloud.delta, cloud.beta).ratio, cloud.single_material, second)
-    volume = cloud.voxelise(_enclosing_grid(cloud))
+def material_found(found: Stored) -> MaterialFound:
+    """What the object, where δ and β are free, says about the matter; what it is made of for one material or two."""
+    matter = found.matter
+    if matter.occupancies:
+        return MaterialFound(matter.delta, matter.channels[0].ratio, matter.single, matter.second)
+    volume = found.voxelise(found.enclosing_grid(MOST_VOXELS))
     delta, beta = volume.delta.ravel().astype(np.float64), volume.beta.ravel().astype(np.float64)
     level = _weighted_median(delta, delta)
     matter = delta > 0.5 * level
@@ -177,17 +176,6 @@ def _require_energy(reconstruction: Reconstruction, exposures: Exposures) -> Non
         abs(found / energy - 1) < 1e-3,
         f"the run's δ and β are those at {energy:g} keV, but the scan's energy is {found:g} keV.",
     )
-
-
-def _enclosing_grid(cloud: GaussianCloud) -> Grid:
-    """A grid around all centres, of the cloud's unit as voxel, or coarser where that would be too many."""
-    centres = cloud.centres.detach().double().numpy()
-    low, high = centres.min(0) - 2, centres.max(0) + 2
-    pitch = max(1.0, float((np.prod(high - low) / MOST_VOXELS) ** (1 / 3)))
-    x, y, z = (int(n) for n in np.ceil((high - low) / pitch))
-    origin = (0.5 * (low + high) - 0.5 * (np.array([x, y, z]) - 1) * pitch) * cloud.unit_length
-    edge = pitch * cloud.unit_length
-    return Grid((z, y, x), (edge, edge, edge), (origin[0], origin[1], origin[2]))
 
 
 def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:

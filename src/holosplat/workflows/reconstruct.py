@@ -1,51 +1,56 @@
-"""`reconstruct`: a scan in, a fitted cloud and its run folder out."""
+"""`reconstruct`: a scan in, a reconstructed Object and its run folder out, by any method."""
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, cast
 
 import numpy as np
-import torch
 
-from ..backends import device_name, resolve
+from ..backends import device_name
 from ..checks import InputError, require
-from ..fit.loop import Fit, FitOptions, Record, split_validation
-from ..io.gaussians import read_gaussians, write_gaussians
+from ..fit.loop import Fit, Record
 from ..io.json import read_json, write_json
-from ..representations import GaussianCloud
+from ..io.objects import read_object, write_object
+from ..matter import MaterialPrior
+from ..methods import Gaussians, Method, Stage, Task, finished
+from ..optics.sampling import fringe_sampling
+from ..progress import FitProgress
+from ..representations import KINDS, Stored
 from ..scan import Scan
+from ..tables import to_table
 from .provenance import environment, scan_hash
 from .run_folder import RunFolder
-from .settings import MaterialPrior, Settings
-from .start import starting_cloud
 
 CHECKPOINT_SECONDS = 20.0
 SMALLEST_FRAME = 11
 """The window of SSIM."""
 FLAT_LEVELS = (0.2, 5.0)
 """Between these lies the median of frames that are relative to the flat field."""
+SCHEMA_VERSION = 2
+"""Of config.json; version 1, of holosplat 0.1, had none."""
 
 RESUMED_WITH = {
     "scan_hash": "scan file",
-    "settings": "settings (--preset, --config)",
+    "method": "method and settings (--method, --preset, --config, --set)",
     "prior": "material (--material, --delta-beta)",
     "seed": "seed (--seed)",
 }
 """What must not change between the parts of a run, as messages call it."""
 
-Progress = Callable[[str, float, Record], None]
-"""Called with (stage, fraction done of the stage, the last record of the fit or {})."""
-
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """A fitted cloud, the energy [keV] of its δ and β, its fit's wave sampling, and how long each stage took [s]."""
+    """What a method made of a scan.
 
-    cloud: GaussianCloud
+    object: the matter. method: the name of what made it. energy_kev: at which its δ and β hold. oversample: wave
+    samples a pixel in its fit. timing: how long each stage took [s]. finished: whether all stages came to their end.
+    """
+
+    object: Stored
+    method: str
     energy_kev: float
     oversample: int
     timing: dict[str, float]
@@ -55,52 +60,27 @@ class Reconstruction:
 def reconstruct(
     scan: Scan,
     prior: MaterialPrior,
-    settings: Settings,
+    method: Method = Gaussians(),
     seed: int = 0,
     *,
     folder: RunFolder | None = None,
     resume: bool = False,
-    on_progress: Progress = lambda stage, fraction, record: None,
+    on_progress: FitProgress = lambda stage, fraction, record: None,
 ) -> Reconstruction:
-    """Fit Gaussians to the training frames of `scan`.
+    """The Object that `method` makes of the training frames of `scan`.
 
     With a `folder`, everything is written there, and a later call with `resume=True` goes on from the last
-    checkpoint, with the same result as if nothing had happened. Ctrl-C (KeyboardInterrupt) ends the fit with
-    what it has reached (`finished` is False); during the start there is nothing yet, and it is passed on.
-    Errors: `InputError` for scans without training frames or matter, or of several times (`Scan.is_series`), and for
-    folders that do not fit.
+    checkpoint, with the same result as if nothing had happened. Ctrl-C (KeyboardInterrupt) ends a fit with what it has
+    reached (`finished` is False); during a start there is nothing yet, and it is passed on. Errors: `InputError` for
+    scans without training frames or matter, or of several times (`Scan.is_series`), for folders that do not fit, and
+    for what the method cannot do.
     """
     require_one_time(scan)
-    _check_frames(scan.train())
-    if resolve(settings.fit.backend) == "cuda":
-        resolve("cpu")  # the start and the judging run there
-    train, _ = split_validation(scan.train(), settings.fit.schedule.validation_views)
-    checkpoint = _resumed(folder, scan, prior, settings, seed, resume) if folder else None
-    timing: dict[str, float] = dict(checkpoint["timing"]) if checkpoint else {}
-    if checkpoint:
-        cloud = _cloud_of(checkpoint)
-    else:
-        began = time.perf_counter()
-        cloud = starting_cloud(train, prior, settings, seed, lambda stage, part: on_progress(stage, part, {}))
-        timing["start"] = time.perf_counter() - began
-    fit = Fit(scan, cloud, fit_options(prior, settings, cloud), seed)
-    if checkpoint:
-        fit.load(checkpoint["fit"])
-    elif folder:
-        _begin(folder, _config(scan, prior, settings, seed) | environment(fit.backend))
-    journal = _Journal(fit, timing, folder, on_progress)
-    try:
-        fit.run(journal.record)
-    except KeyboardInterrupt:
-        on_progress("interrupted", 1.0, {})
-    return journal.close()
-
-
-def fit_options(prior: MaterialPrior, settings: Settings, cloud: GaussianCloud) -> FitOptions:
-    """Those of the settings; without what bounds the occupancy where nothing says what an occupancy of one is."""
-    if prior.kind != "free" or cloud.second is not None:
-        return settings.fit
-    return replace(settings.fit, objective=replace(settings.fit.objective, overfull=0.0, two_levels=0.0))
+    train = scan.train()
+    _check_frames(train)
+    run = _Run(Task(train, prior, seed, lambda stage, part: on_progress(stage, part, {})), method, folder, on_progress)
+    run.begin(_config(scan, prior, method, seed), resume)
+    return run.complete()
 
 
 def require_one_time(scan: Scan) -> None:
@@ -135,106 +115,194 @@ def load_reconstruction(folder: RunFolder) -> Reconstruction:
     try:
         timing = {name: float(value) for name, value in summary["timing_s"].items()}
         energy, oversample = float(summary["energy_kev"]), int(summary["oversample"])
-        finished = bool(summary["finished"])
+        done, method = bool(summary["finished"]), str(summary.get("method", Gaussians.kind))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(
             f"{folder.summary} must be what reconstruct wrote, but it lacks or garbles {error}."
         ) from error
     plain = summary.get("backend") == "reference"  # then it is judged without compiled kernels, too
-    cloud = read_gaussians(folder.gaussians).on("reference" if plain else "cpu")
-    return Reconstruction(cloud, energy, oversample, timing, finished)
+    found = read_object(folder.result()).on("reference" if plain else "cpu")
+    return Reconstruction(found, method, energy, oversample, timing, done)
+
+
+@dataclass
+class _Run:
+    """A reconstruction in progress: the stages one after another, and the folder kept up to date."""
+
+    task: Task
+    method: Method
+    folder: RunFolder | None
+    on_progress: FitProgress
+    timing: dict[str, float] = field(default_factory=dict)
+    _saved: dict[str, Any] | None = None
+    _config: dict[str, Any] = field(default_factory=dict)
+
+    def begin(self, config: dict[str, Any], resume: bool) -> None:
+        """Look at the folder, and at what of the run is there already; writes nothing."""
+        self._config = config
+        if self.folder is None:
+            return
+        if not (resume and self.folder.config.is_file()):
+            self.folder.require_new(advise_resume=not resume)
+            return
+        _require_same(self.folder, config)
+        self._saved = self.folder.load_checkpoint()
+        self.timing |= self._saved["timing"] if self._saved else {}
+
+    def complete(self) -> Reconstruction:
+        """Run what is left of the stages."""
+        found: Stored | None = None
+        stages, first, fit = self.method.stages(), int(self._saved["stage"]) if self._saved else 0, None
+        for number in range(first, len(stages)):
+            stage, saved = stages[number], self._saved if number == first else None
+            start = _restored(saved["start"]) if saved else self._started(stage, found)
+            fit = stage.fit(self.task, start)
+            if fit is None:
+                found = start
+                continue
+            journal = _Journal(fit, number, start, self)
+            complete = journal.run(saved["fit"] if saved else None)
+            self.timing[stage.name] = fit.seconds
+            found = cast(Stored, finished(fit))
+            if not complete:
+                return self._result(found, fit, False)
+        assert found is not None
+        return self._result(found, fit, True)
+
+    def _started(self, stage: Stage, before: Stored | None) -> Stored:
+        began = time.perf_counter()
+        start = cast(Stored, stage.start(self.task, before))
+        self.timing["start"] = self.timing.get("start", 0.0) + time.perf_counter() - began
+        return start
+
+    def make_folder(self, backend: str) -> None:
+        """Make the folder, once there is something to put in it."""
+        if self.folder is not None and not self.folder.config.is_file():
+            self.folder.create()
+            write_json(self.folder.config, self._config | environment(backend))
+
+    def _result(self, found: Stored, fit: Fit | None, complete: bool) -> Reconstruction:
+        exposures = self.task.scan.exposures
+        oversample = fit.model.instrument.oversample if fit else fringe_sampling(exposures)
+        done = Reconstruction(
+            found, self.method.kind, exposures.reference_energy, oversample, dict(self.timing), complete
+        )
+        if self.folder is not None:
+            self.make_folder(found.backend)
+            if fit is None:
+                self.folder.start_metrics([])
+            write_object(self.folder.object, found)
+            write_json(self.folder.summary, _summary(done, fit, self.task.scan))
+        return done
 
 
 class _Journal:
-    """Keeps the run folder up to date while a fit runs: metrics, checkpoints, and the result at the end."""
+    """Runs one fit, and keeps metrics and checkpoints up to date while it runs."""
 
-    def __init__(self, fit: Fit, timing: dict[str, float], folder: RunFolder | None, on_progress: Progress) -> None:
-        self._fit, self._timing, self._folder, self._on_progress = fit, timing, folder, on_progress
+    def __init__(self, fit: Fit, number: int, start: Stored, run: _Run) -> None:
+        self._fit, self._number, self._start, self._run = fit, number, start, run
         self._pending: list[Record] = []
-        self._saved = time.perf_counter()
-        if folder is not None:
-            folder.start_metrics(fit.columns(), keep_until=fit.step)
-            self._save()
+        self._last = time.perf_counter()
 
-    def record(self, record: Record) -> None:
+    def run(self, saved: dict[str, Any] | None) -> bool:
+        """Run the fit, from a saved state if there is one; whether it came to its end."""
+        if saved is not None:
+            self._fit.load(saved)
+        self._run.make_folder(self._fit.backend)
+        if self._run.folder is not None:
+            if saved is None and self._number:
+                self._run.folder.set_aside_metrics(self._number - 1)
+            self._run.folder.start_metrics(self._fit.columns(), keep_until=self._fit.step)
+            self._save()
+        complete = True
+        try:
+            self._fit.run(self._record)
+        except KeyboardInterrupt:
+            complete = False
+            self._run.on_progress("interrupted", 1.0, {})
+        self._save()
+        return complete and self._fit.finished
+
+    def _record(self, record: Record) -> None:
         """Take in one step's record."""
         self._pending.append(record)
-        self._on_progress("fit", self._fit.step / self._fit.options.schedule.steps, record)
-        up_to_date = record["step"] == self._fit.step  # on a GPU, records come late and in batches
-        if up_to_date and time.perf_counter() - self._saved > CHECKPOINT_SECONDS:
-            self._save()
-
-    def close(self) -> Reconstruction:
-        """Save everything once more, with the result."""
-        self._timing["fit"] = self._fit.seconds
         fit = self._fit
-        energy, oversample = fit.train.exposures.reference_energy, fit.instrument.oversample
-        done = Reconstruction(fit.result(), energy, oversample, dict(self._timing), fit.finished)
-        if self._folder is not None:
+        share = fit.schedule.share(fit.step, fit.seconds)
+        name = self._run.method.stages()[self._number].name
+        self._run.on_progress(name, min(1.0, share), record)
+        up_to_date = record["step"] == fit.step  # on a GPU, records come late and in batches
+        if up_to_date and time.perf_counter() - self._last > CHECKPOINT_SECONDS:
             self._save()
-            write_gaussians(self._folder.gaussians, done.cloud)
-            write_json(self._folder.summary, self._summary(done))
-        return done
-
-    def _summary(self, done: Reconstruction) -> dict[str, Any]:
-        fit, cloud = self._fit, done.cloud
-        (h, w), pitch = fit.train.views.shape, fit.train.views.pixel_size
-        return {
-            "finished": done.finished,
-            "backend": fit.backend,
-            "device": device_name(fit.backend),
-            "steps": fit.step,
-            "stopped_early": fit.stopped_early,
-            "best_step": fit.best_step if fit.best_step else fit.step,
-            "gaussians": len(cloud),
-            "oversample": done.oversample,
-            "detector": {"rows": h, "columns": w, "pixel_size_m": pitch},
-            "energy_kev": fit.train.exposures.reference_energy,
-            "material": {"delta": cloud.delta, "beta": cloud.beta, "single": cloud.single_material},
-            "second_material": cloud.second and {"delta": cloud.second[0], "beta": cloud.second[1]},
-            "timing_s": done.timing,
-        }
 
     def _save(self) -> None:
-        if self._folder is None:
+        folder = self._run.folder
+        if folder is None:
             return
-        self._folder.append_metrics(self._pending)
+        folder.append_metrics(self._pending)
         self._pending = []
-        cloud = self._fit.cloud
-        units = {"unit_length": cloud.unit_length, "delta": cloud.delta, "beta": cloud.beta, "second": cloud.second}
-        self._folder.save_checkpoint({"fit": self._fit.state_dict(), "cloud": units, "timing": dict(self._timing)})
-        self._saved = time.perf_counter()
+        start = {"kind": self._start.kind, "state": self._start.state()}
+        state = {"stage": self._number, "start": start, "fit": self._fit.state_dict(), "timing": self._run.timing}
+        folder.save_checkpoint(state)
+        self._last = time.perf_counter()
 
 
-def _cloud_of(checkpoint: dict[str, Any]) -> GaussianCloud:
-    parameters: list[torch.Tensor] = checkpoint["fit"]["trainable"]["parameters"]
-    return GaussianCloud(parameters, **checkpoint["cloud"])
+def _restored(saved: dict[str, Any]) -> Stored:
+    return KINDS[saved["kind"]].from_state(saved["state"])
 
 
-def _resumed(
-    folder: RunFolder, scan: Scan, prior: MaterialPrior, settings: Settings, seed: int, resume: bool
-) -> dict[str, Any] | None:
-    """The checkpoint to go on from, or None for a new run; writes nothing."""
-    if not (resume and folder.config.is_file()):
-        folder.require_new(advise_resume=not resume)
-        return None
-    old, same = folder.read_config(), json.loads(json.dumps(_config(scan, prior, settings, seed)))
-    for config in (old, same):  # another machine may go on with a run
-        for part in ("fit", "volume"):
-            config.get("settings", {}).get(part, {}).pop("backend", None)
+def _summary(done: Reconstruction, fit: Fit | None, train: Scan) -> dict[str, Any]:
+    (h, w), matter = train.views.shape, done.object.matter
+    backend = fit.backend if fit else done.object.backend
+    second = matter.second and {"delta": matter.second.delta, "beta": matter.second.beta}
+    return {
+        "finished": done.finished,
+        "method": done.method,
+        "kind": done.object.kind,
+        "size": done.object.described,
+        "backend": backend,
+        "device": device_name(backend),
+        "steps": fit.step if fit else 0,
+        "stopped_early": bool(fit and fit.stopped_early),
+        "best_step": (fit.best_step or fit.step) if fit else 0,
+        "oversample": done.oversample,
+        "detector": {"rows": h, "columns": w, "pixel_size_m": train.views.pixel_size},
+        "energy_kev": done.energy_kev,
+        "material": {"delta": matter.delta, "beta": matter.beta, "single": matter.single},
+        "second_material": second,
+        "timing_s": done.timing,
+    }
+
+
+def _require_same(folder: RunFolder, config: dict[str, Any]) -> None:
+    """`InputError` unless the run in `folder` was started with this `config`; another machine may go on with it."""
+    old, same = folder.read_config(), json.loads(json.dumps(config))
+    version = old.get("schema_version", 1)
+    require(
+        version == SCHEMA_VERSION,
+        f"{folder.path} was begun by a version of holosplat whose checkpoints differ (schema {version}, now "
+        f"{SCHEMA_VERSION}); start anew into another --out, with --config {folder.config}.",
+    )
+    for table in (old, same):
+        _without_backends(table.get("method", {}))
     for key, name in RESUMED_WITH.items():
         require(
             old.get(key) == same[key],
             f"--resume needs the {name} that {folder.path} was started with; use the same, or another --out.",
         )
-    return folder.load_checkpoint()
 
 
-def _begin(folder: RunFolder, config: dict[str, Any]) -> None:
-    """Make the folder, once there is something to put in it."""
-    folder.create()
-    write_json(folder.config, config)
+def _without_backends(table: Any) -> None:
+    if isinstance(table, dict):
+        table.pop("backend", None)
+        for inner in table.values():
+            _without_backends(inner)
 
 
-def _config(scan: Scan, prior: MaterialPrior, settings: Settings, seed: int) -> dict[str, Any]:
-    return {"settings": asdict(settings), "prior": prior.as_dict(), "seed": seed, "scan_hash": scan_hash(scan)}
+def _config(scan: Scan, prior: MaterialPrior, method: Method, seed: int) -> dict[str, Any]:
+    return {
+        "schema_version": SCHEMA_VERSION,
+        "method": to_table(method),
+        "prior": prior.as_dict(),
+        "seed": seed,
+        "scan_hash": scan_hash(scan),
+    }

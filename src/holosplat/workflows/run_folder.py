@@ -1,4 +1,4 @@
-"""A run is a folder: config.json, metrics.csv, checkpoint.pt, gaussians.h5, summary.json, source.json, report.html."""
+"""A run is a folder: config.json, metrics.csv, checkpoint.pt, object.h5, summary.json, source.json, report.html."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class RunFolder:
         self.config = self.path / "config.json"
         self.metrics = self.path / "metrics.csv"
         self.checkpoint = self.path / "checkpoint.pt"
-        self.gaussians = self.path / "gaussians.h5"
+        self.object = self.path / "object.h5"
         self.summary = self.path / "summary.json"
         self.source = self.path / "source.json"
         self.report = self.path / "report.html"
@@ -37,9 +37,14 @@ class RunFolder:
     def require_run(self) -> None:
         """`InputError` unless the folder holds a reconstruction."""
         require(self.path.is_dir(), f"the run folder {self.path} does not exist; check the path.")
-        found = self.config.is_file() and self.gaussians.is_file()
+        found = self.config.is_file() and self.result().is_file()
         hint = "; it was cut off, finish it with reconstruct --resume" if self.checkpoint.is_file() else ""
-        require(found, f"{self.path} must hold a reconstruction (config.json, gaussians.h5), but it does not{hint}.")
+        require(found, f"{self.path} must hold a reconstruction (config.json, object.h5), but it does not{hint}.")
+
+    def result(self) -> Path:
+        """The file of the reconstructed object; a run of version 0.1 has it under another name."""
+        older = self.path / "gaussians.h5"
+        return older if older.is_file() and not self.object.is_file() else self.object
 
     def create(self) -> None:
         """Make the folder."""
@@ -64,6 +69,11 @@ class RunFolder:
             writer = csv.DictWriter(file, self._columns, restval="", extrasaction="ignore")
             writer.writeheader()
             writer.writerows(row for row in rows if float(row["step"]) <= keep_until)
+
+    def set_aside_metrics(self, stage: int) -> None:
+        """Keep the metrics of an earlier `stage` (0 is the first) as metrics_STAGE.csv; the next one begins its own."""
+        if self.metrics.is_file():
+            self.metrics.replace(self.path / f"metrics_{stage}.csv")
 
     def append_metrics(self, records: list[dict[str, float]]) -> None:
         """Add rows to metrics.csv."""

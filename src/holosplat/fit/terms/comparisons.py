@@ -1,65 +1,14 @@
-"""The terms of the objective. Each is a small function; `Objective` holds their weights."""
+"""How predicted frames, and volumes, are compared or judged: small functions of tensors."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import lru_cache
 
 import torch
 from torch import Tensor
 
-from ..checks import at_least, require
-from .fidelity import reference as plain
-
-
-@dataclass(frozen=True)
-class Objective:
-    """Weights of the terms; a weight of zero leaves the term out.
-
-    Image terms compare predicted with measured frames, after the affine map that takes the training frames' minimum and
-    maximum to 0 and 1: `l1` (where differences below `noise_width` standard deviations of the frames' own noise count
-    by their square, as the likelihood of noise has it, and noisy frames are compared coarse to fine: both blurred by
-    `coarse` pixels at first where noise is half their contrast or more, by less in proportion where it is less, and not
-    at all at the end), `l2_amplitude`, `ssim` (1 - SSIM), `tv_image`, `frc` (1 - FRCM, its weight ramped linearly from
-    0 over the first `frc_ramp` of the steps). Object terms act on the Gaussians: `anisotropy` on scales beyond
-    `anisotropy_limit`, and, on the volume they add up to, `tv_volume`, and `overfull`, the square of what exceeds an
-    occupancy of one, and `two_levels`, which occupancies between nothing and one cost (both not where δ and β are
-    apart). The latter's weight is ramped linearly from 0 over the whole fit, for at its beginning matter may still be
-    too faint; it is larger by `noise_gain` times the share of the frames' contrast that is noise. Terms on the volume
-    are sums along the beam in units of 100 voxels, mean over pixels, so that they weigh the same however fine the
-    pixels or wide the field; and they weigh more with fewer views (the weights are those for eight, and go with one
-    over the root).
-    """
-
-    l1: float = 1.0
-    l2_amplitude: float = 0.0
-    ssim: float = 0.0
-    tv_image: float = 0.0
-    frc: float = 0.0
-    frc_ramp: float = 1.0
-    anisotropy: float = 0.0
-    anisotropy_limit: float = 10.0
-    tv_volume: float = 0.0
-    overfull: float = 0.0
-    two_levels: float = 0.0
-    noise_gain: float = 0.0
-    noise_width: float = 0.0
-    coarse: float = 0.0
-
-    def __post_init__(self) -> None:
-        at_least(self, 0, *vars(self))
-        compared = self.l1 + self.l2_amplitude + self.ssim + self.tv_image + self.frc
-        require(compared > 0, "the objective needs a term on the frames: l1, l2_amplitude, ssim, tv_image or frc.")
-
-    @property
-    def uses_volume(self) -> bool:
-        """Whether a term needs the voxelised object."""
-        return self.tv_volume > 0 or self.overfull > 0 or self.two_levels > 0
-
-
-THESIS = Objective(l1=0.75, ssim=0.20, tv_image=0.05, frc=0.05, frc_ramp=0.5)
-"""The thesis' composite loss: 0.75 L1 + 0.20 (1 - SSIM) + TV + ramped FRC."""
+from ..fidelity import reference as plain
 
 
 def l1(predicted: Tensor, measured: Tensor) -> Tensor:
@@ -76,6 +25,11 @@ def huber(predicted: Tensor, measured: Tensor, width: Tensor) -> Tensor:
     size = (predicted - measured).abs()
     short = torch.minimum(size, width)
     return (short * (size - 0.5 * short) / width).mean(dim=(1, 2))
+
+
+def rounded(residual: Tensor, rounding: float) -> Tensor:
+    """Mean of `√(r² + c²) - c` in each view, c the `rounding`: [V, H, W] → [V]; L1 that is smooth at zero."""
+    return ((residual.square() + rounding**2).sqrt() - rounding).mean(dim=(1, 2))
 
 
 def l2_amplitude(predicted: Tensor, measured: Tensor) -> Tensor:

@@ -1,0 +1,139 @@
+"""Optimisers over named parameters: Adam, with what a method may ask of single groups."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from . import adam
+
+EPSILON = 1e-12
+"""Small beside any gradient: Adam's steps do not depend on the loss' scale."""
+
+Leaves = dict[str, Tensor]
+"""The parameters of a fit by name, each with `requires_grad`; whoever resizes them replaces the entries."""
+
+
+class Optimiser(Protocol):
+    """Moves the leaves of a fit by their gradients."""
+
+    def prepare(self, rates: Mapping[str, float]) -> None:
+        """The part of a step that runs on the host: counts it, and takes the rate of each parameter to the device."""
+        ...
+
+    def apply(self, loss: Tensor) -> None:
+        """The part that runs on the device: moves the leaves in place by their `grad`, and clears it."""
+        ...
+
+    def best(self) -> Leaves | None:
+        """The best parameters so far, where the optimiser keeps them; None where the last ones count."""
+        ...
+
+    def resize(self, names: list[str], keep: Tensor, added: Mapping[str, Tensor]) -> None:
+        """The leaves `names` were replaced by their rows `keep` [K] and the rows `added`: the state follows."""
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """The state, in main memory."""
+        ...
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Go back to a saved state, of leaves that have their saved shapes already."""
+        ...
+
+
+@dataclass(frozen=True)
+class Group:
+    """How Adam moves one parameter where that differs from its default.
+
+    betas: decay of the running means of the gradient and its square; epsilon: beside the root of the latter; decay: the
+    share of the parameter that a step takes away, per unit of its rate (Loshchilov & Hutter 2019); solve: a
+    preconditioner, the gradient [same shape] in, a direction out; together: one step length for the whole tensor, by
+    the largest squared entry (Nicolet, Jacobson & Jakob 2021, "Large steps in inverse rendering of geometry").
+    """
+
+    betas: tuple[float, float] = adam.BETAS
+    epsilon: float = EPSILON
+    decay: float = 0.0
+    solve: Callable[[Tensor], Tensor] | None = None
+    together: bool = False
+
+
+class Adam:
+    """Adam (Kingma & Ba 2015) over named parameters, each at its own rate; fused kernels but for special groups.
+
+    backend: what runs it (see `fit.adam`); groups: what differs from the default, by parameter.
+    """
+
+    def __init__(self, leaves: Leaves, backend: str = "cpu", groups: Mapping[str, Group] | None = None) -> None:
+        self._leaves, self._backend, self._count = leaves, backend, 0
+        self._groups = dict(groups or {})
+        self._fused = [name for name in leaves if name not in self._groups]
+        self._rates: dict[str, float] = {}
+        device = next(iter(leaves.values())).device
+        self._factors = adam.factors([0.0] * len(self._fused), 1, EPSILON).to(device)
+        self._first = {name: torch.zeros_like(leaf) for name, leaf in leaves.items()}
+        self._second = {name: self._spread(name, leaf) for name, leaf in leaves.items()}
+
+    def _spread(self, name: str, leaf: Tensor) -> Tensor:
+        together = name in self._groups and self._groups[name].together
+        return torch.zeros((), dtype=leaf.dtype, device=leaf.device) if together else torch.zeros_like(leaf)
+
+    def prepare(self, rates: Mapping[str, float]) -> None:
+        """See `Optimiser`; a parameter without a rate stays where it is."""
+        self._count += 1
+        self._rates = {name: rates.get(name, 0.0) for name in self._leaves}
+        factors = adam.factors([self._rates[name] for name in self._fused], self._count, EPSILON)
+        self._factors.copy_(factors, non_blocking=True)
+
+    def apply(self, loss: Tensor) -> None:
+        """See `Optimiser`. Parameters without a gradient stay as they are."""
+        moved = [k for k, name in enumerate(self._fused) if self._leaves[name].grad is not None]
+        if moved:
+            names = [self._fused[k] for k in moved]
+            gradients = [g for name in names if (g := self._leaves[name].grad) is not None]
+            parameters = [self._leaves[name].detach() for name in names]
+            first, second = ([state[name] for name in names] for state in (self._first, self._second))
+            factors = self._factors if len(moved) == len(self._fused) else self._factors[[*moved, -1]]
+            adam.step(parameters, gradients, first, second, factors, self._backend)
+        for name, group in self._groups.items():
+            if self._leaves[name].grad is not None:
+                self._apply_special(name, group)
+        for leaf in self._leaves.values():
+            leaf.grad = None
+
+    @torch.no_grad()
+    def _apply_special(self, name: str, group: Group) -> None:
+        leaf, rate, (slow, slower) = self._leaves[name], self._rates[name], group.betas
+        assert leaf.grad is not None
+        gradient = leaf.grad if group.solve is None else group.solve(leaf.grad)
+        square = gradient.square().max() if group.together else gradient.square()
+        self._first[name].mul_(slow).add_(gradient, alpha=1 - slow)
+        self._second[name].mul_(slower).add_(square, alpha=1 - slower)
+        first, second = self._first[name] / (1 - slow**self._count), self._second[name] / (1 - slower**self._count)
+        leaf.mul_(1 - rate * group.decay).sub_(rate * first / (second.sqrt() + group.epsilon))
+
+    def best(self) -> None:
+        """None: the last parameters count."""
+
+    def resize(self, names: list[str], keep: Tensor, added: Mapping[str, Tensor]) -> None:
+        """See `Optimiser`; what is added starts without a history."""
+        for name in names:
+            for state in (self._first, self._second):
+                state[name] = torch.cat([state[name][keep], torch.zeros_like(added[name])])
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `Optimiser`."""
+        first, second = ({n: s.cpu().clone() for n, s in state.items()} for state in (self._first, self._second))
+        return {"count": self._count, "first": first, "second": second}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """See `Optimiser`."""
+        self._count = int(state["count"])
+        for mine, name in ((self._first, "first"), (self._second, "second")):
+            for key, leaf in self._leaves.items():
+                mine[key] = state[name][key].to(leaf.device, leaf.dtype, copy=True)

@@ -1,0 +1,68 @@
+"""Terms on neural fields, measured at random places: total variation, and retrieved thickness on random rays."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from ...geometry import Views
+from ...model import Model
+from ...representations import NeuralField
+from ...representations.neural_field import Samples, uniform
+from ..batch import Batch
+from ..problem import Part
+
+APART = 0.5
+"""Distance [voxel edges] of the two points between which a field's variation is measured."""
+
+
+class FieldVariation:
+    """∫ |∇u| over the field's mask [voxel edges²], from differences along random directions: E |∇u · e| = |∇u| / 2."""
+
+    names = ("variation",)
+
+    def __init__(self, weight: float, probes: int, generator: torch.Generator) -> None:
+        """probes: pairs of points a step."""
+        self._weight, self._probes, self._generator = weight, probes, generator
+
+    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+        """The one part."""
+        field, generator = model.object, self._generator
+        assert isinstance(field, NeuralField)
+        cells = field.mask.nonzero().flip(1)
+        chosen = (uniform(generator, self._probes) * len(cells)).long()
+        at = cells[chosen] + uniform(generator, self._probes, 3)
+        along = torch.randn(self._probes, 3, generator=generator, device=at.device)
+        first, second = field(torch.cat((at, at + APART * normalize(along, dim=1)))).split(self._probes)
+        total = (second - first).abs().mean(dim=0).sum() * (2 * len(cells) / APART)
+        return [Part("variation", self._weight, total)]
+
+
+class RetrievedThickness:
+    """Σ of squared differences from retrieved thickness over all pixels [voxel edges²], mean over views.
+
+    target: [V, H, W] in voxel edges; share: of the pixels that a step looks at, drawn anew each time.
+    """
+
+    names = ("thickness",)
+
+    def __init__(self, target: Tensor, views: Views, share: float, generator: torch.Generator) -> None:
+        self._target, self._views, self._share, self._generator = target, views, share, generator
+
+    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+        """The one part."""
+        field = model.object
+        assert isinstance(field, NeuralField)
+        total = sum((self._view(field, v) for v in range(len(self._views))), start=self._target.new_zeros(()))
+        return [Part("thickness", 1.0, total / (self._share * len(self._views)))]
+
+    def _view(self, field: NeuralField, v: int) -> Tensor:
+        chosen = uniform(self._generator, self._target[v].numel()) < self._share
+        every = field.kept_samples(self._views, v)
+        kept = chosen[every.pixel]
+        rays = Samples(every.pixel[kept], every.depth[kept])
+        found = field.thickness(self._views, v, rays, uniform(self._generator, len(rays.pixel)))[0].flatten()
+        return (found - self._target[v].flatten())[chosen].square().sum()

@@ -1,0 +1,127 @@
+"""The data term: how far predicted frames are from measured ones, by the weights of an `Objective`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from ...matter import Matter
+from ...model import Instrument, Model
+from ...optics.detector import blur
+from ...optics.noise import noise_levels, noise_share, sure_noise
+from ...scan import Scan
+from ..batch import Batch
+from ..fidelity import Target, l1_and_ssim
+from ..problem import Part
+from . import comparisons
+from .objective import IMAGE_TERMS, Objective
+from .spectral import SpectralMisfit
+
+DARK = 0.05
+"""Relative intensity below which noise falls no further."""
+COARSEST_NOISE = 0.5
+"""Noise, as a share of the frames' contrast, from which on frames are blurred by all of `Objective.coarse` at first."""
+LEAST_BLUR = 0.1
+"""Pixels below which a blur changes nothing, and is left out."""
+SMALLEST_ROUNDING = 1e-6
+"""Of `rounded` at zero, in units of the frames' range."""
+
+Weighted = tuple[float | Tensor, Tensor]
+"""Weight, and value [V] of each view."""
+
+
+class FrameTerm:
+    """The terms on frames: mean over the batch's views of the weighted sum of the comparisons in use.
+
+    detach_worst: the thesis' rule, views whose loss exceeds the batch's median give no gradient. low, span: the affine
+    map that takes the training frames' minimum and maximum to 0 and 1.
+    """
+
+    def __init__(
+        self, train: Scan, instrument: Instrument, objective: Objective, matter: Matter, detach_worst: bool = False
+    ) -> None:
+        """train: the frames to fit; matter: what the object is made of, in whose thickness `spectral` is measured."""
+        self.objective, self._detach_worst = objective, detach_worst
+        self.names = ("frames", *(name for name in IMAGE_TERMS if getattr(objective, name) > 0))
+        measured = torch.from_numpy(train.frames)
+        self.low, high = float(measured.min()), float(measured.max())
+        self.span = high - self.low
+        frames = measured.to(instrument.device)
+        self._target = Target(frames, self.low, self.span, instrument.backend)
+        if objective.ssim > 0:
+            _ = self._target.statistics  # once, for all subsets of views
+        coarse = objective.coarse * min(1.0, noise_share(measured) / COARSEST_NOISE) if objective.coarse else 0.0
+        self._blur = NarrowingBlur(frames.shape[1:], coarse, frames.device) if coarse > LEAST_BLUR else None
+        if objective.noise_width > 0 or self._blur:
+            noise = photon_noise(measured)
+            self._width = (objective.noise_width * noise).clamp_min(1e-6 * self.span).to(frames.device)
+        noise = float(noise_levels(measured).mean()) / self.span if objective.rounded > 0 else 0.0
+        self._rounding = max(SMALLEST_ROUNDING, objective.rounding * noise)
+        self.spectral = SpectralMisfit(train, instrument, matter, objective.floor) if objective.spectral > 0 else None
+
+    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+        """The loss of the frames, and the comparisons that it is made of."""
+        parts = self.compared(model.frames(batch.index), batch)
+        per_view = sum(weight * value for weight, value in parts.values())
+        assert isinstance(per_view, Tensor)
+        if self._detach_worst and len(per_view) > 1:
+            per_view = torch.where(per_view > per_view.detach().median(), per_view.detach(), per_view)
+        shown = [Part(name, None, value.detach().mean()) for name, (_, value) in parts.items()]
+        return [Part("frames", 1.0, per_view.mean()), *shown]
+
+    def compared(self, predicted: Tensor, batch: Batch) -> dict[str, Weighted]:
+        """Weight and value [V] of every comparison in use."""
+        w, target = self.objective, self._target if batch.index is None else self._target[batch.index]
+        if w.ssim > 0:
+            difference, dissimilarity = l1_and_ssim(predicted, target)
+        else:  # statistics of frames are not needed
+            difference, dissimilarity = comparisons.l1(predicted, target.frames) / self.span, predicted
+        if w.noise_width > 0 or self._blur:
+            difference = self._beyond_noise(predicted, target.frames, batch) / self.span
+        a, b = ((f - self.low) / self.span if w.tv_image + w.frc > 0 else f for f in (predicted, target.frames))
+        table: dict[str, Callable[[], Tensor]] = {
+            "l1": lambda: difference,
+            "l2_amplitude": lambda: comparisons.l2_amplitude(predicted, target.frames),
+            "ssim": lambda: dissimilarity,
+            "tv_image": lambda: comparisons.tv_image(a),
+            "frc": lambda: comparisons.one_minus_frcm(a, b),
+            "rounded": lambda: comparisons.rounded((predicted - target.frames) / self.span, self._rounding),
+            "spectral": lambda: self._spectral(predicted, batch),
+        }
+        ramps = {"frc": (batch.progress / max(w.frc_ramp, 1e-9)).clamp_max(1.0)}
+        weights = {name: getattr(w, name) for name in table}
+        return {n: (weight * ramps.get(n, 1.0), table[n]()) for n, weight in weights.items() if weight > 0}
+
+    def _spectral(self, predicted: Tensor, batch: Batch) -> Tensor:
+        assert self.spectral is not None
+        return self.spectral(predicted, batch.index)
+
+    def _beyond_noise(self, predicted: Tensor, measured: Tensor, batch: Batch) -> Tensor:
+        """Huber's function of the differences [V] of frames [V, H, W] that are as blurred as is due."""
+        width = self._width if batch.index is None else self._width.index_select(0, batch.index)
+        if self._blur:
+            predicted, measured = (self._blur(frames, batch.progress) for frames in (predicted, measured))
+        return comparisons.huber(predicted, measured, width)
+
+
+class NarrowingBlur:
+    """A Gaussian blur of frames of `shape` whose standard deviation falls from `sigma` [pixels] to 0 during the fit."""
+
+    def __init__(self, shape: Sequence[int], sigma: float, device: torch.device) -> None:
+        rows, columns = torch.fft.fftfreq(shape[0]), torch.fft.rfftfreq(shape[1])
+        self._exponent = (-2 * (math.pi * sigma) ** 2 * (rows[:, None] ** 2 + columns**2)).to(device)
+
+    def __call__(self, frames: Tensor, progress: Tensor) -> Tensor:
+        """Frames [V, H, W], blurred as is due when `progress` [] of the steps are done; periodic."""
+        return blur(frames, torch.exp((1 - progress) ** 2 * self._exponent))
+
+
+def photon_noise(frames: Tensor) -> Tensor:
+    """Standard deviation of each pixel of relative frames [V, H, W] that photons make noisy.
+
+    The frames' own noise is that of their quiet parts, where the intensity is about 1, and goes with its root.
+    """
+    return sure_noise(frames).to(frames)[:, None, None] * frames.clamp_min(DARK).sqrt()

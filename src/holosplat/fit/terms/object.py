@@ -1,0 +1,103 @@
+"""Terms on the object: on Gaussians themselves, and on the volume that any object adds up to."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor
+
+from ...geometry import Grid
+from ...model import Model
+from ...representations import GaussianCloud
+from ..batch import Batch
+from ..problem import Part
+from ..total_variation import total_variation
+from . import comparisons
+from .objective import Objective
+
+DEPTH, VIEWS = 100.0, 8.0
+"""Voxels along the beam, and views, for which the weights of the terms on the volume are meant. Few views leave more
+to what is known of the volume; the weights go with one over the root of their number."""
+
+
+class VolumeTerm:
+    """Total variation, overfull and in-between occupancies of the volume that Gaussians add up to, a block at a time.
+
+    bounded: whether an occupancy of one means something, so that more of it, or less, can be wrong.
+    """
+
+    def __init__(self, objective: Objective, block: Grid, depth: int, views: int, noise: float, bounded: bool) -> None:
+        """block: shape and pitch of what a step looks at; depth: voxels of the whole volume along the beam; noise: the
+        share of the frames' contrast that is noise."""
+        self._block = (block.shape, block.voxel_size[0])
+        self._scale = depth / DEPTH * math.sqrt(VIEWS / views)
+        levels = objective.two_levels * (1 + objective.noise_gain * noise)
+        table = {"tv_volume": objective.tv_volume}
+        if bounded:
+            table |= {"overfull": objective.overfull, "two_levels": levels}
+        self._weights = {name: weight for name, weight in table.items() if weight > 0}
+        self.names = tuple(self._weights)
+
+    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+        """The parts in use, where the batch looks at the volume."""
+        if not (batch.volume and self._weights):
+            return []
+        cloud = model.object
+        assert isinstance(cloud, GaussianCloud)
+        density = cloud.density_around(batch.middle, *self._block)
+        values: dict[str, Callable[[], Tensor]] = {
+            "tv_volume": lambda: len(density) * total_variation(density, backend=cloud.backend),
+            "overfull": lambda: comparisons.overfull(density),
+            "two_levels": lambda: comparisons.two_levels(density),
+        }
+        ramps = {"two_levels": batch.progress}
+        return [
+            Part(name, batch.volume * weight * ramps.get(name, 1.0), self._scale * values[name]())
+            for name, weight in self._weights.items()
+        ]
+
+
+class Anisotropy:
+    """Gaussians longer than `limit` times their shortest axis."""
+
+    names = ("anisotropy",)
+
+    def __init__(self, weight: float, limit: float) -> None:
+        self._weight, self._limit = weight, limit
+
+    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+        """The one part."""
+        cloud = model.object
+        assert isinstance(cloud, GaussianCloud)
+        return [Part("anisotropy", self._weight, comparisons.anisotropy(cloud.log_scales, self._limit))]
+
+
+class Bending:
+    """Σ |L² x|² of the vertices x [pixels] of surfaces, L x their distance from the mean of their neighbours."""
+
+    names = ("bending",)
+
+    def __init__(self, weight: float, operator: Tensor) -> None:
+        """operator: L² [P, P], sparse float64."""
+        self._weight, self._operator = weight, operator
+
+    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+        """The one part."""
+        vertices = model.parameters()["object.vertices"]
+        return [Part("bending", self._weight, torch.sparse.mm(self._operator, vertices).square().sum())]
+
+
+class VoxelVariation:
+    """∫ |∇u| of voxel values [voxel edges²], smoothed below `smoothing`."""
+
+    names = ("variation",)
+
+    def __init__(self, weight: float, smoothing: float) -> None:
+        self._weight, self._smoothing = weight, smoothing
+
+    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+        """The one part."""
+        values = model.parameters()["object.values"]
+        return [Part("variation", self._weight, total_variation(values, self._smoothing, "cpu") * values.numel())]

@@ -1,0 +1,82 @@
+"""Objects of every kind as HDF5 files: tensors as datasets, everything else as one JSON attribute."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..checks import InputError
+from ..representations import KINDS, Stored
+from .atomic import atomic_path
+from .gaussians import FORMAT as GAUSSIANS
+from .gaussians import read_gaussians
+from .hdf5 import Fields, open_hdf5
+
+FORMAT = "holosplat object 1"
+MOST_TEXT = 60_000
+"""Characters of the attribute, at most: HDF5 holds 64 kB of them."""
+
+
+def write_object(path: Path, obj: Stored) -> None:
+    """Write an Object: the attributes `format`, `kind` and `state` (JSON), and a dataset for each of its tensors."""
+    tensors, plain = _parted(obj.state())
+    text = json.dumps(plain)
+    assert len(text) < MOST_TEXT
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs.update(format=FORMAT, kind=obj.kind, state=text)
+        for name, tensor in tensors.items():
+            file[name] = tensor.detach().cpu().numpy()
+
+
+def read_object(path: Path) -> Stored:
+    """The Object that `write_object` wrote, or the Gaussians of a file of version 0.1; `InputError` for any other."""
+    with open_hdf5(path) as file:
+        form = str(file.attrs.get("format", ""))
+        if form == GAUSSIANS:
+            return read_gaussians(path)
+        kind = KINDS.get(str(file.attrs.get("kind", "")))
+        if form != FORMAT or kind is None:
+            raise InputError(
+                f"{path} must be a {FORMAT!r} file of the kinds {', '.join(KINDS)}, but its format is {form!r}."
+            )
+        fields, names = Fields(path, file), list[str]()
+        file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
+        arrays = {name: torch.from_numpy(np.asarray(fields.dataset(name)[()])) for name in names}
+        try:
+            plain = json.loads(str(file.attrs["state"]))
+            return kind.from_state(_joined(arrays, plain))
+        except (KeyError, TypeError, ValueError, AttributeError) as error:
+            raise InputError(f"{path} must hold a whole object, but it lacks or garbles {error}.") from error
+
+
+def _parted(state: Mapping[str, Any], prefix: str = "") -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """The tensors by their path, and what is left."""
+    tensors, plain = dict[str, Tensor](), dict[str, Any]()
+    for name, value in state.items():
+        if isinstance(value, Tensor):
+            tensors[prefix + name] = value
+        elif isinstance(value, Mapping):
+            inner, plain[name] = _parted(value, f"{prefix}{name}/")
+            tensors |= inner
+        else:
+            plain[name] = value
+    return tensors, plain
+
+
+def _joined(tensors: Mapping[str, Tensor], plain: Mapping[str, Any]) -> dict[str, Any]:
+    """The state of which `_parted` made two."""
+    state = json.loads(json.dumps(plain))
+    for path, tensor in tensors.items():
+        *groups, name = path.split("/")
+        place = state
+        for group in groups:
+            place = place.setdefault(group, {})
+        place[name] = tensor
+    return state

@@ -1,0 +1,246 @@
+"""What matter is made of: the channels of a model's values, and what is known of the matter beforehand."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .checks import InputError, require
+from .geometry import Grid
+from .volume import Volume
+
+LEAST_CONTRAST = 1.6
+"""Two materials whose δ differ by less than this factor pass for one."""
+RATIO_RANGE = (1.0, 1e6)
+"""Sizes of δ/β that may be given."""
+
+
+class DeltaBeta(NamedTuple):
+    """Refractive index n = 1 - delta + i·beta, dimensionless; of a difference, either may be negative."""
+
+    delta: float
+    beta: float
+
+    def against(self, medium: DeltaBeta) -> DeltaBeta:
+        """What an object in `medium` adds to it: `(δ - δ_medium, β - β_medium)`."""
+        return DeltaBeta(self.delta - medium.delta, self.beta - medium.beta)
+
+    @property
+    def ratio(self) -> float:
+        """δ/β; infinite (with δ's sign) for β = 0, negative where the two differ in sign, NaN for vacuum."""
+        if self.beta == 0:
+            return math.copysign(math.inf, self.delta) if self.delta else math.nan
+        return self.delta / self.beta
+
+
+@dataclass(frozen=True)
+class Matter:
+    """What the channels of a model's values mean.
+
+    channels: the (δ, β) of a value of one in each of one or two channels. occupancies: True if values are shares of
+    materials, which cannot add up to more than one; False if δ and β are free, each in its own channel.
+    """
+
+    channels: tuple[DeltaBeta, ...]
+    occupancies: bool = True
+
+    def __post_init__(self) -> None:
+        channels = tuple(DeltaBeta(float(delta), float(beta)) for delta, beta in self.channels)
+        require(len(channels) in (1, 2), f"matter must have one or two channels, but it has {len(channels)}.")
+        object.__setattr__(self, "channels", channels)
+
+    @classmethod
+    def one(cls, delta: float, beta: float) -> Matter:
+        """One material; the values are its occupancy."""
+        return cls((DeltaBeta(delta, beta),))
+
+    @classmethod
+    def two(cls, denser: tuple[float, float], lighter: tuple[float, float]) -> Matter:
+        """Two materials, (δ, β) each; the values are their occupancies."""
+        return cls((DeltaBeta(*denser), DeltaBeta(*lighter)))
+
+    @classmethod
+    def free(cls, delta: float, beta: float) -> Matter:
+        """δ and β apart, in units of `delta` and `beta`."""
+        return cls((DeltaBeta(delta, 0.0), DeltaBeta(0.0, beta)), occupancies=False)
+
+    def __len__(self) -> int:
+        """The number of channels."""
+        return len(self.channels)
+
+    @property
+    def single(self) -> bool:
+        """Whether one occupancy carries both δ and β."""
+        return len(self.channels) == 1
+
+    @property
+    def second(self) -> DeltaBeta | None:
+        """The lighter of two materials; None where there is one, or none is told apart."""
+        return self.channels[1] if self.occupancies and len(self.channels) == 2 else None
+
+    @property
+    def delta(self) -> float:
+        """δ of a value of one in the first channel."""
+        return self.channels[0].delta
+
+    @property
+    def beta(self) -> float:
+        """β of the first material, or of a value of one in the channel of β."""
+        return self.channels[0].beta if self.occupancies else self.channels[-1].beta
+
+    def freed(self) -> Matter:
+        """The first material's δ and β as units of two free channels."""
+        return Matter.free(self.delta, self.beta)
+
+    def in_lengths(self, unit: float) -> tuple[tuple[float, float], ...]:
+        """(δ, β) [m] that a line integral of one `unit` [m] of each channel gives."""
+        return tuple((delta * unit, beta * unit) for delta, beta in self.channels)
+
+    def volume(self, values: np.ndarray, grid: Grid) -> Volume:
+        """δ and β on `grid` of values [C, Z, Y, X]."""
+        delta, beta = np.tensordot(np.array(self.channels, dtype=np.float32).T, values, axes=1)
+        return Volume(delta, beta, grid)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, as files hold them; `from_dict` reads them."""
+        return {"channels": [list(channel) for channel in self.channels], "occupancies": self.occupancies}
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Matter:
+        """The matter that `as_dict` described; `InputError` for anything else."""
+        try:
+            channels = tuple(DeltaBeta(float(delta), float(beta)) for delta, beta in values["channels"])
+            return cls(channels, bool(values["occupancies"]))
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"matter must hold channels and occupancies, but it is {values!r}.") from error
+
+
+class MaterialPrior:
+    """What is known of the matter before a reconstruction: one of `Known`, `KnownTwo`, `KnownRatio` and `Unknown`."""
+
+    kind = ""
+    """The name of this knowledge in files and tables."""
+    materials: tuple[DeltaBeta, ...] = ()
+    """The known materials, the denser first."""
+
+    @staticmethod
+    def known(material: DeltaBeta, second: DeltaBeta | None = None) -> MaterialPrior:
+        """δ (above zero) and β of one material, or of two whose δ differ, are known."""
+        if second is None:
+            return Known(DeltaBeta(*material))
+        denser, lighter = sorted((material, second), reverse=True)
+        return KnownTwo(DeltaBeta(*denser), DeltaBeta(*lighter))
+
+    @staticmethod
+    def of_ratio(ratio: float) -> MaterialPrior:
+        """One material of unknown density, with δ/β known (negative where β lies below the medium's)."""
+        return KnownRatio(float(ratio))
+
+    @staticmethod
+    def unknown() -> MaterialPrior:
+        """Nothing is known: the frames decide."""
+        return Unknown()
+
+    @property
+    def fixes_level(self) -> bool:
+        """Whether it is known which δ an occupancy of one has."""
+        return bool(self.materials)
+
+    @property
+    def fixes_ratio(self) -> bool:
+        """Whether the ratio δ/β is known."""
+        return True
+
+    def bound(self, upper: float) -> float:
+        """The bound `upper` of the occupancy where the level of the material is known, else 0 (none)."""
+        return upper if self.fixes_level else 0.0
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON, as config.json holds them."""
+        first = self.materials[0] if self.materials else DeltaBeta(0.0, 0.0)
+        return {"kind": self.kind, "delta": first.delta, "beta": first.beta, "ratio": 0.0}
+
+
+@dataclass(frozen=True)
+class Known(MaterialPrior):
+    """One material of known δ and β, both against its medium."""
+
+    material: DeltaBeta
+    kind = "known"
+
+    def __post_init__(self) -> None:
+        _require_delta(self.material)
+
+    @property
+    def materials(self) -> tuple[DeltaBeta, ...]:  # type: ignore[override]
+        """The material."""
+        return (self.material,)
+
+
+@dataclass(frozen=True)
+class KnownTwo(MaterialPrior):
+    """Two materials of known δ and β, both against their medium."""
+
+    denser: DeltaBeta
+    lighter: DeltaBeta
+    kind = "known"
+
+    def __post_init__(self) -> None:
+        for material in (self.denser, self.lighter):
+            _require_delta(material)
+        require(
+            self.denser.delta >= LEAST_CONTRAST * self.lighter.delta,
+            f"two materials are told apart by δ, of which one must have at least {LEAST_CONTRAST:g} times the other's, "
+            f"but they have {self.denser.delta:.3g} and {self.lighter.delta:.3g}; take them for one.",
+        )
+
+    @property
+    def materials(self) -> tuple[DeltaBeta, ...]:  # type: ignore[override]
+        """The two materials, the denser first."""
+        return (self.denser, self.lighter)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON."""
+        lighter = {"second_delta": self.lighter.delta, "second_beta": self.lighter.beta}
+        return super().as_dict() | {name: value for name, value in lighter.items() if value}
+
+
+@dataclass(frozen=True)
+class KnownRatio(MaterialPrior):
+    """One material of which only δ/β is known."""
+
+    ratio: float
+    kind = "ratio"
+
+    def __post_init__(self) -> None:
+        low, high = RATIO_RANGE
+        require(
+            low <= abs(self.ratio) < high,
+            f"delta_beta must have a size between {low:g} and {high:g}, but it is {self.ratio:g}.",
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON."""
+        return super().as_dict() | {"ratio": self.ratio}
+
+
+@dataclass(frozen=True)
+class Unknown(MaterialPrior):
+    """Nothing is known of the matter."""
+
+    kind = "free"
+
+    @property
+    def fixes_ratio(self) -> bool:
+        """Whether the ratio δ/β is known: it is not."""
+        return False
+
+
+def _require_delta(material: DeltaBeta) -> None:
+    require(
+        material.delta > 0,
+        f"the material must have δ above its medium's, but the difference is {material.delta:.3g}; exchange the two.",
+    )

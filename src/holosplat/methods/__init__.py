@@ -1,0 +1,51 @@
+"""The methods of reconstruction. docs/adding.md says how to add one: a file here, and a line in `METHODS`."""
+
+from __future__ import annotations
+
+from .gaussian_options import FitOptions, GaussianRates
+from .gaussians import Gaussians, gaussian_fit
+from .ground import ExtraTerm
+from .method import Method, Stage, Task, finished, solve
+from .neural_field import NeuralFields, NeuralFit
+from .per_view import PerView
+from .surfaces import Extraction, SurfaceFit, SurfaceOptions, Surfaces, refine_surfaces
+from .voxels import HolographicVoxels, VoxelFit, Voxels
+
+METHODS: dict[str, Method] = {
+    "gaussians": Gaussians(),
+    "surfaces": Surfaces(),
+    "voxels": Voxels(),
+    "neural-field": NeuralFields(),
+    "holographic-tv": HolographicVoxels(),
+    "tikhonov-tv": PerView("tikhonov", "tv"),
+    "ctf-tv": PerView("ctf", "tv"),
+    "paganin-tv": PerView("paganin", "tv"),
+    "paganin-fbp": PerView("paganin", "fbp", bounded=False),
+    "paganin-sirt": PerView("paganin", "sirt", bounded=False),
+}
+"""Every method by the name that the command line knows, with its options by default."""
+
+__all__ = [
+    "METHODS",
+    "ExtraTerm",
+    "Extraction",
+    "FitOptions",
+    "GaussianRates",
+    "Gaussians",
+    "HolographicVoxels",
+    "Method",
+    "NeuralFields",
+    "NeuralFit",
+    "PerView",
+    "Stage",
+    "SurfaceFit",
+    "SurfaceOptions",
+    "Surfaces",
+    "Task",
+    "VoxelFit",
+    "Voxels",
+    "finished",
+    "gaussian_fit",
+    "refine_surfaces",
+    "solve",
+]

@@ -1,0 +1,92 @@
+"""Options of the method of Gaussians."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+from ..baselines import HolographicTV
+from ..checks import at_least, require
+from ..fit.density import DensityControl
+from ..fit.schedule import Schedule
+from ..fit.terms import Objective
+from .ground import ExtraTerm
+
+Backend = Literal["auto", "cpu", "cuda", "reference"]
+"""What may be asked to compute a fit."""
+
+
+@dataclass(frozen=True)
+class GaussianRates:
+    """Adam's rates of the parameters at the start of a fit."""
+
+    centres: float = 0.01
+    """Of the centres [detector pixels]."""
+    log_scales: float = 0.01
+    """Of the logarithms of the axes."""
+    quaternions: float = 0.01
+    """Of the orientations."""
+    raw_amplitudes: float = 0.01
+    """Of the amplitudes before softplus."""
+
+    def __post_init__(self) -> None:
+        at_least(self, 0, *vars(self))
+
+    def at(self, factor: float, moving: bool) -> Mapping[str, float]:
+        """The rates by parameter, of which `factor` is left; only amplitudes move unless `moving`."""
+        still = () if moving else ("centres", "log_scales", "quaternions")
+        return {f"object.{name}": 0.0 if name in still else rate * factor for name, rate in vars(self).items()}
+
+
+def _objective() -> Objective:
+    return Objective(
+        l1=1.0, tv_volume=0.25, overfull=10.0, two_levels=1.25, noise_gain=0.5, noise_width=1.0, coarse=1.0
+    )
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """What is minimised, how, where Gaussians come and go, and which backend does it (see `backends`)."""
+
+    objective: Objective = field(default_factory=_objective)
+    schedule: Schedule = field(default_factory=Schedule)
+    rates: GaussianRates = field(default_factory=GaussianRates)
+    density: DensityControl = field(default_factory=DensityControl)
+    terms: tuple[ExtraTerm, ...] = ()
+    """Further terms by name."""
+    backend: Backend = "auto"
+    """What computes the fit."""
+
+
+@dataclass(frozen=True)
+class GaussianOptions:
+    """Options of Gaussians: their start, and their fit."""
+
+    start: Literal["phase", "random"] = "phase"
+    """`phase`: phase retrieval, total-variation tomography, Gaussians where there is matter; or `random`."""
+    spacing_px: float = 1.0
+    """Distance between Gaussians at a phase start [pixels]."""
+    spacing_noise: float = 2.3
+    """What it grows by, as a share, for the share of the frames' contrast that is noise, at most to twice."""
+    max_start: int = 150_000
+    """Gaussians at the start, at most: their distance grows rather than their number."""
+    approximate_steps: int = 50
+    """Steps in which the Gaussians learn the starting volume."""
+    random_count: int = 8_000
+    """Gaussians of a random start."""
+    separate: bool = False
+    """Whether, with nothing known of the matter, δ and β are fitted apart, not at the one ratio that frames suggest."""
+    most_materials: int = 2
+    """How many materials (1 or 2) may be found where nothing is known."""
+    volume: HolographicTV = field(default_factory=HolographicTV)
+    fit: FitOptions = field(default_factory=FitOptions)
+
+    def __post_init__(self) -> None:
+        require(self.spacing_px > 0, f"spacing_px must be positive, but it is {self.spacing_px}.")
+        at_least(self, 0, "approximate_steps", "spacing_noise")
+        at_least(self, 1, "max_start", "random_count")
+        require(
+            self.most_materials in (1, 2),
+            f"most_materials must be 1 or 2, but it is {self.most_materials}; no more than two can be told apart.",
+        )

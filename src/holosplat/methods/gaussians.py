@@ -1,0 +1,104 @@
+"""Gaussians through the waves: the method that `reconstruct` takes by default."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import torch
+
+from ..backends import resolve
+from ..fit.batches import block_shape
+from ..fit.density import DensityEvent
+from ..fit.loop import Fit, Plan
+from ..fit.optimiser import Adam
+from ..fit.problem import Problem, Term
+from ..fit.terms import Anisotropy, VolumeTerm
+from ..fit.validation import split_validation
+from ..geometry import Grid
+from ..matter import MaterialPrior, Matter
+from ..optics.noise import noise_share
+from ..representations import GaussianCloud, Stored
+from ..scan import Scan
+from .gaussian_options import Backend, FitOptions, GaussianOptions
+from .ground import Ground, ground
+from .method import Stage, Task
+from .start import starting_cloud
+
+
+@dataclass(frozen=True)
+class Gaussians(GaussianOptions):
+    """Gaussians where phase retrieval and tomography find matter, or at random, fitted to the frames."""
+
+    kind: ClassVar[str] = "gaussians"
+
+    def stages(self) -> tuple[Stage, ...]:
+        """One: the start, and the fit."""
+        return (GaussianStage(self),)
+
+    def on_backend(self, backend: Backend) -> Gaussians:
+        """The same method computed by `backend`; the start runs on the CPU, or in plain torch."""
+        volume = replace(self.volume, backend="reference" if backend == "reference" else "cpu")
+        return replace(self, fit=replace(self.fit, backend=backend), volume=volume)
+
+    def with_effort(self, effort: float) -> Gaussians:
+        """The same method with `effort` times the steps, at least one."""
+        steps, first = (max(1, round(effort * n)) for n in (self.fit.schedule.steps, self.approximate_steps))
+        schedule = replace(self.fit.schedule, steps=steps)
+        return replace(self, approximate_steps=first, fit=replace(self.fit, schedule=schedule))
+
+
+@dataclass(frozen=True)
+class GaussianStage:
+    """The start and the fit of `Gaussians`."""
+
+    options: Gaussians
+    name: str = "fit"
+
+    def start(self, task: Task, before: Stored | None) -> GaussianCloud:
+        """The starting cloud."""
+        if resolve(self.options.fit.backend) == "cuda":
+            resolve("cpu")  # the start and the judging run there
+        train, _ = split_validation(task.scan, self.options.fit.schedule.validation_views)
+        return starting_cloud(replace(task, scan=train), self.options)
+
+    def fit(self, task: Task, start: Stored) -> Fit:
+        """The fit of the cloud to the training frames."""
+        assert isinstance(start, GaussianCloud)
+        return gaussian_fit(task.scan, start, resolved(self.options.fit, task.prior, start.matter), task.seed)
+
+
+def resolved(options: FitOptions, prior: MaterialPrior, matter: Matter) -> FitOptions:
+    """The options without what bounds the occupancy where nothing says what an occupancy of one is."""
+    if prior.fixes_ratio or matter.second is not None:
+        return options
+    return replace(options, objective=replace(options.objective, overfull=0.0, two_levels=0.0))
+
+
+def gaussian_fit(scan: Scan, cloud: GaussianCloud, options: FitOptions, seed: int = 0) -> Fit:
+    """The fit of `cloud` to the training frames of `scan`, made ready; errors: those of `ground`."""
+    backend, schedule = resolve(options.backend), options.schedule
+    base = ground(scan, cloud.on(backend), cloud.matter, options.objective, schedule, backend)
+    grid = Grid.of_views(scan.views)
+    terms = [base.frames, *_object_terms(base, options, grid, cloud.matter), *base.extra(options.terms)]
+    plan = Plan(
+        problem=Problem(base.model, tuple(terms)),
+        schedule=schedule,
+        optimiser=lambda leaves: Adam(leaves, backend),
+        rates=lambda factor, step: options.rates.at(factor, step >= schedule.warmup_steps),
+        events=(DensityEvent(options.density, base.train.views),),
+        judge=base.judge,
+        grid=grid if options.objective.uses_volume else None,
+    )
+    return Fit(plan, seed)
+
+
+def _object_terms(base: Ground, options: FitOptions, grid: Grid, matter: Matter) -> list[Term]:
+    w, terms = options.objective, list[Term]()
+    if w.anisotropy > 0:
+        terms.append(Anisotropy(w.anisotropy, w.anisotropy_limit))
+    if w.uses_volume:
+        block = grid.block((0, 0, 0), block_shape(grid, options.schedule))
+        noise = noise_share(torch.from_numpy(base.train.frames))
+        terms.append(VolumeTerm(w, block, grid.shape[0], len(base.train), noise, matter.occupancies))
+    return terms

@@ -1,0 +1,69 @@
+"""What every fit to frames stands on: training and validation frames, wave optics, and the data term."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..checks import InputError, require
+from ..fit.problem import Term
+from ..fit.schedule import Schedule
+from ..fit.terms import TERMS, FrameTerm, Objective
+from ..fit.validation import Judge, split_validation
+from ..matter import Matter
+from ..model import Instrument, Model
+from ..optics.sampling import fringe_sampling
+from ..scan import Scan
+from ..volume import Object
+
+
+@dataclass(frozen=True)
+class ExtraTerm:
+    """A term of `fit.terms.TERMS` beside those of the objective."""
+
+    name: str
+    """Which term."""
+    weight: float = 1.0
+    """Its weight."""
+
+    def __post_init__(self) -> None:
+        if self.name not in TERMS:
+            raise InputError(f"a term must be one of {', '.join(TERMS)}, but it is {self.name!r}.")
+        require(
+            self.weight >= 0, f"the weight of the term {self.name} must not be negative, but it is {self.weight:g}."
+        )
+
+
+@dataclass(frozen=True)
+class Ground:
+    """train: the frames to fit; model: of the object in their exposures; frames: the data term; judge: of the frames
+    set aside, None without any."""
+
+    train: Scan
+    model: Model
+    frames: FrameTerm
+    judge: Judge | None
+
+    def extra(self, terms: tuple[ExtraTerm, ...]) -> list[Term]:
+        """The terms that are asked for by name."""
+        return [TERMS[term.name](term.weight, self.model, self.train) for term in terms]
+
+
+def ground(
+    scan: Scan, obj: Object, matter: Matter, objective: Objective, schedule: Schedule, backend: str, finer: int = 0
+) -> Ground:
+    """The ground of a fit of `obj`, made of `matter`, to the training frames of `scan`.
+
+    backend: resolved. finer: wave samples a pixel, at least, where the schedule does not say how many. Errors:
+    `InputError` without training frames, or where they show nothing.
+    """
+    train, aside = split_validation(scan.train(), schedule.validation_views)
+    require(np.ptp(train.frames) > 0, "all training frames are constant, so there is nothing to fit.")
+    oversample = schedule.oversample or max(finer, fringe_sampling(train.exposures))
+    instrument = Instrument(train.exposures, oversample, backend=backend)
+    frames = FrameTerm(train, instrument, objective, matter, schedule.detach_worst)
+    judge = None
+    if len(aside):
+        judge = Judge(aside, Instrument(aside.exposures, oversample, backend=backend), frames.low, frames.span)
+    return Ground(train, Model(obj, instrument), frames, judge)

@@ -1,0 +1,257 @@
+"""Neural fields: fitted to retrieved thickness on random rays first, then through the full wave model."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from ..baselines import HolographicTV
+from ..checks import at_least, require
+from ..fit.loop import Fit, Plan, Record
+from ..fit.optimiser import Adam, Group, Leaves
+from ..fit.problem import Problem
+from ..fit.schedule import Schedule
+from ..fit.terms import Objective
+from ..fit.terms.field import FieldVariation, RetrievedThickness
+from ..fit.terms.spectral import SpectralMisfit
+from ..fit.trainable import Trainable
+from ..geometry import Grid, Views
+from ..matter import Matter
+from ..model import Model
+from ..representations import NeuralField, Stored, VoxelGrid
+from ..representations.neural_field import Network, grown
+from ..scan import Scan
+from .ground import ExtraTerm, ground
+from .method import Stage, Task, run_quietly
+from .voxels import HolographicStage
+
+WARM_UP, THROUGH_WAVES = "field for the retrieved thickness", "field through the waves"
+BETAS, EPSILON = (0.9, 0.99), 1e-15
+"""Adam's constants (Müller et al. 2022, section 4)."""
+PEAK = 0.995
+"""Quantile of the retrieved thickness that counts as its largest value: single pixels may be artefacts."""
+SECOND_STAGE = 1_000_003
+"""Added to the seed for the stage through the waves."""
+
+
+def _objective() -> Objective:
+    return Objective(l1=0.0, spectral=1.0, floor=0.1)
+
+
+def _schedule() -> Schedule:
+    return Schedule(steps=250, views_per_step=1, decay=0.05)
+
+
+@dataclass(frozen=True)
+class NeuralFit:
+    """Options of a neural field and its fit."""
+
+    network: Network = field(default_factory=Network)
+    """The encoding and the network behind it."""
+    warmup_steps: int = 80
+    """Steps towards the retrieved thickness."""
+    warmup_rays: int = 4096
+    """Rays of all views in each of them."""
+    rate: float = 0.02
+    """Adam's first rate of all weights, in either stage."""
+    shrinkage: float = 0.01
+    """Weight decay of the encoding."""
+    weight: float = 0.01
+    """Weight of total variation, in voxel edges of thickness."""
+    noise_weight: float = 0.1
+    """What it grows by for every pixel of thickness that the noise of the frames amounts to."""
+    probes: int = 4096
+    """Random pairs of points half a pixel apart on which total variation is measured."""
+    hull: float = 0.1
+    """Share of the largest retrieved thickness that counts as matter: the field lives where all views show matter."""
+    margin: int = 2
+    """Pixels around that, and around what is kept."""
+    prune_every: int = 75
+    """Steps between updates of where the field is looked at (0: never)."""
+    empty: float = 0.1
+    """Value up to which nothing is there, in these updates."""
+    objective: Objective = field(default_factory=_objective)
+    """How frames are compared."""
+    schedule: Schedule = field(default_factory=_schedule)
+    """Of the stage through the waves; `seconds` is the limit of both stages together, half of it each."""
+    terms: tuple[ExtraTerm, ...] = ()
+    """Further terms by name, through the waves."""
+
+    def __post_init__(self) -> None:
+        at_least(
+            self, 0, "warmup_steps", "shrinkage", "weight", "noise_weight", "hull", "prune_every", "empty", "margin"
+        )
+        at_least(self, 1, "warmup_rays", "probes")
+        require(self.rate > 0, f"rate must be positive, but it is {self.rate:g}.")
+        steps = self.warmup_steps + self.schedule.steps
+        require(steps > 0, "a fit needs steps: warmup_steps or schedule.steps must be positive.")
+
+
+@dataclass(frozen=True)
+class NeuralFields:
+    """A neural field that learns the line integrals of `HolographicTV`, and is then fitted to the frames."""
+
+    kind: ClassVar[str] = "neural-field"
+
+    volume: HolographicTV = field(default_factory=HolographicTV)
+    fit: NeuralFit = field(default_factory=NeuralFit)
+
+    def stages(self) -> Sequence[Stage]:
+        """The start, and the field, which learns the start's thickness before its fit."""
+        return (HolographicStage(self.volume), NeuralStage(self.fit))
+
+    def with_effort(self, effort: float) -> NeuralFields:
+        """The same method with `effort` times the steps, at least one."""
+        first, steps = (max(1, round(effort * n)) for n in (self.fit.warmup_steps, self.fit.schedule.steps))
+        schedule = replace(self.fit.schedule, steps=steps)
+        return replace(self, fit=replace(self.fit, warmup_steps=first, schedule=schedule))
+
+
+@dataclass(frozen=True)
+class NeuralStage:
+    """A field that has learned the thickness of what came before, fitted to the frames."""
+
+    options: NeuralFit
+    name: str = THROUGH_WAVES
+
+    def start(self, task: Task, before: Stored | None) -> NeuralField:
+        """The field after its warm-up, in the visual hull of what came before."""
+        assert isinstance(before, VoxelGrid)
+        matter = before.matter if task.prior.fixes_ratio or not before.matter.single else before.matter.freed()
+        thickness = before.project(task.scan.views).channels[:, 0].detach()
+        return warmed_up(task, matter, thickness, self.options)
+
+    def fit(self, task: Task, start: Stored) -> Fit | None:
+        """The fit to the frames, or None for no steps."""
+        assert isinstance(start, NeuralField)
+        return waves_fit(task.scan, start, self.options, task.seed) if self.options.schedule.steps else None
+
+
+def warmed_up(task: Task, matter: Matter, thickness: Tensor, options: NeuralFit) -> NeuralField:
+    """A field of `matter` that has learned thickness [V, H, W] [m] of the training frames on random rays.
+
+    Errors: `InputError` if the thickness is of another shape than the frames, or has nothing in common in all views.
+    """
+    views, wanted = task.scan.views, task.scan.frames.shape
+    require(
+        tuple(thickness.shape) == tuple(wanted),
+        f"thickness must have the shape of the training frames {tuple(wanted)}, but it has {tuple(thickness.shape)}.",
+    )
+    hull = grown(visual_hull(thickness, views, Grid.of_views(views), options.hull), options.margin)
+    upper = task.prior.bound(1.0) if matter.single else 0.0
+    field = NeuralField(Grid.of_views(views), matter, options.network, hull, task.seed, upper)
+    if options.warmup_steps == 0:
+        return field
+    fit = _warm_up(task.scan, field, (thickness / field.pitch).float(), options, task.seed)
+    found = run_quietly(fit, task.report(WARM_UP))
+    assert isinstance(found, NeuralField)
+    return found
+
+
+def _warm_up(scan: Scan, field: NeuralField, target: Tensor, options: NeuralFit, seed: int) -> Fit:
+    generator = torch.Generator().manual_seed(seed)
+    share = min(1.0, options.warmup_rays / target.numel())
+    steps = options.warmup_steps
+    schedule = replace(options.schedule, steps=steps, views_per_step=0, validation_views=0)
+    base = ground(scan, field, field.matter, options.objective, schedule, "cpu")
+    terms = (
+        RetrievedThickness(target, scan.views, share, generator),
+        FieldVariation(_weight(base.frames.spectral, options), options.probes, generator),
+    )
+    return Fit(_plan(Problem(base.model, terms), schedule, options, generator), seed)
+
+
+def waves_fit(scan: Scan, field: NeuralField, options: NeuralFit, seed: int = 0) -> Fit:
+    """The fit of `field` to the training frames of `scan`, made ready."""
+    generator = torch.Generator().manual_seed(seed + SECOND_STAGE)
+    drawn = copy.copy(field)
+    drawn.jitter = generator
+    base = ground(scan, drawn, field.matter, options.objective, options.schedule, "cpu")
+    weight = _weight(base.frames.spectral, options) / len(base.train)
+    variation = FieldVariation(weight, options.probes, generator)
+    problem = Problem(base.model, (base.frames, variation, *base.extra(options.terms)))
+    plan = _plan(problem, options.schedule, options, generator)
+    return Fit(replace(plan, judge=base.judge), seed)
+
+
+def _weight(spectral: SpectralMisfit | None, options: NeuralFit) -> float:
+    return options.weight + options.noise_weight * (0.0 if spectral is None else spectral.noise)
+
+
+def _plan(problem: Problem, schedule: Schedule, options: NeuralFit, generator: torch.Generator) -> Plan:
+    field = problem.model.object
+    assert isinstance(field, NeuralField)
+    groups = {
+        f"object.{name}": Group(BETAS, EPSILON, options.shrinkage if name.startswith("encoding.") else 0.0)
+        for name in field.parameters()
+    }
+    return Plan(
+        problem=problem,
+        schedule=replace(schedule, seconds=0.5 * schedule.seconds),
+        optimiser=lambda leaves: Adam(leaves, "cpu", groups),
+        rates=lambda factor, step: dict.fromkeys(groups, options.rate * factor),
+        events=(PruneEvent(options, field.mask),),
+        generator=generator,
+    )
+
+
+class PruneEvent:
+    """Every so many steps, a field is looked at only where its values are not nothing, within its first hull."""
+
+    def __init__(self, options: NeuralFit, mask: Tensor) -> None:
+        """mask: of the field, which all its copies share."""
+        self._options, self._hull, self._mask = options, mask.clone(), mask
+
+    def on_gradients(self, leaves: Leaves) -> None:
+        """Nothing."""
+
+    def after_step(self, trainable: Trainable, step: int, steps: int, generator: torch.Generator) -> bool:
+        """Prune, where it is due."""
+        every, field = self._options.prune_every, trainable.model.object
+        assert isinstance(field, NeuralField)
+        if every == 0 or (step + 1) % every or step + 1 >= steps:
+            return False
+        field.prune(self._options.empty, self._options.margin, self._hull)
+        return True
+
+    def columns(self, model: Model) -> Record:
+        """The number of voxels that are looked at."""
+        assert isinstance(model.object, NeuralField)
+        return {"count": float(model.object.mask.sum())}
+
+    def state_dict(self) -> dict[str, Any]:
+        """The hull and the mask."""
+        return {"hull": self._hull.cpu().clone(), "mask": self._mask.cpu().clone()}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Go back to a saved state; the field of the fit shares the mask."""
+        self._hull = state["hull"]
+        self._mask.copy_(state["mask"])
+
+
+def visual_hull(thickness: Tensor, views: Views, grid: Grid, share: float) -> Tensor:
+    """Voxels [Z, Y, X] of `grid` in front of pixels with matter in all views; a pixel's neighbours count with it.
+
+    thickness: [V, H, W]; matter is what exceeds `share` of its largest value. Voxels that a view misses do not count.
+    """
+    level = share * float(np.quantile(thickness.cpu().numpy(), PEAK))
+    shown = max_pool2d((thickness > level)[:, None].float(), 3, stride=1, padding=1)[:, 0] > 0
+    x, y, z = (torch.from_numpy(axis / views.pixel_size) for axis in grid.axes())
+    hull = torch.ones(grid.shape, dtype=torch.bool)
+    h, w = views.shape
+    for image, rotation, shift in zip(shown, views.rotations, views.shifts / views.pixel_size):
+        column, row = (
+            (a[2] * z[:, None, None] + a[1] * y[:, None] + a[0] * x - s + 0.5 * n).floor().long()
+            for a, s, n in zip(rotation, shift, (w, h))
+        )
+        inside = (column >= 0) & (column < w) & (row >= 0) & (row < h)
+        hull &= inside & image.cpu()[row.clamp(0, h - 1), column.clamp(0, w - 1)]
+    require(bool(hull.any()), "the retrieved thickness of the views has no matter in common; lower hull, or check it.")
+    return hull

@@ -1,0 +1,73 @@
+"""Phase retrieval of each view by itself, then tomography: what others do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+
+from ..baselines import TOMOGRAPHIES
+from ..checks import InputError
+from ..geometry import Grid
+from ..matter import Matter
+from ..optics.retrieval import RETRIEVALS
+from ..representations import Stored, VoxelGrid
+from .method import Stage, Task
+from .start import assumed_material
+from .svmbir import svmbir_volume
+
+SVMBIR = "svmbir"
+"""Another group's model-based reconstruction, where it is installed."""
+
+
+@dataclass(frozen=True)
+class PerView:
+    """Phase retrieval of each view, then tomography, on voxels of one pixel; the occupancy of one material."""
+
+    kind: ClassVar[str] = "per-view"
+
+    retrieval: str = "tikhonov"
+    """Name of the phase retrieval."""
+    tomography: str = "tv"
+    """Name of the tomography."""
+    bounded: bool = True
+    """Whether the occupancy is kept below one where the material is known."""
+
+    def __post_init__(self) -> None:
+        for name, value, choices in (
+            ("retrieval", self.retrieval, tuple(RETRIEVALS)),
+            ("tomography", self.tomography, (*TOMOGRAPHIES, SVMBIR)),
+        ):
+            if value not in choices:
+                raise InputError(f"{name} must be one of {', '.join(choices)}, but it is {value!r}.")
+
+    def stages(self) -> tuple[Stage, ...]:
+        """One, without a fit."""
+        return (PerViewStage(self),)
+
+
+@dataclass(frozen=True)
+class PerViewStage:
+    """Retrieval and tomography."""
+
+    options: PerView
+    name: str = "tomography"
+
+    def start(self, task: Task, before: Stored | None) -> VoxelGrid:
+        """Occupancies of the known material, or of the one that the frames suggest."""
+        scan, how = task.scan, self.options
+        material = assumed_material(scan, task.prior, task.on_progress)
+        retrieve = RETRIEVALS[how.retrieval]
+        frames = torch.from_numpy(scan.frames)
+        thickness = retrieve(frames, scan.exposures, *material, on_progress=task.report("phase retrieval"))
+        grid, report = Grid.of_views(scan.views), task.report(self.name)
+        if how.tomography == SVMBIR:
+            values = svmbir_volume(thickness, scan.views, grid, report)
+        else:
+            upper = 1.0 if how.bounded and task.prior.fixes_level else None
+            values = TOMOGRAPHIES[how.tomography](thickness, scan.views, grid, upper, report)
+        return VoxelGrid(values[None], grid, Matter.one(*material))
+
+    def fit(self, task: Task, start: Stored) -> None:
+        """Nothing is fitted."""

@@ -1,0 +1,181 @@
+"""Voxels: total variation made to agree with the holograms, and voxels fitted through the full wave model."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import torch
+
+from ..baselines import HolographicTV, holographic_tv
+from ..checks import at_least, require
+from ..fit.loop import Fit, Plan
+from ..fit.optimiser import Leaves
+from ..fit.problem import Problem
+from ..fit.projected_gradient import ProjectedGradient
+from ..fit.schedule import Schedule
+from ..fit.terms import Objective
+from ..fit.terms.object import VoxelVariation
+from ..geometry import Grid
+from ..matter import Matter
+from ..optics.sampling import fringe_sampling
+from ..representations import Stored, VoxelGrid
+from ..scan import Scan
+from .ground import ExtraTerm, ground
+from .method import Stage, Task
+from .start import assumed_material
+
+ABSORPTION_REACH = 10.0
+"""How much longer than those of δ the steps of a free β are, in units of the material's. At equal lengths β would not
+move, for it changes the frames a thousand times less; at lengths for equal changes it would fit the noise."""
+
+
+@dataclass(frozen=True)
+class HolographicVoxels:
+    """Phase retrieval and total variation, made to agree with the holograms: the start of the Gaussians, by itself."""
+
+    kind: ClassVar[str] = "holographic-tv"
+
+    volume: HolographicTV = field(default_factory=HolographicTV)
+
+    def stages(self) -> tuple[Stage, ...]:
+        """One, without a fit."""
+        return (HolographicStage(self.volume),)
+
+
+@dataclass(frozen=True)
+class HolographicStage:
+    """The start that Gaussians, voxels and neural fields share."""
+
+    options: HolographicTV
+    name: str = "holographic total variation"
+
+    def start(self, task: Task, before: Stored | None) -> VoxelGrid:
+        """Occupancies of the one material that all matter is taken for."""
+        material = assumed_material(task.scan, task.prior, task.on_progress, self.options.backend)
+        bounded = replace(self.options, upper=task.prior.bound(1.0))
+        values, grid = holographic_tv(task.scan, material, bounded, task.on_progress)
+        return VoxelGrid(values[None], grid, Matter.one(*material))
+
+    def fit(self, task: Task, start: Stored) -> None:
+        """Nothing is fitted."""
+
+
+def _objective() -> Objective:
+    return Objective(l1=0.0, spectral=1.0, floor=0.1)
+
+
+@dataclass(frozen=True)
+class VoxelFit:
+    """Options of voxels fitted through the waves."""
+
+    coarse_steps: int = 0
+    """Evaluations of the wave model and its gradient with one voxel a pixel, before the finest voxels."""
+    steps: int = 60
+    """Evaluations with the finest voxels."""
+    weight: float = 0.05
+    """Weight of total variation, in voxel edges of thickness."""
+    noise_weight: float = 0.03
+    """What it grows by for every pixel of thickness that the noise of the frames amounts to."""
+    smoothing: float = 0.005
+    """Differences between voxels below which total variation is a square."""
+    upper: float = 1.0
+    """Bound of the occupancy of a known material (0: none)."""
+    refine: int = 0
+    """Voxels along a pixel's edge (0: as the first fringe needs)."""
+    max_voxels: int = 20_000_000
+    """Coarser voxels rather than more than this many."""
+    objective: Objective = field(default_factory=_objective)
+    """How frames are compared."""
+    schedule: Schedule = field(default_factory=Schedule)
+    """The loop's options but for the number of steps, which is above; all frames are looked at in every step."""
+    terms: tuple[ExtraTerm, ...] = ()
+    """Further terms by name."""
+
+    def __post_init__(self) -> None:
+        at_least(self, 0, "coarse_steps", "weight", "noise_weight", "upper", "refine")
+        at_least(self, 1, "steps", "max_voxels")
+        require(self.smoothing > 0, f"smoothing must be positive, but it is {self.smoothing}.")
+        require(
+            self.schedule.views_per_step == 0,
+            f"voxels need views_per_step = 0, all frames in every step, but it is {self.schedule.views_per_step}.",
+        )
+
+
+@dataclass(frozen=True)
+class Voxels:
+    """Voxels from `HolographicTV`, fitted to the frames with total variation; δ and β apart where nothing is known."""
+
+    kind: ClassVar[str] = "voxels"
+
+    volume: HolographicTV = field(default_factory=HolographicTV)
+    fit: VoxelFit = field(default_factory=VoxelFit)
+
+    def stages(self) -> Sequence[Stage]:
+        """The start, coarse voxels where steps are given to them, and the finest ones."""
+        coarse = [VoxelStage(self.fit, coarse=True)] if self.fit.coarse_steps else []
+        return (HolographicStage(self.volume), *coarse, VoxelStage(self.fit))
+
+    def with_effort(self, effort: float) -> Voxels:
+        """The same method with `effort` times the steps, at least one."""
+        return replace(self, fit=replace(self.fit, steps=max(1, round(effort * self.fit.steps))))
+
+
+@dataclass(frozen=True)
+class VoxelStage:
+    """A fit of voxels of one size."""
+
+    options: VoxelFit
+    coarse: bool = False
+
+    @property
+    def name(self) -> str:
+        """For progress and summaries."""
+        return "voxels through the waves" + (", coarse" if self.coarse else "")
+
+    def start(self, task: Task, before: Stored | None) -> VoxelGrid:
+        """What came before on the voxels of this stage, with δ and β apart where nothing is known."""
+        assert isinstance(before, VoxelGrid)
+        free = before.matter.single and not task.prior.fixes_ratio
+        refine = 1 if self.coarse else refinement(task.scan, self.options)
+        grid = (before.freed() if free else before).resampled(Grid.of_views(task.scan.views, refine))
+        return grid.with_parameters({"values": grid.values.detach().float()})
+
+    def fit(self, task: Task, start: Stored) -> Fit:
+        """The fit of the voxels to the training frames."""
+        assert isinstance(start, VoxelGrid)
+        options = replace(self.options, upper=task.prior.bound(self.options.upper) if start.matter.single else 0.0)
+        steps = self.options.coarse_steps if self.coarse else self.options.steps
+        return voxel_fit(task.scan, start, replace(options, steps=steps), task.seed)
+
+
+def voxel_fit(scan: Scan, start: VoxelGrid, options: VoxelFit, seed: int = 0) -> Fit:
+    """The fit of `start`, on its own grid, to the training frames of `scan`, made ready.
+
+    Minimised is `mean over views of the misfit + λ/(k² V) Σ |∇u|`, k voxels a pixel and V views, so that λ does not
+    depend on either.
+    """
+    refine = max(1, round(scan.views.pixel_size / start.grid.voxel_size[0]))
+    schedule = replace(options.schedule, steps=options.steps)
+    base = ground(scan, start, start.matter, options.objective, schedule, "cpu", finer=refine)
+    spectral = base.frames.spectral
+    noise = 0.0 if spectral is None else spectral.noise
+    weight = (options.weight + options.noise_weight * noise) / (refine**2 * len(base.train))
+    scale = torch.tensor([1.0, ABSORPTION_REACH][: len(start.matter)])[:, None, None, None]
+    upper = options.upper if options.upper and start.matter.single else float("inf")
+
+    def optimiser(leaves: Leaves) -> ProjectedGradient:
+        return ProjectedGradient(leaves, upper, scale)
+
+    terms = (base.frames, VoxelVariation(weight, options.smoothing), *base.extra(options.terms))
+    return Fit(Plan(Problem(base.model, terms), schedule, optimiser, judge=base.judge), seed)
+
+
+def refinement(train: Scan, options: VoxelFit) -> int:
+    """Voxels along a pixel's edge."""
+    height, width = train.views.shape
+    refine = options.refine or fringe_sampling(train.exposures)
+    while refine > 1 and height * width**2 * refine**3 > options.max_voxels:
+        refine -= 1
+    return refine

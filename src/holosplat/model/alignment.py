@@ -1,0 +1,108 @@
+"""Where beams really are: small corrections of planned exposures, as numbers that can be fitted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from ..checks import require
+from ..geometry import Poses
+from ..scan import Exposures
+
+WIDTHS: dict[str, tuple[int, ...]] = {"turns": (3,), "shifts": (2,), "stretches": (), "blurs": ()}
+"""The corrections by name, and how many numbers each view has of them."""
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Corrections of V planned exposures, float64; None, and zeros, leave the plan as it is.
+
+    turns: [V, 3] rotation vectors ω [rad] about the lab axes; shifts: [V, 2] of the detector (x, y) [pixels];
+    stretches: [V] of the propagation distance, as a share of it; blurs: [V] of the point-spread function's width
+    [pixels]. The exposures become `R' = exp([ω]×) R`, `s' = s + p e`, `z' = z (1 + ε)`, `σ' = |σ + b|`, as
+    `beamline.misalignment` has them. What is None costs nothing. Errors: `InputError` for shapes that do not fit.
+    """
+
+    turns: Tensor | None = None
+    shifts: Tensor | None = None
+    stretches: Tensor | None = None
+    blurs: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        shapes = {name: tuple(p.shape) for name, p in self.parameters().items()}
+        wanted = {name: (len(self), *WIDTHS[name]) for name in shapes}
+        require(shapes == wanted, f"an alignment of {len(self)} views needs the shapes {wanted}, but got {shapes}.")
+
+    @classmethod
+    def planned(cls, count: int, *names: str, device: torch.device | str = "cpu") -> Alignment:
+        """No correction yet of `count` exposures, with room for those called `names`; `InputError` for other names."""
+        unknown = sorted(set(names) - set(WIDTHS))
+        require(not unknown, f"an alignment corrects {', '.join(WIDTHS)}, but {', '.join(unknown)} is asked for.")
+        return cls(**{n: torch.zeros(count, *WIDTHS[n], dtype=torch.float64, device=device) for n in names})
+
+    def __len__(self) -> int:
+        return max((len(p) for p in self.parameters().values()), default=0)
+
+    def parameters(self) -> dict[str, Tensor]:
+        """The corrections by name."""
+        return {name: tensor for name in WIDTHS if (tensor := getattr(self, name)) is not None}
+
+    def with_parameters(self, parameters: Mapping[str, Tensor]) -> Alignment:
+        """The alignment with other corrections in the place of those named."""
+        return replace(self, **dict(parameters))
+
+    def poses(self, planned: Poses, pixel: float, index: Tensor | None = None) -> Poses:
+        """The `planned` poses of all views, corrected; only those of `index` [K] if it is given.
+
+        pixel: the detector's pitch [m], whatever raster the poses are on.
+        """
+        chosen = planned if index is None else planned[index]
+        rotations, shifts = chosen.rotations, chosen.shifts
+        if self.turns is not None:
+            rotations = rotation_matrices(_picked(self.turns, index)) @ rotations
+        if self.shifts is not None:
+            shifts = shifts + pixel * _picked(self.shifts, index)
+        return replace(chosen, rotations=rotations, shifts=shifts)
+
+    def distance(self, planned: Exposures, index: Tensor | None = None) -> Tensor | None:
+        """Propagation distances [K] [m], float64; None where they are as planned."""
+        if self.stretches is None:
+            return None
+        stretches = _picked(self.stretches, index)
+        return _picked(torch.from_numpy(planned.distance).to(stretches), index) * (1 + stretches)
+
+    def psf_sigma_px(self, planned: Exposures, index: Tensor | None = None) -> Tensor | None:
+        """Widths [K] of the point-spread functions [pixels], float64; None where they are as planned."""
+        if self.blurs is None:
+            return None
+        blurs = _picked(self.blurs, index)
+        return (_picked(torch.from_numpy(planned.psf_sigma_px).to(blurs), index) + blurs).abs()
+
+    def exposures(self, planned: Exposures) -> Exposures:
+        """The `planned` exposures, corrected."""
+        with torch.no_grad():
+            poses = self.poses(Poses.of(planned.views), planned.views.pixel_size)
+            distance, sigma = self.distance(planned), self.psf_sigma_px(planned)
+        return replace(
+            planned,
+            views=poses.views(),
+            distance=planned.distance if distance is None else distance.numpy(),
+            psf_sigma_px=planned.psf_sigma_px if sigma is None else sigma.numpy(),
+        )
+
+
+def _picked(values: Tensor, index: Tensor | None) -> Tensor:
+    return values if index is None else values.index_select(0, index)
+
+
+def rotation_matrices(vectors: Tensor) -> Tensor:
+    """`exp([ω]×)` [V, 3, 3] of rotation vectors [V, 3] [rad], smooth at zero (Rodrigues' formula)."""
+    x, y, z = vectors.unbind(1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).reshape(-1, 3, 3)
+    angle = (vectors.square().sum(dim=1) + torch.finfo(vectors.dtype).tiny).sqrt()[:, None, None] / torch.pi
+    first, second = torch.sinc(angle), 0.5 * torch.sinc(0.5 * angle).square()
+    return torch.eye(3, dtype=vectors.dtype, device=vectors.device) + first * cross + second * (cross @ cross)

@@ -1,0 +1,114 @@
+"""`Model`: matter, where the beams are, wave optics and light; the only way from these to frames."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..checks import require
+from ..geometry import Poses, Views
+from ..scan import Exposures
+from ..volume import Component, LineIntegrals, Object, TrainableObject
+from .alignment import Alignment
+from .instrument import Instrument
+from .light import LightField
+
+PARTS = ("object", "alignment", "light")
+"""The parts of a model that may have parameters."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """Everything that a set of exposures depends on; its parameters are named `part.parameter`.
+
+    object: the matter. instrument: the planned exposures and their wave optics. alignment: corrections of where the
+    beams are, None for none. light: a factor of each frame, None for even light.
+    Errors: `InputError` if alignment or light are of another number of exposures.
+    """
+
+    object: Object
+    instrument: Instrument
+    alignment: Alignment | None = None
+    light: LightField | None = None
+
+    def __post_init__(self) -> None:
+        count = len(self.instrument.views)
+        for name, part in (("alignment", self.alignment), ("light", self.light and self.light.coefficients)):
+            require(
+                part is None or len(part) == count,
+                f"the {name} of a model must be of all its {count} exposures; make it anew for them.",
+            )
+
+    def parameters(self) -> dict[str, Tensor]:
+        """Every tensor that can be fitted, by the name `part.parameter`."""
+        return {
+            f"{part}.{name}": tensor
+            for part in PARTS
+            if isinstance(component := getattr(self, part), Component)
+            for name, tensor in component.parameters().items()
+        }
+
+    def with_parameters(self, parameters: Mapping[str, Tensor]) -> Model:
+        """The model with other tensors in the place of those named; `InputError` for a name that it does not have."""
+        unknown = sorted(set(parameters) - set(self.parameters()))
+        require(not unknown, f"the model has no parameter {', '.join(unknown)}; it has {', '.join(self.parameters())}.")
+        changed: dict[str, Any] = {}
+        for part in PARTS:
+            own = {name.partition(".")[2]: p for name, p in parameters.items() if name.startswith(f"{part}.")}
+            if own:
+                changed[part] = getattr(self, part).with_parameters(own)
+        return replace(self, **changed)
+
+    def frames(self, index: Tensor | None = None, delay: float = 0.0) -> Tensor:
+        """Frames [K, h, w] of the exposures `index` [K] (an integer tensor; None: all), of as many times as these have.
+
+        delay: how long after each exposure's time [s] the matter is looked at.
+        """
+        times = self.instrument.times
+        images = self._seen(float(times[0]) + delay, index) if len(times) == 1 else self._of_several_times(index, delay)
+        return images if self.light is None else images * self.light.factor(index)
+
+    def lines(self, time: float, index: Tensor | None = None) -> LineIntegrals:
+        """Line integrals of the matter at `time` [s] on the instrument's raster, in the exposures `index`."""
+        matter = self.object.at(float(time))
+        if isinstance(matter, Component):  # it takes poses, which cost no time to make
+            assert isinstance(matter, TrainableObject)
+            return LineIntegrals.of_any(matter.project(self._poses(index)))
+        return LineIntegrals.of_any(matter.project(self._views(index)))
+
+    def _seen(self, time: float, index: Tensor | None) -> Tensor:
+        lines, planned, alignment = self.lines(time, index), self.instrument.exposures, self.alignment
+        if alignment is None:
+            return self.instrument.frames(lines, index)
+        distance, sigma = alignment.distance(planned, index), alignment.psf_sigma_px(planned, index)
+        return self.instrument.frames(lines, index, distance, sigma)
+
+    def _of_several_times(self, index: Tensor | None, delay: float) -> Tensor:
+        every = np.arange(len(self.instrument.views))
+        chosen = every if index is None else index.cpu().numpy()
+        of = self.instrument.exposures.time[chosen]
+        places = [np.flatnonzero(of == time) for time in np.unique(of)]
+        device = self.instrument.device
+        parts = [self._seen(float(of[at[0]]) + delay, torch.from_numpy(chosen[at]).to(device)) for at in places]
+        return torch.cat(parts)[torch.from_numpy(np.argsort(np.concatenate(places))).to(device)]
+
+    def _poses(self, index: Tensor | None) -> Poses:
+        planned, pixel = self.instrument.poses, self.instrument.exposures.views.pixel_size
+        if self.alignment is not None:
+            return self.alignment.poses(planned, pixel, index)
+        return planned if index is None else planned[index]
+
+    def _views(self, index: Tensor | None) -> Views:
+        if self.alignment is not None:
+            return self._poses(index).views()
+        return self.instrument.views if index is None else self.instrument.views[index.cpu().numpy()]
+
+
+def measure(obj: Object, exposures: Exposures, oversample: int = 1, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Frames [N, H, W] (relative intensity) that `obj` gives in `exposures`, on waves `oversample` times finer."""
+    return Model(obj, Instrument(exposures, oversample, dtype)).frames()
