@@ -31,7 +31,8 @@ def main(out: Path) -> None:
     hs.write_scan(out / "scan.nxs", scan)
 
     # The reconstruction. What you know of the matter goes in as the prior: its δ and β here; else only their ratio,
-    # hs.MaterialPrior.of_ratio(2800), or nothing, hs.MaterialPrior(). The preset "default" is better and slower.
+    # hs.MaterialPrior.of_ratio(2800), or nothing, hs.MaterialPrior.unknown(). Without a method it is hs.Gaussians(),
+    # which is better and slower than the preset "fast".
     prior = hs.MaterialPrior.known(haemoglobin)
     run = hs.RunFolder(out / "run")
     result = hs.reconstruct(scan, prior, hs.preset("fast"), seed=0, folder=run)
@@ -39,11 +40,11 @@ def main(out: Path) -> None:
     # How good is it? On the held-out views, and against the true volume, which only a simulation has.
     grid = hs.Grid.of_views(views)
     scores = hs.evaluate(result, scan, truth=scene.voxelise(grid))
-    print(f"{len(result.cloud)} Gaussians in {sum(result.timing.values()):.1f} s")
+    print(f"{len(result.object)} Gaussians in {sum(result.timing.values()):.1f} s")
     print(*scores.lines(), sep="\n")
 
     # δ and β on voxels, for any other program (HDF5: /delta and /beta, [z, y, x]).
-    hs.write_volume(out / "volume.h5", result.cloud.voxelise(grid))
+    hs.write_volume(out / "volume.h5", result.object.voxelise(grid))
     print(f"wrote {out / 'scan.nxs'}, {out / 'run'} and {out / 'volume.h5'}")
 
 

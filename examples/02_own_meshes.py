@@ -35,13 +35,13 @@ def main(out: Path) -> None:
     prior = hs.MaterialPrior.known(hs.HAEMOGLOBIN.delta_beta(ENERGY_KEV))
     result = hs.reconstruct(scan, prior, hs.preset("fast"))
     grid = hs.Grid.of_views(views)
-    truth, found = scene.voxelise(grid), result.cloud.voxelise(grid)
+    truth, found = scene.voxelise(grid), result.object.voxelise(grid)
     print(*hs.evaluate(result, scan, truth=truth).lines(), sep="\n")
 
     _, axes = plt.subplots(1, 3, figsize=(9, 3.4), layout="constrained")
     axes[0].imshow(scan.frames[0], cmap="gray")
     for axis, volume, title in ((axes[1], truth, "true δ, largest along z"), (axes[2], found, "reconstructed δ")):
-        axis.imshow(volume.delta.max(axis=0), cmap="magma", vmin=0, vmax=prior.delta)
+        axis.imshow(volume.delta.max(axis=0), cmap="magma", vmin=0, vmax=float(truth.delta.max()))
         axis.set_title(title)
     axes[0].set_title("hologram of the first view")
     plt.savefig(out / "hologram_and_volumes.png", dpi=100)

@@ -32,11 +32,13 @@ def main(out: Path) -> None:
         numbers = hs.evaluate(result, judged, truth=truth).headline()
         light = f"{photons} photons a pixel" if photons else "no noise"
         print(
-            f"{light}: {len(result.cloud)} Gaussians, SSIM {numbers['ssim']:.3f}, FRCM {numbers['frcm']:.3f}, "
+            f"{light}: {len(result.object)} Gaussians, SSIM {numbers['ssim']:.3f}, FRCM {numbers['frcm']:.3f}, "
             f"Dice {numbers['dice']:.3f}, error of δ {numbers['relative_error_delta']:.3f}"
         )
         column[0].imshow(scan.frames[1], cmap="gray", vmin=clean.frames.min(), vmax=clean.frames.max())
-        column[1].imshow(result.cloud.voxelise(grid).delta.max(axis=0), cmap="magma", vmin=0, vmax=1.2 * material.delta)
+        column[1].imshow(
+            result.object.voxelise(grid).delta.max(axis=0), cmap="magma", vmin=0, vmax=1.2 * material.delta
+        )
         column[0].set_title(light)
     axes[0, 0].set_ylabel("a training frame")
     axes[1, 0].set_ylabel("largest δ along z")

@@ -1,4 +1,4 @@
-"""Specimens that move: cells in a channel, grown into a time series of mesh files. What `holosplat grow` does."""
+"""Specimens that move: cells in a channel, grown into a time series of mesh files (`holosplat grow`)."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Growth:
     medium: Medium = field(default_factory=Medium)
 
     def check(self) -> None:
-        """`InputError` for what cannot be; the other classes check the rest."""
+        """`InputError` for impossible values; the other classes check the rest."""
         Channel(self.box, self.flow)
         for name, most in (("cells", MOST_CELLS), ("snapshots", MOST_SNAPSHOTS)):
             number = getattr(self, name)
@@ -98,7 +98,7 @@ class Growth:
 
 @dataclass(frozen=True)
 class Grown:
-    """What came out: the state at the last snapshot, the greatest relative changes of any cell's volume and area at a
+    """The result: the state at the last snapshot, the greatest relative changes of any cell's volume and area at a
     snapshot of this run, and the snapshots in the folder."""
 
     state: State

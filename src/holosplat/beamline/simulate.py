@@ -79,7 +79,7 @@ class Simulation:
         return self.oversample or resolving_oversample(exposures, SIMULATED_FRINGE_SAMPLES, at_least=4)
 
     def provenance(self, exposures: Exposures) -> dict[str, str]:
-        """What a scan file says of how its frames were made."""
+        """The entries of a scan file's provenance."""
         made_by = {
             "simulated_with_oversample": str(self.samples(exposures)),
             "photons_per_pixel": str(self.photons_per_pixel or "none"),
@@ -90,7 +90,7 @@ class Simulation:
 
 
 def simulated_frames(obj: Object, exposures: Exposures, how: Simulation = Simulation()) -> Iterator[np.ndarray]:
-    """Frames [H, W] float32 of `obj`, one after another: memory is that of one frame, however many there are.
+    """Frames [H, W] float32 of `obj`, one after another; only one is in memory.
 
     Plain torch (the `reference` of the optics, which no fit uses) on a fine raster in single precision, 1e-6 of the
     contrast from double precision. A frame is the mean of the intensities at its pulses, with noise if asked for.

@@ -81,7 +81,8 @@ class Plan:
     problem, schedule: what is minimised, and how long. optimiser: makes the optimiser of the free parameters. rates:
     (what is left of them, step) → the rate of each parameter. events: what the method does beside the steps. judge:
     of the validation frames, None without any. grid: the volume that terms look at in blocks, None without such terms.
-    generator: everything random, None for one made of the seed.
+    generator: everything random, None for one made of the seed. capture: whether steps on a GPU may be captured in CUDA
+    graphs: their launches must not depend on values.
     """
 
     problem: Problem
@@ -92,6 +93,7 @@ class Plan:
     judge: Judge | None = None
     grid: Grid | None = None
     generator: torch.Generator | None = None
+    capture: bool = True
 
 
 @dataclass
@@ -125,7 +127,8 @@ class Fit:
         self.step, self.seconds, self.stopped_early = 0, 0.0, False
         self._names: dict[int, list[str]] = {}
         self._unread: list[_Unread] = []
-        self._capture = CapturedStep(self._work) if self._device.type == "cuda" else None
+        captured = plan.capture and self._device.type == "cuda"
+        self._capture = CapturedStep(self._work) if captured else None
         self._best = _Best(self.trainable.snapshot())
 
     @property

@@ -48,7 +48,7 @@ def write_volume(path: str | Path, volume: Volume) -> None:
 
 
 def write_slabs(path: str | Path, grid: Grid, slabs: Iterable[tuple[int, Volume]]) -> None:
-    """Write the volume on `grid` of which `slabs` gives parts, each with the y index of its first slice.
+    """Write the volume on `grid` from its parts `slabs`, each with the y index of its first slice.
 
     The parts must cover the grid; `path` is replaced only once all are written.
     """
@@ -64,7 +64,8 @@ def write_slabs(path: str | Path, grid: Grid, slabs: Iterable[tuple[int, Volume]
 
 
 def write_voxels(path: str | Path, obj: Object, grid: Grid, on_progress: Advance = lambda fraction: None) -> None:
-    """Write `obj` voxelised on `grid`, slab by slab: memory is that of `SLAB_VOXELS` voxels, however large the grid.
+    """Write `obj` voxelised on `grid`, slab by slab; at most `SLAB_VOXELS` voxels are in memory, however large the
+    grid.
 
     `on_progress(fraction)` is called after each slab.
     """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
@@ -12,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
+from ..backends import device, resolve
 from ..baselines import HolographicTV
 from ..checks import at_least, require
 from ..fit.loop import Fit, Plan, Record
@@ -28,6 +28,7 @@ from ..model import Model
 from ..representations import NeuralField, Stored, VoxelGrid
 from ..representations.neural_field import Network, grown
 from ..scan import Scan
+from .gaussian_options import Backend
 from .ground import ExtraTerm, ground
 from .method import Stage, Task, run_quietly
 from .voxels import HolographicStage
@@ -83,6 +84,8 @@ class NeuralFit:
     """Of the stage through the waves; `seconds` is the limit of both stages together, half of it each."""
     terms: tuple[ExtraTerm, ...] = ()
     """Further terms by name, through the waves."""
+    backend: Backend = "cpu"
+    """What computes both stages; `cuda` pays for large fields only."""
 
     def __post_init__(self) -> None:
         at_least(
@@ -106,6 +109,11 @@ class NeuralFields:
     def stages(self) -> Sequence[Stage]:
         """The start, and the field, which learns the start's thickness before its fit."""
         return (HolographicStage(self.volume), NeuralStage(self.fit))
+
+    def on_backend(self, backend: Backend) -> NeuralFields:
+        """The same method computed by `backend`; the start runs on the CPU, or in plain torch."""
+        volume = replace(self.volume, backend="reference" if backend == "reference" else "cpu")
+        return replace(self, fit=replace(self.fit, backend=backend), volume=volume)
 
     def with_effort(self, effort: float) -> NeuralFields:
         """The same method with `effort` times the steps, at least one."""
@@ -156,13 +164,14 @@ def warmed_up(task: Task, matter: Matter, thickness: Tensor, options: NeuralFit)
 
 
 def _warm_up(scan: Scan, field: NeuralField, target: Tensor, options: NeuralFit, seed: int) -> Fit:
-    generator = torch.Generator().manual_seed(seed)
+    backend = resolve(options.backend)
+    generator = torch.Generator(device(backend)).manual_seed(seed)
     share = min(1.0, options.warmup_rays / target.numel())
     steps = options.warmup_steps
     schedule = replace(options.schedule, steps=steps, views_per_step=0, validation_views=0)
-    base = ground(scan, field, field.matter, options.objective, schedule, "cpu")
+    base = ground(scan, field.on(backend), field.matter, options.objective, schedule, backend)
     terms = (
-        RetrievedThickness(target, scan.views, share, generator),
+        RetrievedThickness(target.to(generator.device), scan.views, share, generator),
         FieldVariation(_weight(base.frames.spectral, options), options.probes, generator),
     )
     return Fit(_plan(Problem(base.model, terms), schedule, options, generator), seed)
@@ -170,10 +179,11 @@ def _warm_up(scan: Scan, field: NeuralField, target: Tensor, options: NeuralFit,
 
 def waves_fit(scan: Scan, field: NeuralField, options: NeuralFit, seed: int = 0) -> Fit:
     """The fit of `field` to the training frames of `scan`, made ready."""
-    generator = torch.Generator().manual_seed(seed + SECOND_STAGE)
-    drawn = copy.copy(field)
+    backend = resolve(options.backend)
+    generator = torch.Generator(device(backend)).manual_seed(seed + SECOND_STAGE)
+    drawn = field.on(backend)
     drawn.jitter = generator
-    base = ground(scan, drawn, field.matter, options.objective, options.schedule, "cpu")
+    base = ground(scan, drawn, field.matter, options.objective, options.schedule, backend)
     weight = _weight(base.frames.spectral, options) / len(base.train)
     variation = FieldVariation(weight, options.probes, generator)
     problem = Problem(base.model, (base.frames, variation, *base.extra(options.terms)))
@@ -195,10 +205,11 @@ def _plan(problem: Problem, schedule: Schedule, options: NeuralFit, generator: t
     return Plan(
         problem=problem,
         schedule=replace(schedule, seconds=0.5 * schedule.seconds),
-        optimiser=lambda leaves: Adam(leaves, "cpu", groups),
+        optimiser=lambda leaves: Adam(leaves, problem.model.instrument.backend, groups),
         rates=lambda factor, step: dict.fromkeys(groups, options.rate * factor),
         events=(PruneEvent(options, field.mask),),
         generator=generator,
+        capture=False,  # how many samples a step has depends on the mask
     )
 
 

@@ -1,1 +1,1 @@
-"""What an experiment would see, before it is done or simulated."""
+"""The contrast, resolution and data rate of an experiment, before it is done or simulated."""

@@ -35,8 +35,8 @@ class Retrieval(Protocol):
     ) -> Tensor:
         """Thickness [V, H, W] in metres of one material (δ > 0, β of any sign) from relative intensities [V, H, W].
 
-        The result has the frames' type, float32 or float64. `InputError` for frames that are not those of
-        `exposures`, or not finite, or δ ≤ 0.
+        The result has the frames' type, float32 or float64. `InputError` for frames that do not match `exposures` or
+        are not finite, or δ ≤ 0.
         """
         ...
 

@@ -21,8 +21,8 @@ COUPLING = 0.05
 
 @dataclass(frozen=True)
 class ADMM(Regularised):
-    """Options: iterations are those of the multipliers, weight that of total variation, for slopes of the mean that the
-    estimate has."""
+    """Options. iterations: updates of the multipliers; weight: of total variation, relative to the mean slope of the
+    estimate."""
 
 
 def admm(
@@ -65,7 +65,7 @@ def _alternate(model: WaveModel, options: ADMM, on_progress: Advance) -> Tensor:
     damping = torch.full_like(misfit, FIRST_DAMPING).cpu()
 
     def coupled(at: Tensor) -> Tensor:
-        """What the constraints add to the misfit [V]."""
+        """The terms of the constraints in the objective [V]."""
         away = (gradient(at) - slopes + slopes_dual).double().square().sum(dim=(0, 2, 3))
         apart = (at - copy + copy_dual).double().square().sum(dim=(1, 2))
         return 0.5 * (pull[:, 0, 0] * away + pull_copy * apart)

@@ -18,8 +18,8 @@ from .model import DARKEST, WaveModel, view_by_view
 
 @dataclass(frozen=True)
 class Projections:
-    """Options. iterations: there and back; feedback: of what violates the bounds (hybrid input–output only);
-    noise: standard deviation of the frames (None: estimated from them); backend: see `backends`."""
+    """Options. iterations: pairs of projections; feedback: factor of the values that violate the bounds (hybrid
+    input–output only); noise: standard deviation of the frames (None: estimated from them); backend: see `backends`."""
 
     iterations: int = 40
     feedback: float = 0.9

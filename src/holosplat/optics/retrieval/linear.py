@@ -42,7 +42,7 @@ SHARP_EDGED = Prior()
 @dataclass(frozen=True)
 class Linear:
     """Options of the filters. noise: standard deviation of the frames (None: estimated from them; 0: none);
-    model_error: what no filter explains, as a share of the frames' contrast; prior: power expected of the phase."""
+    model_error: the part of the frames' contrast that no filter explains; prior: the expected power of the phase."""
 
     noise: float | None = None
     model_error: float = 0.01
