@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers.strategies import NAMES
+from holosplat.methods.presets import preset, preset_names
 from holosplat.tables import changed, from_table, merged, overridden, to_table
-from holosplat.workflows.settings import presets
 
 FLOATS = st.floats(allow_nan=False, allow_infinity=False)
 
@@ -92,7 +92,7 @@ def test_a_field_is_set_by_its_path(settings, first, steps):
     assert found.rates == dataclasses.replace(settings.rates, first=first)
 
 
-@pytest.mark.parametrize("name", presets())
+@pytest.mark.parametrize("name", preset_names())
 def test_presets_come_back_through_json(name):
-    settings = presets()[name]
+    settings = preset(name)
     assert from_table(type(settings), json.loads(json.dumps(to_table(settings)))) == settings
