@@ -17,8 +17,8 @@ def main(out: Path) -> None:
     """Simulate one scan and reconstruct it with three priors."""
     out.mkdir(parents=True, exist_ok=True)
     views = hs.Views.evenly_spaced(12, shape=(64, 64), pixel_size=0.5e-6)
-    material = hs.HAEMOGLOBIN.delta_beta(20.0)
-    cells = hs.random_cells(4, box=(views.width,) * 3, seed=2)
+    material = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
+    cells = hs.specimens.random_cells(4, box=(views.width,) * 3, seed=2)
     scene = hs.MeshScene.of_one_material(cells, material)
     scan = hs.simulate(scene, hs.Exposures.of(views, energy_kev=20.0, distance=0.1), photons_per_pixel=20_000, seed=2)
 
@@ -28,7 +28,7 @@ def main(out: Path) -> None:
     priors = {
         "δ and β known": hs.MaterialPrior.known(material),
         "δ/β known": hs.MaterialPrior.of_ratio(ratio),
-        "nothing known": hs.MaterialPrior(),
+        "nothing known": hs.MaterialPrior.unknown(),
     }
     grid = hs.Grid.of_views(views)
     truth = scene.voxelise(grid)
@@ -42,7 +42,7 @@ def main(out: Path) -> None:
             f"{name}: found δ = {found.delta:.3e}, δ/β = {found.ratio:.0f}; Dice {numbers['dice']:.3f}, "
             f"error of δ {numbers['relative_error_delta']:.3f}, SSIM of held-out frames {numbers['ssim']:.3f}"
         )
-        axis.imshow(result.cloud.voxelise(grid).delta.max(axis=0), cmap="magma", vmin=0, vmax=1.2 * material.delta)
+        axis.imshow(result.object.voxelise(grid).delta.max(axis=0), cmap="magma", vmin=0, vmax=1.2 * material.delta)
         axis.set_title(name)
     plt.savefig(out / "largest_delta_along_z.png", dpi=100)
 

@@ -17,8 +17,8 @@ def main(out: Path) -> None:
     """Reconstruct the same cells from frames of fewer and fewer photons."""
     out.mkdir(parents=True, exist_ok=True)
     views = hs.Views.evenly_spaced(12, shape=(64, 64), pixel_size=0.5e-6)
-    material = hs.HAEMOGLOBIN.delta_beta(20.0)
-    scene = hs.MeshScene.of_one_material(hs.random_cells(4, box=(views.width,) * 3, seed=3), material)
+    material = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
+    scene = hs.MeshScene.of_one_material(hs.specimens.random_cells(4, box=(views.width,) * 3, seed=3), material)
     clean = hs.simulate(scene, hs.Exposures.of(views, energy_kev=20.0, distance=0.1))
     grid = hs.Grid.of_views(views)
     truth = scene.voxelise(grid)
@@ -32,11 +32,13 @@ def main(out: Path) -> None:
         numbers = hs.evaluate(result, judged, truth=truth).headline()
         light = f"{photons} photons a pixel" if photons else "no noise"
         print(
-            f"{light}: {len(result.cloud)} Gaussians, SSIM {numbers['ssim']:.3f}, FRCM {numbers['frcm']:.3f}, "
+            f"{light}: {len(result.object)} Gaussians, SSIM {numbers['ssim']:.3f}, FRCM {numbers['frcm']:.3f}, "
             f"Dice {numbers['dice']:.3f}, error of δ {numbers['relative_error_delta']:.3f}"
         )
         column[0].imshow(scan.frames[1], cmap="gray", vmin=clean.frames.min(), vmax=clean.frames.max())
-        column[1].imshow(result.cloud.voxelise(grid).delta.max(axis=0), cmap="magma", vmin=0, vmax=1.2 * material.delta)
+        column[1].imshow(
+            result.object.voxelise(grid).delta.max(axis=0), cmap="magma", vmin=0, vmax=1.2 * material.delta
+        )
         column[0].set_title(light)
     axes[0, 0].set_ylabel("a training frame")
     axes[1, 0].set_ylabel("largest δ along z")

@@ -13,30 +13,31 @@ import holosplat as hs
 
 
 def main(out: Path) -> None:
-    """Gaussians, surfaces from them, both against the truth; the bodies as a VTK file."""
+    """Gaussians and surfaces of the same scan, both against the truth; the bodies as a VTK file."""
     out.mkdir(parents=True, exist_ok=True)
     views = hs.Views.evenly_spaced(12, shape=(64, 64), pixel_size=0.5e-6)
-    material = hs.HAEMOGLOBIN.delta_beta(20.0)
-    scene = hs.MeshScene.of_one_material(hs.random_cells(4, box=(views.width,) * 3, seed=4), material)
+    material = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
+    scene = hs.MeshScene.of_one_material(hs.specimens.random_cells(4, box=(views.width,) * 3, seed=4), material)
     scan = hs.simulate(scene, hs.Exposures.of(views, energy_kev=20.0, distance=0.1), photons_per_pixel=10_000, seed=4)
 
-    result = hs.reconstruct(scan, hs.MaterialPrior.known(material), hs.preset("fast"))
-    surfaces = hs.refine_surfaces(result.cloud, scan)
-
+    # A method is an object that holds its options. Surfaces start from the Gaussians of their own options.
+    fast = hs.preset("fast")
     grid = hs.Grid.of_views(views)
-    volumes = {"truth": scene, "Gaussians": result.cloud, "surfaces": surfaces}
+    truth = scene.voxelise(grid)
     _, axes = plt.subplots(1, 3, figsize=(9, 3.4), layout="constrained")
-    truth = scene.voxelise(grid).delta
-    for axis, (name, thing) in zip(axes, volumes.items()):
-        delta = thing.voxelise(grid).delta
-        error = float(((delta - truth) ** 2).sum() ** 0.5 / (truth**2).sum() ** 0.5)
-        print(f"{name}: relative error of δ {error:.3f}")
-        axis.imshow(delta.max(axis=0), cmap="magma", vmin=0, vmax=1.2 * material.delta)
+    volumes = {"truth": truth}
+    for method in (fast, hs.Surfaces(gaussians=fast)):
+        result = hs.reconstruct(scan, hs.MaterialPrior.known(material), method)
+        scores = hs.evaluate(result, scan, truth=truth).headline()
+        print(f"{method.kind}: Dice {scores['dice']:.3f}, error of δ {scores['relative_error_delta']:.3f}")
+        volumes[method.kind] = result.object.voxelise(grid)
+    for axis, (name, volume) in zip(axes, volumes.items()):
+        axis.imshow(volume.delta.max(axis=0), cmap="magma", vmin=0, vmax=1.2 * material.delta)
         axis.set_title(name)
     plt.savefig(out / "largest_delta_along_z.png", dpi=100)
 
-    bodies = surfaces.mesh()
-    hs.write_mesh(out / "bodies.vtk", bodies, length_unit="um")
+    bodies = result.object.mesh()
+    hs.io.write_mesh(out / "bodies.vtk", bodies, length_unit="um")
     print(f"{len(bodies.vertices)} vertices, {len(bodies.faces)} triangles")
 
 

@@ -17,7 +17,7 @@ from . import native
 from .checks import InputError, MissingError
 
 NAMES = ("auto", "cpu", "cuda", "reference")
-"""What one may ask for."""
+"""Names of backends that a user may give."""
 
 DESCRIPTIONS = {
     "cpu": "compiled C++ kernels, float32, SSE2 to AVX-512",
@@ -59,10 +59,10 @@ def support_table() -> list[list[str]]:
 
 
 def resolve(name: str) -> str:
-    """The backend that `name` stands for here: `cpu`, `cuda` or `reference`.
+    """The backend that `name` stands for on this machine: `cpu`, `cuda` or `reference`.
 
-    Errors: `InputError` if the name is unknown, or what it needs is missing (with the reasons of both `cuda` and
-    `cpu`, since one of them is what a user then wants).
+    Errors: `InputError` if the name is unknown, or its requirements are missing (with the reasons for both `cuda` and
+    `cpu`, since the user then needs one of them).
     """
     if name not in NAMES:
         raise InputError(f"backend must be one of {', '.join(NAMES)}, but it is {name!r}.")

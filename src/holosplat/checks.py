@@ -1,7 +1,7 @@
 """Bad input, said clearly: one exception type and the few checks every module shares.
 
-A message is one sentence (or two) that names the field, what it must be, what it is, and what to do.
-The command line prints it without a traceback and exits with a non-zero code.
+A message is one sentence (or two) that names the field, the allowed values, the value given, and the remedy. The
+command line prints it without a traceback and exits with a non-zero code.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ class InputError(ValueError):
 
 
 class MissingError(InputError, RuntimeError):
-    """Something that has to be installed is not; the message says what, and the ways out."""
+    """A required package is not installed; the message names it, and the ways out."""
 
 
 def require(condition: bool, message: str) -> None:

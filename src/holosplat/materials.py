@@ -1,9 +1,9 @@
 """Matter to refractive index: δ and β of formulas and mixtures, n = 1 - δ + iβ (docs/conventions.md).
 
-Atomic scattering factors are those of Chantler (1995, J. Phys. Chem. Ref. Data 24, 71; 2000, ibid. 29, 597),
-read through `xraydb`: δ = r_e λ² Σ n_j f1_j / 2π, β = r_e λ² Σ n_j f2_j / 2π. β is photoabsorption only:
-photons scattered out of the beam (a third of water's attenuation at 20 keV) are not in it.
-Densities are in g/cm³, the unit chemists and tables use; energies in keV.
+Atomic scattering factors come from Chantler (1995, J. Phys. Chem. Ref. Data 24, 71; 2000, ibid. 29, 597) through
+`xraydb`: δ = r_e λ² Σ n_j f1_j / 2π, β = r_e λ² Σ n_j f2_j / 2π. β is photoabsorption only: photons scattered out of
+the beam (a third of water's attenuation at 20 keV) are not in it. Densities are in g/cm³, the unit chemists and tables
+use; energies in keV.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from .tables import read_table
 ENERGY_RANGE_KEV = (0.1, 400.0)
 """Where Chantler's tables hold both f1 and f2 [keV]."""
 MAX_DENSITY_G_CM3 = 30.0
-"""Above osmium (22.6 g/cm³), the densest element: what is denser is a unit mixed up."""
+"""Above osmium (22.6 g/cm³), the densest element: a higher density has a wrong unit."""
 
 
 def _density(name: str, value: Any) -> float:
@@ -124,9 +124,9 @@ def dispersion(
 ) -> np.ndarray:
     """Factors [N, 2] of δ and β at photon energies [N] over those at a reference energy [keV].
 
-    The one rule for matter in frames of several energies. Of a `material` (against a `medium`, if there is one) they
-    are those of its own δ and β; of matter without a formula, those of `scan.far_from_edges`. A factor of what is
-    zero at the reference energy is 1.
+    The one rule for matter in frames of several energies. For a `material` (against a `medium`, if there is one) they
+    follow from its own δ and β; for matter without a formula, from `scan.far_from_edges`. A factor of what is zero at
+    the reference energy is 1.
     """
     if material is None:
         return far_from_edges(energy_kev, reference_kev)

@@ -13,14 +13,15 @@ M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_MMAP_MAX = -1, -3, -4
 INSIDE = {M_MMAP_MAX: 0, M_TRIM_THRESHOLD: 1 << 30}
 """No array is mapped on its own, and up to 1 GB of free memory is kept."""
 OUTSIDE = {M_MMAP_MAX: 65536, M_MMAP_THRESHOLD: 1 << 25, M_TRIM_THRESHOLD: 1 << 26}
-"""What glibc's thresholds, left to themselves, grow to where large arrays come and go."""
+"""The size to which glibc's thresholds grow by themselves where large arrays come and go."""
 
 _lock, _depth = threading.Lock(), 0
 
 
 @contextmanager
 def memory_kept() -> Iterator[None]:
-    """Keep what is freed inside, for the same arrays are needed again; give it back at the end of the outermost block.
+    """Keep memory that is freed inside for the next arrays of the same sizes; return it at the end of the outermost
+    block.
 
     Otherwise glibc returns the memory of large arrays to the system after every step, and each of their pages is
     found missing, mapped and zeroed again in the next. Other C libraries are left alone.

@@ -21,10 +21,10 @@ DISTANCE_RANGE_M = (1e-9, 1e4)
 class Exposures:
     """How each of N frames was taken: poses and raster (`views`), and the physics of its beam and detector.
 
-    energy_kev: [N] photon energies [keV]; distance: [N] effective propagation distances [m];
-    psf_sigma_px: [N] standard deviations of the Gaussian point-spread function [detector pixels];
-    time: [N] seconds since the first frame. A number stands for N equal ones.
-    reference_kev: the energy [keV] at which δ and β of matter are said (None: that of the first frame).
+    energy_kev: [N] photon energies [keV]; distance: [N] effective propagation distances [m]; psf_sigma_px: [N] standard
+    deviations of the Gaussian point-spread function [detector pixels]; time: [N] seconds since the first frame. A
+    number stands for N equal ones. reference_kev: the energy [keV] for which δ and β of matter are given (None: the
+    energy of the first frame).
     """
 
     views: Views
@@ -75,7 +75,8 @@ class Exposures:
 
     @property
     def reference_energy(self) -> float:
-        """The energy [keV] at which δ and β of matter are said: `reference_kev`, or else that of the first frame."""
+        """The energy [keV] for which δ and β of matter are given: `reference_kev`, or else the energy of the first
+        frame."""
         return float(self.energy_kev[0]) if self.reference_kev is None else float(self.reference_kev)
 
     def one_energy(self, user: str) -> float:
@@ -106,9 +107,9 @@ class Exposures:
 def far_from_edges(energy_kev: np.ndarray, reference_kev: float) -> np.ndarray:
     """Factors [N, 2] of δ and β at energies [N] over those at a reference energy [keV]: δ ∝ E⁻², β ∝ E⁻⁴.
 
-    δ is that of free electrons, and photoabsorption falls as E⁻³ per atom, with μ = 2kβ (Als-Nielsen & McMorrow 2011,
-    *Elements of Modern X-ray Physics*, chapters 1 and 3). It holds far above all absorption edges of the matter, over
-    a narrow range of energies; where the formula is known, `materials.dispersion` has the tables' own values.
+    The electrons count as free for δ, and photoabsorption falls as E⁻³ per atom, with μ = 2kβ (Als-Nielsen & McMorrow
+    2011, *Elements of Modern X-ray Physics*, chapters 1 and 3). It holds far above all absorption edges of the matter,
+    over a narrow range of energies; where the formula is known, `materials.dispersion` has the tables' own values.
     """
     ratio = np.asarray(energy_kev, dtype=np.float64) / reference_kev
     return np.stack((ratio**-2, ratio**-4), axis=-1)
@@ -133,8 +134,9 @@ class Scan:
     """Frames and how they were taken.
 
     frames: [N, H, W] float32 intensity relative to the flat field; given as `Frames`, they are read into memory when
-    `scan.frames` is first asked for. `scan.source`, `scan[index]`, `blocks` and what is made of these do not read all.
-    is_test: [N] bool, frames held out of the fit; provenance: what made the scan, as flat text entries.
+    `scan.frames` is first used. `scan.source`, `scan[index]`, `blocks` and scans made from them do not read all frames.
+    is_test: [N] bool, frames held out of the fit.
+    provenance: origin of the scan, as flat text entries.
     """
 
     if TYPE_CHECKING:
@@ -174,6 +176,10 @@ class Scan:
         frames = picked(self.source, index)
         return Scan.of(frames, self.exposures[index], self.is_test[index], self.provenance)
 
+    def in_memory(self) -> Scan:
+        """This scan with all its frames read, where bad ones are named: for who uses each of them, more than once."""
+        return Scan.of(self.frames, self.exposures, self.is_test, self.provenance)
+
     def blocks(self) -> Iterator[np.ndarray]:
         """All frames in turn, some at once, [K, H, W] float32: a few of a long series are in memory at a time."""
         return blocks(self.source)
@@ -190,16 +196,17 @@ class Scan:
 
     @property
     def is_series(self) -> bool:
-        """Whether the frames show several times of what may move: some of them simultaneous, or all from one side.
+        """Whether the frames show a possibly moving object at several times: some are simultaneous, or all have one
+        direction.
 
-        Frames of as many times as directions are a scan of one object that is turned, as in tomography.
+        Frames of as many times as directions are a scan of one turning object, as in tomography.
         """
         count = len(self.instants)
         one_side = np.allclose(self.views.rotations, self.views.rotations[0], atol=1e-6)
         return count > 1 and (count < len(self) or bool(one_side))
 
     def at_instant(self, index: int) -> Scan:
-        """The frames of the instant `index` (0 is the first), as a scan of what does not move: all at time 0."""
+        """The frames of the instant `index` (0 is the first), as a scan of a static object: all at time 0."""
         last = len(self.instants) - 1
         require(0 <= index <= last, f"the scan's instants are counted from 0 to {last}, but {index} is asked for.")
         return self[np.flatnonzero(self.exposures.time == self.instants[index])].as_static()

@@ -45,7 +45,8 @@ class LineIntegrals:
 
     @classmethod
     def of_any(cls, lines: LineIntegrals | tuple[torch.Tensor, torch.Tensor]) -> LineIntegrals:
-        """What an `Object` projects to: these themselves, or the integrals `(B, D)` [V, H, W] in metres."""
+        """From the projections of an `Object`: line integrals by channels, or the integrals `(B, D)` [V, H, W] in
+        metres."""
         return lines if isinstance(lines, LineIntegrals) else cls.of(*lines)
 
     def __getitem__(self, index: int) -> torch.Tensor:
@@ -66,7 +67,7 @@ class Object(Protocol):
         ...
 
     def project(self, views: Views, /) -> LineIntegrals | tuple[torch.Tensor, torch.Tensor]:
-        """Line integrals `(B, D)` of β and δ along the beam, each [V, H, W] in metres, or what unpacks to them."""
+        """Line integrals `(B, D)` of β and δ along the beam, each [V, H, W] in metres, or `LineIntegrals`."""
         ...
 
     def voxelise(self, grid: Grid) -> Volume:

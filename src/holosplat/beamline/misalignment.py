@@ -40,7 +40,7 @@ class Misalignment:
         return self.shift_px > 0 or self.rotation_deg > 0 or self.distance > 0
 
     def true_exposures(self, nominal: Exposures) -> Exposures:
-        """What the exposures `nominal` [V] really are: `R' = exp([ω]×) R`, `s' = s + p e`, `z' = z (1 + ε)`.
+        """The true exposures [V] of the planned ones, `nominal`: `R' = exp([ω]×) R`, `s' = s + p e`, `z' = z (1 + ε)`.
 
         ω, e and ε come from generators of their own, so that one kind of error does not change with another's size.
         """

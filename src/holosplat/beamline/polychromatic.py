@@ -44,7 +44,7 @@ def frames_by_energy(
 ) -> Iterator[np.ndarray]:
     """Frames [H, W] float32 as `simulate.simulated_frames`, of exposures of several energies.
 
-    `matter_at(energy_kev)` is the object with its δ and β at that energy: each frame sees those of its own.
+    `matter_at(energy_kev)` is the object with its δ and β at that energy; each frame uses its own energy.
     """
     quiet = replace(how, photons_per_pixel=None, oversample=how.samples(exposures))
     noise = np.random.default_rng(how.seed)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from ..optics.coherence import joined_blur_px
 from ..optics.illumination import Illumination, PulseModel, Pulses
 from ..optics.noise import PHOTON_RANGE
 from ..optics.resampling import FLIPS, Flip
+from ..progress import Advance
 from ..scan import Exposures, Scan
 
 DEAD_BIT, HOT_BIT = 1 << 1, 1 << 3
@@ -27,7 +27,7 @@ DEAD_BIT, HOT_BIT = 1 << 1, 1 << 3
 
 @dataclass(frozen=True)
 class RecordingOptions:
-    """What is recorded, beside the scan itself."""
+    """Options of a recording."""
 
     photons_per_pixel: float = 10_000.0
     """Mean photons detected in a pixel without the object."""
@@ -36,7 +36,7 @@ class RecordingOptions:
     darks: int = 20
     """Frames without light; they come first."""
     flip: Flip = "none"
-    """What the detector sees reversed: the order of its rows, of its columns, or both."""
+    """The order that the detector reverses: of its rows, of its columns, or of both."""
     seed: int = 0
     """Seed of everything random."""
 
@@ -49,9 +49,9 @@ class RecordingOptions:
 
 @dataclass(frozen=True)
 class Recorded:
-    """What was recorded: numbers of frames, the camera's gain [counts a photon], defective and saturated pixels.
+    """The recording: numbers of frames, the camera's gain [counts a photon], defective and saturated pixels.
 
-    saturated: the share of the projections' good pixels that are.
+    saturated: the saturated part of the projections' good pixels.
     """
 
     projections: int
@@ -93,13 +93,13 @@ def record(
     camera: Camera,
     light: Illumination,
     truth: Path | None = None,
-    on_progress: Callable[[float], None] = lambda fraction: None,
+    on_progress: Advance = lambda fraction: None,
 ) -> Recorded:
     """Record the noise-free scan `source` as raw counts into `out`: darks, flats, then one pulse a projection.
 
-    The file is NXtomo with `image_key`, uint16, frame by frame. `truth` gets what a reconstruction must not see: the
-    light's mean, components and weights, pulse energies, and the sensor's maps (HDF5). `InputError` when the scan
-    already has photon noise, is raw itself, or holds no light.
+    The file is NXtomo with `image_key`, uint16, frame by frame. `truth` gets the values that a reconstruction must not
+    know: the light's mean, components and weights, pulse energies, and the sensor's maps (HDF5). `InputError` when the
+    scan already has photon noise, is raw itself, or holds no light.
     """
     for path in (out, truth) if truth else (out,):
         require_writable(path)
@@ -184,7 +184,7 @@ def _flipped(image: np.ndarray, flip: Flip) -> np.ndarray:
 
 
 def _provenance(options: RecordingOptions, camera: Camera, light: Illumination) -> dict[str, str]:
-    """What was asked for; what was drawn is in the truth file only."""
+    """The options; the random draws are in the truth file only."""
     return {
         f"{name}.{key}": str(value)
         for name, group in (("recorded", options), ("camera", camera), ("illumination", light))
@@ -193,7 +193,7 @@ def _provenance(options: RecordingOptions, camera: Camera, light: Illumination) 
 
 
 def _write_truth(path: Path, bench: _Bench, options: RecordingOptions) -> None:
-    """What was drawn, upright: light, pulses and sensor."""
+    """The random draws, upright: light, pulses and sensor."""
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         file.attrs["photons_per_pixel"] = options.photons_per_pixel
         for name in ("mean", "components", "deviations"):

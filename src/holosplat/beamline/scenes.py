@@ -1,4 +1,4 @@
-"""From mesh files to a scan: what `holosplat simulate` does."""
+"""From mesh files to a scene (`holosplat simulate`)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from ..units import LENGTH_UNITS, unit_factor
 
 @dataclass(frozen=True)
 class Filling:
-    """What fills the meshes: `material`, unless a file-name pattern of `table` matches, and what surrounds them.
+    """The material of the meshes: `material`, unless a file-name pattern of `table` matches; and the medium around
+    them.
 
     With `material=None` every mesh must match a pattern.
     """

@@ -1,8 +1,8 @@
-"""From snapshots of moving bodies to a time-resolved scan: what `holosplat simulate --frame-rate` does."""
+"""From snapshots of moving bodies to a time-resolved scan (`holosplat simulate --frame-rate`)."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -11,6 +11,7 @@ import numpy as np
 
 from ..checks import in_range, require
 from ..io.snapshots import find_snapshots
+from ..progress import Advance
 from ..specimens.mesh_series import ROUNDING, MeshSeries
 from ..units import LENGTH_UNITS, unit_factor
 from .scenes import Filling, field_centre, filled_scene
@@ -62,9 +63,9 @@ class Timing:
 @dataclass(frozen=True)
 class SeriesFiles:
     """How files of snapshots are read: length_unit of their coordinates; origin: the point on the rotation axis at the
-    field's centre, in that unit (default: the middle of what the bodies sweep); interval: seconds from one snapshot to
-    the next (default: as the files say); time_unit: of a collection's time steps; period: edges of the periodic box
-    that the bodies were folded into, in `length_unit`, 0 where it is not periodic (default: none is expected)."""
+    field's centre, in that unit (default: the middle of the box that the bodies sweep); interval: seconds from one
+    snapshot to the next (default: from the files); time_unit: of a collection's time steps; period: edges of the
+    periodic box into which the bodies are folded, in `length_unit`, 0 where it is not periodic (default: no box)."""
 
     length_unit: str = "um"
     origin: tuple[float, float, float] | None = None
@@ -79,13 +80,13 @@ def read_series(
     energy_kev: float,
     timing: Timing,
     files: SeriesFiles = SeriesFiles(),
-    on_progress: Callable[[float], None] = lambda fraction: None,
+    on_progress: Advance = lambda fraction: None,
 ) -> tuple[MeshSeries, np.ndarray]:
     """The moving bodies, filled and centred, and the times [T] of the frames [s], of which the first is 0.
 
     Only the snapshots that the frames need are read (`io.snapshots.find_snapshots` says how files are named). Errors:
-    `InputError` for what cannot be read, bodies that change their triangles, or jump (`MeshSeries`), and times beyond
-    the snapshots. `on_progress(fraction)` is called after each snapshot.
+    `InputError` for files that cannot be read, bodies that change their triangles or jump (`MeshSeries`), and times
+    beyond the snapshots. `on_progress(fraction)` is called after each snapshot.
     """
     snapshots = find_snapshots(paths, files.interval, files.time_unit)
     taken = np.array([snapshot.time - snapshots[0].time for snapshot in snapshots])

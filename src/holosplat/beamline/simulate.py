@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,7 @@ from ..model import Instrument, Model
 from ..optics.detector import poisson
 from ..optics.noise import PHOTON_RANGE
 from ..optics.sampling import resolving_oversample
+from ..progress import Advance
 from ..scan import Exposures, Scan, interleaved_split
 from ..volume import Object
 
@@ -78,7 +79,7 @@ class Simulation:
         return self.oversample or resolving_oversample(exposures, SIMULATED_FRINGE_SAMPLES, at_least=4)
 
     def provenance(self, exposures: Exposures) -> dict[str, str]:
-        """What a scan file says of how its frames were made."""
+        """The entries of a scan file's provenance."""
         made_by = {
             "simulated_with_oversample": str(self.samples(exposures)),
             "photons_per_pixel": str(self.photons_per_pixel or "none"),
@@ -89,7 +90,7 @@ class Simulation:
 
 
 def simulated_frames(obj: Object, exposures: Exposures, how: Simulation = Simulation()) -> Iterator[np.ndarray]:
-    """Frames [H, W] float32 of `obj`, one after another: memory is that of one frame, however many there are.
+    """Frames [H, W] float32 of `obj`, one after another; only one is in memory.
 
     Plain torch (the `reference` of the optics, which no fit uses) on a fine raster in single precision, 1e-6 of the
     contrast from double precision. A frame is the mean of the intensities at its pulses, with noise if asked for.
@@ -116,7 +117,7 @@ def simulate(
     is_test: np.ndarray | None = None,
     oversample: int | None = None,
     shutter: Shutter = Shutter(),
-    on_progress: Callable[[float], None] = lambda fraction: None,
+    on_progress: Advance = lambda fraction: None,
 ) -> Scan:
     """A scan of `obj`, held in memory (`simulated_frames` gives frame by frame): waves on a fine raster, integrated
     over pixels, then photon noise if asked for.

@@ -14,7 +14,8 @@ from .table import Table
 
 
 def beam_table(scan: Scan) -> dict[str, Any]:
-    """What all frames share: `pixel_size_m`, the texts of `provenance`, and `energy_kev` if they do."""
+    """The values that all frames share: `pixel_size_m`, the texts of `provenance`, and `energy_kev` if it is the
+    same."""
     views, exposures = scan.views, scan.exposures
     energy = {"energy_kev": float(exposures.energy_kev[0])} if exposures.has_one_energy else {}
     return {"pixel_size_m": views.pixel_size, **energy, "provenance": dict(scan.provenance)}
@@ -65,7 +66,7 @@ def in_order(head: Table, entries: Sequence[Table]) -> np.ndarray:
 
 
 _NUMBERS = (("energy_kev", None), ("distance_m", None), ("psf_sigma_px", 0.0), ("time_s", 0.0))
-"""Numbers of a frame, in the order of `Exposures`, with what is meant where they are left out."""
+"""Numbers of a frame, in the order of `Exposures`, with their values if they are left out."""
 
 
 def _per_frame(beam: Table, frame: Table, name: str, default: float | None) -> float:

@@ -1,4 +1,4 @@
-"""HDF5 with clear messages: what the readers of scans and volumes share."""
+"""HDF5 with clear messages, for the readers of scans and volumes."""
 
 from __future__ import annotations
 

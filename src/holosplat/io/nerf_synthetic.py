@@ -1,7 +1,7 @@
 """Scans from and to the NeRF-synthetic layout (Mildenhall et al. 2020, "Blender"): PNG images and camera poses.
 
-The layout knows grey values and pinhole cameras. What it cannot say (exact parallel geometry, intensities, optics,
-times) stands in entries called `holosplat`, which other programs pass over; docs/formats.md has the table.
+The layout has grey values and pinhole cameras. Entries called `holosplat` hold the rest (exact parallel geometry,
+intensities, optics, times); other programs ignore them. docs/formats.md has the table.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class NerfOptions:
 
 @dataclass(frozen=True)
 class GivenOptics:
-    """What folders of other programs do not say: energy_kev; distance [m] of propagation; pixel_size [m]; the
+    """Values that folders of other programs lack: energy_kev; distance [m] of propagation; pixel_size [m]; the
     intensities (relative to the flat field) of black and white."""
 
     energy_kev: float
@@ -98,9 +98,9 @@ def write_nerf_synthetic(
 ) -> None:
     """Write `scan` as a folder with train/ and test/ images, their transforms, and points3d.ply.
 
-    Held-out frames have the same grey scale as those for training; what lies beyond it is cut off.
-    thickness: [N, H, W] retrieved for a known material; then the points fill its visual hull, else the field of view.
-    transforms_val.json is a copy of the test's: most readers ask for one.
+    Held-out frames have the same grey scale as training frames; intensities beyond it are cut off. thickness: [N, H, W]
+    retrieved for a known material; then the points fill its visual hull, else the field of view. transforms_val.json is
+    a copy of the test's: most readers ask for one.
     """
     views, train = scan.views, np.flatnonzero(~scan.is_test)
     low, high = grey_range(scan)
@@ -138,8 +138,8 @@ def write_nerf_synthetic(
 def read_nerf_synthetic(path: str | Path, given: GivenOptics | None = None) -> Scan:
     """The scan of a folder in the NeRF-synthetic layout.
 
-    Of holosplat's own folders everything comes back, intensities as exact as the images' bits. For a folder of another
-    program, whose cameras must be all but parallel, `given` says what the layout does not.
+    A folder written by holosplat gives back everything, with intensities as exact as the images' bits. For a folder of
+    another program, whose cameras must be nearly parallel, `given` holds the values that the layout lacks.
     """
     folder = Path(path)
     splits = [Table.read(folder / TRAIN)]
@@ -194,7 +194,7 @@ class _Content:
 
 
 def _write_frame(folder: Path, name: str, scan: Scan, n: int, head: dict[str, Any]) -> dict[str, Any]:
-    """Write the image of frame `n`; its entry in the transforms, but for the pose."""
+    """Write the image of frame `n`, and return its entry in the transforms, without the pose."""
     kind: PngKind = "grey16" if head["white"] == LEVELS["grey16"] else "rgba8"
     span = head["high"] - head["low"]
     grey = (scan.frames[n].astype(np.float64) - head["low"]) / (span or 1.0)
@@ -224,7 +224,8 @@ def _own_scan(head: Table, content: _Content) -> Scan:
 
 
 def _foreign_scan(folder: Path, splits: list[Table], content: _Content, given: GivenOptics) -> Scan:
-    """Cameras taken as parallel: the axes turned round, and what they look at beside the origin is the shift."""
+    """Cameras taken as parallel: the axes are turned round, and the offset of the centre of view from the origin is the
+    shift."""
     angles = [split.number("camera_angle_x") for split in splits]
     require(len(set(angles)) == 1, f"{folder}: camera_angle_x must be the same for all frames, but it is {angles}.")
     tangent = math.tan(0.5 * angles[0])

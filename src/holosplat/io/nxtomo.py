@@ -36,7 +36,7 @@ from .scan_file import (
 
 @dataclass(frozen=True)
 class RawLayout:
-    """What a file of raw counts says beside a scan's exposures.
+    """The fields of a file of raw counts beside a scan's exposures.
 
     kinds: [N] image keys of all frames (0 projection, 1 flat, 2 dark); mask: [H, W] `pixel_mask` of NXdetector, 0 for
     good pixels, as stored; flips: whether the stored frames are upside down, and mirrored left to right.
@@ -143,7 +143,7 @@ def scan_writer(
 ) -> Iterator[Callable[[np.ndarray], None]]:
     """A scan file that grows frame by frame: yields a function that takes the next frame, [H, W] relative intensity.
 
-    With `raw` the file holds counts (uint16), and exposures and is_test are those of all its frames.
+    With `raw` the file holds counts (uint16), and exposures and is_test describe all its frames.
 
     The file appears at `path` when the block ends and all frames are there, and not at all when the block raises
     (Ctrl-C too): no frame is kept in memory. is_test: [N] bool. `view_rotation` holds the poses exactly;

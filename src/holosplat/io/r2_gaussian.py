@@ -1,8 +1,9 @@
 """Scans from and to the folders of R²-Gaussian (Zha et al. 2024): line integrals on angles about one axis.
 
-That program does absorption tomography, so its images are line integrals and no holograms: what is written was
-retrieved before, and what is read becomes the transmission of an absorber in contact with the detector.
-Only the layout and the conventions of its files are used here, in parallel beam; docs/formats.md has them.
+That program does absorption tomography, so its images are line integrals and no holograms: the written line integrals
+are retrieved from the frames, and line integrals that are read become the transmission of an absorber in contact with
+the detector. Only the layout and the conventions of its files are used here, in parallel beam; docs/formats.md has
+them.
 """
 
 from __future__ import annotations
@@ -161,7 +162,7 @@ def _angle(views: Views, n: int) -> float:
 
 
 def _meta(scan: Scan, square: _Square, unit: float, delta: float) -> dict[str, Any]:
-    """meta_data.json without its projections: the scanner, and (under `holosplat`) what leads back to metres."""
+    """meta_data.json without its projections: the scanner, and (under `holosplat`) the conversion to metres."""
     angles = np.rad2deg([_angle(scan.views, n) for n in range(len(scan))])
     scanner: dict[str, Any] = {"mode": "parallel", "filter": None, "DSD": 7.0, "DSO": 5.0}
     scanner |= {"nDetector": [square.side] * 2, "sDetector": [2.0] * 2, "dDetector": [2.0 / square.side] * 2}
@@ -249,7 +250,7 @@ def _own_scan(meta: Table, entries: list[Table], lines: np.ndarray, is_test: np.
 def _absorber(
     lines: np.ndarray, exposures: Exposures, is_test: np.ndarray, unit: float, provenance: dict[str, str]
 ) -> Scan:
-    """The transmission `exp(-p)` of line integrals p, and what a density of one is: μ = 1 / unit, β = μ / 2k."""
+    """The transmission `exp(-p)` of line integrals p, and β of a density of one: μ = 1 / unit, β = μ / 2k."""
     beta = 1 / (2 * wavenumber(exposures.one_energy("an absorber's scan")) * unit)
     told = {
         "converted_from": "R2-Gaussian",

@@ -1,4 +1,4 @@
-"""NXtomo files, opened for reading: what each frame is and how it was taken, and the frames one by one."""
+"""NXtomo files, opened for reading: the kind and the exposure of each frame, and the frames one by one."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class ScanFile:
         return marked[:: -1 if self.flips[0] else 1, :: -1 if self.flips[1] else 1]
 
     def provenance(self) -> dict[str, str]:
-        """What made the scan."""
+        """The provenance of the scan."""
         return _read_provenance(self.fields)
 
 
@@ -95,10 +95,10 @@ def upright(data: h5py.Dataset, number: int, rows: slice, flips: tuple[bool, boo
 
 @contextmanager
 def open_scan(path: str | Path) -> Iterator[ScanFile]:
-    """An NXtomo file, checked but for its frames.
+    """An NXtomo file, checked except for its frames.
 
-    Per-frame datasets may count all frames or the projections only. `InputError` names the file, the dataset, what it
-    must be and what it is.
+    Per-frame datasets may count all frames or the projections only. `InputError` names the file, the dataset, the
+    allowed values and the value found.
     """
     with open_hdf5(path) as file:
         fields = Fields(Path(path), _entry(file, path))
@@ -129,7 +129,7 @@ def _entry(file: h5py.File, path: str | Path) -> h5py.Group:
 
 
 def _frame_kinds(fields: Fields) -> np.ndarray:
-    """What each of all N frames is (the image key), [N] int; checks the frames' shape on the way."""
+    """The image key of each of all N frames, [N] int; checks the frames' shape too."""
     data = fields.dataset(fields.need(DATA))
     if data.ndim != 3 or 0 in data.shape:
         raise InputError(f"{fields.label(DATA)} must have the shape [N, H, W], but it has {data.shape}.")
@@ -220,7 +220,7 @@ def _pixel_size(fields: Fields) -> float:
 
 
 def _energies(fields: Fields, kinds: np.ndarray) -> np.ndarray:
-    """Photon energies [n] of the projections in keV; those that are but rounded differently become one."""
+    """Photon energies [n] of the projections in keV; energies that differ only by rounding become one."""
     name = fields.need(*ENERGIES)
     energies = _per_frame(fields, kinds, name) * fields.unit(name, ENERGY_UNITS, "keV")
     for energy in (energies.min(), energies.max()):

@@ -23,10 +23,10 @@ def uniform_points(views: Views, count: int, seed: int = 0) -> np.ndarray:
 
 
 def hull_points(thickness: np.ndarray, views: Views, count: int, seed: int = 0) -> np.ndarray:
-    """[count, 3] points (x, y, z) [m], even in the visual hull of what casts a shadow (Laurentini 1994).
+    """[count, 3] points (x, y, z) [m], evenly distributed in the visual hull of the shadows (Laurentini 1994).
 
-    thickness: [V, H, W] retrieved line integrals of any scale; shadow is what exceeds a tenth of its 99.9th
-    percentile. A voxel is of the hull if nine tenths of the views have it in their shadow.
+    thickness: [V, H, W] retrieved line integrals of any scale; a shadow consists of the pixels above a tenth of their
+    99.9th percentile. A voxel belongs to the hull if it lies in the shadow of nine tenths of the views.
     """
     shaped("thickness", thickness, (len(views), *views.shape))
     level = SHADOW * float(np.percentile(thickness, 99.9))

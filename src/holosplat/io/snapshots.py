@@ -1,6 +1,6 @@
 """Which mesh files show which body at what time: numbered files, or a ParaView collection (`.pvd`).
 
-A body's files are named alike but for the number at the end: `rbc03_007.vtk` is body `rbc03`, snapshot 7.
+A body's files have the same name except for the number at the end: `rbc03_007.vtk` is body `rbc03`, snapshot 7.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ def find_snapshots(
 ) -> list[Snapshot]:
     """Snapshots in the order of time, all of the same bodies.
 
-    paths: one collection (.pvd), or numbered mesh files and folders of them. The times are `interval` [s] apart, if
-    that is given; or as the headers of legacy VTK files say (`t=17.7us`); or those of the collection, in `time_unit`
-    (seconds, if it is not given). Errors: `InputError` for names without a number, bodies that are missing in some
-    snapshot, a damaged collection, and where nothing says the times.
+    paths: one collection (.pvd), or numbered mesh files and folders of them. The times are `interval` [s] apart, if it
+    is given; else the times in the headers of legacy VTK files (`t=17.7us`); else the time steps of the collection, in
+    `time_unit` (default: seconds). Errors: `InputError` for names without a number, bodies that are missing in some
+    snapshot, a damaged collection, and missing times.
     """
     collections = [path for path in paths if path.suffix.lower() == COLLECTION]
     require(
@@ -124,7 +124,7 @@ def _require_same_bodies(first: dict[str, Path], other: dict[str, Path]) -> None
 
 
 def _time(files: list[Path], said: float | None) -> float:
-    """Time [s] of one snapshot: what its files' headers say, or else what the collection does."""
+    """Time [s] of one snapshot, from its files' headers, or else from the collection."""
     times = {_header_time(file) for file in files}
     if len(times) > 1:
         raise InputError(f"the files of one snapshot must be of one time, but {files[0].name} and others differ.")

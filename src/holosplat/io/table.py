@@ -1,4 +1,4 @@
-"""JSON tables with clear messages: what the readers of folders share."""
+"""JSON tables with clear messages, for the readers of folders."""
 
 from __future__ import annotations
 

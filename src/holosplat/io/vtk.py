@@ -1,7 +1,7 @@
 """Triangle meshes from and to VTK files: legacy and XML, POLYDATA and UNSTRUCTURED_GRID, one body a file.
 
-VTK's readers hand over what they could read of a damaged file and complain on stderr; here their complaints
-are collected and become one `InputError`.
+VTK's readers return the readable part of a damaged file and complain on stderr; here their complaints are collected and
+become one `InputError`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""What VTK takes on trust and crashes on: cells of a damaged file that reach beyond their arrays.
+"""Checks that VTK lacks: cells of a damaged file that reach beyond their arrays crash it.
 
-Both functions return what is wrong, or "" if nothing is, for a message that names the file.
+Both functions return the fault, or "" if there is none, for a message that names the file.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ OPEN_ENDED = {2: 1, 4: 2, 6: 3, 7: 3}
 
 
 def legacy_fault(file: bytes) -> str:
-    """What is wrong with how a legacy file's cells are counted."""
+    """The fault in the counts of a legacy file's cells."""
     lines = file[:1024].split(b"\n", 3)
     binary = len(lines) > 2 and lines[2].strip().upper() == b"BINARY"
     version = re.match(rb".{22}[ \t]*(\d+)\.\d+", file)  # VTK too takes what it cannot read for an old version
@@ -46,8 +46,8 @@ def legacy_fault(file: bytes) -> str:
 
 
 def cells_fault(data: Any) -> str:
-    """What is wrong with the cells of a vtkPolyData or vtkUnstructuredGrid: corners that are no points, or
-    too few or many for the cell's type."""
+    """The fault in the cells of a vtkPolyData or vtkUnstructuredGrid: corners that are no points, or too few or too
+    many corners for the cell's type."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     points = data.GetNumberOfPoints()

@@ -3,15 +3,15 @@
 `FRC(r) = Re Σ F₁F₂* / sqrt(Σ|F₁|² Σ|F₂|²)` over ring `r` (Saxton & Baumeister 1982; Harauz &
 van Heel 1986), of mean-subtracted arrays, without apodisation.
 
-Both thresholds were made for two independent halves of one data set. Against a noise-free truth the same
-reconstruction correlates as the square root of 2 FSC / (1 + FSC), so they are lenient there: 0.143 between
-halves corresponds to 0.5 against the truth (Rosenthal & Henderson 2003).
+Both thresholds apply to two independent halves of one data set. Against a noise-free truth the same reconstruction
+correlates as the square root of 2 FSC / (1 + FSC), so they are lenient there: 0.143 between halves corresponds to 0.5
+against the truth (Rosenthal & Henderson 2003).
 
-Rings. One frequency step is that of the shortest side, `1 / min(n d)` for `n` samples of spacing `d`: the
-coarsest one, so that every ring has samples along each axis. (With the finer step of a long side, rings that
-hold samples of the short axis alternate with rings that do not, and the curve oscillates.) A sample of
-frequency `|f|` belongs to ring `floor(|f| / step + ½)`; rings run from 1 to the Nyquist frequency of the
-coarsest spacing. A square image of N pixels has the textbook rings 1 … ⌊N/2⌋ about the integer radii.
+Rings. One frequency step is the step of the shortest side, `1 / min(n d)` for `n` samples of spacing `d`: the coarsest
+step, so that every ring has samples along each axis. (With the finer step of a long side, rings that hold samples of
+the short axis alternate with rings that do not, and the curve oscillates.) A sample of frequency `|f|` belongs to ring
+`floor(|f| / step + ½)`; rings run from 1 to the Nyquist frequency of the coarsest spacing. A square image of N pixels
+has the textbook rings 1 … ⌊N/2⌋ about the integer radii.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""From photons to counts: what an integrating camera with a scintillator adds to a frame."""
+"""From photons to counts: an integrating camera with a scintillator."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ BITS = (10, 16)
 FLAT_LEVEL = 0.4
 """Part of the camera's range that a mean flat frame fills where no gain is given."""
 HOT_LEVELS = (0.5, 1.2)
-"""Range of what hot pixels show without light, as parts of the camera's range; above 1 they are saturated."""
+"""Range of the levels of hot pixels without light, as parts of the camera's range; pixels above 1 are saturated."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Camera:
     """A camera: photons in, whole numbers of counts out."""
 
     bits: int = 12
-    """Bits of a count (10 to 16); what is brighter is saturated."""
+    """Bits of a count (10 to 16); brighter pixels are saturated."""
     gain: float | None = None
     """Counts a detected photon gives (default: such that a mean flat fills 40 % of the range)."""
     offset: float = 100.0

@@ -92,7 +92,8 @@ class EffectiveGeometry:
 
 
 def effective_geometry(source_distance: float, detector_distance: float, detector_pixel: float) -> EffectiveGeometry:
-    """What a cone beam amounts to, by the Fresnel scaling theorem (Paganin 2006, *Coherent X-Ray Optics*, app. B).
+    """The parallel beam equivalent to a cone beam, by the Fresnel scaling theorem (Paganin 2006, *Coherent X-Ray
+    Optics*, app. B).
 
     source_distance: source to sample z₁ [m]; detector_distance: sample to detector z₂ [m]; detector_pixel: the
     detector's own pixel [m]. `M = (z₁ + z₂)/z₁`, distance `z₂/M`, pixel `p/M`; intensities are relative to the flat.

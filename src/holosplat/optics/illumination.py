@@ -53,7 +53,7 @@ class Illumination:
 
 @dataclass(frozen=True)
 class Pulses:
-    """What was drawn for N pulses: energy [N], relative to the mean; weights [N, K] of the components."""
+    """The random draws for N pulses: energy [N], relative to the mean; weights [N, K] of the components."""
 
     energy: np.ndarray
     weights: np.ndarray

@@ -10,7 +10,8 @@ TILE, QUIET = 16, 0.05
 NORMAL_MEDIAN = 0.6745
 """The median of |x| for a standard normal x."""
 QUIET_TILE = 0.86
-"""What the quiet tiles of pure noise show of its standard deviation (measured on frames of about 96 × 96 pixels)."""
+"""Ratio of the estimate from quiet tiles to the standard deviation, in pure noise (measured on frames of about 96²
+pixels)."""
 
 PHOTON_RANGE = (1e-3, 1e15)
 """Photons a pixel that noise can be simulated for."""
@@ -19,8 +20,8 @@ PHOTON_RANGE = (1e-3, 1e15)
 def noise_level(images: Tensor) -> float:
     """Standard deviation of white noise on images [V, H, W] of at least 3 × 3 pixels.
 
-    By the medians of |second differences along both axes| (the mask of Immerkær 1996, eq. 2, of norm 6) in tiles,
-    of which the quiet ones count: fringes are taken for noise where they fill a tile. Some per cent too low.
+    The estimate uses the medians of |second differences along both axes| (the mask of Immerkær 1996, eq. 2, of norm 6)
+    in the quiet tiles. Fringes that fill a tile count as noise. The estimate is some per cent too low.
     """
     differences = images.diff(n=2, dim=1).diff(n=2, dim=2).abs()
     h, w = (min(TILE, n) for n in differences.shape[1:])
@@ -48,10 +49,10 @@ def noise_levels(frames: Tensor) -> Tensor:
 
 
 def sure_noise(frames: Tensor) -> Tensor:
-    """What of `noise_levels` is surely noise, [V], float64: nothing where fringes fill the frames.
+    """The part of `noise_levels` that is surely noise, [V], float64: zero where fringes fill the frames.
 
-    White noise looks the same to both estimates, fringes do not. If those of the quiet tiles hold signal of variance a,
-    and all wavelets at least twice as much, then `σ² ≥ 2 t² - w²`.
+    Both estimates agree on white noise, but not on fringes. If the quiet tiles hold fringes of variance a, and all
+    wavelets fringes of at least twice that variance, then `σ² ≥ 2 t² - w²`.
     """
     tiles, wavelets = _of_quiet_tiles(frames), wavelet_noise(frames).cpu()
     surely = (2 * tiles.square() - wavelets.square()).clamp_min(0).sqrt()

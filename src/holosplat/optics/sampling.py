@@ -18,8 +18,8 @@ GUARD_PX = 5
 def padding(exposures: Exposures, oversample: int) -> tuple[int, int]:
     """Margin (rows, columns) in detector pixels that the fringes need, such that FFT lengths are 5-smooth.
 
-    At most the field of view itself is added on each side; what would travel further is cut by the
-    propagator (see `fresnel_transfer`).
+    The margin on each side is at most the field of view; the propagator cuts light that would travel further (see
+    `fresnel_transfer`).
     """
     pitch = exposures.views.pixel_size
     optics = zip(exposures.distance, exposures.energy_kev)

@@ -1,8 +1,8 @@
-"""What one object changes in one frame, and how surely photon noise lets that be seen.
+"""The contrast of one object in one frame, and its detectability in photon noise.
 
-The frame is that of `model.Instrument` in float64 on a raster of its own, made for the object: fine enough for
-the fringes and the object, wide enough for what the fringes reach, and blurred by the pixel in Fourier space. It
-says what a detector sees wherever the object lies on its pixels.
+The frame is that of `model.Instrument` in float64 on a raster of its own, made for the object: fine enough for the
+fringes and the object, wide enough for the reach of the fringes, and blurred by the pixel in Fourier space. It gives
+the frame for every position of the object on the detector's pixels.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ SPREAD = 0.9
 class Subject:
     """The one object of a plan: a closed mesh [m] as it lies in the beam (along z), its filling and surroundings.
 
-    material, medium: what fills it and what surrounds it; a medium of None is vacuum.
+    material, medium: of the object and of its surroundings; a medium of None is vacuum.
     """
 
     mesh: TriangleMesh
@@ -70,7 +70,7 @@ class Subject:
         return replace(self, mesh=self.mesh.transformed(np.array([[1, 0, 0], [0, c, -s], [0, s, c]]), np.zeros(3)))
 
     def contrast(self, energy_kev: float) -> DeltaBeta:
-        """What the object adds to its medium, Δδ and Δβ, at `energy_kev` [keV]."""
+        """Differences Δδ and Δβ between the object and its medium, at `energy_kev` [keV]."""
         inside = self.material.delta_beta(energy_kev)
         added = inside.against(self.medium.delta_beta(energy_kev)) if self.medium else inside
         require(
@@ -147,7 +147,8 @@ class Visibility:
 
 
 def signal_to_noise_squared(contrast: np.ndarray) -> np.ndarray:
-    """What pixels of `contrast` c = I - 1 [...] add to the squared signal to noise, at one photon a pixel: [...].
+    """Contributions of pixels of `contrast` c = I - 1 [...] to the squared signal to noise, at one photon a pixel:
+    [...].
 
     The optimal linear filter's (Hotelling's) `SNR² = Σ Δ² / v`, with Δ the difference of the mean counts with and
     without the object, and v the mean of their two variances (Barrett & Myers 2004, *Foundations of Image Science*,
@@ -159,7 +160,7 @@ def signal_to_noise_squared(contrast: np.ndarray) -> np.ndarray:
 
 
 def visibility(subject: Subject, setup: Setup) -> Visibility:
-    """What `subject` changes in a frame taken with `setup`; `InputError` if its fringes reach too far to compute."""
+    """The contrast of `subject` in a frame taken with `setup`; `InputError` if its fringes reach too far to compute."""
     raster = _raster(subject, setup)
     added = subject.contrast(setup.energy_kev)
     thickness, intensity = _frame(subject, setup, added, raster)
@@ -231,7 +232,7 @@ def _frame(subject: Subject, setup: Setup, added: DeltaBeta, raster: _Raster) ->
 def _seen_by_pixels(image: np.ndarray, frequency_scale: float) -> np.ndarray:
     """`image` [n, n] averaged over the square pixel about each sample; a sample is `frequency_scale` of a pixel.
 
-    The pixel's transfer function is `sinc(p fx) sinc(p fy)`, exact for what the raster resolves.
+    The pixel's transfer function is `sinc(p fx) sinc(p fy)`, exact at the frequencies that the raster resolves.
     """
     n = len(image)
     rows, columns = (np.sinc(f / frequency_scale) for f in (np.fft.fftfreq(n), np.fft.rfftfreq(n)))

@@ -1,9 +1,9 @@
-"""Before anything is simulated: what an experiment would see, resolve and store. Pure arithmetic on `contrast`."""
+"""The plan of an experiment: contrast, resolution, motion and data, before any simulation. Pure arithmetic on
+`contrast`."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,10 +11,11 @@ import numpy as np
 from ..checks import in_range, positive, require
 from ..geometry import Grid, Views
 from ..optics.noise import PHOTON_RANGE
+from ..progress import Advance
 from .contrast import Setup, Subject, Visibility, visibility
 
 WANTED_SNR = 5.0
-"""What is seen for sure (Rose 1948, J. Opt. Soc. Am. 38, 196)."""
+"""Signal to noise of a certain detection (Rose 1948, J. Opt. Soc. Am. 38, 196)."""
 NEARLY = 0.9
 """The part of the best signal to noise that counts as nearly as good."""
 BYTES_A_VOXEL = 8
@@ -23,7 +24,7 @@ BYTES_A_VOXEL = 8
 
 @dataclass(frozen=True)
 class Recording:
-    """What is recorded.
+    """The recording.
 
     photons_per_pixel: mean photons detected in a pixel without the object; views: directions over 180°, taken at
     the same instant; detector: (rows, columns) of a frame [pixels], None: not said; frame_rate [Hz]; exposure: time
@@ -144,7 +145,7 @@ class Storage:
 
 @dataclass(frozen=True)
 class Plan:
-    """What an experiment would see, resolve and store."""
+    """Contrast, resolution, motion and data of an experiment."""
 
     waves: Waves
     detection: Detection
@@ -154,7 +155,7 @@ class Plan:
 
 
 def plan(subject: Subject, setup: Setup, recording: Recording) -> Plan:
-    """The plan of an experiment that looks for `subject` with `setup` and stores what `recording` says."""
+    """The plan of an experiment that images `subject` with `setup` and stores the frames of `recording`."""
     seen = visibility(subject, setup)
     return Plan(
         _waves(subject, setup, seen),
@@ -238,10 +239,10 @@ def _storage(setup: Setup, recording: Recording) -> Storage:
 class Survey:
     """Signal to noise over distances and energies.
 
-    energies_kev: [E] keV; distances: [Z] m; information: [E, Z] SNR² at one photon a pixel, its mean over the places
-    of the object on the pixels; spread: [E, Z] m as in `Visibility`; photons_per_pixel: for `snr`; best_frame: [n, n]
-    contrast of the pixels at the best point; setup, subject: what was surveyed (the setup's energy and distance are
-    those of the best point).
+    energies_kev: [E] keV; distances: [Z] m; information: [E, Z] SNR² at one photon a pixel, its mean over the places of
+    the object on the pixels; spread: [E, Z] m as in `Visibility`; photons_per_pixel: for `snr`; best_frame: [n, n]
+    contrast of the pixels at the best point; setup, subject: of the survey (the setup has the energy and the distance
+    of the best point).
     """
 
     energies_kev: np.ndarray
@@ -273,7 +274,7 @@ class Survey:
         return np.array([_reaches(self.distances, snr, NEARLY * snr.max()) for snr in self.snr])
 
     def table(self) -> list[dict[str, float]]:
-        """One row an energy: its best distance, and what is seen there."""
+        """One row an energy: its best distance, and the visibility there."""
         rows = []
         nearly = self.near_distances()
         for e, best in enumerate(self.best_distances()):
@@ -311,7 +312,7 @@ def survey(
     photons_per_pixel: float,
     distances: np.ndarray,
     energies_kev: np.ndarray,
-    on_progress: Callable[[float], None] = lambda fraction: None,
+    on_progress: Advance = lambda fraction: None,
 ) -> Survey:
     """Signal to noise of `subject` at all `distances` [Z] m and `energies_kev` [E], each with its own δ and β.
 

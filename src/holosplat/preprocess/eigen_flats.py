@@ -1,4 +1,4 @@
-"""Principal components of flat fields: what changes in the light from frame to frame, and how much of it is real."""
+"""Principal components of flat fields: the changes of the light from frame to frame that exceed noise."""
 
 from __future__ import annotations
 
@@ -83,8 +83,8 @@ def significant(eigenvalues: np.ndarray, pixels: float) -> int:
     Parallel analysis (Horn 1965, Psychometrika 30, 179) asks which eigenvalues exceed those of random frames. Drawing
     such frames is not needed: the largest eigenvalue of n pixels of white noise in m frames follows the law of Tracy
     and Widom (Johnstone 2001, Ann. Stat. 29, 295, theorem 1.1). Each eigenvalue is tested against the ones below it.
-    `pixels`: how many independent ones there are at most; neighbours that share their noise (a scintillator) make them
-    fewer, which the spread of the lower eigenvalues tells (as in Patterson et al. 2006, PLoS Genet. 2, e190).
+    `pixels`: the largest possible number of independent pixels; neighbours that share noise (a scintillator) make it
+    smaller, and the spread of the lower eigenvalues gives it (as in Patterson et al. 2006, PLoS Genet. 2, e190).
     """
     most = len(eigenvalues) // 2
     wide = OBVIOUS * (1 + math.sqrt(len(eigenvalues) / max(pixels, 1.0))) ** 2 * float(np.median(eigenvalues))
@@ -99,7 +99,7 @@ def significant(eigenvalues: np.ndarray, pixels: float) -> int:
 
 
 def _stands_out(eigenvalues: np.ndarray, n: float) -> bool:
-    """Whether the first of `eigenvalues` exceeds what is expected of noise with their sum."""
+    """Whether the first of `eigenvalues` exceeds the largest eigenvalue expected of noise with their sum."""
     m, total = len(eigenvalues), float(eigenvalues.sum())
     if m < 2 or total <= 0:
         return False

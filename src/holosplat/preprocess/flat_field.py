@@ -8,7 +8,7 @@ import numpy as np
 
 
 def relative_intensity(raw: np.ndarray, dark: np.ndarray | float, light: np.ndarray | float) -> np.ndarray:
-    """(raw - dark) / light: counts relative to those of the same light without an object, float64.
+    """(raw - dark) / light: counts relative to the counts of the same light without an object, float64.
 
     light: flat field less dark field, positive where it is used (see `unlit`).
     """

@@ -1,4 +1,4 @@
-"""Defective pixels: found by what they show in dark and flat frames, and filled from their neighbours."""
+"""Defective pixels: found by their levels in dark and flat frames, and filled from their neighbours."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from scipy.sparse import csr_array
 from ..checks import require, shaped
 
 NEIGHBOURHOOD = 5
-"""Edge of the window that says what is usual for a pixel."""
+"""Edge of the window that gives the usual level of a pixel."""
 RESPONSE_RANGE = (1 / 3, 3.0)
 """A pixel whose flat, less its dark, is not within these multiples of its neighbours' is defective."""
 OUTLIER = 12.0
@@ -56,7 +56,7 @@ class PixelRepair:
         return repaired
 
     def values(self, frame: np.ndarray) -> np.ndarray:
-        """What the defective pixels of `frame` [H, W] are filled with, [B] in raster order."""
+        """The values that fill the defective pixels of `frame` [H, W], [B] in raster order."""
         return self._means @ np.asarray(frame, dtype=np.float64).reshape(-1)
 
     def _neighbours(self) -> csr_array:

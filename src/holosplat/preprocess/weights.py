@@ -11,7 +11,7 @@ from .eigen_flats import EigenFlats
 FAINTEST = 0.02
 """A flat field is not let fall below this part of the mean one."""
 REACH = 6.0
-"""Weights lie within so many standard deviations of those of the flat frames."""
+"""Bound of the weights, in standard deviations of the weights of the flat frames."""
 ITERATIONS = 200
 BINNINGS, SAMPLES = (8, 4, 2), 6
 """Binning, where none is asked for: the coarsest that leaves so many samples for each weight."""
@@ -21,9 +21,9 @@ class TotalVariationWeights:
     """Finds the weights of eigen flat fields for one frame after another.
 
     After Van Nieuwenhove et al. (2015), Opt. Express 23, 27975, sect. 2.3: the weights minimise the total variation of
-    the frame divided by its flat field, both averaged over `binning × binning` pixels so that noise weighs less. It is
-    that of the quotient's logarithm: of the quotient itself, a flat field that is bright where the object is would
-    make less, which strong fringes reward more than the true one.
+    the frame divided by its flat field, both averaged over `binning × binning` pixels so that noise weighs less. The
+    total variation is taken of the quotient's logarithm: the total variation of the quotient itself favours a flat
+    field that is bright at the object, and with strong fringes it prefers that flat field to the true one.
     """
 
     def __init__(self, flats: EigenFlats, binning: int | None = None) -> None:

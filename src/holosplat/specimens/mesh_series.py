@@ -69,7 +69,7 @@ class MeshSeries:
 
     @property
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper corner `(x, y, z)` [m] of what the bodies sweep."""
+        """Lower and upper corner `(x, y, z)` [m] of the box that the bodies sweep."""
         low, high = zip(*(scene.bounds for scene in self.snapshots))
         return np.min(low, axis=0), np.max(high, axis=0)
 

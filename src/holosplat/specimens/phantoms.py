@@ -1,4 +1,4 @@
-"""Balls: packed at random without touching, and in series of shrinking size that show what is still resolved."""
+"""Balls: packed at random without touching, and in series of shrinking size that show the resolution."""
 
 from __future__ import annotations
 

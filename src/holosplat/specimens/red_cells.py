@@ -1,10 +1,10 @@
 """Red blood cells by their published shape, deformed mildly and placed at random without overlap.
 
-The resting shape is that of Evans & Fung (1972, Microvasc. Res. 4, 335): thickness at radius r, with
-t = (r/R)², `D(r) = sqrt(1 - t) (C0 + C1 t + C2 t²)`, R = 3.91 µm, (C0, C1, C2) = (0.81, 7.83, -4.39) µm
-at 300 mosmol: volume 94 µm³, area 135 µm², thickness 0.81 µm in the middle and 2.58 µm at most. Written as
-the image of the unit sphere, `(X, Y, Z) -> (R X, R Y, Z (C0 + C1 t + C2 t²)/2)` with t = X² + Y², it is
-smooth at the rim, has a mesh without poles, and its inverse is an exact test of what is inside.
+The resting shape follows Evans & Fung (1972, Microvasc. Res. 4, 335): thickness at radius r, with t = (r/R)²,
+`D(r) = sqrt(1 - t) (C0 + C1 t + C2 t²)`, R = 3.91 µm, (C0, C1, C2) = (0.81, 7.83, -4.39) µm at 300 mosmol: volume 94
+µm³, area 135 µm², thickness 0.81 µm in the middle and 2.58 µm at most. Written as the image of the unit sphere,
+`(X, Y, Z) -> (R X, R Y, Z (C0 + C1 t + C2 t²)/2)` with t = X² + Y², it is smooth at the rim, has a mesh without poles,
+and its inverse tells exactly whether a point is inside.
 """
 
 from __future__ import annotations

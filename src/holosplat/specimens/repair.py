@@ -1,4 +1,4 @@
-"""Closed, consistently wound meshes: what a projector needs before chords through a mesh mean anything."""
+"""Closed, consistently wound meshes, without which chords through a mesh have no meaning."""
 
 from __future__ import annotations
 
@@ -16,12 +16,11 @@ from ..units import LENGTH_UNITS, unit_factor
 def closed(mesh: TriangleMesh, length_unit: str = "um") -> TriangleMesh:
     """`mesh` watertight and wound outwards (positive volume), or `InputError` saying what is open and where.
 
-    Repairs: duplicate vertices merged, unused ones dropped (the others keep their order); triangles
-    with a repeated vertex dropped, and slivers of no area where they are what is in the way; winding
-    made consistent within each shell; each outermost shell turned outwards. A shell inside another
-    keeps its sense relative to it: a cavity wound inwards stays a cavity, a body wound outwards stays
-    a body (its matter adds to its surroundings'). Where the inner shell's own winding was inconsistent,
-    it has no sense to keep and becomes a cavity (a body again within a cavity).
+    Repairs: duplicate vertices merged, unused ones dropped (the others keep their order); triangles with a repeated
+    vertex dropped, and slivers of no area where they prevent closing; winding made consistent within each shell; each
+    outermost shell turned outwards. A shell inside another keeps its sense relative to it: a cavity wound inwards stays
+    a cavity, a body wound outwards stays a body (its matter adds to its surroundings'). Where the inner shell's own
+    winding was inconsistent, it has no sense to keep and becomes a cavity (a body again within a cavity).
 
     length_unit: the unit in which the error message gives positions (the mesh itself is in metres).
     """

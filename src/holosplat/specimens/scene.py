@@ -65,7 +65,7 @@ class MeshScene:
         return float((np.abs(lab) - half).max())
 
     def _soup(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[tuple[float, float], ...]]:
-        """All meshes as one: vertices [P, 3], faces [F, 3], and of what each face's body is made, [C, F] of C kinds.
+        """All meshes as one: vertices [P, 3], faces [F, 3], and the matter of each face's body, [C, F] of C kinds.
 
         The kinds are the (δ, β) of the materials, or units of δ and of β where there are more than two materials.
         """

@@ -1,9 +1,9 @@
 """From line integrals to frames in one differentiable operation: exit wave → Fresnel → intensity → PSF → pixels.
 
 Backends: `cpu` (C++ between MKL's or scipy's transforms, float32), `cuda` (Triton and torch's transforms, float32) and
-`reference` (plain torch, any float type and device), which is the specification of the others. All give gradients
-of the line integrals and, where they are asked for, of the distances and of the widths of the point-spread functions;
-those of `cpu` and `cuda` are written by hand.
+`reference` (plain torch, any float type and device), which is the specification of the others. All give gradients of
+the line integrals and, on request, of the distances and of the widths of the point-spread functions; the adjoints of
+`cpu` and `cuda` are written by hand.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Refraction = Sequence[tuple[float, float]] | np.ndarray | Tensor
 
 @dataclass(frozen=True)
 class OpticalPath:
-    """What lies between an object and its frames, for V exposures on one raster [H, W] of samples.
+    """The optics between an object and its frames, for V exposures on one raster [H, W] of samples.
 
     rows [V, H], columns [V, W]: complex factors of the Fresnel transfer functions; blur_rows [V, H],
     blur_columns [V, W]: real factors of the point-spread functions' transforms, None where there are none;

@@ -78,7 +78,8 @@ def _asked(needs: tuple[bool, ...]) -> tuple[bool, bool, bool]:
 def _detected_backward(
     gradient: Tensor, wave: Tensor, path: OpticalPath, of_blur: bool
 ) -> tuple[Tensor, tuple[Tensor | None, Tensor | None]]:
-    """The gradient of the wave in the detector plane, in its memory, and those of the blur's factors if wanted."""
+    """The gradient of the wave in the detector plane, in its memory, and the gradients of the blur's factors on
+    request."""
     if path.blur_rows is None or path.blur_columns is None:
         _call("intensity_backward", _detector(path), gradient, wave)
         return wave, (None, None)

@@ -71,7 +71,8 @@ class _Hologram(torch.autograd.Function):
 def _detected_backward(
     gradient: Tensor, wave: Tensor, path: OpticalPath, of_blur: bool
 ) -> tuple[Tensor | None, Tensor | None]:
-    """`wave` in the detector plane becomes its gradient; returned are those of the blur's factors, if wanted."""
+    """Overwrites `wave` in the detector plane by its gradient; returns the gradients of the blur's factors on
+    request."""
     gradients, crop = (None, None), (path.margin, path.factor)
     if path.blur_rows is None or path.blur_columns is None:
         triton_waves.intensity_backward(gradient, wave, *crop)

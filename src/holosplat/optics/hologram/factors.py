@@ -1,4 +1,5 @@
-"""The gradient of a separable filter's factors: how the fast backends come by those of distance and blur."""
+"""The gradient of a separable filter's factors, from which the fast backends compute the gradients of distance and
+blur."""
 
 from __future__ import annotations
 
@@ -9,9 +10,9 @@ from torch.nn.functional import pad
 def factor_gradients(arrived: Tensor, passed: Tensor, rows: Tensor, columns: Tensor) -> tuple[Tensor, Tensor]:
     """Gradients of the factors rows r [V, H] and columns c [V, W] of a filter `out = F⁻¹(r c F(in))` of images.
 
-    passed: the spectrum F(in), not scaled, [V, H, W], or as `rfft2` gives it, [V, H, W // 2 + 1]; arrived: likewise,
-    that of the gradient of `out`. With N samples, `∂L/∂r_y = Σ_x a conj(p c) / N` and likewise for c; gradients of
-    complex numbers are those of real and imaginary part, those of real factors real.
+    passed: the spectrum F(in), not scaled, [V, H, W], or as `rfft2` gives it, [V, H, W // 2 + 1]; arrived: the spectrum
+    of the gradient of `out`, likewise. With N samples, `∂L/∂r_y = Σ_x a conj(p c) / N` and likewise for c. The gradient
+    of a complex number holds the gradients of its real and imaginary parts; the gradient of a real factor is real.
     """
     height, width, kept = rows.shape[1], columns.shape[1], passed.shape[2]
     product = arrived * passed.conj() / (height * width)

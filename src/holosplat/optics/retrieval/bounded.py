@@ -1,7 +1,7 @@
 """A first estimate for everything iterative: the linear inverse, bounded from below by zero, and where matter is.
 
-One frame says next to nothing of the lowest frequencies, nor of those where the response is zero. What it does not
-say follows from matter being nowhere negative, and nowhere at all outside its bodies.
+One frame hardly constrains the lowest frequencies, and the frequencies where the response is zero. Two conditions fill
+them in: matter is nowhere negative, and there is none outside its bodies.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ STEPS = 25
 SIGNIFICANT = 2.5
 """Standard deviations of its noise above which a pixel is matter."""
 MODEL_ERROR = 0.05
-"""What the wave optics leaves unexplained of a frame's contrast, matter being sampled: measured on cells."""
+"""Part of a frame's contrast that the wave optics of sampled matter does not explain, measured on cells."""
 PRIOR = Prior(corner=6.0, decay=1.5)
-"""Wider than that of the linear filters: what it damps too much, the bound gives back."""
+"""Wider than the prior of the linear filters, because the bound restores frequencies that are damped too much."""
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from torch.nn.functional import avg_pool2d, interpolate, pad
 
 from ...backends import device, resolve
 from ...checks import at_least, require
+from ...progress import Advance
 from ...scan import Exposures
 from ...units import wavelength
 from ..hologram import hologram, optical_path
@@ -24,16 +25,16 @@ MOST_SAMPLES = 4_000_000
 DARKEST = 1e-3
 """Least intensity under a root, whose slope would have no bound."""
 SHARPENING = 3
-"""Rounds in which a finer phase learns the means of the pixels; what is then left is added to their samples."""
+"""Rounds that fit a finer phase to the means of the pixels; the remaining difference is then added to their samples."""
 CROSS_TERM = 4.0
 """Weight of the contrast's slope in the curvature; large enough that most first steps are taken."""
 
 
 @dataclass(frozen=True)
 class Regularised:
-    """Options of what is fitted through the waves. iterations: each one step of the wave optics; weight: of the
-    regularisation, 1 is Bayes' for what the method assumes of the matter; noise: standard deviation of the frames
-    (None: estimated from them); backend: see `backends`."""
+    """Options of the fits through the wave optics. iterations: each one step of the wave optics; weight: of the
+    regularisation, 1 is the Bayesian weight under the method's assumptions on the matter; noise: standard deviation of
+    the frames (None: estimated from them); backend: see `backends`."""
 
     iterations: int = 60
     weight: float = 1.0
@@ -49,10 +50,10 @@ class Regularised:
 class WaveModel:
     """Frames [V, h, w] as a function of the phase delay [V, H, W] in radians, `phase = kδT`, on the waves' raster.
 
-    That is the frame padded by the fringes' reach, `oversample` times finer; `support` [V, H, W] says where on it
-    matter may be: where the estimate has it, and beyond the frame's border where it touches that. float32 frames are
-    computed by `backend`, float64 ones by `reference`. `phase` is the estimate to start from, `ratio` the matter's β/δ
-    at the frames' energy, which is one.
+    The raster is the frame padded by the fringes' reach, `oversample` times finer; `support` [V, H, W] marks the
+    samples where matter may be: where the estimate has matter, and beyond the frame's border where the estimate touches
+    it. float32 frames are computed by `backend`, float64 ones by `reference`. `phase` is the estimate to start from,
+    `ratio` the matter's β/δ at the frames' energy, which is one.
     """
 
     def __init__(
@@ -130,9 +131,9 @@ class WaveModel:
     def curvature(self) -> Tensor:
         """About the misfit's second derivative [V, H, W//2 + 1] by spatial frequency, never too small at the lowest.
 
-        `H²/4` is that of a thin object. Behind a thick one a slow change of phase, a little prism, shifts the image
-        that is there: `δI = (λz/2π) ∇δφ · ∇I` (from the transport of intensity, Teague 1983), which at low
-        frequencies is by far the larger.
+        `H²/4` is the derivative for a thin object. Behind a thick object a slow change of phase, a little prism, shifts
+        the image: `δI = (λz/2π) ∇δφ · ∇I` (from the transport of intensity, Teague 1983), which is by far the larger
+        term at low frequencies.
         """
         i = self.frames.double()
         slope2 = i.diff(dim=1).square().mean(dim=(1, 2)) + i.diff(dim=2).square().mean(dim=(1, 2))
@@ -150,8 +151,8 @@ def view_by_view(
     frames: Tensor,
     exposures: Exposures,
     delta: float,
-    solve: Callable[[Tensor, Exposures, Callable[[float], None]], Tensor],
-    on_progress: Callable[[float], None],
+    solve: Callable[[Tensor, Exposures, Advance], Tensor],
+    on_progress: Advance,
 ) -> Tensor:
     """`solve(frames, exposures, on_progress)` of views that are alike, `MOST_SAMPLES` at a time, frames checked."""
     checked(frames, exposures, delta)

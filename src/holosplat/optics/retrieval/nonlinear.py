@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from ...progress import Advance
 from ...scan import Exposures
 from .model import Regularised, WaveModel, view_by_view
 from .spectra import TINY, squared_frequency
@@ -16,14 +16,14 @@ from .spectra import TINY, squared_frequency
 FIRST_DAMPING = 0.05
 """Damping at the start; 1 is the curvature of the strongest frequency."""
 EASE, TIGHTEN = 0.6, 4.0
-"""What a step that helped, and one that did not, does to the damping."""
+"""Factors of the damping after an accepted and after a refused step."""
 STIFFEST = 1.0
-"""Bound of the penalty, in the same unit: frequencies of which next to nothing is expected."""
+"""Bound of the penalty, in the same unit, for frequencies with hardly any expected power."""
 
 
 @dataclass(frozen=True)
 class Tikhonov(Regularised):
-    """Options: iterations are taken or refused, weight is that of the penalty, for Gaussian matter."""
+    """Options. iterations: steps, accepted or refused; weight: of the penalty, for Gaussian matter."""
 
     weight: float = 0.5
 
@@ -35,19 +35,19 @@ def tikhonov(
     beta: float,
     *,
     options: Tikhonov = Tikhonov(),
-    on_progress: Callable[[float], None] = lambda fraction: None,
+    on_progress: Advance = lambda fraction: None,
 ) -> Tensor:
     """Thickness [V, H, W] in metres of one material, β of any sign, that agrees with frames [V, H, W].
 
-    Of `½ Σ (√I(φ) - √I)² + ½ Σ R |F[φ]|²` the minimum is sought over phases φ = kδT that are not negative and lie
-    within a support, as by Huhn et al. (2022), with three differences. R is no constant below and another above
-    the first maximum, but the noise over the power expected (`Spectra`); steps are scaled by frequency, as
-    Levenberg (1944) and Marquardt (1963) damp them, so that the lowest frequencies, which say a millionth of what the
-    others do, move too; and they go out from `bounded_estimate`, whose support they keep. A step that would not
-    lower the objective is refused, and its view damped more.
+    It minimises `½ Σ (√I(φ) - √I)² + ½ Σ R |F[φ]|²` over phases φ = kδT that are not negative and lie within a support,
+    as Huhn et al. (2022) do, with three differences. R is the noise over the expected power (`Spectra`), instead of one
+    constant below and another above the first maximum. Steps are scaled by frequency and damped as by Levenberg (1944)
+    and Marquardt (1963), so that the lowest frequencies, whose signal is a millionth of the others', change too. The
+    iteration starts from `bounded_estimate` and keeps its support. A step that would not lower the objective is
+    refused, and its view is damped more.
     """
 
-    def solve(frames: Tensor, exposures: Exposures, on_progress: Callable[[float], None]) -> Tensor:
+    def solve(frames: Tensor, exposures: Exposures, on_progress: Advance) -> Tensor:
         model = WaveModel(frames, exposures, beta / delta, options.noise, options.backend)
         return model.thickness(descend(model, options, on_progress)[0], delta)
 
@@ -57,8 +57,8 @@ def tikhonov(
 def penalty_weights(model: WaveModel, weight: float) -> Tensor:
     """R [V, H, W//2 + 1]: variance of the roots over the expected power, in the unit of the misfit's curvature.
 
-    The power has the shape of the prior, and in all that of the estimate: what explains a frame's contrast says too
-    little of the lowest frequencies where matter is compact, and the penalty would shrink it.
+    The power has the shape of the prior and the total power of the estimate. A power that only explains a frame's
+    contrast would be too small at the lowest frequencies of compact matter, and the penalty would shrink the matter.
     """
     known = model.spectra
     seen = squared_frequency(model.raster) <= (0.5 / model.exposures.views.pixel_size) ** 2
@@ -76,7 +76,7 @@ def objective(model: WaveModel, phase: Tensor, weights: Tensor) -> tuple[Tensor,
     return value + 0.5 * (phase.double() * pull).sum(dim=(1, 2)), gradient + pull
 
 
-def descend(model: WaveModel, options: Tikhonov, on_progress: Callable[[float], None]) -> tuple[Tensor, Tensor]:
+def descend(model: WaveModel, options: Tikhonov, on_progress: Advance) -> tuple[Tensor, Tensor]:
     """The phase [V, H, W] after all steps, and the objective [iterations + 1, V] before and after each."""
     weights = penalty_weights(model, options.weight)
     curvature = model.curvature() + weights

@@ -1,8 +1,8 @@
-"""What a frame tells of one material, frequency by frequency: response, noise, and the power to be expected.
+"""The information of a frame about one material at each frequency: response, noise, and expected power.
 
-Unknown is the phase delay `φ = kδT` [rad]. A thin object's frame is `F[I - 1] = -H F[φ]` with the response
-`H = 2 (β/δ cos χ + sin χ)`, `χ = πλz f²` (Cloetens et al. 1999, eq. 3, for one material), times the transfer
-functions of point-spread function and pixel. Rasters are real ones: frequencies are those of `rfft2`.
+The unknown is the phase delay `φ = kδT` [rad]. A thin object's frame is `F[I - 1] = -H F[φ]` with the response
+`H = 2 (β/δ cos χ + sin χ)`, `χ = πλz f²` (Cloetens et al. 1999, eq. 3, for one material), times the transfer functions
+of point-spread function and pixel. Rasters are real ones: frequencies are those of `rfft2`.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Prior:
 
 
 def checked(frames: Tensor, exposures: Exposures, delta: float) -> Tensor:
-    """The frames [V, H, W], if they are finite, floating, and those of `exposures`; and δ, if it is positive."""
+    """The frames [V, H, W], if they are finite, floating, and match `exposures`; and δ, if it is positive."""
     known = frames.dtype in (torch.float32, torch.float64)
     require(known, f"frames must be float32 or float64 for phase retrieval, but they are {frames.dtype}; convert them.")
     shaped("frames", frames.detach().cpu().numpy(), (len(exposures), *exposures.views.shape))
@@ -118,8 +118,8 @@ def contrast_level(frames: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Spectra:
-    """The response H and the expected power S of the phase, both [V, H, W//2 + 1], and the standard deviation [V] of
-    what the frames hold beside: noise alone, and noise with what the model cannot explain. All float64."""
+    """The response H and the expected power S of the phase, both [V, H, W//2 + 1], and two standard deviations [V] of
+    the frames: of the noise alone, and of the noise with the model error. All float64."""
 
     response: Tensor
     power: Tensor
@@ -143,8 +143,8 @@ def spectra(
 ) -> Spectra:
     """Of frames [V, H, W] and a response h on `raster`; noise: their standard deviation, or None to estimate it.
 
-    model_error: what no model explains, as a share of the frames' contrast. The power has the prior's shape and
-    explains the frames' variance beyond their noise; what the detector cannot resolve does not count in that.
+    model_error: the part of the frames' contrast that no model explains. The power has the prior's shape and explains
+    the frames' variance beyond their noise, at the frequencies that the detector resolves.
     """
     level = noise_levels(frames) if noise is None else torch.full((len(frames),), noise, dtype=torch.float64)
     contrast = contrast_level(frames)

@@ -1,12 +1,11 @@
 """Gaussians in parallel beams: line integrals (`splat`) and samples on a voxel raster (`voxelise`).
 
-A cloud of N Gaussians has, with every length in PIXELS (someone else scales from metres and back):
+A cloud of N Gaussians has, with every length in PIXELS (the caller scales from metres and back):
 
-- centres [N, 3]: `(x, y, z)` in the object frame, whose origin is the centre of the field of view;
-- scales [N, 3]: standard deviations along the Gaussian's own axes, above zero;
-- quaternions [N, 4]: `(w, x, y, z)`, of any length but zero; they are normalised, and gradients know it;
-- amplitudes [N, C], C = 1 or 2: signed peak values `a` of the Gaussian `a exp(-½ (x-c)ᵀ Σ⁻¹ (x-c))`, whose
-  covariance is `Σ = R_q diag(s²) R_qᵀ`.
+- centres [N, 3]: `(x, y, z)` in the object frame, whose origin is the centre of the field of view; - scales [N, 3]:
+standard deviations along the Gaussian's own axes, above zero; - quaternions [N, 4]: `(w, x, y, z)`, of any length but
+zero; they are normalised, and gradients account for it; - amplitudes [N, C], C = 1 or 2: signed peak values `a` of the
+Gaussian `a exp(-½ (x-c)ᵀ Σ⁻¹ (x-c))`, whose covariance is `Σ = R_q diag(s²) R_qᵀ`.
 
 Backends: `cpu` (C++, float32), `cuda` (Triton, float32, tensors on the GPU) and `reference` (plain torch, any float
 type and device, slow), which is the specification of the others. All give gradients of the four arrays above, and of
@@ -41,10 +40,10 @@ def splat(
 ) -> Tensor:
     """Line integrals [V, C, H, W] of a Gaussian cloud along the beam (amplitude × pixels), for V views.
 
-    The cloud is described at the top of this module. rotations [V, 3, 3]: `x_lab = R x_obj`, the beam along
-    +z_lab; shifts [V, 2]: detector shifts `(sx, sy)` [px]. Pixel `(i, j)` of `shape = (H, W)` has its centre at
-    `x = (j + ½ - W/2) + sx`, `y = (i + ½ - H/2) + sy`. A gradient of the rotations treats their nine numbers as
-    free (that of the third row is zero: it moves matter along the beam), and costs nothing where none is required.
+    The cloud is described at the top of this module. rotations [V, 3, 3]: `x_lab = R x_obj`, the beam along +z_lab;
+    shifts [V, 2]: detector shifts `(sx, sy)` [px]. Pixel `(i, j)` of `shape = (H, W)` has its centre at
+    `x = (j + ½ - W/2) + sx`, `y = (i + ½ - H/2) + sy`. A gradient of the rotations treats their nine numbers as free
+    (the third row has gradient zero: it moves matter along the beam), and costs nothing where none is required.
 
     `pixel_variance` [px²] is added to the projected covariance, mass conserved: the pixel's own, 1/12, stands
     for integration over its area (within 0.3 % for σ ≥ 1 px). The sum over pixels is the mass within 0.3 %

@@ -1,6 +1,6 @@
-"""What the Triton kernels of the splat and the voxeliser share: from a Gaussian's parameters to its covariance, and
-gradients back. As `native/gaussians.hpp`, all in float64: covariances of thin Gaussians, and the integer boxes that
-must equal the reference's, do not survive float32.
+"""The part that the Triton kernels of the splat and the voxeliser share: from a Gaussian's parameters to its
+covariance, and gradients back. As `native/gaussians.hpp`, all in float64: covariances of thin Gaussians, and the
+integer boxes that must equal the reference's, do not survive float32.
 
 Everything here works on a vector of Gaussians, one for each lane. `n` are their indices, and `there` says which exist.
 """
@@ -15,8 +15,8 @@ import triton.language as tl
 from torch import Tensor
 
 Records = tuple[Tensor, Tensor, Tensor]
-"""What a preparing kernel makes of R Gaussians: numbers [R, ·] float32, integers [R, ·] int32, and an int64 list
-[1 + R] of those whose boxes are large, in any order, whose first entry counts them."""
+"""The result of a preparing kernel for R Gaussians: numbers [R, ·] float32, integers [R, ·] int32, and an int64 list
+[1 + R] of the Gaussians with large boxes, in any order; its first entry counts them."""
 
 HALF_LOG2_E = tl.constexpr(0.72134752044448170)  # exp(-½ q) = 2^(-q · this)
 FAINT = tl.constexpr(-30.0)  # what is fainter than 2^-30 of the peak is left out: only needles' boxes have it

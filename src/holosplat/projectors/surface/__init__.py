@@ -38,13 +38,13 @@ def surface_thickness(
     lines: int = 2,
     backend: str = "cpu",
 ) -> Tensor:
-    """Line integrals [V, H, W] of one over what closed surfaces enclose, float64; lengths in PIXELS.
+    """Line integrals [V, H, W] of one over the inside of closed surfaces, float64; lengths in PIXELS.
 
     vertices: [P, 3] float64 `(x, y, z)`, object frame; faces: [F, 3] int64, counter-clockwise seen from outside (a
-    cavity's from within it); rotations [V, 3, 3], shifts [V, 2] `(sx, sy)`, float64: as for `projectors.splat`;
-    lines: rows integrated in a pixel. Overlapping bodies add up. Gradients: of the vertices, the rotations (all nine
-    numbers, as of any matrix) and the shifts; those that are not asked for cost nothing.
-    Errors: `InputError` for other shapes and types, and vertices that are not finite.
+    cavity's from within it); rotations [V, 3, 3], shifts [V, 2] `(sx, sy)`, float64: as for `projectors.splat`; lines:
+    rows integrated in a pixel. Overlapping bodies add up. Gradients: of the vertices, the rotations (all nine numbers,
+    as of any matrix) and the shifts; a gradient that is not required costs nothing. Errors: `InputError` for other
+    shapes and types, and vertices that are not finite.
     """
     _check(vertices, faces)
     require(lines >= 1, f"lines must be at least 1, but it is {lines}.")

@@ -22,13 +22,14 @@ class LatticeProjector:
 
     Backends: `cpu` (compiled) and `reference` (`lattice_reference`, and its derivatives by autograd).
 
-    The hat's variance, 1/6 px², is that of a pixel-sized cube's shadow (1/12) seen by a pixel (1/12), so voxels
-    should be about as large as the raster's pixels. Single pixels carry a ripple of a few per cent where the
-    lattice and the raster beat; their means do not. Arrays are volumes [Z, Y, X] and images [V, H, W].
-    Voxels at the very rim of the detector, with a pixel of their hat outside, are left out.
+    The hat's variance, 1/6 px², is the sum of the variances of a pixel-sized cube's shadow (1/12) and of a pixel
+    (1/12), so voxels should be about as large as the raster's pixels. Single pixels carry a ripple of a few per cent
+    where the lattice and the raster beat; their means do not. Arrays are volumes [Z, Y, X] and images [V, H, W]. Voxels
+    at the very rim of the detector, with a pixel of their hat outside, are left out.
 
-    Poses are taken as they are when the projector is made. Gradients of them are exact but for what enters or leaves at
-    the detector's rim, and but for voxels on a pixel's centre, where hats have a kink: there the mean of both sides'.
+    The projector uses the poses as they are when it is made. Gradients of poses are exact, except for matter that
+    enters or leaves at the detector's rim, and for voxels on a pixel's centre, where hats have a kink: there the
+    gradient is the mean of both sides.
     """
 
     def __init__(self, grid: Grid, views: Views | Poses, backend: str = "cpu") -> None:

@@ -1,1 +1,1 @@
-"""Cells in a channel: the flow, what cells do to it and to each other, and how they move in time."""
+"""Cells in a channel: the flow, the disturbance by the cells, the contacts between cells, and the motion in time."""

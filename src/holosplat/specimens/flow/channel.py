@@ -1,7 +1,7 @@
 """Flow through a straight rectangular channel: Poiseuille's, in closed form.
 
 For half widths a ≤ b across the channel, with y and z measured from its axis (White 2006, Viscous Fluid Flow, eq. 3-48,
-the parabola of the shorter side taken out of the series, so that what is left falls off exponentially from the ends):
+the parabola of the shorter side taken out of the series, so that the remainder falls off exponentially from the ends):
 
     u = G/2μ (a² - y² - 32 a²/π³ Σ (-1)^((n-1)/2)/n³ cos(nπy/2a) cosh(nπz/2a)/cosh(nπb/2a)),   n = 1, 3, 5 …
 """

@@ -1,8 +1,8 @@
 """Repulsion where cells come close to each other or to a wall.
 
-What keeps surfaces apart in a viscous fluid is the film between them, which nodes half a micrometre apart do not
-resolve. A short-ranged force between nodes takes its place: F (1 - r/d)²/(r/d)² below the distance d, smooth where it
-begins and without bound at r = 0.
+In a viscous fluid the film between two surfaces keeps them apart; nodes half a micrometre apart do not resolve it. A
+short-ranged force between nodes takes its place: F (1 - r/d)²/(r/d)² below the distance d, smooth where it begins and
+without bound at r = 0.
 """
 
 from __future__ import annotations

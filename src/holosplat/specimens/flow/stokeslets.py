@@ -1,4 +1,4 @@
-"""What point forces do to a viscous fluid: regularised Stokeslets, summed without a matrix.
+"""The flow of a viscous fluid under point forces: regularised Stokeslets, summed without a matrix.
 
 A force f spread over a blob of size ε moves the fluid at distance r by (Cortez, Fauci & Medovikov 2005, Phys. Fluids
 17, 031504, after Cortez 2001, SIAM J. Sci. Comput. 23, 1204)

@@ -20,7 +20,7 @@ PLASMA_VISCOSITY = 1.2e-3
 
 @dataclass(frozen=True)
 class Medium:
-    """The fluid, the same inside and outside the cells, and what stands in for thin films of it."""
+    """The fluid, the same inside and outside the cells, and the short-ranged force in place of its thin films."""
 
     viscosity: float = PLASMA_VISCOSITY
     """[Pa s]."""
@@ -43,10 +43,10 @@ class Medium:
 class Suspension:
     """Cells of one rest shape in a channel.
 
-    The velocity of a node is that of the fluid there: the undisturbed flow and what the forces of all membranes make of
-    it. With one viscosity inside and outside, that is the whole of Stokes flow, but for the walls, which here do not
-    answer the cells: between walls the flow about a force-free cell falls off exponentially with their distance, so it
-    ends at `reach` (fading from half of it on), where in free space it would go on as 1/r².
+    A node moves with the fluid: with the undisturbed flow and the flow that the forces of all membranes cause. With one
+    viscosity inside and outside, this is the complete Stokes flow except for the walls, which do not reflect the cells'
+    flow here. Between walls the flow around a force-free cell falls off exponentially, so it ends at `reach` (fading
+    from half of it on); in free space it would fall off as 1/r².
     """
 
     def __init__(self, membrane: Membrane, channel: Channel, medium: Medium = Medium()) -> None:

@@ -2,9 +2,9 @@
 
 The object-in-fluid model (Dupin et al. 2007, Phys. Rev. E 75, 066707; Cimrák, Gusenbauer & Schrefl 2012, Comput. Math.
 Appl. 64, 278; Cimrák, Gusenbauer & Jančigová 2014, Comput. Phys. Commun. 185, 900) is springs along edges, bending,
-local and global area, and volume; its forces were published, the energies here are those whose gradients they are
-(areas: in the form that does have an energy). Skalak et al. (1973, Biophys. J. 13, 245) is the continuum alternative to
-springs. Nodes are [..., P, 3] [m], energies [...].
+local and global area, and volume; its forces were published; the energies here have these forces as gradients (areas:
+in the form that has an energy). Skalak et al. (1973, Biophys. J. 13, 245) is the continuum alternative to springs.
+Nodes are [..., P, 3] [m], energies [...].
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Forces on the nodes [N], [..., P, 3]: minus the gradients of `energies`, by hand.
 
-They cost a fifth of what differentiating the energies does; the tests hold both against each other and against finite
-differences. All take `Shape`, the nodes with what several forces need of them.
+They cost a fifth of the automatic derivative of the energies; the tests compare both with each other and with finite
+differences. All take `Shape`, the nodes with the quantities that several forces share.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Shape:
 
     @classmethod
     def of(cls, nodes: Tensor, rest: RestShape) -> Shape:
-        """What is computed once."""
+        """The shared quantities, computed once."""
         corners = corners_of(nodes, rest.faces)
         return cls(nodes, corners, area_vectors(corners))
 

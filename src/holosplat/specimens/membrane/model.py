@@ -17,9 +17,9 @@ from .rest import RestShape
 
 @dataclass(frozen=True)
 class Elasticity:
-    """Elastic moduli of a membrane; what is 0 is left out.
+    """Elastic moduli of a membrane; a modulus of 0 leaves the energy out.
 
-    The defaults are those with which a cell in optical tweezers behaves as measured (docs/cells.md).
+    With the defaults a cell in optical tweezers behaves as measured (docs/cells.md).
     """
 
     skalak_shear: float = 2.9e-6
@@ -59,7 +59,7 @@ class Membrane:
         self.rest = RestShape.of(mesh)
 
     def energies(self, nodes: Tensor) -> dict[str, Tensor]:
-        """Each energy [...] [J] by its name, of those whose modulus is not 0."""
+        """Each energy [...] [J] with a modulus other than 0, by its name."""
         of, rest = self.elasticity, self.rest
         found = {}
         if of.springs:
