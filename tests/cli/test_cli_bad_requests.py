@@ -143,7 +143,7 @@ def test_outputs_that_cannot_be_are_refused_before_any_work(shop, tmp_path):
     for out, words in (
         (shop.run, ["--out", "new or empty", "--resume"]),
         (tmp_path / "file", ["--out", "file"]),
-        (tmp_path / "none/run", ["--out", "existing folder"]),
+        (tmp_path / "none/run", ["existing folder"]),
     ):
         outcome = holosplat("reconstruct", shop.scan, "--out", out, *known(shop))
         refused(outcome, *words)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -17,7 +16,9 @@ from ..io.json import read_json, write_json
 from ..io.objects import read_object, write_object
 from ..matter import MaterialPrior
 from ..methods import Gaussians, Method, Stage, Task, finished
+from ..methods.presets import SCHEMA
 from ..optics.sampling import fringe_sampling
+from ..progress import FitProgress
 from ..representations import KINDS, Stored
 from ..scan import Scan
 from ..tables import to_table
@@ -29,9 +30,6 @@ SMALLEST_FRAME = 11
 """The window of SSIM."""
 FLAT_LEVELS = (0.2, 5.0)
 """Between these lies the median of frames that are relative to the flat field."""
-SCHEMA_VERSION = 2
-"""Of config.json; version 1, of holosplat 0.1, had none."""
-
 RESUMED_WITH = {
     "scan_hash": "scan file",
     "method": "method and settings (--method, --preset, --config, --set)",
@@ -39,9 +37,6 @@ RESUMED_WITH = {
     "seed": "seed (--seed)",
 }
 """What must not change between the parts of a run, as messages call it."""
-
-Progress = Callable[[str, float, Record], None]
-"""Called with (stage, fraction done of the stage, the last record of the fit or {})."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +63,7 @@ def reconstruct(
     *,
     folder: RunFolder | None = None,
     resume: bool = False,
-    on_progress: Progress = lambda stage, fraction, record: None,
+    on_progress: FitProgress = lambda stage, fraction, record: None,
 ) -> Reconstruction:
     """The Object that `method` makes of the training frames of `scan`.
 
@@ -135,7 +130,7 @@ class _Run:
     task: Task
     method: Method
     folder: RunFolder | None
-    on_progress: Progress
+    on_progress: FitProgress
     timing: dict[str, float] = field(default_factory=dict)
     _saved: dict[str, Any] | None = None
     _config: dict[str, Any] = field(default_factory=dict)
@@ -281,9 +276,9 @@ def _require_same(folder: RunFolder, config: dict[str, Any]) -> None:
     old, same = folder.read_config(), json.loads(json.dumps(config))
     version = old.get("schema_version", 1)
     require(
-        version == SCHEMA_VERSION,
+        version == SCHEMA,
         f"{folder.path} was begun by a version of holosplat whose checkpoints differ (schema {version}, now "
-        f"{SCHEMA_VERSION}); start anew into another --out, with --config {folder.config}.",
+        f"{SCHEMA}); start anew into another --out, with --config {folder.config}.",
     )
     for table in (old, same):
         _without_backends(table.get("method", {}))
@@ -303,7 +298,7 @@ def _without_backends(table: Any) -> None:
 
 def _config(scan: Scan, prior: MaterialPrior, method: Method, seed: int) -> dict[str, Any]:
     return {
-        "schema_version": SCHEMA_VERSION,
+        "schema_version": SCHEMA,
         "method": to_table(method),
         "prior": prior.as_dict(),
         "seed": seed,
