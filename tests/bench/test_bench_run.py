@@ -22,6 +22,7 @@ from holosplat.bench.references import REFERENCES
 from holosplat.bench.rows import Row, read_row, write_row
 from holosplat.bench.run import Suite, run_suite
 from holosplat.bench.sizes import contrast_by_size
+from holosplat.matter import Matter
 from holosplat.optics.sampling import fringe_sampling
 from holosplat.representations.voxels import VoxelGrid
 from holosplat.specimens.phantoms import star_of_balls
@@ -295,7 +296,7 @@ def test_true_lines_are_the_true_thickness(monkeypatch):
     monkeypatch.setitem(references.TOMOGRAPHIES, "tv", tomography)
     case = make_case("wide", 3)
     found = references.tv_of_true_lines(case, case.truth(), lambda stage, fraction: None)
-    assert found.matter == hs.Matter.one(*MATERIAL)
+    assert found.matter == Matter.one(*MATERIAL)
     assert len(given["views"]) == 4
     assert given["upper"] == 1
     volume = case.scene.meshes[0].volume

@@ -13,6 +13,7 @@ import holosplat as hs
 from holosplat.bench.case import Case
 from holosplat.bench.method import Method
 from holosplat.bench.run import Suite
+from holosplat.matter import Matter
 from holosplat.methods import Task
 from holosplat.representations.voxels import VoxelGrid
 from holosplat.specimens.red_cells import icosphere
@@ -38,7 +39,7 @@ def voxels(scan: hs.Scan, value: float = 1.0) -> VoxelGrid:
     values = torch.zeros(1, *grid.shape)
     z, y, x = (n // 2 for n in grid.shape)
     values[0, z - 5 : z + 3, y - 3 : y + 5, x - 4 : x + 4] = value
-    return VoxelGrid(values, grid, hs.Matter.one(*MATERIAL))
+    return VoxelGrid(values, grid, Matter.one(*MATERIAL))
 
 
 @dataclass(frozen=True)
