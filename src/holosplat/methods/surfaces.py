@@ -24,6 +24,7 @@ from ..matter import MaterialPrior
 from ..optics.noise import noise_share
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
+from ..projectors.sparse import torch_csr
 from ..representations import GaussianCloud, Stored, SurfaceMesh, isosurface
 from ..representations.isosurface import adjacency, neighbour_mean
 from ..scan import Scan
@@ -205,10 +206,7 @@ def _bending(train: Scan, start: SurfaceMesh, objective: Objective) -> list[Term
     away = csr_array(eye_array(count) - neighbour_mean(start.faces.numpy(), count))
     twice = csr_array(away @ away)
     twice.sort_indices()
-    starts, columns = (torch.from_numpy(a.astype(np.int64)) for a in (twice.indptr, twice.indices))
-    values = torch.from_numpy(twice.data)
-    operator = torch.sparse_csr_tensor(starts, columns, values, twice.shape, check_invariants=True)
-    return [Bending(weight, operator)]
+    return [Bending(weight, torch_csr(twice, np.float64))]
 
 
 def _membrane(start: SurfaceMesh, stiffness: float) -> Callable[[Tensor], Tensor]:
