@@ -47,7 +47,7 @@ def main() -> None:
             found = levels_of(load_case(name, seed, options.snapshots))
             numbers = (found.high / found.low, found.spread, found.share, found.deviation)
             shown = " | ".join(f"{number:.2f}" for number in numbers)
-            print(f"| {name} | {seed} | {shown} | {'yes' if found.are_two else 'no'} |", flush=True)
+            print(f"| {name} | {seed} | {shown} | {'yes' if found.are_two() else 'no'} |", flush=True)
     print(f"\nCommit {commit()}.")
 
 

@@ -13,8 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers.strategies import NAMES
+from holosplat.methods.presets import presets
 from holosplat.tables import changed, from_table, merged, overridden, to_table
-from holosplat.workflows.settings import presets
 
 FLOATS = st.floats(allow_nan=False, allow_infinity=False)
 

@@ -101,7 +101,16 @@ def changed(base: Any, changes: dict[str, Any], where: str = "", kind: Any = Non
     A dataclass of a union is changed entry by entry, or replaced where the change names another `kind`.
     kind: what the result may be, such as a union that `base` is a member of (default: the type of `base`).
     """
-    return from_table(kind or type(base), merged({"": to_table(base)}, {"": changes})[""], where)
+    return from_table(kind or type(base), _with(base, changes), where)
+
+
+def _with(base: Any, changes: Any) -> Any:
+    """The table of `base` with `changes`; what is no dataclass, or becomes another one of a union, is replaced."""
+    if not (_is_dataclass(base) and isinstance(changes, dict)):
+        return changes
+    if _has_tag(type(base)) and changes.get("kind", base.kind) != base.kind:
+        return changes
+    return to_table(base) | {name: _with(getattr(base, name, None), change) for name, change in changes.items()}
 
 
 # --- one field by its path ----------------------------------------------------------------------------------

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from importlib import import_module
 
 import numpy as np
 import pytest
@@ -169,12 +168,11 @@ def test_noisy_frames_get_no_rounds_of_agreement(cell_scan):
         assert (volume.shape != without.shape or not torch.equal(volume, without)) == rounds
 
 
-def test_few_views_get_more_steps_a_round(cell_scan, monkeypatch):
+def test_few_views_get_more_steps_a_round(cell_scan):
     few = cell_scan[np.arange(0, 8, 2)]
     options = replace(USUAL, corrections=1, inner=5)
     as_it_is, _ = holographic_tv(few, CELL, options, quiet)
-    monkeypatch.setattr(import_module("holosplat.baselines.holographic_tv"), "FEW_VIEWS", 0)
-    twice, _ = holographic_tv(few, CELL, replace(options, inner=10), quiet)
+    twice, _ = holographic_tv(few, CELL, replace(options, inner=10, few_views=0), quiet)
     assert torch.equal(as_it_is, twice)
 
 

@@ -105,9 +105,9 @@ def test_levels_that_are_near_each_other_pass_for_one(delta):
 def test_two_materials_need_all_four_signs_of_them():
     """Levels apart, near to all values, the lower one more than a rim, and level."""
     two = Levels(high=2.0, low=1.0, spread=0.25, share=0.5, deviation=0.15)
-    assert two.are_two
+    assert two.are_two()
     for sign in ({"low": 1.5}, {"spread": 0.6}, {"share": 0.05}, {"deviation": 0.5}):
-        assert not replace(two, **sign).are_two
+        assert not replace(two, **sign).are_two()
 
 
 def test_voxels_are_of_the_material_that_they_are_full_of(shares, grid):

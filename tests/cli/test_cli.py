@@ -8,11 +8,9 @@ import os
 import shutil
 import subprocess
 import sys
-from dataclasses import asdict
 from pathlib import Path
 
 import pytest
-from holosplat.workflows.settings import preset
 
 import holosplat.workflows.demo as demo
 from helpers.cli import (
@@ -28,6 +26,8 @@ from helpers.cli import (
     worked,
 )
 from holosplat.cli import main
+from holosplat.methods.presets import SCHEMA, preset
+from holosplat.tables import to_table
 
 
 def test_the_installed_command_is_main():
@@ -67,7 +67,7 @@ def test_the_whole_chain_as_processes(shop, tmp_path):
         "config.json",
         "metrics.csv",
         "checkpoint.pt",
-        "gaussians.h5",
+        "object.h5",
         "summary.json",
         "source.json",
         "report.html",
@@ -75,7 +75,8 @@ def test_the_whole_chain_as_processes(shop, tmp_path):
     assert {path.name for path in (tmp_path / "RUN").iterdir()} == names
     assert "</html>" in (tmp_path / "RUN/report.html").read_text()
     config = json.loads((tmp_path / "RUN/config.json").read_text())
-    assert config["settings"] == asdict(preset("fast"))
+    assert config["schema_version"] == SCHEMA
+    assert config["method"] == to_table(preset("fast"))
     assert config["seed"] == 4
 
 
@@ -83,7 +84,7 @@ def test_the_demo_runs_the_chain_and_shows_its_commands(shop, tmp_path, monkeypa
     """Here on the two small cells."""
     monkeypatch.setattr(demo, "DETECTOR", (ROWS, COLUMNS))
     monkeypatch.setattr(demo, "write_demo_meshes", lambda folder: [Path(shutil.copy(c, folder)) for c in shop.cells])
-    monkeypatch.setattr("holosplat.workflows.settings.preset", lambda name: QUICK)
+    monkeypatch.setattr("holosplat.methods.presets.preset", lambda name: QUICK)
     outcome = worked(holosplat("demo", "--out", tmp_path / "demo"))
     found = {path.name for path in (tmp_path / "demo").iterdir()}
     assert found == {"meshes", "scan.nxs", "truth.h5", "run"}

@@ -73,7 +73,7 @@ def test_folders_that_are_no_runs_are_refused(shop, tmp_path):
     """Missing, empty, and without a result."""
     (tmp_path / "empty").mkdir()
     shutil.copytree(shop.run, tmp_path / "half")
-    (tmp_path / "half/gaussians.h5").unlink()
+    (tmp_path / "half/object.h5").unlink()
     before = everything_in(tmp_path)
     for name in ("none", "empty", "half"):
         run = tmp_path / name
@@ -89,7 +89,7 @@ def test_folders_that_are_no_runs_are_refused(shop, tmp_path):
 @pytest.mark.parametrize(
     ("file", "change", "words"),
     [
-        ("gaussians.h5", lambda path: truncated(path, path.parent), ["gaussians.h5", "truncated"]),
+        ("object.h5", lambda path: truncated(path, path.parent), ["object.h5", "truncated"]),
         ("summary.json", lambda path: path.write_text("{"), ["summary.json", "JSON"]),
         ("summary.json", lambda path: path.unlink(), ["summary.json"]),
         ("summary.json", lambda path: path.write_text("{}"), ["summary.json"]),

@@ -54,7 +54,7 @@ BAD_SCANS: dict[str, tuple[Callable[[h5py.File], object], list[str]]] = {
     "wrong number of angles": (five_angles, ["rotation_angle", "8", "5"]),
     "unknown unit": (put(f"{DETECTOR}/distance", 0.1, "furlong"), ["detector/distance", "furlong", "mm"]),
     "negative distance": (put(f"{DETECTOR}/distance", -0.1), ["detector/distance", "positive", "-0.1"]),
-    "NaN images": (one_nan, ["detector/data", "finite", "1 of 5376"]),
+    "NaN images": (one_nan, ["detector/data", "finite", "1 of 4032"]),
     "no training frame": (put("entry/split", np.ones(8, int)), ["training frame", "/entry/split"]),
     "a pixel of 3.2 m": (huge_pixels, ["pixel_size", "3.2", "unit"]),
     "no images": (drop(f"{DETECTOR}/data"), ["detector/data", "missing"]),

@@ -21,6 +21,7 @@ from holosplat.geometry import Grid
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.volumes import read_volume
 from holosplat.materials import HAEMOGLOBIN, PLASMA, RED_CELL
+from holosplat.tables import to_table
 from holosplat.workflows.evaluate import evaluate, render
 from holosplat.workflows.reconstruct import load_reconstruction
 from holosplat.workflows.run_folder import RunFolder
@@ -31,7 +32,7 @@ def test_a_run_knows_its_material_seed_and_settings(shop):
     material = HAEMOGLOBIN.delta_beta(20)
     assert config["prior"] == {"kind": "known", "delta": material.delta, "beta": material.beta, "ratio": 0.0}
     assert config["seed"] == 5
-    assert config["settings"] == asdict(QUICK)
+    assert config["method"] == to_table(QUICK)
 
 
 @pytest.mark.parametrize(("options", "kind"), [([], "free"), (["--delta-beta", "2800"], "ratio")])
@@ -68,7 +69,7 @@ def test_rendered_frames_are_in_the_scans_order_and_layout(shop, tmp_path, split
 
 
 def test_an_exported_volume_is_the_fields_or_as_asked(shop, tmp_path):
-    cloud, out = load_reconstruction(RunFolder(shop.run)).cloud, tmp_path / "volume.h5"
+    cloud, out = load_reconstruction(RunFolder(shop.run)).object, tmp_path / "volume.h5"
     for options, grid in (
         ([], Grid.centred((COLUMNS, ROWS, COLUMNS), PIXEL)),
         (["--shape", 10, 12, 14, "--voxel-size", 5e-6], Grid.centred((10, 12, 14), 5e-6)),

@@ -13,13 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
-from holosplat.fit.objective import Objective
-from holosplat.workflows.settings import Settings
 
 from holosplat.baselines import HolographicTV
 from holosplat.cli import main
-from holosplat.fit.loop import FitOptions
 from holosplat.fit.schedule import Schedule
+from holosplat.fit.terms import Objective
+from holosplat.methods import FitOptions, Gaussians
 
 PIXEL = 3.2e-6
 ROWS, COLUMNS = 24, 28
@@ -27,13 +26,13 @@ FORMULA = "C2952H4664N812O832S8Fe4"
 MATTER = ["--length-unit", "um", "--material", FORMULA, "--density", "1.335"]
 BEAM = ["--energy-kev", "20", "--distance", "0.1", "--pixel-size", "3.2e-6", "--detector", "24", "28"]
 
-QUICK = Settings(
+QUICK = Gaussians(
     spacing_px=2.0,
     approximate_steps=5,
     volume=HolographicTV(iterations=30, corrections=2, inner=8, refine=1),
     fit=FitOptions(Objective(tv_volume=0.05, overfull=10.0), Schedule(steps=6)),
 )
-"""Settings for runs whose quality does not matter."""
+"""Options for runs whose quality does not matter."""
 
 
 @dataclass(frozen=True)

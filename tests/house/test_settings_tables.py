@@ -99,6 +99,22 @@ def test_another_member_of_a_union_starts_from_its_own_defaults():
     assert changed(Cloud(2.0), {"density": {}}, kind=Cloud | Lattice) == Cloud(2.0, density=Density())
 
 
+def test_a_field_called_kind_is_a_field():
+    """Only a class variable is the name of a member: a field of that name leaves its neighbours alone."""
+
+    @dataclass(frozen=True)
+    class Encoding:
+        kind: str = "hash"
+        levels: int = 4
+
+    @dataclass(frozen=True)
+    class Network:
+        encoding: Encoding = Encoding()
+
+    Network.__annotations__["encoding"] = Encoding
+    assert overridden(Network(Encoding(levels=9)), ["encoding.kind=fourier"]) == Network(Encoding("fourier", 9))
+
+
 def test_merging_leaves_both_tables_alone():
     table, changes = {"a": {"b": 1, "c": {"d": 2}}}, {"a": {"c": {"e": 3}}, "f": 4}
     assert merged(table, changes) == {"a": {"b": 1, "c": {"d": 2, "e": 3}}, "f": 4}

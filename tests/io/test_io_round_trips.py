@@ -1,4 +1,4 @@
-"""Whatever is written comes back: scans, volumes, Gaussians, meshes, images and tables, of any values and names."""
+"""Whatever is written comes back: scans, volumes, objects, meshes, images and tables, of any values and names."""
 
 from __future__ import annotations
 
@@ -16,17 +16,18 @@ from hypothesis.extra.numpy import arrays
 
 from helpers.strategies import NAMES, VIEWS, clouds, images, numbers, scans, vectors
 from holosplat.geometry import Grid, Views
-from holosplat.io.gaussians import read_gaussians, write_gaussians
 from holosplat.io.json import read_json, write_json
 from holosplat.io.nerf_synthetic import NerfOptions, grey_range, read_nerf_synthetic, write_nerf_synthetic
 from holosplat.io.nxtomo import read_scan, write_scan
+from holosplat.io.objects import read_object, write_object
 from holosplat.io.png import LEVELS, read_png, write_png
 from holosplat.io.r2_gaussian import R2Options, read_r2_gaussian, write_r2_gaussian
 from holosplat.io.tiff import read_tiff, write_tiff
 from holosplat.io.volumes import read_volume, write_volume
 from holosplat.io.vtk import read_meshes, write_mesh
+from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
-from holosplat.representations import GaussianCloud
+from holosplat.representations import GaussianCloud, Stored, SurfaceMesh, VoxelGrid
 from holosplat.scan import Scan
 from holosplat.specimens.red_cells import icosphere
 from holosplat.volume import Volume
@@ -144,21 +145,38 @@ def test_a_volume_comes_back(volume, place):
     np.testing.assert_array_equal(found.beta, volume.beta)
 
 
-@given(
-    cloud=clouds(channels=1) | clouds(channels=2),
-    unit=numbers(1e-9, 1e-3),
-    materials=vectors(-1e-5, 1e-5, 2, 2),
-    two=st.booleans(),
-)
-def test_gaussians_come_back(cloud, unit, materials, two, place):
-    arrays_ = [cloud[0], torch.log(cloud[1]), *cloud[2:]]
-    second = tuple(materials[1].tolist()) if two and cloud[3].shape[1] == 2 else None
-    written = GaussianCloud(arrays_, unit, *materials[0].tolist(), second)
-    path = place() / "gaussians.h5"
-    write_gaussians(path, written)
-    found = read_gaussians(path)
-    assert all(torch.equal(a, b) for a, b in zip(found.parameters, written.parameters))
-    assert (found.unit_length, found.materials) == (written.unit_length, written.materials)
+@st.composite
+def objects(draw: st.DrawFn) -> Stored:
+    """Gaussians or voxels of one, two or free materials, or surfaces, with values of any size."""
+    pair, unit = draw(vectors(-1e-5, 1e-5, 2, 2)).tolist(), draw(numbers(1e-9, 1e-3))
+    one = Matter.one(*pair[0])
+    matter = draw(st.sampled_from([one, Matter.two(*pair), Matter.free(*pair[0])]))
+    kind = draw(st.sampled_from(["gaussians", "voxels", "surfaces"]))
+    if kind == "gaussians":
+        centres, scales, *rest = draw(clouds(channels=len(matter)))
+        return GaussianCloud([centres, torch.log(scales), *rest], unit, matter)
+    if kind == "voxels":
+        grid = draw(volumes()).grid
+        return VoxelGrid(torch.from_numpy(draw(arrays(np.float32, (len(matter), *grid.shape)))), grid, matter)
+    sphere, faces = (torch.from_numpy(a.copy()) for a in icosphere(1))
+    return SurfaceMesh(sphere * draw(numbers(0.1, 1e3)), faces.long(), unit, one, draw(st.integers(1, 4)))
+
+
+@given(obj=objects())
+def test_an_object_comes_back(obj, place):
+    """Bit for bit, of its kind and of the same matter."""
+    path = place() / "object.h5"
+    write_object(path, obj)
+    found = read_object(path)
+    assert (type(found), found.matter, found.described) == (type(obj), obj.matter, obj.described)
+    state, wanted = found.state(), obj.state()
+    assert state.keys() == wanted.keys()
+    for name, value in wanted.items():
+        if isinstance(value, torch.Tensor):
+            np.testing.assert_array_equal(state[name].numpy(), value.numpy(), err_msg=name)
+            assert state[name].dtype == value.dtype
+        else:
+            assert state[name] == value, name
 
 
 @given(

@@ -34,38 +34,41 @@ from .primal_dual import PrimalDual
 from .rays import rays_of
 from .tomography import TotalVariation, tv_solver
 
-FEW_VIEWS = 8
-"""With fewer, total variation has more to fill in, and its steps take longer to do so."""
-SETTLING = 2
-"""Rounds of agreement after which misfits are compared."""
-
 Progress = Callable[[str, float], None]
 """Called with (stage, fraction done of it)."""
 
 
 @dataclass(frozen=True)
 class HolographicTV:
-    """Options. retrieval: steps of the phase retrieval; iterations: primal–dual steps on the retrieved thickness;
-    weight: of total variation while the volume is made to agree with the holograms, in pixels of path length;
-    corrections: rounds of that, of `inner` steps each, more with fewer than 8 views; noisy: share of the frames'
-    contrast that is noise from which on there are no rounds, for the volume would agree with the noise; refine: voxels
-    along a pixel's edge in the rounds (0: as the first fringe needs); max_voxels: coarser voxels rather than more than
-    this many; upper: bound of the occupancy (0: none); backend: `cpu`, or `reference` (plain torch, slow).
-    """
+    """Options of the start: phase retrieval, total variation, and agreement with the holograms."""
 
     retrieval: int = 60
+    """Steps of the phase retrieval."""
     iterations: int = 160
+    """Primal–dual steps on the retrieved thickness."""
     weight: float = 0.3
+    """Weight of total variation while the volume is made to agree with the holograms, in pixels of path length."""
     corrections: int = 6
+    """Rounds of agreement (0: none)."""
     inner: int = 12
+    """Primal–dual steps a round, for `few_views` or more."""
+    few_views: int = 8
+    """With fewer views than this a round has more steps: total variation has more to fill in."""
+    settling: int = 2
+    """Rounds after which misfits are compared: in the first ones the solver finds its dual variables."""
     noisy: float = 0.35
+    """Share of the frames' contrast that is noise from which on there are no rounds: the volume would agree with it."""
     refine: int = 0
+    """Voxels along a pixel's edge in the rounds (0: as the first fringe needs)."""
     max_voxels: int = 70_000_000
+    """Coarser voxels rather than more than this many."""
     upper: float = 1.0
+    """Bound of the occupancy (0: none)."""
     backend: Literal["cpu", "reference"] = "cpu"
+    """What computes it: the compiled kernels, or plain torch, which is slow."""
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "weight", "corrections", "inner", "noisy", "refine", "upper")
+        at_least(self, 0, "weight", "corrections", "inner", "few_views", "settling", "noisy", "refine", "upper")
         at_least(self, 1, "retrieval", "iterations", "max_voxels")
 
 
@@ -120,14 +123,14 @@ def _agree(
     grid = Grid.of_views(views, refine)
     projector = projector_for(grid, views.refined(refine), options.backend)
     solver = coarse.on_finer(projector, refine, options.weight)
-    inner = math.ceil(options.inner * max(1.0, FEW_VIEWS / len(scan)))
+    inner = math.ceil(options.inner * max(1.0, options.few_views / len(scan)))
     best, least = solver.volume, float("inf")
     for done in range(options.corrections + 1):
         on_progress("agreement with the holograms", done / options.corrections)
         lines = solver.lines()
         missing = frames - _image(instrument, _refined(lines, finer) * pitch, material).detach()
         misfit = float(missing.square().sum())
-        if misfit < least or done <= SETTLING:
+        if misfit < least or done <= options.settling:
             best, least = solver.volume.clone(), misfit
         if done < options.corrections:
             solver.run(lines + _refined(correction(missing) / pitch, refine), inner)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import require
+from ..checks import at_least, require
 from ..geometry import Grid
 from ..memory import memory_kept
 from ..optics.retrieval import paganin
@@ -17,35 +18,63 @@ from ..scan import Scan
 from .rays import rays_of
 from .tomography import TotalVariation, tv_solver
 
-RATIOS = np.logspace(1.75, 4.25, 11)
-"""δ/β tried by `estimate_ratio`: from heavy elements at low energy to soft matter at high energy."""
 TRIAL_DELTA = 1e-6
 """Any value will do: the retrieved D = δT does not depend on it."""
-WORKING_WIDTH = 64
-"""Frames are binned to about this width for estimates; the ratio acts on the lowest frequencies only."""
+
+
+@dataclass(frozen=True)
+class MaterialEstimate:
+    """How a material that is not known is estimated from the frames."""
+
+    lowest: float = 1.75
+    """Decimal logarithm of the smallest δ/β that is tried: heavy elements at low energy."""
+    highest: float = 4.25
+    """Decimal logarithm of the largest: soft matter at high energy."""
+    tried: int = 11
+    """Ratios that are tried, evenly spaced on a logarithmic scale; between them a parabola decides."""
+    width: int = 64
+    """Frames are binned to about so many pixels for δ/β, which acts on the lowest frequencies only; to twice as many
+    for δ."""
+    weight: float = 0.1
+    """Weight of total variation in the trial volumes, in pixels of path length."""
+    iterations: int = 40
+    """Primal–dual steps for a trial volume."""
+
+    def __post_init__(self) -> None:
+        rises = self.lowest < self.highest
+        require(rises, f"lowest must be below highest, {self.highest:g}, but it is {self.lowest:g}.")
+        at_least(self, 3, "tried")
+        at_least(self, 1, "width", "iterations")
+        at_least(self, 0, "weight")
+
+
+DEFAULT = MaterialEstimate()
 
 Progress = Callable[[str, float], None]
 Backend = Literal["cpu", "reference"]
 
 
-def estimate_ratio(scan: Scan, on_progress: Progress, backend: Backend = "cpu") -> float:
+def estimate_ratio(
+    scan: Scan, on_progress: Progress, backend: Backend = "cpu", options: MaterialEstimate = DEFAULT
+) -> float:
     """A coarse δ/β of the matter in `scan`: the one that gives the most compact volume.
 
     A wrong ratio leaves halos of positive or negative matter around everything, in every view alike, which
-    lower the level of the matter itself. So of 11 ratios, the one whose non-negative tomography has the highest
+    lower the level of the matter itself. So of several ratios, the one whose non-negative tomography has the highest
     `plateau` is taken (the first such peak, from low ratios on), and refined by a parabola on a logarithmic
     scale. Good to a factor of about two; photon noise pulls it down.
     """
-    coarse = scan.binned(max(1, round(scan.views.shape[1] / WORKING_WIDTH)))
-    levels = np.empty(len(RATIOS))
-    for i, ratio in enumerate(RATIOS):
-        on_progress("estimate of delta/beta", i / len(RATIOS))
-        levels[i] = plateau(_trial_volume(coarse, ratio, backend))
+    coarse = scan.binned(max(1, round(scan.views.shape[1] / options.width)))
+    ratios = np.logspace(options.lowest, options.highest, options.tried)
+    levels = np.empty(len(ratios))
+    for i, ratio in enumerate(ratios):
+        on_progress("estimate of delta/beta", i / len(ratios))
+        levels[i] = plateau(_trial_volume(coarse, ratio, backend, options))
     best = _first_peak(levels)
     left, middle, right = levels[best - 1 : best + 2]
     curvature = left - 2 * middle + right
     offset = float(np.clip(0.5 * (left - right) / curvature, -1, 1)) if curvature < 0 else 0.0
-    return float(RATIOS[best] * (RATIOS[1] / RATIOS[0]) ** offset)
+    return float(ratios[best] * (ratios[1] / ratios[0]) ** offset)
 
 
 def _first_peak(levels: np.ndarray) -> int:
@@ -57,11 +86,13 @@ def _first_peak(levels: np.ndarray) -> int:
     return int(inner[0]) if len(inner) else int(np.clip(np.argmax(levels), 1, len(levels) - 2))
 
 
-def estimate_delta(scan: Scan, ratio: float, on_progress: Progress, backend: Backend = "cpu") -> float:
+def estimate_delta(
+    scan: Scan, ratio: float, on_progress: Progress, backend: Backend = "cpu", options: MaterialEstimate = DEFAULT
+) -> float:
     """δ of the one material in `scan` whose δ/β is `ratio`: the plateau of a non-negative tomography."""
     on_progress("estimate of delta", 0.0)
-    coarse = scan.binned(max(1, round(scan.views.shape[1] / (2 * WORKING_WIDTH))))
-    return plateau(_trial_volume(coarse, ratio, backend)) * TRIAL_DELTA
+    coarse = scan.binned(max(1, round(scan.views.shape[1] / (2 * options.width))))
+    return plateau(_trial_volume(coarse, ratio, backend, options)) * TRIAL_DELTA
 
 
 def plateau(occupancy: Tensor) -> float:
@@ -72,10 +103,10 @@ def plateau(occupancy: Tensor) -> float:
     return float(values[int(torch.searchsorted(mass, 0.5 * mass[-1]))])
 
 
-def _trial_volume(scan: Scan, ratio: float, backend: Backend) -> Tensor:
+def _trial_volume(scan: Scan, ratio: float, backend: Backend, options: MaterialEstimate) -> Tensor:
     """Occupancy by Paganin's retrieval and a little total variation, not negative and without an upper bound."""
     lines = paganin(torch.from_numpy(scan.frames), scan.exposures, TRIAL_DELTA, TRIAL_DELTA / ratio)
     rays = rays_of(lines, scan.views, Grid.of_views(scan.views), backend)
-    how = TotalVariation(weight=0.1, first=40, iterations=0)
+    how = TotalVariation(weight=options.weight, first=options.iterations, iterations=0)
     with memory_kept():
         return tv_solver(rays, None, how, lambda fraction: None, backend).volume

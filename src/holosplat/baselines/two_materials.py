@@ -19,6 +19,7 @@ from scipy.optimize import nnls
 from torch import Tensor
 from torch.nn.functional import avg_pool3d
 
+from ..checks import at_least
 from ..geometry import Grid
 from ..matter import LEAST_CONTRAST, DeltaBeta
 from ..model import Instrument
@@ -30,20 +31,35 @@ from ..units import wavelength
 from ..volume import LineIntegrals
 from .material import Backend, plateau
 
-FAINT = 0.3
-"""Below this share of the level that most matter has, there are halos rather than matter."""
-LARGEST_SPREAD = 0.4
-"""Share of the spread that two levels leave where there are two (both kinds of scenes: `benchmarks/two_levels.py`)."""
-LEAST_SHARE = 0.1
-"""Share of all matter that the lighter material must have where it is more than a layer of partly filled voxels."""
-LARGEST_DEVIATION = 0.3
-"""Mean deviation of δ from its level where the lighter material is: below 0.2 for one, more on blurred rims."""
-SLIVER = 0.05
-"""Occupancies below this are noise."""
-BLUR = 1.5
-"""Standard deviation of the blur of frames in which absorption is looked for, in widths √(λz) of the first fringe."""
 STEP, ITERATIONS = 1e-10, 5
 """Of the linearisation in β."""
+
+
+@dataclass(frozen=True)
+class TwoMaterials:
+    """How two materials are told apart."""
+
+    rounds: int = 2
+    """Rounds in which the frames are turned into those of one ratio; with more, the materials drift."""
+    faint: float = 0.3
+    """Below this share of the level that most matter has, there are halos rather than matter."""
+    largest_spread: float = 0.4
+    """Share of the spread that two levels leave, at most, where there are two (`benchmarks/two_levels.py`)."""
+    least_share: float = 0.1
+    """Share of all matter that the lighter material must have where it is more than a layer of partly filled voxels."""
+    largest_deviation: float = 0.3
+    """Mean deviation of δ from its level where the lighter material is: below 0.2 for one, more on blurred rims."""
+    sliver: float = 0.05
+    """Occupancies below this are noise."""
+    blur: float = 1.5
+    """Standard deviation of the blur of frames in which absorption is looked for, in widths √(λz) of a fringe."""
+
+    def __post_init__(self) -> None:
+        at_least(self, 1, "rounds")
+        at_least(self, 0, "faint", "largest_spread", "least_share", "largest_deviation", "sliver", "blur")
+
+
+DEFAULT = TwoMaterials()
 
 
 @dataclass(frozen=True)
@@ -69,36 +85,35 @@ class Levels:
     share: float
     deviation: float
 
-    @property
-    def are_two(self) -> bool:
+    def are_two(self, options: TwoMaterials = DEFAULT) -> bool:
         """Whether these are two materials: far apart, near to all values, the lower one more than rims and level."""
-        apart = self.high >= LEAST_CONTRAST * self.low and self.spread <= LARGEST_SPREAD
-        return apart and self.share > LEAST_SHARE and self.deviation < LARGEST_DEVIATION
+        apart = self.high >= LEAST_CONTRAST * self.low and self.spread <= options.largest_spread
+        return apart and self.share > options.least_share and self.deviation < options.largest_deviation
 
 
-def two_levels(delta: Tensor, pixel: int) -> tuple[float, float] | None:
+def two_levels(delta: Tensor, pixel: int, options: TwoMaterials = DEFAULT) -> tuple[float, float] | None:
     """The two values (higher, lower) that δ takes in a volume [Z, Y, X], or None if it takes but one (`Levels`).
 
     pixel: voxels along a pixel's edge.
     """
-    found = best_levels(delta, pixel)
-    return (found.high, found.low) if found.are_two else None
+    found = best_levels(delta, pixel, options)
+    return (found.high, found.low) if found.are_two(options) else None
 
 
-def best_levels(delta: Tensor, pixel: int) -> Levels:
+def best_levels(delta: Tensor, pixel: int, options: TwoMaterials = DEFAULT) -> Levels:
     """The split of voxels where δ changes little that leaves each nearest to its group's median (k-medians).
 
     Arguments as for `two_levels`.
     """
     coarse = avg_pool3d(delta[None, None], pixel)[0, 0]
     values = coarse.numpy()
-    matter = values > FAINT * plateau(coarse)
+    matter = values > options.faint * plateau(coarse)
     slope = gaussian_gradient_magnitude(values, 1.0)
     flat = values[matter & (slope <= np.median(slope[matter]))]
     high, low = _two_medians(flat)
     nearer = np.minimum(np.abs(flat - high), np.abs(flat - low)).mean()
     spread = np.abs(flat - np.median(flat)).mean()
-    denser, lighter = told_apart(coarse, (high, low), 1)
+    denser, lighter = told_apart(coarse, (high, low), 1, options)
     share = float(lighter.sum() / (denser.sum() + lighter.sum()))
     deviation = float(np.abs(values[lighter.numpy() > 0] / low - 1).mean()) if share else np.inf
     return Levels(high, low, float(nearer / max(spread, np.finfo(np.float32).tiny)), share, deviation)
@@ -116,7 +131,7 @@ def _two_medians(values: np.ndarray) -> tuple[float, float]:
     return float(high), float(low)
 
 
-def told_apart(delta: Tensor, levels: Sequence[float], pixel: int) -> Tensor:
+def told_apart(delta: Tensor, levels: Sequence[float], pixel: int, options: TwoMaterials = DEFAULT) -> Tensor:
     """Occupancies [2, Z, Y, X] of the materials of δ `levels` (higher, lower) in a volume [Z, Y, X] of δ.
 
     Voxels nearer to the lower level are full of the lighter material, unless they are part of a layer thinner than
@@ -127,12 +142,17 @@ def told_apart(delta: Tensor, levels: Sequence[float], pixel: int) -> Tensor:
     between = (values > 0.5 * low) & (values <= 0.5 * (low + high))
     lighter = binary_opening(between, iterations=pixel)
     denser = np.where(lighter, 0, np.clip(values / high, 0, 1))
-    denser[denser < SLIVER] = 0
+    denser[denser < options.sliver] = 0
     return torch.from_numpy(np.stack([denser, lighter]).astype(np.float32))
 
 
 def absorption(
-    scan: Scan, values: Tensor, grid: Grid, deltas: Sequence[float], backend: Backend = "cpu"
+    scan: Scan,
+    values: Tensor,
+    grid: Grid,
+    deltas: Sequence[float],
+    backend: Backend = "cpu",
+    options: TwoMaterials = DEFAULT,
 ) -> list[float]:
     """β, none below zero, of the materials of δ `deltas` with the occupancies `values` [C, Z, Y, X] on `grid`.
 
@@ -141,9 +161,10 @@ def absorption(
     """
     instrument, lines = _lines(scan, values, grid, backend)
     fringe = np.sqrt((wavelength(scan.exposures.energy_kev) * scan.exposures.distance).max()) / scan.views.pixel_size
+    sigma = options.blur * fringe
 
     def blurred(frames: Tensor) -> np.ndarray:
-        return gaussian_filter(frames.numpy().astype(np.float64), (0, BLUR * fringe, BLUR * fringe)).ravel()
+        return gaussian_filter(frames.numpy().astype(np.float64), (0, sigma, sigma)).ravel()
 
     measured = blurred(torch.from_numpy(scan.frames))
     betas = np.zeros(len(deltas))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import UseAppendAction, arg
 
 from ..beamline.poses import Directions, Geometry
 from ..checks import InputError, require
@@ -243,7 +245,9 @@ class MethodOptions:
     preset: str | None = None
     """Named options of Gaussians: default (what you get without), fast, random, thesis."""
     config: Path | None = None
-    """Or: a JSON or TOML file of options, such as the config.json of another run."""
+    """Or: a JSON or TOML file of options, whole or partial, such as the config.json of another run."""
+    changes: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="PATH=VALUE")] = ()
+    """Change one option, such as fit.schedule.steps=500 or fit.steps=500; may be given again and again."""
     backend: Literal["auto", "cpu", "cuda", "reference"] | None = None
     """What computes the fit (default: as the options say, auto); `holosplat backends` lists what there is."""
 
@@ -254,7 +258,7 @@ class MethodOptions:
 
         given = [f"--{name}" for name in ("method", "preset", "config") if getattr(self, name) is not None]
         require(len(given) < 2, f"give one of --method, --preset and --config, but there are {' and '.join(given)}.")
-        method = chosen_method(self.method, self.preset, self.config)
+        method = chosen_method(self.method, self.preset, self.config, self.changes)
         if self.backend:
             move = getattr(method, "on_backend", None)
             if move is None:

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from ..baselines import HolographicTV
+from ..baselines.material import MaterialEstimate
+from ..baselines.two_materials import TwoMaterials
 from ..checks import at_least, require
 from ..fit.density import DensityControl
 from ..fit.schedule import Schedule
@@ -73,18 +75,27 @@ class GaussianOptions:
     """Gaussians at the start, at most: their distance grows rather than their number."""
     approximate_steps: int = 50
     """Steps in which the Gaussians learn the starting volume."""
+    approximate_rates: GaussianRates = GaussianRates(0.02, 0.02, 0.02, 0.05)
+    """Adam's rates in these steps, of which a tenth is left at the last one."""
+    filled: float = 0.05
+    """Share of matter from which on a block of the starting volume becomes a Gaussian."""
     random_count: int = 8_000
     """Gaussians of a random start."""
     separate: bool = False
     """Whether, with nothing known of the matter, δ and β are fitted apart, not at the one ratio that frames suggest."""
     most_materials: int = 2
     """How many materials (1 or 2) may be found where nothing is known."""
+    estimate: MaterialEstimate = field(default_factory=MaterialEstimate)
+    """How δ/β and δ are found where they are not known."""
+    two_materials: TwoMaterials = field(default_factory=TwoMaterials)
+    """How two materials are told apart."""
     volume: HolographicTV = field(default_factory=HolographicTV)
+    """The starting volume."""
     fit: FitOptions = field(default_factory=FitOptions)
 
     def __post_init__(self) -> None:
         require(self.spacing_px > 0, f"spacing_px must be positive, but it is {self.spacing_px}.")
-        at_least(self, 0, "approximate_steps", "spacing_noise")
+        at_least(self, 0, "approximate_steps", "spacing_noise", "filled")
         at_least(self, 1, "max_start", "random_count")
         require(
             self.most_materials in (1, 2),

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..baselines import holographic_tv
-from ..baselines.material import Backend, estimate_delta, estimate_ratio
+from ..baselines.material import DEFAULT, Backend, MaterialEstimate, estimate_delta, estimate_ratio
 from ..baselines.two_materials import Shares, absorption, at_one_ratio, told_apart, two_levels
 from ..geometry import Grid
 from ..materials import WATER
@@ -30,9 +30,6 @@ from ..scan import Scan
 from .gaussian_options import GaussianOptions
 from .method import Progress, Task
 
-ROUNDS = 2
-"""In which the frames of two materials are turned into those of one ratio; more of them let the materials drift."""
-
 Retrieve = Callable[[Scan], tuple[Tensor, Grid]]
 """Occupancy [Z, Y, X] and its grid, by a scan."""
 
@@ -45,7 +42,7 @@ def starting_cloud(task: Task, options: GaussianOptions) -> GaussianCloud:
 
 def _from_phase_retrieval(task: Task, options: GaussianOptions) -> GaussianCloud:
     scan, prior, backend = task.scan, task.prior, options.volume.backend
-    material = assumed_material(scan, prior, task.on_progress, backend)
+    material = assumed_material(scan, prior, task.on_progress, backend, options.estimate)
     how = replace(options.volume, upper=options.volume.upper if prior.fixes_ratio else 0.0)
 
     def retrieve(frames: Scan) -> tuple[Tensor, Grid]:
@@ -57,12 +54,13 @@ def _from_phase_retrieval(task: Task, options: GaussianOptions) -> GaussianCloud
     spacing = _spacing_px(scan, options) * pitch
     if shares is None:
         whole = at_pitch(volume, grid, pitch)
-        cloud = cloud_from_volume(*whole, material, spacing, pitch, options.max_start)
+        cloud = cloud_from_volume(*whole, material, spacing, pitch, options.max_start, options.filled)
     else:
         volume, grid = shares.values, shares.grid
         whole = at_pitch(volume, grid, pitch)
-        cloud = cloud_from_two(*whole, shares.materials, spacing, pitch, options.max_start)
-    cloud = approximate(cloud.on(backend), volume, grid, options.approximate_steps, task.on_progress)
+        cloud = cloud_from_two(*whole, shares.materials, spacing, pitch, options.max_start, options.filled)
+    rates = tuple(vars(options.approximate_rates).values())
+    cloud = approximate(cloud.on(backend), volume, grid, options.approximate_steps, task.on_progress, rates)
     return freed(cloud) if options.separate and not prior.fixes_ratio else cloud
 
 
@@ -71,22 +69,22 @@ def _shares(
 ) -> Shares | None:
     """Where two materials are, if two are known, or nothing is and the volume `found` of `material` shows two."""
     (volume, grid), scan, prior, backend = found, task.scan, task.prior, options.volume.backend
-    pixel = round(scan.views.pixel_size / grid.voxel_size[0]) or 1
+    pixel, how = round(scan.views.pixel_size / grid.voxel_size[0]) or 1, options.two_materials
     known = prior.materials if len(prior.materials) == 2 else ()
     levels = (known[0].delta, known[1].delta) if known else None
     if not prior.fixes_ratio and options.most_materials == 2 and not options.separate:
-        levels = two_levels(volume * material.delta, pixel)
+        levels = two_levels(volume * material.delta, pixel, how)
     if levels is None:
         return None
-    for _ in range(ROUNDS):
+    for _ in range(how.rounds):
         delta = volume * material.delta
-        levels = levels if known else two_levels(delta, pixel) or levels
-        values = told_apart(delta, levels, pixel)
-        betas = [m.beta for m in known] or absorption(scan, values, grid, levels, backend)
+        levels = levels if known else two_levels(delta, pixel, how) or levels
+        values = told_apart(delta, levels, pixel, how)
+        betas = [m.beta for m in known] or absorption(scan, values, grid, levels, backend, how)
         first, second = (DeltaBeta(*pair) for pair in zip(levels, betas))
         shares = Shares(values, grid, (first, second))
         volume, grid = retrieve(at_one_ratio(scan, shares, material.ratio, backend))
-    return replace(shares, values=told_apart(volume * material.delta, levels, pixel), grid=grid)
+    return replace(shares, values=told_apart(volume * material.delta, levels, pixel, how), grid=grid)
 
 
 def _spacing_px(scan: Scan, options: GaussianOptions) -> float:
@@ -94,7 +92,13 @@ def _spacing_px(scan: Scan, options: GaussianOptions) -> float:
     return options.spacing_px * min(2.0, 1 + options.spacing_noise * noise_share(torch.from_numpy(scan.frames)))
 
 
-def assumed_material(scan: Scan, prior: MaterialPrior, on_progress: Progress, backend: Backend = "cpu") -> DeltaBeta:
+def assumed_material(
+    scan: Scan,
+    prior: MaterialPrior,
+    on_progress: Progress,
+    backend: Backend = "cpu",
+    options: MaterialEstimate = DEFAULT,
+) -> DeltaBeta:
     """δ and β of one material for all matter: as known, or as the training frames `scan` suggest.
 
     Where two are known, it has the δ of the denser, and the ratio of an equal mixture.
@@ -104,8 +108,8 @@ def assumed_material(scan: Scan, prior: MaterialPrior, on_progress: Progress, ba
         return DeltaBeta(denser, denser * (dark + bright) / (denser + lighter))
     if prior.materials:
         return prior.materials[0]
-    ratio = prior.ratio if isinstance(prior, KnownRatio) else estimate_ratio(scan, on_progress, backend)
-    delta = estimate_delta(scan, ratio, on_progress, backend)
+    ratio = prior.ratio if isinstance(prior, KnownRatio) else estimate_ratio(scan, on_progress, backend, options)
+    delta = estimate_delta(scan, ratio, on_progress, backend, options)
     return DeltaBeta(delta, delta / ratio)
 
 

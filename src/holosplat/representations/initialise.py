@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -23,10 +23,9 @@ NEXT_TO_NOTHING = 1e-4
 """Amplitude of the material that a Gaussian is not of: so little that softplus hardly lets it grow."""
 
 FILLED = 0.05
-"""Share of matter from which on a block becomes a Gaussian."""
-
-APPROXIMATION_RATES = (0.02, 0.02, 0.02, 0.05)
-"""Adam's first rates of centres, log-scales, quaternions and amplitudes while a cloud learns a volume."""
+"""Share of matter from which on a block becomes a Gaussian, unless the caller says otherwise."""
+RATES = (0.02, 0.02, 0.02, 0.05)
+"""Adam's first rates of centres, log-scales, quaternions and amplitudes while a cloud learns a volume, likewise."""
 
 
 def cloud_from_volume(
@@ -36,24 +35,25 @@ def cloud_from_volume(
     spacing: float,
     unit_length: float,
     max_count: int = 1_000_000,
+    filled: float = FILLED,
 ) -> GaussianCloud:
     """A single-material cloud that approximates `occupancy` [Z, Y, X] on `grid`: one Gaussian a filled block.
 
     Blocks have an edge of about `spacing` [m] (a whole number of voxels), or more, so that there are at most
-    `max_count`. Each block that holds more than 5 % of
-    matter becomes one isotropic Gaussian at its centre of mass, with its mass, and with half a block as standard
-    deviation, so that full blocks add up to a flat density (rms ripple below 2 %).
+    `max_count`. Each block of which more than the share `filled` is matter becomes one isotropic Gaussian at its
+    centre of mass, with its mass, and with half a block as standard deviation, so that full blocks add up to a flat
+    density (rms ripple below 2 %).
     material: (δ, β) of an occupancy of one; unit_length [m]: the cloud's unit, the pixel size.
     """
     voxel = grid.voxel_size[0]
     edge = max(1, round(spacing / voxel))
     mass, centre = _block_moments(occupancy.float().clamp_min(0), edge)
-    while int((mass > FILLED).sum()) > max_count:
+    while int((mass > filled).sum()) > max_count:
         edge += 1
         mass, centre = _block_moments(occupancy.float().clamp_min(0), edge)
-    filled = torch.nonzero(mass > FILLED)
-    require(len(filled) > 0, "the start found no matter in the holograms; check material, energy and distance.")
-    mass, centre = mass[tuple(filled.T)], centre[(slice(None), *filled.T)].T
+    found = torch.nonzero(mass > filled)
+    require(len(found) > 0, "the start found no matter in the holograms; check material, energy and distance.")
+    mass, centre = mass[tuple(found.T)], centre[(slice(None), *found.T)].T
     position = centre * voxel + torch.tensor(grid.origin, dtype=torch.float32)
     sigma = 0.5 * edge * voxel
     peak = mass * (edge * voxel) ** 3 / ((2 * np.pi) ** 1.5 * sigma**3)
@@ -72,6 +72,7 @@ def cloud_from_two(
     spacing: float,
     unit_length: float,
     max_count: int = 1_000_000,
+    filled: float = FILLED,
 ) -> GaussianCloud:
     """A cloud of two materials that approximates `occupancies` [2, Z, Y, X] on `grid`; each Gaussian is of one.
 
@@ -82,10 +83,10 @@ def cloud_from_two(
     for channel, (occupancy, material) in enumerate(zip(occupancies, materials)):
         which = ("denser", "lighter")[channel]
         require(
-            bool((occupancy > FILLED).any()),
+            bool((occupancy > filled).any()),
             f"the start found nothing of the {which} of the two materials; check both, or name one only.",
         )
-        one = cloud_from_volume(occupancy, grid, material, spacing, unit_length, max_count // 2)
+        one = cloud_from_volume(occupancy, grid, material, spacing, unit_length, max_count // 2, filled)
         raw = raw_of(torch.full((len(one), 2), NEXT_TO_NOTHING))
         raw[:, channel] = one.raw_amplitudes[:, 0]
         parts.append((one.centres, one.log_scales, one.quaternions, raw))
@@ -104,12 +105,18 @@ def at_pitch(volume: Tensor, grid: Grid, pitch: float) -> tuple[Tensor, Grid]:
 
 
 def approximate(
-    cloud: GaussianCloud, occupancy: Tensor, grid: Grid, steps: int, on_progress: Callable[[str, float], None]
+    cloud: GaussianCloud,
+    occupancy: Tensor,
+    grid: Grid,
+    steps: int,
+    on_progress: Callable[[str, float], None],
+    rates: Sequence[float] = RATES,
 ) -> GaussianCloud:
     """The cloud after `steps` of Adam towards `occupancy` on `grid`, by mean squared difference.
 
     occupancy: [Z, Y, X], or [C, Z, Y, X] of each of the cloud's channels. It starts a hologram fit where the classical
-    reconstruction ended. `on_progress(stage, fraction)`.
+    reconstruction ended. `on_progress(stage, fraction)`. rates: first ones of centres, log-scales, quaternions and
+    amplitudes.
     """
     leaves = [p.detach().clone().requires_grad_() for p in cloud.parameters().values()]
     cloud = cloud.replaced(leaves)
@@ -121,7 +128,7 @@ def approximate(
             density = cloud.density(grid)
             # The gradient of Σ (density - occupancy)² / power, without the arrays that autograd would keep.
             density.backward((density.detach() - occupancy).mul_(2 / power))
-            for group, rate in zip(optimiser.param_groups, APPROXIMATION_RATES):
+            for group, rate in zip(optimiser.param_groups, rates):
                 group["lr"] = rate * 0.1 ** (step / steps)
             optimiser.step()
             optimiser.zero_grad(set_to_none=True)

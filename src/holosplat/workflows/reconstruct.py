@@ -17,6 +17,7 @@ from ..io.json import read_json, write_json
 from ..io.objects import read_object, write_object
 from ..matter import MaterialPrior
 from ..methods import Gaussians, Method, Stage, Task, finished
+from ..methods.presets import SCHEMA
 from ..optics.sampling import fringe_sampling
 from ..representations import KINDS, Stored
 from ..scan import Scan
@@ -29,9 +30,6 @@ SMALLEST_FRAME = 11
 """The window of SSIM."""
 FLAT_LEVELS = (0.2, 5.0)
 """Between these lies the median of frames that are relative to the flat field."""
-SCHEMA_VERSION = 2
-"""Of config.json; version 1, of holosplat 0.1, had none."""
-
 RESUMED_WITH = {
     "scan_hash": "scan file",
     "method": "method and settings (--method, --preset, --config, --set)",
@@ -281,9 +279,9 @@ def _require_same(folder: RunFolder, config: dict[str, Any]) -> None:
     old, same = folder.read_config(), json.loads(json.dumps(config))
     version = old.get("schema_version", 1)
     require(
-        version == SCHEMA_VERSION,
+        version == SCHEMA,
         f"{folder.path} was begun by a version of holosplat whose checkpoints differ (schema {version}, now "
-        f"{SCHEMA_VERSION}); start anew into another --out, with --config {folder.config}.",
+        f"{SCHEMA}); start anew into another --out, with --config {folder.config}.",
     )
     for table in (old, same):
         _without_backends(table.get("method", {}))
@@ -303,7 +301,7 @@ def _without_backends(table: Any) -> None:
 
 def _config(scan: Scan, prior: MaterialPrior, method: Method, seed: int) -> dict[str, Any]:
     return {
-        "schema_version": SCHEMA_VERSION,
+        "schema_version": SCHEMA,
         "method": to_table(method),
         "prior": prior.as_dict(),
         "seed": seed,
