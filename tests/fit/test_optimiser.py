@@ -149,7 +149,7 @@ def test_resizing_one_part_leaves_the_others():
 
 
 def test_an_unknown_name_is_refused():
-    with pytest.raises((InputError, KeyError), match="object.colours"):
+    with pytest.raises(InputError, match="free must be names of object.centres, .*, but it has object.colours"):
         a_trainable(free=("object.colours",))
 
 
@@ -218,7 +218,7 @@ def test_groups_are_those_of_adamw(dtype, tolerance):
 
 def test_a_group_of_defaults_changes_nothing():
     rates = {"a": 0.05, "b": 0.3, "c": 0.02}
-    assert_there(walked(starts(), {"b": Group()}, rates), walked(starts(), {}, rates), 1e-9)
+    assert_there(walked(starts(), {"b": Group()}, rates), walked(starts(), {}, rates), 1e-7)
 
 
 def test_one_length_for_all_and_a_preconditioner():
