@@ -13,7 +13,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from helpers.strategies import NAMES
-from holosplat.methods.presets import presets
+from holosplat.methods import METHODS
+from holosplat.methods.presets import method_of, preset, preset_names
 from holosplat.tables import changed, from_table, merged, overridden, to_table
 
 FLOATS = st.floats(allow_nan=False, allow_infinity=False)
@@ -59,8 +60,8 @@ class Everything:
 
 
 RATES = st.builds(Rates, FLOATS, st.none() | FLOATS, st.lists(FLOATS, max_size=3).map(tuple))
-METHODS = st.builds(Plain, st.integers(), NAMES.map(Path)) | st.builds(Fine, st.tuples(st.integers(), NAMES), RATES)
-ALL = st.builds(Everything, NAMES, st.booleans(), st.sampled_from(["left", "right"]), RATES, METHODS, st.none() | RATES)
+MEMBERS = st.builds(Plain, st.integers(), NAMES.map(Path)) | st.builds(Fine, st.tuples(st.integers(), NAMES), RATES)
+ALL = st.builds(Everything, NAMES, st.booleans(), st.sampled_from(["left", "right"]), RATES, MEMBERS, st.none() | RATES)
 
 
 @given(ALL)
@@ -92,7 +93,9 @@ def test_a_field_is_set_by_its_path(settings, first, steps):
     assert found.rates == dataclasses.replace(settings.rates, first=first)
 
 
-@pytest.mark.parametrize("name", presets())
-def test_presets_come_back_through_json(name):
-    settings = presets()[name]
-    assert from_table(type(settings), json.loads(json.dumps(to_table(settings)))) == settings
+@pytest.mark.parametrize("name", [*preset_names(), *METHODS])
+def test_the_options_of_every_method_come_back_through_json(name):
+    options = METHODS[name] if name in METHODS else preset(name)
+    table = json.loads(json.dumps(to_table(options)))
+    assert from_table(type(options), table) == options
+    assert method_of(table) == options
