@@ -149,7 +149,7 @@ def test_resizing_one_part_leaves_the_others():
 
 
 def test_an_unknown_name_is_refused():
-    with pytest.raises(InputError, match="free must be names of object.centres, .*, but it has object.colours"):
+    with pytest.raises(InputError, match=r"free must be names of object.centres, .*, but it has object.colours"):
         a_trainable(free=("object.colours",))
 
 

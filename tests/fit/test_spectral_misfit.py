@@ -66,7 +66,9 @@ def test_noise_is_measured_between_shapes(sigma):
 # --- the minimiser ------------------------------------------------------------------------------------------
 
 
-def minimised(value: Callable[[Tensor], Tensor], start: Tensor, upper: float, steps: int) -> tuple[Tensor, list[Tensor]]:
+def minimised(
+    value: Callable[[Tensor], Tensor], start: Tensor, upper: float, steps: int
+) -> tuple[Tensor, list[Tensor]]:
     """The best point after some steps, and every point that was tried."""
     leaves, seen = {"x": start.clone().requires_grad_()}, []
     optimiser = ProjectedGradient(leaves, upper)

@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from helpers.two_balls import DELTA, BETA, NETWORK, ONE, blurred_start, chords, error, misfit_of, scan, truth
+from helpers.two_balls import BETA, DELTA, NETWORK, ONE, blurred_start, chords, error, misfit_of, scan, truth
 from holosplat.checks import InputError
 from holosplat.fit.schedule import Schedule
 from holosplat.fit.terms import Objective
@@ -152,9 +152,7 @@ def test_fields_are_reproducible_by_seed_and_stop_in_time():
     schedule = Schedule(steps=5, views_per_step=2, decay=0.05)
     options = NeuralFit(NETWORK, warmup_steps=5, probes=50, prune_every=2, schedule=schedule)
     grid = Grid.of_views(measured.views)
-    first, same, other = (
-        fit_neural(measured, ONE, thickness, options, seed).values(grid) for seed in (1, 1, 2)
-    )
+    first, same, other = (fit_neural(measured, ONE, thickness, options, seed).values(grid) for seed in (1, 1, 2))
     assert torch.equal(first, same)
     assert not torch.equal(first, other)
     steps: list[float] = []

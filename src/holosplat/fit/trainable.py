@@ -17,7 +17,8 @@ from .problem import Problem
 class Trainable:
     """The model of a problem whose free parameters an optimiser moves; all the others stay as they are.
 
-    optimiser: makes the optimiser of the leaves that it is given. Errors: `InputError` for free names that the model lacks.
+    optimiser: makes the optimiser of the leaves that it is given. Errors: `InputError` for free names that the
+    model lacks.
     """
 
     def __init__(self, problem: Problem, optimiser: Callable[[Leaves], Optimiser]) -> None:
