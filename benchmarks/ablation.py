@@ -74,7 +74,7 @@ class Runs:
 
     def __init__(self, case: Case) -> None:
         self._case, self._scan, self._truth = case, case.scan(), case.truth()
-        self._starts: dict[str, hs.GaussianCloud] = {}
+        self._starts: dict[str, hs.representations.GaussianCloud] = {}
 
     def score(self, settings: Settings) -> Row:
         """The numbers that matter, and how long the fit took (without the start) [s]."""

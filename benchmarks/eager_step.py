@@ -26,7 +26,7 @@ CUTOFF = 4.0
 class EagerStep:
     """Parameters, optimiser, and what the optics need, for the frames [V, H, W] of a scan."""
 
-    def __init__(self, scan: hs.Scan, cloud: hs.GaussianCloud, rates: tuple[float, ...]) -> None:
+    def __init__(self, scan: hs.Scan, cloud: hs.representations.GaussianCloud, rates: tuple[float, ...]) -> None:
         exposures, (h, w) = scan.exposures, scan.views.shape
         pitch = scan.views.pixel_size
         self.cloud = cloud.replaced(p.detach().clone().requires_grad_() for p in cloud.parameters)

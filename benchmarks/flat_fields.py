@@ -47,8 +47,8 @@ def clean_scan(regime: str, seed: int, side: int, views: int, psf_px: float) -> 
     pixel = PIXEL[regime]
     width = side * pixel
     diameter = 20 * pixel if regime == "3.2 µm" else 16 * pixel
-    cells = hs.random_cells(24, (0.75 * width, 0.85 * width, 0.75 * width), seed=seed, diameter=diameter)
-    scene = hs.MeshScene.of_one_material(cells, hs.HAEMOGLOBIN.delta_beta(20.0))
+    cells = hs.specimens.random_cells(24, (0.75 * width, 0.85 * width, 0.75 * width), seed=seed, diameter=diameter)
+    scene = hs.MeshScene.of_one_material(cells, hs.materials.HAEMOGLOBIN.delta_beta(20.0))
     exposures = hs.Exposures.of(hs.Views.evenly_spaced(views, (side, side), pixel), 20.0, 0.1, psf_px)
     return hs.simulate(scene, exposures)
 
@@ -59,15 +59,15 @@ def residuals(
     """(method, mean square with noise, mean square of the flat fields alone, seconds a frame, components)."""
     regime, photons, camera = CASES[case]
     clean, raw, truth, out = (folder / name for name in ("clean.nxs", "raw.nxs", "truth.h5", "scan.nxs"))
-    hs.write_scan(clean, clean_scan(regime, seed, side, views, 0.3))
-    sharp = hs.read_scan(clean).frames
+    hs.io.write_scan(clean, clean_scan(regime, seed, side, views, 0.3))
+    sharp = hs.io.read_scan(clean).frames
     options = RecordingOptions(photons_per_pixel=photons, seed=seed)
     record(clean, raw, options, camera, Illumination(), truth)
     for name, method in METHODS.items():
         started = time.process_time()
         done = correct(raw, out, method)
         seconds = (time.process_time() - started) / views
-        found = hs.read_scan(out).frames
+        found = hs.io.read_scan(out).frames
         wanted = np.stack([spread(frame.astype(np.float64), camera.scintillator_px) for frame in sharp])
         yield (
             name,

@@ -30,7 +30,7 @@ from holosplat.bench.declaration import Between
 from holosplat.workflows.evaluate import Scores, score_object
 from holosplat.workflows.provenance import environment
 
-HAEMOGLOBIN = hs.HAEMOGLOBIN.delta_beta(20.0)
+HAEMOGLOBIN = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Case:
 def cells(seed: int, prior: hs.MaterialPrior | None = None, photons: float | None = None) -> Case:
     """24 cells of 20 px diameter, 128 × 128 px of 3.2 µm, 20 keV, 10 cm, 16 views, PSF 0.05 px, haemoglobin."""
     pixel = 3.2e-6
-    meshes = hs.random_cells(24, (128 * pixel,) * 3, seed, 20 * pixel)
+    meshes = hs.specimens.random_cells(24, (128 * pixel,) * 3, seed, 20 * pixel)
     exposures = hs.Exposures.of(hs.Views.evenly_spaced(16, (128, 128), pixel), 20.0, 0.1, 0.05)
     known = hs.MaterialPrior.known(HAEMOGLOBIN)
     return Case(hs.MeshScene.of_one_material(meshes, HAEMOGLOBIN), exposures, prior or known, photons)
@@ -81,15 +81,15 @@ def poses(seed: int) -> Case:
 
 def plasma(seed: int) -> Case:
     """40 red cells in plasma, 96 × 96 px of 1 µm, 10 keV, 50 cm, 16 views, 1e5 photons a pixel; Δβ is negative."""
-    contrast = hs.RED_CELL.delta_beta(10.0).against(hs.PLASMA.delta_beta(10.0))
-    scene = hs.MeshScene.of_one_material(hs.random_cells(40, (96e-6,) * 3, seed, 7.8e-6), contrast)
+    contrast = hs.materials.RED_CELL.delta_beta(10.0).against(hs.materials.PLASMA.delta_beta(10.0))
+    scene = hs.MeshScene.of_one_material(hs.specimens.random_cells(40, (96e-6,) * 3, seed, 7.8e-6), contrast)
     exposures = hs.Exposures.of(hs.Views.evenly_spaced(16, (96, 96), 1e-6), 10.0, 0.5)
     return Case(scene, exposures, hs.MaterialPrior.known(contrast), 1e5)
 
 
 def snapshot(meshes: list[Path]) -> Case:
     """A snapshot of cells in µm, 128 × 192 px of 0.5 µm, 20 keV, 10 cm, 16 views, haemoglobin."""
-    scene = hs.read_scene(sorted(meshes), hs.Filling(), 20.0)
+    scene = hs.beamline.read_scene(sorted(meshes), hs.beamline.Filling(), 20.0)
     exposures = hs.Exposures.of(hs.Views.evenly_spaced(16, (128, 192), 0.5e-6), 20.0, 0.1)
     return Case(scene, exposures, hs.MaterialPrior.known(HAEMOGLOBIN))
 
@@ -125,7 +125,7 @@ def run(case: Case, preset: str, seed: int, surfaces: bool = False) -> list[dict
     ]
     if surfaces:
         began = time.perf_counter()
-        found = hs.refine_surfaces(result.cloud, scan)
+        found = hs.methods.refine_surfaces(result.cloud, scan)
         seconds += time.perf_counter() - began
         refined = score_object(found, scan, truth, oversampling(scan.train()))
         rows.append({"method": "surfaces", "seconds": seconds, "gaussians": 0, **numbers(refined, material)})

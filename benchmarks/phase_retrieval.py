@@ -15,9 +15,11 @@ import time
 import numpy as np
 import torch
 
-from holosplat import HAEMOGLOBIN, PLASMA, RED_CELL, Exposures, MeshScene, Views, random_cells, simulate
+from holosplat import Exposures, MeshScene, Views, simulate
+from holosplat.materials import HAEMOGLOBIN, PLASMA, RED_CELL
 from holosplat.optics.detector import bin_pixels, poisson
 from holosplat.optics.retrieval import RETRIEVALS, Linear, paganin
+from holosplat.specimens import random_cells
 
 SIDE = 128
 PIXEL, PSF = {"holographic": 0.5e-6, "blurred": 0.5e-6, "strong": 3.2e-6, "plasma": 1e-6}, {"blurred": 0.7}

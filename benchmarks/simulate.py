@@ -50,8 +50,8 @@ FINER, SMALL = 10, (96, 80)
 
 def cells(box: float) -> hs.MeshScene:
     """The cells in a cube of edge `box` [m]."""
-    meshes = hs.random_cells(CELLS, (box, box, box), SEED, DIAMETER)
-    return hs.MeshScene.of_one_material(meshes, hs.HAEMOGLOBIN.delta_beta(20.0))
+    meshes = hs.specimens.random_cells(CELLS, (box, box, box), SEED, DIAMETER)
+    return hs.MeshScene.of_one_material(meshes, hs.materials.HAEMOGLOBIN.delta_beta(20.0))
 
 
 def moving(scene: hs.MeshScene, times: int) -> MeshSeries:
@@ -91,7 +91,9 @@ def accuracy(pixel: float) -> dict[str, float]:
     taken = exposures(SMALL, 1, pixel)
     scene = cells(0.6 * min(SMALL) * pixel)
     frame = next(simulated_frames(scene, taken)).astype(np.float64)
-    same, finer = (hs.measure(scene, taken, n, torch.float64)[0].numpy() for n in (Simulation().samples(taken), FINER))
+    same, finer = (
+        hs.model.measure(scene, taken, n, torch.float64)[0].numpy() for n in (Simulation().samples(taken), FINER)
+    )
     contrast = float(np.linalg.norm(finer - 1))
     errors = {"method": np.linalg.norm(frame - finer), "single_precision": np.linalg.norm(frame - same)}
     return {"pixel": pixel, **{name: float(error) / contrast for name, error in errors.items()}}

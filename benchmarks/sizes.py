@@ -25,13 +25,13 @@ import holosplat as hs
 
 FIELD = 128 * 3.2e-6
 DIAMETER = 20 * 3.2e-6
-MATERIAL = hs.HAEMOGLOBIN.delta_beta(20.0)
+MATERIAL = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
 
 
 def measure(pixels: int, seed: int) -> str:
     """A row of the table."""
     pitch = FIELD / pixels
-    scene = hs.MeshScene.of_one_material(hs.random_cells(24, (FIELD,) * 3, seed, DIAMETER), MATERIAL)
+    scene = hs.MeshScene.of_one_material(hs.specimens.random_cells(24, (FIELD,) * 3, seed, DIAMETER), MATERIAL)
     views = hs.Views.evenly_spaced(16, (pixels, pixels), pitch)
     scan = hs.simulate(scene, hs.Exposures.of(views, 20.0, 0.1, 0.05), seed=seed)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -44,7 +44,7 @@ SIZES = {"256": (8_000, 256), "512": (30_000, 512), "512_244k": (244_000, 512)}
 RATES = (1e-3, 1e-3, 1e-3, 1e-3)
 
 
-def workload(count: int, size: int) -> tuple[hs.Scan, hs.GaussianCloud]:
+def workload(count: int, size: int) -> tuple[hs.Scan, hs.representations.GaussianCloud]:
     """A cloud that fills the field of view, and frames of the same cloud with other amplitudes."""
     generator = torch.Generator().manual_seed(SEED)
     centres = (torch.rand(count, 3, generator=generator) - 0.5) * size
@@ -53,15 +53,17 @@ def workload(count: int, size: int) -> tuple[hs.Scan, hs.GaussianCloud]:
     share = 4.0 * size**2 / count / 100  # about 1 rad through all of it, whatever the number of Gaussians
     amplitudes = share * (0.2 + torch.rand(count, 2, generator=generator))
     delta = 1.5e-7
-    cloud = hs.GaussianCloud((centres, log_scales, quaternions, raw_of(amplitudes)), PIXEL, delta, delta / 1000)
+    cloud = hs.representations.GaussianCloud(
+        (centres, log_scales, quaternions, raw_of(amplitudes)), PIXEL, delta, delta / 1000
+    )
     other = cloud.replaced((centres, log_scales, quaternions, raw_of(amplitudes.flip(0))))
     exposures = hs.Exposures.of(hs.Views.evenly_spaced(VIEWS, (size, size), PIXEL), 20.0, 0.1, 0.5)
     with torch.no_grad():
-        frames = hs.measure(other.on(resolve("auto")), exposures).cpu().numpy()
+        frames = hs.model.measure(other.on(resolve("auto")), exposures).cpu().numpy()
     return hs.Scan(frames, exposures, np.zeros(VIEWS, dtype=bool), {}), cloud
 
 
-def fit_of(scan: hs.Scan, cloud: hs.GaussianCloud, backend: str) -> Fit:
+def fit_of(scan: hs.Scan, cloud: hs.representations.GaussianCloud, backend: str) -> Fit:
     """The project's own loop, with the objective and the rates of this benchmark."""
     position, scale, rotation, amplitude = RATES
     schedule = Schedule(

@@ -54,10 +54,10 @@ def prepared(name: str, seed: int, runs: Path) -> tuple[hs.Scan, hs.Volume, hs.R
         folder.mkdir(parents=True, exist_ok=True)
         case = load_case(name, seed)
         measured = case.scan()
-        hs.write_scan(scan, measured)
-        hs.write_volume(truth, case.truth())
+        hs.io.write_scan(scan, measured)
+        hs.io.write_volume(truth, case.truth())
         hs.reconstruct(measured, case.prior, hs.preset("default"), seed, folder=run)
-    return hs.read_scan(scan), hs.read_volume(truth), hs.load_reconstruction(run)
+    return hs.io.read_scan(scan), hs.io.read_volume(truth), hs.load_reconstruction(run)
 
 
 def measured(name: str, seed: int, runs: Path) -> list[dict[str, Any]]:

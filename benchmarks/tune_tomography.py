@@ -34,7 +34,7 @@ from holosplat.optics.retrieval import RETRIEVALS
 from holosplat.optics.sampling import fringe_sampling
 from holosplat.representations.voxels import VoxelGrid
 
-HAEMOGLOBIN = hs.HAEMOGLOBIN.delta_beta(20.0)
+HAEMOGLOBIN = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
 PITCH = 3.2e-6
 UNEQUAL = [0.0, 33.0, 71.0, 124.0]
 HELD_OUT = [17.0, 52.0, 97.0, 150.0]
@@ -96,7 +96,7 @@ class Job:
 def job(name: str, seed: int, retrieval: str) -> Job:
     """Simulate and retrieve; held-out frames are free of noise."""
     scene = SCENES[name]
-    meshes = hs.random_cells(scene.cells, (scene.side * scene.pitch,) * 3, seed, scene.diameter)
+    meshes = hs.specimens.random_cells(scene.cells, (scene.side * scene.pitch,) * 3, seed, scene.diameter)
     matter = hs.MeshScene.of_one_material(meshes, HAEMOGLOBIN)
     views = hs.Views.from_angles(scene.train + scene.held_out, (scene.side, scene.side), scene.pitch)
     exposures = hs.Exposures.of(views, 20.0, 0.1, scene.psf_px)
@@ -125,7 +125,7 @@ def row(job: Job, method: Callable[..., torch.Tensor], held_out: bool) -> str:
     test = job.scan.test()
     oversample = fringe_sampling(train.exposures)
     with torch.no_grad():
-        predicted = hs.measure(voxels, test.exposures, oversample).numpy()
+        predicted = hs.model.measure(voxels, test.exposures, oversample).numpy()
     mean = image_scores(predicted, test.frames, intensity_range(train.frames)).mean
     return f"{cells} | {mean['ssim']:.4f} | {mean['frcm']:.4f}"
 

@@ -44,8 +44,8 @@ GREY = "gray"
 def scene() -> hs.MeshScene:
     """The cells."""
     width = SIDE * PIXEL
-    cells = hs.random_cells(8, (0.75 * width, 0.85 * width, 0.75 * width), seed=SEED, diameter=16 * PIXEL)
-    return hs.MeshScene.of_one_material(cells, hs.HAEMOGLOBIN.delta_beta(ENERGY))
+    cells = hs.specimens.random_cells(8, (0.75 * width, 0.85 * width, 0.75 * width), seed=SEED, diameter=16 * PIXEL)
+    return hs.MeshScene.of_one_material(cells, hs.materials.HAEMOGLOBIN.delta_beta(ENERGY))
 
 
 def told(psf_px: float = PSF) -> hs.Exposures:
@@ -70,7 +70,7 @@ def blurred(known: bool) -> hs.Scan:
 def banded(bandwidth: float) -> hs.Scan:
     """Frames of a Gaussian spectrum, reconstructed as if all had its mean energy."""
     light = Spectrum.gaussian(ENERGY, bandwidth, 5)
-    filling = hs.Filling(hs.HAEMOGLOBIN)
+    filling = hs.beamline.Filling(hs.materials.HAEMOGLOBIN)
     frames = polychromatic_frames(lambda energy: refilled(scene(), filling, energy), light, told(), Simulation())
     return replace(ideal(), frames=np.stack(list(frames)))
 
@@ -83,10 +83,10 @@ def noisy(photons: float) -> hs.Scan:
 def recorded(work: Path, light: Illumination, method: CorrectionOptions, scan: hs.Scan | None = None) -> hs.Scan:
     """Frames recorded by the camera under `light`, and corrected."""
     clean, raw, out = (work / f"{name}.nxs" for name in ("clean", "raw", "corrected"))
-    hs.write_scan(clean, scan or ideal())
+    hs.io.write_scan(clean, scan or ideal())
     record(clean, raw, RecordingOptions(seed=SEED), Camera(), light, work / "truth.h5")
     correct(raw, out, method)
-    return hs.read_scan(out)
+    return hs.io.read_scan(out)
 
 
 def misaligned(**errors: float) -> hs.Scan:
@@ -100,7 +100,7 @@ def everything(work: Path) -> hs.Scan:
     psf = float(joined_blur_px(PSF, source_blur(SOURCE[0] / 2, SOURCE[1], DISTANCE), PIXEL))
     true = Misalignment(0.2, 0.1, 0.005, SEED).true_exposures(told(psf))
     light = Spectrum.gaussian(ENERGY, 0.01, 3)
-    filling = hs.Filling(hs.HAEMOGLOBIN)
+    filling = hs.beamline.Filling(hs.materials.HAEMOGLOBIN)
     frames = polychromatic_frames(lambda energy: refilled(scene(), filling, energy), light, true, Simulation())
     scan = hs.Scan(np.stack(list(frames)), told(psf), ideal().is_test)
     return recorded(work, Illumination(), CorrectionOptions(), scan)
@@ -131,7 +131,7 @@ def row(name: str, work: Path, preset: str) -> dict[str, float]:
     if not kept.with_suffix(".json").exists():
         scan, truth = CASES[name](work), scene().voxelise(hs.Grid.of_views(told().views))
         started = time.monotonic()
-        prior = hs.MaterialPrior.known(hs.HAEMOGLOBIN.delta_beta(ENERGY))
+        prior = hs.MaterialPrior.known(hs.materials.HAEMOGLOBIN.delta_beta(ENERGY))
         result = hs.reconstruct(scan, prior, hs.preset(preset))
         headline = hs.evaluate(result, ideal(), truth).headline()
         np.save(kept.with_suffix(".npy"), result.cloud.voxelise(truth.grid).delta[:, SIDE // 2])
@@ -176,8 +176,8 @@ def flat_field_picture(work: Path) -> None:
         "dynamic": DYNAMIC,
     }.items():
         correct(work / "raw.nxs", work / "corrected.nxs", method)
-        found[name] = hs.read_scan(work / "corrected.nxs").frames
-    clean, view = hs.read_scan(work / "clean.nxs").frames, 5
+        found[name] = hs.io.read_scan(work / "corrected.nxs").frames
+    clean, view = hs.io.read_scan(work / "clean.nxs").frames, 5
     with open_scan(work / "raw.nxs") as raw, h5py.File(work / "truth.h5") as truth:
         top = {
             "a flat": raw.frame(int(raw.numbers(FLAT)[0])),

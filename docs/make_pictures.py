@@ -11,7 +11,7 @@ from holosplat.report import hero_figure
 
 def main(demo: Path) -> None:
     """Draw docs/images/hero.png from the folder that `holosplat demo` made."""
-    scan, truth = hs.read_scan(demo / "scan.nxs"), hs.read_volume(demo / "truth.h5")
+    scan, truth = hs.io.read_scan(demo / "scan.nxs"), hs.io.read_volume(demo / "truth.h5")
     cloud = hs.load_reconstruction(hs.RunFolder(demo / "run")).cloud
     held_out = scan.test()
     figure = hero_figure(

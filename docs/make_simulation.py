@@ -24,7 +24,7 @@ from holosplat.specimens.mesh_series import MeshSeries
 IMAGES = Path(__file__).parent / "images"
 SEED, PIXEL, SHAPE = 3, 0.5e-6, (72, 72)
 SPEED = 0.05
-MATERIAL = hs.HAEMOGLOBIN.delta_beta(20.0)
+MATERIAL = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
 CONTRAST = {"cmap": "gray", "vmin": 0.55, "vmax": 1.6}
 
 
@@ -34,7 +34,7 @@ INNER = (slice(12, 60), slice(12, 60))
 
 def scene(count: int, edge: float, seed: int = SEED) -> hs.MeshScene:
     """Red cells in a cube of `edge` [m]."""
-    return hs.MeshScene.of_one_material(hs.random_cells(count, (edge,) * 3, seed, 8e-6), MATERIAL)
+    return hs.MeshScene.of_one_material(hs.specimens.random_cells(count, (edge,) * 3, seed, 8e-6), MATERIAL)
 
 
 def drifting(still: hs.MeshScene, seconds: float) -> MeshSeries:

@@ -20,15 +20,15 @@ def main(out: Path) -> None:
     exposures = hs.Exposures.of(views, energy_kev=20.0, distance=0.1, psf_sigma_px=0.5)
 
     # The specimen: eight red cells, turned and placed at random about the origin, which lies on the rotation axis (y).
-    # Your own cells: hs.read_scene(["cell1.vtk", "cell2.vtk"], hs.Filling(...), 20.0, length_unit="um").
-    haemoglobin = hs.HAEMOGLOBIN.delta_beta(20.0)  # δ and β; in plasma: hs.RED_CELL… .against(hs.PLASMA…)
-    cells = hs.random_cells(8, box=(views.width, views.height, views.width), seed=1)
+    # Your own cells: hs.beamline.read_scene(["cell1.vtk", …], hs.beamline.Filling(…), 20.0, length_unit="um").
+    haemoglobin = hs.materials.HAEMOGLOBIN.delta_beta(20.0)  # δ and β; in plasma: RED_CELL… .against(PLASMA…)
+    cells = hs.specimens.random_cells(8, box=(views.width, views.height, views.width), seed=1)
     scene = hs.MeshScene.of_one_material(cells, haemoglobin)
 
     # The measurement, with photon noise. Every fourth view is held out: the fit never sees it, the scores are on it.
-    # A scan of your own is read by hs.read_scan("scan.nxs"); docs/conventions.md lists the fields.
+    # A scan of your own is read by hs.io.read_scan("scan.nxs"); docs/conventions.md lists the fields.
     scan = hs.simulate(scene, exposures, photons_per_pixel=10_000, seed=1)
-    hs.write_scan(out / "scan.nxs", scan)
+    hs.io.write_scan(out / "scan.nxs", scan)
 
     # The reconstruction. What you know of the matter goes in as the prior: its δ and β here; else only their ratio,
     # hs.MaterialPrior.of_ratio(2800), or nothing, hs.MaterialPrior.unknown(). Without a method it is hs.Gaussians(),
@@ -44,7 +44,7 @@ def main(out: Path) -> None:
     print(*scores.lines(), sep="\n")
 
     # δ and β on voxels, for any other program (HDF5: /delta and /beta, [z, y, x]).
-    hs.write_volume(out / "volume.h5", result.object.voxelise(grid))
+    hs.io.write_volume(out / "volume.h5", result.object.voxelise(grid))
     print(f"wrote {out / 'scan.nxs'}, {out / 'run'} and {out / 'volume.h5'}")
 
 

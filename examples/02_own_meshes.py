@@ -17,22 +17,22 @@ ENERGY_KEV = 20.0
 def main(out: Path) -> None:
     """Write meshes, read them as a scene, simulate a scan file, reconstruct it, compare."""
     out.mkdir(parents=True, exist_ok=True)
-    for number, mesh in enumerate(hs.random_cells(3, box=(24e-6, 16e-6, 24e-6), seed=5)):
-        hs.write_mesh(out / f"cell{number}.vtk", mesh, length_unit="um")
+    for number, mesh in enumerate(hs.specimens.random_cells(3, box=(24e-6, 16e-6, 24e-6), seed=5)):
+        hs.io.write_mesh(out / f"cell{number}.vtk", mesh, length_unit="um")
 
     # The files have no unit and no material: both are said here. Several materials: Filling(table={"cell1*": …}).
     # The middle of all meshes comes to the origin, on the rotation axis y; origin=(x, y, z) chooses another point.
-    filling = hs.Filling(hs.HAEMOGLOBIN, medium=None)
-    scene = hs.read_scene(sorted(out.glob("cell*.vtk")), filling, ENERGY_KEV, length_unit="um")
+    filling = hs.beamline.Filling(hs.materials.HAEMOGLOBIN, medium=None)
+    scene = hs.beamline.read_scene(sorted(out.glob("cell*.vtk")), filling, ENERGY_KEV, length_unit="um")
 
     # 64 × 64 pixels of 0.5 µm show a field of 32 µm; a mesh that leaves it would be cut off in some views.
     views = hs.Views.evenly_spaced(12, shape=(64, 64), pixel_size=0.5e-6)
     print(f"{len(scene.meshes)} meshes, with {-1e6 * scene.missing_field(views):.1f} µm of free field around them")
-    hs.write_scan(out / "scan.nxs", hs.simulate(scene, hs.Exposures.of(views, ENERGY_KEV, distance=0.1)))
+    hs.io.write_scan(out / "scan.nxs", hs.simulate(scene, hs.Exposures.of(views, ENERGY_KEV, distance=0.1)))
 
     # From here on as with a measured scan: the file (NXtomo) and the material are all that the reconstruction gets.
-    scan = hs.read_scan(out / "scan.nxs")
-    prior = hs.MaterialPrior.known(hs.HAEMOGLOBIN.delta_beta(ENERGY_KEV))
+    scan = hs.io.read_scan(out / "scan.nxs")
+    prior = hs.MaterialPrior.known(hs.materials.HAEMOGLOBIN.delta_beta(ENERGY_KEV))
     result = hs.reconstruct(scan, prior, hs.preset("fast"))
     grid = hs.Grid.of_views(views)
     truth, found = scene.voxelise(grid), result.object.voxelise(grid)

@@ -17,8 +17,8 @@ def main(out: Path) -> None:
     """Simulate one scan and reconstruct it with three priors."""
     out.mkdir(parents=True, exist_ok=True)
     views = hs.Views.evenly_spaced(12, shape=(64, 64), pixel_size=0.5e-6)
-    material = hs.HAEMOGLOBIN.delta_beta(20.0)
-    cells = hs.random_cells(4, box=(views.width,) * 3, seed=2)
+    material = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
+    cells = hs.specimens.random_cells(4, box=(views.width,) * 3, seed=2)
     scene = hs.MeshScene.of_one_material(cells, material)
     scan = hs.simulate(scene, hs.Exposures.of(views, energy_kev=20.0, distance=0.1), photons_per_pixel=20_000, seed=2)
 

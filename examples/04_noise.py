@@ -17,8 +17,8 @@ def main(out: Path) -> None:
     """Reconstruct the same cells from frames of fewer and fewer photons."""
     out.mkdir(parents=True, exist_ok=True)
     views = hs.Views.evenly_spaced(12, shape=(64, 64), pixel_size=0.5e-6)
-    material = hs.HAEMOGLOBIN.delta_beta(20.0)
-    scene = hs.MeshScene.of_one_material(hs.random_cells(4, box=(views.width,) * 3, seed=3), material)
+    material = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
+    scene = hs.MeshScene.of_one_material(hs.specimens.random_cells(4, box=(views.width,) * 3, seed=3), material)
     clean = hs.simulate(scene, hs.Exposures.of(views, energy_kev=20.0, distance=0.1))
     grid = hs.Grid.of_views(views)
     truth = scene.voxelise(grid)

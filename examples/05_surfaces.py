@@ -16,8 +16,8 @@ def main(out: Path) -> None:
     """Gaussians and surfaces of the same scan, both against the truth; the bodies as a VTK file."""
     out.mkdir(parents=True, exist_ok=True)
     views = hs.Views.evenly_spaced(12, shape=(64, 64), pixel_size=0.5e-6)
-    material = hs.HAEMOGLOBIN.delta_beta(20.0)
-    scene = hs.MeshScene.of_one_material(hs.random_cells(4, box=(views.width,) * 3, seed=4), material)
+    material = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
+    scene = hs.MeshScene.of_one_material(hs.specimens.random_cells(4, box=(views.width,) * 3, seed=4), material)
     scan = hs.simulate(scene, hs.Exposures.of(views, energy_kev=20.0, distance=0.1), photons_per_pixel=10_000, seed=4)
 
     # A method is an object that holds its options. Surfaces start from the Gaussians of their own options.
@@ -37,7 +37,7 @@ def main(out: Path) -> None:
     plt.savefig(out / "largest_delta_along_z.png", dpi=100)
 
     bodies = result.object.mesh()
-    hs.write_mesh(out / "bodies.vtk", bodies, length_unit="um")
+    hs.io.write_mesh(out / "bodies.vtk", bodies, length_unit="um")
     print(f"{len(bodies.vertices)} vertices, {len(bodies.faces)} triangles")
 
 

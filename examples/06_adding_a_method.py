@@ -40,15 +40,15 @@ class Thresholded:
 
     def stages(self) -> Sequence[Stage]:
         """The stages of another method, and one more."""
-        return (*hs.PerView("tikhonov", "tv").stages(), Threshold(self.level))
+        return (*hs.methods.PerView("tikhonov", "tv").stages(), Threshold(self.level))
 
 
 if __name__ == "__main__":
     views = hs.Views.evenly_spaced(12, shape=(64, 64), pixel_size=0.5e-6)
-    material = hs.HAEMOGLOBIN.delta_beta(20.0)
-    scene = hs.MeshScene.of_one_material(hs.random_cells(4, box=(views.width,) * 3, seed=6), material)
+    material = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
+    scene = hs.MeshScene.of_one_material(hs.specimens.random_cells(4, box=(views.width,) * 3, seed=6), material)
     scan = hs.simulate(scene, hs.Exposures.of(views, energy_kev=20.0, distance=0.1))
-    for method in (hs.PerView("tikhonov", "tv"), Thresholded(), hs.preset("fast")):
+    for method in (hs.methods.PerView("tikhonov", "tv"), Thresholded(), hs.preset("fast")):
         result = hs.reconstruct(scan, hs.MaterialPrior.known(material), method)
         print(
             f"{method.kind}:", *hs.evaluate(result, scan, scene.voxelise(hs.Grid.of_views(views))).lines(), sep="\n  "

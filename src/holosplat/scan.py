@@ -176,6 +176,10 @@ class Scan:
         frames = picked(self.source, index)
         return Scan.of(frames, self.exposures[index], self.is_test[index], self.provenance)
 
+    def in_memory(self) -> Scan:
+        """This scan with all its frames read, where bad ones are named: for who uses each of them, more than once."""
+        return Scan.of(self.frames, self.exposures, self.is_test, self.provenance)
+
     def blocks(self) -> Iterator[np.ndarray]:
         """All frames in turn, some at once, [K, H, W] float32: a few of a long series are in memory at a time."""
         return blocks(self.source)

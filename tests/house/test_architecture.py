@@ -20,7 +20,7 @@ Files = dict[str, str]
 """Path below src/holosplat → source text."""
 
 TIERS = (
-    ("units", "version", "checks", "tables", "native", "backends", "memory")
+    ("units", "version", "checks", "lazy", "tables", "native", "backends", "memory", "progress")
     + ("geometry", "frames", "scan", "volume", "mesh", "matter"),
     ("materials", "optics", "metrics", "projectors", "preprocess"),
     ("specimens", "representations", "model"),

@@ -81,6 +81,11 @@ def test_frames_are_read_once_and_kept(stored, reads):
     assert scan.frames is scan.frames
     assert reads == list(range(N))
     np.testing.assert_array_equal(np.asarray(read_scan(stored).source), a_series().frames)
+    reads.clear()
+    at_once = read_scan(stored).in_memory()
+    stored.unlink()
+    np.testing.assert_array_equal(at_once.train().frames, a_series().train().frames)
+    assert reads == list(range(N))
 
 
 def test_frames_are_indexed_as_arrays_are(stored):

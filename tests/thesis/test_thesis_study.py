@@ -234,9 +234,9 @@ def test_the_loop_raises_what_the_study_catches(measured):
 
 def test_a_folder_of_something_else_or_of_another_study_is_refused(measured, tmp_path):
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match=r"--out must be new, empty or a study"):
+    with pytest.raises(InputError, match=r"must be new or empty, but .* a study to go on with"):
         run_study(measured, [SMALL], QUICK, 5, StudyFolder(tmp_path))
-    with pytest.raises(InputError, match=r"--out must lie in an existing folder"):
+    with pytest.raises(InputError, match="must lie in an existing folder"):
         run_study(measured, [SMALL], QUICK, 5, StudyFolder(tmp_path / "no" / "where"))
     folder = StudyFolder(tmp_path / "study")
     with pytest.raises(InputError, match="must hold a finished configuration"):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -12,6 +11,7 @@ from torch import Tensor
 from ..checks import at_least, require
 from ..geometry import Grid, Views
 from ..memory import memory_kept
+from ..progress import Advance
 from ..projectors.voxels import LatticeProjector, SliceProjector
 from .rays import Rays, bounded, checked_upper, rays_of
 
@@ -39,7 +39,7 @@ def sirt(
     views: Views,
     grid: Grid,
     upper: float | None,
-    on_progress: Callable[[float], None],
+    on_progress: Advance,
     *,
     options: Algebraic = Algebraic(),
 ) -> Tensor:
@@ -53,7 +53,7 @@ def sirt(
         return _simultaneous(rays, top, on_progress, options)
 
 
-def _simultaneous(rays: Rays, top: float | None, on_progress: Callable[[float], None], options: Algebraic) -> Tensor:
+def _simultaneous(rays: Rays, top: float | None, on_progress: Advance, options: Algebraic) -> Tensor:
     projector, lowest = rays.projector, 0.0 if options.nonnegative else None
     volume = torch.zeros(projector.array_shape)
     per_ray = _reciprocal(projector.project(torch.ones_like(volume)))
@@ -71,7 +71,7 @@ def art(
     views: Views,
     grid: Grid,
     upper: float | None,
-    on_progress: Callable[[float], None],
+    on_progress: Advance,
     *,
     options: Algebraic = Algebraic(sweeps=40, relaxation=0.5, nonnegative=True),
 ) -> Tensor:

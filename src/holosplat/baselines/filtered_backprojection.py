@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,6 +11,7 @@ from torch import Tensor
 
 from ..checks import require
 from ..geometry import Grid, Views
+from ..progress import Advance
 from .rays import bounded, checked_upper, in_pixels
 
 
@@ -34,7 +34,7 @@ def filtered_backprojection(
     views: Views,
     grid: Grid,
     upper: float | None,
-    on_progress: Callable[[float], None],
+    on_progress: Advance,
     *,
     options: Ramp = Ramp(),
 ) -> Tensor:
@@ -93,7 +93,7 @@ def _filtered(images: Tensor, options: Ramp) -> Tensor:
     return torch.fft.irfft(spectrum, n=length)[..., :width].float()
 
 
-def _smeared(images: Tensor, views: Views, grid: Grid, on_progress: Callable[[float], None]) -> Tensor:
+def _smeared(images: Tensor, views: Views, grid: Grid, on_progress: Advance) -> Tensor:
     """The sum [Z, Y, X] over views of `images` [V, H, W] at the voxels' shadows; zero outside the detector."""
     x, y, z = grid.axes()
     h, w = views.shape

@@ -8,7 +8,6 @@ frequencies that only consistency between views can mend.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal
@@ -27,15 +26,13 @@ from ..optics.retrieval import Tikhonov, tikhonov
 from ..optics.retrieval.bounded import MODEL_ERROR, PRIOR
 from ..optics.retrieval.spectra import Raster, filtered, radian, response, spectra, surrounded
 from ..optics.sampling import fringe_sampling
+from ..progress import Progress
 from ..projectors.voxels import projector_for
 from ..scan import Scan
 from ..volume import LineIntegrals
 from .primal_dual import PrimalDual
 from .rays import rays_of
 from .tomography import TotalVariation, tv_solver
-
-Progress = Callable[[str, float], None]
-"""Called with (stage, fraction done of it)."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,6 +13,7 @@ from ..checks import at_least, require
 from ..geometry import Grid
 from ..memory import memory_kept
 from ..optics.retrieval import paganin
+from ..progress import Progress
 from ..scan import Scan
 from .rays import rays_of
 from .tomography import TotalVariation, tv_solver
@@ -50,7 +50,6 @@ class MaterialEstimate:
 
 DEFAULT = MaterialEstimate()
 
-Progress = Callable[[str, float], None]
 Backend = Literal["cpu", "reference"]
 
 

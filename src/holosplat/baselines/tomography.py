@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -13,6 +12,7 @@ from torch import Tensor
 from ..checks import at_least
 from ..geometry import Grid, Views
 from ..memory import memory_kept
+from ..progress import Advance
 from .algebraic import Algebraic, art, sirt
 from .filtered_backprojection import filtered_backprojection
 from .primal_dual import PrimalDual
@@ -25,16 +25,12 @@ QUIETEST = 1e-4
 class Tomography(Protocol):
     """(thickness [V, H, W] in metres, their views, grid, upper bound or None, progress) → occupancy [Z, Y, X]."""
 
-    def __call__(
-        self, lines: Tensor, views: Views, grid: Grid, upper: float | None, on_progress: Callable[[float], None], /
-    ) -> Tensor:
+    def __call__(self, lines: Tensor, views: Views, grid: Grid, upper: float | None, on_progress: Advance, /) -> Tensor:
         """The occupancy [Z, Y, X], dimensionless float32, never above `upper`; `on_progress(fraction)` on the way."""
         ...
 
 
-def sirt_nonnegative(
-    lines: Tensor, views: Views, grid: Grid, upper: float | None, on_progress: Callable[[float], None]
-) -> Tensor:
+def sirt_nonnegative(lines: Tensor, views: Views, grid: Grid, upper: float | None, on_progress: Advance) -> Tensor:
     """`sirt` with the occupancy kept from going below zero, which lets it run longer."""
     return sirt(lines, views, grid, upper, on_progress, options=Algebraic(sweeps=200, relaxation=1.9, nonnegative=True))
 
@@ -60,7 +56,7 @@ def total_variation(
     views: Views,
     grid: Grid,
     upper: float | None,
-    on_progress: Callable[[float], None],
+    on_progress: Advance,
     *,
     options: TotalVariation = TotalVariation(),
 ) -> Tensor:
@@ -78,7 +74,7 @@ def tv_solver(
     rays: Rays,
     upper: float | None,
     options: TotalVariation,
-    on_progress: Callable[[float], None],
+    on_progress: Advance,
     backend: str = "cpu",
 ) -> PrimalDual:
     """The solver of `total_variation` after its last iteration, for those who go on from there."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,10 +13,12 @@ from torch import Tensor
 from ..checks import InputError, in_range, require
 from ..fit.interrupt import interrupts_held
 from ..io.atomic import atomic_path
+from ..io.folder import require_new
 from ..io.json import read_json, write_json
 from ..io.pvd import TimeStep, write_pvd
 from ..io.vtk import write_mesh
 from ..mesh import TriangleMesh
+from ..progress import Advance
 from ..specimens.flow.channel import Channel
 from ..specimens.flow.integrate import State, Stepper
 from ..specimens.flow.suspension import Medium, Suspension
@@ -120,13 +121,6 @@ class SeriesFolder:
         """The mesh of a cell, counted from 0, at a snapshot."""
         return self.path / f"rbc{cell:02d}_{snapshot:03d}.vtp"
 
-    def require_new(self) -> None:
-        """`InputError` if something is there already."""
-        taken = self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir()))
-        require(not taken, f"--out must be new or empty, but {self.path} holds files; choose another, or add --resume.")
-        parent = self.path.resolve().parent
-        require(parent.is_dir(), f"--out must lie in an existing folder, but {parent} is none; create it.")
-
     def create(self, growth: Growth) -> None:
         """Make the folder."""
         try:
@@ -180,7 +174,7 @@ def grow(
     growth: Growth,
     out: str | Path,
     resume: bool = False,
-    on_progress: Callable[[float], None] = lambda fraction: None,
+    on_progress: Advance = lambda fraction: None,
 ) -> Grown:
     """Let cells flow, and write a time series of meshes to the folder `out` (see `SeriesFolder`).
 
@@ -191,7 +185,7 @@ def grow(
     growth.check()
     folder = SeriesFolder(out)
     suspension = growth.suspension()
-    (folder.require_same(growth) if resume else folder.require_new())
+    (folder.require_same(growth) if resume else require_new(out, "choose another --out, or add --resume"))
     reached = folder.read_state(growth, suspension) if resume else None
     if reached is None:
         first = FIRST_STEP / suspension.channel.shear_rate()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from ..optics.coherence import joined_blur_px
 from ..optics.illumination import Illumination, PulseModel, Pulses
 from ..optics.noise import PHOTON_RANGE
 from ..optics.resampling import FLIPS, Flip
+from ..progress import Advance
 from ..scan import Exposures, Scan
 
 DEAD_BIT, HOT_BIT = 1 << 1, 1 << 3
@@ -93,7 +93,7 @@ def record(
     camera: Camera,
     light: Illumination,
     truth: Path | None = None,
-    on_progress: Callable[[float], None] = lambda fraction: None,
+    on_progress: Advance = lambda fraction: None,
 ) -> Recorded:
     """Record the noise-free scan `source` as raw counts into `out`: darks, flats, then one pulse a projection.
 

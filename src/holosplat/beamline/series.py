@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -11,6 +11,7 @@ import numpy as np
 
 from ..checks import in_range, require
 from ..io.snapshots import find_snapshots
+from ..progress import Advance
 from ..specimens.mesh_series import ROUNDING, MeshSeries
 from ..units import LENGTH_UNITS, unit_factor
 from .scenes import Filling, field_centre, filled_scene
@@ -79,7 +80,7 @@ def read_series(
     energy_kev: float,
     timing: Timing,
     files: SeriesFiles = SeriesFiles(),
-    on_progress: Callable[[float], None] = lambda fraction: None,
+    on_progress: Advance = lambda fraction: None,
 ) -> tuple[MeshSeries, np.ndarray]:
     """The moving bodies, filled and centred, and the times [T] of the frames [s], of which the first is 0.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +15,7 @@ from ..model import Instrument, Model
 from ..optics.detector import poisson
 from ..optics.noise import PHOTON_RANGE
 from ..optics.sampling import resolving_oversample
+from ..progress import Advance
 from ..scan import Exposures, Scan, interleaved_split
 from ..volume import Object
 
@@ -116,7 +117,7 @@ def simulate(
     is_test: np.ndarray | None = None,
     oversample: int | None = None,
     shutter: Shutter = Shutter(),
-    on_progress: Callable[[float], None] = lambda fraction: None,
+    on_progress: Advance = lambda fraction: None,
 ) -> Scan:
     """A scan of `obj`, held in memory (`simulated_frames` gives frame by frame): waves on a fine raster, integrated
     over pixels, then photon noise if asked for.

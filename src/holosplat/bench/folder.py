@@ -11,6 +11,7 @@ import numpy as np
 
 from ..checks import InputError, require
 from ..io.atomic import atomic_path
+from ..io.folder import is_taken, require_parent
 from ..io.json import read_json, write_json
 from .rows import Row, read_row, write_row
 
@@ -37,10 +38,8 @@ class BenchFolder:
 
     def require_usable(self) -> None:
         """`InputError` unless the folder can be made, is empty, or holds a benchmark already."""
-        parent = self.path.resolve().parent
-        require(parent.is_dir(), f"--out must lie in an existing folder, but {parent} is none; create it.")
-        taken = self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir()))
-        if taken:
+        require_parent(self.path)
+        if is_taken(self.path):
             self._require_marked(f"the benchmark's folder (--out) must be new, or hold a benchmark, but {self.path}")
 
     def require_bench(self) -> None:

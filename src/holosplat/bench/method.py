@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from ..matter import MaterialPrior
 from ..methods import Method as Options
 from ..methods import Task, solve
-from ..methods.method import Progress
+from ..progress import Progress
 from ..scan import Scan
 from ..volume import Object
 

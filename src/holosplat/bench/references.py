@@ -12,7 +12,7 @@ from ..baselines import TOMOGRAPHIES
 from ..checks import require
 from ..geometry import Grid
 from ..matter import Matter
-from ..methods.method import Progress
+from ..progress import Progress
 from ..representations.voxels import VoxelGrid
 from ..volume import Object, Volume
 from .case import Case

@@ -13,13 +13,14 @@ from ..backends import resolve
 from ..checks import InputError, require
 from ..metrics import resolution
 from ..optics.sampling import fringe_sampling
+from ..progress import Progress
 from ..scan import Scan
 from ..volume import Object, Volume
 from ..workflows.evaluate import Scores, score_object
 from ..workflows.provenance import environment, scan_hash
 from .case import Case
 from .folder import BenchFolder
-from .method import Method, Progress
+from .method import Method
 from .pictures import TRUTH, Arrays, method_picture, truth_picture
 from .prepare import prepared
 from .record import memory_growth, source_commit

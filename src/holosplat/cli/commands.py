@@ -49,7 +49,7 @@ def reconstruct(
 
     method = how.chosen()
     require(seed >= 0, f"--seed must be 0 or more, but it is {seed}.")
-    measured = at_time(read(scan), time_frame)
+    measured = at_time(read(scan), time_frame).in_memory()
     prior = matter.prior(measured.exposures.reference_energy)
     folder = RunFolder(out)
     with ProgressBar() as bar:

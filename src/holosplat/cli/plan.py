@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import sys
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import arg
 
 from ..checks import in_range, require
+from ..progress import Advance
 from .options import MaterialOptions
 from .progress import ProgressBar
 
@@ -109,7 +109,7 @@ class BeamOptions:
 
 
 @dataclass(frozen=True)
-class RecordingOptions:
+class AcquisitionOptions:
     """What is recorded; what is left out is not printed."""
 
     photons_per_pixel: float = 1000.0
@@ -177,7 +177,7 @@ class RangeOptions:
             require_writable(self.out)
             require_writable(self.out.with_suffix(".csv"))
 
-    def run(self, subject: Subject, setup: Setup, photons: float, on_progress: Callable[[float], None]) -> Survey:
+    def run(self, subject: Subject, setup: Setup, photons: float, on_progress: Advance) -> Survey:
         """The survey of the ranges: distances in equal ratios, energies in equal steps."""
         import numpy as np
 
@@ -194,7 +194,7 @@ class RangeOptions:
 def plan(
     what: ObjectOptions,
     beam: BeamOptions,
-    record: RecordingOptions,
+    record: AcquisitionOptions,
     ranges: RangeOptions,
     as_json: Annotated[bool, arg(name="json")] = False,
 ) -> None:

@@ -51,4 +51,5 @@ _FORMAT = "{desc:28s} {percentage:3.0f}%|{bar:24}| {elapsed}{postfix}"
 
 def _described(record: dict[str, float]) -> str:
     speed = record["step"] / record["seconds"] if record["seconds"] > 0 else 0.0
-    return f"loss {record['loss']:.3e}, {record['count']:.0f} Gaussians, {speed:.1f} steps/s"
+    size = f"{record['count']:.0f} Gaussians, " if "count" in record else ""
+    return f"loss {record['loss']:.3e}, {size}{speed:.1f} steps/s"

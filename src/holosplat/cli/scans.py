@@ -18,4 +18,4 @@ def scan_for(folder: RunFolder, scan: Path) -> Scan:
     if found.is_series:
         found = at_time(found, read_json(folder.source).get("time_frame") if folder.source.is_file() else None)
         require_one_time(found)
-    return found
+    return found.in_memory()

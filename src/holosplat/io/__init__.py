@@ -5,17 +5,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from ..lazy import exports
 
-if TYPE_CHECKING:
-    from .formats import read as read
-
-__all__ = ["read"]
-
-
-def __getattr__(name: str) -> Any:
-    if name != "read":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from .formats import read  # imported when it is used: whoever writes JSON needs no HDF5
-
-    return read
+__getattr__, __dir__, __all__ = exports(__name__, __file__)

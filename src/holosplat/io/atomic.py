@@ -9,13 +9,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ..checks import InputError, require
+from .folder import require_parent
 
 
 def require_writable(path: str | Path) -> None:
     """`InputError` unless `path` is a place for a file: in an existing folder, and no folder itself."""
     require(not Path(path).is_dir(), f"{path} must be a file to write, but it is a folder; add a file name.")
-    folder = Path(os.path.realpath(path)).parent
-    require(folder.is_dir(), f"{path} must lie in an existing folder, but {folder} is none; create it.")
+    require_parent(path)
 
 
 def require_apart(out: Path, *others: Path) -> None:

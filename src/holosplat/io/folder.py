@@ -12,12 +12,21 @@ from pathlib import Path
 from ..checks import InputError, require
 
 
-def require_new(path: str | Path) -> None:
-    """`InputError` unless `path` is free (nothing there, or an empty folder) and lies in an existing folder."""
+def is_taken(path: str | Path) -> bool:
+    """Whether something is at `path`: a file, a broken link, or a folder that is not empty."""
     target = Path(path)
-    taken = os.path.lexists(target) and (not target.is_dir() or any(target.iterdir()))
-    require(not taken, f"{path} must be new, but it is there already; choose another name, or remove it first.")
-    parent = target.resolve().parent
+    return os.path.lexists(target) and (not target.is_dir() or any(target.iterdir()))
+
+
+def require_new(path: str | Path, way_out: str = "choose another name, or remove it first") -> None:
+    """`InputError`, with the advice `way_out`, unless `path` is free (`is_taken`) and lies in an existing folder."""
+    require(not is_taken(path), f"{path} must be new or empty, but it holds something already; {way_out}.")
+    require_parent(path)
+
+
+def require_parent(path: str | Path) -> None:
+    """`InputError` unless `path` lies in an existing folder."""
+    parent = Path(os.path.realpath(path)).parent
     require(parent.is_dir(), f"{path} must lie in an existing folder, but {parent} is none; create it.")
 
 

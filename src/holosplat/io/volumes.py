@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import h5py
@@ -10,6 +10,7 @@ import numpy as np
 
 from ..checks import InputError, finite, in_range
 from ..geometry import Grid
+from ..progress import Advance
 from ..volume import Object, Volume
 from .atomic import atomic_path
 from .hdf5 import Fields, attribute_numbers, open_hdf5
@@ -18,8 +19,6 @@ NAMES = ("delta", "beta")
 VOXEL_RANGE_M = (1e-10, 1e-2)
 SLAB_VOXELS = 1 << 22
 """Voxels that `write_voxels` makes at once: meshes take about 250 MB for them."""
-
-Progress = Callable[[float], None]
 
 
 def read_volume(path: str | Path) -> Volume:
@@ -64,7 +63,7 @@ def write_slabs(path: str | Path, grid: Grid, slabs: Iterable[tuple[int, Volume]
                 array[:, start : start + part.grid.shape[1]] = getattr(part, name)
 
 
-def write_voxels(path: str | Path, obj: Object, grid: Grid, on_progress: Progress = lambda fraction: None) -> None:
+def write_voxels(path: str | Path, obj: Object, grid: Grid, on_progress: Advance = lambda fraction: None) -> None:
     """Write `obj` voxelised on `grid`, slab by slab; at most `SLAB_VOXELS` voxels are in memory, however large the
     grid.
 

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Protocol, runtime_checkable
 
 from ..fit.loop import Fit
 from ..matter import MaterialPrior
+from ..progress import Advance, Progress
 from ..representations import KINDS, Stored
 from ..scan import Scan
-
-Progress = Callable[[str, float], None]
-"""Called with (stage, fraction done of it)."""
 
 
 def quiet(stage: str, fraction: float) -> None:
@@ -32,7 +30,7 @@ class Task:
     seed: int = 0
     on_progress: Progress = quiet
 
-    def report(self, stage: str) -> Callable[[float], None]:
+    def report(self, stage: str) -> Advance:
         """Progress of one stage: a function of the fraction done."""
         return lambda fraction: self.on_progress(stage, fraction)
 
@@ -72,7 +70,7 @@ def finished(fit: Fit) -> Stored:
     return found.on("reference" if fit.backend == "reference" else "cpu")
 
 
-def run_quietly(fit: Fit, report: Callable[[float], None]) -> Stored:
+def run_quietly(fit: Fit, report: Advance) -> Stored:
     """Run a fit to its end without keeping records; what it ended with. Ctrl-C is passed on."""
     fit.run(lambda record: report(min(1.0, fit.schedule.share(fit.step, fit.seconds))))
     return finished(fit)

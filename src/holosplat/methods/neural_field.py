@@ -235,7 +235,7 @@ class PruneEvent:
     def columns(self, model: Model) -> Record:
         """The number of voxels that are looked at."""
         assert isinstance(model.object, NeuralField)
-        return {"count": float(model.object.mask.sum())}
+        return {"occupied": float(model.object.mask.sum())}
 
     def state_dict(self) -> dict[str, Any]:
         """The hull and the mask."""

@@ -17,6 +17,7 @@ from ..materials import WATER
 from ..matter import DeltaBeta, KnownRatio, MaterialPrior, Matter
 from ..optics.noise import noise_share
 from ..optics.retrieval import retrieve_thickness
+from ..progress import Progress
 from ..representations import (
     GaussianCloud,
     approximate,
@@ -28,7 +29,7 @@ from ..representations import (
 )
 from ..scan import Scan
 from .gaussian_options import GaussianOptions
-from .method import Progress, Task
+from .method import Task
 
 Retrieve = Callable[[Scan], tuple[Tensor, Grid]]
 """Occupancy [Z, Y, X] and its grid, by a scan."""

@@ -22,6 +22,7 @@ from ..geometry import Grid
 from ..matter import MaterialPrior
 from ..optics.noise import noise_share
 from ..optics.sampling import fringe_sampling
+from ..progress import Progress
 from ..projectors.sparse import torch_csr
 from ..representations import GaussianCloud, Stored, SurfaceMesh, isosurface
 from ..representations.isosurface import adjacency, neighbour_mean
@@ -29,7 +30,7 @@ from ..scan import Scan
 from .gaussian_options import Backend
 from .gaussians import Gaussians
 from .ground import ExtraTerm, ground
-from .method import Progress, Stage, Task, quiet, run_quietly
+from .method import Stage, Task, quiet, run_quietly
 
 STAGE = "surfaces"
 VERTICES = "object.vertices"

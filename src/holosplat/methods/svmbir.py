@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
 from dataclasses import dataclass
 from types import ModuleType
 
@@ -14,6 +13,7 @@ from torch import Tensor
 from ..baselines.rays import in_pixels
 from ..checks import MissingError, at_least, require
 from ..geometry import Grid, Views
+from ..progress import Advance
 from ..projectors.voxels import rows_match
 
 
@@ -39,7 +39,7 @@ def svmbir_volume(
     lines: Tensor,
     views: Views,
     grid: Grid,
-    on_progress: Callable[[float], None],
+    on_progress: Advance,
     *,
     options: Mbir = Mbir(),
 ) -> Tensor:

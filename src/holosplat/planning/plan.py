@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy as np
 from ..checks import in_range, positive, require
 from ..geometry import Grid, Views
 from ..optics.noise import PHOTON_RANGE
+from ..progress import Advance
 from .contrast import Setup, Subject, Visibility, visibility
 
 WANTED_SNR = 5.0
@@ -312,7 +312,7 @@ def survey(
     photons_per_pixel: float,
     distances: np.ndarray,
     energies_kev: np.ndarray,
-    on_progress: Callable[[float], None] = lambda fraction: None,
+    on_progress: Advance = lambda fraction: None,
 ) -> Survey:
     """Signal to noise of `subject` at all `distances` [Z] m and `energies_kev` [E], each with its own δ and β.
 

@@ -8,7 +8,7 @@ quaternions have no unit.
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -23,11 +23,13 @@ from ..checks import InputError, require
 from ..fit.loop import DivergedError, Fit
 from ..geometry import Grid, Views
 from ..io.atomic import atomic_path
+from ..io.folder import require_new
 from ..io.json import read_json, write_json
 from ..materials import WATER
 from ..matter import Matter
 from ..methods import FitOptions, finished, gaussian_fit
 from ..methods.presets import preset
+from ..progress import FitProgress
 from ..representations.gaussians import GaussianCloud, raw_of
 from ..scan import Scan
 from ..volume import Volume
@@ -44,9 +46,6 @@ CURVES = (
     *("dice", "relative_error_delta", "mean_delta", "mean_beta", "ratio"),
 )
 """Columns of a configuration's curves: δ, β and δ/β are means inside the true cells, weighted by true matter."""
-
-Progress = Callable[[str, float, dict[str, float]], None]
-"""Called with (configuration, fraction of its steps, the last record of its fit)."""
 
 
 @dataclass(frozen=True)
@@ -165,9 +164,7 @@ class StudyFolder:
                 same = old.get(key) == about[key]
                 require(same, f"the study in {self.path} has another {key.replace('_', ' ')}; choose another --out.")
             return
-        taken = self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir()))
-        require(not taken, f"--out must be new, empty or a study, but {self.path} is none of them; choose another.")
-        require(self.path.resolve().parent.is_dir(), f"--out must lie in an existing folder, but {self.path} does not.")
+        require_new(self.path, "choose another --out, or a study to go on with")
         self.path.mkdir(exist_ok=True)
         write_json(self.about, dict(about))
 
@@ -233,7 +230,7 @@ def run_study(
     pace: Pace,
     seed: int,
     folder: StudyFolder,
-    on_progress: Progress = lambda name, fraction, record: None,
+    on_progress: FitProgress = lambda name, fraction, record: None,
 ) -> None:
     """Run what is not finished yet of the `chosen` configurations, one after the other.
 
@@ -262,7 +259,7 @@ def run_configuration(
     pace: Pace,
     seed: int,
     folder: StudyFolder,
-    on_progress: Progress = lambda name, fraction, record: None,
+    on_progress: FitProgress = lambda name, fraction, record: None,
 ) -> None:
     """Fit one configuration to the training frames, look at the held-out ones on the way, and write all of it.
 

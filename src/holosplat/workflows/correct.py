@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -21,6 +20,7 @@ from ..preprocess import (
     eigen_flats,
     relative_intensity,
 )
+from ..progress import Advance
 
 MOST_DEFECTS = 0.2
 """A larger share of defective pixels is no camera to reconstruct from."""
@@ -72,7 +72,7 @@ class Corrected:
 class FlatFielding:
     """The dark and flat fields of a raw file, made ready: a number of a projection in, relative intensity out."""
 
-    def __init__(self, file: ScanFile, options: CorrectionOptions, on_progress: Callable[[float], None]) -> None:
+    def __init__(self, file: ScanFile, options: CorrectionOptions, on_progress: Advance) -> None:
         self.file, self.options = file, options
         darks, self._flats = file.numbers(DARK), file.numbers(FLAT)
         dynamic = options.method == "dynamic"
@@ -151,7 +151,7 @@ def correct(
     source: Path,
     out: Path,
     options: CorrectionOptions = CorrectionOptions(),
-    on_progress: Callable[[float], None] = lambda fraction: None,
+    on_progress: Advance = lambda fraction: None,
 ) -> Corrected:
     """Correct the raw file `source` (NXtomo with flats and darks) into the scan file `out`, one frame at a time.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from ..io.formats import read
 from ..io.nxtomo import scan_writer
 from ..optics.coherence import joined_blur_px
 from ..optics.resampling import FLIPS, Flip, Resampling
+from ..progress import Advance
 from ..scan import PIXEL_RANGE_M, Exposures
 
 LEAST_PIXELS = 8
@@ -26,7 +27,7 @@ def join(
     out: Path,
     pixel_size: float | None = None,
     flips: Sequence[Flip] = (),
-    on_progress: Callable[[float], None] = lambda fraction: None,
+    on_progress: Advance = lambda fraction: None,
 ) -> Exposures:
     """One scan file `out` of all frames of the scans `sources`, one a beam, in their order.
 

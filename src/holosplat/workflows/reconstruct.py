@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -19,6 +18,7 @@ from ..matter import MaterialPrior
 from ..methods import Gaussians, Method, Stage, Task, finished
 from ..methods.presets import SCHEMA
 from ..optics.sampling import fringe_sampling
+from ..progress import FitProgress
 from ..representations import KINDS, Stored
 from ..scan import Scan
 from ..tables import to_table
@@ -37,9 +37,6 @@ RESUMED_WITH = {
     "seed": "seed (--seed)",
 }
 """What must not change between the parts of a run, as messages call it."""
-
-Progress = Callable[[str, float, Record], None]
-"""Called with (stage, fraction done of the stage, the last record of the fit or {})."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +63,7 @@ def reconstruct(
     *,
     folder: RunFolder | None = None,
     resume: bool = False,
-    on_progress: Progress = lambda stage, fraction, record: None,
+    on_progress: FitProgress = lambda stage, fraction, record: None,
 ) -> Reconstruction:
     """The Object that `method` makes of the training frames of `scan`.
 
@@ -133,7 +130,7 @@ class _Run:
     task: Task
     method: Method
     folder: RunFolder | None
-    on_progress: Progress
+    on_progress: FitProgress
     timing: dict[str, float] = field(default_factory=dict)
     _saved: dict[str, Any] | None = None
     _config: dict[str, Any] = field(default_factory=dict)

@@ -12,6 +12,7 @@ import torch
 
 from ..checks import InputError, require
 from ..io.atomic import atomic_path
+from ..io.folder import require_new
 from ..io.json import read_json
 
 
@@ -31,11 +32,7 @@ class RunFolder:
 
     def require_new(self, advise_resume: bool = False) -> None:
         """`InputError` if something is there already; the message may point to --resume."""
-        taken = self.path.exists() and (not self.path.is_dir() or any(self.path.iterdir()))
-        way_out = "choose another, or add --resume" if advise_resume else "choose another"
-        require(not taken, f"the run folder (--out) must be new or empty, but {self.path} holds files; {way_out}.")
-        parent = self.path.resolve().parent
-        require(parent.is_dir(), f"--out must lie in an existing folder, but {parent} is none; create it.")
+        require_new(self.path, f"choose another --out{', or add --resume' if advise_resume else ''}")
 
     def require_run(self) -> None:
         """`InputError` unless the folder holds a reconstruction."""

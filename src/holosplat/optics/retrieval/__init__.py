@@ -7,11 +7,11 @@ docs/phase_retrieval.md.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Protocol
 
 from torch import Tensor
 
+from ...progress import Advance
 from ...scan import Exposures
 from .admm import ADMM, admm
 from .bounded import Estimate, bounded_estimate
@@ -31,7 +31,7 @@ class Retrieval(Protocol):
         delta: float,
         beta: float,
         *,
-        on_progress: Callable[[float], None] = lambda fraction: None,
+        on_progress: Advance = lambda fraction: None,
     ) -> Tensor:
         """Thickness [V, H, W] in metres of one material (δ > 0, β of any sign) from relative intensities [V, H, W].
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ...progress import Advance
 from ...scan import Exposures
 from .model import Regularised, WaveModel, view_by_view
 from .nonlinear import EASE, FIRST_DAMPING, TIGHTEN
@@ -32,7 +32,7 @@ def admm(
     beta: float,
     *,
     options: ADMM = ADMM(),
-    on_progress: Callable[[float], None] = lambda fraction: None,
+    on_progress: Advance = lambda fraction: None,
 ) -> Tensor:
     """Thickness [V, H, W] in metres of one material, β of any sign, with edges: frames [V, H, W] through full waves.
 
@@ -44,14 +44,14 @@ def admm(
     optics in its place and total variation beside the bounds.
     """
 
-    def solve(frames: Tensor, exposures: Exposures, on_progress: Callable[[float], None]) -> Tensor:
+    def solve(frames: Tensor, exposures: Exposures, on_progress: Advance) -> Tensor:
         model = WaveModel(frames, exposures, beta / delta, options.noise, options.backend)
         return model.thickness(_alternate(model, options, on_progress), delta)
 
     return view_by_view(frames, exposures, delta, solve, on_progress)
 
 
-def _alternate(model: WaveModel, options: ADMM, on_progress: Callable[[float], None]) -> Tensor:
+def _alternate(model: WaveModel, options: ADMM, on_progress: Advance) -> Tensor:
     """The bounded phase [V, H, W] after all iterations."""
     phase = model.phase
     weight, edge = _weights(model, options)

@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from ...checks import at_least, require
+from ...progress import Advance
 from ...scan import Exposures
 from ..propagation import exit_wave_of
 from .model import DARKEST, WaveModel, view_by_view
@@ -38,7 +39,7 @@ def gerchberg_saxton(
     beta: float,
     *,
     options: Projections = Projections(),
-    on_progress: Callable[[float], None] = lambda fraction: None,
+    on_progress: Advance = lambda fraction: None,
 ) -> Tensor:
     """Thickness [V, H, W] in metres of one material, β of any sign, by alternating projections.
 
@@ -60,7 +61,7 @@ def hybrid_input_output(
     beta: float,
     *,
     options: Projections = Projections(),
-    on_progress: Callable[[float], None] = lambda fraction: None,
+    on_progress: Advance = lambda fraction: None,
 ) -> Tensor:
     """Thickness [V, H, W] in metres of one material, β of any sign, by Fienup's (1982) hybrid input–output.
 
@@ -81,11 +82,11 @@ def _alternate(
     material: tuple[float, float],
     options: Projections,
     rule: Callable[[Tensor, Tensor, WaveModel], Tensor],
-    on_progress: Callable[[float], None],
+    on_progress: Advance,
 ) -> Tensor:
     delta, beta = material
 
-    def solve(frames: Tensor, exposures: Exposures, on_progress: Callable[[float], None]) -> Tensor:
+    def solve(frames: Tensor, exposures: Exposures, on_progress: Advance) -> Tensor:
         model = WaveModel(frames, exposures, beta / delta, options.noise, options.backend)
         phase = model.phase
         for done in range(options.iterations):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from ...checks import at_least, require
+from ...progress import Advance
 from ...scan import Exposures
 from ...units import wavelength, wavenumber
 from .spectra import (
@@ -60,7 +60,7 @@ def paganin(
     beta: float,
     *,
     options: Linear = Linear(),
-    on_progress: Callable[[float], None] = lambda fraction: None,
+    on_progress: Advance = lambda fraction: None,
 ) -> Tensor:
     """Thickness [V, H, W] in metres of one material by the filter of Paganin et al. (2002), eq. 12.
 
@@ -93,7 +93,7 @@ def contrast_transfer(
     beta: float,
     *,
     options: Linear = Linear(),
-    on_progress: Callable[[float], None] = lambda fraction: None,
+    on_progress: Advance = lambda fraction: None,
 ) -> Tensor:
     """Thickness [V, H, W] in metres of one material, β of any sign, by its contrast transfer function.
 

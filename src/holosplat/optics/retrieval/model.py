@@ -12,6 +12,7 @@ from torch.nn.functional import avg_pool2d, interpolate, pad
 
 from ...backends import device, resolve
 from ...checks import at_least, require
+from ...progress import Advance
 from ...scan import Exposures
 from ...units import wavelength
 from ..hologram import hologram, optical_path
@@ -150,8 +151,8 @@ def view_by_view(
     frames: Tensor,
     exposures: Exposures,
     delta: float,
-    solve: Callable[[Tensor, Exposures, Callable[[float], None]], Tensor],
-    on_progress: Callable[[float], None],
+    solve: Callable[[Tensor, Exposures, Advance], Tensor],
+    on_progress: Advance,
 ) -> Tensor:
     """`solve(frames, exposures, on_progress)` of views that are alike, `MOST_SAMPLES` at a time, frames checked."""
     checked(frames, exposures, delta)

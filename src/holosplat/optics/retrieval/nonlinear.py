@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from ...progress import Advance
 from ...scan import Exposures
 from .model import Regularised, WaveModel, view_by_view
 from .spectra import TINY, squared_frequency
@@ -35,7 +35,7 @@ def tikhonov(
     beta: float,
     *,
     options: Tikhonov = Tikhonov(),
-    on_progress: Callable[[float], None] = lambda fraction: None,
+    on_progress: Advance = lambda fraction: None,
 ) -> Tensor:
     """Thickness [V, H, W] in metres of one material, β of any sign, that agrees with frames [V, H, W].
 
@@ -47,7 +47,7 @@ def tikhonov(
     refused, and its view is damped more.
     """
 
-    def solve(frames: Tensor, exposures: Exposures, on_progress: Callable[[float], None]) -> Tensor:
+    def solve(frames: Tensor, exposures: Exposures, on_progress: Advance) -> Tensor:
         model = WaveModel(frames, exposures, beta / delta, options.noise, options.backend)
         return model.thickness(descend(model, options, on_progress)[0], delta)
 
@@ -76,7 +76,7 @@ def objective(model: WaveModel, phase: Tensor, weights: Tensor) -> tuple[Tensor,
     return value + 0.5 * (phase.double() * pull).sum(dim=(1, 2)), gradient + pull
 
 
-def descend(model: WaveModel, options: Tikhonov, on_progress: Callable[[float], None]) -> tuple[Tensor, Tensor]:
+def descend(model: WaveModel, options: Tikhonov, on_progress: Advance) -> tuple[Tensor, Tensor]:
     """The phase [V, H, W] after all steps, and the objective [iterations + 1, V] before and after each."""
     weights = penalty_weights(model, options.weight)
     curvature = model.curvature() + weights

@@ -1,0 +1,11 @@
+from .formats import read as read
+from .nxtomo import read_scan as read_scan
+from .nxtomo import scan_writer as scan_writer
+from .nxtomo import write_scan as write_scan
+from .pvd import read_pvd as read_pvd
+from .pvd import write_pvd as write_pvd
+from .volumes import read_volume as read_volume
+from .volumes import write_volume as write_volume
+from .volumes import write_voxels as write_voxels
+from .vtk import read_meshes as read_meshes
+from .vtk import write_mesh as write_mesh
