@@ -11,8 +11,9 @@ from mkdocs.structure.files import File
 
 
 def on_config(config: Any) -> Any:
-    """Puts the pages that are made into the navigation."""
-    for title, made in (("Gallery", pages.gallery_pages()), ("API", pages.api_pages())):
+    """Puts the pages of whole sections into the navigation."""
+    sections = {"Gallery": pages.gallery_pages(), "API": pages.api_pages(), "Design": pages.design_pages()}
+    for title, made in sections.items():
         entry = next(entry for entry in config.nav if title in entry)
         first = entry[title]
         entry[title] = [first, *(page for page in sorted(made) if page != first)]

@@ -64,6 +64,11 @@ def root_pages() -> Pages:
     return {site: (ROOT / path).read_text(encoding="utf-8") for path, site in FROM_ROOT.items()}
 
 
+def design_pages() -> list[str]:
+    """Paths on the site of the pages in docs/design."""
+    return [f"design/{path.name}" for path in sorted((ROOT / "docs" / "design").glob("*.md"))]
+
+
 # --- the API reference --------------------------------------------------------------------------------------
 
 
