@@ -37,7 +37,7 @@ def run(example: Path, folder: Path) -> str:
     """Runs the example in the new `folder` and returns what it printed, with the folder's own path left out."""
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    environment = os.environ | {"MPLBACKEND": "Agg"}
+    environment = os.environ | {"MPLBACKEND": "Agg", "OMP_WAIT_POLICY": "passive"}  # threads share the cores
     command = [sys.executable, str(example.resolve()), "out"]
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     if done.returncode or done.stderr:

@@ -18,15 +18,17 @@ MOST_SHIFT_PX, MOST_ROTATION_DEG, MOST_DISTANCE = 1000.0, 45.0, 0.1
 class Misalignment:
     """Standard deviations of the errors of each view, all independent and normally distributed.
 
-    shift_px: of the detector along rows and along columns [pixels]; rotation_deg: of small turns about x, y and z of
-    the lab frame [degrees]; distance: of the propagation distance, as a share of it; seed: draws them.
     Errors: `InputError` for values below 0 or too large to be errors of alignment.
     """
 
     shift_px: float = 0.0
+    """Shifts of the detector along rows and along columns [pixels] (default: none)."""
     rotation_deg: float = 0.0
+    """Small turns about x, y and z of the lab frame [degrees] (default: none)."""
     distance: float = 0.0
+    """Relative error of the propagation distance (default: none)."""
     seed: int = 0
+    """Seed of the errors."""
 
     def __post_init__(self) -> None:
         limits = {"shift_px": MOST_SHIFT_PX, "rotation_deg": MOST_ROTATION_DEG, "distance": MOST_DISTANCE}

@@ -25,14 +25,18 @@ GEOMETRIES: dict[Geometry, tuple[float, ...]] = {
 
 @dataclass(frozen=True)
 class Directions:
-    """Views as the options name them: exactly one of `views` (evenly spaced over 180°), `angles_deg` (with a tilt each
-    in `tilts_deg`, or none), `rotations` (a .npy file of matrices [V, 3, 3]) and `geometry` (a key of `GEOMETRIES`)."""
+    """The views of an experiment: exactly one of `views`, `angles_deg`, `rotations` and `geometry`."""
 
     views: int | None = None
+    """Number of views, evenly spaced over 180°."""
     angles_deg: tuple[float, ...] = ()
+    """Angles about the rotation axis [degrees]."""
     tilts_deg: tuple[float, ...] = ()
+    """Tilts of the beam out of the plane normal to the axis [degrees], one an angle (default: none)."""
     rotations: Path | None = None
+    """File (.npy) of rotation matrices [V, 3, 3]."""
     geometry: Geometry | None = None
+    """Name of a known geometry, a key of `GEOMETRIES`."""
 
     def on(self, shape: tuple[int, int], pixel_size: float) -> Views:
         """The views on a detector of `shape` pixels of `pixel_size` [m]; `InputError` unless one way is named."""

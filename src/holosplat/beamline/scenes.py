@@ -18,15 +18,14 @@ from ..units import LENGTH_UNITS, unit_factor
 
 @dataclass(frozen=True)
 class Filling:
-    """The material of the meshes: `material`, unless a file-name pattern of `table` matches; and the medium around
-    them.
-
-    With `material=None` every mesh must match a pattern.
-    """
+    """The materials of mesh files and the medium around them."""
 
     material: Material | None = HAEMOGLOBIN
+    """Material of meshes that no pattern of `table` matches (None: every mesh must match one)."""
     medium: Material | None = None
+    """Material around the meshes; δ and β are differences to it (None: vacuum)."""
     table: dict[str, Material] = field(default_factory=dict)
+    """File-name pattern → material of the meshes that it matches."""
 
     def of(self, name: str, energy_kev: float) -> DeltaBeta:
         """δ and β of the mesh file `name` against the medium, at `energy_kev` [keV]."""

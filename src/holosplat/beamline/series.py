@@ -23,14 +23,19 @@ MOST_TIMES = 1_000_000
 
 @dataclass(frozen=True)
 class Timing:
-    """When frames are taken: frame_rate [Hz]; frames: how many times, or as many as the snapshots cover; start: the
-    first one's time after the first snapshot [s], or the earliest whose pulses all lie within the snapshots; shutter:
-    motion blur about each time. Errors: `InputError` for a rate or count out of range, or a start below 0."""
+    """Times of the frames of a series.
+
+    Errors: `InputError` for a rate or count out of range, or a start below 0.
+    """
 
     frame_rate: float
+    """Frames a second [Hz]."""
     frames: int | None = None
+    """Number of times (default: as many as the snapshots cover)."""
     start: float | None = None
+    """Time of the first frame after the first snapshot [s] (default: the earliest whose pulses all fit)."""
     shutter: Shutter = field(default_factory=Shutter)
+    """Motion blur about each time (default: none)."""
 
     def __post_init__(self) -> None:
         in_range("frame rate", self.frame_rate, *FRAME_RATE_RANGE, unit="Hz")
@@ -62,16 +67,18 @@ class Timing:
 
 @dataclass(frozen=True)
 class SeriesFiles:
-    """How files of snapshots are read: length_unit of their coordinates; origin: the point on the rotation axis at the
-    field's centre, in that unit (default: the middle of the box that the bodies sweep); interval: seconds from one
-    snapshot to the next (default: from the files); time_unit: of a collection's time steps; period: edges of the
-    periodic box into which the bodies are folded, in `length_unit`, 0 where it is not periodic (default: no box)."""
+    """How files of snapshots are read."""
 
     length_unit: str = "um"
+    """Unit of the files' coordinates."""
     origin: tuple[float, float, float] | None = None
+    """Point on the rotation axis at the field's centre, in `length_unit` (default: the middle of the swept box)."""
     interval: float | None = None
+    """Time from one snapshot to the next [s] (default: from the files)."""
     time_unit: str | None = None
+    """Unit of a collection's time steps (default: seconds)."""
     period: tuple[float, float, float] | None = None
+    """Edges of the periodic box that bodies are folded into, in `length_unit`, 0: open (default: no box)."""
 
 
 def read_series(

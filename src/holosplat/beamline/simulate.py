@@ -27,14 +27,15 @@ MOST_PULSES = 10_000
 
 @dataclass(frozen=True)
 class Shutter:
-    """How long a frame gathers light, and when: a train of flashes, each shorter than any motion.
+    """Length of an exposure and its flashes, each shorter than any motion.
 
-    exposure: its length [s], about the frame's time; pulses: flashes, each in the middle of an equal part of it. A
-    steady beam is many pulses. Errors: `InputError` for a negative length, and for one without the other.
+    Errors: `InputError` for a negative length, and for one without the other.
     """
 
     exposure: float = 0.0
+    """Length of the exposure about the frame's time [s] (default: 0, no motion blur)."""
     pulses: int = 1
+    """Number of flashes, each in the middle of an equal part of the exposure; a steady beam has many."""
 
     def __post_init__(self) -> None:
         require(
@@ -58,16 +59,19 @@ class Shutter:
 
 @dataclass(frozen=True)
 class Simulation:
-    """How frames are simulated: photons_per_pixel: mean counts of Poisson noise, or none; seed: of the noise;
-    oversample: samples a pixel, or by default as many as the fringes need; shutter: when light is gathered.
+    """How frames are simulated.
 
     Errors: `InputError` for photons or a seed out of range.
     """
 
     photons_per_pixel: float | None = None
+    """Mean counts of the Poisson noise (default: no noise)."""
     seed: int = 0
+    """Seed of the noise."""
     oversample: int | None = None
+    """Samples a pixel (default: as many as the fringes need)."""
     shutter: Shutter = Shutter()
+    """Length of an exposure (default: no motion blur)."""
 
     def __post_init__(self) -> None:
         if self.photons_per_pixel is not None:

@@ -16,6 +16,8 @@ from .progress import INTERRUPTED, ProgressBar
 
 if TYPE_CHECKING:
     from ..workflows.evaluate import Evaluation
+    from ..workflows.reconstruct import Reconstruction
+    from ..workflows.run_folder import RunFolder
 
 MOST_VOXELS = 2**31
 """The largest volume that `export` writes: 16 GB for δ and β."""
@@ -92,29 +94,60 @@ def render(run: Positional[Path], scan: Path, out: Path, split: Literal["test", 
 
 def export(
     run: Positional[Path],
-    volume: Path,
+    volume: Path | None = None,
     shape: tuple[int, int, int] | None = None,
     voxel_size: float | None = None,
+    bodies: Path | None = None,
 ) -> None:
-    """Write δ and β of a run as a volume file.
+    """Write δ and β of a run as a volume file, or the bodies of a run of surfaces as meshes.
 
     Args:
         run: Run folder.
         volume: Volume file to write (HDF5).
         shape: Voxels along z, y, x (default: the scan's field of view, Z = X = W, Y = H).
         voxel_size: Edge of a voxel [m] (default: the pixel size).
+        bodies: Folder to make, of a run of surfaces: one VTK file a body (µm), the largest first.
     """
+    from ..workflows.reconstruct import load_reconstruction
+    from ..workflows.run_folder import RunFolder
+
+    require(volume is not None or bodies is not None, "export needs --volume or --bodies; name what to write.")
+    folder = RunFolder(run)
+    result = load_reconstruction(folder)
+    if bodies is not None:
+        _export_bodies(result, bodies)
+    if volume is not None:
+        _export_volume(result, folder, volume, shape, voxel_size)
+
+
+def _export_bodies(result: Reconstruction, out: Path) -> None:
+    from ..io.folder import require_new
+    from ..representations import SurfaceMesh
+    from .surface import write_bodies
+
+    found = result.object
+    if not isinstance(found, SurfaceMesh):
+        raise InputError(
+            f"--bodies needs a run of surfaces, but this one holds {found.described}; use holosplat surface."
+        )
+    require_new(out)
+    _say(f"wrote {out}: {write_bodies(out, found, {})} bodies")
+
+
+def _export_volume(
+    result: Reconstruction,
+    folder: RunFolder,
+    volume: Path,
+    shape: tuple[int, int, int] | None,
+    voxel_size: float | None,
+) -> None:
     from ..geometry import Grid
     from ..io.atomic import require_writable
     from ..io.json import read_json
     from ..io.volumes import write_voxels
     from ..scan import PIXEL_RANGE_M
-    from ..workflows.reconstruct import load_reconstruction
-    from ..workflows.run_folder import RunFolder
 
     require_writable(volume)
-    folder = RunFolder(run)
-    result = load_reconstruction(folder)
     detector = read_json(folder.summary)["detector"]
     rows, columns = int(detector["rows"]), int(detector["columns"])
     edge = float(detector["pixel_size_m"]) if voxel_size is None else voxel_size

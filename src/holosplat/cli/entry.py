@@ -39,7 +39,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Reconstruct a scan by Gaussians, or by another method, into a run folder.",
     ),
     "render": ("commands", "Predict the frames of a scan from a run."),
-    "export": ("commands", "Write δ and β of a run as a volume file."),
+    "export": ("commands", "Write δ and β of a run as a volume file, or the bodies of a run of surfaces as meshes."),
     "surface": (
         "surface",
         "Cut the bodies of a run out as closed surfaces, fit these to the frames, and write them as VTK files (µm).",

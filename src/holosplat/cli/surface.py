@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -16,8 +17,8 @@ from ..io.volumes import read_volume
 from ..io.vtk import write_mesh
 from ..methods.surfaces import SurfaceOptions, oversampling, refine_surfaces
 from ..representations import SurfaceMesh
-from ..workflows.evaluate import Scores, score_object
 from ..workflows.evaluate import evaluate as score
+from ..workflows.evaluate import score_object
 from ..workflows.provenance import scan_hash
 from ..workflows.reconstruct import load_reconstruction
 from ..workflows.run_folder import RunFolder
@@ -56,14 +57,15 @@ def surface(
         found = refine_surfaces(result.object, measured, how, lambda *now: bar.show(now[0], now[1], {}))
     seconds = time.perf_counter() - began
     after = score_object(found, measured, volume, oversampling(measured.train(), how.fit))
-    count = _write(out, found, {"seconds": seconds, "settings": asdict(how), "gaussians": before.as_dict()}, after)
+    said = {"seconds": seconds, "settings": asdict(how), "gaussians": before.as_dict(), "surfaces": after.as_dict()}
+    count = write_bodies(out, found, said)
     for name, scores in (("Gaussians", before), ("surfaces", after)):
         print(f"{name}:", *scores.lines(), sep="\n  ")
     _say(f"wrote {out}: {count} bodies of {len(found.faces)} triangles, {seconds:.1f} s")
 
 
-def _write(out: Path, found: SurfaceMesh, summary: dict[str, Any], after: Scores) -> int:
-    """The folder, whole or not at all; returns the number of bodies."""
+def write_bodies(out: Path, found: SurfaceMesh, said: Mapping[str, Any]) -> int:
+    """Write one VTK file a body (µm), and summary.json with what is `said` beside their sizes; returns their number."""
     bodies = found.bodies()
     with atomic_folder(out) as temporary:
         for body in bodies:
@@ -73,7 +75,7 @@ def _write(out: Path, found: SurfaceMesh, summary: dict[str, Any], after: Scores
             "length_unit": LENGTH_UNIT,
             "material": {"delta": found.matter.delta, "beta": found.matter.beta},
         }
-        write_json(temporary / "summary.json", about | summary | {"surfaces": after.as_dict()})
+        write_json(temporary / "summary.json", {**about, **said})
     return len(bodies)
 
 

@@ -37,12 +37,14 @@ from the axis may a point stray, per half field of view of depth."""
 
 @dataclass(frozen=True)
 class NerfOptions:
-    """png: 16-bit grey, or the 8-bit RGBA that some programs insist on; camera_distance: from the origin, in units of
-    half the field of view; seed_points: points in points3d.ply."""
+    """Options of the folder."""
 
     png: PngKind = "grey16"
+    """Kind of the images: 16-bit grey, or 8-bit RGBA for programs that read only this."""
     camera_distance: float = 100.0
+    """Distance of the cameras from the origin, in half fields of view; larger ones are more parallel."""
     seed_points: int = 20_000
+    """Number of points in points3d.ply."""
 
     def __post_init__(self) -> None:
         in_range("camera_distance", self.camera_distance, *CAMERA_DISTANCES, unit="half fields of view")
@@ -51,14 +53,18 @@ class NerfOptions:
 
 @dataclass(frozen=True)
 class GivenOptics:
-    """Values that folders of other programs lack: energy_kev; distance [m] of propagation; pixel_size [m]; the
-    intensities (relative to the flat field) of black and white."""
+    """Values that folders of other programs lack."""
 
     energy_kev: float
+    """Photon energy [keV]."""
     distance: float
+    """Propagation distance [m]."""
     pixel_size: float
+    """Pixel size in the sample plane [m]."""
     black: float = 0.0
+    """Intensity of black, relative to the flat field."""
     white: float = 1.0
+    """Intensity of white, relative to the flat field."""
 
     def __post_init__(self) -> None:
         in_range("energy", self.energy_kev, *ENERGY_RANGE_KEV, unit="keV")

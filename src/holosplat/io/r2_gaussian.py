@@ -39,10 +39,12 @@ CONTACT = DISTANCE_RANGE_M[0]
 
 @dataclass(frozen=True)
 class R2Options:
-    """truth: the true volume, for its scores of the reconstruction; seed_points: points to start from."""
+    """Options of the folder."""
 
     truth: Volume | None = None
+    """The true volume, with which that program scores its reconstruction (default: zeros)."""
     seed_points: int = 50_000
+    """Number of points to start from."""
 
     def __post_init__(self) -> None:
         at_least(self, 1, "seed_points")

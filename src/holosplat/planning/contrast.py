@@ -82,18 +82,18 @@ class Subject:
 
 @dataclass(frozen=True)
 class Setup:
-    """How a frame is taken.
-
-    energy_kev [keV]; distance, pixel_size: effective ones, in the sample plane [m]; psf_sigma_px: standard deviation
-    of the detector's Gaussian point-spread function [pixels]; source_angle: standard deviation of the Gaussian source
-    as the object sees it [rad], which blurs by `source_angle × distance`.
-    """
+    """The beam and the detector of one frame."""
 
     energy_kev: float = 20.0
+    """Photon energy [keV]."""
     distance: float = 0.1
+    """Effective propagation distance, in the sample plane [m]."""
     pixel_size: float = 3.2e-6
+    """Effective pixel size, in the sample plane [m]."""
     psf_sigma_px: float = 0.0
+    """Standard deviation of the detector's Gaussian point-spread function [pixels]."""
     source_angle: float = 0.0
+    """Standard deviation of the Gaussian source, seen from the object [rad]; times the distance it is the blur."""
 
     def __post_init__(self) -> None:
         in_range("energy", self.energy_kev, *ENERGY_RANGE_KEV, unit="keV")

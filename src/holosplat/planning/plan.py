@@ -24,22 +24,24 @@ BYTES_A_VOXEL = 8
 
 @dataclass(frozen=True)
 class Recording:
-    """The recording.
-
-    photons_per_pixel: mean photons detected in a pixel without the object; views: directions over 180°, taken at
-    the same instant; detector: (rows, columns) of a frame [pixels], None: not said; frame_rate [Hz]; exposure: time
-    with light in one frame [s] (a pulse's length), None: the whole frame; velocity: of the object across the beam
-    [m/s]; bit_depth: bits stored for a pixel; frames: instants recorded.
-    """
+    """The frames and views that are recorded."""
 
     photons_per_pixel: float = 1000.0
+    """Mean photons detected in a pixel without the object."""
     views: int = 16
+    """Number of directions over 180°, recorded at the same instant."""
     detector: tuple[int, int] | None = None
+    """(rows, columns) of a frame [pixels] (default: not given, so no field and no data rate)."""
     frame_rate: float | None = None
+    """Frames a second [Hz] (default: no rates are computed)."""
     exposure: float | None = None
+    """Time with light in one frame, such as a pulse's length [s] (default: the whole frame)."""
     velocity: float | None = None
+    """Velocity of the object across the beam [m/s] (default: no motion is considered)."""
     bit_depth: int = 16
+    """Bits stored for a pixel."""
     frames: int = 1
+    """Number of recorded instants."""
 
     def __post_init__(self) -> None:
         in_range("photons_per_pixel", self.photons_per_pixel, *PHOTON_RANGE)

@@ -36,19 +36,18 @@ COARSE_POINTS, FINE_LEVEL = 162, 4
 
 @dataclass(frozen=True, eq=False)
 class RedCell:
-    """One cell: size, pose and bending. Bending and stretch keep the volume exactly (unit Jacobian).
-
-    diameter: of the undeformed cell [m]; rotation: [3, 3] and centre: [3] (metres), with
-    `x = rotation @ x_cell + centre` and the cell's axis along its own z; stretch: logarithm of the stretch
-    along the cell's x and of the shrinkage along its y; bend: [5] amplitudes, in radii, of the mid-plane's
-    bending (Zernike's bowl, two saddles, two trefoils, each of unit root mean square over the disc).
-    """
+    """One cell: size, pose and bending. Bending and stretch keep the volume exactly (unit Jacobian)."""
 
     diameter: float = DIAMETER
+    """Of the undeformed cell [m]."""
     rotation: np.ndarray = field(default_factory=lambda: np.eye(3))
+    """[3, 3], with `x = rotation @ x_cell + centre` and the cell's axis along its own z."""
     centre: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    """[3] [m]."""
     stretch: float = 0.0
+    """Logarithm of the stretch along the cell's x and of the shrinkage along its y."""
     bend: np.ndarray = field(default_factory=lambda: np.zeros(5))
+    """[5] amplitudes of the mid-plane's bending [radii]: Zernike's bowl, two saddles, two trefoils, unit rms each."""
 
     def __post_init__(self) -> None:
         in_range("cell diameter", self.diameter, 1e-9, 1.0, unit="metres")

@@ -18,13 +18,16 @@ from .model import DARKEST, WaveModel, view_by_view
 
 @dataclass(frozen=True)
 class Projections:
-    """Options. iterations: pairs of projections; feedback: factor of the values that violate the bounds (hybrid
-    input–output only); noise: standard deviation of the frames (None: estimated from them); backend: see `backends`."""
+    """Options of the alternating projections."""
 
     iterations: int = 40
+    """Pairs of projections."""
     feedback: float = 0.9
+    """Factor of the values that violate the bounds, for hybrid input–output only (Fienup 1982)."""
     noise: float | None = None
+    """Standard deviation of the frames (default: estimated from them)."""
     backend: str = "cpu"
+    """Implementation of the wave optics (see `backends`)."""
 
     def __post_init__(self) -> None:
         at_least(self, 1, "iterations")

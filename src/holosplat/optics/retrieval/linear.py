@@ -41,12 +41,14 @@ SHARP_EDGED = Prior()
 
 @dataclass(frozen=True)
 class Linear:
-    """Options of the filters. noise: standard deviation of the frames (None: estimated from them; 0: none);
-    model_error: the part of the frames' contrast that no filter explains; prior: the expected power of the phase."""
+    """Options of the filters."""
 
     noise: float | None = None
+    """Standard deviation of the frames (default: estimated from them; 0: none)."""
     model_error: float = 0.01
+    """Part of the frames' contrast that no filter explains; it damps frequencies where the response is weak."""
     prior: Prior = SHARP_EDGED
+    """Expected power of the phase."""
 
     def __post_init__(self) -> None:
         at_least(self, 0, "model_error")

@@ -32,14 +32,16 @@ CROSS_TERM = 4.0
 
 @dataclass(frozen=True)
 class Regularised:
-    """Options of the fits through the wave optics. iterations: each one step of the wave optics; weight: of the
-    regularisation, 1 is the Bayesian weight under the method's assumptions on the matter; noise: standard deviation of
-    the frames (None: estimated from them); backend: see `backends`."""
+    """Options of the fits through the wave optics."""
 
     iterations: int = 60
+    """Steps, each one evaluation of the wave optics and its gradient."""
     weight: float = 1.0
+    """Weight of the regularisation; 1 is the Bayesian weight under the method's assumptions on the matter."""
     noise: float | None = None
+    """Standard deviation of the frames (default: estimated from them)."""
     backend: str = "cpu"
+    """Implementation of the wave optics (see `backends`)."""
 
     def __post_init__(self) -> None:
         at_least(self, 1, "iterations")

@@ -23,9 +23,10 @@ STIFFEST = 1.0
 
 @dataclass(frozen=True)
 class Tikhonov(Regularised):
-    """Options. iterations: steps, accepted or refused; weight: of the penalty, for Gaussian matter."""
+    """Options of the fit with a quadratic penalty; its iterations are accepted or refused steps."""
 
     weight: float = 0.5
+    """Weight of the penalty; 1 is the Bayesian weight for Gaussian matter."""
 
 
 def tikhonov(

@@ -31,11 +31,13 @@ LEAST_SIGNAL = 0.01
 class Prior:
     """Power expected of a phase: `1 / (f² + corner²)^decay`, f in cycles per field of view.
 
-    Projected bodies with sharp edges fall off as f⁻³ to f⁻⁴, below the frequency that their size sets.
+    Projected bodies with sharp edges fall off as f⁻³ to f⁻⁴, and are level below the frequency that their size sets.
     """
 
     corner: float = 3.0
+    """Frequency below which the power is level [cycles per field of view]."""
     decay: float = 2.0
+    """Half the exponent of the fall-off."""
 
     def __post_init__(self) -> None:
         at_least(self, 0.1, "corner", "decay")
