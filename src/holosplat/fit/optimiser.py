@@ -50,10 +50,12 @@ class Optimiser(Protocol):
 class Group:
     """How Adam moves one parameter where that differs from its default.
 
-    betas: decay of the running means of the gradient and its square; epsilon: beside the root of the latter; decay: the
-    share of the parameter that a step takes away, per unit of its rate (Loshchilov & Hutter 2019); solve: a
-    preconditioner, the gradient [same shape] in, a direction out; together: one step length for the whole tensor, by
-    the largest squared entry (Nicolet, Jacobson & Jakob 2021, "Large steps in inverse rendering of geometry").
+    betas: decay of the running means of the gradient and of its square
+    epsilon: number beside the root of the mean square
+    decay: share of the parameter that a step takes away, per unit of its rate (Loshchilov & Hutter 2019)
+    solve: preconditioner, the gradient [same shape] in, a direction out; None for the gradient itself
+    together: one step length for the whole tensor, by its largest squared entry (Nicolet, Jacobson & Jakob 2021,
+        "Large steps in inverse rendering of geometry")
     """
 
     betas: tuple[float, float] = adam.BETAS

@@ -45,8 +45,12 @@ class Term(Protocol):
 
 @dataclass(frozen=True)
 class Problem:
-    """Plain data: the model to begin with, and the terms. free: names of the parameters that are fitted, such as
-    `object.centres` (None: all of them)."""
+    """What is to be minimised, as plain data.
+
+    model: the model to begin with
+    terms: the summands of the loss, in the order in which they are added
+    free: names of the parameters that are fitted, such as `object.centres`; None for all of them
+    """
 
     model: Model
     terms: tuple[Term, ...]

@@ -43,8 +43,12 @@ RESUMED_WITH = {
 class Reconstruction:
     """What a method made of a scan.
 
-    object: the matter. method: the name of what made it. energy_kev: at which its δ and β hold. oversample: wave
-    samples a pixel in its fit. timing: how long each stage took [s]. finished: whether all stages came to their end.
+    object: the matter, of any kind
+    method: name of the method
+    energy_kev: photon energy [keV] at which δ and β hold
+    oversample: wave samples a pixel in the fit
+    timing: seconds that each stage took
+    finished: whether all stages came to their end
     """
 
     object: Stored
