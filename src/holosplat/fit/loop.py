@@ -235,7 +235,7 @@ class Fit:
             "step": self.step,
             "seconds": self.seconds,
             "generator": self._batches.generator.get_state(),
-            "order": self._batches.order,
+            "order": list(self._batches.order),
             "best": (best.score, best.step, {name: leaf.cpu().clone() for name, leaf in best.leaves.items()}),
             "stopped_early": self.stopped_early,
         }
