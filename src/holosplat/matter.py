@@ -40,8 +40,9 @@ class DeltaBeta(NamedTuple):
 class Matter:
     """What the channels of a model's values mean.
 
-    channels: the (δ, β) of a value of one in each of one or two channels. occupancies: True if values are shares of
-    materials, which cannot add up to more than one; False if δ and β are free, each in its own channel.
+    channels: (δ, β) of a value of one, for each of one or two channels
+    occupancies: True if values are shares of materials, which cannot add up to more than one; False if δ and β are
+        free, each in its own channel
     """
 
     channels: tuple[DeltaBeta, ...]

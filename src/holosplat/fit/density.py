@@ -20,24 +20,26 @@ CENTRES = "object.centres"
 
 @dataclass(frozen=True)
 class DensityControl:
-    """Options of densification and pruning; lengths in detector pixels.
-
-    every: steps between events (0: never), between the steps `start` and `stop` (fractions of all steps);
-    grow_fraction: the share of Gaussians, those with the largest mean position gradient, that is cloned (axes
-    up to `split_scale_px`) or split in two (longer ones); max_count: no growth beyond;
-    faint: Gaussians whose peak is below this share of the material are removed; huge_px: a longest axis above;
-    needle: a longest-to-shortest axis ratio above; those whose centre lies outside every view's field go too.
-    """
+    """Options of densification and pruning."""
 
     every: int = 0
+    """Steps between events (0: never, as after a phase start, which has its Gaussians)."""
     start: float = 0.1
+    """First event, as a share of all steps."""
     stop: float = 0.7
+    """Last event, as a share of all steps: what came last needs time to settle."""
     grow_fraction: float = 0.05
+    """Share of Gaussians that is cloned or split, those with the largest mean position gradient."""
     split_scale_px: float = 0.7
+    """Longest axis [pixels] up to which a Gaussian is cloned; longer ones are split in two."""
     max_count: int = 200_000
+    """No growth beyond so many Gaussians."""
     faint: float = 0.01
+    """Gaussians whose peak is below this share of the material are removed."""
     huge_px: float = 20.0
+    """Gaussians with a longer axis [pixels] are removed."""
     needle: float = 30.0
+    """Gaussians with a larger ratio of longest to shortest axis are removed; so are those outside every field of view."""
 
     def due(self, step: int, steps: int) -> bool:
         """Whether an event takes place after `step`."""

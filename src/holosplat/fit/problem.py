@@ -25,7 +25,10 @@ class Part(NamedTuple):
 
 
 class Term(Protocol):
-    """What a model costs in one batch. A term reads the model's frames, its object, its alignment or its light."""
+    """What a model costs in one batch. A term reads the model's frames, its object, its alignment or its light.
+
+    A term whose weights or widths follow from the frames says them in `resolved`, name → number, for config.json.
+    """
 
     @property
     def names(self) -> Sequence[str]:
@@ -42,12 +45,23 @@ class Term(Protocol):
 
 @dataclass(frozen=True)
 class Problem:
-    """Plain data: the model to begin with, and the terms. free: names of the parameters that are fitted, such as
-    `object.centres` (None: all of them)."""
+    """What is to be minimised, as plain data.
+
+    model: the model to begin with
+    terms: the summands of the loss, in the order in which they are added
+    free: names of the parameters that are fitted, such as `object.centres`; None for all of them
+    """
 
     model: Model
     terms: tuple[Term, ...]
     free: tuple[str, ...] | None = None
+
+    def resolved(self) -> dict[str, float]:
+        """The weights and widths that options have become by noise, prior and number of views."""
+        found: dict[str, float] = {}
+        for term in self.terms:
+            found |= getattr(term, "resolved", {})
+        return found
 
     def loss(self, model: Model, batch: Batch) -> tuple[Tensor, Tensor, list[str]]:
         """The loss of `model`; the values [1 + K] of the loss and its parts, detached; and their names."""

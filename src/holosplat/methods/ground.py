@@ -37,8 +37,13 @@ class ExtraTerm:
 
 @dataclass(frozen=True)
 class Ground:
-    """train: the frames to fit; model: of the object in their exposures; frames: the data term; judge: of the frames
-    set aside, None without any."""
+    """What a fit to frames begins with.
+
+    train: the frames to fit
+    model: the object in their exposures
+    frames: the data term
+    judge: scores the frames that are set aside; None without any
+    """
 
     train: Scan
     model: Model

@@ -21,8 +21,10 @@ def quiet(stage: str, fraction: float) -> None:
 class Task:
     """What a method is given.
 
-    scan: the training frames, of one time; prior: what is known of the matter; seed: of everything random; on_progress:
-    called with (stage, fraction done of it).
+    scan: the training frames, of one time
+    prior: what is known of the matter
+    seed: seed of everything random
+    on_progress: called with (stage, fraction done of it)
     """
 
     scan: Scan

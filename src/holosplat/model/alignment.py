@@ -18,12 +18,14 @@ WIDTHS: dict[str, tuple[int, ...]] = {"turns": (3,), "shifts": (2,), "stretches"
 
 @dataclass(frozen=True)
 class Alignment:
-    """Corrections of V planned exposures, float64; None, and zeros, leave the plan as it is.
+    """Corrections of V planned exposures, float64; None costs nothing, and zeros leave the plan as it is.
 
-    turns: [V, 3] rotation vectors ω [rad] about the lab axes; shifts: [V, 2] of the detector (x, y) [pixels];
-    stretches: [V] of the propagation distance, as a share of it; blurs: [V] of the point-spread function's width
-    [pixels]. The exposures become `R' = exp([ω]×) R`, `s' = s + p e`, `z' = z (1 + ε)`, `σ' = |σ + b|`, as
-    `beamline.misalignment` has them. What is None costs nothing. Errors: `InputError` for shapes that do not fit.
+    turns: [V, 3] rotation vectors ω [rad] about the lab axes: `R' = exp([ω]×) R`
+    shifts: [V, 2] shifts e of the detector along x and y [pixels of pitch p]: `s' = s + p e`
+    stretches: [V] changes ε of the propagation distance, as a share of it: `z' = z (1 + ε)`
+    blurs: [V] changes b of the width of the point-spread function [pixels]: `σ' = |σ + b|`
+
+    The signs are those of `beamline.misalignment`. Errors: `InputError` for shapes that do not fit together.
     """
 
     turns: Tensor | None = None

@@ -15,7 +15,10 @@ from ..checks import require
 class LightField:
     """A factor of each of V frames: `exp(Σ c_k m_k)`, above zero everywhere; coefficients of zero are even light.
 
-    coefficients: [V, K]; modes: [K, h, w], the same for all frames. Errors: `InputError` if their counts differ.
+    coefficients: [V, K] numbers c, those that can be fitted
+    modes: [K, h, w] images m, the same for all frames
+
+    Errors: `InputError` if the counts differ.
     """
 
     coefficients: Tensor

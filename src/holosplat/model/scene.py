@@ -26,8 +26,11 @@ PARTS = ("object", "alignment", "light")
 class Model:
     """Everything that a set of exposures depends on; its parameters are named `part.parameter`.
 
-    object: the matter. instrument: the planned exposures and their wave optics. alignment: corrections of where the
-    beams are, None for none. light: a factor of each frame, None for even light.
+    object: the matter
+    instrument: the planned exposures and their wave optics
+    alignment: corrections of where the beams are; None for none
+    light: a factor of each frame; None for even light
+
     Errors: `InputError` if alignment or light are of another number of exposures.
     """
 

@@ -43,8 +43,12 @@ RESUMED_WITH = {
 class Reconstruction:
     """What a method made of a scan.
 
-    object: the matter. method: the name of what made it. energy_kev: at which its δ and β hold. oversample: wave
-    samples a pixel in its fit. timing: how long each stage took [s]. finished: whether all stages came to their end.
+    object: the matter, of any kind
+    method: name of the method
+    energy_kev: photon energy [keV] at which δ and β hold
+    oversample: wave samples a pixel in the fit
+    timing: seconds that each stage took
+    finished: whether all stages came to their end
     """
 
     object: Stored
@@ -179,6 +183,13 @@ class _Run:
             self.folder.create()
             write_json(self.folder.config, self._config | environment(backend))
 
+    def note_resolved(self, stage: str, fit: Fit) -> None:
+        """Add to config.json what the options have become in a stage: wave samples a pixel, weights and widths."""
+        if self.folder is not None:
+            config = self.folder.read_config()
+            found = {"oversample": fit.model.instrument.oversample, **fit.plan.problem.resolved()}
+            write_json(self.folder.config, config | {"resolved": config.get("resolved", {}) | {stage: found}})
+
     def _result(self, found: Stored, fit: Fit | None, complete: bool) -> Reconstruction:
         exposures = self.task.scan.exposures
         oversample = fit.model.instrument.oversample if fit else fringe_sampling(exposures)
@@ -207,6 +218,7 @@ class _Journal:
         if saved is not None:
             self._fit.load(saved)
         self._run.make_folder(self._fit.backend)
+        self._run.note_resolved(self._run.method.stages()[self._number].name, self._fit)
         if self._run.folder is not None:
             if saved is None and self._number:
                 self._run.folder.set_aside_metrics(self._number - 1)
