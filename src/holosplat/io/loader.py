@@ -15,8 +15,10 @@ if TYPE_CHECKING:
 class Loader:
     """One format of scans, told from what a path holds.
 
-    name: of the format, as messages say it; mark: what a path of that format is ("a folder with scan.json");
-    recognises: whether a path is one, by its content; read: the scan at such a path, with what it does not say itself;
+    name: of the format, as messages say it.
+    mark: what a path of that format is ("a folder with scan.json").
+    recognises: whether a path is one, by its content.
+    read: the scan at such a path, with what it does not say itself.
     takes: names of what that may be (energy_kev [keV], distance [m], pixel_size [m], black, white).
     """
 
