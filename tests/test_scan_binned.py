@@ -9,6 +9,7 @@ import torch
 from helpers.holographic import CELL, PIXEL, SHAPE, cells, scan_of
 from holosplat.checks import InputError
 from holosplat.geometry import Views, rotation_y
+from holosplat.matter import Matter
 from holosplat.representations import GaussianCloud
 from holosplat.representations.gaussians import raw_of
 from holosplat.scan import Exposures, Scan
@@ -20,7 +21,7 @@ def test_binned_pixels_are_where_they_say(shape, factor):
     """A known Gaussian: its lines, binned, are its lines on the binned scan's own views."""
     centre, sigma = torch.tensor([[3.3, -2.2, 1.4]]), torch.full((1, 3), np.log(4.0))
     one = GaussianCloud(
-        (centre, sigma, torch.tensor([[1.0, 0, 0, 0]]), raw_of(torch.tensor([[0.7]]))), PIXEL, 1e-6, 1e-9
+        (centre, sigma, torch.tensor([[1.0, 0, 0, 0]]), raw_of(torch.tensor([[0.7]]))), PIXEL, Matter.one(1e-6, 1e-9)
     )
     shifts = PIXEL * np.array([[0, 0], [1.3, -0.6], [-0.4, 2.1]])
     views = Views(rotation_y([0, 40, 110]), shifts, shape, PIXEL)

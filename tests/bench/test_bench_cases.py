@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from holosplat.workflows.settings import MaterialPrior
 
 from holosplat.bench.case import FOLDER, Case, case_names, load_case
 from holosplat.bench.declaration import declared_names
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.materials import DeltaBeta, parse_material
+from holosplat.matter import MaterialPrior
 from holosplat.scan import Exposures
 from holosplat.specimens.phantoms import Ball
 from holosplat.specimens.scene import MeshScene
@@ -90,7 +90,7 @@ def test_the_scene_is_matter_on_a_raster(case):
     truth = case.truth()
     assert truth.grid.shape[1:] == case.exposures.views.shape
     if case.prior.kind == "known":
-        assert truth.delta.max() == near(case.prior.delta, rel=1e-5)
+        assert truth.delta.max() == near(case.prior.materials[0].delta, rel=1e-5)
     assert truth.delta.min() >= -1e-6 * truth.delta.max()
     share = np.mean(truth.delta > 0.5 * truth.delta.max())
     assert 0.002 < share < 0.4
@@ -138,7 +138,7 @@ def test_main12_with_seed_0_is_the_demonstration(loaded):
 def test_matter_of_plasma_shells_and_capsules():
     plasma, shells, capsules = (load_case(name) for name in ("plasma8-1e4", "shells8", "two_materials8"))
     assert plasma.prior.kind == "known"
-    assert plasma.prior.delta > 0 > plasma.prior.beta
+    assert plasma.prior.materials[0].delta > 0 > plasma.prior.materials[0].beta
     assert plasma.photons == 1e4
     outer, core = shells.scene.materials[0], shells.scene.materials[-1]
     assert core == (-outer.delta, -outer.beta)
@@ -148,7 +148,7 @@ def test_matter_of_plasma_shells_and_capsules():
     assert core.delta + outer.delta == near(oil.delta)
     assert core.beta + outer.beta == near(oil.beta)
     assert oil.ratio > 5 * outer.ratio
-    assert capsules.prior == MaterialPrior()
+    assert capsules.prior == MaterialPrior.unknown()
 
 
 def test_views_lie_as_declared():
@@ -367,6 +367,6 @@ def test_a_case_has_frames_of_both_kinds():
     exposures = Exposures.of(Views.evenly_spaced(3, (9, 9), 1e-6), 20.0, 0.1)
     for is_test in (np.zeros(3, dtype=bool), np.ones(3, dtype=bool)):
         with pytest.raises(InputError, match="frames for training and held-out ones"):
-            Case("x", 0, scene, exposures, is_test, MaterialPrior())
+            Case("x", 0, scene, exposures, is_test, MaterialPrior.unknown())
     with pytest.raises(InputError, match="is_test must have the shape"):
-        Case("x", 0, scene, exposures, np.zeros(2, dtype=bool), MaterialPrior())
+        Case("x", 0, scene, exposures, np.zeros(2, dtype=bool), MaterialPrior.unknown())

@@ -12,7 +12,7 @@ import torch
 import holosplat as hs
 from holosplat.bench.method import Method
 from holosplat.bench.methods import METHODS, methods
-from holosplat.model import Instrument
+from holosplat.model import Instrument, Model
 from holosplat.specimens.red_cells import icosphere
 
 MATERIAL = hs.DeltaBeta(2e-7, 2e-10)
@@ -89,8 +89,7 @@ def test_a_method_gives_an_object(result, scan):
     grid = hs.Grid.of_views(scan.views)
     volume = result.voxelise(grid)
     assert volume.delta.shape == grid.shape
-    instrument = Instrument(scan.test().exposures)
-    frames = instrument.measure(result)
+    frames = Model(result, Instrument(scan.test().exposures)).frames()
     assert tuple(frames.shape) == (2, *SHAPE)
     assert bool(torch.isfinite(frames).all())
 
@@ -109,7 +108,7 @@ def test_a_method_is_right_whatever_the_unit_of_length(method, result, scan):
     """Ten times larger, with δ and β a tenth and the same Fresnel number, the occupancy is the same."""
     views = replace(scan.views, pixel_size=10 * PITCH)
     exposures = replace(scan.exposures, views=views, distance=100 * scan.exposures.distance)
-    prior = hs.MaterialPrior("known", MATERIAL.delta / 10, MATERIAL.beta / 10)
+    prior = hs.MaterialPrior.known(hs.DeltaBeta(MATERIAL.delta / 10, MATERIAL.beta / 10))
     larger = run(method, replace(scan, exposures=exposures), prior=prior)
     one, other = (o.voxelise(hs.Grid.of_views(v)).delta for o, v in ((result, scan.views), (larger, views)))
     assert np.linalg.norm(10 * other - one) < 0.02 * np.linalg.norm(one)
@@ -130,7 +129,7 @@ def test_a_method_reports_its_progress(method, scan):
 
 @pytest.mark.parametrize("kind", ["ratio", "free"])
 def test_a_method_does_without_the_material_or_says_why_not(method, scan, kind):
-    prior = hs.MaterialPrior.of_ratio(MATERIAL.ratio) if kind == "ratio" else hs.MaterialPrior()
+    prior = hs.MaterialPrior.of_ratio(MATERIAL.ratio) if kind == "ratio" else hs.MaterialPrior.unknown()
     found = result_or_reason(method, scan, prior)
     if isinstance(found, str):
         assert "material" in found

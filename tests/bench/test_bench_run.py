@@ -22,6 +22,7 @@ from holosplat.bench.references import REFERENCES
 from holosplat.bench.rows import Row, read_row, write_row
 from holosplat.bench.run import Suite, run_suite
 from holosplat.bench.sizes import contrast_by_size
+from holosplat.matter import Matter
 from holosplat.optics.sampling import fringe_sampling
 from holosplat.representations.voxels import VoxelGrid
 from holosplat.specimens.phantoms import star_of_balls
@@ -86,7 +87,7 @@ def test_the_size_of_a_result_is_what_it_says_or_unknown(recorder, tmp_path):
 
     def sized(scan):
         v = voxels(scan)
-        return Sized(v.values, v.grid, v.delta, v.beta)
+        return Sized(v.values, v.grid, v.matter)
 
     class Plain:
         def __init__(self, obj: hs.Object) -> None:
@@ -215,7 +216,7 @@ def test_a_case_that_has_changed_is_not_mixed_with_its_past(tmp_path, part):
         "material": replace(case, scene=replace(case.scene, materials=(hs.DeltaBeta(2e-7, 1e-10),))),
         "split": replace(case, is_test=np.arange(6) == 1),
         "distance": replace(case, exposures=replace(case.exposures, distance=0.03)),
-        "prior": replace(case, prior=hs.MaterialPrior()),
+        "prior": replace(case, prior=hs.MaterialPrior.unknown()),
         "photons": replace(case, photons=1e4),
     }[part]
     assert fingerprint(make_case("round", 1)) == fingerprint(case) != fingerprint(changed)
@@ -295,10 +296,10 @@ def test_true_lines_are_the_true_thickness(monkeypatch):
     monkeypatch.setitem(references.TOMOGRAPHIES, "tv", tomography)
     case = make_case("wide", 3)
     found = references.tv_of_true_lines(case, case.truth(), lambda stage, fraction: None)
-    assert (found.delta, found.beta) == (MATERIAL.delta, MATERIAL.beta)
+    assert found.matter == Matter.one(*MATERIAL)
     assert len(given["views"]) == 4
     assert given["upper"] == 1
     volume = case.scene.meshes[0].volume
     assert given["lines"].sum(dim=(1, 2)).numpy() * PITCH**2 == pytest.approx(volume, rel=0.01)
     with pytest.raises(hs.InputError, match="known material"):
-        references.tv_of_true_lines(replace(case, prior=hs.MaterialPrior()), case.truth(), lambda s, f: None)
+        references.tv_of_true_lines(replace(case, prior=hs.MaterialPrior.unknown()), case.truth(), lambda s, f: None)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 
 import pytest
 
 from helpers.cli import COLUMNS, PIXEL, QUICK, ROWS, Workshop, holosplat, known, simulate, worked
 from holosplat.io.vtk import write_mesh
 from holosplat.specimens.red_cells import random_cells
+from holosplat.tables import to_table
 
 
 @pytest.fixture(scope="session")
@@ -21,7 +21,7 @@ def shop(tmp_path_factory) -> Workshop:
     for cell, file in zip(cells, files):
         write_mesh(file, cell, "um")
     made = Workshop(path, files, path / "scan.nxs", path / "truth.h5", path / "quick.json", path / "run")
-    made.quick.write_text(json.dumps(asdict(QUICK)))
+    made.quick.write_text(json.dumps(to_table(QUICK)))
     worked(simulate(made, "--views", 8, "--out", made.scan, "--truth", made.truth))
     worked(holosplat("reconstruct", made.scan, "--out", made.run, *known(made), "--seed", 5))
     return made

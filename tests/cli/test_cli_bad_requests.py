@@ -44,6 +44,10 @@ def one_nan(file: h5py.File) -> None:
     file[f"{DETECTOR}/data"][2, 3, 4] = np.nan
 
 
+def one_nan_held_out(file: h5py.File) -> None:
+    file[f"{DETECTOR}/data"][3, 3, 4] = np.nan
+
+
 BAD_SCANS: dict[str, tuple[Callable[[h5py.File], object], list[str]]] = {
     "missing energy": (
         lambda f: f.__delitem__("entry/instrument/beam/incident_energy"),
@@ -55,6 +59,7 @@ BAD_SCANS: dict[str, tuple[Callable[[h5py.File], object], list[str]]] = {
     "unknown unit": (put(f"{DETECTOR}/distance", 0.1, "furlong"), ["detector/distance", "furlong", "mm"]),
     "negative distance": (put(f"{DETECTOR}/distance", -0.1), ["detector/distance", "positive", "-0.1"]),
     "NaN images": (one_nan, ["detector/data", "finite", "1 of 5376"]),
+    "NaN in a held-out image": (one_nan_held_out, ["detector/data", "finite", "1 of 5376"]),
     "no training frame": (put("entry/split", np.ones(8, int)), ["training frame", "/entry/split"]),
     "a pixel of 3.2 m": (huge_pixels, ["pixel_size", "3.2", "unit"]),
     "no images": (drop(f"{DETECTOR}/data"), ["detector/data", "missing"]),

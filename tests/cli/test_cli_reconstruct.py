@@ -9,7 +9,7 @@ import shutil
 import signal
 import subprocess
 import time
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -123,7 +123,7 @@ def test_a_run_finds_its_scan_or_asks_for_it(shop, tmp_path):
 def test_ctrl_c_leaves_a_usable_run_that_goes_on(shop, tmp_path):
     """Exit code 130, a result and its report; --resume ends the fit."""
     long = replace(QUICK, fit=replace(QUICK.fit, schedule=Schedule(steps=1000)))
-    (tmp_path / "long.json").write_text(json.dumps(asdict(long)))
+    (tmp_path / "long.json").write_text(json.dumps(to_table(long)))
     arguments = ["reconstruct", shop.scan, "--out", "run", "--material", "haemoglobin", "--config", "long.json"]
     log = tmp_path / "stderr"
     with log.open("w") as stderr:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +18,7 @@ from holosplat.io.vtk import write_mesh
 from holosplat.materials import Compound
 from holosplat.mesh import TriangleMesh
 from holosplat.specimens.red_cells import icosphere
+from holosplat.tables import to_table
 
 PIXEL = 1e-6
 BEAM = ["--material", FORMULA, "--density", "1.335", "--pixel-size", "1e-6", "--detector", "21", "34"]
@@ -95,7 +95,7 @@ def test_one_time_of_a_series_is_reconstructed_and_judged(folder, tmp_path, monk
     monkeypatch.setattr("holosplat.report.run.report_run", lambda *what: tmp_path / "run/report.html")
     options = ["--frame-rate", 5e5, "--views", 4, "--truth-frames", 2, "--truth", tmp_path / "t.h5"]
     worked(holosplat("simulate", folder, *BEAM, *options, "--out", tmp_path / "s.nxs"))
-    (tmp_path / "quick.json").write_text(json.dumps(asdict(QUICK)))
+    (tmp_path / "quick.json").write_text(json.dumps(to_table(QUICK)))
     known = ["--material", "haemoglobin", "--config", tmp_path / "quick.json"]
     before = everything_in(tmp_path)
     refused(

@@ -5,28 +5,28 @@ from __future__ import annotations
 import json
 import shutil
 import signal
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from holosplat.fit.objective import Objective
-from holosplat.workflows.settings import MaterialPrior, Settings
-from holosplat.workflows.surfaces import extract_surfaces
 
 from helpers.cli import Outcome, holosplat, worked
 from holosplat.baselines import HolographicTV
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
-from holosplat.fit.loop import FitOptions
 from holosplat.fit.schedule import Schedule
+from holosplat.fit.terms import Objective
 from holosplat.geometry import Grid, Views
-from holosplat.io.gaussians import write_gaussians
 from holosplat.io.json import read_json, write_json
 from holosplat.io.nxtomo import read_scan, write_scan
+from holosplat.io.objects import write_object
 from holosplat.io.volumes import write_volume
 from holosplat.io.vtk import read_meshes
 from holosplat.materials import HAEMOGLOBIN
+from holosplat.matter import MaterialPrior
+from holosplat.methods import FitOptions, Gaussians
+from holosplat.methods.surfaces import extract_surfaces
 from holosplat.representations import freed
 from holosplat.scan import Exposures, interleaved_split
 from holosplat.specimens.red_cells import random_cells
@@ -38,13 +38,13 @@ from holosplat.workflows.run_folder import RunFolder
 PIXEL = 1e-6
 ROWS, COLUMNS = 25, 29
 MATTER = HAEMOGLOBIN.delta_beta(20.0)
-QUICK = Settings(
+QUICK = Gaussians(
     spacing_px=2.0,
     approximate_steps=10,
     volume=HolographicTV(iterations=40, corrections=2, inner=8, refine=1),
     fit=FitOptions(Objective(tv_volume=0.05, overfull=10.0), Schedule(steps=20)),
 )
-"""Settings for runs whose quality does not matter."""
+"""Options for runs whose quality does not matter."""
 
 
 @pytest.fixture(scope="module")
@@ -82,7 +82,7 @@ def test_a_run_becomes_bodies_that_explain_the_frames_better(shop, tmp_path):
     summary = read_json(out / "summary.json")
     assert summary["surfaces"]["ssim"] > summary["gaussians"]["ssim"]
     assert summary["surfaces"]["relative_error_delta"] < summary["gaussians"]["relative_error_delta"]
-    assert summary["settings"]["fit"]["steps"] == 20
+    assert summary["settings"]["fit"]["schedule"]["steps"] == 20
     assert summary["material"]["delta"] == MATTER.delta
     for mesh in read_meshes(out, summary["length_unit"]):
         volume = summary["bodies"][mesh.name.removesuffix(".vtk")]["volume_m3"]
@@ -122,7 +122,7 @@ def test_another_scan_is_remarked_upon(shop, tmp_path):
 
 def test_a_run_of_an_estimated_material_is_taken(shop, tmp_path):
     unknown = RunFolder(shutil.copytree(shop / "run", tmp_path / "unknown"))
-    write_json(unknown.config, unknown.read_config() | {"prior": asdict(MaterialPrior())})
+    write_json(unknown.config, unknown.read_config() | {"prior": MaterialPrior.unknown().as_dict()})
     options = ["--scan", shop / "scan.nxs", "--steps", 1]
     assert "what the run estimated" in worked(holosplat("surface", unknown.path, "--out", tmp_path / "b", *options)).err
     known = worked(holosplat("surface", shop / "run", "--out", tmp_path / "c", *options))
@@ -131,7 +131,7 @@ def test_a_run_of_an_estimated_material_is_taken(shop, tmp_path):
 
 def test_a_run_with_delta_and_beta_apart_is_refused(shop, tmp_path):
     apart = RunFolder(shutil.copytree(shop / "run", tmp_path / "apart"))
-    write_gaussians(apart.gaussians, freed(load_reconstruction(apart).cloud))
+    write_object(apart.object, freed(load_reconstruction(apart).object))
     out = tmp_path / "bodies"
     command = holosplat("surface", apart.path, "--scan", shop / "scan.nxs", "--out", out)
     refused(command, "surfaces need one material", "δ and β apart", "--material")
@@ -139,7 +139,7 @@ def test_a_run_with_delta_and_beta_apart_is_refused(shop, tmp_path):
 
 
 def test_a_cloud_of_two_channels_is_refused(shop):
-    cloud = load_reconstruction(RunFolder(shop / "run")).cloud
+    cloud = load_reconstruction(RunFolder(shop / "run")).object
     with pytest.raises(InputError, match="δ and β apart"):
         extract_surfaces(freed(cloud), read_scan(shop / "scan.nxs"))
 

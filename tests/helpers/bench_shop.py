@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -11,6 +13,8 @@ import holosplat as hs
 from holosplat.bench.case import Case
 from holosplat.bench.method import Method
 from holosplat.bench.run import Suite
+from holosplat.matter import Matter
+from holosplat.methods import Task
 from holosplat.representations.voxels import VoxelGrid
 from holosplat.specimens.red_cells import icosphere
 
@@ -35,7 +39,25 @@ def voxels(scan: hs.Scan, value: float = 1.0) -> VoxelGrid:
     values = torch.zeros(1, *grid.shape)
     z, y, x = (n // 2 for n in grid.shape)
     values[0, z - 5 : z + 3, y - 3 : y + 5, x - 4 : x + 4] = value
-    return VoxelGrid(values, grid, MATERIAL.delta, MATERIAL.beta)
+    return VoxelGrid(values, grid, Matter.one(*MATERIAL))
+
+
+@dataclass(frozen=True)
+class Fake:
+    """Options of a method with one stage, without a fit."""
+
+    act: Callable[[Task], hs.Object]
+    kind: ClassVar[str] = "fake"
+    name: ClassVar[str] = "fake"
+
+    def stages(self) -> tuple[Fake]:
+        return (self,)
+
+    def start(self, task: Task, before: object) -> hs.Object:
+        return self.act(task)
+
+    def fit(self, task: Task, start: hs.Object) -> None:
+        """Nothing is fitted."""
 
 
 class Recorder:
@@ -45,12 +67,12 @@ class Recorder:
         self.calls: list[tuple[str, hs.Scan, hs.MaterialPrior, int]] = []
 
     def method(self, name: str, act: Callable[[hs.Scan], hs.Object] = voxels) -> Method:
-        def run(scan, prior, seed, on_progress):
-            on_progress("thinking", 0.5)
-            self.calls.append((name, scan, prior, seed))
-            return act(scan)
+        def start(task: Task) -> hs.Object:
+            task.on_progress("thinking", 0.5)
+            self.calls.append((name, task.scan, task.prior, task.seed))
+            return act(task.scan)
 
-        return Method(name, "fakes", f"a fake called {name}", run)
+        return Method(name, "fakes", f"a fake called {name}", Fake(start))
 
     @property
     def names(self) -> list[str]:

@@ -1,15 +1,14 @@
-"""Cells whose scan the tests of reconstruction share, and settings for short runs."""
+"""Cells whose scan the tests of reconstruction share, and options for short runs."""
 
 from __future__ import annotations
 
-from holosplat.fit.objective import Objective
-from holosplat.workflows.settings import MaterialPrior, Settings
-
 from holosplat.baselines import HolographicTV
 from holosplat.fit.density import DensityControl
-from holosplat.fit.loop import FitOptions
 from holosplat.fit.schedule import Schedule
+from holosplat.fit.terms import Objective
 from holosplat.materials import HAEMOGLOBIN
+from holosplat.matter import MaterialPrior
+from holosplat.methods import FitOptions, Gaussians
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
 
@@ -19,19 +18,19 @@ CELL = HAEMOGLOBIN.delta_beta(20)
 KNOWN = MaterialPrior.known(CELL)
 STEPS = 12
 
-SMALL = Settings(
+SMALL = Gaussians(
     spacing_px=1.5,
     approximate_steps=10,
     volume=HolographicTV(iterations=40, corrections=3, inner=10),
     fit=FitOptions(Objective(tv_volume=0.05, overfull=10.0), Schedule(steps=STEPS)),
 )
-RANDOM = Settings(
+RANDOM = Gaussians(
     start="random",
     random_count=150,
     fit=FitOptions(
         Objective(l1=1.0, ssim=0.2, frc=0.1, tv_volume=0.01),
         Schedule(steps=STEPS, views_per_step=2, validation_views=1, validate_every=4, volume_edge=12),
-        DensityControl(every=3, start=0.0, stop=0.9, grow_fraction=0.1),
+        density=DensityControl(every=3, start=0.0, stop=0.9, grow_fraction=0.1),
     ),
 )
 """A fit in which everything is drawn at random that can be."""

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from holosplat.geometry import Grid, Views
+from holosplat.representations import NeuralField
 
 DOUBLE = torch.float64
 ROWS = Grid((11, 7, 9), (1.1, 1.0, 0.9), (-4.0, -3.0, -3.7))
@@ -32,3 +33,10 @@ def anyhow(count: int, shape: tuple[int, int], seed: int = 0) -> Views:
 def randoms(*shape: int, seed: int = 0, dtype: torch.dtype = DOUBLE) -> Tensor:
     """Normal random numbers."""
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=dtype)
+
+
+def pronounced(field: NeuralField) -> NeuralField:
+    """The field in float64, with an encoding that tells places apart."""
+    field = field.to(dtype=DOUBLE)
+    encoding = {name: 3e3 * p for name, p in field.parameters().items() if name.startswith("encoding.")}
+    return field.with_parameters(encoding)

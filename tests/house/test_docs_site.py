@@ -69,6 +69,37 @@ def test_broken_links_are_seen():
     ]
 
 
+GONE = ROOT / "docs" / "design" / "model_and_problem.md"
+"""A page that also names files of earlier versions."""
+
+
+def missing_files(text: str) -> list[str]:
+    """Source files that a page names, such as `fit/loop.py`, and that are not in the repository.
+
+    A path counts from the repository, the package or any folder in it.
+    """
+    named = {
+        name for span in re.findall(r"`([^`\n]+)`", text) for name in re.findall(r"[\w./-]+\.(?:py|cpp|hpp)\b", span)
+    }
+    rooms = ("src", "native", "tests", "docs", "examples", "benchmarks")
+    there = [path.as_posix() for room in rooms for path in (ROOT / room).rglob("*.[ch]*")]
+    there += [path.as_posix() for room in rooms for path in (ROOT / room).rglob("*.py")]
+    made = set(re.findall(r"(?:This is all of|, say)\s+`([\w/.]+)`", text))  # by the reader
+    return sorted(name for name in named - made if not any(path.endswith(f"/{name}") for path in there))
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if p != GONE], ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_named_files_exist(page):
+    assert missing_files(page.read_text(encoding="utf-8")) == []
+
+
+def test_missing_files_are_seen():
+    assert missing_files("See `fit/loop.py`, `fit/misfit.py` and `python benchmarks/none.py --csv FILE`.") == [
+        "benchmarks/none.py",
+        "fit/misfit.py",
+    ]
+
+
 @pytest.mark.parametrize(
     ("page", "link", "turned"),
     [

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views, rotation_y
 from holosplat.io.r2_gaussian import R2Options, read_r2_gaussian, write_r2_gaussian
+from holosplat.matter import Matter
 from holosplat.optics import retrieve_thickness
 from holosplat.representations.gaussians import GaussianCloud, raw_of
 from holosplat.scan import Exposures, Scan
@@ -33,7 +34,9 @@ def blob(centre: tuple[float, float, float], sigma: float) -> GaussianCloud:
     position = torch.tensor([centre])
     spread = torch.full((1, 3), float(np.log(sigma)))
     return GaussianCloud(
-        (position, spread, torch.tensor([[1.0, 0, 0, 0]]), raw_of(torch.ones(1))[:, None]), PIXEL, DELTA, 1e-10
+        (position, spread, torch.tensor([[1.0, 0, 0, 0]]), raw_of(torch.ones(1))[:, None]),
+        PIXEL,
+        Matter.one(DELTA, 1e-10),
     )
 
 

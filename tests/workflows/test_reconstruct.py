@@ -9,17 +9,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from holosplat.fit.objective import Objective
-from holosplat.workflows.settings import MaterialPrior, preset
-from holosplat.workflows.start import starting_cloud
 
 from helpers.runs import CELL, KNOWN, PIXEL, RANDOM, SHAPE, SMALL, Interruption, scene
 from holosplat import native
 from holosplat.baselines import HolographicTV
 from holosplat.checks import InputError
-from holosplat.fit.loop import FitOptions
 from holosplat.fit.schedule import Schedule
+from holosplat.fit.terms import Objective
 from holosplat.geometry import Grid, Views
+from holosplat.matter import MaterialPrior, Matter
+from holosplat.methods import FitOptions, Task
+from holosplat.methods.presets import preset
+from holosplat.methods.start import starting_cloud
 from holosplat.model import measure
 from holosplat.representations import GaussianCloud
 from holosplat.representations.gaussians import raw_of
@@ -50,7 +51,7 @@ def test_cells_of_known_material_are_reconstructed(scan, truth):
     assert abs(scores.volume.delta_deviation) < 0.1
     assert result.finished
     assert result.oversample == 2
-    assert (result.cloud.delta, result.cloud.beta) == CELL
+    assert result.object.matter == Matter.one(*CELL)
     stages = list(dict.fromkeys(stage for stage, _ in told))
     assert stages[0] == "phase retrieval"
     assert stages[-1] == "fit"
@@ -64,9 +65,12 @@ def test_held_out_frames_are_never_read(scan):
     """Poisoned with huge values, they change nothing at all, from the start on."""
     frames = np.where(scan.is_test[:, None, None], np.float32(1e30), scan.frames)
     poisoned = replace(scan, frames=frames)
-    for settings, prior in ((SMALL, KNOWN), (SMALL, MaterialPrior()), (RANDOM, KNOWN)):
-        a, b = (reconstruct(s, prior, settings).cloud for s in (scan, poisoned))
-        assert all(np.array_equal(p.numpy(), q.numpy()) for p, q in zip(a.parameters, b.parameters))
+    for settings, prior in ((SMALL, KNOWN), (SMALL, MaterialPrior.unknown()), (RANDOM, KNOWN)):
+        a, b = (reconstruct(s, prior, settings).object for s in (scan, poisoned))
+        assert all(
+            np.array_equal(p.numpy(), q.numpy())
+            for p, q in zip(a.parameters().values(), b.parameters().values(), strict=True)
+        )
 
 
 def test_a_scan_without_training_frames_is_refused(scan, tmp_path):
@@ -115,10 +119,10 @@ def test_with_the_ratio_alone_delta_is_found(scan, truth):
 @pytest.mark.parametrize("separate", [False, True])
 def test_with_nothing_known_delta_and_beta_are_found(scan, truth, separate):
     """At the one ratio that the frames suggest, or fitted apart; nothing bounds the occupancy then."""
-    result = reconstruct(scan, MaterialPrior(), replace(SMALL, separate=separate))
+    result = reconstruct(scan, MaterialPrior.unknown(), replace(SMALL, separate=separate))
     found = evaluate(result, scan, truth)
     assert found.material.single_material != separate
-    assert result.cloud.raw_amplitudes.shape[1] == 1 + separate
+    assert result.object.raw_amplitudes.shape[1] == 1 + separate
     assert found.material.delta == pytest.approx(CELL.delta, rel=0.35, abs=0)
     assert CELL.ratio / 2.5 < found.material.ratio < 2.5 * CELL.ratio
     assert found.volume.dice > 0.92
@@ -126,18 +130,18 @@ def test_with_nothing_known_delta_and_beta_are_found(scan, truth, separate):
     assert ("found apart" if separate else "one for all") in found.lines()[-1]
 
 
-@pytest.mark.parametrize("prior", [KNOWN, MaterialPrior()], ids=lambda p: p.kind)
+@pytest.mark.parametrize("prior", [KNOWN, MaterialPrior.unknown()], ids=lambda p: p.kind)
 def test_the_occupancy_is_bounded_only_where_one_means_something(scan, prior):
     weights = Objective(tv_volume=0.05, overfull=10.0, two_levels=1.0)
     settings = replace(SMALL, fit=FitOptions(weights, Schedule(steps=2)))
     recorded: set[str] = set()
     result = reconstruct(scan, prior, settings, on_progress=lambda stage, part, record: recorded.update(record))
-    assert result.cloud.single_material
+    assert result.object.matter.single
     assert "tv_volume" in recorded
     assert ({"overfull", "two_levels"} <= recorded) == (prior.kind == "known")
 
 
-@pytest.mark.parametrize(("prior", "upper"), [(KNOWN, 1.0), (MaterialPrior(), 0.0)], ids=["known", "free"])
+@pytest.mark.parametrize(("prior", "upper"), [(KNOWN, 1.0), (MaterialPrior.unknown(), 0.0)], ids=["known", "free"])
 def test_so_is_the_occupancy_of_the_start(scan, monkeypatch, prior, upper):
     begun: list[HolographicTV] = []
 
@@ -145,37 +149,36 @@ def test_so_is_the_occupancy_of_the_start(scan, monkeypatch, prior, upper):
         begun.append(options)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("holosplat.workflows.start.holographic_tv", begin)
+    monkeypatch.setattr("holosplat.methods.start.holographic_tv", begin)
     with pytest.raises(KeyboardInterrupt):
-        starting_cloud(scan.train(), prior, SMALL, 0, lambda stage, part: None)
+        starting_cloud(Task(scan.train(), prior), SMALL)
     assert [options.upper for options in begun] == [upper]
 
 
 def test_noisy_frames_get_fewer_and_larger_gaussians(scan):
     noisy = replace(scan, frames=scan.frames + np.random.default_rng(0).normal(0, 0.02, scan.frames.shape).astype("f4"))
-    clouds = [
-        starting_cloud(noisy.train(), KNOWN, replace(SMALL, spacing_noise=rule), 0, lambda stage, part: None)
-        for rule in (0.0, 2.3)
-    ]
+    clouds = [starting_cloud(Task(noisy.train(), KNOWN), replace(SMALL, spacing_noise=rule)) for rule in (0.0, 2.3)]
     assert len(clouds[1]) < 0.5 * len(clouds[0])
     assert float(clouds[1].scales.median()) > 1.3 * float(clouds[0].scales.median())
 
 
-@pytest.mark.parametrize("prior", [KNOWN, MaterialPrior.of_ratio(2800.0), MaterialPrior()], ids=lambda p: p.kind)
+@pytest.mark.parametrize(
+    "prior", [KNOWN, MaterialPrior.of_ratio(2800.0), MaterialPrior.unknown()], ids=lambda p: p.kind
+)
 def test_a_random_start_runs_with_every_prior(scan, prior):
     settings = replace(RANDOM, fit=FitOptions(schedule=Schedule(steps=3)))
     result = reconstruct(scan, prior, settings)
-    assert len(result.cloud) == 150
-    assert result.cloud.single_material == (prior.kind != "free")
-    assert result.cloud.delta > 0
+    assert len(result.object) == 150
+    assert result.object.matter.single == (prior.kind != "free")
+    assert result.object.matter.delta > 0
     if prior.kind == "ratio":
-        assert result.cloud.delta / result.cloud.beta == pytest.approx(2800)
+        assert result.object.matter.channels[0].ratio == pytest.approx(2800)
 
 
 def test_too_many_gaussians_become_larger_ones(scan):
     few = replace(SMALL, max_start=400, fit=FitOptions(schedule=Schedule(steps=1)))
     many = replace(few, max_start=10_000)
-    counts = [len(reconstruct(scan, KNOWN, settings).cloud) for settings in (few, many)]
+    counts = [len(reconstruct(scan, KNOWN, settings).object) for settings in (few, many)]
     assert counts[0] <= 400 < counts[1]
 
 
@@ -186,12 +189,13 @@ def a_result() -> Reconstruction:
     """Two wide Gaussians far apart."""
     centres, log_scales = torch.tensor([[-12.0, 0, 0], [12.0, 0, 0]]), torch.full((2, 3), math.log(3))
     quaternions, raw = torch.tensor([[1.0, 0, 0, 0]]).repeat(2, 1), raw_of(torch.full((2, 1), 0.8))
-    return Reconstruction(GaussianCloud((centres, log_scales, quaternions, raw), PIXEL, *CELL), 20.0, 2, {}, True)
+    cloud = GaussianCloud((centres, log_scales, quaternions, raw), PIXEL, Matter.one(*CELL))
+    return Reconstruction(cloud, "gaussians", 20.0, 2, {}, True)
 
 
 def test_rendered_frames_are_measured_ones(scan):
     result = a_result()
-    wanted = measure(result.cloud, scan.exposures, 2).detach().numpy()
+    wanted = measure(result.object, scan.exposures, 2).detach().numpy()
     np.testing.assert_allclose(render(result, scan.exposures), wanted, rtol=0, atol=1e-5)
 
 
@@ -208,7 +212,7 @@ def test_scores_are_taken_on_the_right_frames_and_grid(scan, truth):
     frames[0, 0, 0] += 0.5  # a training frame
     own = replace(scan, frames=frames)
     grid = Grid.centred((20, 30, 40), 1.2 * PIXEL)
-    scores = evaluate(result, own, result.cloud.voxelise(grid))
+    scores = evaluate(result, own, result.object.voxelise(grid))
     assert scores.test.mean["ssim"] == pytest.approx(1)
     assert scores.train.mean["l1"] > 0
     assert scores.volume.relative_error_delta == 0
@@ -243,7 +247,9 @@ def test_the_material_of_a_free_cloud_is_that_of_its_matter():
     sigmas = torch.tensor([3.43, 3.0, 7.1, 1.0, 1.0])  # 45, 30 and 25 % of the mass; the last two mark the corners
     centres = torch.tensor([[0.0, -25, 0], [0, 0, 0], [0, 35, 0], [-18, -40, -18], [18, 60, 18]])
     quaternions = torch.tensor([[1.0, 0, 0, 0]]).repeat(5, 1)
-    cloud = GaussianCloud((centres, sigmas.log()[:, None].repeat(1, 3), quaternions, raw_of(amplitudes)), PIXEL, *CELL)
+    cloud = GaussianCloud(
+        (centres, sigmas.log()[:, None].repeat(1, 3), quaternions, raw_of(amplitudes)), PIXEL, Matter.free(*CELL)
+    )
     found = material_found(cloud)
     assert not found.single_material
     assert found.ratio == pytest.approx(4 * CELL.ratio, rel=0.01)
@@ -263,8 +269,8 @@ def test_another_backend_goes_on_and_judges(scan, tmp_path):
     folder = RunFolder(tmp_path / "run")
     reconstruct(scan, KNOWN, RANDOM, seed=3, folder=folder, on_progress=Interruption(2))
     plain = replace(RANDOM, fit=replace(RANDOM.fit, backend="reference"))
-    assert reconstruct(scan, KNOWN, plain, seed=3, folder=folder, resume=True).cloud.backend == "reference"
-    assert load_reconstruction(folder).cloud.backend == "reference"
+    assert reconstruct(scan, KNOWN, plain, seed=3, folder=folder, resume=True).object.backend == "reference"
+    assert load_reconstruction(folder).object.backend == "reference"
     assert json.loads(folder.summary.read_text())["backend"] == "reference"
 
 

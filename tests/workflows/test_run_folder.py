@@ -7,23 +7,24 @@ import hashlib
 import json
 import math
 import signal
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import h5py
 import numpy as np
 import pytest
 import torch
-from holosplat.workflows.settings import MaterialPrior, Settings, from_plain, preset, presets, read_settings
 
 import holosplat.workflows.reconstruct as module
 from helpers.runs import CELL, KNOWN, PIXEL, RANDOM, SMALL, STEPS, Interruption
 from holosplat.checks import InputError
-from holosplat.fit.loop import FitOptions
+from holosplat.fit.optimiser import Adam
 from holosplat.fit.schedule import Schedule
-from holosplat.fit.trainable import Trainable
-from holosplat.materials import DeltaBeta
+from holosplat.matter import DeltaBeta, MaterialPrior, Matter
+from holosplat.methods import FitOptions, GaussianRates, Gaussians
+from holosplat.methods.presets import read_method
 from holosplat.model import Instrument
 from holosplat.representations.gaussians import PARAMETERS
+from holosplat.tables import from_table
 from holosplat.workflows.evaluate import evaluate
 from holosplat.workflows.provenance import scan_hash
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
@@ -42,7 +43,7 @@ def metrics(folder: RunFolder) -> list[dict[str, str]]:
 
 
 def gaussians(folder: RunFolder) -> dict[str, np.ndarray]:
-    with h5py.File(folder.gaussians) as file:
+    with h5py.File(folder.object) as file:
         return {name: file[name][()] for name in PARAMETERS}
 
 
@@ -73,7 +74,7 @@ def random_whole(scan, tmp_path_factory) -> RunFolder:
 
 
 def test_a_run_folder_holds_what_was_done(scan, whole):
-    names = {"config.json", "metrics.csv", "checkpoint.pt", "gaussians.h5", "summary.json"}
+    names = {"config.json", "metrics.csv", "checkpoint.pt", "object.h5", "summary.json"}
     assert set(contents(whole)) == names
     config = json.loads(whole.config.read_text())
     assert config["seed"] == 3
@@ -86,7 +87,8 @@ def test_a_run_folder_holds_what_was_done(scan, whole):
     assert (summary["steps"], summary["best_step"]) == (STEPS, STEPS)
     assert summary["detector"] == {"rows": 40, "columns": 48, "pixel_size_m": PIXEL}
     assert summary["material"] == {"delta": CELL.delta, "beta": CELL.beta, "single": True}
-    assert summary["gaussians"] == len(gaussians(whole)["centres"])
+    assert (summary["method"], summary["kind"]) == ("gaussians", "gaussians")
+    assert summary["size"] == f"{len(gaussians(whole)['centres'])} Gaussians"
     rows = metrics(whole)
     assert [int(row["step"]) for row in rows] == list(range(1, STEPS + 1))
     assert all(float(row["loss"]) > 0 and float(row["l1"]) > 0 for row in rows)
@@ -95,54 +97,36 @@ def test_a_run_folder_holds_what_was_done(scan, whole):
 
 def test_a_run_folder_gives_the_reconstruction_back(scan, whole):
     loaded, again = load_reconstruction(whole), reconstruct(scan, KNOWN, SMALL, seed=3)
-    for a, b in zip(loaded.cloud.parameters, again.cloud.parameters):
-        assert np.array_equal(a.numpy(), b.numpy())
-    assert (loaded.cloud.unit_length, loaded.cloud.delta, loaded.cloud.beta) == (PIXEL, *CELL)
+    assert loaded.object.parameters().keys() == again.object.parameters().keys()
+    for name, found in loaded.object.parameters().items():
+        assert torch.equal(found, again.object.parameters()[name])
+    assert (loaded.object.unit_length, loaded.object.matter) == (PIXEL, Matter.one(*CELL))
     assert (loaded.oversample, loaded.finished) == (again.oversample, True)
     assert loaded.timing.keys() == again.timing.keys()
 
 
-def test_settings_go_round_through_config_json(whole):
-    saved = json.loads(whole.config.read_text())["settings"]
-    assert from_plain(Settings, saved, "settings") == SMALL
-    assert read_settings(whole.config) == SMALL
-    for settings in presets().values():
-        assert from_plain(Settings, json.loads(json.dumps(asdict(settings))), "settings") == settings
+def test_options_go_round_through_config_json(whole):
+    saved = json.loads(whole.config.read_text())["method"]
+    assert from_table(Gaussians, saved) == SMALL
+    assert read_method(whole.config) == SMALL
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda s: s.update(speed=3), "settings has the unknown entries speed"),
-        (lambda s: s["fit"]["schedule"].update(stepz=3), r"settings\.fit\.schedule has the unknown entries stepz"),
-        (lambda s: s["fit"].pop("density"), r"settings\.fit lacks the entries density"),
-        (
-            lambda s: s["fit"]["schedule"].update(steps="many"),
-            r"settings\.fit\.schedule\.steps must be of the type int",
-        ),
-        (lambda s: s.update(start="guess"), r"settings\.start must be one of phase, random"),
-        (lambda s: s.update(volume=4), r"settings\.volume must be a table"),
-        (lambda s: s["fit"]["schedule"].update(steps=-1), "steps must not be negative"),
-        (lambda s: s["fit"]["schedule"].update(decay=0.0), "decay"),
-        (lambda s: s["fit"]["schedule"].update(volume_edge=1), "volume_edge"),
-        (lambda s: s["volume"].update(iterations=0), "iterations"),
-        (lambda s: s["volume"].update(weight=-0.1), "weight"),
-        (lambda s: s.update(spacing_px=0), "spacing_px"),
-        (lambda s: s.update(random_count=0), "random_count"),
+        (lambda s: s["fit"]["schedule"].update(volume_edge=1), r"fit\.schedule: volume_edge must be at least 2"),
+        (lambda s: s["volume"].update(weight=-0.1), "volume: weight must not be negative"),
+        (lambda s: s.update(random_count=0), "random_count must be at least 1"),
+        (lambda s: s["fit"].update(terms=[{"name": "none"}]), "a term must be one of .*'none'"),
     ],
 )
-def test_settings_that_are_none_are_refused(tmp_path, change, message):
-    values = asdict(SMALL)
-    change(values)
-    path = tmp_path / "settings.json"
-    path.write_text(json.dumps(values))
+def test_a_config_with_values_that_cannot_be_is_refused(whole, tmp_path, change, message):
+    config = json.loads(whole.config.read_text())
+    change(config["method"])
+    path = tmp_path / "config.json"
+    path.write_text(json.dumps(config))
     with pytest.raises(InputError, match=message):
-        read_settings(path)
-
-
-def test_an_unknown_preset_is_refused():
-    with pytest.raises(InputError, match=r"preset must be one of default, fast, thesis.*'quick'"):
-        preset("quick")
+        read_method(path)
 
 
 def test_a_taken_folder_is_refused_and_left_alone(scan, whole, tmp_path):
@@ -180,27 +164,32 @@ def test_the_same_seed_gives_the_same_run(request, scan, tmp_path, settings):
     "settings",
     [
         replace(SMALL, fit=FitOptions(schedule=Schedule(steps=2, views_per_step=1))),
-        replace(RANDOM, fit=FitOptions(schedule=Schedule(steps=1, rate_position=0.0))),
+        replace(RANDOM, fit=FitOptions(schedule=Schedule(steps=1), rates=GaussianRates(centres=0.0))),
     ],
     ids=["views drawn", "random start"],
 )
 def test_another_seed_gives_another_run_where_anything_is_random(scan, settings):
-    first, other = (reconstruct(scan, KNOWN, settings, seed=seed).cloud.centres for seed in (3, 4))
+    first, other = (reconstruct(scan, KNOWN, settings, seed=seed).object.centres for seed in (3, 4))
     assert not torch.equal(first, other)
 
 
 def test_the_result_is_the_best_state_by_the_validation_views(scan, tmp_path):
     """Not the last one, where the fit has got worse (at rates far too high)."""
-    hasty = Schedule(STEPS, rate_position=2, rate_amplitude=2, decay=1, validation_views=2, validate_every=1)
+    hasty = FitOptions(
+        schedule=Schedule(STEPS, decay=1, validation_views=2, validate_every=1),
+        rates=GaussianRates(centres=2, raw_amplitudes=2),
+    )
     folder = RunFolder(tmp_path / "run")
-    result = reconstruct(scan, KNOWN, replace(RANDOM, fit=FitOptions(schedule=hasty)), folder=folder)
+    result = reconstruct(scan, KNOWN, replace(RANDOM, fit=hasty), folder=folder)
     summary = json.loads(folder.summary.read_text())
     assert summary["best_step"] < summary["steps"] == STEPS
     state = folder.load_checkpoint()["fit"]
-    for found, best, last in zip(result.cloud.parameters, state["best"][2], state["trainable"]["parameters"]):
-        assert torch.equal(found, best)
-        assert not torch.equal(found, last)
-    assert np.array_equal(gaussians(folder)["centres"], result.cloud.centres.numpy())
+    best, last = state["best"][2], state["trainable"]["parameters"]
+    assert set(best) == set(last)
+    for name, found in result.object.parameters().items():
+        assert torch.equal(found, best[f"object.{name}"])
+        assert not torch.equal(found, last[f"object.{name}"])
+    assert np.array_equal(gaussians(folder)["centres"], result.object.centres.numpy())
 
 
 # --- interruption and resumption ----------------------------------------------------------------------------
@@ -214,7 +203,7 @@ def test_an_interrupted_run_is_usable_and_goes_on_as_if_nothing_had_happened(req
     assert not half.finished
     assert stop.stages[-1] == "interrupted"
     loaded = load_reconstruction(folder)
-    assert (loaded.finished, len(loaded.cloud)) == (False, len(half.cloud))
+    assert (loaded.finished, len(loaded.object)) == (False, len(half.object))
     assert math.isfinite(evaluate(loaded, scan, None).test.mean["ssim"])
     assert json.loads(folder.summary.read_text())["steps"] == 5
     assert [int(row["step"]) for row in metrics(folder)] == [1, 2, 3, 4, 5]
@@ -227,7 +216,7 @@ def test_an_interrupted_run_is_usable_and_goes_on_as_if_nothing_had_happened(req
     assert done.timing["fit"] > half.timing["fit"]
 
 
-@pytest.mark.parametrize("where", [(Instrument, "frames"), (Trainable, "apply")], ids=["before", "after the step"])
+@pytest.mark.parametrize("where", [(Instrument, "frames"), (Adam, "apply")], ids=["before", "after the step"])
 def test_ctrl_c_in_the_middle_of_a_step_does_no_harm(scan, random_whole, tmp_path, monkeypatch, where):
     """The signal comes at any time; what is saved must be the state between two steps."""
     folder, calls = RunFolder(tmp_path / "run"), []
@@ -286,7 +275,7 @@ def test_resuming_where_nothing_is_starts_a_run(scan, whole, tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         reconstruct(scan, KNOWN, SMALL, seed=3, folder=folder, on_progress=at_the_start)
-    assert not folder.gaussians.exists()
+    assert not folder.object.exists()
     reconstruct(scan, KNOWN, SMALL, seed=3, folder=folder, resume=True)
     assert_same_result(folder, whole)
 
@@ -294,7 +283,7 @@ def test_resuming_where_nothing_is_starts_a_run(scan, whole, tmp_path):
 @pytest.mark.parametrize(
     ("what", "change"),
     [
-        ("settings", lambda a: {**a, "settings": replace(SMALL, spacing_px=1.4)}),
+        ("method and settings", lambda a: {**a, "method": replace(SMALL, spacing_px=1.4)}),
         ("(prior|material)", lambda a: {**a, "prior": MaterialPrior.known(DeltaBeta(CELL.delta, 1.01 * CELL.beta))}),
         ("seed", lambda a: {**a, "seed": 4}),
         ("scan", lambda a: {**a, "scan": replace(a["scan"], frames=a["scan"].frames + np.float32(1e-3))}),
@@ -303,7 +292,7 @@ def test_resuming_where_nothing_is_starts_a_run(scan, whole, tmp_path):
 )
 def test_resuming_with_something_else_is_refused(scan, whole, what, change):
     before = contents(whole)
-    arguments = change({"scan": scan, "prior": KNOWN, "settings": SMALL, "seed": 3})
+    arguments = change({"scan": scan, "prior": KNOWN, "method": SMALL, "seed": 3})
     with pytest.raises(InputError, match=rf"--resume needs the {what}.* that .* was started with"):
         reconstruct(**arguments, folder=whole, resume=True)
     assert contents(whole) == before

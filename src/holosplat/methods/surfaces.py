@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
-import numpy as np
 import torch
 from scipy.sparse import csc_array, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
@@ -24,6 +23,7 @@ from ..matter import MaterialPrior
 from ..optics.noise import noise_share
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
+from ..projectors.sparse import torch_csr
 from ..representations import GaussianCloud, Stored, SurfaceMesh, isosurface
 from ..representations.isosurface import adjacency, neighbour_mean
 from ..scan import Scan
@@ -203,12 +203,7 @@ def _bending(train: Scan, start: SurfaceMesh, objective: Objective) -> list[Term
     weight = objective.bending * (1 + objective.noise_gain * noise_share(frames)) / frames[0].numel()
     count = len(start.vertices)
     away = csr_array(eye_array(count) - neighbour_mean(start.faces.numpy(), count))
-    twice = csr_array(away @ away)
-    twice.sort_indices()
-    starts, columns = (torch.from_numpy(a.astype(np.int64)) for a in (twice.indptr, twice.indices))
-    values = torch.from_numpy(twice.data)
-    operator = torch.sparse_csr_tensor(starts, columns, values, twice.shape, check_invariants=True)
-    return [Bending(weight, operator)]
+    return [Bending(weight, torch_csr(csr_array(away @ away), torch.float64))]
 
 
 def _membrane(start: SurfaceMesh, stiffness: float) -> Callable[[Tensor], Tensor]:

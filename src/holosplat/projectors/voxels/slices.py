@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 import scipy.sparse
 import torch
@@ -11,6 +9,7 @@ from torch import Tensor
 
 from ...checks import require
 from ...geometry import Grid, Views
+from ..sparse import torch_csr
 
 
 class SliceProjector:
@@ -29,7 +28,7 @@ class SliceProjector:
         nz, ny, nx = grid.shape
         self.array_shape = (nz, nx, ny)
         matrix = slice_matrix(grid, views)
-        self._forward, self._adjoint = _torch_csr(matrix), _torch_csr(matrix.T.tocsr())
+        self._forward, self._adjoint = (torch_csr(m, torch.float32) for m in (matrix, matrix.T.tocsr()))
 
     def project(self, array: Tensor) -> Tensor:
         """Line integrals [V, W, H] in metres × value of a volume in the order [Z, X, Y]."""
@@ -96,15 +95,3 @@ def _trapezoid_integral(t: np.ndarray, wide: float, narrow: float) -> np.ndarray
     a, b = 0.5 * (wide + narrow), 0.5 * (wide - narrow)
     inside = (ramp(t + a) - ramp(t + b) - ramp(t - b) + ramp(t - a)) / (wide * narrow)
     return np.where(t >= a, 1.0, inside)
-
-
-def _torch_csr(matrix: scipy.sparse.csr_matrix) -> Tensor:
-    with warnings.catch_warnings():  # torch calls its CSR support beta
-        warnings.simplefilter("ignore")
-        return torch.sparse_csr_tensor(
-            torch.from_numpy(matrix.indptr.astype(np.int64)),
-            torch.from_numpy(matrix.indices.astype(np.int64)),
-            torch.from_numpy(matrix.data.astype(np.float32)),
-            size=matrix.shape,
-            check_invariants=True,
-        )
