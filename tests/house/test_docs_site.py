@@ -13,6 +13,8 @@ from types import ModuleType
 
 import pytest
 
+import holosplat
+
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 
@@ -98,6 +100,27 @@ def test_missing_files_are_seen():
         "benchmarks/none.py",
         "fit/misfit.py",
     ]
+
+
+def unknown_names(text: str) -> list[str]:
+    """Names such as `hs.io.read_scan` in a page that the package has not."""
+    unknown = []
+    for name in sorted(set(re.findall(r"\bhs((?:\.[A-Za-z_]+)+)", text))):
+        thing: object = holosplat
+        for part in name.split(".")[1:]:
+            thing = getattr(thing, part, None)
+        if thing is None:
+            unknown.append(f"hs{name}")
+    return unknown
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_names_of_the_package_exist(page):
+    assert unknown_names(page.read_text(encoding="utf-8")) == []
+
+
+def test_unknown_names_are_seen():
+    assert unknown_names("`hs.io.read_scan(path)`, `hs.no_such`, `hs.io.no_such`") == ["hs.io.no_such", "hs.no_such"]
 
 
 @pytest.mark.parametrize(
