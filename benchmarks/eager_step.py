@@ -29,23 +29,23 @@ class EagerStep:
     def __init__(self, scan: hs.Scan, cloud: hs.representations.GaussianCloud, rates: tuple[float, ...]) -> None:
         exposures, (h, w) = scan.exposures, scan.views.shape
         pitch = scan.views.pixel_size
-        self.cloud = cloud.replaced(p.detach().clone().requires_grad_() for p in cloud.parameters)
-        groups = [{"params": [p], "lr": rate} for p, rate in zip(self.cloud.parameters, rates)]
+        self.cloud = cloud.replaced(p.detach().clone().requires_grad_() for p in cloud.parameters().values())
+        groups = [{"params": [p], "lr": rate} for p, rate in zip(self.cloud.parameters().values(), rates)]
         self.optimiser = torch.optim.Adam(groups, eps=1e-12)
         self.rotations = torch.from_numpy(scan.views.rotations).float()
         self.shape, self.margin = (h, w), (h // 2, w // 2)
-        padded = (2 * h, 2 * w)
-        self.transfer = fresnel_transfer(padded, pitch, exposures.distance, exposures.energy_kev, torch.complex64)
+        padded, energy = (2 * h, 2 * w), exposures.one_energy("the eager step")
+        self.transfer = fresnel_transfer(padded, pitch, exposures.distance, energy, torch.complex64)
         self.blur = gaussian_transfer(padded, exposures.psf_sigma_px, torch.float32)
-        self.phase = wavenumber(exposures.energy_kev) * cloud.delta * cloud.unit_length
-        self.loss_of_amplitude = wavenumber(exposures.energy_kev) * cloud.beta * cloud.unit_length
+        self.phase = wavenumber(energy) * cloud.matter.delta * cloud.unit_length
+        self.loss_of_amplitude = wavenumber(energy) * cloud.matter.beta * cloud.unit_length
         low, high = float(scan.frames.min()), float(scan.frames.max())
         self.low, self.span = low, high - low
         self.measured = (torch.from_numpy(scan.frames) - low) / self.span
 
     def frames(self) -> Tensor:
         """Predicted frames [V, H, W]."""
-        centres, log_scales, quaternions, raw = self.cloud.parameters
+        centres, log_scales, quaternions, raw = self.cloud.parameters().values()
         lines = splat(centres, log_scales.exp(), quaternions, softplus(raw), self.rotations, self.shape, CUTOFF)
         my, mx = self.margin
         lines = pad(lines, (mx, mx, my, my))

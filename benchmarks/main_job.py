@@ -21,12 +21,12 @@ from typing import Any
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
-from holosplat.fit.surfaces import oversampling
 from machine import commit
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from holosplat.bench.declaration import Between
+from holosplat.methods.surfaces import oversampling
 from holosplat.workflows.evaluate import Scores, score_object
 from holosplat.workflows.provenance import environment
 
@@ -97,7 +97,7 @@ def snapshot(meshes: list[Path]) -> Case:
 CASES: dict[str, Callable[[int], Case]] = {
     "cells": cells,
     "ratio": lambda seed: cells(seed, hs.MaterialPrior.of_ratio(HAEMOGLOBIN.ratio)),
-    "free": lambda seed: cells(seed, hs.MaterialPrior()),
+    "free": lambda seed: cells(seed, hs.MaterialPrior.unknown()),
     "noise": lambda seed: cells(seed, photons=2000.0),
     "nine": nine,
     "poses": poses,
@@ -112,6 +112,7 @@ def run(case: Case, preset: str, seed: int, surfaces: bool = False) -> list[dict
     began = time.perf_counter()
     result = hs.reconstruct(scan, case.prior, hs.preset(preset), seed)
     seconds = time.perf_counter() - began
+    assert isinstance(result.object, hs.representations.GaussianCloud)
     scores = hs.evaluate(result, scan, truth)
     material = scores.as_dict()["material"]
     rows = [
@@ -119,13 +120,13 @@ def run(case: Case, preset: str, seed: int, surfaces: bool = False) -> list[dict
             "method": "gaussians",
             "seconds": seconds,
             **{f"{stage}_seconds": value for stage, value in result.timing.items()},
-            "gaussians": len(result.cloud),
+            "gaussians": len(result.object),
             **numbers(scores, material),
         }
     ]
     if surfaces:
         began = time.perf_counter()
-        found = hs.methods.refine_surfaces(result.cloud, scan)
+        found = hs.methods.refine_surfaces(result.object, scan)
         seconds += time.perf_counter() - began
         refined = score_object(found, scan, truth, oversampling(scan.train()))
         rows.append({"method": "surfaces", "seconds": seconds, "gaussians": 0, **numbers(refined, material)})

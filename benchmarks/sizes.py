@@ -38,12 +38,13 @@ def measure(pixels: int, seed: int) -> str:
     began = time.perf_counter()
     result = hs.reconstruct(scan, hs.MaterialPrior.known(MATERIAL), hs.preset("default"), seed)
     seconds = time.perf_counter() - began
+    assert isinstance(result.object, hs.representations.GaussianCloud)
     after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     found = hs.evaluate(result, scan, scene.voxelise(hs.Grid.of_views(views))).headline()
     scores = " | ".join(f"{found[name]:.3f}" for name in ("ssim", "frcm", "dice", "relative_error_delta"))
     times = f"{result.timing['start']:.0f} + {result.timing['fit']:.0f} = {seconds:.0f}"
     memory = f"{max(before, after) / 2**20:.1f}" + ("" if after > before else " (simulation)")
-    return f"| {pixels} | {1e6 * pitch:.2g} | {scores} | {len(result.cloud)} | {times} | {memory} |"
+    return f"| {pixels} | {1e6 * pitch:.2g} | {scores} | {len(result.object)} | {times} | {memory} |"
 
 
 def main() -> None:

@@ -26,15 +26,18 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 import numpy as np
 import torch
 from eager_step import EagerStep
-from holosplat.fit.objective import Objective
 from machine import commit, memory_megabytes
 
 import holosplat as hs
 from holosplat.backends import device_name, resolve
 from holosplat.fit.fidelity import Target, l1_and_ssim
-from holosplat.fit.loop import Fit, FitOptions
+from holosplat.fit.loop import Fit
 from holosplat.fit.schedule import Schedule
+from holosplat.fit.terms import Objective
 from holosplat.geometry import Poses
+from holosplat.matter import Matter
+from holosplat.methods import FitOptions, GaussianRates, gaussian_fit
+from holosplat.methods.gaussian_options import Backend
 from holosplat.representations.gaussians import raw_of
 from holosplat.volume import LineIntegrals
 from holosplat.workflows.provenance import environment
@@ -54,7 +57,7 @@ def workload(count: int, size: int) -> tuple[hs.Scan, hs.representations.Gaussia
     amplitudes = share * (0.2 + torch.rand(count, 2, generator=generator))
     delta = 1.5e-7
     cloud = hs.representations.GaussianCloud(
-        (centres, log_scales, quaternions, raw_of(amplitudes)), PIXEL, delta, delta / 1000
+        (centres, log_scales, quaternions, raw_of(amplitudes)), PIXEL, Matter.free(delta, delta / 1000)
     )
     other = cloud.replaced((centres, log_scales, quaternions, raw_of(amplitudes.flip(0))))
     exposures = hs.Exposures.of(hs.Views.evenly_spaced(VIEWS, (size, size), PIXEL), 20.0, 0.1, 0.5)
@@ -63,19 +66,11 @@ def workload(count: int, size: int) -> tuple[hs.Scan, hs.representations.Gaussia
     return hs.Scan(frames, exposures, np.zeros(VIEWS, dtype=bool), {}), cloud
 
 
-def fit_of(scan: hs.Scan, cloud: hs.representations.GaussianCloud, backend: str) -> Fit:
+def fit_of(scan: hs.Scan, cloud: hs.representations.GaussianCloud, backend: Backend) -> Fit:
     """The project's own loop, with the objective and the rates of this benchmark."""
-    position, scale, rotation, amplitude = RATES
-    schedule = Schedule(
-        steps=10_000,
-        rate_position=position,
-        rate_scale=scale,
-        rate_rotation=rotation,
-        rate_amplitude=amplitude,
-        oversample=1,
-        decay=1.0,
-    )
-    return Fit(scan, cloud, FitOptions(Objective(l1=0.8, ssim=0.2), schedule, backend=backend))
+    schedule = Schedule(steps=10_000, oversample=1, decay=1.0)
+    options = FitOptions(Objective(l1=0.8, ssim=0.2), schedule, GaussianRates(*RATES), backend=backend)
+    return gaussian_fit(scan, cloud, options)
 
 
 def steps(fit: Fit, count: int) -> tuple[list[float], float]:
@@ -138,7 +133,9 @@ def parts(size: str, repeat: int = 10) -> dict[str, float]:
     """Best times [ms] of the parts of a step, one after the other."""
     scan, cloud = workload(*SIZES[size])
     fit = fit_of(scan, cloud, "cpu")
-    cloud, poses = fit.cloud, Poses.of(fit.instrument.views)
+    cloud, instrument = fit.model.object, fit.model.instrument
+    assert isinstance(cloud, hs.representations.GaussianCloud)
+    poses, rates = Poses.of(instrument.views), GaussianRates(*RATES).at(1.0, moving=True)
     times: dict[str, list[float]] = {}
 
     def timed(name: str, act: Callable[..., Any], *arguments: Any) -> Any:
@@ -149,30 +146,37 @@ def parts(size: str, repeat: int = 10) -> dict[str, float]:
 
     low, span = float(scan.frames.min()), float(np.ptp(scan.frames))
     target = Target(torch.from_numpy(scan.frames), low, span, "cpu")
+
+    def adam(loss: torch.Tensor) -> None:
+        fit.trainable.optimiser.prepare(rates)
+        fit.trainable.optimiser.apply(loss)
+
     for _ in range(repeat):
         lines = timed("splat", cloud.project, poses)
         held = LineIntegrals(lines.channels.detach().requires_grad_(), lines.materials)
-        frames = timed("optics", fit.instrument.frames, held)
+        frames = timed("optics", instrument.frames, held)
         shown = frames.detach().requires_grad_()
         l1, ssim = timed("l1_ssim", l1_and_ssim, shown, target)
-        timed("l1_ssim_backward", (0.8 * l1 + 0.2 * ssim).mean().backward)
+        loss = (0.8 * l1 + 0.2 * ssim).mean()
+        timed("l1_ssim_backward", loss.backward)
         timed("optics_backward", frames.backward, shown.grad)
         timed("splat_backward", lines.channels.backward, held.channels.grad)
-        timed("adam", fit.trainable.step, RATES)
+        timed("adam", adam, loss.detach())
     return {f"part_ms_{size}_{name}": min(values) for name, values in times.items()}
 
 
 def memory(size: str) -> dict[str, float]:
     """Peak memory of steps [MB] beyond what is there before, gradients and predicted frames; page faults a step."""
-    fit = fit_of(*workload(*SIZES[size]), "cpu")
+    scan, cloud = workload(*SIZES[size])
+    fit = fit_of(scan, cloud, "cpu")
     before = memory_megabytes("VmRSS")
     Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here
     steps(fit, 1)
     faults = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
     steps(fit, 20)
     faults = resource.getrusage(resource.RUSAGE_SELF).ru_minflt - faults
-    gradients = sum(p.numel() * p.element_size() for p in fit.cloud.parameters)
-    outputs = (gradients + fit.train.frames.nbytes) / 1e6
+    gradients = sum(p.numel() * p.element_size() for p in fit.trainable.leaves.values())
+    outputs = (gradients + scan.frames.nbytes) / 1e6
     grown = memory_megabytes("VmHWM") - before - outputs
     return {f"memory_mb_{size}": grown, f"page_faults_{size}": faults / 20}
 

@@ -22,13 +22,13 @@ from typing import Any
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import torch
-from holosplat.fit.surfaces import SurfaceFit, fit_surfaces, oversampling
-from holosplat.workflows.surfaces import Extraction, extract_surfaces
 from machine import commit
 
 import holosplat as hs
 from holosplat.bench.case import load_case
-from holosplat.representations import SurfaceMesh
+from holosplat.methods import Extraction, SurfaceFit, SurfaceOptions, finished
+from holosplat.methods.surfaces import extract_surfaces, oversampling, surface_fit
+from holosplat.representations import GaussianCloud, SurfaceMesh
 from holosplat.workflows.evaluate import Scores, score_object
 from holosplat.workflows.provenance import environment
 
@@ -37,7 +37,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "as they are": {},
     "triangles of 1.5 px": {"spacing": 1.5},
     "waves as coarse as the Gaussians'": {"coarser": 1},
-    "no smoothness": {"smoothness": 0.0},
+    "no smoothness": {"bending": 0.0},
     "plain L1": {"rounding": 0.0},
     "no membrane": {"stiffness": 0.0},
     "40 steps": {"steps": 40},
@@ -46,8 +46,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
 """What is changed, one thing at a time, in options of the extraction or the fit."""
 
 
-def prepared(name: str, seed: int, runs: Path) -> tuple[hs.Scan, hs.Volume, hs.Reconstruction]:
-    """Scan, truth and reconstruction by Gaussians, from `runs` or made there."""
+def prepared(name: str, seed: int, runs: Path) -> tuple[hs.Scan, hs.Volume, GaussianCloud, int]:
+    """Scan, truth, Gaussians and the wave samples per pixel that these were fitted with, from `runs` or made there."""
     folder = runs / f"{name}_{seed}"
     scan, truth, run = folder / "scan.nxs", folder / "truth.h5", hs.RunFolder(folder / "run")
     if not run.summary.is_file():
@@ -57,24 +57,45 @@ def prepared(name: str, seed: int, runs: Path) -> tuple[hs.Scan, hs.Volume, hs.R
         hs.io.write_scan(scan, measured)
         hs.io.write_volume(truth, case.truth())
         hs.reconstruct(measured, case.prior, hs.preset("default"), seed, folder=run)
-    return hs.io.read_scan(scan), hs.io.read_volume(truth), hs.load_reconstruction(run)
+    found = hs.load_reconstruction(run)
+    assert isinstance(found.object, GaussianCloud)
+    return hs.io.read_scan(scan), hs.io.read_volume(truth), found.object, found.oversample
+
+
+def with_changes(fit: SurfaceFit, changes: dict[str, Any]) -> SurfaceFit:
+    """The options with other values of those that `changes` names, wherever they are; other names are left out."""
+
+    def own(part: Any) -> dict[str, Any]:
+        return {name: value for name, value in changes.items() if name in vars(part)}
+
+    objective, schedule = replace(fit.objective, **own(fit.objective)), replace(fit.schedule, **own(fit.schedule))
+    return replace(fit, objective=objective, schedule=schedule, **own(fit))
+
+
+def fitted_surfaces(scan: hs.Scan, start: SurfaceMesh, options: SurfaceFit) -> SurfaceMesh:
+    """The surfaces that a fit from `start` ends with."""
+    fit = surface_fit(scan, start, options)
+    fit.run(lambda record: None)
+    found = finished(fit)
+    assert isinstance(found, SurfaceMesh)
+    return found
 
 
 def measured(name: str, seed: int, runs: Path) -> list[dict[str, Any]]:
     """One row each for the Gaussians, for the surfaces cut out of them, and for these after the fit."""
-    scan, truth, result = prepared(name, seed, runs)
-    settings = hs.SurfaceSettings()
-    sampling = oversampling(scan.train(), settings.fit)
+    scan, truth, cloud, sampled = prepared(name, seed, runs)
+    options = SurfaceOptions()
+    sampling = oversampling(scan.train(), options.fit)
     rows = [
-        row("Gaussians", score_object(result.cloud, scan, truth, result.oversample), 0.0),
-        row("Gaussians, finer waves", score_object(result.cloud, scan, truth, sampling), 0.0),
+        row("Gaussians", score_object(cloud, scan, truth, sampled), 0.0),
+        row("Gaussians, finer waves", score_object(cloud, scan, truth, sampling), 0.0),
     ]
     began = time.process_time()
-    start = extract_surfaces(result.cloud, scan, settings.extraction)
+    start = extract_surfaces(cloud, scan, options.extraction)
     cut = time.process_time() - began
     rows.append(row("marching cubes", score_object(start, scan, truth, sampling), cut) | sizes(start))
     began = time.process_time()
-    found = fit_surfaces(scan, start, settings.fit)
+    found = fitted_surfaces(scan, start, options.fit)
     fitted = time.process_time() - began
     rows.append(row("surfaces", score_object(found, scan, truth, sampling), fitted) | sizes(found))
     return [{"case": name, "seed": seed, **r} for r in rows]
@@ -82,15 +103,14 @@ def measured(name: str, seed: int, runs: Path) -> list[dict[str, Any]]:
 
 def variants(name: str, seed: int, runs: Path) -> list[dict[str, Any]]:
     """One row for each of `VARIANTS`, judged with the same waves."""
-    scan, truth, result = prepared(name, seed, runs)
+    scan, truth, cloud, _ = prepared(name, seed, runs)
     sampling = oversampling(scan.train())
     rows = []
     for called, changes in VARIANTS.items():
-        changed = {k: v for k, v in changes.items() if k not in ("spacing", "coarser")}
-        fit = replace(SurfaceFit(oversample=sampling - changes.get("coarser", 0)), **changed)
-        start = extract_surfaces(result.cloud, scan, Extraction(spacing=changes.get("spacing", 1.0)))
+        fit = with_changes(SurfaceFit(), {"oversample": sampling - changes.get("coarser", 0), **changes})
+        start = extract_surfaces(cloud, scan, Extraction(spacing=changes.get("spacing", 1.0)))
         began = time.process_time()
-        found = fit_surfaces(scan, start, fit)
+        found = fitted_surfaces(scan, start, fit)
         seconds = time.process_time() - began
         scores = score_object(found, scan, truth, sampling)
         rows.append({"case": name, "seed": seed, **row(called, scores, seconds)})

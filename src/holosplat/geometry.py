@@ -45,8 +45,10 @@ def rotation_tilted(angles_deg: np.ndarray | list[float], tilts_deg: np.ndarray 
 class Views:
     """V parallel-beam views on one detector raster.
 
-    rotations: [V, 3, 3], `x_lab = R x_obj`; shifts: [V, 2] detector shifts `(sx, sy)` [m];
-    shape: `(H, W)` pixels; pixel_size: pitch `p` [m] of square pixels.
+    rotations: [V, 3, 3], `x_lab = R x_obj`.
+    shifts: [V, 2] detector shifts `(sx, sy)` [m].
+    shape: `(H, W)` pixels.
+    pixel_size: pitch `p` [m] of square pixels.
     """
 
     rotations: np.ndarray
@@ -126,8 +128,12 @@ class Views:
 class Poses:
     """V views made ready for kernels: tensors that stay on a device, picked by index without waiting for it.
 
-    rotations: [V, 3, 3] float64; shifts: [V, 2] float64, detector shifts `(sx, sy)` [m]; shape: `(H, W)` pixels;
-    pixel_size [m]. Rotations and shifts may require gradients, which projections then give them.
+    rotations: [V, 3, 3] float64.
+    shifts: [V, 2] float64, detector shifts `(sx, sy)` [m].
+    shape: `(H, W)` pixels.
+    pixel_size: pitch of square pixels [m].
+
+    Rotations and shifts may require gradients, which projections then give them.
     """
 
     rotations: torch.Tensor
@@ -164,7 +170,9 @@ class Poses:
 class Grid:
     """A volume's raster, indexed `[z, y, x]`.
 
-    shape: `(Z, Y, X)` voxels; voxel_size: `(dx, dy, dz)` [m]; origin: centre `(x, y, z)` [m] of voxel [0, 0, 0].
+    shape: `(Z, Y, X)` voxels.
+    voxel_size: `(dx, dy, dz)` [m].
+    origin: centre `(x, y, z)` [m] of voxel [0, 0, 0].
     """
 
     shape: tuple[int, int, int]

@@ -21,10 +21,13 @@ DISTANCE_RANGE_M = (1e-9, 1e4)
 class Exposures:
     """How each of N frames was taken: poses and raster (`views`), and the physics of its beam and detector.
 
-    energy_kev: [N] photon energies [keV]; distance: [N] effective propagation distances [m]; psf_sigma_px: [N] standard
-    deviations of the Gaussian point-spread function [detector pixels]; time: [N] seconds since the first frame. A
-    number stands for N equal ones. reference_kev: the energy [keV] for which δ and β of matter are given (None: the
-    energy of the first frame).
+    energy_kev: [N] photon energies [keV].
+    distance: [N] effective propagation distances [m].
+    psf_sigma_px: [N] standard deviations of the Gaussian point-spread function [detector pixels].
+    time: [N] seconds since the first frame.
+    reference_kev: the energy [keV] for which δ and β of matter are given (None: the energy of the first frame).
+
+    A number stands for N equal ones.
     """
 
     views: Views

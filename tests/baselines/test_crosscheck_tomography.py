@@ -11,9 +11,9 @@ import torch
 
 from holosplat.baselines.algebraic import Algebraic, sirt
 from holosplat.baselines.filtered_backprojection import Ramp, filtered_backprojection
-from holosplat.bench import svmbir as bench
 from holosplat.checks import InputError, MissingError
 from holosplat.geometry import Grid, Views
+from holosplat.methods import svmbir as other
 from holosplat.projectors.voxels import SliceProjector
 
 SIDE, ROWS = 49, 3
@@ -128,7 +128,7 @@ def test_svmbir_sees_what_we_see():
     grid = Grid.of_views(views)
     projector = SliceProjector(grid, views)
     lines = projector.lines_out(projector.project(projector.volume_in(volume)))
-    found = bench.svmbir_volume(lines, views, grid, quiet, options=bench.Mbir(snr_db=50, sharpness=0, iterations=100))
+    found = other.svmbir_volume(lines, views, grid, quiet, options=other.Mbir(snr_db=50, sharpness=0, iterations=100))
     assert found.shape == grid.shape
     assert apart(found[:, 2].double().numpy(), truth) < 0.1  # its prior couples rows; a wrong sign would be above 1
     assert float(found[12:36, 0, 12:36].mean()) == pytest.approx(0.3, rel=0.1)
@@ -142,29 +142,29 @@ def test_svmbir_takes_a_shifted_detector():
     projector = SliceProjector(grid, views)
     volume = torch.from_numpy(truth).float()[:, None].repeat(1, ROWS, 1)
     lines = projector.lines_out(projector.project(projector.volume_in(volume)))
-    found = bench.svmbir_volume(lines, views, grid, quiet, options=bench.Mbir(snr_db=50, sharpness=0, iterations=100))
+    found = other.svmbir_volume(lines, views, grid, quiet, options=other.Mbir(snr_db=50, sharpness=0, iterations=100))
     assert apart(found[:, 1].double().numpy(), truth) < 0.02
 
 
 def test_what_svmbir_cannot_do_is_refused(monkeypatch):
-    monkeypatch.setattr(bench, "_svmbir", lambda: None)
+    monkeypatch.setattr(other, "_svmbir", lambda: None)
     views = views_at()
     lines, grid = as_thickness(disc_lines()), Grid.of_views(views)
     tilted = Views(views.rotations[:, [0, 2, 1]] * [[1], [1], [-1]], views.shifts, views.shape, PITCH)
     wobbling = Views(views.rotations, PITCH * np.eye(40, 2), views.shape, PITCH)
     with pytest.raises(InputError, match="svmbir needs views that turn about the y axis only"):
-        bench.svmbir_volume(lines, tilted, grid, quiet)
+        other.svmbir_volume(lines, tilted, grid, quiet)
     with pytest.raises(InputError, match="svmbir needs"):
-        bench.svmbir_volume(lines, wobbling, grid, quiet)
+        other.svmbir_volume(lines, wobbling, grid, quiet)
     with pytest.raises(InputError, match="rows along y are the detector's rows"):
-        bench.svmbir_volume(lines, views, Grid.of_views(views, 2), quiet)
+        other.svmbir_volume(lines, views, Grid.of_views(views, 2), quiet)
     away = Grid(grid.shape, grid.voxel_size, (grid.origin[0] + PITCH, *grid.origin[1:]))
     with pytest.raises(InputError, match="its middle on the rotation axis, but it is 1 pixels off"):
-        bench.svmbir_volume(lines, views, away, quiet)
+        other.svmbir_volume(lines, views, away, quiet)
 
 
 def test_without_svmbir_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "svmbir", None)
     views = views_at()
     with pytest.raises(MissingError, match=r"pip install 'holosplat\[bench\]'"):
-        bench.svmbir_volume(as_thickness(disc_lines()), views, Grid.of_views(views), quiet)
+        other.svmbir_volume(as_thickness(disc_lines()), views, Grid.of_views(views), quiet)

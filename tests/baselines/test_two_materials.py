@@ -7,9 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from holosplat.workflows.settings import MaterialPrior, Settings, preset
-from holosplat.workflows.start import starting_cloud
-from holosplat.workflows.surfaces import extract_surfaces
 from scipy.ndimage import gaussian_filter
 
 from helpers.cli import holosplat, refused, worked
@@ -18,12 +15,17 @@ from holosplat.baselines import HolographicTV
 from holosplat.baselines.two_materials import Levels, Shares, absorption, at_one_ratio, told_apart, two_levels
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
-from holosplat.fit import objective as terms
+from holosplat.fit.terms import comparisons as terms
 from holosplat.geometry import Grid, Views
-from holosplat.io.gaussians import read_gaussians, write_gaussians
 from holosplat.io.json import read_json
 from holosplat.io.nxtomo import write_scan
+from holosplat.io.objects import read_object, write_object
 from holosplat.materials import Compound, DeltaBeta
+from holosplat.matter import MaterialPrior, Matter
+from holosplat.methods import Gaussians, Task
+from holosplat.methods.presets import preset
+from holosplat.methods.start import starting_cloud
+from holosplat.methods.surfaces import extract_surfaces
 from holosplat.model import Instrument, measure
 from holosplat.representations import GaussianCloud, VoxelLines, approximate, cloud_from_two
 from holosplat.representations.gaussians import raw_of
@@ -174,10 +176,10 @@ def two_clouds() -> tuple[GaussianCloud, GaussianCloud, GaussianCloud]:
     shapes = (0.3 * torch.randn(n, 3, generator=draw) + 0.5, torch.randn(n, 4, generator=draw))
     amplitudes = torch.rand(n, 2, generator=draw) + 0.05
     one, other = (
-        GaussianCloud((centres, *shapes, raw_of(amplitudes[:, [c]])), PIXEL, *material)
+        GaussianCloud((centres, *shapes, raw_of(amplitudes[:, [c]])), PIXEL, Matter.one(*material))
         for c, material in enumerate(BOTH)
     )
-    return GaussianCloud((centres, *shapes, raw_of(amplitudes)), PIXEL, *SILICA, second=OIL), one, other
+    return GaussianCloud((centres, *shapes, raw_of(amplitudes)), PIXEL, Matter.two(SILICA, OIL)), one, other
 
 
 def test_a_cloud_of_two_materials_is_the_sum_of_two_clouds():
@@ -194,15 +196,16 @@ def test_a_cloud_of_two_materials_is_the_sum_of_two_clouds():
 
 def test_a_cloud_of_two_materials_keeps_them(tmp_path):
     both, _, _ = two_clouds()
-    assert both.occupancies
-    assert not both.single_material
-    assert both.materials == (SILICA, OIL)
-    assert both.detached().on("reference").second == OIL
-    write_gaussians(tmp_path / "gaussians.h5", both)
-    found = read_gaussians(tmp_path / "gaussians.h5")
-    assert found.materials == both.materials
-    for a, b in zip(found.parameters, both.parameters):
-        torch.testing.assert_close(a, b, rtol=0, atol=0)
+    assert both.matter.occupancies
+    assert not both.matter.single
+    assert both.matter.channels == (SILICA, OIL)
+    assert both.detached().on("reference").matter.second == OIL
+    write_object(tmp_path / "object.h5", both)
+    found = read_object(tmp_path / "object.h5")
+    assert isinstance(found, GaussianCloud)
+    assert found.matter == both.matter
+    for name, p in both.parameters().items():
+        torch.testing.assert_close(found.parameters()[name], p, rtol=0, atol=0)
 
 
 def test_gaussians_of_two_start_as_one_or_the_other(shares, grid):
@@ -255,7 +258,7 @@ def truth(grid):
     return capsules().voxelise(grid)
 
 
-def settings() -> Settings:
+def settings() -> Gaussians:
     quick = preset("default")
     schedule = replace(quick.fit.schedule, steps=80)
     return replace(quick, fit=replace(quick.fit, schedule=schedule))
@@ -263,9 +266,9 @@ def settings() -> Settings:
 
 def test_two_materials_are_found_where_nothing_is_known(scan, truth):
     """And δ is then half as wrong as with one ratio for all."""
-    found = reconstruct(scan, MaterialPrior(), settings())
-    assert found.cloud.second is not None
-    (high, dark), (low, _) = found.cloud.materials
+    found = reconstruct(scan, MaterialPrior.unknown(), settings())
+    assert found.object.matter.second is not None
+    (high, dark), (low, _) = found.object.matter.channels
     assert high == pytest.approx(SILICA.delta, rel=0.05)
     assert low == pytest.approx(OIL.delta, rel=0.2)
     assert dark == pytest.approx(SILICA.beta, rel=0.35)
@@ -282,31 +285,31 @@ def test_two_materials_are_found_where_nothing_is_known(scan, truth):
 
 def test_two_known_materials_are_taken_as_they_are(scan, truth):
     found = reconstruct(scan, PRIOR, settings())
-    assert found.cloud.materials == BOTH
+    assert found.object.matter.channels == BOTH
     scores = evaluate(found, scan, truth)
     assert scores.volume.relative_error_delta < 0.18
     assert scores.volume.dice > 0.92
 
 
 def test_delta_and_beta_apart_are_still_to_be_had(scan):
-    cloud = starting_cloud(scan.train(), MaterialPrior(), replace(settings(), separate=True), 0, lambda *now: None)
-    assert cloud.second is None
-    assert not cloud.occupancies
+    cloud = starting_cloud(Task(scan.train(), MaterialPrior.unknown()), replace(settings(), separate=True))
+    assert cloud.matter.second is None
+    assert not cloud.matter.occupancies
 
 
 def test_a_second_material_is_not_looked_for_where_there_shall_be_one(scan):
-    cloud = starting_cloud(scan.train(), MaterialPrior(), replace(QUICK, most_materials=1), 0, lambda *now: None)
-    assert cloud.single_material
+    cloud = starting_cloud(Task(scan.train(), MaterialPrior.unknown()), replace(QUICK, most_materials=1))
+    assert cloud.matter.single
     with pytest.raises(InputError, match="most_materials must be 1 or 2"):
         replace(QUICK, most_materials=3)
 
 
 def test_a_random_start_of_two_known_materials_has_both(scan):
-    cloud = starting_cloud(scan.train(), PRIOR, preset("random"), 0, lambda *now: None)
-    assert cloud.materials == BOTH
+    cloud = starting_cloud(Task(scan.train(), PRIOR), preset("random"))
+    assert cloud.matter.channels == BOTH
 
 
-QUICK = Settings(
+QUICK = Gaussians(
     spacing_px=2.0,
     approximate_steps=5,
     volume=HolographicTV(iterations=30, corrections=1, inner=5, refine=1),
@@ -322,13 +325,13 @@ def test_a_run_of_two_materials_is_resumed_as_one(scan, tmp_path):
             raise KeyboardInterrupt
 
     whole, parts = RunFolder(tmp_path / "whole"), RunFolder(tmp_path / "parts")
-    expected = reconstruct(scan, PRIOR, QUICK, folder=whole).cloud
+    expected = reconstruct(scan, PRIOR, QUICK, folder=whole).object
     assert not reconstruct(scan, PRIOR, QUICK, folder=parts, on_progress=stop).finished
     reconstruct(scan, PRIOR, QUICK, folder=parts, resume=True)
-    found = load_reconstruction(parts).cloud
-    assert found.materials == BOTH
-    for a, b in zip(found.parameters, expected.parameters):
-        torch.testing.assert_close(a, b, rtol=0, atol=0)
+    found = load_reconstruction(parts).object
+    assert found.matter.channels == BOTH
+    for name, p in expected.parameters().items():
+        torch.testing.assert_close(found.parameters()[name], p, rtol=0, atol=0)
     assert read_json(parts.summary)["second_material"] == {"delta": OIL.delta, "beta": OIL.beta}
 
 
@@ -336,22 +339,22 @@ def test_the_plain_path_needs_no_kernels(scan, monkeypatch):
     monkeypatch.setattr(native, "call", lambda *_: pytest.fail("a kernel was called"))
     volume = replace(QUICK.volume, backend="reference", iterations=8)
     plain = replace(QUICK, volume=volume, fit=replace(QUICK.fit, backend="reference"))
-    cloud = starting_cloud(scan.train()[[0, 3, 6]], PRIOR, plain, 0, lambda *now: None)
-    assert cloud.materials == BOTH
+    cloud = starting_cloud(Task(scan.train()[[0, 3, 6]], PRIOR), plain)
+    assert cloud.matter.channels == BOTH
     values = torch.rand(2, 9, 11, 13, generator=torch.Generator().manual_seed(2))
     grid = Grid((9, 11, 13), (PIXEL,) * 3, (-6 * PIXEL, -5 * PIXEL, -4 * PIXEL))
     assert len(absorption(scan.train(), values, grid, [1e-6, 4e-7], "reference")) == 2
 
 
 def test_surfaces_of_two_materials_are_refused(scan, tmp_path):
-    cloud = starting_cloud(scan.train(), PRIOR, QUICK, 0, lambda *now: None)
+    cloud = starting_cloud(Task(scan.train(), PRIOR), QUICK)
     with pytest.raises(InputError, match="has two materials"):
         extract_surfaces(cloud, scan)
 
 
 def test_frames_of_a_cloud_of_two_go_through_the_same_optics(scan):
     """`measure` of the start is near the frames: the materials reach the waves in metres, not in pixels."""
-    cloud = starting_cloud(scan.train(), PRIOR, settings(), 0, lambda *now: None)
+    cloud = starting_cloud(Task(scan.train(), PRIOR), settings())
     with torch.no_grad():
         frames = measure(cloud, scan.train().exposures)
     misfit = np.square(frames.numpy() - scan.train().frames).mean() / scan.train().frames.var()
@@ -366,7 +369,7 @@ def test_two_materials_are_named_on_the_command_line(scan, tmp_path):
     run = tmp_path / "run"
     named = ("--material", "SiO2", "--density", 2.2, "--second-material", "C16H34", "--second-density", 0.77)
     worked(holosplat("reconstruct", tmp_path / "scan.nxs", *named, "--preset", "fast", "--out", run))
-    assert read_gaussians(run / "gaussians.h5").materials == pytest.approx(np.array(BOTH), rel=1e-6)
+    assert read_object(run / "object.h5").matter.channels == pytest.approx(np.array(BOTH), rel=1e-6)
     shown = worked(holosplat("evaluate", run))
     assert "of two" in shown.out
     refused(holosplat("surface", run, "--out", tmp_path / "surfaces"), "two materials")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from itertools import chain
 
 import numpy as np
@@ -13,8 +12,6 @@ from torch import Tensor
 from holosplat import native
 from holosplat.checks import InputError
 from holosplat.fit import adam
-from holosplat.fit.trainable import Trainable
-from holosplat.representations.gaussians import GaussianCloud
 
 RATES = (0.02, 0.01, 0.003, 0.05)
 EPSILON = 1e-12
@@ -154,90 +151,3 @@ def test_arrays_that_do_not_fit_together_are_refused():
             adam.step(*wrong, factors)
     with pytest.raises(InputError, match="backend"):
         adam.step(*arrays, factors, "tpu")
-
-
-# --- a cloud under optimisation -----------------------------------------------------------------------------
-
-
-def a_trainable(count: int = 12) -> Trainable:
-    generator = torch.Generator().manual_seed(2)
-    parameters = [torch.randn(count, width, generator=generator) for width in (3, 3, 4, 1)]
-    return Trainable(GaussianCloud(parameters, 1e-6, 1e-7, 1e-9))
-
-
-def advance(trainable: Trainable, steps: int, start: int = 0) -> None:
-    for count in range(start, start + steps):
-        generator = torch.Generator().manual_seed(count)
-        for p in trainable.cloud.parameters:
-            p.grad = torch.randn(p.shape, generator=generator)
-        trainable.step(RATES)
-
-
-def same(a: Trainable, b: Trainable) -> bool:
-    return all(torch.equal(p, q) for p, q in zip(a.cloud.parameters, b.cloud.parameters))
-
-
-def test_a_checkpoint_of_torchs_adam_goes_on():
-    """States saved when torch's optimiser moved the parameters: names, types and all."""
-    whole = a_trainable()
-    leaves = [p.detach().clone().requires_grad_() for p in whole.cloud.parameters]
-    optimiser = torch.optim.Adam([{"params": [p], "lr": rate} for p, rate in zip(leaves, RATES)], eps=1e-12, fused=True)
-    for count in range(5):
-        generator = torch.Generator().manual_seed(count)
-        for p in leaves:
-            p.grad = torch.randn(p.shape, generator=generator)
-        optimiser.step()
-    state = {"parameters": [p.detach() for p in leaves], "moments": [optimiser.state[p] for p in leaves]}
-    advance(whole, 5)
-    mine = whole.state_dict()["moments"]
-    for a, b in zip(mine, state["moments"]):
-        assert {name: (v.shape, v.dtype) for name, v in a.items()} == {n: (v.shape, v.dtype) for n, v in b.items()}
-    resumed = a_trainable(3)
-    resumed.load(state)
-    advance(resumed, 5, start=5)
-    advance(whole, 5, start=5)
-    for p, q in zip(resumed.cloud.parameters, whole.cloud.parameters):
-        np.testing.assert_allclose(p.detach(), q.detach(), atol=1e-6)
-
-
-@pytest.mark.parametrize("stop", [0, 1, 4])
-def test_a_saved_state_goes_on_bit_for_bit(stop):
-    whole, first, second = a_trainable(), a_trainable(), a_trainable(5)
-    advance(whole, 7)
-    advance(first, stop)
-    buffer = io.BytesIO()
-    torch.save(first.state_dict(), buffer)
-    buffer.seek(0)
-    second.load(torch.load(buffer, weights_only=True))
-    for trainable in (first, second):
-        advance(trainable, 7 - stop, start=stop)
-        assert same(trainable, whole)
-        assert [float(m["step"]) for m in trainable.state_dict()["moments"]] == [7] * 4
-
-
-def test_a_parameter_without_gradient_stays_and_keeps_its_moments():
-    trainable = a_trainable()
-    advance(trainable, 2)
-    before, saved = trainable.cloud.detached(), trainable.state_dict()["moments"]
-    trainable.cloud.quaternions.grad = torch.ones(12, 4)
-    trainable.step(RATES)
-    moved = [not torch.equal(p, q) for p, q in zip(trainable.cloud.parameters, before.parameters)]
-    assert moved == [False, False, True, False]
-    after = trainable.state_dict()["moments"]
-    assert [not torch.equal(a["exp_avg"], b["exp_avg"]) for a, b in zip(after, saved)] == moved
-    assert all(p.grad is None for p in trainable.cloud.parameters)
-    advance(trainable, 1)
-    assert all(bool(torch.isfinite(p).all()) for p in trainable.cloud.parameters)
-
-
-def test_two_halves_are_a_step():
-    """What is prepared before the gradients exist is used after."""
-    whole, halves = a_trainable(), a_trainable()
-    advance(whole, 3)
-    for count in range(3):
-        halves.prepare(RATES)
-        generator = torch.Generator().manual_seed(count)
-        for p in halves.cloud.parameters:
-            p.grad = torch.randn(p.shape, generator=generator)
-        halves.apply()
-    assert same(whole, halves)

@@ -8,16 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from holosplat.fit.objective import Objective
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from holosplat import native
 from holosplat.checks import InputError, MissingError
 from holosplat.fit.density import DensityControl
-from holosplat.fit.loop import Fit, FitOptions
+from holosplat.fit.loop import Fit
 from holosplat.fit.schedule import Schedule
+from holosplat.fit.terms import Objective
 from holosplat.geometry import Views
+from holosplat.matter import Matter
+from holosplat.methods import FitOptions, GaussianRates, gaussian_fit
 from holosplat.model import measure
 from holosplat.representations import GaussianCloud, random_cloud
 from holosplat.scan import Exposures, Scan
@@ -26,12 +28,14 @@ PIXEL, SHAPE, COUNT = 2e-6, (11, 13), 6
 EVERYTHING = Objective(
     l1=0.7, l2_amplitude=0.1, ssim=0.2, tv_image=0.01, frc=0.1, anisotropy=0.1, tv_volume=0.05, overfull=1.0
 )
-SCHEDULE = Schedule(steps=2, views_per_step=2, volume_edge=6, oversample=1, rate_position=0.01, rate_scale=0.01)
+SCHEDULE = Schedule(steps=2, views_per_step=2, volume_edge=6, oversample=1)
+RATES = GaussianRates(0.01, 0.01, 0.01, 0.02)
 
 
 def a_cloud(channels: int = 1, seed: int = 0) -> GaussianCloud:
     """Turned ellipsoids: the gradients of round Gaussians' rotations are rounding errors, which Adam would follow."""
-    cloud = random_cloud(COUNT, Views.evenly_spaced(1, SHAPE, PIXEL), (7e-7, 2.6e-10), channels, 6e-6, seed)
+    matter = Matter.one(7e-7, 2.6e-10) if channels == 1 else Matter.free(7e-7, 2.6e-10)
+    cloud = random_cloud(COUNT, Views.evenly_spaced(1, SHAPE, PIXEL), matter, 6e-6, seed)
     generator = torch.Generator().manual_seed(seed)
     cloud.log_scales += 0.5 * torch.randn(COUNT, 3, generator=generator)
     cloud.quaternions += torch.randn(COUNT, 4, generator=generator)
@@ -46,19 +50,17 @@ def a_scan(channels: int = 1) -> Scan:
     return Scan(frames, exposures, np.zeros(3, dtype=bool), {})
 
 
-def a_fit(backend: str, channels: int = 1, objective: Objective = EVERYTHING, **schedule: float) -> Fit:
-    return Fit(
-        a_scan(channels),
-        a_cloud(channels),
-        FitOptions(objective, replace(SCHEDULE, **schedule), backend=backend),  # type: ignore[arg-type]
-    )
+def a_fit(backend: str, channels: int = 1, objective: Objective = EVERYTHING, rates=RATES, **schedule: float) -> Fit:
+    how = replace(SCHEDULE, **schedule)  # type: ignore[arg-type]
+    options = FitOptions(objective, how, rates, backend=backend)  # type: ignore[arg-type]
+    return gaussian_fit(a_scan(channels), a_cloud(channels), options)
 
 
 def run(fit: Fit) -> tuple[list[dict[str, float]], list[Tensor]]:
     """Every record, and the parameters at the end."""
     records: list[dict[str, float]] = []
     fit.run(records.append)
-    return records, [p.detach() for p in fit.result().parameters]
+    return records, list(fit.result().parameters().values())
 
 
 class Waits(TorchDispatchMode):
@@ -127,18 +129,18 @@ def test_a_plain_fit_needs_no_kernels(monkeypatch):
 
     scan = a_scan()
     monkeypatch.setattr(native, "call", absent)
-    options = FitOptions(EVERYTHING, SCHEDULE, DensityControl(every=2, start=0, stop=1), backend="reference")
-    fit = Fit(scan, a_cloud(), options)
+    options = FitOptions(EVERYTHING, SCHEDULE, RATES, DensityControl(every=2, start=0, stop=1), backend="reference")
+    fit = gaussian_fit(scan, a_cloud(), options)
     fit.run(lambda record: None)
     assert fit.finished
     with pytest.raises(MissingError, match="no kernels"):
-        Fit(scan, a_cloud(), replace(options, backend="cpu"))
+        gaussian_fit(scan, a_cloud(), replace(options, backend="cpu"))
 
 
 @pytest.mark.parametrize("looks", [{}, {"validation_views": 1, "validate_every": 1}], ids=["", "validated"])
 def test_a_diverging_fit_stops_with_a_sentence(looks):
     """And its sound steps were handed out."""
-    fit, records = a_fit("cpu", rate_scale=1e6, steps=6, **looks), []
+    fit, records = a_fit("cpu", rates=replace(RATES, log_scales=1e6), steps=6, **looks), []
     with pytest.raises(InputError, match=r"diverged at step [1-6].*lower the rates"):
         fit.run(records.append)
     assert len(records) == fit.step - 1

@@ -9,26 +9,50 @@ import pytest
 import torch
 from torch import Tensor
 
-from helpers.fit_balls import MATERIAL, PIXEL, SHAPE, a_cloud, fit_of, run
-from holosplat.fit.density import DensityControl, GradientRecord, control_density, doomed, outside
+from helpers.fit_balls import MATERIAL, PIXEL, SHAPE, a_cloud, a_scan, fit_of, run
+from holosplat.fit.density import CENTRES, DensityControl, DensityEvent, doomed, outside
+from holosplat.fit.loop import Fit
+from holosplat.fit.optimiser import Adam
 from holosplat.fit.trainable import Trainable
 from holosplat.geometry import Views, rotation_y
+from holosplat.matter import Matter
 from holosplat.representations import GaussianCloud
 from holosplat.representations.gaussians import PARAMETERS, raw_of
 from holosplat.scan import Scan
 
 
-def trained(cloud: GaussianCloud, scan: Scan, steps: int = 3) -> tuple[Trainable, GradientRecord]:
+def event_of(fit: Fit) -> DensityEvent:
+    """The fit's density control."""
+    (event,) = fit.plan.events
+    assert isinstance(event, DensityEvent)
+    return event
+
+
+def trained(cloud: GaussianCloud, scan: Scan, steps: int = 3) -> tuple[Trainable, Tensor]:
     """A cloud under optimisation with some history, and its position gradients."""
     fit = fit_of(scan, cloud=cloud, steps=steps, density=DensityControl(every=10 * steps))
     run(fit)
-    return fit.trainable, fit.gradients
+    total = event_of(fit).total
+    assert total is not None
+    return fit.trainable, total
 
 
-def moments(trainable: Trainable) -> dict[str, list[Tensor]]:
-    """Copies of Adam's moments of every parameter."""
-    states = trainable.state_dict()["moments"]
-    return {name: [state[name] for state in states] for name in ("exp_avg", "exp_avg_sq", "step")}
+def of(trainable: Trainable) -> GaussianCloud:
+    """The cloud under optimisation."""
+    assert isinstance(trainable.model.object, GaussianCloud)
+    return trainable.model.object
+
+
+def untrained(cloud: GaussianCloud) -> Trainable:
+    """A cloud under optimisation, at its start."""
+    return fit_of(a_scan(), cloud=cloud).trainable
+
+
+def event(options: DensityControl, views: Views, total: Tensor | None = None) -> DensityEvent:
+    """Density control after gradients that add up to `total`."""
+    made = DensityEvent(options, views)
+    made.total = total
+    return made
 
 
 GROW_ONLY = DensityControl(every=1, grow_fraction=0.2, faint=0.0, huge_px=1e9, needle=1e9)
@@ -37,16 +61,16 @@ GROW_ONLY = DensityControl(every=1, grow_fraction=0.2, faint=0.0, huge_px=1e9, n
 @pytest.mark.parametrize("limit", [1e9, 0.0])
 def test_cloning_and_splitting_conserve_mass_and_place(scan, limit):
     """`limit` on the scale decides which of the two happens."""
-    trainable, record = trained(a_cloud(), scan)
-    before = trainable.cloud.detached()
-    largest = set(torch.topk(record.total, 20).indices.tolist())
-    options = replace(GROW_ONLY, split_scale_px=limit)
-    added, removed = control_density(trainable, record, scan.views, options, torch.Generator().manual_seed(1))
-    cloud = trainable.cloud.detached()
+    trainable, total = trained(a_cloud(), scan)
+    before = of(trainable).detached()
+    largest = set(torch.topk(total, 20).indices.tolist())
+    control = event(replace(GROW_ONLY, split_scale_px=limit), scan.views, total)
+    added, removed = control.control(trainable, torch.Generator().manual_seed(1))
+    cloud = of(trainable).detached()
     assert (added, removed, len(cloud)) == (20, 0, 120)
     kept = [i for i in range(100) if i not in largest]
-    for old, new in zip(before.parameters, cloud.parameters):
-        assert torch.equal(old[kept], new[:80])
+    for name, old in before.parameters().items():
+        assert torch.equal(old[kept], cloud.parameters()[name][:80])
     parents = sorted(largest)
     for half in (slice(80, 100), slice(100, 120)):
         np.testing.assert_allclose(cloud.masses()[half], before.masses()[parents] / 2, rtol=1e-4)
@@ -55,45 +79,46 @@ def test_cloning_and_splitting_conserve_mass_and_place(scan, limit):
     np.testing.assert_allclose((cloud.centres[80:100] + cloud.centres[100:]) / 2, before.centres[parents], atol=1e-5)
     apart = (cloud.centres[80:100] - cloud.centres[100:]).norm(dim=1)
     np.testing.assert_allclose(apart, before.scales[parents].mean(dim=1), rtol=0.1)  # half a deviation to each side
-    assert record.total is None
+    assert control.total is None
 
 
 def test_children_of_a_turned_needle_lie_along_it(scan):
     """Offsets are in the Gaussian's own axes."""
-    parameters = [p[:40].clone() for p in a_cloud().parameters]
+    parameters = [p[:40].clone() for p in a_cloud().parameters().values()]
     parameters[0][:] = 0
     parameters[1][:] = torch.tensor([4.0, 0.05, 0.05]).log()
     parameters[2][:] = torch.tensor([0.5**0.5, 0, 0, 0.5**0.5])  # 90° about z: the long axis is y
-    trainable = Trainable(a_cloud().replaced(parameters))
-    record = GradientRecord()
-    record.add(torch.ones(40, 3))
-    control_density(trainable, record, scan.views, replace(GROW_ONLY, grow_fraction=1.0), torch.Generator())
-    offset = (trainable.cloud.centres[:40] - trainable.cloud.centres[40:]).detach().abs().mean(0)
+    trainable = untrained(a_cloud().replaced(parameters))
+    event(replace(GROW_ONLY, grow_fraction=1.0), scan.views, torch.ones(40)).control(trainable, torch.Generator())
+    centres = of(trainable).centres.detach()
+    offset = (centres[:40] - centres[40:]).abs().mean(0)
     assert float(offset[1]) > 10 * float(offset[0] + offset[2])
 
 
 def test_growth_stops_at_the_largest_count(scan):
-    trainable, record = trained(a_cloud(), scan)
+    trainable, total = trained(a_cloud(), scan)
     for wanted in (107, 107):
-        control_density(trainable, record, scan.views, replace(GROW_ONLY, max_count=107), torch.Generator())
-        assert len(trainable.cloud) == wanted
-        record.add(torch.ones(len(trainable.cloud), 3))
+        event(replace(GROW_ONLY, max_count=107), scan.views, total).control(trainable, torch.Generator())
+        assert len(of(trainable)) == wanted
+        total = torch.ones(wanted)
 
 
 def test_moments_follow_their_gaussians(scan):
     """Resizing keeps the moments of kept Gaussians, starts new ones at zero, and keeps the step count."""
-    trainable, record = trained(a_cloud(), scan)
-    before, largest = moments(trainable), torch.topk(record.total, 20).indices.tolist()
+    trainable, total = trained(a_cloud(), scan)
+    before, largest = trainable.optimiser.state_dict(), torch.topk(total, 20).indices.tolist()
     kept = [i for i in range(100) if i not in largest]
-    control_density(trainable, record, scan.views, GROW_ONLY, torch.Generator())
-    after = moments(trainable)
-    for name in ("exp_avg", "exp_avg_sq"):
-        for old, new in zip(before[name], after[name]):
-            assert torch.equal(new[:80], old[kept])
+    event(GROW_ONLY, scan.views, total).control(trainable, torch.Generator())
+    after = trainable.optimiser.state_dict()
+    for moment in ("first", "second"):
+        assert set(after[moment]) == {f"object.{name}" for name in PARAMETERS}
+        for name, new in after[moment].items():
+            assert torch.equal(new[:80], before[moment][name][kept])
             assert len(new) == 120
+            assert before[moment][name].any()
             assert not new[80:].any()
-    assert all(float(step) == 3 for step in after["step"])
-    assert all(p.is_leaf and p.requires_grad for p in trainable.cloud.parameters)
+    assert after["count"] == 3
+    assert all(p.is_leaf and p.requires_grad for p in of(trainable).parameters().values())
 
 
 def test_resize_is_the_only_way_to_another_count(scan, monkeypatch):
@@ -104,9 +129,9 @@ def test_resize_is_the_only_way_to_another_count(scan, monkeypatch):
     assert {r["count"] for r in run(fit_of(scan, density=density, steps=6))} == {100}
 
     def counted(self, *args):
-        sizes.append(len(self.cloud))
+        sizes.append(len(of(self)))
         resize(self, *args)
-        sizes.append(len(self.cloud))
+        sizes.append(len(of(self)))
 
     monkeypatch.setattr(Trainable, "resize", counted)
     counts = [r["count"] for r in run(fit_of(scan, density=density, steps=6))]
@@ -128,19 +153,19 @@ def test_events_take_place_when_due(scan):
 def test_growth_follows_the_gradients_since_the_last_event(scan, monkeypatch):
     """The record sums the norms of the position gradients of every step, and is cleared by an event."""
     fit = fit_of(scan, density=replace(GROW_ONLY, every=3, start=0, stop=1), steps=6)
-    norms, apply = [], Trainable.apply
+    norms, apply, control = [], Adam.apply, event_of(fit)
 
-    def spy(self):
-        norms.append(self.cloud.centres.grad.norm(dim=1).clone())
-        apply(self)
+    def spy(self, loss):
+        norms.append(self._leaves[CENTRES].grad.norm(dim=1).clone())
+        apply(self, loss)
 
-    monkeypatch.setattr(Trainable, "apply", spy)
+    monkeypatch.setattr(Adam, "apply", spy)
     run(fit, until=2)
-    assert torch.equal(fit.gradients.total, norms[0] + norms[1])
+    assert torch.equal(control.total, norms[0] + norms[1])
     run(fit, until=3)
-    assert fit.gradients.total is None
+    assert control.total is None
     run(fit, until=4)
-    assert torch.equal(fit.gradients.total, norms[3])
+    assert torch.equal(control.total, norms[3])
 
 
 def spoilt_cloud(defect: str) -> GaussianCloud:
@@ -158,7 +183,7 @@ def spoilt_cloud(defect: str) -> GaussianCloud:
         centres[2] = torch.tensor([1.0, 10.5, 0])  # beyond the last row: y ends at 10 pixels
     elif defect in PARAMETERS:
         (centres, log_scales, quaternions, raw)[PARAMETERS.index(defect)][2, 0] = float("nan")
-    return GaussianCloud((centres, log_scales, quaternions, raw), PIXEL, *MATERIAL)
+    return GaussianCloud((centres, log_scales, quaternions, raw), PIXEL, Matter.one(*MATERIAL))
 
 
 PRUNING = DensityControl(every=1, grow_fraction=0.0, faint=0.01, huge_px=8.0, needle=7.0)
@@ -169,24 +194,24 @@ def test_only_the_bad_gaussian_goes(scan, defect):
     cloud = spoilt_cloud(defect)
     bad = [2] if defect != "none" else []
     assert torch.nonzero(doomed(cloud, scan.views, PRUNING)).flatten().tolist() == bad
-    trainable = Trainable(cloud)
-    added, removed = control_density(trainable, GradientRecord(), scan.views, PRUNING, torch.Generator())
-    assert (added, removed) == (0, len(bad))
+    trainable = untrained(cloud)
+    assert event(PRUNING, scan.views).control(trainable, torch.Generator()) == (0, len(bad))
     kept = [i for i in range(5) if i not in bad]
-    assert torch.equal(trainable.cloud.centres, cloud.centres[kept])
+    assert torch.equal(of(trainable).centres, cloud.centres[kept])
 
 
 def test_two_channels_are_faint_only_together(scan):
     raw = raw_of(torch.tensor([[0.5, 0.5], [0.004, 0.5], [0.5, 0.004], [0.004, 0.004], [0.5, 0.5]]))
-    cloud = GaussianCloud((*spoilt_cloud("none").parameters[:3], raw), PIXEL, *MATERIAL)
+    good = spoilt_cloud("none")
+    cloud = good.replaced((good.centres, good.log_scales, good.quaternions, raw), Matter.free(*MATERIAL))
     assert doomed(cloud, scan.views, PRUNING).tolist() == [False, False, False, True, False]
 
 
 def test_a_cloud_is_never_emptied(scan):
-    trainable = Trainable(a_cloud(10))
+    trainable = untrained(a_cloud(10))
     nothing_is_good_enough = replace(PRUNING, faint=1e9)
-    control_density(trainable, GradientRecord(), scan.views, nothing_is_good_enough, torch.Generator())
-    assert len(trainable.cloud) == 10
+    event(nothing_is_good_enough, scan.views).control(trainable, torch.Generator())
+    assert len(of(trainable)) == 10
 
 
 def test_a_gaussian_that_one_view_sees_is_inside():

@@ -9,8 +9,8 @@ from torch import Tensor
 
 from holosplat import native
 from holosplat.checks import InputError
-from holosplat.fit import objective as terms
 from holosplat.fit.fidelity import Target, cpu, l1_and_ssim, reference
+from holosplat.fit.terms import comparisons as terms
 
 LOW, SPAN = 0.8, 0.7
 VALUE_TOLERANCE, GRADIENT_TOLERANCE = 1e-6, 5e-6

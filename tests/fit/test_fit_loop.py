@@ -9,17 +9,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from holosplat.fit.misfit import photon_noise
-from holosplat.fit.objective import Objective
 from scipy.ndimage import fourier_gaussian
 
-from helpers.fit_balls import HASTY, MATERIAL, a_cloud, equal, fit_of, run
+from helpers.fit_balls import HASTY, MATERIAL, RATES, a_cloud, cloud_of, equal, fit_of, found_by, frames_of, run
 from holosplat.checks import InputError
-from holosplat.fit import objective as terms
 from holosplat.fit.density import DensityControl
+from holosplat.fit.terms import Objective
+from holosplat.fit.terms import comparisons as terms
+from holosplat.fit.terms.frames import photon_noise
 from holosplat.fit.total_variation import total_variation
-from holosplat.fit.trainable import Trainable
 from holosplat.geometry import Grid
+from holosplat.matter import Matter
+from holosplat.methods import GaussianRates
 from holosplat.model import Instrument
 from holosplat.optics.detector import poisson
 from holosplat.optics.noise import noise_share
@@ -30,35 +31,37 @@ from holosplat.representations import GaussianCloud, random_cloud
 
 def test_the_loss_falls_and_held_out_frames_are_predicted_better(scan):
     def held_out_error(cloud: GaussianCloud) -> float:
-        with torch.no_grad():
-            predicted = Instrument(scan.test().exposures, 2).measure(cloud).numpy()
+        predicted = frames_of(cloud, Instrument(scan.test().exposures, 2)).numpy()
         return float(np.abs(predicted - scan.test().frames).mean())
 
-    fit = fit_of(scan, cloud=a_cloud(200), steps=80, rate_position=0.2, rate_scale=0.1, rate_amplitude=0.2)
-    before = held_out_error(fit.cloud)
+    fit = fit_of(scan, cloud=a_cloud(200), steps=80, rates=GaussianRates(0.2, 0.1, 0.01, 0.2))
+    before = held_out_error(cloud_of(fit))
     losses = [record["loss"] for record in run(fit)]
     assert losses[-1] < 0.35 * losses[0]
-    assert held_out_error(fit.result()) < 0.75 * before
+    assert held_out_error(found_by(fit)) < 0.75 * before
     assert fit.finished
     assert not fit.stopped_early
 
 
 def test_a_loss_is_the_weighted_sum_of_its_recorded_terms(scan):
     """Weights, the linear FRC ramp, and volume terms made up for the steps they are left out of."""
-    weights = Objective(0.7, 0.5, 0.2, 0.05, 0.3, 0.5, 0.4, 1.001, 0.02, 3.0, 0.5)
-    fit = fit_of(scan, objective=weights, steps=12, volume_every=3, volume_edge=10)
+    image = {"l1": 0.7, "l2_amplitude": 0.5, "ssim": 0.2, "tv_image": 0.05, "frc": 0.3, "frc_ramp": 0.5}
+    volume = {"tv_volume": 0.02, "overfull": 3.0, "two_levels": 0.5}
+    weights = Objective(**image, anisotropy=0.4, anisotropy_limit=1.001, **volume)
     bright = a_cloud()
     bright.raw_amplitudes += 3  # so that the occupancy exceeds one somewhere
-    fit.trainable = Trainable(bright)
+    fit = fit_of(scan, objective=weights, cloud=bright, steps=12, volume_every=3, volume_edge=10)
     for step, record in enumerate(run(fit)):
         factors = dict.fromkeys(("l1", "l2_amplitude", "ssim", "tv_image", "anisotropy"), 1.0)
         factors["frc"] = min(1.0, step / 6)
         if step % 3 == 0:
             factors |= {"tv_volume": 3.0, "overfull": 3.0, "two_levels": 3.0 * step / 12}
-        assert set(record) == {"step", "loss", "count", *factors}
+        assert set(record) == {"step", "loss", "frames", "count", *factors}
         assert all(record[name] > 0 for name in factors if name != "anisotropy" or step > 0)
         wanted = sum(factor * getattr(weights, name) * record[name] for name, factor in factors.items())
         assert record["loss"] == pytest.approx(wanted, rel=1e-5)
+        of_frames = sum(f * getattr(weights, n) * record[n] for n, f in factors.items() if n in image)
+        assert record["frames"] == pytest.approx(of_frames, rel=1e-5)
         assert set(record) <= set(fit.columns())
     assert fit.columns()[:3] == ["step", "seconds", "loss"]
 
@@ -68,8 +71,7 @@ def test_recorded_image_terms_are_those_of_the_frames_on_the_training_range(scan
     fit = fit_of(scan, objective=Objective(1, 1, 1, 1), steps=1)
     train = scan.train()
     low, high = train.frames.min(), train.frames.max()
-    with torch.no_grad():
-        predicted = Instrument(train.exposures, fit.instrument.oversample).measure(fit.cloud)
+    predicted = frames_of(cloud_of(fit), Instrument(train.exposures, fit.model.instrument.oversample))
     measured = torch.from_numpy(train.frames)
     a, b = ((frames - low) / (high - low) for frames in (predicted, measured))
     (record,) = run(fit)
@@ -87,9 +89,8 @@ def test_differences_within_the_noise_count_by_their_square(scan):
         assert (found[1] < 0.98 * found[0]) == wide
     measured = torch.from_numpy(noisy.train().frames)
     width = 1.2 * photon_noise(measured)
-    with torch.no_grad():
-        fit = fit_of(noisy, objective=Objective(noise_width=1.2), steps=1)
-        predicted = Instrument(noisy.train().exposures, fit.instrument.oversample).measure(fit.cloud)
+    fit = fit_of(noisy, objective=Objective(noise_width=1.2), steps=1)
+    predicted = frames_of(cloud_of(fit), Instrument(noisy.train().exposures, fit.model.instrument.oversample))
     wanted = terms.huber(predicted, measured, width).mean() / (measured.max() - measured.min())
     assert found[1] == pytest.approx(float(wanted), rel=1e-5)
 
@@ -102,10 +103,10 @@ def test_noisy_frames_are_compared_coarse_to_fine(scan):
         train = noisy.train()
         share = noise_share(torch.from_numpy(train.frames))
         fit = fit_of(noisy, objective=Objective(coarse=sigma), steps=4)
-        predicted = [fit.instrument.measure(fit.cloud).detach().numpy()]
+        predicted = [frames_of(cloud_of(fit), fit.model.instrument).numpy()]
         records = run(fit, 1)
         fit.step = 2
-        predicted.append(fit.instrument.measure(fit.cloud).detach().numpy())
+        predicted.append(frames_of(cloud_of(fit), fit.model.instrument).numpy())
         records += run(fit, 3)
         for record, prediction, narrower in zip(records, predicted, (1.0, 0.5)):
             width = narrower * sigma * min(1.0, share / 0.5)
@@ -134,7 +135,7 @@ def test_constant_frames_are_refused(scan):
 
 
 def test_bounds_are_for_amplitudes_that_are_occupancies(scan):
-    two = random_cloud(30, scan.views, MATERIAL, 2, 1e-5, 0)
+    two = random_cloud(30, scan.views, Matter.free(*MATERIAL), 1e-5, 0)
     weights = Objective(overfull=1.0, two_levels=1.0, tv_volume=0.1)
     (record,) = run(fit_of(scan, objective=weights, steps=1, cloud=two))
     assert "tv_volume" in record
@@ -148,9 +149,7 @@ def test_terms_on_the_volume_weigh_by_its_depth_and_the_number_of_views(scan):
         fit = fit_of(train, objective=weights, steps=1)
         grid = Grid.of_views(train.views)
         with torch.no_grad():
-            plain = float(
-                total_variation(fit.cloud.density_around(torch.tensor(grid.centre), grid.shape, grid.voxel_size[0]))
-            )
+            plain = float(total_variation(cloud_of(fit).density(grid)))
         (record,) = run(fit)
         found[len(train)] = record["tv_volume"] / plain
     depth = scan.views.shape[1] / 100
@@ -159,10 +158,11 @@ def test_terms_on_the_volume_weigh_by_its_depth_and_the_number_of_views(scan):
 
 def test_total_variation_of_two_channels_is_the_sum_of_theirs(scan):
     """A material counts the same whether another one is there or not."""
-    two = random_cloud(30, scan.views, MATERIAL, 2, 1e-5, 0)
+    two = random_cloud(30, scan.views, Matter.free(*MATERIAL), 1e-5, 0)
     channels = two.raw_amplitudes.detach() + torch.tensor([0.0, 1.5])
     amplitudes = [channels, channels[:, :1], channels[:, 1:]]
-    clouds = [GaussianCloud([*two.parameters[:3], a], two.unit_length, *MATERIAL) for a in amplitudes]
+    matters = [Matter.free(*MATERIAL), *[Matter.one(*MATERIAL)] * 2]
+    clouds = [two.replaced((two.centres, two.log_scales, two.quaternions, a), m) for a, m in zip(amplitudes, matters)]
     both, first, second = (run(fit_of(scan, objective=Objective(tv_volume=1.0), cloud=c, steps=1))[0] for c in clouds)
     assert first["tv_volume"] < 0.8 * second["tv_volume"]
     assert both["tv_volume"] == pytest.approx(first["tv_volume"] + second["tv_volume"], rel=1e-4)
@@ -203,8 +203,7 @@ EVERYTHING = {
     "validate_every": 3,
     "volume_every": 2,
     "volume_edge": 8,
-    "rate_position": 0.1,
-    "rate_amplitude": 0.1,
+    "rates": replace(RATES, centres=0.1, raw_amplitudes=0.1),
 }
 """A fit that uses all that is random or carries state."""
 
@@ -229,9 +228,9 @@ def test_an_interrupted_fit_goes_on_bit_for_bit(scan, stop):
     assert second.step == stop
     assert second.seconds == first.seconds > 0
     assert head + run(second) == records
-    assert equal(second.cloud, whole.cloud)
-    assert equal(second.result(), whole.result())
-    assert (second.best_score, second.best_step) == (whole.best_score, whole.best_step)
+    assert equal(cloud_of(second), cloud_of(whole))
+    assert equal(found_by(second), found_by(whole))
+    assert second.state_dict()["best"][:2] == whole.state_dict()["best"][:2]
 
 
 def test_a_stopped_fit_stays_stopped(scan):
@@ -242,7 +241,7 @@ def test_a_stopped_fit_stays_stopped(scan):
     other.load(through_a_file(fit.state_dict()))
     assert other.finished
     assert run(other) == []
-    assert equal(other.result(), fit.result())
+    assert equal(found_by(other), found_by(fit))
 
 
 def test_a_state_kept_in_memory_does_not_change(scan):
@@ -257,23 +256,24 @@ def test_a_state_kept_in_memory_does_not_change(scan):
         again = fit_of(scan, **EVERYTHING)
         again.load(state)
         run(again)
-        assert equal(again.cloud, whole.cloud)
+        assert equal(cloud_of(again), cloud_of(whole))
 
 
 def test_the_same_seed_gives_the_same_fit_and_another_one_does_not(scan):
     fits = [fit_of(scan, seed=seed, **EVERYTHING) for seed in (3, 3, 4)]
     records = [run(fit) for fit in fits]
     assert records[0] == records[1]
-    assert equal(fits[0].cloud, fits[1].cloud)
-    assert len(fits[0].cloud) != len(fits[2].cloud) or not equal(fits[0].cloud, fits[2].cloud)
+    first, same, other = map(cloud_of, fits)
+    assert equal(first, same)
+    assert len(first) != len(other) or not equal(first, other)
 
 
 def test_the_start_cloud_is_left_alone(scan):
     cloud = a_cloud()
-    before = copy.deepcopy(cloud.parameters)
+    before = copy.deepcopy(cloud.parameters())
     run(fit_of(scan, cloud=cloud, steps=2))
-    assert all(torch.equal(a, b) for a, b in zip(cloud.parameters, before))
-    assert not any(p.requires_grad for p in cloud.parameters)
+    assert all(torch.equal(p, before[name]) for name, p in cloud.parameters().items())
+    assert not any(p.requires_grad for p in cloud.parameters().values())
 
 
 def test_test_frames_are_never_read(scan):
@@ -282,8 +282,8 @@ def test_test_frames_are_never_read(scan):
     frames[scan.is_test] = 1e30
     fits = [fit_of(s, **EVERYTHING) for s in (scan, replace(scan, frames=frames))]
     assert run(fits[0]) == run(fits[1])
-    assert equal(fits[0].cloud, fits[1].cloud)
-    assert equal(fits[0].result(), fits[1].result())
+    assert equal(*map(cloud_of, fits))
+    assert equal(*map(found_by, fits))
 
 
 def test_a_scan_without_training_frames_is_refused(scan):

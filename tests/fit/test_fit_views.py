@@ -9,15 +9,17 @@ from itertools import chain
 import numpy as np
 import pytest
 import torch
-from holosplat.fit.objective import Objective
 
-from helpers.fit_balls import HASTY, PIXEL, SHAPE, a_cloud, a_scan, equal, fit_of, run
+from helpers.fit_balls import HASTY, PIXEL, SHAPE, a_cloud, a_scan, cloud_of, equal, fit_of, found_by, frames_of, run
 from holosplat.checks import InputError
-from holosplat.fit import objective as terms
-from holosplat.fit.loop import Fit, split_validation
+from holosplat.fit.loop import Fit
+from holosplat.fit.optimiser import Adam
 from holosplat.fit.schedule import Schedule
-from holosplat.fit.trainable import Trainable
+from holosplat.fit.terms import Objective
+from holosplat.fit.terms import comparisons as terms
+from holosplat.fit.validation import split_validation
 from holosplat.geometry import Views
+from holosplat.methods import GaussianRates
 from holosplat.model import Instrument
 from holosplat.representations import GaussianCloud
 from holosplat.scan import Exposures, Scan
@@ -27,13 +29,14 @@ from holosplat.scan import Exposures, Scan
 
 def batches(fit: Fit, monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
     """The views of every step, as the instrument is asked for them."""
-    seen, frames = [], fit.instrument.frames
+    instrument = fit.model.instrument
+    seen, frames = [], instrument.frames
 
     def spy(lines, index=None):
-        seen.append(list(range(len(fit.train))) if index is None else index.tolist())
+        seen.append(list(range(len(instrument.views))) if index is None else index.tolist())
         return frames(lines, index)
 
-    monkeypatch.setattr(fit.instrument, "frames", spy)
+    monkeypatch.setattr(instrument, "frames", spy)
     run(fit)
     return seen
 
@@ -66,17 +69,17 @@ def test_drawn_views_are_compared_with_their_own_frames(scan, monkeypatch, ssim)
     unequal = replace(scan.exposures, distance=np.linspace(0.02, 0.08, len(scan)))
     unlike = replace(scan, exposures=unequal)
     fit = fit_of(unlike, steps=4, views_per_step=2, objective=Objective(l1=1.0, ssim=ssim))
-    whole = Instrument(fit.train.exposures, fit.instrument.oversample)
-    wanted, frames = [], fit.instrument.frames
+    train, instrument = unlike.train(), fit.model.instrument
+    whole = Instrument(train.exposures, instrument.oversample)
+    wanted, frames = [], instrument.frames
 
     def spy(lines, index=None):
-        with torch.no_grad():
-            predicted = whole.measure(fit.cloud.detached(), index.numpy())
-        difference = (predicted - torch.from_numpy(fit.train.frames)[index]).abs().mean()
-        wanted.append(float(difference) / float(np.ptp(fit.train.frames)))
+        predicted = frames_of(cloud_of(fit).detached(), whole, index)
+        difference = (predicted - torch.from_numpy(train.frames)[index]).abs().mean()
+        wanted.append(float(difference) / float(np.ptp(train.frames)))
         return frames(lines, index)
 
-    monkeypatch.setattr(fit.instrument, "frames", spy)
+    monkeypatch.setattr(instrument, "frames", spy)
     assert [record["l1"] for record in run(fit)] == pytest.approx(wanted, rel=1e-4)
 
 
@@ -85,24 +88,26 @@ def test_drawn_views_are_compared_with_their_own_frames(scan, monkeypatch, ssim)
 
 def test_rates_decay_exponentially_to_the_asked_fraction(scan, monkeypatch):
     schedule = Schedule(steps=11, decay=0.01)
-    assert schedule.rates(0) == (0.02, 0.01, 0.01, 0.02)
-    assert schedule.rates(5) == pytest.approx((0.002, 0.001, 0.001, 0.002))
-    assert schedule.rates(10) == pytest.approx((0.0002, 0.0001, 0.0001, 0.0002))
-    used, prepare = [], Trainable.prepare
-    monkeypatch.setattr(Trainable, "prepare", lambda self, rates: (used.append(rates), prepare(self, rates)))
-    run(fit_of(scan, steps=11, decay=0.01, rate_position=0.3))
+    assert [schedule.factor(step, 0.0) for step in (0, 5, 10)] == pytest.approx([1.0, 0.1, 0.01])
+    used, prepare = [], Adam.prepare
+    monkeypatch.setattr(Adam, "prepare", lambda self, rates: (used.append(rates), prepare(self, rates)))
+    rates = GaussianRates(0.3, 0.01, 0.03, 0.02)
+    run(fit_of(scan, steps=11, decay=0.01, rates=rates))
     assert len(used) == 11
-    assert used[-1] == pytest.approx((0.003, 1e-4, 1e-4, 2e-4))
+    first = {f"object.{name}": rate for name, rate in vars(rates).items()}
+    assert used[0] == first
+    assert used[5] == pytest.approx({name: 0.1 * rate for name, rate in first.items()})
+    assert used[-1] == pytest.approx({name: 0.01 * rate for name, rate in first.items()})
 
 
 def test_each_parameter_moves_at_its_own_rate(scan):
     """Adam's first step is as long as the rate (where there is a gradient at all)."""
-    fit = fit_of(scan, steps=5, rate_position=0.04, rate_scale=0.03, rate_rotation=0.02, rate_amplitude=0.01)
     stretched = a_cloud()
     stretched.log_scales += torch.linspace(-0.5, 0.5, 3)  # round Gaussians do not feel rotations
-    fit.trainable = Trainable(stretched)
+    fit = fit_of(scan, steps=5, cloud=stretched, rates=GaussianRates(0.04, 0.03, 0.02, 0.01))
     run(fit, until=1)
-    moved = [float((a - b).abs().median()) for a, b in zip(fit.cloud.detached().parameters, stretched.parameters)]
+    after = cloud_of(fit).detached().parameters()
+    moved = [float((after[name] - p).abs().median()) for name, p in stretched.parameters().items()]
     assert moved == pytest.approx([0.04, 0.03, 0.02, 0.01], rel=0.05)
 
 
@@ -110,11 +115,11 @@ def test_warm_up_moves_amplitudes_only(scan):
     start = a_cloud()
     fit = fit_of(scan, steps=8, warmup_steps=4)
     run(fit, until=4)
-    same = [torch.equal(a, b) for a, b in zip(fit.cloud.parameters, start.parameters)]
-    assert same == [True, True, True, False]
+    same = {name: torch.equal(p, start.parameters()[name]) for name, p in cloud_of(fit).parameters().items()}
+    assert same == {"centres": True, "log_scales": True, "quaternions": True, "raw_amplitudes": False}
     run(fit, until=5)
-    assert not torch.equal(fit.cloud.centres, start.centres)
-    assert not torch.equal(fit.cloud.log_scales, start.log_scales)
+    assert not torch.equal(cloud_of(fit).centres, start.centres)
+    assert not torch.equal(cloud_of(fit).log_scales, start.log_scales)
 
 
 def spoilt(scan: Scan, frames: list[int], seed: int) -> Scan:
@@ -134,7 +139,7 @@ def test_views_above_the_median_give_no_gradient(train, bad):
     def after_one_step(scan: Scan, detach: bool) -> GaussianCloud:
         fit = fit_of(scan, steps=2, detach_worst=detach)
         run(fit, until=1)
-        return fit.cloud
+        return cloud_of(fit)
 
     first, second = (after_one_step(s, True) for s in scans)
     assert equal(first, second)
@@ -184,7 +189,10 @@ def test_validation_frames_are_other_frames():
 def test_a_fit_keeps_training_validation_and_test_frames_apart():
     scan = replace(numbered(12), is_test=np.arange(12) % 4 == 3)
     fit = fit_of(scan, validation_views=3)
-    parts = [numbers(fit.train), numbers(fit.validation), numbers(scan.test())]
+    assert fit.plan.judge is not None
+    trained, _ = split_validation(scan.train(), 3)
+    np.testing.assert_array_equal(fit.model.instrument.exposures.views.rotations, trained.views.rotations)
+    parts = [numbers(trained), numbers(fit.plan.judge.scan), numbers(scan.test())]
     assert [len(part) for part in parts] == [6, 3, 3]
     assert set.union(*parts) == set(range(12))
 
@@ -193,12 +201,13 @@ def test_validation_frames_do_not_move_the_fit(scan):
     """Whatever they show: the last state (not the best one) is the same."""
     plain = fit_of(scan, steps=5, validation_views=2, validate_every=2)
     frames = scan.frames.copy()
-    validation = [i for i in range(6) if not (frames[i] == plain.train.frames).all(axis=(1, 2)).any()]
+    trained, _ = split_validation(scan.train(), 2)
+    validation = [i for i in range(6) if not (frames[i] == trained.frames).all(axis=(1, 2)).any()]
     assert len(validation) == 2
     frames[validation] = 7.0
     other = fit_of(replace(scan, frames=frames), steps=5, validation_views=2, validate_every=2)
     a, b = run(plain), run(other)
-    assert equal(plain.cloud, other.cloud)
+    assert equal(cloud_of(plain), cloud_of(other))
     assert a[-1]["val_l1"] != b[-1]["val_l1"]
 
 
@@ -213,25 +222,26 @@ def test_the_best_state_by_the_validation_views_is_the_result(scan):
 
     def look(record: dict[str, float]) -> None:
         if "val_ssim" in record:
-            seen.append((disagreement(record), fit.step, fit.cloud.detached()))
+            seen.append((disagreement(record), fit.step, cloud_of(fit).detached()))
 
     fit.run(look)
     assert [step for _, step, _ in seen] == [4, 8, 12, 16, 20, 24, 28, 32, 33]
     score, step, cloud = min(seen, key=lambda look: look[0])
     assert step < 33
     assert fit.best_step == step
-    assert fit.best_score == pytest.approx(score)
-    assert equal(fit.result(), cloud)
-    assert not equal(fit.result(), fit.cloud)
+    assert fit.state_dict()["best"][:2] == (pytest.approx(score), step)
+    assert equal(found_by(fit), cloud)
+    assert not equal(found_by(fit), cloud_of(fit))
 
 
 def test_validation_scores_are_those_of_the_validation_frames(scan):
     fit = fit_of(scan, steps=1, validation_views=2, validate_every=1)
     (record,) = run(fit)
-    low, high = fit.train.frames.min(), fit.train.frames.max()
-    with torch.no_grad():
-        predicted = Instrument(fit.validation.exposures, fit.instrument.oversample).measure(fit.cloud).numpy()
-    a, b = (torch.from_numpy((frames - low) / (high - low)) for frames in (predicted, fit.validation.frames))
+    train, validation = split_validation(scan.train(), 2)
+    low, high = train.frames.min(), train.frames.max()
+    instrument = Instrument(validation.exposures, fit.model.instrument.oversample)
+    predicted = frames_of(cloud_of(fit), instrument).numpy()
+    a, b = (torch.from_numpy((frames - low) / (high - low)) for frames in (predicted, validation.frames))
     assert record["val_l1"] == pytest.approx(float(terms.l1(a, b).mean()), rel=1e-4)
     assert record["val_ssim"] == pytest.approx(1 - float(terms.one_minus_ssim(a, b).mean()), rel=1e-4)
     assert record["val_frcm"] == pytest.approx(1 - float(terms.one_minus_frcm(a, b).mean()), rel=1e-3)
@@ -241,7 +251,7 @@ def test_validation_scores_are_those_of_the_validation_frames(scan):
 def test_without_validation_the_last_state_is_the_result(scan):
     fit = fit_of(scan, steps=3)
     assert not any(name.startswith("val_") for record in run(fit) for name in record)
-    assert equal(fit.result(), fit.cloud)
+    assert equal(found_by(fit), cloud_of(fit))
 
 
 def test_a_fit_that_gets_no_better_stops_early(scan):

@@ -4,20 +4,24 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from holosplat.fit.objective import Objective
 from torch import Tensor
 
 from holosplat.beamline.simulate import simulate
 from holosplat.fit.density import DensityControl
-from holosplat.fit.loop import Fit, FitOptions
+from holosplat.fit.loop import Fit
 from holosplat.fit.schedule import Schedule
+from holosplat.fit.terms import Objective
 from holosplat.geometry import Views
+from holosplat.matter import Matter
+from holosplat.methods import FitOptions, GaussianRates, gaussian_fit
+from holosplat.model import Instrument, Model
 from holosplat.representations import GaussianCloud, random_cloud
 from holosplat.scan import Exposures, Scan
 
 PIXEL = 2e-6
 MATERIAL = (7e-7, 2.6e-10)
 SHAPE = (20, 24)
+RATES = GaussianRates(0.02, 0.01, 0.01, 0.02)
 BALLS = np.array([[-5.0, -3.0, 2.0, 4.0], [4.0, 4.0, -3.0, 3.0], [3.0, -5.0, -1.0, 3.5]]) * PIXEL
 """Centre (x, y, z) and radius of each ball [m]."""
 
@@ -50,13 +54,32 @@ def a_scan(train: int = 6, test: int = 2) -> Scan:
 
 
 def a_cloud(count: int = 100, seed: int = 0) -> GaussianCloud:
-    return random_cloud(count, Views.evenly_spaced(1, SHAPE, PIXEL), MATERIAL, 1, 4e-6, seed)
+    return random_cloud(count, Views.evenly_spaced(1, SHAPE, PIXEL), Matter.one(*MATERIAL), 4e-6, seed)
 
 
-def fit_of(scan: Scan, *, objective=None, density=None, seed=0, cloud=None, **schedule) -> Fit:
+def fit_of(scan: Scan, *, objective=None, density=None, seed=0, cloud=None, rates=RATES, terms=(), **schedule) -> Fit:
     """A fit of a small random cloud; `schedule` are fields of `Schedule`."""
-    options = FitOptions(objective or Objective(), Schedule(**schedule), density or DensityControl(), "cpu")
-    return Fit(scan, cloud or a_cloud(), options, seed)
+    how = Schedule(**schedule)
+    options = FitOptions(objective or Objective(), how, rates, density or DensityControl(), terms, "cpu")
+    return gaussian_fit(scan, cloud or a_cloud(), options, seed)
+
+
+def cloud_of(fit: Fit) -> GaussianCloud:
+    """The cloud as it is now."""
+    assert isinstance(fit.model.object, GaussianCloud)
+    return fit.model.object
+
+
+def found_by(fit: Fit) -> GaussianCloud:
+    """The cloud that the fit ends with."""
+    assert isinstance(fit.result().object, GaussianCloud)
+    return fit.result().object
+
+
+def frames_of(cloud: GaussianCloud, instrument: Instrument, index: Tensor | None = None) -> Tensor:
+    """Frames of a cloud in the exposures of `instrument`, without gradients."""
+    with torch.no_grad():
+        return Model(cloud, instrument).frames(index)
 
 
 def run(fit: Fit, until: int | None = None) -> list[dict[str, float]]:
@@ -68,8 +91,8 @@ def run(fit: Fit, until: int | None = None) -> list[dict[str, float]]:
 
 def equal(a: GaussianCloud, b: GaussianCloud) -> bool:
     """Whether two clouds are bit for bit the same."""
-    return all(torch.equal(p, q) for p, q in zip(a.parameters, b.parameters))
+    return all(torch.equal(p, b.parameters()[name]) for name, p in a.parameters().items())
 
 
-HASTY = {"rate_position": 3.0, "rate_scale": 0.5, "rate_amplitude": 2.0, "decay": 1.0}
+HASTY = {"rates": GaussianRates(3.0, 0.5, 0.01, 2.0), "decay": 1.0}
 """Rates at which the fit soon gets worse on views it does not see."""

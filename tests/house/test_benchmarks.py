@@ -10,11 +10,11 @@ from types import ModuleType
 import numpy as np
 import pytest
 import torch
-from holosplat.fit.objective import Objective
-from holosplat.workflows.settings import preset
 
-from holosplat.fit.loop import FitOptions
 from holosplat.fit.schedule import Schedule
+from holosplat.fit.terms import Objective
+from holosplat.methods import FitOptions
+from holosplat.methods.presets import preset
 from holosplat.projectors.splat import splat
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
@@ -54,7 +54,7 @@ def test_the_eager_step_is_our_step(scripts):
     """The same loss before the first step, up to matter beyond the frame, and a falling one after some."""
     step = scripts["step"]
     scan, cloud = step.workload(200, 48)
-    inside = cloud.replaced((cloud.centres * 0.5, *cloud.parameters[1:]))
+    inside = cloud.with_parameters({"centres": cloud.centres * 0.5})
     eager, fit = scripts["eager_step"].EagerStep(scan, inside, step.RATES), step.fit_of(scan, inside, "cpu")
     losses = [eager.step() for _ in range(3)]
     times, last = step.steps(fit, 1)

@@ -13,6 +13,8 @@ from types import ModuleType
 
 import pytest
 
+import holosplat
+
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 
@@ -67,6 +69,58 @@ def test_broken_links_are_seen():
         "docs/no.md",
         "docs/method.md#no",
     ]
+
+
+GONE = ROOT / "docs" / "design" / "model_and_problem.md"
+"""A page that also names files of earlier versions."""
+
+
+def missing_files(text: str) -> list[str]:
+    """Source files that a page names, such as `fit/loop.py`, and that are not in the repository.
+
+    A path counts from the repository, the package or any folder in it.
+    """
+    named = {
+        name for span in re.findall(r"`([^`\n]+)`", text) for name in re.findall(r"[\w./-]+\.(?:py|cpp|hpp)\b", span)
+    }
+    rooms = ("src", "native", "tests", "docs", "examples", "benchmarks")
+    there = [path.as_posix() for room in rooms for path in (ROOT / room).rglob("*.[ch]*")]
+    there += [path.as_posix() for room in rooms for path in (ROOT / room).rglob("*.py")]
+    made = set(re.findall(r"(?:This is all of|, say)\s+`([\w/.]+)`", text))  # by the reader
+    return sorted(name for name in named - made if not any(path.endswith(f"/{name}") for path in there))
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if p != GONE], ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_named_files_exist(page):
+    assert missing_files(page.read_text(encoding="utf-8")) == []
+
+
+def test_missing_files_are_seen():
+    assert missing_files("See `fit/loop.py`, `fit/misfit.py` and `python benchmarks/none.py --csv FILE`.") == [
+        "benchmarks/none.py",
+        "fit/misfit.py",
+    ]
+
+
+def unknown_names(text: str) -> list[str]:
+    """Names such as `hs.io.read_scan` in a page that the package has not."""
+    unknown = []
+    for name in sorted(set(re.findall(r"\bhs((?:\.[A-Za-z_]+)+)", text))):
+        thing: object = holosplat
+        for part in name.split(".")[1:]:
+            thing = getattr(thing, part, None)
+        if thing is None:
+            unknown.append(f"hs{name}")
+    return unknown
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_names_of_the_package_exist(page):
+    assert unknown_names(page.read_text(encoding="utf-8")) == []
+
+
+def test_unknown_names_are_seen():
+    assert unknown_names("`hs.io.read_scan(path)`, `hs.no_such`, `hs.io.no_such`") == ["hs.io.no_such", "hs.no_such"]
 
 
 @pytest.mark.parametrize(

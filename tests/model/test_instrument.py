@@ -13,7 +13,7 @@ from helpers.waves import DOUBLE, LAMBDA, PITCH, SHAPE, Bump, K, at, exposures, 
 from holosplat.beamline.simulate import SIMULATED_FRINGE_SAMPLES, simulate
 from holosplat.materials import DeltaBeta
 from holosplat.mesh import TriangleMesh
-from holosplat.model import Instrument, measure
+from holosplat.model import Instrument, Model, measure
 from holosplat.optics import (
     bin_pixels,
 )
@@ -104,7 +104,7 @@ def test_frames_of_one_scan_are_those_taken_one_by_one():
     obj = replace(MATTER, velocity=(1.5 * PITCH, -0.5 * PITCH))
     alone = torch.cat([measure(obj, taken[[i]], 1, DOUBLE) for i in range(4)])
     assert torch.allclose(measure(obj, taken, 1, DOUBLE), alone, atol=2e-6)
-    some = Instrument(taken, 1, DOUBLE).measure(obj, np.array([3, 0, 1]))
+    some = Model(obj, Instrument(taken, 1, DOUBLE)).frames(torch.tensor([3, 0, 1]))
     assert torch.allclose(some, alone[[3, 0, 1]], atol=2e-6)
 
 

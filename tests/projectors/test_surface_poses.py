@@ -10,6 +10,7 @@ from torch import Tensor
 
 from helpers.poses import asking, gradients, relative
 from holosplat.geometry import Poses, Views
+from holosplat.matter import Matter
 from holosplat.projectors.surface import cpu, surface_thickness
 from holosplat.representations import SurfaceMesh
 from holosplat.specimens.red_cells import icosphere
@@ -91,7 +92,7 @@ MOVES = [(turned, 0, 0.01), (turned, 1, 0.01), (turned, 2, 0.01), (shifted, 0, 0
 @pytest.mark.parametrize(("move", "axis", "step"), MOVES)
 def test_the_gradient_predicts_the_image_to_second_order_in_the_pixel(move, axis, step):
     """Of a weighted sum of each view's image, when the sample turns or the detector is shifted."""
-    mesh, gaps = SurfaceMesh(*ball(4, 9.0, (2.0, -3.0, 4.0)), 1.0, 1.0, 1.0, lines=32), []
+    mesh, gaps = SurfaceMesh(*ball(4, 9.0, (2.0, -3.0, 4.0)), 1.0, Matter.one(1.0, 1.0), lines=32), []
     for factor in (1, 2, 4):
         views = anyhow(4, (41, 46)).refined(factor)
         ahead, back = (move(views, axis, sign * step) for sign in (1, -1))
@@ -149,7 +150,7 @@ def test_gradients_of_a_scan_in_metres_scale():
     found = []
     for pixel in (1.0, 2.5e-7):
         poses = asking(anyhow(2, (33, 46), pixel))
-        lines = SurfaceMesh(vertices, faces, pixel, 1.0, 0.5).project(poses)
+        lines = SurfaceMesh(vertices, faces, pixel, Matter.one(1.0, 0.5)).project(poses)
         (lines[1] * noise(2, 33, 46)).sum().backward()
         by_rotation, by_shift = gradients(poses)
         found.append((by_rotation / pixel, by_shift))

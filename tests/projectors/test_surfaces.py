@@ -1,5 +1,5 @@
 """Deformable surfaces: their projector against closed forms and the other mesh projector, its gradient, extraction,
-the Object, and bodies recovered from few holograms."""
+and the Object."""
 
 from __future__ import annotations
 
@@ -8,39 +8,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from holosplat.fit.surfaces import SurfaceFit, fit_surfaces
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from holosplat.beamline.simulate import simulate
+from helpers.bumpy import BETA, DELTA, SHAPE, area, bumpy, poses, surfaces
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Poses, Views
 from holosplat.materials import HAEMOGLOBIN
+from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
 from holosplat.model import measure
 from holosplat.projectors.mesh import mesh_line_integrals, voxelise_meshes
 from holosplat.projectors.surface import surface_occupancy, surface_thickness
 from holosplat.representations import SurfaceMesh, isosurface
 from holosplat.scan import Exposures
-from holosplat.specimens.red_cells import icosphere
 from holosplat.specimens.repair import closed
 from holosplat.specimens.scene import MeshScene
-
-SHAPE = (33, 46)
-DELTA, BETA = HAEMOGLOBIN.delta_beta(20.0)
-
-
-def bumpy(subdivisions: int, radius: float, centre=(0.0, 0.0, 0.0), depth: float = 0.15) -> TriangleMesh:
-    """A ball with three smooth bumps, star-shaped about its centre."""
-    sphere, faces = icosphere(subdivisions)
-    bumps = 1 + depth * np.sin(2 * sphere[:, 0] + 1) * np.cos(2.5 * sphere[:, 1]) + 0.5 * depth * sphere[:, 2] ** 3
-    return TriangleMesh(radius * bumps[:, None] * sphere + np.array(centre), faces)
-
-
-def poses(count: int, shape=SHAPE, seed: int = 0, pitch: float = 1.0) -> Views:
-    """Views from all directions, on detectors shifted by a pixel or two."""
-    shifts = np.random.default_rng(seed).uniform(-2, 2, (count, 2)) * pitch
-    return Views(Rotation.random(count, rng=seed).as_matrix(), shifts, shape, pitch)
 
 
 def tensors(mesh: TriangleMesh) -> tuple[Tensor, Tensor]:
@@ -226,11 +208,6 @@ def ball(radius: float, grid: Grid, centre=(0.0, 0.0, 0.0)) -> np.ndarray:
     return 1 / (1 + np.exp((r - radius) / 0.8))
 
 
-def area(mesh: TriangleMesh) -> float:
-    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
-    return float(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-
-
 def test_volume_and_area_of_spheres_converge_to_second_order():
     r = 6.1
     gaps = []
@@ -270,13 +247,6 @@ def test_specks_are_left_out_and_an_empty_volume_is_refused():
 # --- the Object ---------------------------------------------------------------------------------------------
 
 
-def surfaces(*meshes: TriangleMesh, unit: float = 1e-6) -> SurfaceMesh:
-    starts = np.cumsum([0, *(len(m.vertices) for m in meshes)])
-    vertices = np.concatenate([m.vertices for m in meshes])
-    faces = np.concatenate([m.faces + s for m, s in zip(meshes, starts)])
-    return SurfaceMesh(torch.from_numpy(vertices), torch.from_numpy(faces), unit, DELTA, BETA)
-
-
 def test_units_scale_and_voxels_hold_what_projections_hold():
     mesh = bumpy(3, 9.0, (1.0, 2.0, -1.5))
     found = surfaces(mesh)
@@ -310,73 +280,4 @@ def test_bodies_come_with_their_cavities_the_largest_first():
     with pytest.raises(InputError, match="enclose no matter"):
         surfaces(hollow).bodies()
     with pytest.raises(InputError, match="at least one face"):
-        SurfaceMesh(torch.zeros(3, 3), torch.zeros(0, 3), 1.0, DELTA, BETA)
-
-
-# --- the fit ------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def few_views():
-    """A bumpy body in four views without a common axis, a fifth held out; and a ball to start from."""
-    pitch = 1e-6
-    true = bumpy(3, 9.0, (0.6, -0.4, 0.3), depth=0.25)
-    views = poses(5, (35, 42), seed=3, pitch=pitch)
-    exposures = Exposures.of(views, 20.0, 0.05, 0.3)
-    scene = MeshScene.of_one_material([replace(true, vertices=pitch * true.vertices)], HAEMOGLOBIN.delta_beta(20.0))
-    scan = simulate(scene, exposures, is_test=np.array([0, 0, 0, 0, 1], dtype=bool))
-    return scan, true, surfaces(bumpy(3, 8.5, depth=0.0), unit=pitch)
-
-
-def dice(found: SurfaceMesh, true: TriangleMesh) -> float:
-    grid = Grid.centred((33, 33, 33), 1e-6)
-    a, b = (s.voxelise(grid).delta > 0.5 * DELTA for s in (found, surfaces(true)))
-    return float(2 * (a & b).sum() / (a.sum() + b.sum()))
-
-
-def test_a_deformed_ball_is_recovered_from_four_views(few_views):
-    scan, true, start = few_views
-    records = []
-    found = fit_surfaces(
-        scan, start, SurfaceFit(steps=160, rate=0.5), lambda stage, done, record: records.append(record)
-    )
-    assert dice(start, true) < 0.92
-    assert dice(found, true) > 0.985
-    assert abs(found.mesh().volume / (true.volume * 1e-18) - 1) < 0.01
-    assert [r["step"] for r in records] == list(range(1, 161))
-    assert records[-1]["loss"] < 0.1 * records[0]["loss"]
-    held_out = scan.test()
-    before, after = (
-        float((measure(s, held_out.exposures, 2) - torch.from_numpy(held_out.frames)).abs().mean())
-        for s in (start, found)
-    )
-    assert after < 0.1 * before
-    assert torch.equal(found.faces, start.faces)
-
-
-def test_smoothness_smooths_and_no_step_changes_nothing(few_views):
-    scan, _, start = few_views
-    rough = start.replaced(start.vertices + 0.3 * torch.randn(start.vertices.shape, generator=_seeded()))
-    assert torch.equal(fit_surfaces(scan, rough, SurfaceFit(steps=0)).vertices, rough.vertices)
-    areas = [area(fit_surfaces(scan, rough, SurfaceFit(steps=8, smoothness=w)).mesh()) for w in (0.0, 100.0)]
-    assert areas[1] < 0.97 * areas[0]
-
-
-def _seeded() -> torch.Generator:
-    return torch.Generator().manual_seed(1)
-
-
-def test_senseless_fits_are_refused(few_views):
-    scan, _, start = few_views
-    for options, words in (
-        ({"rate": 0.0}, "rate must be a positive number of pixels"),
-        ({"decay": 0.0}, "decay must lie in"),
-        ({"steps": -1}, "steps must not be negative"),
-        ({"smoothness": -1.0}, "smoothness must not be negative"),
-    ):
-        with pytest.raises(InputError, match=words):
-            SurfaceFit(**options)
-    with pytest.raises(InputError, match="all training frames are constant"):
-        fit_surfaces(replace(scan, frames=np.ones_like(scan.frames)), start)
-    with pytest.raises(InputError, match="diverged at step 1; lower its rate"):
-        fit_surfaces(scan, start, SurfaceFit(steps=3, rate=1e308))
+        SurfaceMesh(torch.zeros(3, 3), torch.zeros(0, 3), 1.0, Matter.one(DELTA, BETA))

@@ -11,7 +11,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from holosplat.geometry import Poses, Views, rotation_y
-from holosplat.model.instrument import Instrument
+from holosplat.matter import Matter
+from holosplat.model import Instrument
 from holosplat.representations import GaussianCloud
 from holosplat.representations.gaussians import raw_of
 from holosplat.scan import Exposures
@@ -29,7 +30,8 @@ def a_cloud(backend: str, channels: int, unit: float = PIXEL) -> GaussianCloud:
     scales = (0.7 + torch.rand(9, 3, generator=r)) * (PIXEL / unit)
     raw = raw_of(0.2 + torch.rand(9, channels, generator=r))
     parameters = [a.to(dtype) for a in (centres, scales.log(), torch.randn(9, 4, generator=r), raw)]
-    return GaussianCloud(parameters, unit, DELTA, BETA).on(backend)
+    matter = Matter.one(DELTA, BETA) if channels == 1 else Matter.free(DELTA, BETA)
+    return GaussianCloud(parameters, unit, matter).on(backend)
 
 
 def exposures() -> Exposures:
@@ -104,7 +106,7 @@ def test_the_frames_by_finite_differences_in_metres():
 
 def test_still_poses_get_no_gradient():
     cloud, views = a_cloud("cpu", 1), exposures().views
-    leaves = [p.requires_grad_() for p in cloud.parameters]
+    leaves = [p.requires_grad_() for p in cloud.parameters().values()]
     poses = Poses.of(views)
     cloud.project(poses).channels.sum().backward()
     assert poses.rotations.grad is None

@@ -12,6 +12,7 @@ from torch.nn.functional import avg_pool2d, softplus
 
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views, rotation_y
+from holosplat.matter import Matter
 from holosplat.projectors.voxels import voxel_line_integrals
 from holosplat.representations import GaussianCloud, approximate, at_pitch, cloud_from_volume, freed, random_cloud
 from holosplat.representations.gaussians import PARAMETERS, raw_of
@@ -29,7 +30,8 @@ def a_cloud(channels: int = 1, count: int = 6, seed: int = 0, beta: float = BETA
     scales = 1.5 + 1.5 * torch.rand(count, 3, generator=rng)
     amplitudes = 0.2 + torch.rand(count, channels, generator=rng)
     quaternions = torch.randn(count, 4, generator=rng)
-    return GaussianCloud((centres, scales.log(), quaternions, raw_of(amplitudes)), PIXEL, DELTA, beta)
+    matter = Matter.one(DELTA, beta) if channels == 1 else Matter.free(DELTA, beta)
+    return GaussianCloud((centres, scales.log(), quaternions, raw_of(amplitudes)), PIXEL, matter)
 
 
 def some_views(shape: tuple[int, int] = SHAPE) -> Views:
@@ -46,7 +48,7 @@ def largest_difference(found: torch.Tensor, wanted: torch.Tensor) -> float:
 
 def in_float64(cloud: GaussianCloud) -> GaussianCloud:
     """The cloud in double precision, drawn by the reference backend."""
-    twin = cloud.replaced([p.detach().double() for p in cloud.parameters])
+    twin = cloud.replaced([p.detach().double() for p in cloud.parameters().values()])
     twin.backend = "reference"
     return twin
 
@@ -59,7 +61,8 @@ def test_a_cloud_is_an_object_that_does_not_move():
     assert isinstance(cloud, Object)
     assert cloud.at(3.0) is cloud
     assert len(cloud) == 6
-    assert [getattr(cloud, name) is p for name, p in zip(PARAMETERS, cloud.parameters)] == [True] * 4
+    assert all(getattr(cloud, name) is p for name, p in cloud.parameters().items())
+    assert tuple(cloud.parameters()) == PARAMETERS
 
 
 @pytest.mark.parametrize("channels", [1, 2])
@@ -79,7 +82,7 @@ def test_line_integrals_are_in_metres():
     """One round Gaussian: the peak is a·δ·√(2π)·σ, and the sum over pixels a·δ·(2π)^{3/2}·σ³."""
     sigma, amplitude = 3.0, 0.8
     parameters = [torch.zeros(1, 3), torch.full((1, 3), np.log(sigma)), torch.tensor([[1.0, 0, 0, 0]])]
-    cloud = GaussianCloud([*parameters, raw_of(torch.tensor([[amplitude]]))], PIXEL, DELTA, BETA)
+    cloud = GaussianCloud([*parameters, raw_of(torch.tensor([[amplitude]]))], PIXEL, Matter.one(DELTA, BETA))
     B, D = cloud.project(Views.evenly_spaced(3, (41, 41), PIXEL))
     peak = amplitude * DELTA * np.sqrt(2 * np.pi) * sigma * PIXEL
     mass = amplitude * DELTA * (2 * np.pi) ** 1.5 * (sigma * PIXEL) ** 3
@@ -90,8 +93,8 @@ def test_line_integrals_are_in_metres():
 
 def test_the_unit_of_length_changes_nothing_but_the_numbers():
     cloud, views = a_cloud(), some_views()
-    centres, log_scales, quaternions, raw = cloud.parameters
-    other = GaussianCloud((centres / 2.5, log_scales - np.log(2.5), quaternions, raw), 2.5 * PIXEL, DELTA, BETA)
+    centres, log_scales, quaternions, raw = cloud.parameters().values()
+    other = GaussianCloud((centres / 2.5, log_scales - np.log(2.5), quaternions, raw), 2.5 * PIXEL, cloud.matter)
     grid = Grid.centred((20, 22, 24), 1.1 * PIXEL)
     for found, wanted in zip(other.project(views), cloud.project(views)):
         assert largest_difference(found, wanted) < 1e-4
@@ -130,9 +133,11 @@ def test_beta_of_either_sign():
 
 def test_two_channels_are_two_clouds_in_the_same_places():
     both, views, grid = a_cloud(channels=2), some_views(), Grid.centred((9, 10, 11), PIXEL)
-    of_delta, of_beta = (both.replaced((*both.parameters[:3], both.raw_amplitudes[:, c : c + 1])) for c in (0, 1))
-    assert of_delta.single_material
-    assert not both.single_material
+    places = (both.centres, both.log_scales, both.quaternions)
+    one = Matter.one(DELTA, BETA)
+    of_delta, of_beta = (both.replaced((*places, both.raw_amplitudes[:, c : c + 1]), one) for c in (0, 1))
+    assert of_delta.matter.single
+    assert not both.matter.single
     B, D = both.project(views)
     np.testing.assert_allclose(D, of_delta.project(views)[1], rtol=1e-5, atol=1e-14)
     np.testing.assert_allclose(B, of_beta.project(views)[0], rtol=1e-5, atol=1e-17)
@@ -199,7 +204,7 @@ def test_raw_amplitudes_and_amplitudes_are_inverse():
 @pytest.mark.parametrize("act", ["project", "density"])
 def test_gradients_reach_all_parameters_and_match_the_reference_in_float64(channels, act):
     def gradients(cloud: GaussianCloud) -> tuple[torch.Tensor, ...]:
-        leaves = [p.clone().requires_grad_() for p in cloud.parameters]
+        leaves = [p.clone().requires_grad_() for p in cloud.parameters().values()]
         used = cloud.replaced(leaves)
         if act == "project":
             B, D = used.project(some_views())
@@ -219,11 +224,11 @@ def test_gradients_reach_all_parameters_and_match_the_reference_in_float64(chann
 def test_copies_keep_units_and_backend():
     cloud = a_cloud(beta=-BETA)
     cloud.backend = "reference"
-    leaves = [p.clone().requires_grad_() for p in cloud.parameters]
+    leaves = [p.clone().requires_grad_() for p in cloud.parameters().values()]
     for copy in (cloud.replaced(leaves), cloud.replaced(leaves).detached()):
-        assert (copy.unit_length, copy.delta, copy.beta, copy.backend) == (PIXEL, DELTA, -BETA, "reference")
+        assert (copy.unit_length, copy.matter, copy.backend) == (PIXEL, Matter.one(DELTA, -BETA), "reference")
     detached = cloud.replaced(leaves).detached()
-    assert not any(p.requires_grad for p in detached.parameters)
+    assert not any(p.requires_grad for p in detached.parameters().values())
     with torch.no_grad():
         leaves[0].add_(1.0)
     assert torch.equal(detached.centres, cloud.centres)
@@ -231,10 +236,10 @@ def test_copies_keep_units_and_backend():
 
 @pytest.mark.parametrize("which", range(4))
 def test_parameters_of_the_wrong_shape_are_refused(which):
-    parameters = list(a_cloud().parameters)
+    parameters = list(a_cloud().parameters().values())
     parameters[which] = parameters[which][:, :0] if which == 3 else parameters[which][:-1]
     with pytest.raises(InputError, match="shapes"):
-        GaussianCloud(parameters, PIXEL, DELTA, BETA)
+        GaussianCloud(parameters, PIXEL, Matter.one(DELTA, BETA))
 
 
 # --- where clouds start -------------------------------------------------------------------------------------
@@ -261,8 +266,7 @@ def test_a_cloud_from_a_volume_has_its_mass_and_its_centre(spacing):
     wanted = [float((axis * body).sum() / body.sum()) for axis in (x, y, z)]
     found = (cloud.centres * PIXEL * masses[:, None]).sum(0) / masses.sum()
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-3 * voxel)
-    assert (cloud.unit_length, cloud.delta, cloud.beta) == (PIXEL, DELTA, -BETA)
-    assert cloud.single_material
+    assert (cloud.unit_length, cloud.matter) == (PIXEL, Matter.one(DELTA, -BETA))
 
 
 def test_spacing_is_the_distance_between_gaussians():
@@ -326,13 +330,13 @@ def test_approximating_a_volume_lowers_the_error():
     grid, stages = Grid((17, 20, 22), (PIXEL,) * 3, (-8 * PIXEL, -9 * PIXEL, -11 * PIXEL)), []
     body = a_body()
     start = cloud_from_volume(body, grid, (DELTA, -BETA), 2 * PIXEL, PIXEL)
-    before = [p.clone() for p in start.parameters]
+    before = [p.clone() for p in start.parameters().values()]
     better = approximate(start, body, grid, 25, lambda stage, fraction: stages.append(fraction))
     errors = [float((c.density(grid)[0] - body).norm() / body.norm()) for c in (start, better)]
     assert errors[1] < 0.75 * errors[0]
-    assert all(torch.equal(p, q) for p, q in zip(start.parameters, before))
-    assert not any(p.requires_grad for p in better.parameters)
-    assert better.beta == -BETA
+    assert all(torch.equal(p, q) for p, q in zip(start.parameters().values(), before))
+    assert not any(p.requires_grad for p in better.parameters().values())
+    assert better.matter == Matter.one(DELTA, -BETA)
     assert len(stages) == 25
     assert stages == sorted(stages)
     assert 0 <= stages[0] < stages[-1] <= 1
@@ -341,7 +345,8 @@ def test_approximating_a_volume_lowers_the_error():
 @pytest.mark.parametrize("channels", [1, 2])
 def test_a_random_cloud_is_a_ball_of_the_asked_mass(channels):
     views, thickness = Views.evenly_spaced(4, (40, 60), PIXEL), 3e-6
-    cloud = random_cloud(4000, views, (DELTA, BETA), channels, thickness, seed=3)
+    matter = Matter.one(DELTA, BETA) if channels == 1 else Matter.free(DELTA, BETA)
+    cloud = random_cloud(4000, views, matter, thickness, seed=3)
     radius = 0.5 * 40
     distance = cloud.centres.norm(dim=1)
     assert len(cloud) == 4000
@@ -357,19 +362,19 @@ def test_a_random_cloud_is_a_ball_of_the_asked_mass(channels):
 
 def test_a_random_cloud_is_reproducible_by_its_seed():
     views = Views.evenly_spaced(4, (40, 60), PIXEL)
-    first, same, other = (random_cloud(50, views, (DELTA, BETA), 1, 1e-6, seed) for seed in (5, 5, 6))
-    assert all(torch.equal(a, b) for a, b in zip(first.parameters, same.parameters))
+    first, same, other = (random_cloud(50, views, Matter.one(DELTA, BETA), 1e-6, seed) for seed in (5, 5, 6))
+    assert all(torch.equal(p, same.parameters()[name]) for name, p in first.parameters().items())
     assert not torch.equal(first.centres, other.centres)
     with pytest.raises(InputError, match="number of Gaussians"):
-        random_cloud(0, views, (DELTA, BETA), 1, 1e-6, 0)
+        random_cloud(0, views, Matter.one(DELTA, BETA), 1e-6, 0)
 
 
 def test_a_freed_cloud_looks_the_same_but_has_two_amplitudes():
     cloud, views = a_cloud(), some_views()
     free = freed(cloud)
-    assert not free.single_material
+    assert free.matter == Matter.free(DELTA, BETA)
     for found, wanted in zip(free.project(views), cloud.project(views)):
         np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=0)
     free.centres.add_(1.0)
     free.raw_amplitudes.add_(1.0)
-    assert all(torch.equal(a, b) for a, b in zip(cloud.parameters, a_cloud().parameters))
+    assert all(torch.equal(p, a_cloud().parameters()[name]) for name, p in cloud.parameters().items())

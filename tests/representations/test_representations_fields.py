@@ -9,9 +9,11 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from helpers.voxels import pronounced
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
-from holosplat.representations import Encoding, Matter, Network, NeuralField, VoxelGrid, VoxelLines
+from holosplat.matter import Matter
+from holosplat.representations import Encoding, Network, NeuralField, VoxelGrid, VoxelLines
 from holosplat.representations.neural_field import grown
 from holosplat.representations.voxel_lines import resampling
 from holosplat.volume import Object
@@ -65,7 +67,7 @@ def test_a_ball_casts_its_chords(poses, most, finer):
     grid = Grid((27, 23, 25), (PIXEL,) * 3, tuple(-0.5 * (n - 1) * PIXEL for n in (25, 23, 27)))
     radius, centre = 7 * PIXEL, (1.5 * PIXEL, -0.6 * PIXEL, 0.8 * PIXEL)
     views = POSES[poses]().padded((2, 3)).refined(finer)
-    lines = VoxelGrid(ball(grid, radius, centre), grid, 2.0, 1.0).project(views)
+    lines = VoxelGrid(ball(grid, radius, centre), grid, Matter.one(2.0, 1.0)).project(views)
     true = chord(views, radius, centre)
     inner = true > radius
     error = (lines.channels[:, 0].numpy() - true) / (2 * radius)
@@ -115,7 +117,7 @@ def test_uneven_voxels_about_the_axis():
 def test_voxels_are_resampled_without_loss():
     grid = Grid.centred((8, 6, 10), PIXEL)
     values = torch.rand(2, *grid.shape, generator=torch.Generator().manual_seed(4))
-    voxels = VoxelGrid(values, grid, 3.0, 0.5)
+    voxels = VoxelGrid(values, grid, Matter.free(3.0, 0.5))
     assert voxels.resampled(grid) is voxels
     assert np.array_equal(voxels.voxelise(grid).delta, 3 * values[0].numpy())
     assert np.array_equal(voxels.voxelise(grid).beta, 0.5 * values[1].numpy())
@@ -132,29 +134,30 @@ def test_voxels_are_resampled_without_loss():
 
 def test_voxels_are_objects_of_a_known_size():
     grid = Grid.centred((3, 4, 5), PIXEL)
-    one = VoxelGrid(torch.rand(1, 3, 4, 5), grid, 1e-6, -1e-9)
+    one = VoxelGrid(torch.rand(1, 3, 4, 5), grid, Matter.one(1e-6, -1e-9))
     assert isinstance(one, Object)
     assert one.at(3.0) is one
     assert one.stored_bytes == 2 * 60
     two = one.freed()
-    assert (two.stored_bytes, two.single_material) == (4 * 60, False)
+    assert (two.stored_bytes, two.matter) == (4 * 60, Matter.free(1e-6, -1e-9))
     views = about_axis(1)
     assert all(torch.allclose(a, b, atol=0) for a, b in zip(one.project(views), two.project(views)))
     with pytest.raises(InputError, match="voxel values must have the shape"):
-        VoxelGrid(torch.rand(3, 3, 4, 5), grid, 1.0, 1.0)
+        VoxelGrid(torch.rand(3, 3, 4, 5), grid, Matter.free(1.0, 1.0))
 
 
 # --- neural fields ------------------------------------------------------------------------------------------
 
 
-def smooth(grid: Grid, matter: Matter, network: Network = SMALL, mask: torch.Tensor | None = None) -> NeuralField:
+ONE = Matter.one(1.0, 0.0)
+
+
+def smooth(
+    grid: Grid, matter: Matter = ONE, network: Network = SMALL, mask: torch.Tensor | None = None, upper: float = 1.0
+) -> NeuralField:
     """A field with some structure, in float64."""
     full = torch.ones(grid.shape, dtype=torch.bool) if mask is None else mask
-    field = NeuralField(grid, matter, network, full, seed=1).double()
-    with torch.no_grad():
-        for parameter in field.encoding.parameters():
-            parameter.mul_(3e3)
-    return field
+    return pronounced(NeuralField(grid, matter, network, full, 1, upper))
 
 
 @pytest.mark.parametrize("kind", ["hash", "fourier"])
@@ -164,7 +167,7 @@ def test_line_integrals_converge_with_the_square_of_the_step(kind):
     for factor in (1, 3, 9):
         grid = Grid.centred((8, 5, 10), PIXEL).divided((factor, factor, factor))
         encoding = Encoding(kind, 2, 2, 6.0 * factor, 6.0 * factor, 12, waves=4, bandwidth=0.03 / factor)
-        field = smooth(grid, Matter(1.0, 0.0), Network(encoding, 8, 1))
+        field = smooth(grid, ONE, Network(encoding, 8, 1))
         with torch.no_grad():
             lines = field.project(Views.from_angles([0.0, 90.0], (grid.shape[1], grid.shape[2]), grid.voxel_size[0]))
         own = field.values(grid)[0].sum(dim=0) * grid.voxel_size[0]
@@ -180,19 +183,18 @@ def test_line_integrals_converge_with_the_square_of_the_step(kind):
 def test_projections_are_those_of_its_own_voxels(poses):
     """Within what samples a voxel apart see of the rim of the mask."""
     grid, views = Grid.centred((9, 9, 9), PIXEL).divided((3, 3, 3)), POSES[poses](2, (11, 11), PIXEL)
-    field = smooth(grid, Matter(1.0, 0.0), SMALL, ball(grid, 4 * PIXEL)[0] > 0.5)
+    field = smooth(grid, ONE, SMALL, ball(grid, 4 * PIXEL)[0] > 0.5)
     with torch.no_grad():
         rays = field.project(views).channels[:, 0]
-    voxels = VoxelGrid(field.values(grid).float(), grid, 1.0, 0.0).project(views).channels[:, 0]
+    voxels = VoxelGrid(field.values(grid).float(), grid, ONE).project(views).channels[:, 0]
     assert float((rays - voxels).square().mean() / voxels.square().mean()) < 0.05**2
 
 
 def test_a_uniform_field_has_the_length_of_its_box():
     grid = Grid.centred((12, 9, 15), PIXEL)
-    field = smooth(grid, Matter(1.0, 0.5, upper=2.0))
-    with torch.no_grad():
-        field.output.weight.zero_()
-        field.output.bias.zero_()
+    field = smooth(grid, Matter.one(1.0, 0.5), upper=2.0)
+    output = {name: 0 * p for name, p in field.parameters().items() if name.startswith("output.")}
+    field = field.with_parameters(output)
     lines = field.project(Views.from_angles([0.0, 90.0], (9, 11), PIXEL)).channels[:, 0]
     assert torch.allclose(lines[0, 4], torch.tensor(12 * PIXEL, dtype=torch.float64), atol=0)
     assert torch.allclose(lines[1, 4], torch.tensor(15 * PIXEL, dtype=torch.float64), atol=0)
@@ -201,12 +203,16 @@ def test_a_uniform_field_has_the_length_of_its_box():
     assert volume.beta[3, 2, 4] == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize("matter", [Matter(1.0, 0.1), Matter(1.0, 0.1, upper=0.0), Matter(1.0, 0.1, channels=2)])
+@pytest.mark.parametrize(
+    ("matter", "upper"), [(Matter.one(1.0, 0.1), 1.0), (Matter.one(1.0, 0.1), 0.0), (Matter.free(1.0, 0.1), 1.0)]
+)
 @pytest.mark.parametrize("log2_size", [4, 12], ids=["hashed", "dense"])
-def test_gradients_are_those_of_finite_differences(matter, log2_size):
+def test_gradients_are_those_of_finite_differences(matter, upper, log2_size):
     """In float64, along a random direction of each parameter."""
     network = Network(Encoding(levels=2, features=2, coarsest=8.0, finest=3.0, log2_size=log2_size), 8, 1)
-    field = smooth(Grid.centred((7, 5, 9), PIXEL), matter, network)
+    start = smooth(Grid.centred((7, 5, 9), PIXEL), matter, network, upper=upper)
+    leaves = {name: p.clone().requires_grad_() for name, p in start.parameters().items()}
+    field = start.with_parameters(leaves)
     views = any_pose(1, (5, 7)).refined(2)
 
     def total() -> torch.Tensor:
@@ -214,7 +220,7 @@ def test_gradients_are_those_of_finite_differences(matter, log2_size):
         return (lines * torch.linspace(0.5, 1.5, lines.numel(), dtype=lines.dtype).reshape(lines.shape)).sum()
 
     total().backward()
-    for parameter in field.parameters():
+    for parameter in leaves.values():
         assert parameter.grad is not None
         way = torch.randn(parameter.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
         slope, step = float((parameter.grad * way).sum()), 1e-6
@@ -251,9 +257,9 @@ def test_features_are_linear_within_cells_and_continuous_between(log2_size):
 def test_the_mask_only_leaves_out_what_it_covers():
     grid, views = Grid.centred((9, 7, 11), PIXEL), any_pose(2, (11, 13))
     matter = ball(grid, 3 * PIXEL)[0] > 0
-    whole, masked = (smooth(grid, Matter(1.0, 0.0), SMALL, mask) for mask in (None, matter))
+    whole, masked = (smooth(grid, ONE, SMALL, mask) for mask in (None, matter))
     assert torch.equal(masked.values(grid), whole.values(grid) * matter)
-    parts = [smooth(grid, Matter(1.0, 0.0), SMALL, mask).project(views).channels for mask in (matter, ~matter)]
+    parts = [smooth(grid, ONE, SMALL, mask).project(views).channels for mask in (matter, ~matter)]
     assert torch.allclose(parts[0] + parts[1], whole.project(views).channels, atol=1e-20)
     chosen = torch.tensor([3, 40, 41])
     some, every = whole.samples(views, 0, chosen), whole.samples(views, 0)
@@ -264,12 +270,12 @@ def test_the_mask_only_leaves_out_what_it_covers():
 
 def test_pruning_keeps_what_is_there():
     grid = Grid.centred((9, 7, 11), PIXEL)
-    field = smooth(grid, Matter(1.0, 0.0))
+    field = smooth(grid)
     values = field.values(grid)[0]
     level = float(values.median())
     within = torch.arange(11) > 2
     field.prune(level, 1, within)
-    mask = field.get_buffer("mask")
+    mask = field.mask
     assert torch.equal(mask, grown(values > level, 1) & within)
     before = mask.clone()
     field.prune(2.0, 1, within)
@@ -279,13 +285,16 @@ def test_pruning_keeps_what_is_there():
 def test_fields_are_objects_reproducible_by_seed():
     grid = Grid.centred((9, 7, 11), PIXEL)
     mask = torch.ones(grid.shape, dtype=torch.bool)
-    first, same, other = (NeuralField(grid, Matter(1.0, 0.0), SMALL, mask, seed) for seed in (3, 3, 4))
+    first, same, other = (NeuralField(grid, ONE, SMALL, mask, seed) for seed in (3, 3, 4))
     assert isinstance(first, Object)
     assert first.at(1.0) is first
     assert torch.equal(first.values(grid), same.values(grid))
     assert not torch.equal(first.values(grid), other.values(grid))
-    count = sum(p.numel() for p in first.parameters())
+    count = sum(p.numel() for p in first.parameters().values())
     assert first.stored_bytes == 2 * count + mask.numel() // 8
+
+
+CUBE = Grid.centred((3, 3, 3), 1.0)
 
 
 @pytest.mark.parametrize(
@@ -296,9 +305,10 @@ def test_fields_are_objects_reproducible_by_seed():
         (lambda: Encoding(coarsest=1.0, finest=2.0), "finest must lie between"),
         (lambda: Encoding(bandwidth=0.0), "bandwidth must be positive"),
         (lambda: Network(hidden=0), "hidden must be at least 1"),
-        (lambda: Matter(1.0, 0.0, channels=3), "channels must be 1 or 2"),
-        (lambda: Matter(0.0, 0.0), "delta must be positive"),
-        (lambda: NeuralField(Grid.centred((3, 3, 3), 1.0), Matter(1.0, 0.0), SMALL, torch.ones(2, 3, 3)), "mask"),
+        (lambda: Matter(((1.0, 0.0),) * 3), "matter must have one or two channels, but it has 3"),  # type: ignore[arg-type]
+        (lambda: NeuralField(CUBE, Matter.one(0.0, 0.0), SMALL, torch.ones(3, 3, 3)), "matter of positive δ"),
+        (lambda: NeuralField(CUBE, ONE, SMALL, torch.ones(3, 3, 3), upper=-1.0), "upper must not be negative"),
+        (lambda: NeuralField(CUBE, ONE, SMALL, torch.ones(2, 3, 3)), "mask"),
     ],
 )
 def test_bad_options_are_refused(make, message):

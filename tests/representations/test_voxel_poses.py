@@ -9,13 +9,12 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
-from torch.nn.functional import avg_pool3d, pad
 
 from helpers.poses import asking, gradients, relative
+from helpers.voxels import pronounced, twin
 from holosplat.geometry import Grid, Poses, Views
-from holosplat.projectors.voxels.lattice import lattice_reference
-from holosplat.representations import Encoding, Matter, Network, NeuralField, VoxelGrid, VoxelLines
-from holosplat.representations.voxel_lines import along_axes, axis_matrices
+from holosplat.matter import Matter
+from holosplat.representations import Encoding, Network, NeuralField, VoxelGrid, VoxelLines
 
 PIXEL = 2e-6
 
@@ -35,17 +34,6 @@ POSES = {"axis": about_axis, "any": any_pose}
 
 def numbers(*shape: int, seed: int = 0) -> Tensor:
     return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-
-
-def twin(values: Tensor, grid: Grid, poses: Poses, factors: tuple[int, int, int]) -> Tensor:
-    """Line integrals [V, C, H, W] of values [C, Z, Y, X] in plain torch, any float type."""
-    fine = grid.divided(factors)
-    (nz, ny, nx), (x, y, z) = fine.shape, (o - 0.5 * d for o, d in zip(fine.origin, fine.voxel_size))
-    between = Grid((nz + 1, ny + 1, nx + 1), fine.voxel_size, (x, y, z))
-    values = along_axes(values, axis_matrices(grid, fine))
-    corners = avg_pool3d(pad(values, (1, 1, 1, 1, 1, 1)), 2, stride=1)
-    pairs = [(lattice_reference(a, fine, poses), lattice_reference(b, between, poses)) for a, b in zip(values, corners)]
-    return torch.stack([0.5 * (a + b) for a, b in pairs], dim=1)
 
 
 GRIDS = {
@@ -73,7 +61,7 @@ def test_values_and_poses_have_the_gradients_of_the_twin(views, grid):
 @pytest.mark.parametrize("views", POSES)
 def test_known_poses_cast_what_views_cast(views):
     grid, views = Grid.centred((9, 11, 7), PIXEL), POSES[views]()
-    voxels = VoxelGrid(numbers(2, *grid.shape).float(), grid, 2.0, 0.5)
+    voxels = VoxelGrid(numbers(2, *grid.shape).float(), grid, Matter.free(2.0, 0.5))
     as_views, as_poses = voxels.project(views), voxels.project(Poses.of(views))
     assert torch.equal(as_views.channels, as_poses.channels)
     unknown = voxels.project(asking(views)).channels
@@ -89,7 +77,7 @@ def test_a_moving_ball_is_predicted_in_metres():
     grid, views = Grid.centred((25, 23, 21), PIXEL), any_pose(3, (35, 38))
     x, y, z = (torch.from_numpy(axis / PIXEL) for axis in grid.axes())
     values = torch.exp(-((z[:, None, None] - 2) ** 2 + (y[:, None] + 1.5) ** 2 + (x - 1) ** 2) / 8)[None].float()
-    voxels = VoxelGrid(values, grid, 2.0, 0.5)
+    voxels = VoxelGrid(values, grid, Matter.one(2.0, 0.5))
     weight = torch.sin(0.2 * torch.arange(38.0) + 0.3) * torch.cos(0.3 * torch.arange(35.0)[:, None])
     turn, shift = Rotation.from_rotvec([0.06, -0.04, 0.05]).as_matrix(), 0.5 * PIXEL * np.array([1.0, -0.7])
     poses = asking(views)
@@ -109,13 +97,8 @@ def test_a_moving_ball_is_predicted_in_metres():
 def field(encoding: Encoding) -> NeuralField:
     """A field with some structure, in float64."""
     grid = Grid.centred((7, 5, 9), PIXEL)
-    made = NeuralField(
-        grid, Matter(1.0, 0.1), Network(encoding, 8, 1), torch.ones(grid.shape, dtype=torch.bool), seed=1
-    )
-    with torch.no_grad():
-        for parameter in made.encoding.parameters():
-            parameter.mul_(3e3)
-    return made.double()
+    everywhere = torch.ones(grid.shape, dtype=torch.bool)
+    return pronounced(NeuralField(grid, Matter.one(1.0, 0.1), Network(encoding, 8, 1), everywhere, seed=1))
 
 
 ENCODINGS = {

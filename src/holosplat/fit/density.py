@@ -39,7 +39,7 @@ class DensityControl:
     huge_px: float = 20.0
     """Gaussians with a longer axis [pixels] are removed."""
     needle: float = 30.0
-    """Gaussians with a larger ratio of longest to shortest axis are removed; so are those outside every field of view."""
+    """Gaussians with a larger ratio of longest to shortest axis are removed; so are those outside every view."""
 
     def due(self, step: int, steps: int) -> bool:
         """Whether an event takes place after `step`."""

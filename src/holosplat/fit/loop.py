@@ -78,11 +78,15 @@ def _no_rates(factor: float, step: int) -> Mapping[str, float]:
 class Plan:
     """Everything that a fit needs.
 
-    problem, schedule: what is minimised, and how long. optimiser: makes the optimiser of the free parameters. rates:
-    (what is left of them, step) → the rate of each parameter. events: what the method does beside the steps. judge:
-    of the validation frames, None without any. grid: the volume that terms look at in blocks, None without such terms.
-    generator: everything random, None for one made of the seed. capture: whether steps on a GPU may be captured in CUDA
-    graphs: their launches must not depend on values.
+    problem: what is minimised
+    schedule: how long, and by how many frames a step
+    optimiser: makes the optimiser of the free parameters
+    rates: (share of the rates that is left, step) → the rate of each parameter
+    events: what the method does beside the steps
+    judge: scores the validation frames; None without any
+    grid: the volume that terms look at in blocks; None without such terms
+    generator: draws everything random; None for one made of the seed
+    capture: whether steps on a GPU may become CUDA graphs: their launches must not depend on values
     """
 
     problem: Problem
@@ -235,7 +239,7 @@ class Fit:
             "step": self.step,
             "seconds": self.seconds,
             "generator": self._batches.generator.get_state(),
-            "order": self._batches.order,
+            "order": list(self._batches.order),
             "best": (best.score, best.step, {name: leaf.cpu().clone() for name, leaf in best.leaves.items()}),
             "stopped_early": self.stopped_early,
         }

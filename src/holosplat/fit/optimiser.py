@@ -66,18 +66,22 @@ class Group:
 
 
 class Adam:
-    """Adam (Kingma & Ba 2015) over named parameters, each at its own rate; fused kernels but for special groups.
+    """Adam (Kingma & Ba 2015) over named parameters, each at its own rate.
 
-    backend: what runs it (see `fit.adam`); groups: what differs from the default, by parameter.
+    backend: what runs it (see `fit.adam`), but for special groups and what its kernels do not take (float64), which
+    plain torch moves; groups: what differs from the default, by parameter. All that changes between steps lies on the
+    device, so that `apply` can be captured.
     """
 
     def __init__(self, leaves: Leaves, backend: str = "cpu", groups: Mapping[str, Group] | None = None) -> None:
         self._leaves, self._backend, self._count = leaves, backend, 0
-        self._groups = dict(groups or {})
+        exact = [n for n, leaf in leaves.items() if backend != "reference" and leaf.dtype != torch.float32]
+        self._groups = {**dict.fromkeys(exact, Group()), **(groups or {})}
         self._fused = [name for name in leaves if name not in self._groups]
-        self._rates: dict[str, float] = {}
         device = next(iter(leaves.values())).device
         self._factors = adam.factors([0.0] * len(self._fused), 1, EPSILON).to(device)
+        self._special = torch.zeros(len(self._groups), 3, dtype=torch.float64, device=device)
+        """Rate, and what the two running means fall short of, of every group."""
         self._first = {name: torch.zeros_like(leaf) for name, leaf in leaves.items()}
         self._second = {name: self._spread(name, leaf) for name, leaf in leaves.items()}
 
@@ -88,9 +92,11 @@ class Adam:
     def prepare(self, rates: Mapping[str, float]) -> None:
         """See `Optimiser`; a parameter without a rate stays where it is."""
         self._count += 1
-        self._rates = {name: rates.get(name, 0.0) for name in self._leaves}
-        factors = adam.factors([self._rates[name] for name in self._fused], self._count, EPSILON)
+        factors = adam.factors([rates.get(name, 0.0) for name in self._fused], self._count, EPSILON)
         self._factors.copy_(factors, non_blocking=True)
+        if self._groups:
+            rows = [(rates.get(n, 0.0), *(1 - b**self._count for b in g.betas)) for n, g in self._groups.items()]
+            self._special.copy_(torch.tensor(rows, dtype=torch.float64), non_blocking=True)
 
     def apply(self, loss: Tensor) -> None:
         """See `Optimiser`. Parameters without a gradient stay as they are."""
@@ -102,21 +108,21 @@ class Adam:
             first, second = ([state[name] for name in names] for state in (self._first, self._second))
             factors = self._factors if len(moved) == len(self._fused) else self._factors[[*moved, -1]]
             adam.step(parameters, gradients, first, second, factors, self._backend)
-        for name, group in self._groups.items():
+        for (name, group), factors in zip(self._groups.items(), self._special):
             if self._leaves[name].grad is not None:
-                self._apply_special(name, group)
+                self._apply_special(name, group, factors)
         for leaf in self._leaves.values():
             leaf.grad = None
 
     @torch.no_grad()
-    def _apply_special(self, name: str, group: Group) -> None:
-        leaf, rate, (slow, slower) = self._leaves[name], self._rates[name], group.betas
+    def _apply_special(self, name: str, group: Group, factors: Tensor) -> None:
+        leaf, (slow, slower), (rate, short, shorter) = self._leaves[name], group.betas, factors
         assert leaf.grad is not None
         gradient = leaf.grad if group.solve is None else group.solve(leaf.grad)
         square = gradient.square().max() if group.together else gradient.square()
         self._first[name].mul_(slow).add_(gradient, alpha=1 - slow)
         self._second[name].mul_(slower).add_(square, alpha=1 - slower)
-        first, second = self._first[name] / (1 - slow**self._count), self._second[name] / (1 - slower**self._count)
+        first, second = self._first[name] / short, self._second[name] / shorter
         leaf.mul_(1 - rate * group.decay).sub_(rate * first / (second.sqrt() + group.epsilon))
 
     def best(self) -> None:

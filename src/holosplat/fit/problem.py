@@ -25,7 +25,10 @@ class Part(NamedTuple):
 
 
 class Term(Protocol):
-    """What a model costs in one batch. A term reads the model's frames, its object, its alignment or its light."""
+    """What a model costs in one batch. A term reads the model's frames, its object, its alignment or its light.
+
+    A term whose weights or widths follow from the frames says them in `resolved`, name → number, for config.json.
+    """
 
     @property
     def names(self) -> Sequence[str]:
@@ -52,6 +55,13 @@ class Problem:
     model: Model
     terms: tuple[Term, ...]
     free: tuple[str, ...] | None = None
+
+    def resolved(self) -> dict[str, float]:
+        """The weights and widths that options have become by noise, prior and number of views."""
+        found: dict[str, float] = {}
+        for term in self.terms:
+            found |= getattr(term, "resolved", {})
+        return found
 
     def loss(self, model: Model, batch: Batch) -> tuple[Tensor, Tensor, list[str]]:
         """The loss of `model`; the values [1 + K] of the loss and its parts, detached; and their names."""

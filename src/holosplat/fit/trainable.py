@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..checks import require
 from ..model import Model
 from .optimiser import Leaves, Optimiser
 from .problem import Problem
@@ -16,12 +17,15 @@ from .problem import Problem
 class Trainable:
     """The model of a problem whose free parameters an optimiser moves; all the others stay as they are.
 
-    optimiser: makes the optimiser of the leaves that it is given.
+    optimiser: makes the optimiser of the leaves that it is given. Errors: `InputError` for free names that the
+    model lacks.
     """
 
     def __init__(self, problem: Problem, optimiser: Callable[[Leaves], Optimiser]) -> None:
         every = problem.model.parameters()
-        free = every if problem.free is None else problem.free
+        free = tuple(every) if problem.free is None else problem.free
+        unknown = sorted(set(free) - set(every))
+        require(not unknown, f"free must be names of {', '.join(every)}, but it has {', '.join(unknown)}.")
         self.leaves: Leaves = {name: _leaf(every[name]) for name in free}
         self.model: Model = problem.model.with_parameters(self.leaves)
         self.optimiser = optimiser(self.leaves)

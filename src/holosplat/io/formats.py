@@ -1,4 +1,4 @@
-"""Scans of every format that the project knows: `read` tells it from what a path holds."""
+"""Scans of every format that the project knows: `read` recognises the format by the content of a path."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ LOADERS: tuple[Loader, ...] = (
 def read(path: str | Path, given: Mapping[str, float] | None = None) -> Scan:
     """The scan at `path`, a file or folder of any format in `LOADERS`.
 
-    given: what folders of other programs do not say, by name (`Loader.takes`): energy_kev [keV], distance [m],
-    pixel_size [m], black and white [relative intensity]. Errors: `InputError` for a path that is not there, holds no
-    scan that is known or one that is damaged, and for what is `given` and does not belong to its format.
+    given: values that folders of other programs lack, by name (`Loader.takes`): energy_kev [keV], distance [m],
+    pixel_size [m], black and white [relative intensity]. Errors: `InputError` for a path that does not exist, holds no
+    known scan or a damaged one, and for `given` values that do not belong to its format.
     """
     loader, given = loader_of(path), given or {}
     stray = [name for name in given if name not in loader.takes]
@@ -38,7 +38,7 @@ def read(path: str | Path, given: Mapping[str, float] | None = None) -> Scan:
 
 
 def loader_of(path: str | Path) -> Loader:
-    """What reads `path`; `InputError` for a path that none knows, or more than one."""
+    """The loader of `path`; `InputError` if none or more than one recognises it."""
     found = Path(path)
     require(found.exists(), f"{path} must be a scan, but there is no such file or folder; check the path.")
     loaders = [loader for loader in LOADERS if loader.recognises(found)]

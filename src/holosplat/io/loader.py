@@ -1,4 +1,4 @@
-"""What a format of scans says of itself, to stand in the table of `formats`."""
+"""The description of a format of scans, an entry of the table in `formats`."""
 
 from __future__ import annotations
 
@@ -13,11 +13,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Loader:
-    """One format of scans, told from what a path holds.
+    """One format of scans, recognised by the content of a path.
 
-    name: of the format, as messages say it; mark: what a path of that format is ("a folder with scan.json");
-    recognises: whether a path is one, by its content; read: the scan at such a path, with what it does not say itself;
-    takes: names of what that may be (energy_kev [keV], distance [m], pixel_size [m], black, white).
+    name: of the format, for messages.
+    mark: description of a path of that format ("a folder with scan.json").
+    recognises: whether a path is one, by its content.
+    read: the scan at such a path, with the values that it lacks.
+    takes: names of these values (energy_kev [keV], distance [m], pixel_size [m], black, white).
     """
 
     name: str

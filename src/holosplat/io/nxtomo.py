@@ -38,8 +38,9 @@ from .scan_file import (
 class RawLayout:
     """The fields of a file of raw counts beside a scan's exposures.
 
-    kinds: [N] image keys of all frames (0 projection, 1 flat, 2 dark); mask: [H, W] `pixel_mask` of NXdetector, 0 for
-    good pixels, as stored; flips: whether the stored frames are upside down, and mirrored left to right.
+    kinds: [N] image keys of all frames (0 projection, 1 flat, 2 dark).
+    mask: [H, W] `pixel_mask` of NXdetector, 0 for good pixels, as stored.
+    flips: whether the stored frames are upside down, and mirrored left to right.
     """
 
     kinds: np.ndarray
@@ -51,9 +52,12 @@ class RawLayout:
 class StoredFrames(Frames):
     """The projections of an NXtomo file, flat-field corrected when they are read.
 
-    numbers: [N] of the projections among the file's frames; dark, light: [H, W] mean dark field and mean flat field
-    less that, light None where the file is corrected already; stamp: of the file when it was opened. The file is
-    opened anew for each reading. Errors: `InputError` for a file that is gone or changed, or values not finite.
+    numbers: [N] of the projections among the file's frames.
+    dark, light: [H, W] mean dark field and mean flat field less that, light None where the file is corrected already.
+    stamp: of the file when it was opened.
+
+    The file is opened anew for each reading. Errors: `InputError` for a file that is gone or changed, or values not
+    finite.
     """
 
     path: Path

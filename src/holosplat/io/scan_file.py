@@ -42,8 +42,9 @@ MOST_RADIANS = 4 * np.pi
 class ScanFile:
     """An NXtomo file that is open: how its n projections were taken, and its N frames of all kinds, read one by one.
 
-    kinds: [N], PROJECTION, FLAT, DARK or INVALID; exposures, is_test: of the projections; flips: whether the file's
-    frames are upside down, and whether they are mirrored left to right.
+    kinds: [N], PROJECTION, FLAT, DARK or INVALID.
+    exposures, is_test: of the projections.
+    flips: whether the file's frames are upside down, and whether they are mirrored left to right.
     """
 
     fields: Fields

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
-import numpy as np
 import torch
 from scipy.sparse import csc_array, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
@@ -204,9 +203,7 @@ def _bending(train: Scan, start: SurfaceMesh, objective: Objective) -> list[Term
     weight = objective.bending * (1 + objective.noise_gain * noise_share(frames)) / frames[0].numel()
     count = len(start.vertices)
     away = csr_array(eye_array(count) - neighbour_mean(start.faces.numpy(), count))
-    twice = csr_array(away @ away)
-    twice.sort_indices()
-    return [Bending(weight, torch_csr(twice, np.float64))]
+    return [Bending(weight, torch_csr(csr_array(away @ away), torch.float64))]
 
 
 def _membrane(start: SurfaceMesh, stiffness: float) -> Callable[[Tensor], Tensor]:

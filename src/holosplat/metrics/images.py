@@ -24,9 +24,11 @@ SSIM_K1, SSIM_K2 = 0.01, 0.03
 class ImageScores:
     """Scores of N predicted images against the measured ones.
 
-    ssim, psnr [dB], l1, frcm: [N] float64; data_range: `(low, high)` of the training frames, which the scores
-    of intensity take to 0 and 1; frequency: [R] [cycles/pixel]; frc: [N, R]; half_bit: [R], the ½-bit
-    threshold.
+    ssim, psnr [dB], l1, frcm: [N] float64.
+    data_range: `(low, high)` of the training frames, which the scores of intensity take to 0 and 1.
+    frequency: [R] [cycles/pixel].
+    frc: [N, R].
+    half_bit: [R], the ½-bit threshold.
     """
 
     ssim: np.ndarray

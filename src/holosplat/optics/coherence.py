@@ -21,7 +21,8 @@ FWHM = 2 * math.sqrt(2 * math.log(2))
 class Spectrum:
     """Photon energies and the share of the detected light at each, as an incoherent sum takes them.
 
-    energies_kev: [E] photon energies [keV]; weights: [E] shares, not negative; they are scaled to the sum 1.
+    energies_kev: [E] photon energies [keV].
+    weights: [E] shares, not negative; they are scaled to the sum 1.
     """
 
     energies_kev: np.ndarray
@@ -83,7 +84,9 @@ def joined_blur_px(psf_sigma_px: float | np.ndarray, blur: float | np.ndarray, p
 class EffectiveGeometry:
     """The parallel beam that gives the same frames as a cone.
 
-    magnification: M; distance: effective propagation distance [m]; pixel_size: effective pixel [m].
+    magnification: M.
+    distance: effective propagation distance [m].
+    pixel_size: effective pixel [m].
     """
 
     magnification: float

@@ -66,8 +66,10 @@ class Pulses:
 class PulseModel:
     """A mean and principal components of the light on a frame.
 
-    mean: [H, W], of mean 1; components: [K, H, W], orthogonal, of mean square 1; deviations: [K] standard deviations
-    of their weights, falling; energy_jitter: standard deviation of the pulse energy.
+    mean: [H, W], of mean 1.
+    components: [K, H, W], orthogonal, of mean square 1.
+    deviations: [K] standard deviations of their weights, falling.
+    energy_jitter: standard deviation of the pulse energy.
     """
 
     mean: np.ndarray

@@ -122,12 +122,14 @@ class Setup:
 class Visibility:
     """One object in one frame.
 
-    phase: largest phase shift k |Δδ| T [rad]; absorption: largest loss of intensity 1 - exp(-2 k Δβ T), negative
-    where the object absorbs less than its medium; lowest, highest: extremes of the contrast `I - 1` that a pixel
-    can see; rms: root mean square of the contrast over the object's shadow; spread: diameter [m] of the circle about
-    the object's centre that holds 90 % of SNR²;
-    information: [f, f] SNR² at one photon a pixel, for f × f places (y, x) of the object on the pixels, evenly
-    spread over one pixel; middle: [n, n] contrast of the pixels with the object's centre on the corner of four.
+    phase: largest phase shift k |Δδ| T [rad].
+    absorption: largest loss of intensity 1 - exp(-2 k Δβ T), negative where the object absorbs less than its medium.
+    lowest, highest: extremes of the contrast `I - 1` that a pixel can see.
+    rms: root mean square of the contrast over the object's shadow.
+    spread: diameter [m] of the circle about the object's centre that holds 90 % of SNR².
+    information: [f, f] SNR² at one photon a pixel, for f × f places (y, x) of the object on the pixels, evenly spread
+        over one pixel.
+    middle: [n, n] contrast of the pixels with the object's centre on the corner of four.
     """
 
     phase: float

@@ -94,8 +94,8 @@ class Waves:
 class Detection:
     """Matched-filter signal to noise of one object in one view, and the photons a pixel that make it `WANTED_SNR`.
 
-    snr, photons: the object in the middle of an even detector, on the corner of four pixels; snr_rms, photons_mean:
-    for the mean SNR² over all places on the pixels; (worst, best): over these places.
+    snr, photons: the object in the middle of an even detector, on the corner of four pixels.
+    snr_rms, photons_mean: for the mean SNR² over all places on the pixels; (worst, best) pairs are over these places.
     """
 
     snr: float
@@ -241,10 +241,13 @@ def _storage(setup: Setup, recording: Recording) -> Storage:
 class Survey:
     """Signal to noise over distances and energies.
 
-    energies_kev: [E] keV; distances: [Z] m; information: [E, Z] SNR² at one photon a pixel, its mean over the places of
-    the object on the pixels; spread: [E, Z] m as in `Visibility`; photons_per_pixel: for `snr`; best_frame: [n, n]
-    contrast of the pixels at the best point; setup, subject: of the survey (the setup has the energy and the distance
-    of the best point).
+    energies_kev: [E] keV.
+    distances: [Z] m.
+    information: [E, Z] SNR² at one photon a pixel, its mean over the places of the object on the pixels.
+    spread: [E, Z] m as in `Visibility`.
+    photons_per_pixel: for `snr`.
+    best_frame: [n, n] contrast of the pixels at the best point.
+    setup, subject: of the survey (the setup has the energy and the distance of the best point).
     """
 
     energies_kev: np.ndarray

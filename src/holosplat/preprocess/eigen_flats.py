@@ -24,8 +24,10 @@ DEVIATIONS = 2.0
 class EigenFlats:
     """Flat fields as a mean and components: `mean + Σ w_k components_k`, with w of mean 0 and the given deviations.
 
-    mean: [H, W]; components: [K, H, W], orthogonal, of mean square 1; deviations: [K]; eigenvalues: [F - 1] mean
-    square of each principal component's share in a frame, of which the first K are kept.
+    mean: [H, W].
+    components: [K, H, W], orthogonal, of mean square 1.
+    deviations: [K].
+    eigenvalues: [F - 1] mean square of each principal component's share in a frame, of which the first K are kept.
     """
 
     mean: np.ndarray

@@ -1,23 +1,20 @@
-"""Sparse matrices of scipy as tensors."""
+"""Scipy's sparse matrices as torch's."""
 
 from __future__ import annotations
 
 import warnings
 
 import numpy as np
-import scipy.sparse
 import torch
+from scipy.sparse import csr_array, csr_matrix
 from torch import Tensor
 
 
-def torch_csr(matrix: scipy.sparse.csr_matrix | scipy.sparse.csr_array, dtype: type[np.floating]) -> Tensor:
-    """A matrix with sorted columns as a sparse tensor of the same shape, of numpy's `dtype`."""
+def torch_csr(matrix: csr_matrix | csr_array, dtype: torch.dtype) -> Tensor:
+    """The same matrix as a CSR tensor of `dtype`, its columns sorted within each row."""
+    matrix.sort_indices()
+    starts, columns = (torch.from_numpy(a.astype(np.int64)) for a in (matrix.indptr, matrix.indices))
     with warnings.catch_warnings():  # torch calls its CSR support beta
         warnings.simplefilter("ignore")
-        return torch.sparse_csr_tensor(
-            torch.from_numpy(matrix.indptr.astype(np.int64)),
-            torch.from_numpy(matrix.indices.astype(np.int64)),
-            torch.from_numpy(matrix.data.astype(dtype)),
-            size=matrix.shape,
-            check_invariants=True,
-        )
+        values = torch.from_numpy(matrix.data).to(dtype)
+        return torch.sparse_csr_tensor(starts, columns, values, size=matrix.shape, check_invariants=True)

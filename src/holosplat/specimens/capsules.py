@@ -20,7 +20,9 @@ REACH = 1.004
 class Capsule:
     """Two ellipsoids about one centre: the outer has `half_axes`, the inner, filled by the core, `half_axes - shell`.
 
-    centre: [3] `(x, y, z)` [m]; half_axes: [3] of the outer surface [m]; shell: thickness at the axes [m];
+    centre: [3] `(x, y, z)` [m].
+    half_axes: [3] of the outer surface [m].
+    shell: thickness at the axes [m].
     rotation: [3, 3], with `x = rotation @ x_capsule + centre`.
     """
 

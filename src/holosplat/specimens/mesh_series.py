@@ -21,8 +21,11 @@ ROUNDING = 1e-9
 class MeshSeries:
     """Snapshots of the same bodies at growing times; between them each vertex moves straight and evenly.
 
-    snapshots: scenes [T] whose bodies come in the same order, with the same triangles and materials; times: [T] s.
+    snapshots: scenes [T] whose bodies come in the same order, with the same triangles and materials.
+    times: [T] s.
+
     Straight lines leave a body's volume right to second order in how far it turns between two snapshots.
+
     Errors: `InputError` naming the body whose triangles, number or material change.
     """
 

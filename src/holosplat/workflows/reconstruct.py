@@ -183,6 +183,13 @@ class _Run:
             self.folder.create()
             write_json(self.folder.config, self._config | environment(backend))
 
+    def note_resolved(self, stage: str, fit: Fit) -> None:
+        """Add to config.json what the options have become in a stage: wave samples a pixel, weights and widths."""
+        if self.folder is not None:
+            config = self.folder.read_config()
+            found = {"oversample": fit.model.instrument.oversample, **fit.plan.problem.resolved()}
+            write_json(self.folder.config, config | {"resolved": config.get("resolved", {}) | {stage: found}})
+
     def _result(self, found: Stored, fit: Fit | None, complete: bool) -> Reconstruction:
         exposures = self.task.scan.exposures
         oversample = fit.model.instrument.oversample if fit else fringe_sampling(exposures)
@@ -211,6 +218,7 @@ class _Journal:
         if saved is not None:
             self._fit.load(saved)
         self._run.make_folder(self._fit.backend)
+        self._run.note_resolved(self._run.method.stages()[self._number].name, self._fit)
         if self._run.folder is not None:
             if saved is None and self._number:
                 self._run.folder.set_aside_metrics(self._number - 1)

@@ -27,6 +27,7 @@ class FieldVariation:
     def __init__(self, weight: float, probes: int, generator: torch.Generator) -> None:
         """probes: pairs of points a step."""
         self._weight, self._probes, self._generator = weight, probes, generator
+        self.resolved = {"variation": weight}
 
     def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
         """The one part."""

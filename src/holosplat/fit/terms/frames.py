@@ -61,6 +61,19 @@ class FrameTerm:
         noise = float(noise_levels(measured).mean()) / self.span if objective.rounded > 0 else 0.0
         self._rounding = max(SMALLEST_ROUNDING, objective.rounding * noise)
         self.spectral = SpectralMisfit(train, instrument, matter, objective.floor) if objective.spectral > 0 else None
+        self.resolved = self._resolved(coarse if self._blur else 0.0)
+        """What the frames make of the objective's options: `coarse` [pixels], `noise_width` (its mean over the pixels)
+        and `rounding` in units of the frames' range, `floor`."""
+
+    def _resolved(self, coarse: float) -> dict[str, float]:
+        w, found = self.objective, dict[str, float]()
+        if w.coarse > 0:
+            found["coarse"] = coarse
+        if w.noise_width > 0:
+            found["noise_width"] = float(self._width.mean()) / self.span
+        if w.rounded > 0:
+            found["rounding"] = self._rounding
+        return found if self.spectral is None else found | {"floor": self.spectral.floor}
 
     def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
         """The loss of the frames, and the comparisons that it is made of."""

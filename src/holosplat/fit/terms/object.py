@@ -39,6 +39,8 @@ class VolumeTerm:
             table |= {"overfull": objective.overfull, "two_levels": levels}
         self._weights = {name: weight for name, weight in table.items() if weight > 0}
         self.names = tuple(self._weights)
+        self.resolved = {name: self._scale * weight for name, weight in self._weights.items()}
+        """The weights, after noise and the number of views, of sums along the beam in voxels."""
 
     def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
         """The parts in use, where the batch looks at the volume."""
@@ -82,6 +84,7 @@ class Bending:
     def __init__(self, weight: float, operator: Tensor) -> None:
         """operator: L² [P, P], sparse float64."""
         self._weight, self._operator = weight, operator
+        self.resolved = {"bending": weight}
 
     def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
         """The one part."""
@@ -96,6 +99,7 @@ class VoxelVariation:
 
     def __init__(self, weight: float, smoothing: float) -> None:
         self._weight, self._smoothing = weight, smoothing
+        self.resolved = {"variation": weight}
 
     def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
         """The one part."""

@@ -39,7 +39,9 @@ class SpectralMisfit:
         response = linear_response(exposures, matter.beta / matter.delta)
         self.noise = noise_level(self._amplitudes) / float(unit.mean())
         """Standard deviation of r that the noise of the measured frames gives [pixels of thickness]."""
-        self._weights = (1 / (response**2 + (floor + NOISE_FLOOR * self.noise) ** 2)).float().to(on)
+        self.floor = floor + NOISE_FLOOR * self.noise
+        """f, which noise has raised."""
+        self._weights = (1 / (response**2 + self.floor**2)).float().to(on)
 
     def __call__(self, frames: Tensor, index: Tensor | None = None) -> Tensor:
         """Misfits [V] of predicted frames [V, H, W] of all views, or of the views `index` [V]."""

@@ -29,11 +29,15 @@ Refraction = Sequence[tuple[float, float]] | np.ndarray | Tensor
 class OpticalPath:
     """The optics between an object and its frames, for V exposures on one raster [H, W] of samples.
 
-    rows [V, H], columns [V, W]: complex factors of the Fresnel transfer functions; blur_rows [V, H],
-    blur_columns [V, W]: real factors of the point-spread functions' transforms, None where there are none;
-    wavelength: [V] [m], float64; alike: whether one point-spread function serves all views; shape: rows and columns
-    (h, w) of a frame; margin: samples (y, x) between the raster's border and the frame's; factor: samples along a
-    pixel's edge; pitch: of the samples [m].
+    rows [V, H], columns [V, W]: complex factors of the Fresnel transfer functions.
+    blur_rows [V, H], blur_columns [V, W]: real factors of the point-spread functions' transforms, None where there are
+        none.
+    wavelength: [V] [m], float64.
+    alike: whether one point-spread function serves all views.
+    shape: rows and columns (h, w) of a frame.
+    margin: samples (y, x) between the raster's border and the frame's.
+    factor: samples along a pixel's edge.
+    pitch: of the samples [m].
 
     The factors may come from distances and widths that want gradients (`optical_path`, `corrected`).
     """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.sparse
+import torch
 from torch import Tensor
 
 from ...checks import require
@@ -27,7 +28,7 @@ class SliceProjector:
         nz, ny, nx = grid.shape
         self.array_shape = (nz, nx, ny)
         matrix = slice_matrix(grid, views)
-        self._forward, self._adjoint = torch_csr(matrix, np.float32), torch_csr(matrix.T.tocsr(), np.float32)
+        self._forward, self._adjoint = (torch_csr(m, torch.float32) for m in (matrix, matrix.T.tocsr()))
 
     def project(self, array: Tensor) -> Tensor:
         """Line integrals [V, W, H] in metres × value of a volume in the order [Z, X, Y]."""

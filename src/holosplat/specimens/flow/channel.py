@@ -25,7 +25,8 @@ SPEED_RANGE = (1e-9, 10.0)
 class Channel:
     """A channel along x with walls at y = 0, Ly and z = 0, Lz, periodic in x.
 
-    box: (Lx, Ly, Lz) [m]; peak: velocity on the axis [m/s].
+    box: (Lx, Ly, Lz) [m].
+    peak: velocity on the axis [m/s].
     """
 
     box: tuple[float, float, float]

@@ -17,10 +17,15 @@ from .geometry import corners_of, cross, dihedral_angles, edge_lengths, enclosed
 class RestShape:
     """A closed surface of P nodes, F triangles and E edges, and its measures at rest (float64 unless `to` changed it).
 
-    faces: [F, 3]; edges: [E, 2], nodes a and b of each; opposite: [E, 2], the third nodes c and d of the triangles
-    (a, b, c) and (b, a, d) beside it; beside: [E, 2], the numbers of these triangles; length: [E] [m]; angle: [E]
-    between the triangles' normals, positive where the surface is convex [rad]; area: [F] [m²]; frame: [F, 2, 2], the
-    inverse of each triangle's two sides (columns, in its own plane) [1/m]; surface [m²]; volume [m³].
+    faces: [F, 3].
+    edges: [E, 2], nodes a and b of each.
+    opposite: [E, 2], the third nodes c and d of the triangles (a, b, c) and (b, a, d) beside it.
+    beside: [E, 2], the numbers of these triangles.
+    length: [E] [m].
+    angle: [E] between the triangles' normals, positive where the surface is convex [rad].
+    area: [F] [m²].
+    frame: [F, 2, 2], the inverse of each triangle's two sides (columns, in its own plane) [1/m].
+    surface, volume: of the whole membrane [m², m³].
     """
 
     faces: Tensor
