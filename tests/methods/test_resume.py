@@ -132,7 +132,10 @@ def test_the_mask_of_a_field_is_pruned_and_resumed():
     fit = FITS["neural"](0)
     counts = [record["occupied"] for record in run(fit)]
     assert counts[0] == counts[6] > counts[7] == counts[11]
-    second = FITS["neural"](1)
+    second, views = FITS["neural"](1), scan().views
+    before = second.model.object.kept_samples(views, 0)
     second.load(through_a_file(fit.state_dict()))
+    after = second.model.object.kept_samples(views, 0)
+    assert len(after.pixel) == len(fit.model.object.samples(views, 0).pixel) < len(before.pixel)
     np.testing.assert_array_equal(second.model.object.mask, fit.model.object.mask)
     assert int(second.model.object.mask.sum()) == counts[-1]

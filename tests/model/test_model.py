@@ -18,6 +18,7 @@ from holosplat.checks import InputError
 from holosplat.geometry import Grid, Poses, Views, rotation_y
 from holosplat.matter import Matter
 from holosplat.model import Alignment, Instrument, LightField, Model, measure, smooth_modes
+from holosplat.model.alignment import WIDTHS
 from holosplat.representations import GaussianCloud, VoxelGrid
 from holosplat.representations.gaussians import raw_of
 from holosplat.scan import Exposures
@@ -189,6 +190,15 @@ def test_a_correction_alone_leaves_the_others_out(monkeypatch):
     assert poses.rotations is blurred.poses.rotations
     assert poses.shifts is blurred.poses.shifts
     assert alignment.distance(planned()) is None
+
+
+def test_frames_that_need_the_host_are_known():
+    """New optics are made there, and times are told apart there: such steps cannot be captured."""
+    model = Model(a_cloud(), Instrument(planned()))
+    aligned = {name: replace(model, alignment=Alignment.planned(4, name)).capturable for name in WIDTHS}
+    assert model.capturable
+    assert aligned == {"turns": True, "shifts": True, "stretches": False, "blurs": False}
+    assert not Model(a_cloud(), Instrument(at_times())).capturable
 
 
 # --- light --------------------------------------------------------------------------------------------------

@@ -131,7 +131,7 @@ class Fit:
         self.step, self.seconds, self.stopped_early = 0, 0.0, False
         self._names: dict[int, list[str]] = {}
         self._unread: list[_Unread] = []
-        captured = plan.capture and self._device.type == "cuda"
+        captured = plan.capture and plan.problem.model.capturable and self._device.type == "cuda"
         self._capture = CapturedStep(self._work) if captured else None
         self._best = _Best(self.trainable.snapshot())
 

@@ -303,8 +303,12 @@ class NeuralField:
         """
         kept = grown(self.values(self.grid)[0] > threshold, grow) & within
         if bool(kept.any()):
-            self.mask.copy_(kept)
-            self._samples.clear()
+            self.look_at(kept)
+
+    def look_at(self, mask: Tensor) -> None:
+        """The mask becomes `mask` [Z, Y, X], in all copies that share it; samples that were ready are found anew."""
+        self.mask.copy_(mask)
+        self._samples.clear()
 
 
 def _require_shapes(what: str, given: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> None:
