@@ -111,5 +111,5 @@ def test_surfaces_are_cut_out_of_gaussians_alone(method, run, tmp_path):
     if method == "gaussians":
         worked(outcome)
     else:
-        refused(outcome, "surfaces are cut out of Gaussians", KINDS.get(method, method))
+        refused(outcome, "surfaces are cut out of Gaussians", KINDS.get(method, method), "--method gaussians")
         assert not (tmp_path / "bodies").exists()

@@ -127,7 +127,8 @@ class SurfaceStage:
         task.on_progress(f"{STAGE}: extraction", 0.0)
         require(
             isinstance(before, GaussianCloud),
-            f"surfaces are cut out of Gaussians, but what came before is {getattr(before, 'kind', before)!r}.",
+            f"surfaces are cut out of Gaussians, but what came before is {getattr(before, 'kind', before)!r}; "
+            "reconstruct with --method gaussians first.",
         )
         assert isinstance(before, GaussianCloud)
         return extract_surfaces(before, task.scan, self.options.extraction)
