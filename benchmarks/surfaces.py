@@ -15,13 +15,13 @@ import json
 import os
 import tempfile
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import torch
+from changes import changed
 from machine import commit
 
 import holosplat as hs
@@ -62,16 +62,6 @@ def prepared(name: str, seed: int, runs: Path) -> tuple[hs.Scan, hs.Volume, Gaus
     return hs.io.read_scan(scan), hs.io.read_volume(truth), found.object, found.oversample
 
 
-def with_changes(fit: SurfaceFit, changes: dict[str, Any]) -> SurfaceFit:
-    """The options with other values of those that `changes` names, wherever they are; other names are left out."""
-
-    def own(part: Any) -> dict[str, Any]:
-        return {name: value for name, value in changes.items() if name in vars(part)}
-
-    objective, schedule = replace(fit.objective, **own(fit.objective)), replace(fit.schedule, **own(fit.schedule))
-    return replace(fit, objective=objective, schedule=schedule, **own(fit))
-
-
 def fitted_surfaces(scan: hs.Scan, start: SurfaceMesh, options: SurfaceFit) -> SurfaceMesh:
     """The surfaces that a fit from `start` ends with."""
     fit = surface_fit(scan, start, options)
@@ -106,9 +96,11 @@ def variants(name: str, seed: int, runs: Path) -> list[dict[str, Any]]:
     scan, truth, cloud, _ = prepared(name, seed, runs)
     sampling = oversampling(scan.train())
     rows = []
-    for called, changes in VARIANTS.items():
-        fit = with_changes(SurfaceFit(), {"oversample": sampling - changes.get("coarser", 0), **changes})
-        start = extract_surfaces(cloud, scan, Extraction(spacing=changes.get("spacing", 1.0)))
+    for called, every in VARIANTS.items():
+        changes = dict(every)
+        spacing, coarser = changes.pop("spacing", 1.0), changes.pop("coarser", 0)
+        fit = changed(SurfaceFit(), {"oversample": sampling - coarser, **changes})
+        start = extract_surfaces(cloud, scan, Extraction(spacing=spacing))
         began = time.process_time()
         found = fitted_surfaces(scan, start, fit)
         seconds = time.process_time() - began
