@@ -25,13 +25,7 @@ BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 def scripts(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
     """The modules of benchmarks/, which import one another by bare names."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
-    return {
-        name: importlib.import_module(name)
-        for name in (
-            *("step", "eager_step", "kernels", "plain_torch", "ablation", "simulate"),
-            *("tweezers", "espresso_flow", "tune_fields", "trials", "second_order", "two_levels", "cavity"),
-        )
-    }
+    return {path.stem: importlib.import_module(path.stem) for path in BENCHMARKS.glob("*.py")}
 
 
 @pytest.mark.parametrize("add", ["index_add_", "scatter_add_"])
@@ -205,3 +199,24 @@ def test_the_table_of_fields_compares_with_the_defaults(scripts):
         for case, label, error in (("a", "as it is", 0.2), ("b", "as it is", 0.1), ("a", "x", 0.1), ("b", "x", 0.2))
     ]
     assert scripts["tune_fields"].table(rows, "voxels")[-1] == "| x | 0.150 | ×0.50, ×2.00 | 0.900 | 0.800 / 0.700 |"
+
+
+def test_every_variant_of_surfaces_changes_something(scripts):
+    surfaces, changed = scripts["surfaces"], scripts["changes"].changed
+    found = {}
+    for name, changes in surfaces.VARIANTS.items():
+        of_fit = {k: v for k, v in changes.items() if k not in ("spacing", "coarser")}
+        found[name] = (changed(surfaces.SurfaceFit(), of_fit), changes.get("spacing"), changes.get("coarser"))
+    assert found.pop("as they are") == (surfaces.SurfaceFit(), None, None)
+    assert (surfaces.SurfaceFit(), None, None) not in found.values()
+    assert found["40 steps"][0].schedule.steps == 40
+    assert found["no smoothness"][0].objective.bending == 0
+
+
+def test_changed_options_must_exist(scripts):
+    tune = scripts["tune_fields"]
+    found = scripts["changes"].changed(tune.VoxelFit(), {"steps": 7, "floor": 0.3, "decay": 0.5})
+    assert (found.steps, found.objective.floor, found.schedule.decay) == (7, 0.3, 0.5)
+    assert found.schedule.steps == tune.VoxelFit().schedule.steps  # its own steps are what a name means
+    with pytest.raises(KeyError, match="VoxelFit has no option flour"):
+        scripts["changes"].changed(tune.VoxelFit(), {"flour": 0.3})
