@@ -114,9 +114,10 @@ class Matter:
         """The matter that `as_dict` described; `InputError` for anything else."""
         try:
             channels = tuple(DeltaBeta(float(delta), float(beta)) for delta, beta in values["channels"])
-            return cls(channels, bool(values["occupancies"]))
+            occupancies = bool(values["occupancies"])
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"matter must hold channels and occupancies, but it is {values!r}.") from error
+        return cls(channels, occupancies)
 
 
 class MaterialPrior:

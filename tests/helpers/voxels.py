@@ -8,9 +8,12 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
+from torch.nn.functional import avg_pool3d, pad
 
-from holosplat.geometry import Grid, Views
+from holosplat.geometry import Grid, Poses, Views
+from holosplat.projectors.voxels.lattice import lattice_reference
 from holosplat.representations import NeuralField
+from holosplat.representations.voxel_lines import along_axes, axis_matrices
 
 DOUBLE = torch.float64
 ROWS = Grid((11, 7, 9), (1.1, 1.0, 0.9), (-4.0, -3.0, -3.7))
@@ -40,3 +43,14 @@ def pronounced(field: NeuralField) -> NeuralField:
     field = field.to(dtype=DOUBLE)
     encoding = {name: 3e3 * p for name, p in field.parameters().items() if name.startswith("encoding.")}
     return field.with_parameters(encoding)
+
+
+def twin(values: Tensor, grid: Grid, poses: Poses, factors: tuple[int, int, int]) -> Tensor:
+    """Line integrals [V, C, H, W] of values [C, Z, Y, X] in plain torch, any float type."""
+    fine = grid.divided(factors)
+    (nz, ny, nx), (x, y, z) = fine.shape, (o - 0.5 * d for o, d in zip(fine.origin, fine.voxel_size))
+    between = Grid((nz + 1, ny + 1, nx + 1), fine.voxel_size, (x, y, z))
+    values = along_axes(values, axis_matrices(grid, fine))
+    corners = avg_pool3d(pad(values, (1, 1, 1, 1, 1, 1)), 2, stride=1)
+    pairs = [(lattice_reference(a, fine, poses), lattice_reference(b, between, poses)) for a, b in zip(values, corners)]
+    return torch.stack([0.5 * (a + b) for a, b in pairs], dim=1)

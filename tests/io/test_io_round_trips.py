@@ -157,7 +157,9 @@ def objects(draw: st.DrawFn) -> Stored:
         return GaussianCloud([centres, torch.log(scales), *rest], unit, matter)
     if kind == "voxels":
         grid = draw(volumes()).grid
-        return VoxelGrid(torch.from_numpy(draw(arrays(np.float32, (len(matter), *grid.shape)))), grid, matter)
+        finite = st.floats(width=32, allow_nan=False, allow_infinity=False)  # others are refused where they are read
+        values = draw(arrays(np.float32, (len(matter), *grid.shape), elements=finite))
+        return VoxelGrid(torch.from_numpy(values), grid, matter)
     sphere, faces = (torch.from_numpy(a.copy()) for a in icosphere(1))
     return SurfaceMesh(sphere * draw(numbers(0.1, 1e3)), faces.long(), unit, one, draw(st.integers(1, 4)))
 

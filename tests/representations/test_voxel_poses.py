@@ -9,15 +9,12 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
-from torch.nn.functional import avg_pool3d, pad
 
 from helpers.poses import asking, gradients, relative
-from helpers.voxels import pronounced
+from helpers.voxels import pronounced, twin
 from holosplat.geometry import Grid, Poses, Views
 from holosplat.matter import Matter
-from holosplat.projectors.voxels.lattice import lattice_reference
 from holosplat.representations import Encoding, Network, NeuralField, VoxelGrid, VoxelLines
-from holosplat.representations.voxel_lines import along_axes, axis_matrices
 
 PIXEL = 2e-6
 
@@ -37,17 +34,6 @@ POSES = {"axis": about_axis, "any": any_pose}
 
 def numbers(*shape: int, seed: int = 0) -> Tensor:
     return torch.rand(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
-
-
-def twin(values: Tensor, grid: Grid, poses: Poses, factors: tuple[int, int, int]) -> Tensor:
-    """Line integrals [V, C, H, W] of values [C, Z, Y, X] in plain torch, any float type."""
-    fine = grid.divided(factors)
-    (nz, ny, nx), (x, y, z) = fine.shape, (o - 0.5 * d for o, d in zip(fine.origin, fine.voxel_size))
-    between = Grid((nz + 1, ny + 1, nx + 1), fine.voxel_size, (x, y, z))
-    values = along_axes(values, axis_matrices(grid, fine))
-    corners = avg_pool3d(pad(values, (1, 1, 1, 1, 1, 1)), 2, stride=1)
-    pairs = [(lattice_reference(a, fine, poses), lattice_reference(b, between, poses)) for a, b in zip(values, corners)]
-    return torch.stack([0.5 * (a + b) for a, b in pairs], dim=1)
 
 
 GRIDS = {

@@ -131,7 +131,7 @@ class Fit:
         self.step, self.seconds, self.stopped_early = 0, 0.0, False
         self._names: dict[int, list[str]] = {}
         self._unread: list[_Unread] = []
-        captured = plan.capture and self._device.type == "cuda"
+        captured = plan.capture and plan.problem.model.capturable and self._device.type == "cuda"
         self._capture = CapturedStep(self._work) if captured else None
         self._best = _Best(self.trainable.snapshot())
 
@@ -239,7 +239,7 @@ class Fit:
             "step": self.step,
             "seconds": self.seconds,
             "generator": self._batches.generator.get_state(),
-            "order": self._batches.order,
+            "order": list(self._batches.order),
             "best": (best.score, best.step, {name: leaf.cpu().clone() for name, leaf in best.leaves.items()}),
             "stopped_early": self.stopped_early,
         }

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import InputError
+from ..checks import InputError, finite
 from ..representations import KINDS, Stored
 from .atomic import atomic_path
 from .gaussians import FORMAT as GAUSSIANS
@@ -48,10 +48,12 @@ def read_object(path: Path) -> Stored:
             )
         fields, names = Fields(path, file), list[str]()
         file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
-        arrays = {name: torch.from_numpy(np.asarray(fields.dataset(name)[()])) for name in names}
+        arrays = {name: finite(fields.label(name), np.asarray(fields.dataset(name)[()])) for name in names}
         try:
             plain = json.loads(str(file.attrs["state"]))
-            return kind.from_state(_joined(arrays, plain))
+            return kind.from_state(_joined({name: torch.from_numpy(a) for name, a in arrays.items()}, plain))
+        except InputError as error:
+            raise InputError(f"{path} must hold a whole object, but it does not: {error}") from error
         except (KeyError, TypeError, ValueError, AttributeError) as error:
             raise InputError(f"{path} must hold a whole object, but it lacks or garbles {error}.") from error
 

@@ -207,7 +207,7 @@ def _plan(problem: Problem, schedule: Schedule, options: NeuralFit, generator: t
         schedule=replace(schedule, seconds=0.5 * schedule.seconds),
         optimiser=lambda leaves: Adam(leaves, problem.model.instrument.backend, groups),
         rates=lambda factor, step: dict.fromkeys(groups, options.rate * factor),
-        events=(PruneEvent(options, field.mask),),
+        events=(PruneEvent(options, field),),
         generator=generator,
         capture=False,  # how many samples a step has depends on the mask
     )
@@ -216,9 +216,9 @@ def _plan(problem: Problem, schedule: Schedule, options: NeuralFit, generator: t
 class PruneEvent:
     """Every so many steps, a field is looked at only where its values are not nothing, within its first hull."""
 
-    def __init__(self, options: NeuralFit, mask: Tensor) -> None:
-        """mask: of the field, which all its copies share."""
-        self._options, self._hull, self._mask = options, mask.clone(), mask
+    def __init__(self, options: NeuralFit, field: NeuralField) -> None:
+        """field: whose mask all its copies share."""
+        self._options, self._hull, self._field = options, field.mask.clone(), field
 
     def on_gradients(self, leaves: Leaves) -> None:
         """Nothing."""
@@ -239,12 +239,12 @@ class PruneEvent:
 
     def state_dict(self) -> dict[str, Any]:
         """The hull and the mask."""
-        return {"hull": self._hull.cpu().clone(), "mask": self._mask.cpu().clone()}
+        return {"hull": self._hull.cpu().clone(), "mask": self._field.mask.cpu().clone()}
 
     def load(self, state: dict[str, Any]) -> None:
         """Go back to a saved state; the field of the fit shares the mask."""
-        self._hull = state["hull"]
-        self._mask.copy_(state["mask"])
+        self._hull = state["hull"].to(self._field.mask.device)
+        self._field.look_at(state["mask"])
 
 
 def visual_hull(thickness: Tensor, views: Views, grid: Grid, share: float) -> Tensor:

@@ -47,6 +47,13 @@ class Model:
                 f"the {name} of a model must be of all its {count} exposures; make it anew for them.",
             )
 
+    @property
+    def capturable(self) -> bool:
+        """Whether frames are made on the device alone: those of one time, at the planned distances and blurs."""
+        alignment = self.alignment
+        planned = alignment is None or (alignment.stretches is None and alignment.blurs is None)
+        return planned and len(self.instrument.times) == 1
+
     def parameters(self) -> dict[str, Tensor]:
         """Every tensor that can be fitted, by the name `part.parameter`."""
         return {

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import normalize, softplus
 
 from ..backends import device
-from ..checks import require
+from ..checks import positive, require
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..projectors.splat import splat, voxelise
@@ -102,9 +102,10 @@ class GaussianCloud:
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> GaussianCloud:
-        """The cloud that `state` described."""
+        """The cloud that `state` described; `InputError` where it does not fit together."""
         matter = Matter.from_dict(state["matter"])
-        return cls([state[name] for name in PARAMETERS], float(state["unit_length"]), matter)
+        unit = positive("unit_length", state["unit_length"], "metres")
+        return cls([state[name] for name in PARAMETERS], unit, matter)
 
     def enclosing_grid(self, most_voxels: int) -> Grid:
         """A grid around all centres, of `unit_length` a voxel, or coarser where those would be over `most_voxels`."""

@@ -154,12 +154,14 @@ class NeuralField:
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> NeuralField:
-        """The field that `state` described."""
+        """The field that `state` described; `InputError` where it does not fit together."""
         size, origin = (tuple(float(v) for v in state[name]) for name in ("voxel_size", "origin"))
         grid = Grid(tuple(state["mask"].shape), size, origin)  # type: ignore[arg-type]
         network = from_table(Network, state["network"], "network")
         field = cls(grid, Matter.from_dict(state["matter"]), network, state["mask"], upper=float(state["upper"]))
-        field._constants = dict(state["constants"])
+        for name, mine in (("weights", field._weights), ("constants", field._constants)):
+            _require_shapes(name, state.get(name, {}), mine)
+        field._constants = dict(state.get("constants", {}))
         return field.with_parameters(state["weights"])
 
     @property
@@ -301,8 +303,21 @@ class NeuralField:
         """
         kept = grown(self.values(self.grid)[0] > threshold, grow) & within
         if bool(kept.any()):
-            self.mask.copy_(kept)
-            self._samples.clear()
+            self.look_at(kept)
+
+    def look_at(self, mask: Tensor) -> None:
+        """The mask becomes `mask` [Z, Y, X], in all copies that share it; samples that were ready are found anew."""
+        self.mask.copy_(mask)
+        self._samples.clear()
+
+
+def _require_shapes(what: str, given: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> None:
+    for name in {**wanted, **given}:
+        shapes = [tuple(found.shape) if (found := table.get(name)) is not None else None for table in (wanted, given)]
+        require(
+            shapes[0] == shapes[1],
+            f"{what}/{name} of the network must have the shape {shapes[0]}, but it has {shapes[1]}.",
+        )
 
 
 def uniform(generator: torch.Generator, *shape: int) -> Tensor:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import InputError, require
+from ..checks import InputError, positive, require
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..mesh import TriangleMesh, shell_labels, winding_number
@@ -53,10 +53,16 @@ class SurfaceMesh:
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> SurfaceMesh:
-        """The surfaces that `state` described."""
+        """The surfaces that `state` described; `InputError` where it does not fit together."""
         matter = Matter.from_dict(state["matter"])
-        faces = state["faces"].long()
-        return cls(state["vertices"], faces, float(state["unit_length"]), matter, int(state["lines"]))
+        faces, unit = state["faces"].long(), positive("unit_length", state["unit_length"], "metres")
+        found = cls(state["vertices"], faces, unit, matter, int(state["lines"]))
+        last = len(found.vertices) - 1
+        require(
+            0 <= int(faces.min()) <= int(faces.max()) <= last,
+            f"faces must name vertices from 0 to {last}, but they name {int(faces.min())} to {int(faces.max())}.",
+        )
+        return found
 
     @property
     def described(self) -> str:

@@ -1,0 +1,188 @@
+"""Every fitted method, stopped in any of its stages, goes on from its run folder as if nothing had happened."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import holosplat.workflows.reconstruct as module
+from helpers.runs import KNOWN, RANDOM
+from holosplat.baselines import HolographicTV
+from holosplat.fit.schedule import Schedule
+from holosplat.fit.terms import Objective
+from holosplat.io.objects import read_object
+from holosplat.matter import MaterialPrior
+from holosplat.methods import (
+    FitOptions,
+    Gaussians,
+    HolographicVoxels,
+    Method,
+    NeuralFields,
+    NeuralFit,
+    PerView,
+    SurfaceFit,
+    Surfaces,
+    VoxelFit,
+    Voxels,
+)
+from holosplat.representations import NeuralField
+from holosplat.scan import Scan
+from holosplat.volume import Object
+from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
+from holosplat.workflows.run_folder import RunFolder
+
+VOLUME = HolographicTV(iterations=30, corrections=2, inner=8, refine=1)
+CLOUD = Gaussians(
+    spacing_px=2.0,
+    approximate_steps=5,
+    volume=VOLUME,
+    fit=FitOptions(Objective(tv_volume=0.05, overfull=10.0), Schedule(steps=12)),
+)
+SURFACES = SurfaceFit(schedule=Schedule(steps=6, decay=0.1, views_per_step=2))
+VOXELS = VoxelFit(coarse_steps=5, steps=7)
+FIELD = NeuralFit(
+    warmup_steps=20, prune_every=2, schedule=Schedule(steps=7, views_per_step=1, validation_views=1, validate_every=2)
+)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A method, and where it is stopped: the name of a stage and a step in it."""
+
+    method: Method
+    stage: str
+    step: int
+    first: tuple[str, ...] = ()
+    """Files of the metrics of earlier stages."""
+
+
+CASES = {
+    "gaussians": Case(RANDOM, "fit", 5),
+    "surfaces, in the Gaussians": Case(Surfaces(gaussians=CLOUD, fit=SURFACES), "fit", 4, ("metrics_0.csv",)),
+    "surfaces": Case(Surfaces(gaussians=CLOUD, fit=SURFACES), "surfaces", 3, ("metrics_0.csv",)),
+    "voxels, coarse": Case(Voxels(VOLUME, VOXELS), "voxels through the waves, coarse", 3, ("metrics_1.csv",)),
+    "voxels": Case(Voxels(VOLUME, VOXELS), "voxels through the waves", 4, ("metrics_1.csv",)),
+    "neural-field": Case(NeuralFields(VOLUME, FIELD), "field through the waves", 3),
+}
+
+
+@pytest.fixture(scope="module", params=CASES)
+def case(request) -> Case:
+    return CASES[request.param]
+
+
+@pytest.fixture(scope="module")
+def whole(scan, case, tmp_path_factory) -> RunFolder:
+    """A run that nobody stopped."""
+    folder = RunFolder(tmp_path_factory.mktemp("whole") / "run")
+    reconstruct(scan, KNOWN, case.method, seed=3, folder=folder)
+    return folder
+
+
+def stopping(case: Case, error: type[BaseException]):
+    """A progress that raises at the case's stage and step."""
+
+    def progress(stage: str, fraction: float, record: dict[str, float]) -> None:
+        if stage == case.stage and record.get("step") == case.step:
+            raise error
+
+    return progress
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    """The rows of a table of metrics, without the clock."""
+    with path.open(newline="") as file:
+        return [{name: value for name, value in row.items() if name != "seconds"} for row in csv.DictReader(file)]
+
+
+def assert_same(folder: RunFolder, whole: RunFolder, case: Case) -> None:
+    """Bit for bit the same object, and the same metrics of all stages."""
+    found, wanted = (read_object(each.object) for each in (folder, whole))
+    assert (found.kind, found.described) == (wanted.kind, wanted.described)
+    for name, value in wanted.parameters().items():
+        assert torch.equal(found.parameters()[name], value), name
+    if isinstance(wanted, NeuralField):
+        assert isinstance(found, NeuralField)
+        assert torch.equal(found.mask, wanted.mask)
+    for name in ("metrics.csv", *case.first):
+        assert rows(folder.path / name) == rows(whole.path / name), name
+    assert {path.name for path in folder.path.iterdir()} == {path.name for path in whole.path.iterdir()}
+    summaries = [json.loads(each.summary.read_text()) for each in (folder, whole)]
+    assert summaries[0]["timing_s"].keys() == summaries[1]["timing_s"].keys()
+    assert all({**summary, "timing_s": 0} == {**summaries[1], "timing_s": 0} for summary in summaries)
+
+
+def test_every_stage_has_its_metrics(case, whole):
+    """Those of the last one in metrics.csv, of the others beside it."""
+    assert {path.name for path in whole.path.glob("metrics*.csv")} == {"metrics.csv", *case.first}
+    steps = {"surfaces": 6, "voxels": 7, "neural-field": 7, "gaussians": 12}[load_reconstruction(whole).object.kind]
+    assert [int(row["step"]) for row in rows(whole.metrics)] == list(range(1, steps + 1))
+    assert all(float(row["loss"]) > 0 for row in rows(whole.metrics))
+
+
+def test_an_interrupted_run_is_usable_and_goes_on(scan, case, whole, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    half = reconstruct(scan, KNOWN, case.method, seed=3, folder=folder, on_progress=stopping(case, KeyboardInterrupt))
+    assert not half.finished
+    summary = json.loads(folder.summary.read_text())
+    assert (summary["finished"], summary["steps"]) == (False, case.step)
+    assert load_reconstruction(folder).object.kind == half.object.kind == summary["kind"]
+    stages: list[str] = []
+    done = reconstruct(
+        scan,
+        KNOWN,
+        case.method,
+        seed=3,
+        folder=folder,
+        resume=True,
+        on_progress=lambda stage, fraction, record: stages.append(stage),
+    )
+    assert done.finished
+    assert stages[0] == case.stage, "nothing before it is done again"
+    assert_same(folder, whole, case)
+
+
+def test_a_run_that_died_goes_on_from_its_last_checkpoint(scan, case, whole, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "CHECKPOINT_SECONDS", 0.0)
+    folder = RunFolder(tmp_path / "run")
+    with pytest.raises(RuntimeError):
+        reconstruct(scan, KNOWN, case.method, seed=3, folder=folder, on_progress=stopping(case, RuntimeError))
+    reconstruct(scan, KNOWN, case.method, seed=3, folder=folder, resume=True)
+    assert_same(folder, whole, case)
+
+
+# --- what a reconstruction gives ----------------------------------------------------------------------------
+
+UNFITTED = {
+    "holographic-tv": HolographicVoxels(VOLUME),
+    "per-view": PerView("paganin", "fbp", bounded=False),
+    "no steps": replace(CLOUD, fit=replace(CLOUD.fit, schedule=Schedule(steps=0))),
+}
+
+
+@pytest.mark.parametrize("name", UNFITTED)
+def test_a_method_without_a_fit_is_an_object_all_the_same(scan, tmp_path, name):
+    folder = RunFolder(tmp_path / "run")
+    found = reconstruct(scan, KNOWN, UNFITTED[name], folder=folder)
+    assert isinstance(found.object, Object)
+    assert found.finished
+    assert found.timing["start"] > 0
+    assert rows(folder.metrics) == []
+    loaded = load_reconstruction(folder)
+    for key, value in found.object.parameters().items():
+        assert torch.equal(loaded.object.parameters()[key], value)
+    again = reconstruct(scan, KNOWN, UNFITTED[name], folder=folder, resume=True)
+    assert again.object.described == found.object.described
+
+
+@pytest.mark.parametrize("case_name", ["voxels", "neural-field"])
+def test_with_nothing_known_delta_and_beta_are_free_in_files_too(scan: Scan, tmp_path, case_name):
+    folder = RunFolder(tmp_path / "run")
+    found = reconstruct(scan, MaterialPrior.unknown(), CASES[case_name].method, folder=folder)
+    assert not found.object.matter.occupancies
+    assert load_reconstruction(folder).object.matter == found.object.matter
