@@ -26,6 +26,7 @@ from machine import commit
 
 import holosplat as hs
 from holosplat.bench.case import load_case
+from holosplat.io.json import write_json
 from holosplat.methods import Extraction, SurfaceFit, SurfaceOptions, finished
 from holosplat.methods.surfaces import extract_surfaces, oversampling, surface_fit
 from holosplat.representations import GaussianCloud, SurfaceMesh
@@ -57,6 +58,7 @@ def prepared(name: str, seed: int, runs: Path) -> tuple[hs.Scan, hs.Volume, Gaus
         hs.io.write_scan(scan, measured)
         hs.io.write_volume(truth, case.truth())
         hs.reconstruct(measured, case.prior, hs.preset("default"), seed, folder=run)
+        write_json(run.source, {"scan": str(scan.resolve()), "time_frame": None})  # for those who read the run later
     found = hs.load_reconstruction(run)
     assert isinstance(found.object, GaussianCloud)
     return hs.io.read_scan(scan), hs.io.read_volume(truth), found.object, found.oversample

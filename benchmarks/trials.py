@@ -21,6 +21,7 @@ from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
+import numpy as np
 import torch
 from machine import commit
 from second_order import cloud_of, gauss_newton, planned, quasi_newton
@@ -160,14 +161,14 @@ def weighted(scan: hs.Scan, cloud: GaussianCloud, options: FitOptions) -> Fit:
     """
     plan, train = planned(scan, cloud, options), scan.train()
     model = plan.problem.model
-    term = FilteredFrames(train, model, options.objective, lambda frames, progress: frames)
-    noise = float(sure_noise(term.measured).mean()) / term.span
+    noise = float(sure_noise(torch.from_numpy(train.frames)).mean() / float(np.ptp(train.frames)))
     response = linear_response(train.exposures, cloud.matter.beta / cloud.matter.delta)
-    weight = (1 / (response**2 + (FLOOR + 5 * noise) ** 2).sqrt()).float()
+    relative = (1 / (response**2 + (FLOOR + 5 * noise) ** 2).sqrt()).float()
+    weight = torch.ones_like(relative)
+    term = FilteredFrames(train, model, options.objective, lambda frames, progress: filtered(frames, weight))
     plain = pull(term, model)
-    term.keep = lambda frames, progress: filtered(frames, weight)
-    scale = plain / pull(term, model)
-    term.keep = lambda frames, progress: filtered(frames, scale * weight)
+    weight = relative  # which `term` looks up anew
+    weight = relative * (plain / pull(term, model))
     return with_frames(plan, term)
 
 
