@@ -23,36 +23,34 @@ from typing import Any
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
-from holosplat.workflows.start import starting_cloud
 from machine import commit
 
 import holosplat as hs
 from holosplat.bench.case import Case, case_names, load_case
-from holosplat.fit.loop import Fit
+from holosplat.methods import Task, finished
+from holosplat.methods.gaussians import GaussianStage
 from holosplat.workflows.evaluate import score_object
-from holosplat.workflows.reconstruct import fit_options
 
 AS_IT_IS = "as it is"
-Settings = hs.Settings
 Row = dict[str, Any]
 
 
-def objective(**changed: float) -> Callable[[Settings], Settings]:
+def objective(**changed: float) -> Callable[[hs.Gaussians], hs.Gaussians]:
     """Other weights in the objective of the fit."""
     return lambda s: replace(s, fit=replace(s.fit, objective=replace(s.fit.objective, **changed)))
 
 
-def schedule(**changed: int) -> Callable[[Settings], Settings]:
+def schedule(**changed: int) -> Callable[[hs.Gaussians], hs.Gaussians]:
     """Another schedule of the fit."""
     return lambda s: replace(s, fit=replace(s.fit, schedule=replace(s.fit.schedule, **changed)))
 
 
-def without_noise_rules(s: Settings) -> Settings:
+def without_noise_rules(s: hs.Gaussians) -> hs.Gaussians:
     """The same weights and spacing, however noisy the frames are."""
     return objective(noise_gain=0.0)(replace(s, spacing_noise=0.0))
 
 
-VARIANTS: dict[str, Callable[[Settings], Settings]] = {
+VARIANTS: dict[str, Callable[[hs.Gaussians], hs.Gaussians]] = {
     AS_IT_IS: lambda s: s,
     "no two levels": objective(two_levels=0.0),
     "no total variation in the fit": objective(tv_volume=0.0),
@@ -76,18 +74,17 @@ class Runs:
         self._case, self._scan, self._truth = case, case.scan(), case.truth()
         self._starts: dict[str, hs.representations.GaussianCloud] = {}
 
-    def score(self, settings: Settings) -> Row:
+    def score(self, settings: hs.Gaussians) -> Row:
         """The numbers that matter, and how long the fit took (without the start) [s]."""
+        stage, task = GaussianStage(settings), Task(self._scan.train(), self._case.prior)
         key = repr(replace(settings, fit=hs.preset("default").fit))
         if key not in self._starts:
-            train, prior = self._scan.train(), self._case.prior
-            self._starts[key] = starting_cloud(train, prior, settings, 0, lambda stage, fraction: None)
+            self._starts[key] = stage.start(task, None)
         began = time.perf_counter()
-        cloud = self._starts[key].detached()
-        fit = Fit(self._scan, cloud, fit_options(self._case.prior, settings, cloud), 0)
+        fit = stage.fit(task, self._starts[key])
         fit.run(lambda record: None)
         seconds = time.perf_counter() - began
-        found = score_object(fit.result(), self._scan, self._truth, fit.instrument.oversample).headline()
+        found = score_object(finished(fit), self._scan, self._truth, fit.model.instrument.oversample).headline()
         return {"photons": self._case.photons or 0, "seconds": seconds, **found}
 
 

@@ -32,7 +32,7 @@ def main() -> None:
         matter = truth.delta > 0
         wall = truth.delta > 0.999 * truth.delta.max()
         cavity = binary_erosion(binary_fill_holes(matter) & ~matter)
-        found = hs.reconstruct(case.scan(), case.prior, hs.preset("default")).cloud.voxelise(truth.grid).delta
+        found = hs.reconstruct(case.scan(), case.prior, hs.preset("default")).object.voxelise(truth.grid).delta
         level = found[wall].mean()
         print(f"| {seed} | {level / truth.delta[wall].mean():.3f} | {found[cavity].mean() / level:.4f} |", flush=True)
     print(f"\nCommit {commit()}.")

@@ -15,17 +15,18 @@ import json
 import os
 import tempfile
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import torch
+from changes import changed
 from machine import commit
 
 import holosplat as hs
 from holosplat.bench.case import load_case
+from holosplat.io.json import write_json
 from holosplat.methods import Extraction, SurfaceFit, SurfaceOptions, finished
 from holosplat.methods.surfaces import extract_surfaces, oversampling, surface_fit
 from holosplat.representations import GaussianCloud, SurfaceMesh
@@ -57,19 +58,10 @@ def prepared(name: str, seed: int, runs: Path) -> tuple[hs.Scan, hs.Volume, Gaus
         hs.io.write_scan(scan, measured)
         hs.io.write_volume(truth, case.truth())
         hs.reconstruct(measured, case.prior, hs.preset("default"), seed, folder=run)
+        write_json(run.source, {"scan": str(scan.resolve()), "time_frame": None})  # for those who read the run later
     found = hs.load_reconstruction(run)
     assert isinstance(found.object, GaussianCloud)
     return hs.io.read_scan(scan), hs.io.read_volume(truth), found.object, found.oversample
-
-
-def with_changes(fit: SurfaceFit, changes: dict[str, Any]) -> SurfaceFit:
-    """The options with other values of those that `changes` names, wherever they are; other names are left out."""
-
-    def own(part: Any) -> dict[str, Any]:
-        return {name: value for name, value in changes.items() if name in vars(part)}
-
-    objective, schedule = replace(fit.objective, **own(fit.objective)), replace(fit.schedule, **own(fit.schedule))
-    return replace(fit, objective=objective, schedule=schedule, **own(fit))
 
 
 def fitted_surfaces(scan: hs.Scan, start: SurfaceMesh, options: SurfaceFit) -> SurfaceMesh:
@@ -106,9 +98,11 @@ def variants(name: str, seed: int, runs: Path) -> list[dict[str, Any]]:
     scan, truth, cloud, _ = prepared(name, seed, runs)
     sampling = oversampling(scan.train())
     rows = []
-    for called, changes in VARIANTS.items():
-        fit = with_changes(SurfaceFit(), {"oversample": sampling - changes.get("coarser", 0), **changes})
-        start = extract_surfaces(cloud, scan, Extraction(spacing=changes.get("spacing", 1.0)))
+    for called, every in VARIANTS.items():
+        changes = dict(every)
+        spacing, coarser = changes.pop("spacing", 1.0), changes.pop("coarser", 0)
+        fit = changed(SurfaceFit(), {"oversample": sampling - coarser, **changes})
+        start = extract_surfaces(cloud, scan, Extraction(spacing=spacing))
         began = time.process_time()
         found = fitted_surfaces(scan, start, fit)
         seconds = time.process_time() - began

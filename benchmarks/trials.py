@@ -13,32 +13,39 @@ import argparse
 import csv
 import os
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
+import numpy as np
 import torch
-from holosplat.fit.misfit import Draw, NarrowingBlur
-from holosplat.fit.waves import linear_response
-from holosplat.workflows.start import starting_cloud
 from machine import commit
+from second_order import cloud_of, gauss_newton, planned, quasi_newton
 from torch import Tensor
 from torch.nn.functional import softplus
 
 import holosplat as hs
 from holosplat.bench.case import load_case
+from holosplat.fit.batch import Batch
 from holosplat.fit.density import _pair
 from holosplat.fit.fidelity import Target
-from holosplat.fit.loop import Fit, FitOptions
-from holosplat.geometry import Poses
+from holosplat.fit.loop import Fit, Plan, Record
+from holosplat.fit.optimiser import Leaves, Optimiser
+from holosplat.fit.problem import Problem
+from holosplat.fit.terms import FrameTerm, Objective
+from holosplat.fit.terms.frames import NarrowingBlur, Weighted
+from holosplat.fit.terms.spectral import linear_response
+from holosplat.fit.trainable import Trainable
+from holosplat.methods import FitOptions, Task, finished, gaussian_fit
+from holosplat.methods.gaussians import GaussianStage, resolved
+from holosplat.model import Model
 from holosplat.optics.noise import sure_noise
-from holosplat.representations.gaussians import GaussianCloud, raw_of
+from holosplat.representations.gaussians import GaussianCloud
 from holosplat.workflows.evaluate import score_object
-from holosplat.workflows.reconstruct import fit_options
 
 CASES, SEEDS = ["cells8", "noise12-2000", "thesis16", "foam12"], [12]
 """Narrow fringes, noise, coarse pixels, much surface."""
@@ -46,22 +53,49 @@ FLOOR = 0.1
 """Of the response, in frames weighted by its inverse; as in the fit of voxels."""
 
 
-class Averaged(Fit):
-    """The mean of the parameters over the last third, with rates that fall threefold only."""
+class Averaging:
+    """An optimiser whose best parameters are the mean of those after its first `skipped` steps."""
 
-    def __init__(self, scan: hs.Scan, cloud: GaussianCloud, options: FitOptions) -> None:
-        super().__init__(scan, cloud, replace(options, schedule=replace(options.schedule, decay=0.3)))
-        self._sum, self._from = [torch.zeros_like(p) for p in cloud.parameters], options.schedule.steps * 2 // 3
+    def __init__(self, inner: Optimiser, leaves: Leaves, skipped: int) -> None:
+        self._inner, self._leaves, self._skipped, self._count = inner, leaves, skipped, 0
+        self._sums = {name: torch.zeros_like(leaf) for name, leaf in leaves.items()}
 
-    def _advance(self) -> None:
-        super()._advance()
-        if self.step > self._from:
-            for total, parameter in zip(self._sum, self.cloud.parameters):
-                total += parameter.detach()
+    def prepare(self, rates: Mapping[str, float]) -> None:
+        """See `Optimiser`."""
+        self._inner.prepare(rates)
 
-    def result(self) -> GaussianCloud:
+    def apply(self, loss: Tensor) -> None:
+        """See `Optimiser`."""
+        self._inner.apply(loss)
+        self._count += 1
+        if self._count > self._skipped:
+            for name, leaf in self._leaves.items():
+                self._sums[name] += leaf.detach()
+
+    def best(self) -> Leaves | None:
         """The mean."""
-        return self.cloud.replaced([total / (self.step - self._from) for total in self._sum])
+        added = self._count - self._skipped
+        return {name: total / added for name, total in self._sums.items()} if added > 0 else None
+
+    def resize(self, names: list[str], keep: Tensor, added: Mapping[str, Tensor]) -> None:
+        """See `Optimiser`."""
+        raise NotImplementedError("a mean needs the same Gaussians in all steps")
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `Optimiser`."""
+        return {"inner": self._inner.state_dict(), "count": self._count, "sums": self._sums}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """See `Optimiser`."""
+        self._inner.load(state["inner"])
+        self._count, self._sums = state["count"], state["sums"]
+
+
+def averaged(scan: hs.Scan, cloud: GaussianCloud, options: FitOptions) -> Fit:
+    """The mean of the parameters over the last third, with rates that fall threefold only."""
+    plan = planned(scan, cloud, replace(options, schedule=replace(options.schedule, decay=0.3)))
+    skipped = options.schedule.steps * 2 // 3
+    return Fit(replace(plan, optimiser=lambda leaves: Averaging(plan.optimiser(leaves), leaves, skipped)))
 
 
 class Thinned(GaussianCloud):
@@ -75,196 +109,127 @@ class Thinned(GaussianCloud):
         return softplus(self.raw_amplitudes) * self.mask
 
 
-class Dropout(Fit):
+@dataclass(frozen=True)
+class ThinnedProblem(Problem):
+    """A problem in which a `share` of the Gaussians is left out of every step of the first four fifths."""
+
+    share: float = 0.0
+    generator: torch.Generator | None = None
+
+    def loss(self, model: Model, batch: Batch) -> tuple[Tensor, Tensor, list[str]]:
+        """See `Problem`; the Gaussians that are left are enhanced for the others."""
+        if batch.progress >= 0.8:
+            return super().loss(model, batch)
+        whole = cloud_of(model)
+        thinned = Thinned(whole.parameters().values(), whole.unit_length, whole.matter)
+        kept = torch.rand(len(whole), 1, generator=self.generator) >= self.share
+        thinned.backend, thinned.mask = whole.backend, kept / (1 - self.share)
+        return super().loss(replace(model, object=thinned), batch)
+
+
+def dropout(scan: hs.Scan, cloud: GaussianCloud, options: FitOptions, share: float) -> Fit:
     """A share of the Gaussians left out of every step of the first four fifths, the others enhanced for it."""
-
-    def __init__(self, scan: hs.Scan, cloud: GaussianCloud, options: FitOptions, share: float) -> None:
-        super().__init__(scan, cloud, options)
-        self._share, self._random = share, torch.Generator().manual_seed(1)
-
-    def _work(self, draw: Draw) -> Tensor:
-        whole = self.cloud
-        if self.step < 0.8 * self.options.schedule.steps:
-            thinned = Thinned(whole.parameters, whole.unit_length, whole.delta, whole.beta, whole.second)
-            kept = torch.rand(len(whole), 1, generator=self._random) >= self._share
-            thinned.backend, thinned.mask = whole.backend, kept / (1 - self._share)
-            self.trainable.cloud = thinned
-        values = super()._work(draw)
-        self.trainable.cloud = whole
-        return values
+    plan = planned(scan, cloud, options)
+    p, generator = plan.problem, torch.Generator().manual_seed(1)
+    return Fit(replace(plan, problem=ThinnedProblem(p.model, p.terms, p.free, share, generator)))
 
 
-class Weighted(Fit):
+class FilteredFrames(FrameTerm):
+    """The data term of frames after a filter, which takes frames [V, H, W] and the share of the fit that is done."""
+
+    def __init__(
+        self, scan: hs.Scan, model: Model, objective: Objective, keep: Callable[[Tensor, Tensor], Tensor]
+    ) -> None:
+        super().__init__(scan, model.instrument, objective, cloud_of(model).matter)
+        self.measured, self.keep = torch.from_numpy(scan.frames), keep
+
+    def compared(self, predicted: Tensor, batch: Batch) -> dict[str, Weighted]:
+        """See `FrameTerm`."""
+        self._target = Target(self.keep(self.measured, batch.progress), self.low, self.span, "cpu")
+        return super().compared(self.keep(predicted, batch.progress), batch)
+
+
+def with_frames(plan: Plan, term: FrameTerm) -> Fit:
+    """A fit by another data term."""
+    return Fit(replace(plan, problem=replace(plan.problem, terms=(term, *plan.problem.terms[1:]))))
+
+
+def weighted(scan: hs.Scan, cloud: GaussianCloud, options: FitOptions) -> Fit:
     """Frames divided by the linear response of a view, above a floor that grows with noise: large shapes count more.
 
     The weight of the term is such that at the start its gradient in the amplitudes is as long as that of plain frames.
     """
-
-    def __init__(self, scan: hs.Scan, cloud: GaussianCloud, options: FitOptions) -> None:
-        super().__init__(scan, cloud, options)
-        self._frames, self._plain = self._misfit._target.frames, self._misfit._image_terms
-        self._misfit._image_terms = self._weighted_terms
-        noise = sure_noise(self._frames).mean() / self._misfit.span
-        response = linear_response(self.train.exposures, cloud.beta / cloud.delta)
-        weight = (1 / (response**2 + (FLOOR + 5 * noise) ** 2).sqrt()).float()
-        self._weight = torch.ones_like(weight)
-        plain = self._pull()
-        self._weight = weight
-        self._weight = weight * (plain / self._pull())
-
-    def _weighted_terms(self, predicted: Tensor, draw: Draw) -> dict[str, tuple[float | Tensor, Tensor]]:
-        misfit = self._misfit
-        misfit._target = Target(filtered(self._frames, self._weight), misfit.low, misfit.span, self.backend)
-        return self._plain(filtered(predicted, self._weight), draw)
-
-    def _pull(self) -> float:
-        """Length of the gradient of the image terms in the amplitudes."""
-        cloud, draw = self.cloud, self._draw()
-        predicted = self.instrument.frames(cloud.project(Poses.of(self.instrument.views, self.instrument.device)))
-        loss = sum(weight * value.mean() for weight, value in self._weighted_terms(predicted, draw).values())
-        return float(torch.autograd.grad(loss, cloud.raw_amplitudes)[0].norm())
+    plan, train = planned(scan, cloud, options), scan.train()
+    model = plan.problem.model
+    noise = float(sure_noise(torch.from_numpy(train.frames)).mean() / float(np.ptp(train.frames)))
+    response = linear_response(train.exposures, cloud.matter.beta / cloud.matter.delta)
+    relative = (1 / (response**2 + (FLOOR + 5 * noise) ** 2).sqrt()).float()
+    weight = torch.ones_like(relative)
+    term = FilteredFrames(train, model, options.objective, lambda frames, progress: filtered(frames, weight))
+    plain = pull(term, model)
+    weight = relative  # which `term` looks up anew
+    weight = relative * (plain / pull(term, model))
+    return with_frames(plan, term)
 
 
-class Relocating(Fit):
+def pull(term: FrameTerm, model: Model) -> float:
+    """Length of the gradient of the data term in the amplitudes."""
+    amplitudes = cloud_of(model).raw_amplitudes.detach().requires_grad_()
+    model = model.with_parameters({"object.raw_amplitudes": amplitudes})
+    part = term(model, Batch(None, torch.zeros(3, dtype=torch.float64), torch.tensor(0.0), 0))[0]
+    return float(torch.autograd.grad(part.value, amplitudes)[0].norm())
+
+
+class Relocation:
     """Every 25 steps, from 10 to 60 % of them, the 3 % of Gaussians of least mass go to where the objective pulls most.
 
     There they take half of a Gaussian (as in MCMC splatting, Kheradmand et al. 2024, without its noise). `by`: gradient
     that says where: `centres`, or `density` (of the amplitudes, over the volume of the Gaussian).
     """
 
-    def __init__(self, scan: hs.Scan, cloud: GaussianCloud, options: FitOptions, by: str) -> None:
-        super().__init__(scan, cloud, options)
-        self._by, self._pull = by, torch.zeros(len(cloud))
+    def __init__(self, count: int, by: str) -> None:
+        self._by, self._pull = by, torch.zeros(count)
 
-    def _work(self, draw: Draw) -> Tensor:
-        cloud = self.cloud
-        leaf = cloud.centres if self._by == "centres" else cloud.raw_amplitudes
-        handle = leaf.register_hook(self._record)
-        values = super()._work(draw)
-        handle.remove()
-        steps = self.options.schedule.steps
-        if 0.1 * steps <= self.step <= 0.6 * steps and self.step % 25 == 0:
-            self._relocate(max(1, round(0.03 * len(cloud))))
-        return values
-
-    def _record(self, gradient: Tensor) -> None:
+    def on_gradients(self, leaves: Leaves) -> None:
+        """Take in the gradients of one step."""
+        gradient = leaves["object.centres" if self._by == "centres" else "object.raw_amplitudes"].grad
+        assert gradient is not None
         size = gradient.norm(dim=1)
-        self._pull += size if self._by == "centres" else size / self.cloud.scales.detach().prod(dim=1)
+        volume = leaves["object.log_scales"].detach().exp().prod(dim=1)
+        self._pull += size if self._by == "centres" else size / volume
 
-    def _relocate(self, count: int) -> None:
-        cloud = self.cloud
-        mass = cloud.masses().detach().sum(dim=1)
-        lost = torch.topk(mass, count, largest=False).indices
+    def after_step(self, trainable: Trainable, step: int, steps: int, generator: torch.Generator) -> bool:
+        """Relocate, where it is due."""
+        if not 0.1 * steps <= step <= 0.6 * steps or step % 25:
+            return False
+        cloud = cloud_of(trainable.model)
+        count = max(1, round(0.03 * len(cloud)))
+        lost = torch.topk(cloud.masses().detach().sum(dim=1), count, largest=False).indices
         self._pull[lost] = 0
         chosen = torch.topk(self._pull, count).indices
         keep = torch.ones(len(cloud), dtype=torch.bool)
         keep[lost] = keep[chosen] = False
-        self.trainable.resize(torch.nonzero(keep)[:, 0], _pair(cloud, chosen, self._generator, shrink=1.26))
+        trainable.resize("object", torch.nonzero(keep)[:, 0], _pair(cloud, chosen, generator, shrink=1.26))
         self._pull = torch.zeros(len(cloud))
+        return True
+
+    def columns(self, model: Model) -> Record:
+        """None."""
+        return {}
+
+    def state_dict(self) -> dict[str, Any]:
+        """What was taken in since the last time."""
+        return {"pull": self._pull}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Go back to a saved state."""
+        self._pull = state["pull"]
 
 
-class Signed(GaussianCloud):
-    """A cloud whose amplitudes are its fourth parameter itself, of either sign."""
-
-    @property
-    def amplitudes(self) -> Tensor:
-        """Peak values [N, C]."""
-        return self.raw_amplitudes
-
-
-class GaussNewton(Fit):
-    """Before steps 0, 100 and 200, three Levenberg–Marquardt steps for all amplitudes together.
-
-    The curvature is that of the frames (absolute differences reweighted as squares), the gradient that of the whole
-    objective; ten conjugate gradients a step; a step that does not lower the objective is taken back.
-    """
-
-    damping = 1e-3
-
-    def _advance(self) -> None:
-        if self.step % 100 == 0:
-            for _ in range(3):
-                self._amplitude_step()
-        super()._advance()
-
-    def _amplitude_step(self) -> None:
-        draw, cloud = self._draw(), self.cloud.detached()
-        amplitudes = cloud.amplitudes.requires_grad_()
-        signed = with_amplitudes(cloud, amplitudes)
-        before = self._misfit(signed, draw)[0]
-        gradient = torch.autograd.grad(before, amplitudes)[0]
-        poses = Poses.of(self.instrument.views, self.instrument.device)
-        with torch.no_grad():
-            lines = signed.project(poses)
-            difference = self.instrument.frames(lines) - self._misfit._target.frames
-        weight = 1 / (difference.abs() + 0.01 * self._misfit.span) / difference.numel() / self._misfit.span
-
-        def curvature(direction: Tensor) -> Tensor:
-            along = with_amplitudes(cloud, direction).project(poses).channels
-            size = 0.01 * lines.channels.abs().max() / along.abs().max().clamp_min(1e-20)
-            with torch.no_grad():
-                ahead, behind = (
-                    self.instrument.frames(replace(lines, channels=lines.channels + s * size * along)) for s in (1, -1)
-                )
-            change = weight * (ahead - behind) / (2 * size)
-            frames = self.instrument.frames(signed.project(poses))  # anew: its gradient can be taken once
-            return torch.autograd.grad(frames, amplitudes, change)[0]
-
-        scale = float((curvature(gradient) * gradient).sum() / gradient.square().sum())
-        move = conjugate_gradients(lambda v: curvature(v) + self.damping * scale * v, -gradient)
-        moved = (amplitudes.detach() + move).clamp_min(1e-4)
-        with torch.no_grad():
-            after = self._misfit(with_amplitudes(cloud, moved), draw)[0]
-            better = bool(after < before)
-            self.damping *= 0.3 if better else 10.0
-            if better:
-                self.cloud.raw_amplitudes.copy_(raw_of(moved))
-
-
-class QuasiNewton(Fit):
-    """L-BFGS with a strong line search in place of Adam, as many gradients, in five rounds of one objective each.
-
-    Parameters are in units of a hundred of Adam's steps; gradients in units of the first loss.
-    """
-
-    def _advance(self) -> None:
-        steps, draw, start = self.options.schedule.steps, self._draw(), self.cloud.detached()
-        units = [100 * rate for rate in self.options.schedule.rates(0)]
-        leaves = [torch.zeros_like(p).requires_grad_() for p in start.parameters]
-        evaluations = min(steps // 5, steps - self.step)
-        optimiser = torch.optim.LBFGS(
-            leaves,
-            max_iter=evaluations,
-            max_eval=evaluations,
-            history_size=20,
-            tolerance_grad=0.0,
-            tolerance_change=0.0,
-            line_search_fn="strong_wolfe",
-        )
-
-        def cloud() -> GaussianCloud:
-            return start.replaced([p + unit * x for p, unit, x in zip(start.parameters, units, leaves)])
-
-        scale = float(self._misfit(start, draw)[0])
-
-        def closure() -> Tensor:
-            optimiser.zero_grad()
-            loss = self._misfit(cloud(), draw)[0] / scale
-            loss.backward()
-            return loss.detach()
-
-        optimiser.step(closure)
-        self.step += evaluations
-        with torch.no_grad():
-            for leaf, found in zip(self.cloud.parameters, cloud().parameters):
-                leaf.copy_(found)
-
-
-def with_amplitudes(cloud: GaussianCloud, amplitudes: Tensor) -> Signed:
-    """`cloud` with other amplitudes [N, C], of either sign."""
-    signed = Signed([*cloud.parameters[:3], amplitudes], cloud.unit_length, cloud.delta, cloud.beta, cloud.second)
-    signed.backend = cloud.backend
-    return signed
+def relocating(scan: hs.Scan, cloud: GaussianCloud, options: FitOptions, by: str) -> Fit:
+    """Gaussians of little mass go to where the objective pulls most."""
+    plan = planned(scan, cloud, options)
+    return Fit(replace(plan, events=(*plan.events, Relocation(len(cloud), by))))
 
 
 def filtered(frames: Tensor, transfer: Tensor) -> Tensor:
@@ -273,50 +238,37 @@ def filtered(frames: Tensor, transfer: Tensor) -> Tensor:
     return torch.fft.irfft2(spectra, s=(frames.shape[1], frames.shape[2])) + 1
 
 
-def conjugate_gradients(matrix: Callable[[Tensor], Tensor], right: Tensor, steps: int = 10) -> Tensor:
-    """An approximate solution of `matrix(x) = right` (Hestenes & Stiefel 1952)."""
-    found, residual = torch.zeros_like(right), right.clone()
-    direction, square = residual.clone(), residual.square().sum()
-    for _ in range(steps):
-        image = matrix(direction)
-        length = square / (direction * image).sum().clamp_min(1e-30)
-        found, residual = found + length * direction, residual - length * image
-        square, last = residual.square().sum(), square
-        direction = residual + square / last * direction
-    return found
-
-
 def blurred(scan: hs.Scan, cloud: GaussianCloud, options: FitOptions, sigma: float) -> Fit:
     """Frames compared coarse to fine from `sigma` pixels on, whether there is noise or not."""
-    fit = Fit(scan, cloud, options)
-    fit._misfit._blur = NarrowingBlur(fit.train.frames.shape[1:], sigma, torch.device("cpu"))
-    return fit
+    plan, train = planned(scan, cloud, options), scan.train()
+    blur = NarrowingBlur(train.frames.shape[1:], sigma, torch.device("cpu"))
+    return with_frames(plan, FilteredFrames(train, plan.problem.model, replace(options.objective, coarse=0.0), blur))
 
 
 def judged(scan: hs.Scan, cloud: GaussianCloud, options: FitOptions) -> Fit:
     """Two training views set aside, looked at every 25 steps, to choose the best state."""
-    return Fit(scan, cloud, replace(options, schedule=replace(options.schedule, validation_views=2)))
+    return gaussian_fit(scan, cloud, replace(options, schedule=replace(options.schedule, validation_views=2)))
 
 
 def densified(scan: hs.Scan, cloud: GaussianCloud, options: FitOptions) -> Fit:
     """Density control as splatting has it: 5 % cloned or split every 50 steps, by the gradient of positions."""
     control = replace(options.density, every=50, start=0.1, stop=0.6)
-    return Fit(scan, cloud, replace(options, density=control))
+    return gaussian_fit(scan, cloud, replace(options, density=control))
 
 
 TRIALS: dict[str, Callable[[hs.Scan, GaussianCloud, FitOptions], Fit]] = {
-    "as it is": Fit,
-    "mean of the late iterates": Averaged,
-    "dropout of a tenth": partial(Dropout, share=0.1),
-    "dropout of three tenths": partial(Dropout, share=0.3),
+    "as it is": gaussian_fit,
+    "mean of the late iterates": averaged,
+    "dropout of a tenth": partial(dropout, share=0.1),
+    "dropout of three tenths": partial(dropout, share=0.3),
     "blurred by 1 px at first": partial(blurred, sigma=1.0),
     "blurred by 2 px at first": partial(blurred, sigma=2.0),
-    "weighted by the response": Weighted,
-    "Gauss–Newton for the amplitudes": GaussNewton,
-    "L-BFGS": QuasiNewton,
+    "weighted by the response": weighted,
+    "Gauss–Newton for the amplitudes": gauss_newton,
+    "L-BFGS": quasi_newton,
     "growth by gradient": densified,
-    "relocation": partial(Relocating, by="centres"),
-    "relocation by density": partial(Relocating, by="density"),
+    "relocation": partial(relocating, by="centres"),
+    "relocation by density": partial(relocating, by="density"),
     "best by validation views": judged,
 }
 
@@ -337,13 +289,14 @@ def main() -> None:
         for seed in options.seeds:
             case = load_case(name, seed, options.snapshots)
             scan, truth = case.scan(), case.truth()
-            start = starting_cloud(scan.train(), case.prior, settings, 0, lambda stage, fraction: None)
+            start = GaussianStage(settings).start(Task(scan.train(), case.prior), None)
+            fit_options = resolved(settings.fit, case.prior, start.matter)
             for trial in options.trials:
                 began = time.perf_counter()
-                fit = TRIALS[trial](scan, start.detached(), fit_options(case.prior, settings, start))
+                fit = TRIALS[trial](scan, start, fit_options)
                 fit.run(lambda record: None)
                 seconds = time.perf_counter() - began
-                found = score_object(fit.result(), scan, truth, fit.instrument.oversample).headline()
+                found = score_object(finished(fit), scan, truth, fit.model.instrument.oversample).headline()
                 rows.append(
                     {"case": name, "seed": seed, "trial": trial, "commit": commit(), "seconds": seconds, **found}
                 )

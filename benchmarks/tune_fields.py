@@ -15,8 +15,8 @@ import csv
 import os
 import sys
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -24,16 +24,15 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
 import torch
-from holosplat.fit.neural import NeuralFit, fit_neural
-from holosplat.fit.voxels import VoxelFit, fit_voxels
-from holosplat.workflows.settings import preset
+from changes import changed
 from machine import commit
 
 from holosplat.bench.case import Case, load_case
-from holosplat.bench.methods import holographic_voxels
+from holosplat.methods import Method, NeuralFields, NeuralFit, Task, VoxelFit, Voxels, finished
+from holosplat.methods.presets import preset
+from holosplat.methods.voxels import HolographicStage
 from holosplat.optics.sampling import fringe_sampling
-from holosplat.representations import Encoding, Matter, Network, VoxelGrid
-from holosplat.volume import Object
+from holosplat.representations import Encoding, Network, Stored, VoxelGrid
 from holosplat.workflows.evaluate import score_object
 
 CASES, SEEDS = ["cells8", "noise12-2000", "thesis16"], [11]
@@ -56,27 +55,25 @@ NEURAL: dict[str, Sequence[Any]] = {
     "network": (Network(hidden=64), Network(Encoding(levels=5)), Network(Encoding(kind="fourier"))),
 }
 TABLES = {"voxels": VOXELS, "neural": NEURAL}
-Fitted = Callable[[Any], Object]
+METHODS = {"voxels": (Voxels, VoxelFit()), "neural": (NeuralFields, NeuralFit())}
 
 
-def fits(case: Case, start: VoxelGrid) -> dict[str, tuple[Any, Fitted]]:
-    """Of each method the default options, and what fits a case with given ones."""
-    train = case.scan().train()
-    thickness = start.project(train.views).channels[:, 0]
-    matter = Matter(start.delta, start.beta, 1, upper=1.0)
-
-    def quiet(stage: str, fraction: float) -> None: ...
-
-    return {
-        "voxels": (VoxelFit(), lambda options: fit_voxels(train, start, options, quiet)),
-        "neural": (NeuralFit(), lambda options: fit_neural(train, matter, thickness, options, 0, quiet)),
-    }
+def continued(method: Method, task: Task, start: VoxelGrid) -> Stored:
+    """What the stages of `method` make of `start`, which stands for its first stage."""
+    found: Stored = start
+    for stage in method.stages()[1:]:
+        found = stage.start(task, found)
+        fit = stage.fit(task, found)
+        if fit is not None:
+            fit.run(lambda record: None)
+            found = finished(fit)
+    return found
 
 
 def variants(options: Any, table: dict[str, Sequence[Any]]) -> list[tuple[str, Any]]:
     """The options as they are, and with every single other value of the table."""
     others = [(name, value) for name, values in table.items() for value in values]
-    return [("as it is", options), *((_label(k, v), replace(options, **{k: v})) for k, v in others)]
+    return [("as it is", options), *((_label(k, v), changed(options, {k: v})) for k, v in others)]
 
 
 def _label(name: str, value: Any) -> str:
@@ -97,15 +94,15 @@ def scored(case: Case, methods: Sequence[str], varied: Sequence[str]) -> list[di
     if case.prior.kind != "known":
         raise SystemExit(f"{case.name} tells nothing of its material; choose cases of a known one.")
     scan, truth = case.scan(), case.truth()
-    start = holographic_voxels(scan.train(), case.prior, preset("default").volume, lambda stage, fraction: None)
+    task = Task(scan.train(), case.prior)
+    start = HolographicStage(preset("default").volume).start(task, None)
     oversample, rows = fringe_sampling(scan.exposures), []
-    runs = fits(case, start)
     for name in methods:
-        options, fit = runs[name]
+        method, options = METHODS[name]
         table = {k: v for k, v in TABLES[name].items() if not varied or k in varied}
         for label, chosen in variants(options, table):
             began = time.perf_counter()
-            found = fit(chosen)
+            found = continued(method(fit=chosen), task, start)
             seconds = time.perf_counter() - began
             numbers = score_object(found, scan, truth, oversample).headline()
             rows.append({"case": case.name, "seed": case.seed, "method": name, "variant": label, "commit": commit()})

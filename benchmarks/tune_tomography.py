@@ -22,13 +22,14 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
 import torch
-from holosplat.bench.svmbir import Mbir, svmbir_volume
 from machine import commit
 
 import holosplat as hs
 from holosplat.baselines.algebraic import Algebraic, art, sirt
 from holosplat.baselines.filtered_backprojection import Ramp, filtered_backprojection
 from holosplat.baselines.tomography import TOMOGRAPHIES, TotalVariation, total_variation
+from holosplat.matter import Matter
+from holosplat.methods.svmbir import Mbir, svmbir_volume
 from holosplat.metrics import image_scores, intensity_range, volume_scores
 from holosplat.optics.retrieval import RETRIEVALS
 from holosplat.optics.sampling import fringe_sampling
@@ -117,7 +118,7 @@ def row(job: Job, method: Callable[..., torch.Tensor], held_out: bool) -> str:
     began = time.perf_counter()
     volume = method(job.lines, train.views, grid, 1.0, lambda fraction: None)
     seconds = time.perf_counter() - began
-    voxels = VoxelGrid(volume[None], grid, *HAEMOGLOBIN)
+    voxels = VoxelGrid(volume[None], grid, Matter.one(*HAEMOGLOBIN))
     scores = volume_scores(voxels.voxelise(grid), job.truth)
     cells = f"{scores.dice:.4f} | {scores.relative_error_delta:.4f} | {seconds:.1f}"
     if not held_out:

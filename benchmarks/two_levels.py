@@ -16,19 +16,20 @@ from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-from holosplat.workflows.settings import MaterialPrior, preset
-from holosplat.workflows.start import assumed_material
 from machine import commit
 
 from holosplat.baselines import holographic_tv
 from holosplat.baselines.two_materials import Levels, best_levels
 from holosplat.bench.case import Case, case_names, load_case
+from holosplat.matter import MaterialPrior
+from holosplat.methods.presets import preset
+from holosplat.methods.start import assumed_material
 
 
 def levels_of(case: Case) -> Levels:
     """The two levels of a case that is told nothing of its matter."""
     train = case.scan().train()
-    material = assumed_material(train, MaterialPrior(), lambda stage, fraction: None)
+    material = assumed_material(train, MaterialPrior.unknown(), lambda stage, fraction: None)
     unbounded = replace(preset("default").volume, upper=0.0)
     volume, grid = holographic_tv(train, material, unbounded, lambda stage, fraction: None)
     return best_levels(volume * material.delta, round(train.views.pixel_size / grid.voxel_size[0]) or 1)

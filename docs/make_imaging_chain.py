@@ -134,7 +134,7 @@ def row(name: str, work: Path, preset: str) -> dict[str, float]:
         prior = hs.MaterialPrior.known(hs.materials.HAEMOGLOBIN.delta_beta(ENERGY))
         result = hs.reconstruct(scan, prior, hs.preset(preset))
         headline = hs.evaluate(result, ideal(), truth).headline()
-        np.save(kept.with_suffix(".npy"), result.cloud.voxelise(truth.grid).delta[:, SIDE // 2])
+        np.save(kept.with_suffix(".npy"), result.object.voxelise(truth.grid).delta[:, SIDE // 2])
         kept.with_suffix(".json").write_text(json.dumps({score: headline[score] for score in SCORES}))
         print(f"{name}: {time.monotonic() - started:.0f} s", flush=True)
     return json.loads(kept.with_suffix(".json").read_text())

@@ -95,7 +95,7 @@ def imperfections() -> None:
         scores = hs.evaluate(result, scan, truth).headline()
         print(f"| {name} | {scores['ssim']:.3f} | {scores['dice']:.3f} | {scores['relative_error_delta']:.3f} |")
         draw(above, scan.frames[2][INNER], name, **CONTRAST)
-        delta, outline = (v.delta[middle][INNER] / MATERIAL.delta for v in (result.cloud.voxelise(grid), truth))
+        delta, outline = (v.delta[middle][INNER] / MATERIAL.delta for v in (result.object.voxelise(grid), truth))
         draw(below, delta, f"δ of a slice, Dice {scores['dice']:.2f}", cmap="magma", vmin=0, vmax=1)
         below.contour(outline, [0.5], colors="w", linewidths=0.6)
     figure.savefig(IMAGES / "simulation_imperfections.png", dpi=110)

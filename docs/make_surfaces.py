@@ -25,9 +25,9 @@ from holosplat.report.surface import Deviation, render_surface
 def main(run: Path, truth: Path) -> None:
     """Draw docs/images/surfaces.png: the truth, and how far Gaussians and surfaces lie from it."""
     true, folder = hs.io.read_volume(truth), hs.RunFolder(run)
-    cloud = hs.load_reconstruction(folder).cloud
+    cloud = hs.load_reconstruction(folder).object
     found = hs.methods.refine_surfaces(cloud, hs.io.read_scan(folder.source_scan()))
-    level, limit = 0.5 * cloud.delta, 0.5 * max(true.grid.voxel_size)
+    level, limit = 0.5 * cloud.matter.delta, 0.5 * max(true.grid.voxel_size)
     colours = matplotlib.colormaps[SIGNED_MAP]
     paint = Deviation(true.delta, level, limit, lambda d: colours(0.5 + 0.5 * d)[:, :3])
     panels = (

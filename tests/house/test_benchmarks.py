@@ -13,8 +13,9 @@ import torch
 
 from holosplat.fit.schedule import Schedule
 from holosplat.fit.terms import Objective
-from holosplat.methods import FitOptions
+from holosplat.methods import FitOptions, GaussianRates
 from holosplat.methods.presets import preset
+from holosplat.model import measure
 from holosplat.projectors.splat import splat
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
@@ -24,13 +25,7 @@ BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 def scripts(monkeypatch: pytest.MonkeyPatch) -> dict[str, ModuleType]:
     """The modules of benchmarks/, which import one another by bare names."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
-    return {
-        name: importlib.import_module(name)
-        for name in (
-            *("step", "eager_step", "kernels", "plain_torch", "ablation", "simulate"),
-            *("tweezers", "espresso_flow", "tune_fields", "trials", "two_levels", "cavity"),
-        )
-    }
+    return {path.stem: importlib.import_module(path.stem) for path in BENCHMARKS.glob("*.py")}
 
 
 @pytest.mark.parametrize("add", ["index_add_", "scatter_add_"])
@@ -119,22 +114,22 @@ def test_every_trial_lowers_the_misfit_in_a_way_of_its_own(scripts):
     scan, cloud = scripts["step"].workload(60, 40)
     found = {}
     for name, make in scripts["trials"].TRIALS.items():
-        schedule = Schedule(steps=100, rate_position=0.05, rate_scale=0.03, rate_amplitude=0.05, validate_every=10)
-        fit = make(scan, cloud.detached(), FitOptions(Objective(), schedule))
-        before = fit.instrument.measure(cloud.detached())
+        schedule, rates = Schedule(steps=100, validate_every=10), GaussianRates(0.05, 0.03, 0.01, 0.05)
+        fit = make(scan, cloud, FitOptions(Objective(), schedule, rates))
         fit.run(lambda record: None)
-        after = fit.instrument.measure(fit.result())
-        measured = torch.from_numpy(fit.train.frames)
+        oversample = fit.model.instrument.oversample
+        before, after = (measure(obj, scan.exposures, oversample) for obj in (cloud, fit.result().object))
+        measured = torch.from_numpy(scan.frames)
         gain = float((after - measured).abs().mean() / (before - measured).abs().mean())
         assert gain < 0.95, name
-        found[name] = (len(fit.cloud), round(gain, 3))
+        found[name] = (len(fit.result().object), round(gain, 3))
     assert len(set(found.values())) == len(found), found
 
 
 def test_conjugate_gradients_solve_what_they_are_given(scripts):
     factor = torch.randn(6, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     matrix, right = factor @ factor.T + torch.eye(6), torch.arange(6.0, dtype=torch.float64)
-    found = scripts["trials"].conjugate_gradients(lambda v: matrix @ v, right)
+    found = scripts["second_order"].conjugate_gradients(lambda v: matrix @ v, right)
     torch.testing.assert_close(matrix @ found, right, rtol=1e-6, atol=1e-6)
 
 
@@ -204,3 +199,24 @@ def test_the_table_of_fields_compares_with_the_defaults(scripts):
         for case, label, error in (("a", "as it is", 0.2), ("b", "as it is", 0.1), ("a", "x", 0.1), ("b", "x", 0.2))
     ]
     assert scripts["tune_fields"].table(rows, "voxels")[-1] == "| x | 0.150 | ×0.50, ×2.00 | 0.900 | 0.800 / 0.700 |"
+
+
+def test_every_variant_of_surfaces_changes_something(scripts):
+    surfaces, changed = scripts["surfaces"], scripts["changes"].changed
+    found = {}
+    for name, changes in surfaces.VARIANTS.items():
+        of_fit = {k: v for k, v in changes.items() if k not in ("spacing", "coarser")}
+        found[name] = (changed(surfaces.SurfaceFit(), of_fit), changes.get("spacing"), changes.get("coarser"))
+    assert found.pop("as they are") == (surfaces.SurfaceFit(), None, None)
+    assert (surfaces.SurfaceFit(), None, None) not in found.values()
+    assert found["40 steps"][0].schedule.steps == 40
+    assert found["no smoothness"][0].objective.bending == 0
+
+
+def test_changed_options_must_exist(scripts):
+    tune = scripts["tune_fields"]
+    found = scripts["changes"].changed(tune.VoxelFit(), {"steps": 7, "floor": 0.3, "decay": 0.5})
+    assert (found.steps, found.objective.floor, found.schedule.decay) == (7, 0.3, 0.5)
+    assert found.schedule.steps == tune.VoxelFit().schedule.steps  # its own steps are what a name means
+    with pytest.raises(KeyError, match="VoxelFit has no option flour"):
+        scripts["changes"].changed(tune.VoxelFit(), {"flour": 0.3})
