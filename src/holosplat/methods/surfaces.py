@@ -23,7 +23,6 @@ from ..matter import MaterialPrior
 from ..optics.noise import noise_share
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
-from ..projectors.sparse import torch_csr
 from ..representations import GaussianCloud, Stored, SurfaceMesh, isosurface
 from ..representations.isosurface import adjacency, neighbour_mean
 from ..scan import Scan
@@ -204,7 +203,7 @@ def _bending(train: Scan, start: SurfaceMesh, objective: Objective) -> list[Term
     weight = objective.bending * (1 + objective.noise_gain * noise_share(frames)) / frames[0].numel()
     count = len(start.vertices)
     away = csr_array(eye_array(count) - neighbour_mean(start.faces.numpy(), count))
-    return [Bending(weight, torch_csr(csr_array(away @ away), torch.float64))]
+    return [Bending(weight, csr_array(away @ away))]
 
 
 def _membrane(start: SurfaceMesh, stiffness: float) -> Callable[[Tensor], Tensor]:

@@ -88,36 +88,40 @@ class FrameTerm:
     def compared(self, predicted: Tensor, batch: Batch) -> dict[str, Weighted]:
         """Weight and value [V] of every comparison in use."""
         w, target = self.objective, self._target if batch.index is None else self._target[batch.index]
-        if w.ssim > 0:
-            difference, dissimilarity = l1_and_ssim(predicted, target)
-        else:  # statistics of frames are not needed
-            difference, dissimilarity = comparisons.l1(predicted, target.frames) / self.span, predicted
-        if w.noise_width > 0 or self._blur:
-            difference = self._beyond_noise(predicted, target.frames, batch) / self.span
+        fused = l1_and_ssim(predicted, target) if w.ssim > 0 else None
         a, b = ((f - self.low) / self.span if w.tv_image + w.frc > 0 else f for f in (predicted, target.frames))
         table: dict[str, Callable[[], Tensor]] = {
-            "l1": lambda: difference,
+            "l1": lambda: self._absolute(predicted, target, batch) if fused is None or self._noisy else fused[0],
             "l2_amplitude": lambda: comparisons.l2_amplitude(predicted, target.frames),
-            "ssim": lambda: dissimilarity,
             "tv_image": lambda: comparisons.tv_image(a),
             "frc": lambda: comparisons.one_minus_frcm(a, b),
             "rounded": lambda: comparisons.rounded((predicted - target.frames) / self.span, self._rounding),
             "spectral": lambda: self._spectral(predicted, batch),
         }
+        if fused is not None:
+            table["ssim"] = lambda: fused[1]
         ramps = {"frc": (batch.progress / max(w.frc_ramp, 1e-9)).clamp_max(1.0)}
-        weights = {name: getattr(w, name) for name in table}
+        weights = {name: getattr(w, name) for name in IMAGE_TERMS}
         return {n: (weight * ramps.get(n, 1.0), table[n]()) for n, weight in weights.items() if weight > 0}
 
     def _spectral(self, predicted: Tensor, batch: Batch) -> Tensor:
         assert self.spectral is not None
         return self.spectral(predicted, batch.index)
 
-    def _beyond_noise(self, predicted: Tensor, measured: Tensor, batch: Batch) -> Tensor:
-        """Huber's function of the differences [V] of frames [V, H, W] that are as blurred as is due."""
+    @property
+    def _noisy(self) -> bool:
+        """Whether differences within the noise count less, or frames are compared coarse to fine."""
+        return self.objective.noise_width > 0 or self._blur is not None
+
+    def _absolute(self, predicted: Tensor, target: Target, batch: Batch) -> Tensor:
+        """Mean absolute differences [V], or Huber's function of those of frames that are as blurred as is due."""
+        measured = target.frames
+        if not self._noisy:
+            return comparisons.l1(predicted, measured) / self.span
         width = self._width if batch.index is None else self._width.index_select(0, batch.index)
         if self._blur:
             predicted, measured = (self._blur(frames, batch.progress) for frames in (predicted, measured))
-        return comparisons.huber(predicted, measured, width)
+        return comparisons.huber(predicted, measured, width) / self.span
 
 
 class NarrowingBlur:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from typing import Any
 
+import numpy as np
 import torch
+from scipy.sparse import csr_array
 from torch import Tensor
 
 from ...geometry import Grid
@@ -81,15 +84,29 @@ class Bending:
 
     names = ("bending",)
 
-    def __init__(self, weight: float, operator: Tensor) -> None:
+    def __init__(self, weight: float, operator: csr_array) -> None:
         """operator: L² [P, P], sparse float64."""
-        self._weight, self._operator = weight, operator
+        self._weight, self._operators = weight, (operator, csr_array(operator.T))
         self.resolved = {"bending": weight}
 
     def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
         """The one part."""
         vertices = model.parameters()["object.vertices"]
-        return [Part("bending", self._weight, torch.sparse.mm(self._operator, vertices).square().sum())]
+        return [Part("bending", self._weight, _SquaredProduct.apply(vertices, *self._operators))]
+
+
+class _SquaredProduct(torch.autograd.Function):
+    """Σ (A x)² of a sparse A on the CPU; torch's own backward pass would transpose A anew in every step."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, matrix: csr_array, transposed: csr_array) -> Tensor:  # type: ignore[override]
+        product = matrix @ x.detach().numpy()
+        ctx.slope = torch.from_numpy(2 * (transposed @ product))
+        return x.new_tensor(np.square(product).sum())
+
+    @staticmethod
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, None, None]:  # type: ignore[override]
+        return upstream * ctx.slope, None, None
 
 
 class VoxelVariation:
