@@ -121,9 +121,11 @@ def overridden(base: Any, assignments: Sequence[str]) -> Any:
 
     Names in the middle of a path may be left out where one field only is meant (`fit.steps=500`). The field's type
     says how the value is read: `none` is None, lists are in brackets (`[1, 2]`), text needs no quotes. The path that
-    ends in `kind` chooses the member of a union. Raises `InputError` for a path that names no field (the message has
+    ends in `kind` chooses the member of a union. The values are checked together, so that their order does not matter
+    (one weight to zero, another one up). Raises `InputError` for a path that names no field (the message has
     the nearest ones) or several, and for a value that the field cannot take.
     """
+    together: dict[str, Any] = {}
     for assignment in assignments:
         path, equals, text = assignment.partition("=")
         require(
@@ -134,8 +136,10 @@ def overridden(base: Any, assignments: Sequence[str]) -> Any:
         change: Any = _parsed(hint, text.strip())
         for name in reversed(names):
             change = {name: change}
-        base = changed(base, change)
-    return base
+        together = merged(together, change)
+        if names[-1] == "kind":  # later paths are those of the new member
+            base, together = changed(base, together), {}
+    return changed(base, together) if together else base
 
 
 def paths(base: Any) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from typing import ClassVar, Literal
 import pytest
 
 from holosplat.checks import InputError, at_least
+from holosplat.methods import Voxels
 from holosplat.tables import changed, from_table, merged, overridden, paths, read_table, to_table
 
 
@@ -159,6 +160,10 @@ def test_a_field_is_changed_by_its_path(assignment, read):
 def test_assignments_follow_one_another():
     assert overridden(Whole(), ["steps=1", "steps=2", "name=x"]) == Whole("x", Cloud(fit=Fit(Schedule(2))))
     assert overridden(Whole(), []) == Whole()
+    weights = ["fit.objective.spectral=0", "fit.objective.l1=1"]  # neither order may pass through an empty objective
+    for order in (weights, weights[::-1]):
+        objective = overridden(Voxels(), order).fit.objective
+        assert (objective.spectral, objective.l1) == (0.0, 1.0)
     changed_kind = overridden(Whole(method=Lattice(3)), ["method.kind=cloud", "spacing=3"])
     assert changed_kind.method == Cloud(3.0)
 
