@@ -65,7 +65,9 @@ class _Hologram(torch.autograd.Function):
             path_gradients = factor_gradients(spectrum, passed, path.rows, path.columns)
         if not of_lines:
             return None, None, None, *path_gradients, *blur_gradients
-        wave, out = _inverse(_transfer(spectrum, path.rows, path.columns, conjugate=True)), torch.empty_like(lines)
+        wave = _inverse(_transfer(spectrum, path.rows, path.columns, conjugate=True))
+        del spectrum  # a wave's worth of memory, before the next array is made
+        out = torch.empty_like(lines)
         _call("exit_wave_backward", _raster(lines), ctx.table, lines, wave, out)
         return out, None, None, *path_gradients, *blur_gradients
 
