@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,10 +9,10 @@ import pytest
 
 import holosplat as hs
 from helpers.bench_shop import SHAPES, Recorder, fail, make_case, suite
+from helpers.cli import holosplat as run_command
 from holosplat.bench import record
 from holosplat.bench.folder import BenchFolder
 from holosplat.bench.run import chosen, run_suite
-from holosplat.cli import main
 
 # --- names and folders --------------------------------------------------------------------------------------
 
@@ -66,17 +63,8 @@ def test_names_that_could_leave_the_folder_are_refused(tmp_path):
 
 def holosplat(*arguments: object) -> tuple[int, str, str]:
     """Exit code, stdout and stderr of a command run within this process."""
-    out, err, before = io.StringIO(), io.StringIO(), sys.argv
-    sys.argv, code = ["holosplat", *map(str, arguments)], 0
-    try:
-        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-            main()
-    except SystemExit as end:
-        code = end.code or 0
-    finally:
-        sys.argv = before
-    assert isinstance(code, int)
-    return code, out.getvalue(), err.getvalue()
+    done = run_command(*arguments)
+    return done.code, done.out, done.err
 
 
 @pytest.fixture
