@@ -2,39 +2,70 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from ..checks import InputError, require
 from ..scan import Scan
-from . import nerf_synthetic, nxtomo, r2_gaussian, run_scan, tiff
+from . import arrays, euxfel, exchange, images, nerf_synthetic, nxtomo, r2_gaussian, run_scan, tiff
 from .loader import Loader
+from .raw_file import ScanFile, with_fields
+from .reading import Reading
 
 ScanFormat = Literal["nxtomo", "nerf-synthetic", "tiff", "r2-gaussian"]
 """Formats that scans are written in."""
 
 LOADERS: tuple[Loader, ...] = (
     nxtomo.LOADER,
+    exchange.LOADER,
+    arrays.LOADER,
     tiff.LOADER,
+    images.LOADER,
+    euxfel.LOADER,
     nerf_synthetic.LOADER,
     r2_gaussian.LOADER,
-    run_scan.loader(lambda path: read(path)),
+    run_scan.loader(lambda path, reading: read_as(path, reading)),
 )
 """Every format that scans are read from; a new one is a file and a line here (docs/adding.md)."""
 
 
-def read(path: str | Path, given: Mapping[str, float] | None = None) -> Scan:
+def read(path: str | Path, given: Mapping[str, Any] | None = None) -> Scan:
     """The scan at `path`, a file or folder of any format in `LOADERS`.
 
-    given: values that folders of other programs lack, by name (`Loader.takes`): energy_kev [keV], distance [m],
-    pixel_size [m], black and white [relative intensity]. Errors: `InputError` for a path that does not exist, holds no
-    known scan or a damaged one, and for `given` values that do not belong to its format.
+    given: values that files lack, or that go before theirs, by name (`Loader.takes`): energy_kev [keV], distance [m],
+    pixel_size [m], angles_deg [N], and the others of `Loader.takes`. Errors: `InputError` for a path that does not
+    exist, holds no known scan or a damaged one, and for `given` values that do not belong to its format.
     """
-    loader, given = loader_of(path), given or {}
+    given = given or {}
+    return _loader_for(path, given).read(Path(path), given)
+
+
+def read_as(path: str | Path, reading: Reading) -> Scan:
+    """The scan at `path`, as `read`, with what is said of it beside its files, and cut to the part that is taken."""
+    return reading.applied(read(path, reading.told.given()))
+
+
+@contextmanager
+def open_raw(path: str | Path, given: Mapping[str, Any]) -> Iterator[ScanFile]:
+    """The file or folder at `path`, open frame by frame, with its flats and darks and those that are `given`.
+
+    Errors: `InputError` as of `read`, and for a format whose frames are corrected already.
+    """
+    loader = _loader_for(path, given)
+    if loader.opens is None:
+        raise InputError(f"{path} holds corrected frames already ({loader.name}); use it as it is.")
+    with loader.opens(Path(path), given) as file:
+        yield with_fields(file, given)
+
+
+def _loader_for(path: str | Path, given: Mapping[str, Any]) -> Loader:
+    """The loader of `path`; `InputError` for values that it does not take."""
+    loader = loader_of(path)
     stray = [name for name in given if name not in loader.takes]
     require(not stray, f"{', '.join(stray)}: not for a source in {loader.name}; leave it away.")
-    return loader.read(Path(path), given)
+    return loader
 
 
 def loader_of(path: str | Path) -> Loader:

@@ -51,12 +51,12 @@ class Fields:
         """The first of `names` that exists, or None."""
         return next((name for name in names if name in self.group), None)
 
-    def need(self, *names: str) -> str:
-        """The first of `names` that exists; `InputError` when none does."""
+    def need(self, *names: str, way_out: str = "add it") -> str:
+        """The first of `names` that exists; `InputError`, with the advice `way_out`, when none does."""
         found = self.find(*names)
         if found is None:
             others = "".join(f" (or {self._below}/{name})" for name in names[1:])
-            raise InputError(f"{self.label(names[0])}{others} must be there, but it is missing; add it.")
+            raise InputError(f"{self.label(names[0])}{others} must be there, but it is missing; {way_out}.")
         return found
 
     def dataset(self, name: str) -> h5py.Dataset:

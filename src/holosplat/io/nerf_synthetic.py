@@ -16,7 +16,7 @@ import numpy as np
 
 from ..checks import InputError, at_least, in_range, require
 from ..geometry import Views
-from ..scan import DISTANCE_RANGE_M, ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan
+from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan, checked_distance
 from .exposure_tables import beam_table, exposure_table, in_order, read_exposures
 from .folder import atomic_folder
 from .json import write_json
@@ -68,7 +68,7 @@ class GivenOptics:
 
     def __post_init__(self) -> None:
         in_range("energy", self.energy_kev, *ENERGY_RANGE_KEV, unit="keV")
-        in_range("propagation distance", self.distance, *DISTANCE_RANGE_M, unit="metres")
+        checked_distance(self.distance)
         in_range("pixel size", self.pixel_size, *PIXEL_RANGE_M, unit="metres")
         good = math.isfinite(self.black) and math.isfinite(self.white) and self.black < self.white
         require(good, f"black must be below white, but they are {self.black:g} and {self.white:g}; exchange them.")

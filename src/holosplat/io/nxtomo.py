@@ -6,32 +6,19 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 
-from ..checks import InputError, finite, require, shaped
-from ..frames import Frames
-from ..preprocess.flat_field import relative_intensity, unlit
+from ..checks import finite, require, shaped
 from ..scan import Exposures, Scan
 from ..version import __version__
+from . import arrays, exchange
 from .atomic import atomic_path
-from .hdf5 import Fields, open_hdf5
 from .loader import Loader
-from .scan_file import (
-    ANGLE,
-    DARK,
-    DATA,
-    FLAT,
-    FLIPS,
-    IMAGE_KEY,
-    MASK,
-    PROJECTION,
-    SPLIT,
-    ScanFile,
-    open_scan,
-    upright,
-)
+from .raw_file import NOTHING, PROJECTION, TAKES, reader
+from .scan_file import ANGLES, DATA, FLIPS, IMAGE_KEY, MASK, SPLIT, open_scan
 
 
 @dataclass(frozen=True)
@@ -48,85 +35,14 @@ class RawLayout:
     flips: tuple[bool, bool] = (False, False)
 
 
-@dataclass(frozen=True)
-class StoredFrames(Frames):
-    """The projections of an NXtomo file, flat-field corrected when they are read.
-
-    numbers: [N] of the projections among the file's frames.
-    dark, light: [H, W] mean dark field and mean flat field less that, light None where the file is corrected already.
-    stamp: of the file when it was opened.
-
-    The file is opened anew for each reading. Errors: `InputError` for a file that is gone or changed, or values not
-    finite.
-    """
-
-    path: Path
-    label: str
-    dataset: str
-    flips: tuple[bool, bool]
-    numbers: np.ndarray
-    dark: np.ndarray
-    light: np.ndarray | None
-    shape: tuple[int, int, int]
-    stamp: tuple[int, ...]
-
-    @classmethod
-    def of(cls, file: ScanFile) -> StoredFrames:
-        """Those of an open file, whose dark and flat frames are read for their means."""
-        fields, shape, numbers = file.fields, file.exposures.views.shape, file.numbers(PROJECTION)
-        dark, light = _fields_of_light(file)
-        path, name = fields.path.resolve(), str(fields.dataset(DATA).name)
-        whole = (len(numbers), *shape)
-        return cls(path, fields.label(DATA), name, file.flips, numbers, dark, light, whole, _stamp(path))
-
-    def read(self, numbers: np.ndarray) -> np.ndarray:
-        """See `Frames.read`."""
-        gone = f"{self.path} must be the file that was opened, but it is gone; put it back, or open another."
-        require(self.path.is_file(), gone)
-        changed = f"{self.path} must be the file that was opened, but it has changed since; open it again."
-        require(_stamp(self.path) == self.stamp, changed)
-        frames = np.empty((len(numbers), *self.shape[1:]), dtype=np.float32)
-        with open_hdf5(self.path) as file:
-            data = Fields(self.path, file).dataset(self.dataset)
-            for i, n in enumerate(self.numbers[numbers]):  # one by one: raw frames are wider, and there may be many
-                raw = upright(data, int(n), slice(0, self.shape[1]), self.flips)
-                frames[i] = raw if self.light is None else relative_intensity(raw, self.dark, self.light)
-        return finite(self.label, frames)
-
-
-def read_scan(path: str | Path) -> Scan:
+def read_scan(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Scan:
     """The projections of an NXtomo file, flat-field corrected, and how they were taken.
 
     Frames marked flat and dark correct the others: (frame - mean dark) / (mean flat - mean dark); frames
-    marked invalid are dropped. The projections are read when they are asked for (`StoredFrames`). `InputError` as of
-    `open_scan`.
+    marked invalid are dropped. The projections are read when they are asked for (`StoredFrames`). given and
+    `InputError` as of `open_scan`.
     """
-    with open_scan(path) as file:
-        return Scan.of(StoredFrames.of(file), file.exposures, file.is_test, file.provenance())
-
-
-def _stamp(path: Path) -> tuple[int, ...]:
-    """What changes when a file is written anew."""
-    found = path.stat()
-    return found.st_mtime_ns, found.st_size, found.st_ino
-
-
-def _fields_of_light(file: ScanFile) -> tuple[np.ndarray, np.ndarray | None]:
-    """The mean dark field [H, W], and the mean flat field less that, None where the file has no flats."""
-    label, flats, darks = file.fields.label, file.numbers(FLAT), file.numbers(DARK)
-    if len(darks) and not len(flats):
-        raise InputError(f"{label(IMAGE_KEY)} must mark flats (1) beside the dark ones (2), but it marks none.")
-    dark = file.mean(DARK)
-    if not len(flats):
-        return dark, None
-    light = file.mean(FLAT) - dark
-    bad = int(unlit(light).sum())
-    require(
-        bad == 0,
-        f"{label(DATA)} must have flat frames brighter than dark ones everywhere, but in {bad} of {light.size} pixels "
-        "they are not; `holosplat correct` repairs such pixels.",
-    )
-    return dark, light
+    return reader(open_scan)(Path(path), given)
 
 
 def write_scan(path: str | Path, scan: Scan) -> None:
@@ -189,7 +105,7 @@ def _write_entry(
     _write_sample(_group(entry, "sample", "NXsample"), exposures)
     _write_process(_group(entry, "process", "NXprocess"), provenance)
     plot = _group(entry, "data", "NXdata", signal="data", axes=["rotation_angle", ".", "."])
-    for source in (DATA, IMAGE_KEY, ANGLE):
+    for source in (DATA, IMAGE_KEY, ANGLES[0]):
         entry[source].attrs["target"] = f"/entry/{source}"
         plot[source.rsplit("/", 1)[1]] = entry[source]
     return data
@@ -253,11 +169,7 @@ def _escaped(key: str) -> str:
 
 
 def _recognises(path: Path) -> bool:
-    return path.is_file() and h5py.is_hdf5(path)
+    return path.is_file() and h5py.is_hdf5(path) and not (exchange.recognises(path) or arrays.recognises(path))
 
 
-def _read(path: Path, given: Mapping[str, float]) -> Scan:
-    return read_scan(path)
-
-
-LOADER = Loader("nxtomo", "an HDF5 file", _recognises, _read)
+LOADER = Loader("nxtomo", "an HDF5 file", _recognises, read_scan, (*TAKES, "entry"), open_scan)

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..checks import InputError, at_least, finite, in_range, positive, require, shaped
 from ..geometry import Grid, Views
-from ..scan import DISTANCE_RANGE_M, ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan
+from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan
 from ..units import wavenumber
 from ..volume import Volume
 from .exposure_tables import beam_table, exposure_table, in_order, read_exposures
@@ -34,7 +34,6 @@ WORLD = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """`x_world = WORLD x_obj`: at angle 0 its beam runs along -x, columns along y, rows along -z; its axis is z."""
 SEED_DENSITY = 0.15
 """Density of the points to start from, of a material of 1: they overlap (the default of its own script)."""
-CONTACT = DISTANCE_RANGE_M[0]
 
 
 @dataclass(frozen=True)
@@ -141,7 +140,7 @@ def read_r2_gaussian(path: str | Path, energy_kev: float | None = None, pixel_si
     h, w = lines.shape[1:]
     views = Views.from_angles(np.rad2deg(angles), (h, w), pixel_size)
     unit = pixel_size / _pitch(scanner, (h, w))
-    return _absorber(lines, Exposures.of(views, energy_kev, CONTACT), is_test, unit, {})
+    return _absorber(lines, Exposures.of(views, energy_kev, 0.0), is_test, unit, {})
 
 
 def _require_one_axis(views: Views) -> None:
@@ -244,7 +243,7 @@ def _own_scan(meta: Table, entries: list[Table], lines: np.ndarray, is_test: np.
     frames = [entry.table("holosplat") for entry in entries]
     order = in_order(ours, frames)
     exposures = read_exposures(ours, [frames[k] for k in order], (h, w))
-    contact = replace(exposures, distance=np.array(CONTACT), psf_sigma_px=np.array(0.0))
+    contact = replace(exposures, distance=np.array(0.0), psf_sigma_px=np.array(0.0))
     cut = lines[order, top : top + h, left : left + w]
     return _absorber(cut, contact, is_test[order], ours.number("metres_per_unit"), ours.texts("provenance"))
 

@@ -1,30 +1,38 @@
-"""NXtomo files, opened for reading: the kind and the exposure of each frame, and the frames one by one."""
+"""NXtomo files, opened for reading: the kind and the exposure of each frame, and the frames one by one.
+
+The names are those of docs/conventions.md, and of the dialects of Diamond (`entry1/tomo_entry`) and the ESRF
+(`entry0000`, nxtomo): where one quantity has several names, the first that a file has is read.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
 
 from ..checks import InputError, finite, in_range, require, shaped
 from ..geometry import Views, rotation_y
-from ..preprocess.flat_field import mean_frame
-from ..scan import DISTANCE_RANGE_M, ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures
+from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, checked_distance
 from ..units import ANGLE_UNITS, ENERGY_UNITS, LENGTH_UNITS, TIME_UNITS
 from .hdf5 import Fields, attribute_text, open_hdf5
+from .raw_file import DARK, FLAT, INVALID, NOTHING, PROJECTION, ScanFile, angles_of_projections, require_said, said
 
 DATA = "instrument/detector/data"
+DATA_NAMES = (DATA, "data/data")
 IMAGE_KEY = "instrument/detector/image_key"
+IMAGE_KEYS = ("instrument/detector/image_key_control", IMAGE_KEY, "data/image_key")
 MASK = "instrument/detector/pixel_mask"
 FLIPS = ("instrument/detector/y_flipped", "instrument/detector/x_flipped")
-PIXEL_SIZES = ("instrument/detector/x_pixel_size", "instrument/detector/y_pixel_size")
+DETECTOR = "instrument/detector/"
+PIXEL_SIZES = ("sample/{}_pixel_size", DETECTOR + "{}_magnified_pixel_size", DETECTOR + "{}_pixel_size")
+"""Names of a pixel's size along x and y; those in the sample's plane come first."""
 DISTANCES = ("sample/propagation_distance", "instrument/detector/distance")
-ENERGIES = ("instrument/beam/incident_energy", "beam/incident_energy")
-ANGLE = "sample/rotation_angle"
+ENERGIES = ("instrument/beam/incident_energy", "beam/incident_energy", "instrument/monochromator/energy")
+ANGLES = ("sample/rotation_angle", "data/rotation_angle")
 ROTATION = "sample/view_rotation"
 SHIFT = "instrument/detector/shift"
 TIME = "sample/time"
@@ -32,121 +40,113 @@ PSF_SIGMA = "instrument/detector/psf_sigma"
 SPLIT = "split"
 PROVENANCE = "process/provenance"
 
-PROJECTION, FLAT, DARK, INVALID = range(4)
 PIXEL_UNITS = {"px": 1.0, "pixel": 1.0, "pixels": 1.0, "": 1.0}
+ALIGNMENT = -1
+"""Image key of frames at an angle seen before, which the ESRF takes to check for drift."""
 MOST_RADIANS = 4 * np.pi
 """Angles without a unit are radians (the SI unit); beyond two turns they are degrees in all likelihood."""
 
 
-@dataclass(frozen=True)
-class ScanFile:
-    """An NXtomo file that is open: how its n projections were taken, and its N frames of all kinds, read one by one.
-
-    kinds: [N], PROJECTION, FLAT, DARK or INVALID.
-    exposures, is_test: of the projections.
-    flips: whether the file's frames are upside down, and whether they are mirrored left to right.
-    """
-
-    fields: Fields
-    kinds: np.ndarray
-    exposures: Exposures
-    is_test: np.ndarray
-    flips: tuple[bool, bool]
-
-    def numbers(self, kind: int) -> np.ndarray:
-        """Which of the N frames are of `kind`."""
-        return np.flatnonzero(self.kinds == kind)
-
-    def frame(self, number: int) -> np.ndarray:
-        """Frame `number` [H, W] as float64, turned upright."""
-        return self.rows(number, slice(0, self.exposures.views.shape[0]))
-
-    def rows(self, number: int, rows: slice) -> np.ndarray:
-        """The rows `rows` (from start to stop) of frame `number`, float64, turned upright."""
-        return upright(self.fields.dataset(DATA), number, rows, self.flips)
-
-    def mean(self, kind: int) -> np.ndarray:
-        """The mean [H, W] of the frames of `kind`; zeros where there are none."""
-        return mean_frame((self.frame(n) for n in self.numbers(kind)), self.exposures.views.shape)
-
-    def mask(self) -> np.ndarray:
-        """[H, W] bool: the pixels that the file marks as defective (`pixel_mask` of NXdetector), turned upright."""
-        shape = self.exposures.views.shape
-        if not self.fields.find(MASK):
-            return np.zeros(shape, dtype=bool)
-        marked = shaped(self.fields.label(MASK), self.fields.numbers(MASK), shape) != 0
-        return marked[:: -1 if self.flips[0] else 1, :: -1 if self.flips[1] else 1]
-
-    def provenance(self) -> dict[str, str]:
-        """The provenance of the scan."""
-        return _read_provenance(self.fields)
-
-
-def upright(data: h5py.Dataset, number: int, rows: slice, flips: tuple[bool, bool]) -> np.ndarray:
-    """The rows `rows` (from start to stop) of frame `number` of `data` [N, H, W], float64, turned upright.
-
-    flips: whether the stored frames are upside down, and mirrored left to right.
-    """
-    upside_down, mirrored = flips
-    height = data.shape[1]
-    stored = slice(height - rows.stop, height - rows.start) if upside_down else rows
-    found = data[number, stored].astype(np.float64)
-    return found[:: -1 if upside_down else 1, :: -1 if mirrored else 1]
-
-
 @contextmanager
-def open_scan(path: str | Path) -> Iterator[ScanFile]:
+def open_scan(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterator[ScanFile]:
     """An NXtomo file, checked except for its frames.
 
-    Per-frame datasets may count all frames or the projections only. `InputError` names the file, the dataset, the
-    allowed values and the value found.
+    given: values that go before the file's, by name (`TAKES`). Per-frame datasets may count all frames or the
+    projections only. `InputError` names the file, the dataset, the allowed values and the value found.
     """
     with open_hdf5(path) as file:
-        fields = Fields(Path(path), _entry(file, path))
+        fields = Fields(Path(path), _entry(file, Path(path), given.get("entry")))
         kinds = _frame_kinds(fields)
-        views = _views(fields, kinds, fields.dataset(DATA).shape[1:])
+        _require_no_two_missing(fields, given)
+        views = _views(fields, kinds, given)
         psf_sigma = _optional(fields, kinds, PSF_SIGMA, PIXEL_UNITS, "px")
         time = _optional(fields, kinds, TIME, TIME_UNITS, "s")
-        energy, distance = _energies(fields, kinds), _distances(fields, kinds)
+        energy, distance = _energies(fields, kinds, given), _distances(fields, kinds, given)
         is_test = _split(fields, kinds)
         require(bool((psf_sigma >= 0).all()), f"{fields.label(PSF_SIGMA)} must not be negative; correct it.")
         exposures = Exposures(views, energy, distance, psf_sigma, time)
         flips = [bool(fields.numbers(name).any()) if fields.find(name) else False for name in FLIPS]
-        yield ScanFile(fields, kinds, exposures, is_test, (flips[0], flips[1]))
-
-
-def _entry(file: h5py.File, path: str | Path) -> h5py.Group:
-    """/entry, or else the file's default or only NXentry group."""
-    groups = {name: item for name, item in file.items() if isinstance(item, h5py.Group)}
-    entries = [g for g in groups.values() if attribute_text(g.attrs.get("NX_class")) == "NXentry"]
-    for name in ("entry", attribute_text(file.attrs.get("default"))):
-        if name in groups:
-            return groups[name]
-    if len(entries) != 1:
-        raise InputError(
-            f"{path} must hold the group /entry (NeXus NXtomo), but it holds {', '.join(file) or 'nothing'}."
+        data = fields.need(*DATA_NAMES)
+        yield ScanFile(
+            *(Path(path), fields.label(data), (fields.dataset(data),), kinds, exposures, is_test),
+            *((flips[0], flips[1]), _marked(fields, views.shape), _read_provenance(fields)),
+            fields.label(fields.find(*IMAGE_KEYS) or IMAGE_KEY),
         )
-    return entries[0]
+
+
+def _entry(file: h5py.File, path: Path, wanted: str | None) -> h5py.Group:
+    """The group of the scan: the one that is `wanted`, or /entry, or the file's default or only one with frames."""
+    found = _scans_in(file)
+    if wanted is not None:
+        group = file.get(wanted)
+        if not isinstance(group, h5py.Group):
+            raise InputError(f"{path} has no group {wanted}; --entry must be one of {', '.join(found) or 'none'}.")
+        return group
+    for name in ("entry", attribute_text(file.attrs.get("default")) or "entry", *(found if len(found) == 1 else ())):
+        group = file.get(name)
+        if isinstance(group, h5py.Group) and (name in found or not found):
+            return group
+    if found:
+        raise InputError(f"{path} holds several scans; choose one by --entry: {', '.join(found)}.")
+    raise InputError(
+        f"{path} must hold the group /entry (NeXus NXtomo), but it holds {', '.join(file) or 'nothing'}; frames are "
+        f"looked for as {' or '.join(DATA_NAMES)} in a group, or a group in that."
+    )
+
+
+def _scans_in(file: h5py.File) -> list[str]:
+    """The groups that hold frames: at the top of the file, or one below, as Diamond has them."""
+    found = []
+    for name, group in file.items():
+        if not isinstance(group, h5py.Group):
+            continue
+        inner = [f"{name}/{n}" for n, item in group.items() if isinstance(item, h5py.Group) and _holds_frames(item)]
+        found += [name] if _holds_frames(group) else inner
+    return found
+
+
+def _holds_frames(group: h5py.Group) -> bool:
+    return any(isinstance(group.get(name), h5py.Dataset) for name in DATA_NAMES)
 
 
 def _frame_kinds(fields: Fields) -> np.ndarray:
     """The image key of each of all N frames, [N] int; checks the frames' shape too."""
-    data = fields.dataset(fields.need(DATA))
+    name = fields.need(*DATA_NAMES)
+    data = fields.dataset(name)
     if data.ndim != 3 or 0 in data.shape:
-        raise InputError(f"{fields.label(DATA)} must have the shape [N, H, W], but it has {data.shape}.")
-    if not fields.find(IMAGE_KEY):
+        raise InputError(f"{fields.label(name)} must have the shape [N, H, W], but it has {data.shape}.")
+    key = fields.find(*IMAGE_KEYS)
+    if key is None:
         return np.full(len(data), PROJECTION)
-    kinds = shaped(fields.label(IMAGE_KEY), fields.numbers(IMAGE_KEY), (len(data),))
+    kinds = shaped(fields.label(key), fields.numbers(key), (len(data),))
+    if key == IMAGE_KEYS[0]:
+        kinds[kinds == ALIGNMENT] = INVALID
     known = np.isin(kinds, (PROJECTION, FLAT, DARK, INVALID))
     if not known.all():
         wrong = kinds[~known][0]
         raise InputError(
-            f"{fields.label(IMAGE_KEY)} must hold 0 (projection), 1 (flat), 2 (dark) or 3 (invalid), "
-            f"but it holds {wrong:g}."
+            f"{fields.label(key)} must hold 0 (projection), 1 (flat), 2 (dark) or 3 (invalid), but it holds {wrong:g}."
         )
     if not (kinds == PROJECTION).any():
-        raise InputError(f"{fields.label(IMAGE_KEY)} must mark at least one projection (0), but it marks none.")
+        raise InputError(f"{fields.label(key)} must mark at least one projection (0), but it marks none.")
     return kinds.astype(int)
+
+
+def _require_no_two_missing(fields: Fields, given: Mapping[str, Any]) -> None:
+    """`InputError` that names all options at once, where a file says little; one missing dataset is named by itself."""
+    names = {
+        "energy_kev": ENERGIES,
+        "distance": DISTANCES,
+        "pixel_size": [n.format(x) for n in PIXEL_SIZES for x in "xy"],
+    }
+    missing = [name for name, paths in names.items() if given.get(name) is None and not fields.find(*paths)]
+    if len(missing) > 1:
+        require_said(str(fields.path), missing)
+
+
+def _marked(fields: Fields, shape: tuple[int, int]) -> np.ndarray | None:
+    """`pixel_mask` [H, W] of NXdetector as stored, if there is one."""
+    return shaped(fields.label(MASK), fields.numbers(MASK), shape) if fields.find(MASK) else None
 
 
 def _per_frame(fields: Fields, kinds: np.ndarray, name: str, tail: tuple[int, ...] = ()) -> np.ndarray:
@@ -181,11 +181,12 @@ def _optional(
     return _per_frame(fields, kinds, name, tail) * fields.unit(name, table, unit)
 
 
-def _views(fields: Fields, kinds: np.ndarray, shape: tuple[int, int]) -> Views:
+def _views(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> Views:
+    shape = fields.dataset(fields.need(*DATA_NAMES)).shape[1:]
     shifts = _optional(fields, kinds, SHIFT, LENGTH_UNITS, "m", (2,))
-    pixel_size = _pixel_size(fields)
-    if not fields.find(ROTATION):
-        return Views(_rotations_of_angles(fields, kinds), shifts, shape, pixel_size)
+    pixel_size = said(given, "pixel_size") or _pixel_size(fields)
+    if given.get("angles_deg") is not None or not fields.find(ROTATION):
+        return Views(_rotations_of_angles(fields, kinds, given), shifts, shape, pixel_size)
     rotations = _per_frame(fields, kinds, ROTATION, (3, 3))
     try:
         return Views(rotations, shifts, shape, pixel_size)
@@ -193,36 +194,51 @@ def _views(fields: Fields, kinds: np.ndarray, shape: tuple[int, int]) -> Views:
         raise InputError(f"{fields.label(ROTATION)}: {error}") from None
 
 
-def _rotations_of_angles(fields: Fields, kinds: np.ndarray) -> np.ndarray:
-    angles = _per_frame(fields, kinds, fields.need(ANGLE))
-    if "units" not in fields.dataset(ANGLE).attrs and np.abs(angles).max() > MOST_RADIANS:
+def _rotations_of_angles(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> np.ndarray:
+    if given.get("angles_deg") is not None:
+        return rotation_y(angles_of_projections(given["angles_deg"], kinds == PROJECTION))
+    name = fields.need(*ANGLES, way_out="say it by --angles FILE, or add it")
+    angles = _per_frame(fields, kinds, name)
+    if "units" not in fields.dataset(name).attrs and np.abs(angles).max() > MOST_RADIANS:
         raise InputError(
-            f"{fields.label(ANGLE)} must carry @units, without which it is in radians, but it reaches "
+            f"{fields.label(name)} must carry @units, without which it is in radians, but it reaches "
             f"{np.abs(angles).max():g}; set @units to 'deg' if these are degrees."
         )
-    return rotation_y(np.rad2deg(angles * fields.unit(ANGLE, ANGLE_UNITS, "rad")))
+    return rotation_y(np.rad2deg(angles * fields.unit(name, ANGLE_UNITS, "rad")))
 
 
 def _pixel_size(fields: Fields) -> float:
-    sizes = []
-    for name in PIXEL_SIZES:
-        if fields.find(name):
-            number = shaped(fields.label(name), fields.numbers(name).reshape(-1), (1,))[0]
-            size = number * fields.unit(name, LENGTH_UNITS, "m")
-            sizes.append(in_range(fields.label(name), size, *PIXEL_RANGE_M, unit="metres"))
-    if not sizes:
-        fields.need(PIXEL_SIZES[0])
-    if not np.isclose(sizes[0], sizes[-1], rtol=1e-6, atol=0):
-        raise InputError(
-            f"{fields.label(PIXEL_SIZES[0])} and y_pixel_size must be equal (square pixels), but they are "
-            f"{sizes[0]:g} m and {sizes[1]:g} m; resample the frames first."
+    """The pixel size [m], which x and y must share; the one along y alone is not enough."""
+    for names in ((name.format("x"), name.format("y")) for name in PIXEL_SIZES):
+        found = [name for name in names if fields.find(name)]
+        if not found:
+            continue
+        sizes = [
+            in_range(fields.label(name), number * fields.unit(name, LENGTH_UNITS, "m"), *PIXEL_RANGE_M, unit="metres")
+            for name in found
+            for number in shaped(fields.label(name), fields.numbers(name).reshape(-1), (1,))
+        ]
+        require(
+            found[0] == names[0],
+            f"{fields.label(names[0])} must be there beside y_pixel_size ({sizes[0]:g} m), but it is missing; say the "
+            "size of square pixels by --pixel-size, or add it.",
         )
-    return sizes[0]
+        if not np.isclose(sizes[0], sizes[-1], rtol=1e-6, atol=0):
+            raise InputError(
+                f"{fields.label(names[0])} and {names[1].rsplit('/', 1)[1]} must be equal (square pixels), but they "
+                f"are {sizes[0]:g} m and {sizes[1]:g} m; resample the frames first."
+            )
+        return sizes[0]
+    missing = fields.label(PIXEL_SIZES[-1].format("x"))
+    raise InputError(f"{missing} must be there, but it is missing; say it by --pixel-size, or add it.")
 
 
-def _energies(fields: Fields, kinds: np.ndarray) -> np.ndarray:
+def _energies(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> np.ndarray:
     """Photon energies [n] of the projections in keV; energies that differ only by rounding become one."""
-    name = fields.need(*ENERGIES)
+    told = said(given, "energy_kev")
+    if told is not None:
+        return np.full(int((kinds == PROJECTION).sum()), told)
+    name = fields.need(*ENERGIES, way_out="say it by --energy-kev, or add it")
     energies = _per_frame(fields, kinds, name) * fields.unit(name, ENERGY_UNITS, "keV")
     for energy in (energies.min(), energies.max()):
         in_range(fields.label(name), float(energy), *ENERGY_RANGE_KEV, unit="keV")
@@ -230,11 +246,14 @@ def _energies(fields: Fields, kinds: np.ndarray) -> np.ndarray:
     return np.full(len(energies), energies[0]) if same else energies
 
 
-def _distances(fields: Fields, kinds: np.ndarray) -> np.ndarray:
-    name = fields.need(*DISTANCES)
+def _distances(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> np.ndarray:
+    told = said(given, "distance")
+    if told is not None:
+        return np.full(int((kinds == PROJECTION).sum()), told)
+    name = fields.need(*DISTANCES, way_out="say it by --distance, or add it")
     distances = _per_frame(fields, kinds, name) * fields.unit(name, LENGTH_UNITS, "m")
     for distance in (distances.min(), distances.max()):
-        in_range(fields.label(name), float(distance), *DISTANCE_RANGE_M, unit="metres")
+        checked_distance(float(distance), fields.label(name))
     return distances
 
 

@@ -1,0 +1,112 @@
+"""Frames as plain arrays: a NumPy archive (.npz), or an HDF5 file with datasets at its top.
+
+`counts` [N, H, W] are projections, `flats` and `darks` [n, H, W] (or [H, W]) what corrects them, `angles_deg` [N] the
+angles; `energy_kev`, `distance` and `pixel_size` [m] may stand beside them.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from ..checks import InputError, require
+from .hdf5 import open_hdf5
+from .loader import Loader
+from .raw_file import (
+    DARK,
+    FLAT,
+    NOTHING,
+    PROJECTION,
+    RANGES,
+    TAKES,
+    ScanFile,
+    Stack,
+    exposures_of,
+    reader,
+    together,
+)
+
+FRAMES = ("counts", "projections", "proj", "data")
+FLATS = ("flats", "flat", "white")
+DARKS = ("darks", "dark")
+ANGLES = ("angles_deg", "angles", "theta_deg")
+
+
+@contextmanager
+def open_arrays(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterator[ScanFile]:
+    """An archive or HDF5 file of plain arrays, checked except for its frames.
+
+    given: values that go before the file's, by name (`TAKES`). Errors: `InputError` for a damaged file, and for values
+    that neither say, with the option that says them.
+    """
+    source = Path(path)
+    with _arrays(source) as arrays:
+        frames, flats, darks, angles = (_first(arrays, names) for names in (FRAMES, FLATS, DARKS, ANGLES))
+        parts = [(PROJECTION, _stack(frames)), (FLAT, _stack(flats)), (DARK, _stack(darks))]
+        stacks, kinds = together(str(path), parts)
+        projections = kinds == PROJECTION
+        found: dict[str, Any] = {} if angles is None else {"angles_deg": np.asarray(angles)}
+        found |= {name: float(np.asarray(arrays[name]).reshape(-1)[0]) for name in RANGES if name in arrays}
+        exposures = exposures_of(str(path), given, found, stacks[0].shape[1:], projections)  # type: ignore[arg-type]
+        nothing_held_out = np.zeros(int(projections.sum()), dtype=bool)
+        yield ScanFile(source, str(path), stacks, kinds, exposures, nothing_held_out, kinds_label=str(path))
+
+
+@contextmanager
+def _arrays(path: Path) -> Iterator[Mapping[str, Any]]:
+    """The arrays of an archive, or the datasets of an open HDF5 file."""
+    if h5py.is_hdf5(path):
+        with open_hdf5(path) as file:
+            yield {name: item for name, item in file.items() if isinstance(item, h5py.Dataset)}
+        return
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            arrays = {name: archive[name] for name in archive.files if name not in ("provenance",)}
+    except (OSError, ValueError, zipfile.BadZipFile) as error:
+        raise InputError(f"{path} must be a complete NumPy archive, but reading it failed: {error}.") from None
+    for name in (*FRAMES, *FLATS, *DARKS, *ANGLES, *RANGES):
+        numbers = name not in arrays or arrays[name].dtype.kind in "iufb"
+        require(numbers, f"{path}: {name} must hold numbers, but it does not.")
+    yield arrays
+
+
+def _first(arrays: Mapping[str, Any], names: tuple[str, ...]) -> Any:
+    return next((arrays[name] for name in names if name in arrays), None)
+
+
+def _stack(frames: Any) -> Stack | None:
+    """Frames [n, H, W]; a single frame [H, W] is read and becomes one of them."""
+    if frames is None or len(frames.shape) != 2:
+        return frames
+    return np.asarray(frames)[None]
+
+
+def recognises(path: Path) -> bool:
+    """Whether a file of HDF5 or NumPy holds such arrays."""
+    if h5py.is_hdf5(path):
+        with open_hdf5(path) as file:
+            return any(isinstance(file.get(name), h5py.Dataset) for name in FRAMES)
+    if path.suffix.lower() != ".npz" or not zipfile.is_zipfile(path):
+        return False
+    with zipfile.ZipFile(path) as archive:
+        return any(f"{name}.npy" in archive.namelist() for name in FRAMES)
+
+
+def _recognises(path: Path) -> bool:
+    return path.is_file() and recognises(path)
+
+
+LOADER = Loader(
+    "arrays",
+    f"a NumPy archive (.npz) or an HDF5 file with the array {FRAMES[0]}",
+    _recognises,
+    reader(open_arrays),
+    TAKES,
+    open_arrays,
+)

@@ -1,0 +1,216 @@
+"""Runs of the European XFEL: cameras as views, trains and pulses as times, by the package extra_data.
+
+A run is a folder of files RAW-R0001-DA01-S00000.h5 and so on. A camera such as the Shimadzu HPV-X2 is a source
+(`SPB_EHD_HPVX2_1/CAM/CAMERA:daqOutput`), whose key `data.image.pixels` holds the frames of each train, [P, H, W].
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from fnmatch import fnmatch
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..checks import InputError, MissingError, finite, positive, require
+from ..frames import Frames
+from ..preprocess.flat_field import mean_frame, relative_intensity, unlit
+from ..scan import Exposures, Scan
+from .loader import Loader
+from .raw_file import DARK, FLAT, NOTHING, PROJECTION, TAKES, ScanFile, exposures_of, together
+from .reading import marked
+
+FILES = re.compile(r"(RAW|CORR|PROC)-R\d+-\w+-S\d+\.h5$")
+SOURCES = "*HPVX2*"
+PIXELS = "data.image.pixels"
+TRAIN_INTERVAL_S = 0.1
+"""Trains come ten times a second, and are numbered one by one (Decking et al. 2020, Nature Photonics 14, 391)."""
+
+
+@dataclass(frozen=True)
+class KeyStack:
+    """The frames [n, H, W] of one camera of a run, those of a train one after another.
+
+    places: train's identity and the pulse in it, of each frame.
+    """
+
+    path: Path
+    source: str
+    places: tuple[tuple[int, int], ...]
+    shape: tuple[int, int, int]
+
+    def __getitem__(self, index: tuple[int, slice]) -> np.ndarray:
+        number, rows = index
+        train, pulse = self.places[number]
+        key = _run(str(self.path))[self.source, PIXELS]
+        single = len(key.entry_shape) == 2
+        frame = key.select_trains(_by_id()[[train]]).ndarray(roi=() if single else (slice(pulse, pulse + 1),))
+        return frame.reshape(self.shape[1:])[rows]
+
+
+@dataclass(frozen=True)
+class ModuleFrames(Frames):
+    """The frames of several cameras, each corrected by its own fields: frame t·M + m is that of camera m at time t.
+
+    dark, light: [M, H, W] mean dark field, and mean flat field less that; light None where there are no flats.
+    """
+
+    stacks: tuple[KeyStack, ...]
+    dark: np.ndarray
+    light: np.ndarray | None
+    shape: tuple[int, int, int]
+
+    def read(self, numbers: np.ndarray) -> np.ndarray:
+        """See `Frames.read`."""
+        frames = np.empty((len(numbers), *self.shape[1:]), dtype=np.float32)
+        for i, n in enumerate(numbers):
+            time, camera = divmod(int(n), len(self.stacks))
+            raw = self.stacks[camera][time, slice(0, self.shape[1])].astype(np.float64)
+            frames[i] = raw if self.light is None else relative_intensity(raw, self.dark[camera], self.light[camera])
+        return finite(str(self.stacks[0].path), frames)
+
+
+def read_euxfel(path: Path, given: Mapping[str, Any] = NOTHING) -> Scan:
+    """All cameras of a run as the views of a scan, at every train and pulse that is taken.
+
+    given: energy_kev, distance, pixel_size, angles_deg of the cameras; sources, names of cameras with * and ?; trains
+    and pulses, numbers and ranges counted from 0; frame_rate of the camera [Hz]; flats and darks, runs of the same
+    cameras. Errors: `InputError` for cameras, trains or pulses that the run does not have, and for what is not said.
+    """
+    stacks = _cameras(path, given)
+    dark = np.stack([_mean(camera, given, "darks") for camera in stacks])
+    light = np.stack([_mean(camera, given, "flats") for camera in stacks]) - dark if given.get("flats") else None
+    require(light is not None or not given.get("darks"), "--darks needs --flats, by which frames are divided.")
+    bad = 0 if light is None else int(unlit(light).sum())
+    require(bad == 0, f"flats must be brighter than darks everywhere, but in {bad} pixels they are not; use correct.")
+    h, w = stacks[0].shape[1:]
+    frames = ModuleFrames(stacks, dark, light, (len(stacks) * stacks[0].shape[0], h, w))
+    exposures = exposures_of(str(path), given, {}, (h, w), np.ones(len(stacks), dtype=bool))
+    exposures = exposures.repeated(_times(stacks[0], given))
+    return Scan.of(frames, exposures, np.zeros(len(exposures), dtype=bool), _told(stacks))
+
+
+@contextmanager
+def open_euxfel(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterator[ScanFile]:
+    """One camera of a run, with the flats and darks of other runs; given and errors as of `read_euxfel`."""
+    stacks = _cameras(Path(path), given)
+    require(
+        len(stacks) == 1,
+        f"cameras are corrected one by one, but {path} has {', '.join(stack.source for stack in stacks)}; choose one "
+        "by --sources, and join what comes out (holosplat join).",
+    )
+    camera = stacks[0]
+    parts = [
+        (PROJECTION, camera),
+        *((kind, _other(camera, given, name)) for kind, name in ((FLAT, "flats"), (DARK, "darks"))),
+    ]
+    joined, kinds = together(str(path), parts)
+    shape = (camera.shape[1], camera.shape[2])
+    one = exposures_of(str(path), given, {}, shape, np.ones(1, dtype=bool))
+    exposures: Exposures = one.repeated(_times(camera, given))
+    label, held_out = f"{path}: {camera.source}", np.zeros(len(exposures), dtype=bool)
+    yield ScanFile(Path(path), label, joined, kinds, exposures, held_out, texts=_told(stacks), has_given_fields=True)
+
+
+def _cameras(path: Path, given: Mapping[str, Any]) -> tuple[KeyStack, ...]:
+    """A stack for each camera that is wanted, of the trains that all of them have."""
+    run, wanted = _run(str(path)), [word.strip() for word in str(given.get("sources") or SOURCES).split(",")]
+    having = [source for source in sorted(run.instrument_sources) if PIXELS in run.keys_for_source(source)]
+    names = [source for source in having if any(fnmatch(source, f"*{word}*") for word in wanted)]
+    require(
+        len(names) > 0,
+        f"{path} must have cameras named {', '.join(wanted)}, but those with {PIXELS} are "
+        f"{', '.join(having) or 'none'}; name them by --sources.",
+    )
+    trains = _trains(path, run, names, given.get("trains"))
+    entry = [run[name, PIXELS].entry_shape for name in names]
+    require(
+        len(entry[0]) in (2, 3) and all(shape == entry[0] for shape in entry),
+        f"{path}: all cameras must have the same frames, [pulses, rows, columns], but theirs are "
+        f"{', '.join(str(tuple(shape)) for shape in entry)}; take one by --sources.",
+    )
+    count = 1 if len(entry[0]) == 2 else entry[0][0]
+    pulses = np.flatnonzero(marked("--pulses", given.get("pulses") or ":", count))
+    places = tuple((int(train), int(pulse)) for train in trains for pulse in pulses)
+    return tuple(KeyStack(path, name, places, (len(places), *entry[0][-2:])) for name in names)
+
+
+def _trains(path: Path, run: Any, names: list[str], wanted: str | None) -> np.ndarray:
+    """The trains' identities, of those of which all cameras have frames, in their order."""
+    common = set.intersection(*(set(run[name, PIXELS].drop_empty_trains().train_ids) for name in names))
+    require(len(common) > 0, f"{path} has no train of which all of {', '.join(names)} have frames; name others.")
+    trains = np.array(sorted(common), dtype=np.int64)
+    return trains[marked("--trains", wanted or ":", len(trains))]
+
+
+def _times(stack: KeyStack, given: Mapping[str, Any]) -> np.ndarray:
+    """[n] seconds since the first frame."""
+    trains, pulses = np.array(stack.places).T
+    several = len(np.unique(pulses)) > 1
+    rate = given.get("frame_rate")
+    require(
+        not several or rate is not None,
+        f"{stack.path} does not say how often the camera takes a frame; say it by --frame-rate, such as 1.128e6.",
+    )
+    period = 1 / positive("--frame-rate", rate, "Hz") if several else 0.0
+    return TRAIN_INTERVAL_S * (trains - trains[0]) + period * (pulses - pulses[0])
+
+
+def _other(camera: KeyStack, given: Mapping[str, Any], name: str) -> KeyStack | None:
+    """The frames of the same camera in another run, of all its trains."""
+    if not given.get(name):
+        return None
+    return _cameras(Path(given[name]), {"sources": camera.source, "pulses": given.get("pulses")})[0]
+
+
+def _mean(camera: KeyStack, given: Mapping[str, Any], name: str) -> np.ndarray:
+    """The mean frame [H, W] of the same camera in another run; zeros where there is none."""
+    other, shape = _other(camera, given, name), camera.shape[1:]
+    if other is None:
+        return np.zeros(shape)
+    require(
+        other.shape[1:] == shape, f"{given[name]} must have frames of {shape} pixels, but they have {other.shape[1:]}."
+    )
+    return mean_frame(
+        (other[n, slice(0, shape[0])].astype(np.float64) for n in range(other.shape[0])), (shape[0], shape[1])
+    )
+
+
+def _told(stacks: tuple[KeyStack, ...]) -> dict[str, str]:
+    trains = sorted({train for train, _ in stacks[0].places})
+    return {"euxfel_sources": ", ".join(s.source for s in stacks), "euxfel_trains": f"{trains[0]} … {trains[-1]}"}
+
+
+@lru_cache(maxsize=4)
+def _run(path: str) -> Any:
+    try:
+        from extra_data import RunDirectory
+    except ImportError:
+        raise MissingError(
+            'runs of the European XFEL need extra_data; install it by pip install "holosplat[euxfel]".'
+        ) from None
+    try:
+        return RunDirectory(path)
+    except Exception as error:  # extra_data raises many kinds for damaged files
+        raise InputError(f"{path} must be a run of the European XFEL, but opening it failed: {error}.") from None
+
+
+def _by_id() -> Any:
+    from extra_data import by_id
+
+    return by_id
+
+
+def _recognises(path: Path) -> bool:
+    return path.is_dir() and any(FILES.match(file.name) for file in path.iterdir())
+
+
+LOADER = Loader(
+    *("euxfel", "a run of the European XFEL (RAW-R….h5)", _recognises, read_euxfel),
+    *((*TAKES, "sources", "trains", "pulses", "frame_rate"), open_euxfel),
+)

@@ -1,0 +1,225 @@
+"""How a scan is read: what is said beside its files, and which part of it is taken."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from ..checks import InputError, finite, require
+from ..tables import from_table, to_table
+
+if TYPE_CHECKING:
+    from ..geometry import Views
+    from ..scan import Scan
+
+Sense = Literal["clockwise", "anticlockwise"]
+
+OWN_WAY = ("angles", "axis_column", "sense")
+"""Fields of `Told` that no loader takes by their own name."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """What is said of a scan beside its files; it goes before what they say themselves."""
+
+    energy_kev: float | None = None
+    """Photon energy [keV] (default: as the files say)."""
+    distance: float | None = None
+    """Effective propagation distance [m] (default: as the files say)."""
+    pixel_size: float | None = None
+    """Effective pixel size [m] (default: as the files say)."""
+    angles: Path | None = None
+    """Text file of the frames' angles [degrees], one a line (default: as the files say)."""
+    flats: Path | None = None
+    """Images without the object: a file (TIFF, PNG, .npy) or a folder of them (default: as the files have them)."""
+    darks: Path | None = None
+    """Images without light, likewise."""
+    files: str | None = None
+    """Of a folder of images: the names of the projections, such as 'raw_*.tif' (default: all but flat* and dark*)."""
+    entry: str | None = None
+    """HDF5: the group to read, where a file holds several scans."""
+    sources: str | None = None
+    """European XFEL: the cameras that are the views, names or parts of them with commas between (default: HPVX2)."""
+    trains: str | None = None
+    """European XFEL: trains to take, counted from 0, as --views (default: all)."""
+    pulses: str | None = None
+    """European XFEL: pulses of a train to take, counted from 0, as --views (default: all)."""
+    frame_rate: float | None = None
+    """European XFEL: frames a second that the camera takes within a train [Hz]."""
+    axis_column: float | None = None
+    """Column of the rotation axis in the files' frames, 0 the middle of the first one (default: as the files say, or
+    the middle)."""
+    sense: Sense = "clockwise"
+    """How the object turns as the angle grows, seen from above (row 0 at the top, the beam going away)."""
+    black: float | None = None
+    """Grey images, nerf-synthetic: intensity of black pixels, relative to the flat field (default: 0)."""
+    white: float | None = None
+    """Grey images, nerf-synthetic: intensity of white pixels, relative to the flat field (default: 1)."""
+
+    def given(self) -> dict[str, Any]:
+        """The values for a loader, by name (`Loader.takes`); angles as `angles_deg` [N]."""
+        said = {name: value for name, value in vars(self).items() if value is not None and name not in OWN_WAY}
+        return said if self.angles is None else {**said, "angles_deg": read_angles(self.angles)}
+
+    def placed(self, views: Views) -> Views:
+        """The views with the rotation axis and the sense of rotation that are said."""
+        if self.axis_column is not None:
+            views = views.about_column(self.axis_column)
+        return views if self.sense == "clockwise" else views.turned_back()
+
+
+@dataclass(frozen=True)
+class Part:
+    """Which part of a scan is taken."""
+
+    time_frame: int | Literal["all"] | None = None
+    """Of a time-resolved scan: the time to take, counted from 0, or all if nothing moved."""
+    views: str | None = None
+    """Frames to take, counted from 0: numbers and ranges start:stop:step, as in 0:91:8 or 3,5,20:30."""
+    test_views: str | None = None
+    """Frames to hold out of the fit, in the same form; the others are then for training (default: as the files say)."""
+    crop: str | None = None
+    """Rows and columns to keep, such as 0:40,10:150, in pixels of the files' frames; : keeps all."""
+    bin: int = 1
+    """Average pixels this many by this many, after cropping."""
+
+    def of(self, scan: Scan) -> Scan:
+        """This part of `scan`; frames keep their order, pixels their place in space.
+
+        Errors: `InputError` for frames, rows, columns or times that the scan does not have.
+        """
+        require(self.bin >= 1, f"--bin must be at least 1, but it is {self.bin}.")
+        scan = self._chosen(at_time(scan, self.time_frame))
+        if self.crop is not None:
+            scan = scan.cropped(*_corner(self.crop, scan.views.shape))
+        return scan.binned(self.bin)
+
+    def _chosen(self, scan: Scan) -> Scan:
+        taken = np.ones(len(scan), dtype=bool) if self.views is None else marked("--views", self.views, len(scan))
+        if self.test_views is not None:
+            held_out = marked("--test-views", self.test_views, len(scan))
+            scan, taken = scan.with_split(held_out), taken | held_out
+        return scan if taken.all() else scan[np.flatnonzero(taken)]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How a scan is read."""
+
+    told: Told = field(default_factory=Told)
+    part: Part = field(default_factory=Part)
+
+    def applied(self, scan: Scan) -> Scan:
+        """A scan that a loader has read, with its axis and sense of rotation, and cut to the part that is taken."""
+        views = self.told.placed(scan.views)
+        return self.part.of(scan if views is scan.views else scan.with_views(views))
+
+    def as_table(self) -> dict[str, Any]:
+        """What differs from the default, by field, ready for JSON; paths are absolute. `time_frame` is not there."""
+        said = _said(self.told) | _said(replace(self.part, time_frame=None))
+        return {name: to_table(value.resolve() if isinstance(value, Path) else value) for name, value in said.items()}
+
+    @classmethod
+    def from_table(cls, table: dict[str, Any], where: str = "") -> Reading:
+        """The reading of `as_table`. Errors: `InputError` for entries that are unknown or of another type."""
+        parts = {field.name for field in fields(Part)}
+        told = {name: value for name, value in table.items() if name not in parts}
+        part = {name: value for name, value in table.items() if name in parts}
+        return cls(from_table(Told, told, where), from_table(Part, part, where))
+
+    def over(self, other: Reading) -> Reading:
+        """`other` with all that differs from the default here."""
+        return Reading(replace(other.told, **_said(self.told)), replace(other.part, **_said(self.part)))
+
+
+def _said(kind: Told | Part) -> dict[str, Any]:
+    """The fields that differ from the default."""
+    return {name: value for name, value in vars(kind).items() if value != getattr(type(kind)(), name)}
+
+
+def at_time(scan: Scan, time_frame: int | str | None) -> Scan:
+    """The frames of the instant `time_frame`, of "all" as if nothing moved, or (None) the scan as it is."""
+    if time_frame is None:
+        return scan
+    return scan.at_instant(time_frame) if isinstance(time_frame, int) else scan.as_static()
+
+
+def read_angles(path: Path) -> np.ndarray:
+    """The angles [N] in degrees of a text file: numbers separated by lines, spaces or commas; # begins a comment."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"--angles must be a text file of angles, but reading {path} failed: {error}.") from None
+    rows = [line.split("#")[0].replace(",", " ").split() for line in lines]
+    rows = [row for row in rows if row]
+    one_a_line = all(len(row) == 1 for row in rows) or len(rows) == 1
+    require(
+        one_a_line, f"{path} must hold one angle a line, but a line holds {max(map(len, rows), default=0)} numbers."
+    )
+    words = [word for row in rows for word in row]
+    require(len(words) > 0, f"{path} must hold the frames' angles in degrees, but it holds none.")
+    return finite(f"{path}: angles", np.array([_number(path, word) for word in words]))
+
+
+def _number(path: Path, word: str) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        raise InputError(f"{path} must hold angles in degrees, but it holds {word!r}.") from None
+
+
+def _corner(text: str, shape: tuple[int, int]) -> tuple[slice, slice]:
+    """The rows and columns of `--crop`, with `shape` (H, W) filled in where a bound is left out."""
+    parts = text.split(",")
+    require(len(parts) == 2, f"--crop must be ROWS,COLUMNS, as in 0:40,10:150, but it is {text!r}.")
+    found = []
+    for name, part, count in zip(("rows", "columns"), parts, shape):
+        start, stop, step = _bounds("--crop", part, "rows and columns are written start:stop, as in 0:40,10:150")
+        require(step is None, f"--crop takes {name} one by one, but it says {part!r}; use --bin for larger pixels.")
+        low, high, _ = slice(start, stop).indices(count)
+        inside = low < high and all(bound is None or -count <= bound <= count for bound in (start, stop))
+        require(inside, f"--crop must keep some of the {count} {name}, but it says {part!r}.")
+        found.append(slice(low, high))
+    return found[0], found[1]
+
+
+def marked(option: str, text: str, count: int) -> np.ndarray:
+    """[count] bool: what of `count` the `text` of an option names, numbers and ranges with commas between.
+
+    Errors: `InputError` for what is not there, or is no number.
+    """
+    found = np.zeros(count, dtype=bool)
+    for part in text.split(","):
+        if ":" in part:
+            start, stop, step = _bounds(option, part, "ranges are written start:stop:step, as in 0:91:8")
+            require(step is None or step > 0, f"{option} must go forwards, but it says {part!r}.")
+            found[start:stop:step] = True
+            continue
+        number = _whole(option, part)
+        require(
+            -count <= number < count,
+            f"{option} counts what there is from 0 to {count - 1}, but it says {number}.",
+        )
+        found[number] = True
+    require(bool(found.any()), f"{option} must name some, but {text!r} names none of the {count}.")
+    return found
+
+
+def _bounds(option: str, text: str, advice: str) -> tuple[int | None, int | None, int | None]:
+    words = text.split(":")
+    require(2 <= len(words) <= 3, f"{option} cannot be {text!r}: {advice}.")
+    start, stop, step = (_whole(option, word) if word.strip() else None for word in [*words, ""][:3])
+    require(step != 0, f"{option} cannot go in steps of 0.")
+    return start, stop, step
+
+
+def _whole(option: str, word: str) -> int:
+    try:
+        return int(word)
+    except ValueError:
+        raise InputError(
+            f"{option} must be made of whole numbers, as in 0:91:8 or 3,5, but it says {word!r}."
+        ) from None

@@ -1,0 +1,115 @@
+"""Frames in image files (TIFF, PNG) and NumPy arrays, read one by one when they are asked for."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..checks import InputError, require
+
+IMAGES = (".tif", ".tiff", ".png")
+
+
+@dataclass(frozen=True)
+class ImageStack:
+    """Grey images [n, H, W] of files; pages of TIFF files are images of their own.
+
+    pages: file and page of each image.
+    """
+
+    pages: tuple[tuple[Path, int], ...]
+    shape: tuple[int, int, int]
+
+    @classmethod
+    def of(cls, files: Sequence[Path]) -> ImageStack:
+        """All pages of `files`, in this order. Errors: `InputError` for files that hold no grey images."""
+        pages = tuple((file, page) for file in files for page in range(_page_count(file)))
+        require(len(pages) > 0, f"{files[0]} must hold an image, but it holds none; it may be damaged.")
+        first = _image(*pages[0])
+        return cls(pages, (len(pages), *first.shape))
+
+    def __getitem__(self, index: tuple[int, slice]) -> np.ndarray:
+        number, rows = index
+        file, page = self.pages[number]
+        image = _image(file, page)
+        require(
+            image.shape == self.shape[1:],
+            f"{file} must have {self.shape[1:]} pixels as the first image, but it has {image.shape}.",
+        )
+        return image[rows]
+
+
+def stack_of(path: Path, pattern: str | None = None) -> ImageStack | np.ndarray:
+    """The frames of an image file, of all images in a folder (those that match `pattern`), or of a .npy file.
+
+    A folder's files are taken in the order of their names, with numbers in them counted as numbers.
+    """
+    if path.suffix.lower() == ".npy" and path.is_file():
+        return _array(path)
+    files = images_in(path, pattern) if path.is_dir() else [path]
+    require(len(files) > 0, f"{path} must hold images ({', '.join(IMAGES)}), but it holds none{_like(pattern)}.")
+    require(files[0].is_file(), f"{path} must be images or a folder of them, but there is nothing; check the path.")
+    return ImageStack.of(files)
+
+
+def images_in(folder: Path, pattern: str | None = None) -> list[Path]:
+    """The image files in a folder whose names match `pattern`, in the order of the numbers in their names."""
+    found = [file for file in folder.glob(pattern or "*") if file.suffix.lower() in IMAGES and file.is_file()]
+    return sorted(found, key=lambda file: [(word.isdigit(), word.zfill(20)) for word in re.split(r"(\d+)", file.name)])
+
+
+def _like(pattern: str | None) -> str:
+    return f" named {pattern}" if pattern else ""
+
+
+def _array(path: Path) -> np.ndarray:
+    try:
+        found = np.load(path, allow_pickle=False)
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} must be a NumPy array, but reading it failed: {error}.") from None
+    require(found.ndim in (2, 3) and found.dtype.kind in "iuf", f"{path} must hold frames [N, H, W] of numbers.")
+    return found.reshape(-1, *found.shape[-2:])
+
+
+def _page_count(file: Path) -> int:
+    if file.suffix.lower() == ".png":
+        return 1
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(file) as opened:
+            return len(opened.pages)
+    except Exception as error:  # tifffile raises many kinds for damaged files
+        raise InputError(f"{file} must be a complete TIFF file, but it is damaged or none: {error}.") from None
+
+
+def _image(file: Path, page: int) -> np.ndarray:
+    """One grey image [H, W]; of a coloured one whose colours are equal, one of them."""
+    try:
+        image = _png(file) if file.suffix.lower() == ".png" else _tiff(file, page)
+    except InputError:
+        raise
+    except Exception as error:  # tifffile and Pillow raise many kinds for damaged files
+        raise InputError(f"{file} must be a complete image, but it is damaged or none: {error}.") from None
+    if image.ndim == 3 and image.shape[2] in (3, 4) and (image[..., :3] == image[..., :1]).all():
+        image = image[..., 0]
+    grey = image.ndim == 2 and image.dtype.kind in "iuf"
+    require(grey, f"{file} must hold grey images of numbers, but one is {image.dtype} of the shape {image.shape}.")
+    return image
+
+
+def _png(file: Path) -> np.ndarray:
+    from PIL import Image
+
+    with Image.open(file) as opened:
+        return np.asarray(opened.convert("RGB") if opened.mode == "P" else opened)
+
+
+def _tiff(file: Path, page: int) -> np.ndarray:
+    import tifffile
+
+    return tifffile.imread(file, key=page)
