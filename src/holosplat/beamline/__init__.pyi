@@ -1,4 +1,5 @@
 from .grow import Growth as Growth
+from .light import UnevenLight as UnevenLight
 from .misalignment import Misalignment as Misalignment
 from .record import RecordingOptions as RecordingOptions
 from .scenes import Filling as Filling

@@ -10,7 +10,6 @@ import numpy as np
 
 from ..checks import InputError, require
 from ..optics.coherence import Spectrum
-from ..optics.detector import poisson
 from ..scan import Exposures
 from ..specimens.mesh_series import MeshSeries
 from ..specimens.scene import MeshScene
@@ -25,18 +24,17 @@ def polychromatic_frames(
     """Frames [H, W] float32 as `simulate.simulated_frames`, but of light with a `spectrum`.
 
     `matter_at(energy_kev)` is the object with its δ and β at that energy. A frame is `Σ w_e I_e`, each energy's
-    intensity relative to its own flat; photon noise comes last. All energies are sampled as the exposures' own is.
+    intensity relative to its own flat; light and photon noise come last. All energies are sampled as the exposures'
+    own is.
     """
-    quiet = replace(how, photons_per_pixel=None, oversample=how.samples(exposures))
+    quiet = how.quiet(exposures)
     parts = [
         simulated_frames(matter_at(energy), replace(exposures, energy_kev=energy, reference_kev=None), quiet)
         for energy in map(float, spectrum.energies_kev)
     ]
-    noise = np.random.default_rng(how.seed)
-    for of_energies in zip(*parts):
-        frame = np.tensordot(spectrum.weights, np.stack(of_energies), 1)
-        photons = how.photons_per_pixel
-        yield (frame if photons is None else poisson(frame, photons, noise)).astype(np.float32)
+    detect = how.detector(exposures)
+    for i, of_energies in enumerate(zip(*parts)):
+        yield detect(np.tensordot(spectrum.weights, np.stack(of_energies), 1), i)
 
 
 def frames_by_energy(
@@ -46,13 +44,12 @@ def frames_by_energy(
 
     `matter_at(energy_kev)` is the object with its δ and β at that energy; each frame uses its own energy.
     """
-    quiet = replace(how, photons_per_pixel=None, oversample=how.samples(exposures))
-    noise = np.random.default_rng(how.seed)
+    quiet = how.quiet(exposures)
+    detect = how.detector(exposures)
     for i, energy in enumerate(exposures.energy_kev.tolist()):
         own = replace(exposures[[i]], reference_kev=None)
         (frame,) = simulated_frames(matter_at(energy), own, quiet)
-        photons = how.photons_per_pixel
-        yield frame if photons is None else poisson(frame, photons, noise).astype(np.float32)
+        yield detect(frame, i)
 
 
 def refilled(matter: MeshScene | MeshSeries, filling: Filling, energy_kev: float) -> MeshScene | MeshSeries:

@@ -12,7 +12,9 @@ from ..checks import at_least, in_range, require
 from ..io.atomic import atomic_path, require_apart, require_writable
 from ..io.formats import loader_of, read
 from ..io.nxtomo import RawLayout, scan_writer
-from ..io.scan_file import DARK, FLAT, PROJECTION, open_scan
+from ..io.raw_file import DARK, FLAT, PROJECTION
+from ..io.reading import Part
+from ..io.scan_file import open_scan
 from ..optics.camera import Camera, Sensor
 from ..optics.coherence import joined_blur_px
 from ..optics.illumination import Illumination, PulseModel, Pulses
@@ -94,8 +96,10 @@ def record(
     light: Illumination,
     truth: Path | None = None,
     on_progress: Advance = lambda fraction: None,
+    *,
+    part: Part = Part(),
 ) -> Recorded:
-    """Record the noise-free scan `source` as raw counts into `out`: darks, flats, then one pulse a projection.
+    """Record the noise-free scan `source`, or a part, as raw counts into `out`: darks, flats, a pulse a projection.
 
     The file is NXtomo with `image_key`, uint16, frame by frame. `truth` gets the values that a reconstruction must not
     know: the light's mean, components and weights, pulse energies, and the sensor's maps (HDF5). `InputError` when the
@@ -106,7 +110,7 @@ def record(
     require_apart(out, source, *([truth] if truth else []))
     require_apart(truth or out, source)
     _require_corrected(source)
-    scan = read(source)
+    scan = part.of(read(source))
     _require_noise_free(source, scan)
     bench = _Bench.drawn(scan, options, camera, light)
     upright = RawLayout(_kinds(options, len(scan)), _mask(bench.sensor))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from ..optics.sampling import resolving_oversample
 from ..progress import Advance
 from ..scan import Exposures, Scan, interleaved_split
 from ..volume import Object
+from .light import EVEN_LIGHT, UnevenLight
 
 SIMULATED_FRINGE_SAMPLES = 8
 """Samples on the first fringe in simulations: frames of rounded bodies are then right to 0.5 % of their contrast
@@ -72,6 +73,8 @@ class Simulation:
     """Samples a pixel (default: as many as the fringes need)."""
     shutter: Shutter = Shutter()
     """Length of an exposure (default: no motion blur)."""
+    light: UnevenLight = EVEN_LIGHT
+    """How the light differs from the flat field (default: not at all)."""
 
     def __post_init__(self) -> None:
         if self.photons_per_pixel is not None:
@@ -90,16 +93,34 @@ class Simulation:
             "seed": str(self.seed),
         }
         shutter = {"exposure_s": f"{self.shutter.exposure:g}", "pulses": str(self.shutter.pulses)}
-        return made_by | (shutter if self.shutter.pulses > 1 else {})
+        return made_by | (shutter if self.shutter.pulses > 1 else {}) | self.light.facts()
+
+    def quiet(self, exposures: Exposures) -> Simulation:
+        """The same simulation of `exposures` before their light and noise."""
+        return replace(self, photons_per_pixel=None, oversample=self.samples(exposures), light=EVEN_LIGHT)
+
+    def detector(self, exposures: Exposures) -> Callable[[np.ndarray, int], np.ndarray]:
+        """What turns a relative intensity [H, W] and the number of its frame into the frame, float32: the light, photon
+        noise, and the division by the flat. It is to be called frame after frame."""
+        noise, photons = np.random.default_rng(self.seed), self.photons_per_pixel
+        lamp = None if self.light.is_even else self.light.on(len(exposures), exposures.views.shape)
+
+        def detect(intensity: np.ndarray, frame: int) -> np.ndarray:
+            if lamp is not None:
+                return lamp.recorded(intensity, frame, photons, noise).astype(np.float32)
+            return (intensity if photons is None else poisson(intensity, photons, noise)).astype(np.float32)
+
+        return detect
 
 
 def simulated_frames(obj: Object, exposures: Exposures, how: Simulation = Simulation()) -> Iterator[np.ndarray]:
     """Frames [H, W] float32 of `obj`, one after another; only one is in memory.
 
     Plain torch (the `reference` of the optics, which no fit uses) on a fine raster in single precision, 1e-6 of the
-    contrast from double precision. A frame is the mean of the intensities at its pulses, with noise if asked for.
+    contrast from double precision. A frame is the mean of the intensities at its pulses, with the light and the
+    noise that are asked for.
     """
-    fine, noise = how.samples(exposures), np.random.default_rng(how.seed)
+    fine, detect = how.samples(exposures), how.detector(exposures)
     with memory_kept():
         for i in range(len(exposures)):
             instrument = Instrument(exposures[[i]], fine, torch.float32, "reference")
@@ -108,8 +129,7 @@ def simulated_frames(obj: Object, exposures: Exposures, how: Simulation = Simula
             for offset in how.shutter.offsets:
                 frame += model.frames(delay=float(offset))[0].numpy()
             frame /= how.shutter.pulses
-            photons = how.photons_per_pixel
-            yield (frame if photons is None else poisson(frame, photons, noise)).astype(np.float32)
+            yield detect(frame, i)
 
 
 def simulate(
@@ -121,15 +141,16 @@ def simulate(
     is_test: np.ndarray | None = None,
     oversample: int | None = None,
     shutter: Shutter = Shutter(),
+    light: UnevenLight = EVEN_LIGHT,
     on_progress: Advance = lambda fraction: None,
 ) -> Scan:
     """A scan of `obj`, held in memory (`simulated_frames` gives frame by frame): waves on a fine raster, integrated
     over pixels, then photon noise if asked for.
 
     is_test: [N] bool, default every fourth frame; oversample: samples per pixel, default from the fringe width;
-    shutter: motion blur; `on_progress(fraction)` is called after each frame.
+    shutter: motion blur; light: how it differs from the flat field; `on_progress(fraction)` is called after each frame.
     """
-    how = Simulation(photons_per_pixel, seed, oversample, shutter)
+    how = Simulation(photons_per_pixel, seed, oversample, shutter, light)
     frames = np.empty((len(exposures), *exposures.views.shape), dtype=np.float32)
     for i, frame in enumerate(simulated_frames(obj, exposures, how)):
         frames[i] = frame

@@ -9,12 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
+from ..beamline.light import EVEN_LIGHT, UnevenLight
 from ..beamline.simulate import simulate
 from ..checks import InputError, require, shaped
 from ..geometry import Grid
 from ..matter import MaterialPrior
 from ..optics.detector import poisson
 from ..scan import Exposures, Scan
+from ..specimens.continuous import ContinuousScene
 from ..specimens.phantoms import Ball
 from ..specimens.scene import MeshScene
 from ..volume import Volume
@@ -23,6 +25,7 @@ from .declaration import declared_names, read_declaration
 FOLDER = Path(__file__).with_name("cases")
 """The suite: a TOML file for each case, or for several that differ little."""
 ORDER = ("main", "thesis", "cells", "xmpi", "plasma8", "noise12", "crowded12", "two_materials8", "shells8", "foam12")
+ORDER += ("soft12", "tissue16", "coated", "absorber12", "contact91")
 """How tables list the files of the suite; others follow by name."""
 
 
@@ -30,11 +33,12 @@ ORDER = ("main", "thesis", "cells", "xmpi", "plasma8", "noise12", "crowded12", "
 class Case:
     """name: of the case; seed: of its scene and its noise; scene: the truth; exposures: N frames; is_test: [N] bool,
     those held out; prior: what every method is told of the matter; photons: a pixel, None without noise; summary: one
-    line about the case; specimen: what the scene is, in words; balls: those of a resolution phantom, mesh by mesh."""
+    line about the case; specimen: what the scene is, in words; balls: those of a resolution phantom, mesh by mesh;
+    light: how it differs from the flat field on the frames for training."""
 
     name: str
     seed: int
-    scene: MeshScene
+    scene: MeshScene | ContinuousScene
     exposures: Exposures
     is_test: np.ndarray
     prior: MaterialPrior
@@ -42,6 +46,7 @@ class Case:
     summary: str = ""
     specimen: str = ""
     balls: tuple[Ball, ...] = ()
+    light: UnevenLight = EVEN_LIGHT
 
     def __post_init__(self) -> None:
         require(self.seed >= 0, f"seed must be 0 or more, but it is {self.seed}.")
@@ -57,14 +62,26 @@ class Case:
         )
 
     def scan(self) -> Scan:
-        """The measured frames: those for training as noisy as `photons` makes them, the held-out ones noise-free."""
+        """The measured frames: those for training in the case's light and as noisy as `photons` makes them.
+
+        Held-out ones have even light and no noise.
+        """
         clean = simulate(self.scene, self.exposures, seed=self.seed, is_test=self.is_test)
         said = {"case": self.name, "specimen": self.specimen}
-        if self.photons is None:
+        if self.photons is None and self.light.is_even:
             return replace(clean, provenance=clean.provenance | said)
         frames = clean.frames.copy()
-        frames[~self.is_test] = poisson(frames[~self.is_test], self.photons, self.seed)
-        said |= {"photons_per_pixel": f"{self.photons:g}", "held_out_frames": "noise-free"}
+        if self.photons is not None and self.light.is_even:
+            frames[~self.is_test] = poisson(frames[~self.is_test], self.photons, self.seed)
+        else:
+            lamp = replace(self.light, light_seed=self.light.light_seed + self.seed).on(
+                len(frames), self.exposures.views.shape
+            )
+            noise = np.random.default_rng(self.seed)
+            for n in np.flatnonzero(~self.is_test):
+                frames[n] = lamp.recorded(frames[n], int(n), self.photons, noise)
+        photons = {} if self.photons is None else {"photons_per_pixel": f"{self.photons:g}"}
+        said |= photons | self.light.facts() | {"held_out_frames": "noise-free"}
         return replace(clean, frames=frames, provenance=clean.provenance | said)
 
     def truth(self) -> Volume:
@@ -89,7 +106,7 @@ def load_case(name: str | Path, seed: int = 0, snapshots: Path | None = None) ->
     path, called = _found(str(name))
     declared = read_declaration(path, called, snapshots is not None)
     try:
-        scene, bodies = declared.scene(seed, snapshots)
+        scene, text, balls = declared.scene(seed, snapshots)
     except InputError as error:
         raise InputError(f"{path}, case {called}: {error}") from None
     exposures, is_test = declared.exposures()
@@ -102,8 +119,9 @@ def load_case(name: str | Path, seed: int = 0, snapshots: Path | None = None) ->
         prior=declared.material_prior(),
         photons=declared.photons,
         summary=declared.summary,
-        specimen=bodies.text,
-        balls=bodies.balls,
+        specimen=text,
+        balls=balls,
+        light=declared.light,
     )
 
 

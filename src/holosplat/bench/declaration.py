@@ -12,36 +12,50 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from ..beamline.light import EVEN_LIGHT, UnevenLight
 from ..checks import InputError, in_range, require
 from ..geometry import Views, rotation_tilted, rotation_y
 from ..materials import DeltaBeta, parse_material
 from ..matter import MaterialPrior
 from ..optics.noise import PHOTON_RANGE
 from ..scan import Exposures, interleaved_split
+from ..specimens.continuous import ContinuousScene
+from ..specimens.phantoms import Ball
 from ..specimens.scene import MeshScene
 from ..tables import from_table, merged, read_table
-from .specimens import Bodies, Specimen
+from .soft_specimens import Continuous
+from .specimens import Specimen
 
 MOST_PIXELS = 4096
 
 
 @dataclass(frozen=True)
 class Substance:
-    """A preset's name ("plasma"), "vacuum", or a formula with its density [g/cm³]."""
+    """A preset's name ("plasma"), "vacuum", a formula with its density [g/cm³], or `delta` and `beta` themselves."""
 
     shorthand: ClassVar[str] = "formula"
-    formula: str
+    formula: str | None = None
     density: float | None = None
+    delta: float | None = None
+    beta: float | None = None
 
     def __post_init__(self) -> None:
-        empty = self.formula == "vacuum"
-        require(not empty or self.density is None, "vacuum has no density; remove it.")
+        numbers = self.delta is not None and self.beta is not None
+        neither = self.delta is None and self.beta is None
+        require(
+            (numbers and self.formula is None) or (neither and self.formula is not None),
+            "a substance must be given by its formula, or by both delta and beta; give one of the two.",
+        )
+        empty = self.formula in ("vacuum", None)
+        require(not empty or self.density is None, "vacuum, or delta and beta, have no density; remove it.")
         if not empty:
-            parse_material(self.formula, self.density)
+            parse_material(self.formula or "", self.density)
 
     def delta_beta(self, energy_kev: float) -> DeltaBeta:
-        """δ and β at `energy_kev` [keV]."""
-        if self.formula == "vacuum":
+        """δ and β at `energy_kev` [keV]; those that are given are taken as they are."""
+        if self.delta is not None and self.beta is not None:
+            return DeltaBeta(self.delta, self.beta)
+        if self.formula is None or self.formula == "vacuum":
             return DeltaBeta(0.0, 0.0)
         return parse_material(self.formula, self.density).delta_beta(energy_kev)
 
@@ -138,7 +152,8 @@ class Listed:
 @dataclass(frozen=True)
 class Declaration:
     """A case without its seed. summary: one line about it; photons: mean counts a pixel of a frame for training, or
-    none for frames without noise; prior: what methods are told of `matter.material` against the medium."""
+    none for frames without noise; prior: what methods are told of `matter.material` against the medium; light: how it
+    differs from the flat field on frames for training."""
 
     summary: str
     specimen: Specimen
@@ -148,6 +163,7 @@ class Declaration:
     views: Interleaved | Between | Listed
     prior: Literal["known", "ratio", "free"]
     photons: float | None = None
+    light: UnevenLight = EVEN_LIGHT
 
     def __post_init__(self) -> None:
         core, wanted = self.matter.core is not None, self.specimen.has_core
@@ -178,14 +194,20 @@ class Declaration:
             return MaterialPrior.known(contrast)
         return MaterialPrior.of_ratio(contrast.ratio) if self.prior == "ratio" else MaterialPrior.unknown()
 
-    def scene(self, seed: int, snapshots: Path | None) -> tuple[MeshScene, Bodies]:
-        """The filled bodies that `seed` gives: a core adds what it is filled with, less the material around it."""
+    def scene(self, seed: int, snapshots: Path | None) -> tuple[MeshScene | ContinuousScene, str, tuple[Ball, ...]]:
+        """The matter that `seed` gives, what it is in words, and the balls of a phantom of balls.
+
+        The core of a mesh adds what it is filled with, less the material around it.
+        """
+        material, medium = self._delta_beta(self.matter.material), self._delta_beta(self.matter.medium)
+        if isinstance(self.specimen, Continuous):
+            cores = [self._delta_beta(self.matter.core).against(medium)] if self.matter.core else []
+            return *self.specimen.continuous(seed, [material.against(medium), *cores]), ()
         bodies = self.specimen.bodies(seed, snapshots)
-        material = self._delta_beta(self.matter.material)
-        filling = [material.against(self._delta_beta(self.matter.medium))] * len(bodies.outer)
+        filling = [material.against(medium)] * len(bodies.outer)
         if self.matter.core is not None:
             filling += [self._delta_beta(self.matter.core).against(material)] * len(bodies.cores)
-        return MeshScene((*bodies.outer, *bodies.cores), tuple(filling)), bodies
+        return MeshScene((*bodies.outer, *bodies.cores), tuple(filling)), bodies.text, bodies.balls
 
     def _delta_beta(self, substance: Substance) -> DeltaBeta:
         return substance.delta_beta(self.beam.energy_kev)

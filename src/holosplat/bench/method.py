@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 from ..matter import MaterialPrior
 from ..methods import Method as Options
-from ..methods import Task, solve
 from ..progress import Progress
 from ..scan import Scan
 from ..volume import Object
+from ..workflows.reconstruct import reconstruct
 
 
 @dataclass(frozen=True)
@@ -24,4 +24,6 @@ class Method:
 
     def run(self, scan: Scan, prior: MaterialPrior, seed: int, on_progress: Progress) -> Object:
         """The Object that the method makes of the training frames `scan`; `InputError` where it cannot."""
-        return solve(self.options, Task(scan, prior, seed, on_progress))
+        return reconstruct(
+            scan, prior, self.options, seed, on_progress=lambda stage, part, record: on_progress(stage, part)
+        ).object

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..methods import Gaussians, HolographicVoxels, NeuralFields, PerView, Surfaces, Voxels
+from ..methods import Auto, Gaussians, HolographicVoxels, NeuralFields, PerView, SmoothVolume, Surfaces, Voxels
 from ..methods.per_view import SVMBIR
 from ..methods.presets import preset
 from .method import Method
@@ -14,6 +14,7 @@ VOXELS = "voxels through the waves"
 NEURAL = "neural field through the waves"
 GAUSSIANS = "Gaussians through the waves"
 SURFACES = "surfaces through the waves"
+AUTO = "chosen by the frames"
 
 
 def methods(effort: float = 1.0) -> dict[str, Method]:
@@ -56,6 +57,12 @@ def _through_waves(effort: float) -> list[Method]:
             HolographicVoxels(),
         ),
         (
+            "volume",
+            VOXELS,
+            "a smooth volume of continuous matter: reconstruct --method volume",
+            SmoothVolume(),
+        ),
+        (
             "voxels-waves",
             VOXELS,
             "voxels from holographic-tv, fitted to the holograms, with total variation",
@@ -76,7 +83,7 @@ def _through_waves(effort: float) -> list[Method]:
         (
             "gaussians",
             GAUSSIANS,
-            "from phase retrieval and total variation: what reconstruct does by default",
+            "from phase retrieval and total variation: reconstruct --method gaussians",
             Gaussians().with_effort(effort),
         ),
         (
@@ -84,6 +91,12 @@ def _through_waves(effort: float) -> list[Method]:
             SURFACES,
             "closed surfaces cut out of the Gaussians and fitted to the holograms: reconstruct --method surfaces",
             Surfaces().with_effort(effort),
+        ),
+        (
+            "auto",
+            AUTO,
+            "what suits the matter, with the best state kept: what reconstruct does by default",
+            Auto().with_effort(effort),
         ),
     ]
     return [Method(*row) for row in rows]

@@ -14,6 +14,8 @@ from ..io.json import read_json, write_json
 from ..io.nxtomo import read_scan, write_scan
 from ..io.volumes import read_volume, write_volume
 from ..scan import Scan
+from ..specimens.continuous import ContinuousScene
+from ..specimens.scene import MeshScene
 from ..volume import Volume
 from ..workflows.provenance import scan_hash
 from .case import Case
@@ -53,13 +55,26 @@ def fingerprint(case: Case) -> str:
         digest.update(np.ascontiguousarray(array).tobytes())
     energy = exposures.one_energy("a case of the benchmark")
     numbers = (views.shape, views.pixel_size, energy, case.photons, case.prior.as_dict(), case.seed)
-    digest.update(repr((numbers, [tuple(material) for material in case.scene.materials])).encode())
+    digest.update(repr((numbers, _matter(case.scene))).encode())
+    if not case.light.is_even:
+        digest.update(repr(case.light).encode())
     return digest.hexdigest()[:16]
 
 
+def _matter(scene: MeshScene | ContinuousScene) -> list[object]:
+    """δ and β of each body, and the profiles of continuous ones."""
+    if isinstance(scene, ContinuousScene):
+        return [(element.profile, tuple(element.matter)) for element in scene.elements]
+    return [tuple(material) for material in scene.materials]
+
+
 def _arrays(case: Case) -> Iterable[np.ndarray]:
-    for mesh in case.scene.meshes:
-        yield from (mesh.vertices, mesh.faces)
+    if isinstance(case.scene, ContinuousScene):
+        for element in case.scene.elements:
+            yield from (element.centre, element.axes, element.gradient)
+    else:
+        for mesh in case.scene.meshes:
+            yield from (mesh.vertices, mesh.faces)
     exposures = case.exposures
     yield from (exposures.views.rotations, exposures.views.shifts)
     yield from (exposures.distance, exposures.psf_sigma_px, exposures.time, np.asarray(case.is_test, dtype=bool))
@@ -82,5 +97,6 @@ def described(case: Case) -> dict[str, Any]:
         "held_out_frames": int(np.count_nonzero(case.is_test)),
         "shares_axis": views.shares_axis,
         "photons": case.photons,
+        "light": case.light.facts(),
         "prior": case.prior.as_dict(),
     }

@@ -14,7 +14,7 @@ RESET_PEAK = "5"
 
 def source_commit() -> str:
     """The commit of this package's source tree, with `-dirty` if it was changed; empty outside a git checkout."""
-    root = Path(__file__).resolve().parents[4]
+    root = Path(__file__).resolve().parents[3]
     if not (root / ".git").exists():
         return ""
     command = ["git", "describe", "--always", "--dirty", "--abbrev=10", "--exclude=*"]

@@ -18,6 +18,7 @@ from ..specimens.foam import random_foam
 from ..specimens.phantoms import Ball, star_of_balls
 from ..specimens.red_cells import crowded_cells, random_cells
 from ..specimens.repair import closed
+from .soft_specimens import Continuous
 
 Extents = tuple[float, float, float]
 """`(x, y, z)` [m]."""
@@ -162,5 +163,7 @@ class BallStar:
         return Bodies(f"{len(balls)} balls of {len(self.diameters)} diameters, seed {seed}", meshes, balls=tuple(balls))
 
 
-Specimen = RedCells | CrowdedCells | Snapshots | Capsules | FoamDrop | BallStar
+Meshed = RedCells | CrowdedCells | Snapshots | Capsules | FoamDrop | BallStar
+"""Every kind of closed meshes."""
+Specimen = Meshed | Continuous
 """Every kind that a case's file may declare."""

@@ -1,4 +1,5 @@
-"""Truth objects: meshes made closed, red blood cells by their published shape, capsules, foam, and balls in series."""
+"""Truth objects: meshes made closed, red blood cells by their published shape, capsules, foam, balls in series, and
+continuous matter."""
 
 from __future__ import annotations
 

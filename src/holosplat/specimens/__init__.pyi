@@ -1,5 +1,10 @@
 from .capsules import Capsule as Capsule
 from .capsules import place_capsules as place_capsules
+from .continuous import Bump as Bump
+from .continuous import ContinuousScene as ContinuousScene
+from .continuous import Element as Element
+from .continuous import Soft as Soft
+from .continuous import ellipsoid as ellipsoid
 from .flow.suspension import Medium as Medium
 from .flow.suspension import Suspension as Suspension
 from .foam import Foam as Foam
@@ -18,3 +23,9 @@ from .red_cells import place_cells as place_cells
 from .red_cells import random_cells as random_cells
 from .repair import closed as closed
 from .scene import MeshScene as MeshScene
+from .soft_matter import body_with_absorber as body_with_absorber
+from .soft_matter import coated_droplets as coated_droplets
+from .soft_matter import round_cell as round_cell
+from .soft_matter import shepp_logan as shepp_logan
+from .soft_matter import soft_cells as soft_cells
+from .soft_matter import tissue as tissue

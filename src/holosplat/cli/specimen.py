@@ -1,0 +1,139 @@
+"""What `holosplat simulate` images: mesh files, a volume, or a continuous specimen that it generates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from ..checks import InputError, require
+from .options import BeamlineOptions, MeshOptions
+
+if TYPE_CHECKING:
+    from ..beamline.scenes import Filling
+    from ..specimens.continuous import ContinuousScene
+    from ..specimens.voxel_scene import VoxelScene
+
+Kind = Literal["soft-cells", "round-cell", "tissue", "head-phantom", "coated-droplets", "body-with-absorber"]
+CORED = ("coated-droplets", "body-with-absorber")
+
+
+@dataclass(frozen=True)
+class VolumeOptions:
+    """What the images of a TIFF stack show; an HDF5 volume says it itself."""
+
+    voxel_size: float | None = None
+    """Edge of the cubic voxels [m]."""
+    value_delta: float | None = None
+    """δ of a value of one (default: that of --material, so that values are its share)."""
+    value_delta_beta: float | None = None
+    """δ/β, with --value-delta (default: no absorption)."""
+    stacked: Literal["y", "z"] = "y"
+    """Axis along which images follow each other: y, the rotation axis, for slices across it, or z."""
+
+    def volume(self, paths: tuple[Path, ...], filling: Filling, energy_kev: float) -> VoxelScene:
+        """The scene that the volume files `paths` describe."""
+        from ..io.volume_files import StackMeaning, read_specimen
+        from ..matter import DeltaBeta
+        from ..specimens.voxel_scene import VoxelScene
+
+        known = self.value_delta is not None
+        require(known or self.value_delta_beta is None, "--value-delta-beta needs --value-delta.")
+        if self.voxel_size is None:
+            require(not known, "--value-delta needs --voxel-size; both are of TIFF images.")
+            return VoxelScene(read_specimen(paths, None))
+        if self.value_delta is not None:
+            ratio = self.value_delta_beta
+            require(ratio != 0, "--value-delta-beta must not be 0; leave it out where nothing absorbs.")
+            of = DeltaBeta(self.value_delta, self.value_delta / ratio if ratio is not None else 0.0)
+        else:
+            of = filling.of(paths[0].name, energy_kev)
+        return VoxelScene(read_specimen(paths, StackMeaning(self.voxel_size, of, self.stacked)))
+
+
+@dataclass(frozen=True)
+class GeneratedOptions:
+    """Continuous matter that is generated, in place of files."""
+
+    specimen: Kind | None = None
+    """Kind of specimen."""
+    specimen_size: float | None = None
+    """Its extent [m] (default: 0.85 of the shorter side of the field of view)."""
+    specimen_count: int = 9
+    """Number of cells or droplets."""
+    specimen_edge: float | None = None
+    """Width of the edges of soft cells and of the head phantom [m] (default: 3 pixels, or 4 % of the
+    extent where that is less)."""
+    specimen_seed: int = 0
+    """Seed of the specimen."""
+    core: str | None = None
+    """Formula or name of what is in coated droplets, or of the absorber; --material is around it."""
+    core_density: float | None = None
+    """Its density [g/cm³]; a named one has its own."""
+
+    def scene(self, beamline: BeamlineOptions, filling: Filling) -> ContinuousScene:
+        """The specimen in the beamline's field of view."""
+        from ..specimens import soft_matter
+
+        assert self.specimen is not None
+        pixel = beamline.pixel_size
+        size = self.specimen_size or 0.85 * min(beamline.detector) * pixel
+        edge, seed, box = self.specimen_edge, self.specimen_seed, (size, size, size)
+        edge = min(3 * pixel, 0.04 * size) if edge is None else edge
+        require(seed >= 0, f"--specimen-seed must be 0 or more, but it is {seed}.")
+        matter = filling.of(self.specimen, beamline.energy_kev)
+        cores = self._cores(filling, beamline.energy_kev)
+        if self.specimen == "soft-cells":
+            return soft_matter.soft_cells(self.specimen_count, (0.2 * size, 0.35 * size), box, matter, seed, edge)
+        if self.specimen == "round-cell":
+            return soft_matter.round_cell(size, matter, seed)
+        if self.specimen == "tissue":
+            return soft_matter.tissue(box, matter, seed)
+        if self.specimen == "head-phantom":
+            return soft_matter.shepp_logan(size, matter, edge)
+        if self.specimen == "coated-droplets":
+            sizes = (0.18 * size, 0.36 * size)
+            return soft_matter.coated_droplets(
+                self.specimen_count, sizes, 0.04 * size, box, (cores[0], matter), self.specimen_seed
+            )
+        return soft_matter.body_with_absorber((size, 0.75 * size, 0.9 * size), matter, cores[0], 0.16 * size, seed)
+
+    def _cores(self, filling: Filling, energy_kev: float) -> list:
+        """δ and β of the core against the medium, if the kind has one."""
+        from ..materials import parse_material
+
+        cored = self.specimen in CORED
+        require(cored or self.core is None, f"--core is what is inside {' and '.join(CORED)}, not {self.specimen}.")
+        require(self.core is not None or self.core_density is None, "--core-density needs --core.")
+        if not cored:
+            return []
+        if self.core is None:
+            raise InputError(f"--specimen {self.specimen} needs --core, the material that is inside.")
+        found = parse_material(self.core, self.core_density).delta_beta(energy_kev)
+        return [found.against(filling.medium.delta_beta(energy_kev)) if filling.medium else found]
+
+
+@dataclass(frozen=True)
+class SpecimenOptions:
+    """What is imaged."""
+
+    meshes: MeshOptions = MeshOptions()
+    volume: VolumeOptions = VolumeOptions()
+    generated: GeneratedOptions = GeneratedOptions()
+
+    def continuous(
+        self, paths: tuple[Path, ...], beamline: BeamlineOptions, filling: Filling
+    ) -> ContinuousScene | VoxelScene | None:
+        """The specimen, unless `paths` are meshes; `InputError` for a mixture."""
+        from ..io.volume_files import VOLUME_SUFFIXES
+
+        of_volume = [path for path in paths if path.suffix.lower() in VOLUME_SUFFIXES]
+        if self.generated.specimen is not None:
+            require(not paths, "--specimen generates what is imaged; give it or files, not both.")
+            return self.generated.scene(beamline, filling)
+        require(len(paths) > 0, "simulate needs mesh files, a volume, or --specimen.")
+        if not of_volume:
+            require(self.volume == VolumeOptions(), "--voxel-size and --value-delta are of TIFF images, not of meshes.")
+            return None
+        require(len(of_volume) == len(paths), "simulate takes meshes or a volume, but there are both; give one kind.")
+        return self.volume.volume(paths, filling, beamline.energy_kev)

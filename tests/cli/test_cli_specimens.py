@@ -1,0 +1,126 @@
+"""`holosplat simulate` of generated matter and of volumes, `holosplat materials`, and what they refuse."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+import tifffile
+
+from helpers.cli import Outcome, holosplat, worked
+from holosplat.geometry import Grid
+from holosplat.io.nxtomo import read_scan
+from holosplat.io.volumes import read_volume
+
+FIELD: list[object] = ["--detector", 21, 30, "--pixel-size", "2e-6", "--views", 4]
+
+
+def ran(*arguments: object) -> Outcome:
+    return worked(holosplat(*arguments))
+
+
+KINDS = {
+    "soft-cells": ["--specimen-count", 3],
+    "round-cell": [],
+    "tissue": [],
+    "head-phantom": [],
+    "coated-droplets": ["--core", "paraffin", "--specimen-count", 3],
+    "body-with-absorber": ["--core", "iron"],
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_is_generated(kind, tmp_path):
+    scan, truth = tmp_path / "s.nxs", tmp_path / "t.h5"
+    ran("simulate", "--specimen", kind, "--material", "PMMA", *KINDS[kind], *FIELD, "--out", scan, "--truth", truth)
+    found, volume = read_scan(scan), read_volume(truth)
+    assert found.frames.shape == (4, 21, 30)
+    assert found.frames.std() > 0.01
+    assert found.provenance["specimen"] == kind
+    assert volume.grid.shape == (30, 21, 30)
+    assert volume.delta.max() > 4e-7
+
+
+def test_a_volume_gives_the_frames_of_what_it_was_made_of(tmp_path):
+    """A cell, and its true volume of half a pixel, as HDF5 and as TIFF images; granules of a pixel lose fringes."""
+    out = {name: tmp_path / f"{name}.nxs" for name in ("cells", "volume", "tiff")}
+    truth, fine = tmp_path / "t.h5", tmp_path / "fine.h5"
+    generate = ["--specimen", "round-cell", "--specimen-size", "36e-6", "--material", "PMMA", "--medium", "water"]
+    ran("simulate", *generate, *FIELD, "--out", out["cells"], "--truth", truth)
+    half = ["--detector", 42, 60, "--pixel-size", "1e-6", "--views", 1, "--test-every", 0]
+    ran("simulate", *generate, *half, "--out", tmp_path / "x.nxs", "--truth", fine)
+    ran("simulate", fine, *FIELD, "--out", out["volume"], "--truth", tmp_path / "t2.h5")
+    volume = read_volume(fine)
+    ratio = volume.delta.sum(dtype=float) / volume.beta.sum(dtype=float)
+    tifffile.imwrite(tmp_path / "fine.tif", volume.delta.transpose(1, 0, 2) / 1e-7, photometric="minisblack")
+    says = ["--voxel-size", "1e-6", "--value-delta", "1e-7", "--value-delta-beta", ratio]
+    ran("simulate", tmp_path / "fine.tif", *says, *FIELD, "--out", out["tiff"])
+    frames = {name: read_scan(path).frames for name, path in out.items()}
+    contrast = frames["cells"].std()
+    assert contrast > 0.005
+    assert np.sqrt(np.mean((frames["volume"] - frames["cells"]) ** 2)) < 0.2 * contrast
+    assert np.sqrt(np.mean((frames["tiff"] - frames["volume"]) ** 2)) < 0.01 * contrast
+    again = read_volume(tmp_path / "t2.h5")
+    assert again.grid == read_volume(truth).grid == Grid.centred((30, 21, 30), 2e-6)
+    assert np.linalg.norm(again.delta - read_volume(truth).delta) < 0.03 * np.linalg.norm(again.delta)
+    assert read_scan(out["tiff"]).provenance["volume"] == "fine.tif"
+
+
+def test_light_is_in_the_frames_and_in_the_file(tmp_path):
+    out = tmp_path / "s.nxs"
+    light = ["--light-smooth", 0.02, "--light-grain", 0.004, "--photons-per-pixel", 1e6]
+    ran(
+        "simulate",
+        "--specimen",
+        "round-cell",
+        "--medium",
+        "haemoglobin",
+        "--material",
+        "red cell",
+        *light,
+        *FIELD,
+        "--out",
+        out,
+    )
+    scan = read_scan(out)
+    assert scan.provenance["light_grain"] == "0.004"
+    assert 0.005 < scan.frames[:, 0].std() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "needs mesh files, a volume, or --specimen"),
+        (["--specimen", "tissue", "a.vtk"], "give it or files, not both"),
+        (["--specimen", "coated-droplets"], "needs --core"),
+        (["--specimen", "tissue", "--core", "iron"], "--core is what is inside"),
+        (["--specimen", "coated-droplets", "--core-density", 1], "--core-density needs --core"),
+        (["--specimen", "tissue", "--frame-rate", 100], "--frame-rate is of moving meshes"),
+        (["--specimen", "tissue", "--bandwidth", 0.01], "a spectrum needs meshes"),
+        (["--specimen", "tissue", "--specimen-seed", -1], "specimen-seed must be 0 or more"),
+        (["--specimen", "tissue", "--light-drift-px", 3], "light_drift_px moves the pattern"),
+        (["a.vtk", "--voxel-size", "1e-6"], "of TIFF images, not of meshes"),
+        (["a.vtk", "b.h5"], "meshes or a volume, but there are both"),
+        (["a.tif"], "give --voxel-size"),
+        (["a.tif", "--value-delta", "1e-7"], "--value-delta needs --voxel-size"),
+        (["a.tif", "--voxel-size", "1e-6", "--value-delta-beta", 100], "--value-delta-beta needs --value-delta"),
+        (["a.h5", "--voxel-size", "1e-6"], "says its voxel size, δ and β itself"),
+    ],
+)
+def test_requests_that_cannot_be_are_refused(arguments, said, tmp_path):
+    outcome = holosplat("simulate", *arguments, *FIELD, "--out", tmp_path / "s.nxs")
+    assert outcome.code == 2
+    assert re.search(r"\W+".join(re.findall(r"\w+", said)), outcome.said)
+    assert not (tmp_path / "s.nxs").exists()
+
+
+def test_materials_are_listed():
+    everything = ran("materials").out.splitlines()
+    assert len(everything) > 50
+    bone = [line for line in ran("materials", "bone", "--energy-kev", 30).out.splitlines() if line.startswith("cort")]
+    assert "ICRU-44" in bone[0]
+    assert "1.92" in bone[0]
+    refused = holosplat("materials", "kryptonite")
+    assert refused.code == 2
+    assert "kryptonite is in none" in refused.err
