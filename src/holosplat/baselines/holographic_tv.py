@@ -14,25 +14,25 @@ from typing import Literal
 
 import torch
 from torch import Tensor
-from torch.nn.functional import interpolate, pad
 
 from ..checks import at_least
 from ..geometry import Grid, Views
 from ..materials import DeltaBeta
 from ..memory import memory_kept
-from ..model import Instrument
+from ..model import Instrument, SolvedLight
+from ..optics.background import Light
 from ..optics.noise import noise_share
-from ..optics.retrieval import Tikhonov, tikhonov
+from ..optics.retrieval import Tikhonov, absorption_alone, tikhonov
 from ..optics.retrieval.bounded import MODEL_ERROR, PRIOR
-from ..optics.retrieval.spectra import Raster, filtered, radian, response, spectra, surrounded
+from ..optics.retrieval.spectra import Raster, filtered, noise_found, radian, response, spectra, surrounded
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..projectors.voxels import projector_for
 from ..scan import Scan
-from ..volume import LineIntegrals
 from .primal_dual import PrimalDual
-from .rays import rays_of
+from .rays import photons_left, rays_of
 from .tomography import TotalVariation, tv_solver
+from .wave_frames import frames_of, refined
 
 
 @dataclass(frozen=True)
@@ -70,25 +70,29 @@ class HolographicTV:
 
 
 def holographic_tv(
-    scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress
+    scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress, light: Light | None = None
 ) -> tuple[Tensor, Grid]:
     """Occupancy [Z, Y, X] of `material` (δ > 0, β of any sign) from the frames of `scan`, and its grid.
 
-    `on_progress(stage, fraction)` is called between pieces of work.
+    `on_progress(stage, fraction)` is called between pieces of work. light: uneven light that the frames were divided
+    by; what is left of it is found anew in each round of agreement, beside what the volume predicts.
     """
     with memory_kept():
-        return _holographic_tv(scan, material, options, on_progress)
+        return _holographic_tv(scan, material, options, on_progress, light)
 
 
 def _holographic_tv(
-    scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress
+    scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress, light: Light | None
 ) -> tuple[Tensor, Grid]:
     noise = noise_share(torch.from_numpy(scan.frames))
+    whole = scan.views.shape
     scan, refine = _working_resolution(scan, options)
+    light = light if scan.views.shape == whole else None  # binned frames are many: their light is known well
     solver = _tomography(scan, material, options, on_progress)
-    if options.corrections == 0 or noise > options.noisy:
+    alone = absorption_alone(scan.exposures, material.beta / material.delta)  # then retrieval left nothing to correct
+    if options.corrections == 0 or noise > options.noisy or alone.all():
         return solver.volume, Grid.of_views(scan.views)
-    return _agree(scan, material, solver, options, refine, on_progress)
+    return _agree(scan, material, solver, options, refine, on_progress, light)
 
 
 def _tomography(scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress) -> PrimalDual:
@@ -100,11 +104,18 @@ def _tomography(scan: Scan, material: DeltaBeta, options: HolographicTV, on_prog
     rays = rays_of(lines, scan.views, Grid.of_views(scan.views), options.backend)
     first = min(TotalVariation.first, options.iterations)
     steps = TotalVariation(first=first, iterations=options.iterations - first)
-    return tv_solver(rays, options.upper or None, steps, partial(on_progress, "tomography"), options.backend)
+    weights = photons_left(lines, scan.exposures, material)
+    return tv_solver(rays, options.upper or None, steps, partial(on_progress, "tomography"), options.backend, weights)
 
 
 def _agree(
-    scan: Scan, material: DeltaBeta, coarse: PrimalDual, options: HolographicTV, refine: int, on_progress: Progress
+    scan: Scan,
+    material: DeltaBeta,
+    coarse: PrimalDual,
+    options: HolographicTV,
+    refine: int,
+    on_progress: Progress,
+    light: Light | None,
 ) -> tuple[Tensor, Grid]:
     """The volume after rounds of agreement with the holograms, on voxels `refine` times finer than pixels.
 
@@ -115,6 +126,7 @@ def _agree(
     """
     frames, pitch, views = torch.from_numpy(scan.frames), scan.views.pixel_size, _in_pixels(scan.views)
     correction = Correction(scan, material)
+    beside = None if light is None or light.background is None else SolvedLight(light.background, frames)
     finer = math.ceil(fringe_sampling(scan.exposures) / refine)
     instrument = Instrument(scan.exposures, refine * finer, backend=options.backend)
     grid = Grid.of_views(views, refine)
@@ -125,12 +137,14 @@ def _agree(
     for done in range(options.corrections + 1):
         on_progress("agreement with the holograms", done / options.corrections)
         lines = solver.lines()
-        missing = frames - _image(instrument, _refined(lines, finer) * pitch, material).detach()
+        predicted = frames_of(instrument, refined(lines, finer) * pitch, material).detach()
+        lit = predicted if beside is None else predicted * beside.factor(images=predicted)
+        missing = frames - lit
         misfit = float(missing.square().sum())
         if misfit < least or done <= options.settling:
             best, least = solver.volume.clone(), misfit
         if done < options.corrections:
-            solver.run(lines + _refined(correction(missing) / pitch, refine), inner)
+            solver.run(lines + refined(correction(missing) / pitch, refine), inner)
     return best, _in_metres(grid, pitch)
 
 
@@ -147,7 +161,7 @@ class Correction:
         wide, _ = surrounded(frames, scan.exposures)
         raster = Raster((wide.shape[-2], wide.shape[-1]), scan.views.pixel_size)
         h = response(scan.exposures, material.beta / material.delta, raster)
-        known = spectra(frames, scan.exposures, h, raster, None, MODEL_ERROR, PRIOR)
+        known = spectra(frames, scan.exposures, h, raster, noise_found(frames, None), MODEL_ERROR, PRIOR)
         self._inverse = known.inverse
 
     def __call__(self, missing: Tensor) -> Tensor:
@@ -166,19 +180,6 @@ def _working_resolution(scan: Scan, options: HolographicTV) -> tuple[Scan, int]:
     while w * w * h / factor**3 > options.max_voxels:
         factor += 1
     return scan.binned(factor), refine
-
-
-def _image(instrument: Instrument, lines: Tensor, material: DeltaBeta) -> Tensor:
-    """Frames from thickness [V, H, W] in metres on the unpadded raster (matter outside it counts as none)."""
-    (my, mx), s = instrument.margin, instrument.oversample
-    padded = pad(lines, (mx * s, mx * s, my * s, my * s))
-    return instrument.frames(LineIntegrals(padded[:, None], ((material.delta, material.beta),)))
-
-
-def _refined(images: Tensor, factor: int) -> Tensor:
-    if factor == 1:
-        return images
-    return interpolate(images[None], scale_factor=factor, mode="bilinear", align_corners=False)[0]
 
 
 def _in_pixels(views: Views) -> Views:

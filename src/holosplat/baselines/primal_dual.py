@@ -71,6 +71,7 @@ class PrimalDual:
         self._residual_dual = torch.zeros_like(path)
         self._gradient_dual = self._array.new_zeros(3, *self._array.shape)
         self._damping: Tensor | None = None
+        self._softening = 1 + self._dual_step
 
     @property
     def volume(self) -> Tensor:
@@ -106,6 +107,10 @@ class PrimalDual:
         self._dual_step = self._dual_step.min()
         self._damping = 1 / (1 + self._dual_step * spectrum)
 
+    def weigh(self, weights: Tensor) -> None:
+        """From now on the data term is `½ Σ w (A u - b)²`, w > 0 for each ray [V, H, W]; 1 is how it begins."""
+        self._softening = 1 + self._dual_step / self.projector.lines_in(weights)
+
     def run(self, images: Tensor, iterations: int) -> None:
         """`iterations` more steps towards the volume that explains the line integrals [V, H, W]."""
         lines = self.projector.lines_in(images)
@@ -116,7 +121,7 @@ class PrimalDual:
         difference = self.projector.project(self._extrapolated) - lines
         ascended = self._residual_dual + self._dual_step * difference
         if self._damping is None:
-            self._residual_dual = ascended / (1 + self._dual_step)
+            self._residual_dual = ascended / self._softening
         else:
             spectrum = torch.fft.rfft2(ascended, norm="ortho") * self._damping
             self._residual_dual = torch.fft.irfft2(spectrum, s=ascended.shape[-2:], norm="ortho")

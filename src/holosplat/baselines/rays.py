@@ -11,7 +11,15 @@ from torch.nn.functional import interpolate
 
 from ..checks import InputError, require
 from ..geometry import Grid, Views
+from ..matter import DeltaBeta
 from ..projectors.voxels import LatticeProjector, SliceProjector, projector_for
+from ..scan import Exposures
+from ..units import wavenumber
+
+EVEN = 0.5
+"""Share of the light that all rays must pass for their weights to be taken as equal."""
+FEWEST = 1e-3
+"""Share of the light below which a ray's weight falls no further."""
 
 
 @dataclass(frozen=True)
@@ -58,6 +66,17 @@ def in_pixels(lines: Tensor, views: Views, grid: Grid) -> tuple[Views, Grid]:
     (dx, dy, dz), (x, y, z) = ([length / pitch for length in lengths] for lengths in (grid.voxel_size, grid.origin))
     in_views = Views(views.rotations, views.shifts / pitch, views.shape, 1.0)
     return in_views, Grid(grid.shape, (dx, dy, dz), (x, y, z))
+
+
+def photons_left(lines: Tensor, exposures: Exposures, material: DeltaBeta) -> Tensor | None:
+    """Share of the light [V, H, W] that passes `lines` [V, H, W] [m] of `material`, or None if all pass half of it.
+
+    The logarithm of an intensity I has the variance 1/N I for N photons beside the matter, so I is the weight of a ray
+    (Sauer & Bouman 1993, eq. 13). Where all rays weigh about the same, weights change nothing.
+    """
+    mu = 2 * wavenumber(exposures.energy_kev) * exposures.refraction(*material)[1]
+    share = torch.exp(-torch.from_numpy(mu)[:, None, None] * lines).clamp(FEWEST, 1.0).float()
+    return share if float(share.min()) < EVEN else None
 
 
 def bounded(volume: Tensor, lowest: float | None, upper: float | None) -> Tensor:

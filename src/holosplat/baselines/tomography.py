@@ -12,6 +12,7 @@ from torch import Tensor
 from ..checks import at_least
 from ..geometry import Grid, Views
 from ..memory import memory_kept
+from ..metrics.correlation import shortest_side
 from ..progress import Advance
 from .algebraic import Algebraic, art, sirt
 from .filtered_backprojection import filtered_backprojection
@@ -76,14 +77,20 @@ def tv_solver(
     options: TotalVariation,
     on_progress: Advance,
     backend: str = "cpu",
+    weights: Tensor | None = None,
 ) -> PrimalDual:
-    """The solver of `total_variation` after its last iteration, for those who go on from there."""
+    """The solver of `total_variation` after its last iteration, for those who go on from there.
+
+    weights: trust in each ray [V, H, W], above 0; with them, frequencies are trusted alike to the end.
+    """
     start, coupling = torch.zeros(rays.grid.shape), 1 / rays.refine**2
     solver = PrimalDual(rays.projector, start, options.weight, checked_upper(upper), coupling, backend)
+    if weights is not None:
+        solver.weigh(weights)
     images, total = rays.projector.lines_out(rays.measured), options.first + options.iterations
     for done in range(total):
         on_progress(done / total)
-        if done == options.first and options.discount > 0:
+        if done == options.first and options.discount > 0 and weights is None:
             solver.discount(misfit_spectrum(rays, solver.lines() - images) ** options.discount)
         solver.run(images, 1)
     return solver
@@ -98,7 +105,7 @@ def misfit_spectrum(rays: Rays, misfit: Tensor) -> Tensor:
     power = torch.fft.rfft2(ordered, norm="ortho").abs().square().mean(0)
     h, w = ordered.shape[1:]
     frequency = np.hypot(np.fft.fftfreq(h)[:, None], np.fft.rfftfreq(w))
-    steps = min(h, w)
+    steps = int(shortest_side((h, w), (1.0, 1.0)))
     ring = torch.from_numpy(np.minimum(np.rint(frequency * steps), steps // 2).astype(np.int64)).ravel()
     sums = torch.zeros(steps // 2 + 1, dtype=power.dtype).index_add(0, ring, power.ravel())
     means = sums / torch.bincount(ring, minlength=len(sums)).clamp_min(1)

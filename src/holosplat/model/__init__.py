@@ -1,8 +1,9 @@
 """From matter to frames: the only way that leads there."""
 
+from ..optics.modes import smooth_modes
 from .alignment import Alignment
 from .instrument import Instrument
-from .light import LightField, smooth_modes
+from .light import LightField, SolvedLight
 from .scene import Model, measure
 
-__all__ = ["Alignment", "Instrument", "LightField", "Model", "measure", "smooth_modes"]
+__all__ = ["Alignment", "Instrument", "LightField", "Model", "SolvedLight", "measure", "smooth_modes"]

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..checks import require
+from ..optics.background import DARKEST, Background, posterior_covariance
 
 
 @dataclass(frozen=True)
@@ -46,24 +47,54 @@ class LightField:
         """The same modes with other coefficients."""
         return replace(self, coefficients=parameters.get("coefficients", self.coefficients))
 
-    def factor(self, index: Tensor | None = None) -> Tensor:
-        """The factor [V, h, w] of all frames, or of those of `index`."""
+    def __len__(self) -> int:
+        return len(self.coefficients)
+
+    def factor(self, index: Tensor | None = None, images: Tensor | None = None) -> Tensor:
+        """The factor [V, h, w] of all frames, or of those of `index`, whatever even light gives as `images`."""
         chosen = self.coefficients if index is None else self.coefficients.index_select(0, index)
         return torch.einsum("vk,khw->vhw", chosen, self.modes).exp()
 
 
-def smooth_modes(shape: tuple[int, int], order: int, device: torch.device | str = "cpu") -> Tensor:
-    """Products of cosines [K, h, w] up to `order` half waves along each side, `(order + 1)²` of them, float32.
+class SolvedLight:
+    """The factor of each of V frames that explains best what matter in even light does not: it has no parameters.
 
-    The first is constant one; they are those of the discrete cosine transform, of rms one.
+    In every step its coefficients c solve `(MᵀM/p + T⁻¹) c = Mᵀ log(measured / images) / p - T⁻¹ b`: a ridge regression
+    on the modes M, for noise of power p at their frequencies, and a prior of variances T about -b where the frames were
+    divided by `exp(Σ b m)` before. The light is thus eliminated ("variable projection", Golub & Pereyra 1973), and
+    gradients by the matter are right without going through it, for c is at its optimum.
     """
-    require(order >= 0, f"the order of smooth modes must be 0 or more, but it is {order}.")
-    rows, columns = (_cosines(n, order, device) for n in shape)
-    modes = rows[:, None, :, None] * columns[None, :, None, :]
-    return modes.reshape(-1, *shape).float()
 
+    def __init__(self, background: Background, measured: Tensor) -> None:
+        """background: the light that the frames `measured` [V, h, w] were divided by, on whose device this computes."""
+        on = measured.device
+        modes = background.modes()
+        flat = modes.double().flatten(1)
+        gain = posterior_covariance((flat @ flat.T)[None], background.variances, background.powers)
+        self._modes, self._measured = modes.to(on), measured
+        self._gain = (gain / background.powers[:, None, None]).float().to(on)
+        pull = background.coefficients / background.variances
+        self._before = torch.einsum("vkl,vl->vk", gain, pull).float().to(on)
 
-def _cosines(count: int, order: int, device: torch.device | str) -> Tensor:
-    place = (torch.arange(count, dtype=torch.float64, device=device) + 0.5) / count
-    waves = torch.cos(torch.pi * torch.arange(order + 1, dtype=torch.float64, device=device)[:, None] * place)
-    return waves / waves.square().mean(dim=1, keepdim=True).sqrt().clamp_min(1e-12)
+    def __len__(self) -> int:
+        return len(self._measured)
+
+    def coefficients(self, images: Tensor, index: Tensor | None = None) -> Tensor:
+        """The coefficients [V, K] beside `images` [V, h, w] of even light, of all frames or of those of `index`."""
+        measured, gain, before = self._measured, self._gain, self._before
+        if index is not None:
+            measured, gain, before = (part.index_select(0, index) for part in (measured, gain, before))
+        seen = (measured > DARKEST) & (images > DARKEST)
+        ratio = torch.where(seen, measured.clamp_min(DARKEST) / images.detach().clamp_min(DARKEST), 1.0).log()
+        right = torch.einsum("vhw,khw->vk", ratio, self._modes)
+        return torch.einsum("vkl,vl->vk", gain, right) - before
+
+    def settled(self, images: Tensor) -> LightField:
+        """The light beside `images` [V, h, w] of even light, as numbers."""
+        return LightField(self.coefficients(images).detach(), self._modes)
+
+    def factor(self, index: Tensor | None = None, images: Tensor | None = None) -> Tensor:
+        """The factor [V, h, w] beside `images` of even light; one without any."""
+        if images is None:
+            return torch.ones_like(self._measured if index is None else self._measured[index])
+        return torch.einsum("vk,khw->vhw", self.coefficients(images, index), self._modes).exp()

@@ -16,7 +16,7 @@ from ..scan import Exposures
 from ..volume import Component, LineIntegrals, Object, TrainableObject
 from .alignment import Alignment
 from .instrument import Instrument
-from .light import LightField
+from .light import LightField, SolvedLight
 
 PARTS = ("object", "alignment", "light")
 """The parts of a model that may have parameters."""
@@ -37,11 +37,11 @@ class Model:
     object: Object
     instrument: Instrument
     alignment: Alignment | None = None
-    light: LightField | None = None
+    light: LightField | SolvedLight | None = None
 
     def __post_init__(self) -> None:
         count = len(self.instrument.views)
-        for name, part in (("alignment", self.alignment), ("light", self.light and self.light.coefficients)):
+        for name, part in (("alignment", self.alignment), ("light", self.light)):
             require(
                 part is None or len(part) == count,
                 f"the {name} of a model must be of all its {count} exposures; make it anew for them.",
@@ -81,7 +81,7 @@ class Model:
         """
         times = self.instrument.times
         images = self._seen(float(times[0]) + delay, index) if len(times) == 1 else self._of_several_times(index, delay)
-        return images if self.light is None else images * self.light.factor(index)
+        return images if self.light is None else images * self.light.factor(index, images)
 
     def lines(self, time: float, index: Tensor | None = None) -> LineIntegrals:
         """Line integrals of the matter at `time` [s] on the instrument's raster, in the exposures `index`."""

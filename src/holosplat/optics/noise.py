@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -9,6 +11,8 @@ TILE, QUIET = 16, 0.05
 """Edge of the tiles in which the noise is measured [pixels], and the quantile of the tiles' values that is believed."""
 NORMAL_MEDIAN = 0.6745
 """The median of |x| for a standard normal x."""
+NORMS = (1.0, math.sqrt(2), math.sqrt(6))
+"""Of the differences of order 0, 1 and 2: roots of the summed squares of 1; 1, -1; 1, -2, 1."""
 QUIET_TILE = 0.86
 """Ratio of the estimate from quiet tiles to the standard deviation, in pure noise (measured on frames of about 96²
 pixels)."""
@@ -18,23 +22,40 @@ PHOTON_RANGE = (1e-3, 1e15)
 
 
 def noise_level(images: Tensor) -> float:
-    """Standard deviation of white noise on images [V, H, W] of at least 3 × 3 pixels.
+    """Standard deviation of white noise on images [V, H, W].
 
     The estimate uses the medians of |second differences along both axes| (the mask of Immerkær 1996, eq. 2, of norm 6)
-    in the quiet tiles. Fringes that fill a tile count as noise. The estimate is some per cent too low.
+    in the quiet tiles. Fringes that fill a tile count as noise. The estimate is some per cent too low. Images of one or
+    two rows, or columns, have differences of lower order across them; tiles of few rows are longer.
     """
-    differences = images.diff(n=2, dim=1).diff(n=2, dim=2).abs()
-    h, w = (min(TILE, n) for n in differences.shape[1:])
+    differences, norm = _rough(images)
+    rows, columns = differences.shape[1:]
+    h = min(TILE, rows)
+    w = min(TILE if rows >= TILE // 2 else TILE**2 // h, columns)
     tiles = differences.unfold(1, h, h).unfold(2, w, w).flatten(3).median(dim=-1).values
-    return float(tiles.flatten().quantile(QUIET)) / (6 * NORMAL_MEDIAN)
+    return float(tiles.flatten().quantile(QUIET)) / (norm * NORMAL_MEDIAN)
+
+
+def _rough(images: Tensor) -> tuple[Tensor, float]:
+    """|Differences| of images [V, H, W] along both axes, of second order where there are three samples, and their norm:
+    what they make of the standard deviation of white noise."""
+    norm = 1.0
+    for axis in (1, 2):
+        order = min(2, images.shape[axis] - 1)
+        images, norm = images.diff(n=order, dim=axis), norm * NORMS[order]
+    return images.abs(), norm
 
 
 def wavelet_noise(frames: Tensor) -> Tensor:
     """Standard deviation [V] of the noise, float64: median absolute deviation of the finest diagonal Haar wavelets.
 
-    Donoho & Johnstone (1994), section 4.2. Fringes of the finest pitch pass for noise.
+    Donoho & Johnstone (1994), section 4.2. Fringes of the finest pitch pass for noise. Frames of one row, or one
+    column, have no diagonal; second differences along them take its place.
     """
     i = frames.detach().double()
+    if min(i.shape[1:]) < 2:
+        differences, norm = _rough(i)
+        return differences.flatten(1).median(1).values / (norm * NORMAL_MEDIAN)
     diagonal = 0.5 * (i[:, :-1, :-1] + i[:, 1:, 1:] - i[:, :-1, 1:] - i[:, 1:, :-1])
     return diagonal.abs().flatten(1).median(1).values / NORMAL_MEDIAN
 

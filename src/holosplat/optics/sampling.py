@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from ..scan import Exposures
 from ..units import wavelength
 from .propagation import fresnel_reach_px
@@ -11,6 +13,9 @@ from .propagation import fresnel_reach_px
 FRINGE_SAMPLES = 1.5
 """Wave samples on the first fringe's width √(λz) in reconstructions, and where they are judged: with fewer, the fringes
 at the edges of cells are lost (docs/method.md); more cost memory and time as their square."""
+NARROWEST_FRINGE = 1 / 16
+"""Pixels on a first fringe below which it needs no samples of its own: light moves by less than a thousandth of a pixel
+where the phase changes by one radian a pixel (λz/2πp²)."""
 GUARD_PX = 5
 """Detector pixels of margin beyond the fringes' reach: room for the point-spread function and faint tails."""
 
@@ -31,18 +36,30 @@ def padding(exposures: Exposures, oversample: int) -> tuple[int, int]:
 
 
 def fringe_sampling(exposures: Exposures, extra: int = 0) -> int:
-    """Samples per detector pixel that fits and what judges them work with; extra: further ones, for safety."""
-    return resolving_oversample(exposures, FRINGE_SAMPLES, at_least=1) + extra
+    """Samples per detector pixel that fits and what judges them work with; extra: further ones, for safety.
+
+    Frames whose first fringe is narrower than `NARROWEST_FRINGE` pixels, or that have none, need one sample a pixel.
+    """
+    seen = np.flatnonzero(fringes(exposures) >= NARROWEST_FRINGE * exposures.views.pixel_size)
+    return extra + (resolving_oversample(exposures[seen], FRINGE_SAMPLES, at_least=1) if len(seen) else 1)
+
+
+def fringes(exposures: Exposures) -> np.ndarray:
+    """Widths √(λz) [V] of the first fringes [m]; 0 in contact."""
+    return np.sqrt(wavelength(exposures.energy_kev) * exposures.distance)
 
 
 def resolving_oversample(exposures: Exposures, samples_per_fringe: float, at_least: int) -> int:
     """Samples per detector pixel that put `samples_per_fringe` samples on the first fringe's width √(λz).
 
     At most `2 samples_per_fringe`, or 8: fringes far narrower than a pixel hardly change a pixel's mean (with 16,
-    cells of 64 µm on 3.2 µm pixels stay right to 1.5 % of their contrast however short the distance).
+    cells of 64 µm on 3.2 µm pixels stay right to 1.5 % of their contrast however short the distance). In contact there
+    is no fringe, and `at_least` is what is taken.
     """
-    fringe = math.sqrt((wavelength(exposures.energy_kev) * exposures.distance).min())
-    wanted = math.ceil(exposures.views.pixel_size * samples_per_fringe / fringe)
+    widths = fringes(exposures)
+    if not widths.any():
+        return at_least
+    wanted = math.ceil(exposures.views.pixel_size * samples_per_fringe / widths[widths > 0].min())
     return max(at_least, min(wanted, max(8, math.ceil(2 * samples_per_fringe))))
 
 

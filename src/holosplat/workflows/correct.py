@@ -9,9 +9,13 @@ from typing import Literal
 import numpy as np
 
 from ..checks import require
+from ..frames import Frames
 from ..io.atomic import require_apart, require_writable
+from ..io.formats import open_raw
 from ..io.nxtomo import scan_writer
-from ..io.scan_file import DARK, FLAT, PROJECTION, ScanFile, open_scan
+from ..io.raw_file import DARK, FLAT, PROJECTION, ScanFile
+from ..io.reading import Reading
+from ..optics.air import Box
 from ..preprocess import (
     EigenFlats,
     PixelRepair,
@@ -21,6 +25,8 @@ from ..preprocess import (
     relative_intensity,
 )
 from ..progress import Advance
+from ..scan import Scan
+from .air_light import AirLight
 
 MOST_DEFECTS = 0.2
 """A larger share of defective pixels is no camera to reconstruct from."""
@@ -28,45 +34,55 @@ RIM = 0.05
 """Width of a frame's rim, as a part of its shorter side, that `normalise = "rim"` takes to be free of the object."""
 
 Method = Literal["dynamic", "plain"]
-Normalise = Literal["mean", "rim", "none"]
+Normalise = Literal["air", "mean", "rim", "none"]
+
+ENOUGH_FLATS = 3
+"""Flats that the dynamic method needs."""
 
 
 @dataclass(frozen=True)
 class CorrectionOptions:
     """How raw frames are corrected."""
 
-    method: Method = "dynamic"
-    """dynamic: a flat field for each frame, from the flats' principal components; plain: the mean flat field."""
+    method: Method | None = None
+    """dynamic: a flat field for each frame, from the flats' principal components; plain: the mean flat field (default:
+    dynamic with three flats or more)."""
     normalise: Normalise | None = None
-    """What is brought to 1 in each frame: its mean, its rim, or nothing (default: dynamic the mean, plain nothing)."""
+    """What is brought to 1 in each frame: its air, by a smooth factor, its mean, its rim, or nothing (default: the air
+    where it is uneven beyond its noise, else dynamic the mean, plain nothing)."""
+    air: tuple[Box, ...] = ()
+    """Boxes without matter in any frame: first row, end row, first column, end column (default: found)."""
     components: int | None = None
     """Most principal components (default: as many as stand out of the noise)."""
     binning: int | None = None
     """Pixels are averaged this many by this many to find their weights (default: 8, less for small frames)."""
 
     def __post_init__(self) -> None:
-        require(self.method in ("dynamic", "plain"), f"method must be dynamic or plain, but it is {self.method!r}.")
-        known = self.normalise in (None, "mean", "rim", "none")
-        require(known, f"normalise must be mean, rim or none, but it is {self.normalise!r}.")
+        known = self.method in (None, "dynamic", "plain")
+        require(known, f"method must be dynamic or plain, but it is {self.method!r}.")
+        known = self.normalise in (None, "air", "mean", "rim", "none")
+        require(known, f"normalise must be air, mean, rim or none, but it is {self.normalise!r}.")
+        goes = not self.air or self.normalise in (None, "air")
+        require(goes, f"--air goes with --normalise air, but this is {self.normalise}; leave one of them.")
         for name in ("components", "binning"):
             value = getattr(self, name)
-            require(value is None or self.method == "dynamic", f"{name} goes with the method dynamic; leave it.")
+            require(value is None or self.method != "plain", f"{name} goes with the method dynamic; leave it.")
             require(value is None or value >= 1, f"{name} must be at least 1, but it is {value}.")
-
-    @property
-    def reference(self) -> Normalise:
-        """What is brought to 1, by default too."""
-        return self.normalise or ("mean" if self.method == "dynamic" else "none")
 
 
 @dataclass(frozen=True)
 class Corrected:
-    """What was corrected: frames; defective pixels that the file marks, and that were found beside; components used."""
+    """What was corrected: frames; defective pixels that the file marks, and that were found beside; components used;
+    the method; flats in the file; what was normalised; projections without air, which took the others' mean light."""
 
     frames: int
     marked: int
     found: int
     components: int
+    method: Method = "dynamic"
+    flats: int = 0
+    normalised: Normalise = "none"
+    airless: int = 0
 
 
 class FlatFielding:
@@ -75,10 +91,13 @@ class FlatFielding:
     def __init__(self, file: ScanFile, options: CorrectionOptions, on_progress: Advance) -> None:
         self.file, self.options = file, options
         darks, self._flats = file.numbers(DARK), file.numbers(FLAT)
-        dynamic = options.method == "dynamic"
-        enough = len(self._flats) >= (3 if dynamic else 1)
+        self.flats = len(self._flats)
+        self.method: Method = options.method or ("dynamic" if self.flats >= ENOUGH_FLATS else "plain")
+        dynamic = self.method == "dynamic"
+        enough = self.flats >= (ENOUGH_FLATS if dynamic else 1)
         wanted = "at least three flats (1) for the dynamic method" if dynamic else "flats (1)"
-        require(enough, f"{file.fields.path} must mark {wanted} in image_key, but it marks {len(self._flats)}.")
+        hint = "; take --method plain" if dynamic and self.flats else ""
+        require(enough, f"{file.path} must mark {wanted} in image_key, but it marks {self.flats}{hint}.")
         dark, noise = _mean_and_noise(file, darks)
         self.marked = file.mask()
         mean_flat = file.mean(FLAT)
@@ -87,7 +106,7 @@ class FlatFielding:
         share = found.mean()
         require(
             share <= MOST_DEFECTS,
-            f"{file.fields.path}: {share:.0%} of the pixels are defective by its darks and flats; check its image_key.",
+            f"{file.path}: {share:.0%} of the pixels are defective by its darks and flats; check its image_key.",
         )
         on_progress(0.1)
         self.repair = PixelRepair(found)
@@ -101,29 +120,14 @@ class FlatFielding:
         """The relative intensity [H, W] of frame `number` of the file."""
         raw = self.repair(self.file.frame(number))
         bright = raw.mean() > self.dark.mean()
-        require(
-            bool(bright), f"{self.file.fields.path}: frame {number} is as dark as the dark ones; mark it invalid (3)."
-        )
-        frame = relative_intensity(raw, self.dark, self.flat_field(raw))
-        return frame / self._level(frame)
+        require(bool(bright), f"{self.file.path}: frame {number} is as dark as the dark ones; mark it invalid (3).")
+        return relative_intensity(raw, self.dark, self.flat_field(raw))
 
     def flat_field(self, raw: np.ndarray) -> np.ndarray:
         """The flat field less the dark one, [H, W] counts, for a frame of counts `raw` [H, W] already repaired."""
         if self.eigen is None or self._weights is None:
             return self.light
         return self.eigen.light(self._weights(raw - self.dark))
-
-    def _level(self, frame: np.ndarray) -> float:
-        """What is brought to 1."""
-        if self.options.reference == "none":
-            return 1.0
-        counted = np.ones(frame.shape, dtype=bool)
-        if self.options.reference == "rim":
-            width = max(1, round(RIM * min(frame.shape)))
-            counted[width:-width, width:-width] = False
-        level = float(frame[counted].mean())
-        require(level > 0, f"{self.file.fields.path} has a projection whose rim is dark; normalise by its mean.")
-        return level
 
     def _eigen_flats(self) -> EigenFlats:
         """Principal components of the flats, read twice by rows and once whole for their means and repairs."""
@@ -133,9 +137,7 @@ class FlatFielding:
             raw = self.file.frame(n)
             repaired[i] = self.repair.values(raw)
             brightness[i] = (self.repair(raw) - self.dark).mean()
-        require(
-            bool((brightness > 0).all()), f"{self.file.fields.path} has flats without light; mark them invalid (3)."
-        )
+        require(bool((brightness > 0).all()), f"{self.file.path} has flats without light; mark them invalid (3).")
         h, w = self.dark.shape
 
         def rows_of(rows: slice) -> np.ndarray:
@@ -152,29 +154,81 @@ def correct(
     out: Path,
     options: CorrectionOptions = CorrectionOptions(),
     on_progress: Advance = lambda fraction: None,
+    reading: Reading = Reading(),
 ) -> Corrected:
     """Correct the raw file `source` (NXtomo with flats and darks) into the scan file `out`, one frame at a time.
 
     Defective pixels, marked in the file or found in its darks and flats, are filled from their neighbours; frames are
-    turned upright. `InputError` when the file has no flats, or too many defective pixels.
+    turned upright, corrected as a whole, and then cut to the part that `reading` takes. `InputError` when the file has
+    no flats, or too many defective pixels.
     """
     require_writable(out)
     require_apart(out, source)
-    with open_scan(source) as file:
+    with open_raw(source, reading.told.given()) as file:
         fielding = FlatFielding(file, options, on_progress)
-        projections = file.numbers(PROJECTION)
         count = 0 if fielding.eigen is None else len(fielding.eigen)
         marked = int(fielding.marked.sum())
+        normal = Normalisation(fielding, options)
+        on_progress(0.5)
         described = {
-            "corrected": options.method if fielding.eigen is None else f"dynamic, {count} components",
-            "normalised": options.reference,
+            "corrected": fielding.method if fielding.eigen is None else f"dynamic, {count} components",
+            "normalised": normal.what,
             "defective_pixels": f"{marked} marked, {fielding.found} found",
         }
-        with scan_writer(out, file.exposures, file.is_test, file.provenance() | described) as add:
-            for i, number in enumerate(projections):
-                add(fielding(int(number)))
-                on_progress(0.3 + 0.7 * (i + 1) / len(projections))
-    return Corrected(len(projections), marked, fielding.found, count)
+        whole = Scan.of(_Corrected(fielding, normal), file.exposures, file.is_test, file.provenance() | described)
+        scan = reading.applied(whole)
+        with scan_writer(out, scan.exposures, scan.is_test, scan.provenance) as add:
+            for i in range(len(scan)):
+                add(scan[[i]].frames[0])
+                on_progress(0.5 + 0.5 * (i + 1) / len(scan))
+    airless = normal.light.airless if normal.light else 0
+    return Corrected(len(scan), marked, fielding.found, count, fielding.method, fielding.flats, normal.what, airless)
+
+
+class Normalisation:
+    """What is brought to 1 in each frame, by `options`; what: its name; light: by air, where that is it."""
+
+    def __init__(self, fielding: FlatFielding, options: CorrectionOptions) -> None:
+        """Looks at all projections once where air may be found; `InputError` where it is asked for in vain."""
+        self._path, wanted = fielding.file.path, options.normalise
+        self.light: AirLight | None = None
+        asked = wanted == "air" or bool(options.air)
+        if asked or wanted is None:
+            numbers = fielding.file.numbers(PROJECTION)
+            self.light = AirLight.of(lambda i: fielding(int(numbers[i])), len(numbers), options.air, asked)
+        require(
+            not asked or self.light is not None,
+            f"{self._path}: no projection shows air; give boxes of it by --air, or take --normalise mean.",
+        )
+        otherwise: Normalise = "mean" if fielding.method == "dynamic" else "none"
+        self.what: Normalise = "air" if self.light else wanted or otherwise
+
+    def __call__(self, number: int, frame: np.ndarray) -> np.ndarray:
+        """The frame [H, W] of projection `number`, normalised."""
+        if self.light is not None:
+            return frame / self.light.factor(number, (frame.shape[0], frame.shape[1]))
+        if self.what == "none":
+            return frame
+        counted = np.ones(frame.shape, dtype=bool)
+        if self.what == "rim":
+            width = max(1, round(RIM * min(frame.shape)))
+            counted[width:-width, width:-width] = False
+        level = float(frame[counted].mean())
+        require(level > 0, f"{self._path} has a projection whose rim is dark; normalise by its mean.")
+        return frame / level
+
+
+class _Corrected(Frames):
+    """The projections of an open raw file, corrected when they are read."""
+
+    def __init__(self, fielding: FlatFielding, normal: Normalisation) -> None:
+        self._fielding, self._numbers, self._normal = fielding, fielding.file.numbers(PROJECTION), normal
+        self.shape = (len(self._numbers), *fielding.dark.shape)
+
+    def read(self, numbers: np.ndarray) -> np.ndarray:
+        """See `Frames.read`."""
+        read = [self._normal(int(i), self._fielding(int(self._numbers[i]))) for i in numbers]
+        return np.stack(read).astype(np.float32)
 
 
 def _mean_and_noise(file: ScanFile, numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

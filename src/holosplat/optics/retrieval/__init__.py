@@ -15,6 +15,7 @@ from ...progress import Advance
 from ...scan import Exposures
 from .admm import ADMM, admm
 from .bounded import Estimate, bounded_estimate
+from .contact import absorption_alone
 from .iterative import Projections, gerchberg_saxton, hybrid_input_output
 from .linear import Linear, contrast_transfer, invert_contrast, paganin, retrieve_thickness
 from .nonlinear import Tikhonov, tikhonov
@@ -60,6 +61,7 @@ __all__ = [
     "Projections",
     "Retrieval",
     "Tikhonov",
+    "absorption_alone",
     "admm",
     "bounded_estimate",
     "contrast_transfer",

@@ -10,8 +10,10 @@ from torch import Tensor
 
 from ...progress import Advance
 from ...scan import Exposures
+from .contact import or_in_contact
 from .model import Regularised, WaveModel, view_by_view
 from .nonlinear import EASE, FIRST_DAMPING, TIGHTEN
+from .spectra import Noise
 
 EDGE = 0.5
 """Jumps of phase that are taken for edges within one iteration, in mean slopes of the matter."""
@@ -25,6 +27,7 @@ class ADMM(Regularised):
     estimate."""
 
 
+@or_in_contact
 def admm(
     frames: Tensor,
     exposures: Exposures,
@@ -44,36 +47,36 @@ def admm(
     optics in its place and total variation beside the bounds.
     """
 
-    def solve(frames: Tensor, exposures: Exposures, on_progress: Advance) -> Tensor:
-        model = WaveModel(frames, exposures, beta / delta, options.noise, options.backend)
+    def solve(frames: Tensor, exposures: Exposures, noise: Noise, on_progress: Advance) -> Tensor:
+        model = WaveModel(frames, exposures, beta / delta, noise, options.backend)
         return model.thickness(_alternate(model, options, on_progress), delta)
 
-    return view_by_view(frames, exposures, delta, solve, on_progress)
+    return view_by_view(frames, exposures, delta, options.noise, solve, on_progress)
 
 
 def _alternate(model: WaveModel, options: ADMM, on_progress: Advance) -> Tensor:
     """The bounded phase [V, H, W] after all iterations."""
     phase = model.phase
     weight, edge = _weights(model, options)
-    pull_slopes, pull_copy = weight / edge, COUPLING / model.oversample**2
+    pull_slopes, pull_copy = weight / edge, COUPLING * model.strongest / model.oversample**2
     like = {"device": phase.device, "dtype": phase.dtype}
-    pull, shrink = pull_slopes.to(**like), edge.to(**like)
+    pull, shrink, hold = pull_slopes.to(**like), edge.to(**like), pull_copy.to(**like)
     curvature = model.curvature() + pull_slopes * _laplacian(model.raster.shape) + pull_copy
     slopes, copy = gradient(phase), phase.clone()
     slopes_dual, copy_dual = torch.zeros_like(slopes), torch.zeros_like(phase)
     misfit, fall = model.misfit(phase)
-    damping = torch.full_like(misfit, FIRST_DAMPING).cpu()
+    damping = FIRST_DAMPING * model.strongest.flatten().to(misfit.dtype)
 
     def coupled(at: Tensor) -> Tensor:
         """The terms of the constraints in the objective [V]."""
         away = (gradient(at) - slopes + slopes_dual).double().square().sum(dim=(0, 2, 3))
         apart = (at - copy + copy_dual).double().square().sum(dim=(1, 2))
-        return 0.5 * (pull[:, 0, 0] * away + pull_copy * apart)
+        return 0.5 * (pull[:, 0, 0] * away + hold[:, 0, 0] * apart)
 
     for done in range(options.iterations):
         on_progress(done / options.iterations)
         slant = fall + pull * gradient_adjoint(gradient(phase) - slopes + slopes_dual)
-        slant = slant + pull_copy * (phase - copy + copy_dual)
+        slant = slant + hold * (phase - copy + copy_dual)
         scale = 1 / (curvature + damping[:, None, None] / model.oversample**2)
         trial = phase - model.filter(slant, scale)
         trial_misfit, trial_fall = model.misfit(trial)
@@ -100,7 +103,7 @@ def _weights(model: WaveModel, options: ADMM) -> tuple[Tensor, Tensor]:
     """
     slope = gradient(model.phase).square().sum(dim=0).sqrt().double().sum(dim=(1, 2))
     mean = (slope / model.support.double().sum(dim=(1, 2)).clamp_min(1)).cpu().clamp_min(1e-9)
-    weight = options.weight * 0.25 * model.spectra.error.square() / mean / model.oversample**2
+    weight = options.weight * 0.25 * model.spectra.unexplained.mean(dim=(1, 2)) / mean / model.oversample**2
     return weight.clamp_min(1e-12)[:, None, None], (EDGE * mean)[:, None, None]
 
 

@@ -14,7 +14,7 @@ from torch.nn.functional import max_pool2d
 
 from ...scan import Exposures
 from ..noise import wavelet_noise
-from .spectra import Prior, Raster, filtered, response, spectra, surrounded
+from .spectra import Noise, Prior, Raster, filtered, response, spectra, surrounded
 
 STEPS = 25
 """Alternations between the frame and the bound. Where noise hides the lowest frequencies they go on to drift."""
@@ -34,8 +34,8 @@ class Estimate:
     support: Tensor
 
 
-def bounded_estimate(frames: Tensor, exposures: Exposures, ratio: float, noise: float | None) -> Estimate:
-    """From frames [V, H, W] of a material with β/δ = `ratio`; noise: their standard deviation, None to estimate it.
+def bounded_estimate(frames: Tensor, exposures: Exposures, ratio: float, noise: Noise) -> Estimate:
+    """From frames [V, H, W] of a material with β/δ = `ratio`; noise: theirs, None to estimate it.
 
     Wiener's inverse `W` of the contrast transfer function, in alternation with the bound (Papoulis 1975 and
     Gerchberg 1974, who extend spectra so): `φ ← φ₀ + (1 - W H) [φ]`, where `[φ]` is φ where it exceeds
@@ -46,9 +46,11 @@ def bounded_estimate(frames: Tensor, exposures: Exposures, ratio: float, noise: 
     raster = Raster((contrast.shape[-2], contrast.shape[-1]), exposures.views.pixel_size)
     known = spectra(frames, exposures, response(exposures, ratio, raster), raster, noise, MODEL_ERROR, PRIOR)
     trusted = 1 - known.inverse * known.response
-    noise_gain = known.inverse.square().mean(dim=(1, 2)).sqrt()
-    doubtful = wavelet_noise(frames) if noise is None else known.noise
-    least = (SIGNIFICANT * doubtful * noise_gain)[:, None, None]
+    if noise is None:
+        doubtful = wavelet_noise(frames) * known.inverse.square().mean(dim=(1, 2)).sqrt()
+    else:
+        doubtful = known.noise_of(known.inverse)
+    least = (SIGNIFICANT * doubtful)[:, None, None]
     linear = -filtered(contrast, known.inverse)
     inside = torch.zeros_like(linear[:1])
     inside[crop] = 1

@@ -9,11 +9,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from ...checks import at_least, require
+from ...checks import at_least
 from ...progress import Advance
 from ...scan import Exposures
 from ..propagation import exit_wave_of
+from .contact import or_in_contact
 from .model import DARKEST, WaveModel, view_by_view
+from .spectra import Noise, check_noise
 
 
 @dataclass(frozen=True)
@@ -24,17 +26,18 @@ class Projections:
     """Pairs of projections."""
     feedback: float = 0.9
     """Factor of the values that violate the bounds, for hybrid input–output only (Fienup 1982)."""
-    noise: float | None = None
-    """Standard deviation of the frames (default: estimated from them)."""
+    noise: Noise = None
+    """Standard deviation of the frames, or their noise model (default: estimated from them)."""
     backend: str = "cpu"
     """Implementation of the wave optics (see `backends`)."""
 
     def __post_init__(self) -> None:
         at_least(self, 1, "iterations")
         at_least(self, 0, "feedback")
-        require(self.noise is None or self.noise >= 0, f"noise must not be negative, but it is {self.noise}.")
+        check_noise(self.noise)
 
 
+@or_in_contact
 def gerchberg_saxton(
     frames: Tensor,
     exposures: Exposures,
@@ -57,6 +60,7 @@ def gerchberg_saxton(
     return _alternate(frames, exposures, (delta, beta), options, reduce, on_progress)
 
 
+@or_in_contact
 def hybrid_input_output(
     frames: Tensor,
     exposures: Exposures,
@@ -89,15 +93,15 @@ def _alternate(
 ) -> Tensor:
     delta, beta = material
 
-    def solve(frames: Tensor, exposures: Exposures, on_progress: Advance) -> Tensor:
-        model = WaveModel(frames, exposures, beta / delta, options.noise, options.backend)
+    def solve(frames: Tensor, exposures: Exposures, noise: Noise, on_progress: Advance) -> Tensor:
+        model = WaveModel(frames, exposures, beta / delta, noise, options.backend)
         phase = model.phase
         for done in range(options.iterations):
             on_progress(done / options.iterations)
             phase = rule(phase, through_detector(model, phase), model)
         return model.thickness(model.bounded(phase), delta)
 
-    return view_by_view(frames, exposures, delta, solve, on_progress)
+    return view_by_view(frames, exposures, delta, options.noise, solve, on_progress)
 
 
 def through_detector(model: WaveModel, phase: Tensor) -> Tensor:

@@ -14,15 +14,19 @@ from ...checks import at_least, require
 from ...progress import Advance
 from ...scan import Exposures
 from ...units import wavelength, wavenumber
+from .contact import or_in_contact
 from .spectra import (
+    Noise,
     Prior,
     Raster,
     absorption,
+    check_noise,
     checked,
     column,
     detector_transfer,
     filtered,
     fresnel_phase,
+    noise_found,
     radian,
     response,
     spectra,
@@ -43,8 +47,8 @@ SHARP_EDGED = Prior()
 class Linear:
     """Options of the filters."""
 
-    noise: float | None = None
-    """Standard deviation of the frames (default: estimated from them; 0: none)."""
+    noise: Noise = None
+    """Standard deviation of the frames, or their noise model (default: estimated from them; 0: none)."""
     model_error: float = 0.01
     """Part of the frames' contrast that no filter explains; it damps frequencies where the response is weak."""
     prior: Prior = SHARP_EDGED
@@ -52,9 +56,10 @@ class Linear:
 
     def __post_init__(self) -> None:
         at_least(self, 0, "model_error")
-        require(self.noise is None or self.noise >= 0, f"noise must not be negative, but it is {self.noise}.")
+        check_noise(self.noise)
 
 
+@or_in_contact
 def paganin(
     frames: Tensor,
     exposures: Exposures,
@@ -73,7 +78,7 @@ def paganin(
     """
     if beta < WEAKEST_ABSORPTION * delta and options.noise != 0:
         return contrast_transfer(frames, exposures, delta, beta, options=options, on_progress=on_progress)
-    checked(frames, exposures, delta)
+    frames = checked(frames, exposures, delta)
     on_progress(0.0)
     if options.noise == 0:
         physics = (exposures.views.pixel_size, exposures.distance, exposures.energy_kev)
@@ -82,12 +87,15 @@ def paganin(
     raster = Raster((contrast.shape[-2], contrast.shape[-1]), exposures.views.pixel_size)
     ratio = absorption(exposures, beta / delta)
     h = 2 * (ratio + fresnel_phase(exposures, raster)) * detector_transfer(exposures, raster)
-    known = spectra(frames, exposures, h, raster, options.noise, options.model_error, options.prior)
+    known = spectra(
+        frames, exposures, h, raster, noise_found(frames, options.noise), options.model_error, options.prior
+    )
     contact = 1 + 2 * ratio * filtered(contrast, known.inverse)
     mu = column(2 * wavenumber(exposures.energy_kev) * exposures.refraction(delta, beta)[1])
     return (-torch.log(contact.clamp_min(1e-6)) / mu)[crop].to(frames.dtype)
 
 
+@or_in_contact
 def contrast_transfer(
     frames: Tensor,
     exposures: Exposures,
@@ -103,12 +111,14 @@ def contrast_transfer(
     denominator, one below and one above the first maximum (Yu et al. 2018), this is Wiener's inverse: the constant
     is the noise of the frames over the power expected of the phase, and differs from frequency to frequency.
     """
-    checked(frames, exposures, delta)
+    frames = checked(frames, exposures, delta)
     on_progress(0.0)
     contrast, crop = surrounded(frames, exposures)
     raster = Raster((contrast.shape[-2], contrast.shape[-1]), exposures.views.pixel_size)
     h = response(exposures, beta / delta, raster)
-    known = spectra(frames, exposures, h, raster, options.noise, options.model_error, options.prior)
+    known = spectra(
+        frames, exposures, h, raster, noise_found(frames, options.noise), options.model_error, options.prior
+    )
     return (-filtered(contrast, known.inverse) * radian(exposures, delta))[crop].to(frames.dtype)
 
 
@@ -124,12 +134,13 @@ def retrieve_thickness(
     energy_kev, delta, beta: of all views, or of each [V].
 
     Paganin et al. (2002), eq. 12: `T = -ln(F⁻¹[F[I] / (1 + πλz (δ/β) f²)]) / 2kβ`. A contrast with β ≤ 0 (cells
-    in plasma) has no such filter and is solved in the linear limit (`invert_contrast`). Frames are continued by
-    their edge values; pitch: pixel size [m]; δ must be positive.
+    in plasma) has no such filter and is solved in the linear limit (`invert_contrast`), but for frames in contact
+    (all distances 0), which need none. Frames are continued by their edge values; pitch: pixel size [m]; δ must be
+    positive.
     """
     z, energy, d, b = _per_view(distance, energy_kev, delta, beta)
     require(bool((d > 0).all()), f"phase retrieval needs a material with δ > 0, but δ is {d.min():g}.")
-    if (b < WEAKEST_ABSORPTION * d).any():
+    if (b < WEAKEST_ABSORPTION * d).any() and z.any():
         return invert_contrast(frames - 1, pitch, distance, energy_kev, delta, beta)
     lam_z = wavelength(energy) * z
     padded, crop = _continued(frames, pitch, lam_z, d, b, "replicate")

@@ -11,14 +11,29 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, pad
 
 from ...backends import device, resolve
-from ...checks import at_least, require
+from ...checks import at_least
 from ...progress import Advance
 from ...scan import Exposures
 from ...units import wavelength
 from ..hologram import hologram, optical_path
 from ..sampling import fringe_sampling, padding
 from .bounded import MODEL_ERROR, PRIOR, Estimate, bounded_estimate
-from .spectra import Raster, absorption, checked, filtered, radian, response, spectra, squared_frequency
+from .spectra import (
+    Noise,
+    Raster,
+    absorption,
+    check_noise,
+    checked,
+    column,
+    filtered,
+    noise_found,
+    part_of,
+    radian,
+    response,
+    sensitivity,
+    spectra,
+    squared_frequency,
+)
 
 MOST_SAMPLES = 4_000_000
 """Samples of the waves worked on at once; more views follow in turn."""
@@ -38,15 +53,15 @@ class Regularised:
     """Steps, each one evaluation of the wave optics and its gradient."""
     weight: float = 1.0
     """Weight of the regularisation; 1 is the Bayesian weight under the method's assumptions on the matter."""
-    noise: float | None = None
-    """Standard deviation of the frames (default: estimated from them)."""
+    noise: Noise = None
+    """Standard deviation of the frames, or their noise model (default: estimated from them)."""
     backend: str = "cpu"
     """Implementation of the wave optics (see `backends`)."""
 
     def __post_init__(self) -> None:
         at_least(self, 1, "iterations")
         at_least(self, 0, "weight")
-        require(self.noise is None or self.noise >= 0, f"noise must not be negative, but it is {self.noise}.")
+        check_noise(self.noise)
 
 
 class WaveModel:
@@ -55,12 +70,11 @@ class WaveModel:
     The raster is the frame padded by the fringes' reach, `oversample` times finer; `support` [V, H, W] marks the
     samples where matter may be: where the estimate has matter, and beyond the frame's border where the estimate touches
     it. float32 frames are computed by `backend`, float64 ones by `reference`. `phase` is the estimate to start from,
-    `ratio` the matter's β/δ at the frames' energy, which is one.
+    `ratio` the matter's β/δ at the frames' energy, which is one, and `strongest` [V, 1, 1] about the curvature of the
+    strongest frequency: 1 where fringes are seen, and far less where hardly any are.
     """
 
-    def __init__(
-        self, frames: Tensor, exposures: Exposures, ratio: float, noise: float | None, backend: str = "cpu"
-    ) -> None:
+    def __init__(self, frames: Tensor, exposures: Exposures, ratio: float, noise: Noise, backend: str = "cpu") -> None:
         estimate = bounded_estimate(frames, exposures, ratio, noise)
         energy = exposures.one_energy("the wave model of a phase retrieval")
         self.exposures, self.ratio = exposures, float(absorption(exposures, ratio)[0])
@@ -84,6 +98,7 @@ class WaveModel:
         self.spectra = spectra(
             frames, exposures, response(exposures, ratio, self.raster), self.raster, noise, MODEL_ERROR, PRIOR
         )
+        self.strongest = column(sensitivity(exposures, ratio) ** 2)
         self.support, self.phase = self._spread(estimate)
 
     def _spread(self, estimate: Estimate) -> tuple[Tensor, Tensor]:
@@ -153,15 +168,19 @@ def view_by_view(
     frames: Tensor,
     exposures: Exposures,
     delta: float,
-    solve: Callable[[Tensor, Exposures, Advance], Tensor],
+    noise: Noise,
+    solve: Callable[[Tensor, Exposures, Noise, Advance], Tensor],
     on_progress: Advance,
 ) -> Tensor:
-    """`solve(frames, exposures, on_progress)` of views that are alike, `MOST_SAMPLES` at a time, frames checked."""
-    checked(frames, exposures, delta)
+    """`solve(frames, exposures, noise, on_progress)` of views alike, `MOST_SAMPLES` at a time, with frames checked."""
+    frames = checked(frames, exposures, delta)
+    noise = noise_found(frames, noise)
     found, done = torch.empty_like(frames), 0
     for index in _batches(exposures):
         start, share = done / len(exposures), len(index) / len(exposures)
-        part = solve(frames[index], exposures[index], lambda f, a=start, b=share: on_progress(a + b * f))
+        part = solve(
+            frames[index], exposures[index], part_of(noise, index), lambda f, a=start, b=share: on_progress(a + b * f)
+        )
         found[index] = part.to(frames.device, frames.dtype)
         done += len(index)
     on_progress(1.0)

@@ -10,8 +10,9 @@ from torch import Tensor
 
 from ...progress import Advance
 from ...scan import Exposures
+from .contact import or_in_contact
 from .model import Regularised, WaveModel, view_by_view
-from .spectra import TINY, squared_frequency
+from .spectra import TINY, Noise, squared_frequency
 
 FIRST_DAMPING = 0.05
 """Damping at the start; 1 is the curvature of the strongest frequency."""
@@ -29,6 +30,7 @@ class Tikhonov(Regularised):
     """Weight of the penalty; 1 is the Bayesian weight for Gaussian matter."""
 
 
+@or_in_contact
 def tikhonov(
     frames: Tensor,
     exposures: Exposures,
@@ -48,11 +50,11 @@ def tikhonov(
     refused, and its view is damped more.
     """
 
-    def solve(frames: Tensor, exposures: Exposures, on_progress: Advance) -> Tensor:
-        model = WaveModel(frames, exposures, beta / delta, options.noise, options.backend)
+    def solve(frames: Tensor, exposures: Exposures, noise: Noise, on_progress: Advance) -> Tensor:
+        model = WaveModel(frames, exposures, beta / delta, noise, options.backend)
         return model.thickness(descend(model, options, on_progress)[0], delta)
 
-    return view_by_view(frames, exposures, delta, solve, on_progress)
+    return view_by_view(frames, exposures, delta, options.noise, solve, on_progress)
 
 
 def penalty_weights(model: WaveModel, weight: float) -> Tensor:
@@ -65,8 +67,8 @@ def penalty_weights(model: WaveModel, weight: float) -> Tensor:
     seen = squared_frequency(model.raster) <= (0.5 / model.exposures.views.pixel_size) ** 2
     found = torch.fft.rfft2(model.phase.cpu().double()).abs().square() / math.prod(model.raster.shape)
     scale = found[:, seen].mean(dim=1) / model.oversample**2 / known.power[:, seen].mean(dim=1)
-    variance = 0.25 * known.error.square() / scale.clamp_min(TINY)
-    stiffness = (weight * variance[:, None, None] / known.power).clamp_max(STIFFEST)
+    variance = 0.25 * known.unexplained / scale.clamp_min(TINY)[:, None, None]
+    stiffness = (weight * variance / known.power).minimum(STIFFEST * model.strongest)
     return stiffness / model.oversample**2
 
 
@@ -83,7 +85,7 @@ def descend(model: WaveModel, options: Tikhonov, on_progress: Advance) -> tuple[
     curvature = model.curvature() + weights
     phase = model.phase
     value, gradient = objective(model, phase, weights)
-    damping = torch.full_like(value, FIRST_DAMPING).cpu()
+    damping = FIRST_DAMPING * model.strongest.flatten().to(value.dtype)
     values = [value]
     for done in range(options.iterations):
         on_progress(done / options.iterations)

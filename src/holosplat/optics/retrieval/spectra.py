@@ -19,10 +19,14 @@ from ...checks import at_least, finite, require, shaped
 from ...scan import Exposures
 from ...units import wavelength, wavenumber
 from ..noise import noise_levels
+from ..noise_model import NoiseModel
 from ..sampling import smooth_margin
 
 TINY = 1e-24
 """Variance added for frames without any contrast."""
+Noise = float | NoiseModel | None
+"""Standard deviation of all frames, their noise, or None to estimate it."""
+
 LEAST_SIGNAL = 0.01
 """Share of a frame's variance that is taken for signal at least, however strong its noise seems."""
 
@@ -43,10 +47,15 @@ class Prior:
         at_least(self, 0.1, "corner", "decay")
 
 
-def checked(frames: Tensor, exposures: Exposures, delta: float) -> Tensor:
-    """The frames [V, H, W], if they are finite, floating, and match `exposures`; and δ, if it is positive."""
-    known = frames.dtype in (torch.float32, torch.float64)
+def checked(frames: Tensor | np.ndarray, exposures: Exposures, delta: float) -> Tensor:
+    """The frames [V, H, W] as a tensor, if they are finite, floating, and match `exposures`; and δ, if it is positive.
+
+    A NumPy array of the host's byte order is taken as it is.
+    """
+    known = str(frames.dtype).removeprefix("torch.").lstrip("<>") in ("float32", "float64", "f4", "f8")
     require(known, f"frames must be float32 or float64 for phase retrieval, but they are {frames.dtype}; convert them.")
+    if isinstance(frames, np.ndarray):
+        frames = torch.from_numpy(np.ascontiguousarray(frames, dtype=frames.dtype.newbyteorder("=")))
     shaped("frames", frames.detach().cpu().numpy(), (len(exposures), *exposures.views.shape))
     finite("frames", frames.detach().cpu().numpy())
     require(delta > 0, f"phase retrieval needs a material with δ > 0, but δ is {delta:g}.")
@@ -113,6 +122,23 @@ def response(exposures: Exposures, ratio: float, raster: Raster) -> Tensor:
     return 2 * (absorption(exposures, ratio) * torch.cos(chi) + torch.sin(chi)) * detector_transfer(exposures, raster)
 
 
+def sensitivity(exposures: Exposures, ratio: float) -> np.ndarray:
+    """How strongly a phase acts on amplitudes at most [V], for a material with β/δ = `ratio`; 1: as fringes do.
+
+    Twice the greatest |β/δ cos χ + sin χ| at the frequencies of the frames, but not above 1: fringes that reach half
+    the full response count as full ones. In contact it is 2 |β|/δ, of the order of a thousandth, and what is measured
+    in radians or in thickness wants its steps and weights in this unit.
+    """
+    delta, beta = exposures.refraction(1.0, ratio)
+    chi = np.minimum(finest_phase(exposures), 0.5 * np.pi)[:, None] * np.linspace(0, 1, 33)
+    return np.minimum(1.0, 2 * np.abs((beta / delta)[:, None] * np.cos(chi) + np.sin(chi)).max(axis=1))
+
+
+def finest_phase(exposures: Exposures) -> np.ndarray:
+    """`χ = πλz f²` [V] at the highest frequency of the frames, in the corner of their spectra: `πλz / 2p²`."""
+    return 0.5 * np.pi * wavelength(exposures.energy_kev) * exposures.distance / exposures.views.pixel_size**2
+
+
 def contrast_level(frames: Tensor) -> Tensor:
     """Root mean square [V] of `I - 1`, float64."""
     return (frames.detach().double() - 1).square().mean(dim=(1, 2)).sqrt()
@@ -121,17 +147,31 @@ def contrast_level(frames: Tensor) -> Tensor:
 @dataclass(frozen=True)
 class Spectra:
     """The response H and the expected power S of the phase, both [V, H, W//2 + 1], and two standard deviations [V] of
-    the frames: of the noise alone, and of the noise with the model error. All float64."""
+    the frames: of the white noise alone, and of this noise with the model error; grain: power [V, H, W//2 + 1] of
+    correlated noise beside both, None without any. All float64."""
 
     response: Tensor
     power: Tensor
     noise: Tensor
     error: Tensor
+    grain: Tensor | None = None
+
+    @property
+    def unexplained(self) -> Tensor:
+        """Power [V, H, W//2 + 1], or [V, 1, 1] where it is the same at all frequencies, that is not the phase's."""
+        white = self.error.square()[:, None, None]
+        return white if self.grain is None else white + self.grain
+
+    def noise_of(self, gain: Tensor) -> Tensor:
+        """Standard deviation [V] of what a filter `gain` [V, H, W//2 + 1] makes of the noise."""
+        if self.grain is None:
+            return self.noise * gain.square().mean(dim=(1, 2)).sqrt()
+        return (gain.square() * (self.noise.square()[:, None, None] + self.grain)).mean(dim=(1, 2)).sqrt()
 
     @property
     def inverse(self) -> Tensor:
         """Wiener's inverse `H S / (H² S + σ²)` of the response."""
-        return self.response * self.power / (self.response.square() * self.power + self.error.square()[:, None, None])
+        return self.response * self.power / (self.response.square() * self.power + self.unexplained)
 
 
 def spectra(
@@ -139,25 +179,55 @@ def spectra(
     exposures: Exposures,
     h: Tensor,
     raster: Raster,
-    noise: float | None,
+    noise: Noise,
     model_error: float,
     prior: Prior,
 ) -> Spectra:
-    """Of frames [V, H, W] and a response h on `raster`; noise: their standard deviation, or None to estimate it.
+    """Of frames [V, H, W] and a response h on `raster`; noise: theirs, or None to estimate it (as white noise).
 
     model_error: the part of the frames' contrast that no model explains. The power has the prior's shape and explains
     the frames' variance beyond their noise, at the frequencies that the detector resolves.
     """
-    level = noise_levels(frames) if noise is None else torch.full((len(frames),), noise, dtype=torch.float64)
+    level, grain = _levels(frames, exposures, raster, noise)
     contrast = contrast_level(frames)
-    signal = (contrast.square() - level.square()).clamp_min(LEAST_SIGNAL * contrast.square() + TINY)
+    all_noise = noise.level if isinstance(noise, NoiseModel) else level
+    signal = (contrast.square() - all_noise.square()).clamp_min(LEAST_SIGNAL * contrast.square() + TINY)
     f2 = squared_frequency(raster)
     height, width = (n * exposures.views.pixel_size for n in exposures.views.shape)
     shape = (f2 * height * width + prior.corner**2) ** -prior.decay
     seen = f2 <= (0.5 / exposures.views.pixel_size) ** 2
     explained = (h.square() * shape)[:, seen].mean(dim=1)
     error = (level.square() + (model_error * contrast).square() + TINY).sqrt()
-    return Spectra(h, shape * (signal / explained)[:, None, None], level, error)
+    return Spectra(h, shape * (signal / explained)[:, None, None], level, error, grain)
+
+
+def _levels(frames: Tensor, exposures: Exposures, raster: Raster, noise: Noise) -> tuple[Tensor, Tensor | None]:
+    """Standard deviations [V] of white noise, and the power of grain on `raster`."""
+    if isinstance(noise, NoiseModel):
+        finer = round(exposures.views.pixel_size / raster.pitch)
+        power = noise.power_on(raster.shape, finer) - noise.white.square()[:, None, None]
+        return noise.white, power if noise.has_grain else None
+    level = noise_levels(frames) if noise is None else torch.full((len(frames),), noise, dtype=torch.float64)
+    return level, None
+
+
+def noise_found(frames: Tensor, noise: Noise) -> Noise:
+    """The noise of frames [V, H, W] if it is not given and has grain; else what is given."""
+    if noise is not None:
+        return noise
+    found = NoiseModel.of_frames(frames)
+    return found if found.has_grain else None
+
+
+def part_of(noise: Noise, index: np.ndarray) -> Noise:
+    """The noise of some of the frames."""
+    return noise[index] if isinstance(noise, NoiseModel) else noise
+
+
+def check_noise(noise: Noise) -> None:
+    """`InputError` for a negative standard deviation."""
+    if isinstance(noise, float | int):
+        require(noise >= 0, f"noise must not be negative, but it is {noise}.")
 
 
 def filtered(images: Tensor, factor: Tensor) -> Tensor:

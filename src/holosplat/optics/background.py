@@ -1,0 +1,235 @@
+"""Uneven light: a smooth factor of each frame, found in air, and from what frames and matter disagree on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from ..checks import InputError, require
+from .air import Box, air_in_boxes, find_air, has_air
+from .modes import half_waves, smooth_modes
+from .noise_model import NoiseModel
+
+ORDER = 8
+"""Half waves across a frame up to which light changes."""
+LOWEST = 2
+"""Half waves up to which air is tested for unevenness."""
+ROUNDS = 30
+"""Rounds in which the strengths of the modes and their coefficients are found from each other."""
+UNEVEN, SEEN = 6.0, 0.07
+"""Light is uneven if the squares of its lowest modes in air exceed those of noise by so many of their deviations, and
+it is so large a part of the frames' contrast."""
+FAINTEST = 1e-4
+"""Noise [relative intensity] assumed at least: light is not known better."""
+DARKEST = 0.05
+"""Relative intensity below which frames say nothing of the light."""
+
+
+Kind = Literal["auto", "even", "smooth"]
+
+
+@dataclass(frozen=True)
+class LightOptions:
+    """What is assumed of the light beside the flat fields."""
+
+    kind: Kind = "auto"
+    """auto: smooth where the air is uneven beyond its noise, else even; even: none; smooth: in any case."""
+    air: tuple[Box, ...] = ()
+    """Boxes without matter or fringes in any frame: first row, end row, first column, end column (default: found)."""
+
+    def __post_init__(self) -> None:
+        require(
+            self.kind in ("auto", "even", "smooth"), f"light must be auto, even or smooth, but it is {self.kind!r}."
+        )
+
+    def air_of(self, frames: Tensor) -> Tensor:
+        """The air [V, H, W] bool of frames [V, H, W]."""
+        if not self.air:
+            return find_air(frames)
+        return air_in_boxes(self.air, len(frames), (frames.shape[-2], frames.shape[-1]))
+
+
+@dataclass(frozen=True)
+class Light:
+    """What is known of the light of some frames: air [V, H, W] bool; noise; background, None where light is even."""
+
+    air: Tensor
+    noise: NoiseModel
+    background: Background | None
+
+    @classmethod
+    def of(cls, frames: Tensor, options: LightOptions = LightOptions()) -> Light:
+        """By frames [V, H, W]; errors: `InputError` for smooth light where no frame has air."""
+        air = options.air_of(frames)
+        noise = NoiseModel.of_frames(frames, air)
+        background = _found(frames, noise, air, options.kind)
+        if background is not None and not options.air:  # without steep light more of the air is seen to be quiet
+            air = find_air(frames / background.factor()) | air
+            noise = NoiseModel.of_frames(frames, air)
+            background = Background.of_air(frames, air, noise)
+        return cls(air, noise, background)
+
+    def evened(self, frames: Tensor) -> Tensor:
+        """Frames [V, H, W] as they would be in even light."""
+        return frames if self.background is None else (frames / self.background.factor()).to(frames.dtype)
+
+    @property
+    def doubt(self) -> NoiseModel:
+        """The noise of the evened frames, and with it what is not known of the light."""
+        return self.noise if self.background is None else self.noise.with_more(self.background.doubt(self.air))
+
+    def settled(self, frames: Tensor, predicted: Tensor) -> Light:
+        """The same where matter predicts these frames [V, H, W] in even light, and `frames` were measured."""
+        known = self.background
+        return self if known is None else replace(self, background=known.seen_beside(frames, predicted))
+
+
+@dataclass(frozen=True)
+class Background:
+    """The light of V frames, `exp(Σ c_k m_k)`, and how sure it is.
+
+    coefficients: [V, K] c, float64
+    covariances: [V, K, K] of c, float64
+    variances: [K] expected squares of c, float64, by which c is regularised
+    powers: [V] power of the frames' noise at the modes' frequencies, float64
+    shape: (H, W) of the frames
+    """
+
+    coefficients: Tensor
+    covariances: Tensor
+    variances: Tensor
+    powers: Tensor
+    shape: tuple[int, int]
+
+    @classmethod
+    def of_air(cls, frames: Tensor, air: Tensor, noise: NoiseModel) -> Background:
+        """The light of frames [V, H, W] by their air [V, H, W] bool; that of frames without air is even, and unsure.
+
+        The modes are those of `smooth_modes`. All of one number of half waves are expected to be equally strong, in all
+        frames; how strong, the frames decide: by expectation and maximisation (Dempster et al. 1977), whose maximum is
+        that of the marginal likelihood ("empirical Bayes", MacKay 1992).
+        """
+        shape = (frames.shape[-2], frames.shape[-1])
+        modes, bands = _modes(shape), _bands()
+        seen, powers = air & (frames > DARKEST), _lowest_power(noise)
+        values = torch.where(seen, frames.double(), 1.0).log().flatten(1)
+        normal, right = _sums(values, seen.double().flatten(1), modes)
+        variances = torch.full((len(modes),), 1e-2, dtype=torch.float64)
+        usable = has_air(air)
+        count = torch.zeros(int(bands.max()) + 1, dtype=torch.float64).index_add(
+            0, bands, torch.ones(len(modes)).double()
+        )
+        for _ in range(ROUNDS):
+            mean, covariance = _posterior(normal, right, variances, powers)
+            squares = (mean.square() + covariance.diagonal(dim1=1, dim2=2))[usable].mean(dim=0)
+            variances = (torch.zeros_like(count).index_add(0, bands, squares) / count)[bands].clamp_min(1e-12)
+        mean, covariance = _posterior(normal, right, variances, powers)
+        return cls(mean, covariance, variances, powers, shape)
+
+    def __len__(self) -> int:
+        return len(self.coefficients)
+
+    def __getitem__(self, index: Tensor) -> Background:
+        """The light of some of the frames."""
+        return replace(
+            self,
+            coefficients=self.coefficients[index],
+            covariances=self.covariances[index],
+            powers=self.powers[index],
+        )
+
+    def modes(self, device: torch.device | str = "cpu") -> Tensor:
+        """The modes [K, H, W], float32."""
+        return smooth_modes(self.shape, ORDER, device)
+
+    def factor(self) -> Tensor:
+        """The light [V, H, W], float64."""
+        return (self.coefficients @ _modes(self.shape)).exp().reshape(-1, *self.shape)
+
+    def seen_beside(self, measured: Tensor, predicted: Tensor) -> Background:
+        """The light that measured frames [V, H, W] have beside those that matter predicts in even light."""
+        modes = _modes(self.shape)
+        seen = (measured > DARKEST) & (predicted > DARKEST)
+        ratio = torch.where(seen, measured.double() / predicted.double().clamp_min(DARKEST), 1.0).log()
+        normal, right = _sums(ratio.flatten(1), seen.double().flatten(1), modes)
+        mean, covariance = _posterior(normal, right, self.variances, self.powers)
+        return replace(self, coefficients=mean, covariances=covariance)
+
+    def doubt(self, air: Tensor) -> Tensor:
+        """Power [H, W//2 + 1] of what is not known of the light where there is no air [V, H, W], mean of all frames."""
+        h, w = self.shape
+        strength, vectors = torch.linalg.eigh(self.covariances.mean(dim=0))
+        fields = (vectors * strength.clamp_min(0).sqrt()).T @ _modes(self.shape)
+        power = torch.fft.rfft2(fields.reshape(-1, h, w), norm="ortho").abs().square().sum(dim=0)
+        return power / (1 - air.double().mean()).clamp_min(0.1)
+
+
+def is_uneven(frames: Tensor, air: Tensor, noise: NoiseModel) -> bool:
+    """Whether the light of relative frames [V, H, W] is uneven in their air [V, H, W] bool, beyond their noise.
+
+    The level of the frames counts as light; it is even where it is one. Without air there is no saying: False.
+    """
+    usable = has_air(air)
+    if not bool(usable.any()):
+        return False
+    lit, seen = frames[usable].double(), air[usable].double()
+    modes = smooth_modes((frames.shape[1], frames.shape[2]), LOWEST).double().flatten(1)
+    normal, right = _sums((lit - 1).flatten(1), seen.flatten(1), modes)
+    ridge = 1e-6 * normal.diagonal(dim1=1, dim2=2).mean(dim=1)[:, None, None] * torch.eye(len(modes)).double()
+    found = torch.linalg.solve(normal + ridge, right)
+    power = _lowest_power(noise)[usable]
+    squares = float(((found * right).sum(dim=1) / power.clamp_min(1e-30)).sum())
+    freedom = float(right.numel())
+    size = ((found @ modes).reshape(lit.shape) * seen).square().sum() / seen.sum()
+    contrast = (lit - 1).square().mean()
+    return squares > freedom + UNEVEN * (2 * freedom) ** 0.5 and bool(size > SEEN**2 * contrast)
+
+
+def _found(frames: Tensor, noise: NoiseModel, air: Tensor, kind: Kind) -> Background | None:
+    """The uneven light, None where it is even."""
+    if kind == "even" or (kind == "auto" and not is_uneven(frames, air, noise)):
+        return None
+    if not bool(has_air(air).any()):
+        raise InputError(
+            "no frame shows air, by which smooth light could be told from matter; give boxes of it by --air, or take "
+            "--light even."
+        )
+    return Background.of_air(frames, air, noise)
+
+
+def _modes(shape: tuple[int, int]) -> Tensor:
+    return smooth_modes(shape, ORDER).double().flatten(1)
+
+
+def _bands() -> Tensor:
+    """The band [K] of each mode: modes of about as many half waves."""
+    return half_waves(ORDER).round().long()
+
+
+def _lowest_power(noise: NoiseModel) -> Tensor:
+    """Power [V] of the noise at the lowest frequencies."""
+    few = max(2, ORDER // 2)
+    return noise.power()[:, : few + 1, : few + 1].mean(dim=(1, 2)).clamp_min(FAINTEST**2)
+
+
+def _sums(values: Tensor, seen: Tensor, modes: Tensor) -> tuple[Tensor, Tensor]:
+    """Of values [V, P], where they are seen [V, P], and modes [K, P]: their products [V, K, K] and [V, K]."""
+    normal = torch.stack([(modes * one) @ modes.T for one in seen])
+    return normal, (values * seen) @ modes.T
+
+
+def _posterior(normal: Tensor, right: Tensor, variances: Tensor, powers: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean [V, K] and covariance [V, K, K] of coefficients whose prior has `variances` [K]."""
+    covariance = posterior_covariance(normal, variances, powers)
+    return torch.einsum("vkl,vl->vk", covariance, right / powers[:, None]), covariance
+
+
+def posterior_covariance(normal: Tensor, variances: Tensor, powers: Tensor) -> Tensor:
+    """`(N/p + T⁻¹)⁻¹ = S (S N S/p + 1)⁻¹ S` [V, K, K], S² = T: of normal equations N [V, K, K], variances T [K] and
+    noise of power p [V]; so it is exact for any T."""
+    scale = variances.sqrt()
+    inner = normal * scale[:, None] * scale / powers[:, None, None] + torch.eye(len(scale), dtype=torch.float64)
+    return torch.linalg.inv(inner) * scale[:, None] * scale

@@ -1,0 +1,217 @@
+"""`NoiseModel`: the noise of each frame, white and correlated, as power at every spatial frequency."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.ndimage import gaussian_filter, map_coordinates
+from torch import Tensor
+
+from ..checks import require
+from .air import find_air, has_air
+from .modes import smooth_modes
+from .noise import sure_noise
+
+DETREND = 3
+"""Half waves across a frame up to which light, and not grain, changes."""
+RIDGE = 1e-3
+"""Of the fit of these modes to air, relative to the information of a frame that is all air."""
+LAGS = 4
+"""Correlations are believed up to a distance of this part of a frame's shorter side."""
+RIM = 0.15
+"""Part of the columns at either side where neighbours must be correlated, too: faint fringes are in the middle."""
+CALM_WINDOW, QUIET, CALM = 8.0, 0.1, 1.5
+"""So must they where the noise, in a window of this standard deviation [pixels], has no more than this factor of the
+power in the quietest parts, of this quantile: the power of fringes varies, that of grain does not."""
+ALIKE = 0.4
+"""In both places at least by this part of what they are in all air."""
+PLATEAU = 0.35
+"""Spatial frequency [cycles per pixel] from which on along both axes noise passes for white."""
+SURE = 6.0
+"""Standard errors by which neighbours must be correlated, or there is no grain."""
+FAINTEST = 0.03
+"""Grain of a smaller part of a frame's contrast is none: it may be fringes that fade away."""
+
+
+@dataclass(frozen=True)
+class NoiseModel:
+    """The noise of V frames of relative intensity, where that is about 1.
+
+    white: [V] standard deviation of the white noise, float64
+    grain: [V, H, W//2 + 1] power spectrum of the correlated noise beside it, float64, at the frequencies of `rfft2`
+        and in its unitary convention: white noise of variance s² has the power s² at every frequency
+
+    width: W; 0 stands for an even one
+
+    The noise of amplitudes √I is half of it. Errors: `InputError` if the shapes do not match.
+    """
+
+    white: Tensor
+    grain: Tensor
+    width: int = 0
+
+    def __post_init__(self) -> None:
+        require(
+            self.grain.ndim == 3 and self.white.shape == self.grain.shape[:1],
+            f"a noise model needs white noise [V] and grain [V, H, W//2 + 1], but they have the shapes "
+            f"{tuple(self.white.shape)} and {tuple(self.grain.shape)}.",
+        )
+
+    def __len__(self) -> int:
+        return len(self.white)
+
+    def __getitem__(self, index: Tensor | np.ndarray | slice) -> NoiseModel:
+        """The noise of some of the frames."""
+        return NoiseModel(self.white[index], self.grain[index], self.width)
+
+    @classmethod
+    def white_only(cls, white: Tensor, shape: tuple[int, int]) -> NoiseModel:
+        """White noise [V] on frames of `shape` (H, W), without grain."""
+        grain = torch.zeros(len(white), shape[0], shape[1] // 2 + 1, dtype=torch.float64)
+        return cls(white.double(), grain, shape[1])
+
+    @classmethod
+    def of_frames(cls, frames: Tensor, air: Tensor | None = None) -> NoiseModel:
+        """The noise of relative frames [V, H, W], by their air [V, H, W] bool, or by air that they show themselves.
+
+        Grain is that which correlates neighbours in air beyond what slow light does (`DETREND`). Its spectrum is that
+        of the mean of all frames' correlations (Blackman & Tukey 1958, with Parzen's window), without the white noise.
+        The white noise is that of the highest frequencies in each frame's air. Of a frame without air it is what both
+        estimates of `noise.sure_noise` agree on: fringes that fill a frame are not noise.
+        """
+        air = find_air(frames) if air is None else air
+        usable = has_air(air)
+        shape = (frames.shape[-2], frames.shape[-1])
+        white = torch.where(usable, torch.zeros(len(frames), dtype=torch.float64), sure_noise(frames))
+        if not bool(usable.any()):
+            return cls.white_only(white, shape)
+        rest = _without_light(frames[usable].double(), air[usable])
+        white[usable] = _finest(rest, air[usable])
+        return cls(white, _grain(rest, air[usable], white[usable], frames)[None].expand(len(frames), -1, -1), shape[1])
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the frames."""
+        return self.grain.shape[1], self.width or 2 * (self.grain.shape[2] - 1)
+
+    @property
+    def has_grain(self) -> bool:
+        """Whether any of the noise is correlated."""
+        return bool((self.grain > 0).any())
+
+    @property
+    def level(self) -> Tensor:
+        """Standard deviation [V] of all noise, float64."""
+        return (self.white.square() + _mean_power(self.grain, self.shape)).sqrt()
+
+    def with_more(self, power: Tensor) -> NoiseModel:
+        """The same noise and more of the correlated kind, of `power` [H, W//2 + 1] or [V, H, W//2 + 1]."""
+        return NoiseModel(self.white, self.grain + power, self.width)
+
+    def power(self) -> Tensor:
+        """Power [V, H, W//2 + 1] of all noise at the frequencies of `rfft2`, float64."""
+        return self.white.square()[:, None, None] + self.grain
+
+    def power_on(self, shape: tuple[int, int], oversample: int = 1) -> Tensor:
+        """The same [V, H', W'//2 + 1] at the frequencies of a raster of `shape` with pixels divided by `oversample`.
+
+        Beyond the frequencies that pixels see there is white noise alone.
+        """
+        (h, w), (k, n) = self.shape, self.grain.shape[1:]
+        rows, columns = np.fft.fftfreq(shape[0]) * oversample * h, np.fft.rfftfreq(shape[1]) * oversample * w
+        white = self.white.square()[:, None, None].expand(-1, len(rows), len(columns))
+        if not self.has_grain:
+            return white
+        centred = torch.fft.fftshift(self.grain, dim=1).numpy()
+        at = np.stack(np.meshgrid(rows + k // 2, columns, indexing="ij"))
+        inside = np.stack([map_coordinates(image, at, order=1, mode="nearest") for image in centred])
+        beyond = (np.abs(rows) > k / 2)[:, None] | (columns > n)
+        return white + torch.from_numpy(np.where(beyond, 0.0, inside))
+
+
+def _without_light(frames: Tensor, air: Tensor) -> Tensor:
+    """What is left of frames [V, H, W] in their air without their slow light, relative to it; zero elsewhere."""
+    modes = smooth_modes((frames.shape[1], frames.shape[2]), DETREND).double().flatten(1)
+    seen = air.double().flatten(1)
+    normal = torch.einsum("vp,kp,lp->vkl", seen, modes, modes) / seen.shape[1]
+    right = torch.einsum("vp,kp->vk", seen * frames.flatten(1), modes) / seen.shape[1]
+    ridge = RIDGE * torch.eye(len(modes), dtype=torch.float64)
+    ridge[0, 0] = 0.0  # the level itself costs nothing
+    light = (torch.linalg.solve(normal + ridge, right) @ modes).reshape(frames.shape)
+    return torch.where(air, frames / torch.where(air, light, 1.0) - 1, 0.0)
+
+
+def _finest(rest: Tensor, air: Tensor) -> Tensor:
+    """Standard deviation [V] of white noise by the diagonal wavelets that lie in air [V, H, W]."""
+    diagonal = 0.5 * (rest[:, :-1, :-1] + rest[:, 1:, 1:] - rest[:, :-1, 1:] - rest[:, 1:, :-1])
+    whole = air[:, :-1, :-1] & air[:, 1:, 1:] & air[:, :-1, 1:] & air[:, 1:, :-1]
+    power = (diagonal.square() * whole).sum(dim=(1, 2)) / whole.sum(dim=(1, 2)).clamp_min(1)
+    return power.sqrt()
+
+
+def _grain(rest: Tensor, air: Tensor, white: Tensor, frames: Tensor) -> Tensor:
+    """Power spectrum [H, W//2 + 1] of the correlated noise, the same for all frames; zero where none is sure."""
+    h, w = rest.shape[1:]
+    correlation, among, sure = _correlation(rest, air)
+    none = torch.zeros(h, w // 2 + 1, dtype=torch.float64)
+    rim = torch.zeros(w, dtype=torch.bool)
+    rim[: max(1, round(RIM * w))] = rim[-max(1, round(RIM * w)) :] = True
+    for part in (air & rim, _calm(rest, air)):
+        _, there, surely = _correlation(rest * part, part)
+        sure = sure and surely and there > ALIKE * among
+    if not sure:
+        return none
+    reach = max(2, min(h, w) // LAGS)
+    rows, columns = (torch.fft.fftfreq(2 * n, 1 / (2 * n), dtype=torch.float64).abs() / reach for n in (h, w))
+    tapered = correlation * _parzen((rows[:, None].square() + columns.square()).sqrt())
+    within = tapered[torch.fft.fftfreq(h, 1 / h).long()][:, torch.fft.fftfreq(w, 1 / w).long()]
+    power = torch.fft.rfft2(within).real
+    fy, fx = torch.fft.fftfreq(h).abs(), torch.fft.rfftfreq(w)
+    high = (fy[:, None] > PLATEAU) & (fx > PLATEAU)
+    plateau = float(power[high].mean()) if bool(high.any()) else float(white.square().mean())
+    grain = (power - plateau).clamp_min(0)
+    contrast = float((frames.double() - 1).square().mean().sqrt())
+    return grain if float(_mean_power(grain[None], (h, w))) ** 0.5 > FAINTEST * contrast else none
+
+
+def _calm(rest: Tensor, air: Tensor) -> Tensor:
+    """The parts [V, H, W] bool of air in which the noise is about as weak as in its quietest parts."""
+    found = []
+    for image, seen in zip(rest.numpy(), air.double().numpy()):
+        share = gaussian_filter(seen, CALM_WINDOW, mode="constant").clip(1e-6)
+        power = gaussian_filter(gaussian_filter(image, 1.0) ** 2, CALM_WINDOW, mode="constant") / share
+        found.append((seen > 0) & (power <= CALM * np.quantile(power[seen > 0], QUIET)))
+    return torch.from_numpy(np.stack(found))
+
+
+def _correlation(rest: Tensor, air: Tensor) -> tuple[Tensor, float, bool]:
+    """Mean products [2H, 2W] of noise [V, H, W] with itself at all distances in air; of direct neighbours, relative to
+    the variance; and whether that is surely above zero."""
+    twice = (2 * rest.shape[1], 2 * rest.shape[2])
+    sums, counts = (
+        torch.fft.irfft2(torch.fft.rfft2(images, s=twice).abs().square().sum(dim=0), s=twice)
+        for images in (rest, air.double())
+    )
+    found = sums / counts.clamp_min(1.0)
+    neighbours = torch.stack((found[0, 1], found[1, 0], found[1, 1], found[1, -1]))
+    mean = float(neighbours.mean() / found[0, 0].clamp_min(1e-30))
+    error = (len(neighbours) * max(1.0, float(air.double().sum()))) ** -0.5
+    return found, mean, mean > SURE * error
+
+
+def _parzen(distance: Tensor) -> Tensor:
+    """Parzen's (1961) window of a distance relative to its reach; its transform has no negative value."""
+    near = 1 - 6 * distance.square() * (1 - distance)
+    return torch.where(distance < 0.5, near, 2 * (1 - distance).clamp_min(0).pow(3))
+
+
+def _mean_power(power: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Mean [V] over all frequencies of a spectrum [V, H, W//2 + 1] of real images of `shape` (H, W)."""
+    rows, columns = shape
+    weight = torch.full((columns // 2 + 1,), 2.0, dtype=power.dtype)
+    weight[0] = 1.0
+    if columns % 2 == 0:
+        weight[-1] = 1.0
+    return (power * weight).sum(dim=(1, 2)) / (rows * columns)

@@ -1,0 +1,71 @@
+"""Absorption alone: frames taken in contact, or so close behind the matter that no fringe is seen.
+
+Behind matter of thickness T the intensity is then `exp(-2 k β T)` (docs/conventions.md), and nothing in it depends on
+δ. What every method of retrieval returns there is the logarithm, with no prior: tomography weighs the noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import wraps
+from typing import Any, TypeVar, cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ...checks import require
+from ...scan import Exposures
+from ...units import wavenumber
+from ..noise import noise_levels
+from .spectra import checked, column, finest_phase
+
+UNSEEN = 0.01
+"""Refraction that changes the contrast of the finest detail by less than this share of its absorption is not seen."""
+LEAST_INTENSITY = 1e-6
+"""Intensity taken for the darkest pixel's, where frames have no noise that would set it."""
+
+Method = TypeVar("Method", bound=Callable[..., Tensor])
+
+
+def absorption_alone(exposures: Exposures, ratio: float) -> np.ndarray:
+    """[V] bool: views in which refraction is not seen beside absorption, for matter with β/δ = `ratio`.
+
+    A thin object's response is `2 (β/δ cos χ + sin χ)` (`spectra`): without fringes where χ stays far below |β|/δ.
+    """
+    delta, beta = exposures.refraction(1.0, ratio)
+    return finest_phase(exposures) <= UNSEEN * np.abs(beta) / delta
+
+
+def contact_thickness(frames: Tensor, exposures: Exposures, delta: float, beta: float) -> Tensor:
+    """Thickness [V, H, W] in metres, `-ln I / 2kβ`, of matter with β ≠ 0 from frames [V, H, W] of absorption alone.
+
+    Errors: `InputError` for matter that does not absorb.
+    """
+    require(
+        beta != 0,
+        "frames in contact (distance 0) show absorption alone, but the material has β = 0; give one that absorbs, or "
+        "frames taken at a distance.",
+    )
+    mu = column(2 * wavenumber(exposures.energy_kev) * exposures.refraction(delta, beta)[1])
+    one_photon = noise_levels(frames)[:, None, None].square()  # variance σ² of relative frames: a photon counts σ²
+    least = one_photon.clamp_min(LEAST_INTENSITY).to(frames.device)
+    return (-torch.log(torch.maximum(frames.double(), least)) / mu.to(frames.device)).to(frames.dtype)
+
+
+def or_in_contact(method: Method) -> Method:
+    """`method` for the views that show refraction, and `contact_thickness` for those that show absorption alone."""
+
+    @wraps(method)
+    def retrieve(frames: Tensor, exposures: Exposures, delta: float, beta: float, **options: Any) -> Tensor:
+        checked(frames, exposures, delta)
+        alone = absorption_alone(exposures, beta / delta)
+        if not alone.any():
+            return method(frames, exposures, delta, beta, **options)
+        found = torch.empty_like(frames)
+        found[alone] = contact_thickness(frames[alone], exposures[alone], delta, beta)
+        if not alone.all():
+            found[~alone] = method(frames[~alone], exposures[~alone], delta, beta, **options)
+        return found
+
+    return cast(Method, retrieve)

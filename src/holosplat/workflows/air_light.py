@@ -1,0 +1,77 @@
+"""The light of all projections of a raw file, by their air: found on binned frames, given on whole ones."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ..checks import InputError
+from ..optics.air import Box, has_air
+from ..optics.background import ORDER, Light, LightOptions
+from ..optics.modes import cosines
+
+LONGEST = 128
+"""Pixels along the longer side of the binned frames, at most."""
+
+
+@dataclass(frozen=True)
+class AirLight:
+    """coefficients [V, (K + 1)²] of smooth light; airless: how many projections had no air, and take the mean light."""
+
+    coefficients: np.ndarray
+    airless: int
+
+    @classmethod
+    def of(
+        cls, frame: Callable[[int], np.ndarray], count: int, air: Sequence[Box] = (), asked: bool = False
+    ) -> AirLight | None:
+        """Of `count` relative frames [H, W], `frame(i)` one at a time; None where none of them has air, or all is even.
+
+        air: boxes of it, or nothing to find it; asked: whether even light counts, too. Errors: `InputError` for boxes
+        outside the frames.
+        """
+        first = frame(0)
+        factor = max(1, math.ceil(max(first.shape) / LONGEST))
+        binned = np.stack([_binned(first if i == 0 else frame(i), factor) for i in range(count)])
+        options = LightOptions("smooth" if asked else "auto", tuple(_shrunk(box, factor, first.shape) for box in air))
+        frames = torch.from_numpy(binned)
+        usable = has_air(options.air_of(frames))
+        if not bool(usable.any()):
+            return None
+        found = Light.of(frames, options)
+        if found.background is None:
+            return None
+        usable = has_air(found.air)
+        coefficients = found.background.coefficients
+        coefficients = torch.where(usable[:, None], coefficients, coefficients[usable].mean(dim=0))
+        return cls(coefficients.numpy(), int((~usable).sum()))
+
+    def factor(self, number: int, shape: tuple[int, int]) -> np.ndarray:
+        """The light [H, W] of projection `number`."""
+        rows, columns = (cosines(n, ORDER, "cpu").numpy() for n in shape)
+        return np.exp(rows.T @ self.coefficients[number].reshape(ORDER + 1, ORDER + 1) @ columns)
+
+
+def _binned(frame: np.ndarray, factor: int) -> np.ndarray:
+    h, w = (n // factor * factor for n in frame.shape)
+    return frame[:h, :w].reshape(h // factor, factor, w // factor, factor).mean(axis=(1, 3))
+
+
+def _shrunk(box: Box, factor: int, shape: tuple[int, ...]) -> Box:
+    """A box in binned pixels, of those that lie in it whole, one at least."""
+    top, bottom, left, right = box
+    inside = 0 <= top < bottom <= shape[0] and 0 <= left < right <= shape[1]
+    if not inside:
+        raise InputError(
+            f"a box of --air must lie within {shape[0]} rows and {shape[1]} columns, its ends after its beginnings, "
+            f"but it is rows {top} to {bottom}, columns {left} to {right}; correct it."
+        )
+    starts = [math.ceil(n / factor) for n in (top, left)]
+    ends = [max(start + 1, end // factor) for start, end in zip(starts, (bottom, right))]
+    most = [n // factor for n in shape]
+    starts, ends = ([min(n, m - k) for n, m in zip(side, most)] for side, k in ((starts, 1), (ends, 0)))
+    return starts[0], ends[0], starts[1], ends[1]

@@ -1,0 +1,115 @@
+"""Uneven light: found in air, and beside what matter predicts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import gaussian_filter
+
+from holosplat.checks import InputError
+from holosplat.model import SolvedLight
+from holosplat.optics.background import Light, LightOptions
+
+SHAPES = [(5, 72, 72), (4, 61, 90)]
+
+
+def rings(shape: tuple[int, int]) -> np.ndarray:
+    """A faint ball with fringes about its edge, in the middle."""
+    rows, columns = np.mgrid[: shape[0], : shape[1]]
+    out = np.hypot(rows - shape[0] / 2, columns - shape[1] / 2) - 12
+    return 1 + 0.15 * np.cos(0.1 * out * np.abs(out)) * np.exp(-((out / 4) ** 2)) - 0.01 * (out < 0)
+
+
+def uneven(shape: tuple[int, ...], kind: str, size: float = 0.02, seed: int = 3) -> np.ndarray:
+    """Smooth factors of rms `size` about one: slopes, blurred noise, or a bump."""
+    draw, light = np.random.default_rng(seed), []
+    rows, columns = np.meshgrid(*(np.linspace(-1, 1, n) for n in shape[1:]), indexing="ij")
+    for _ in range(shape[0]):
+        if kind == "slopes":
+            field = draw.normal() + draw.normal() * rows + draw.normal() * columns
+        elif kind == "clouds":
+            edge = min(shape[1:])
+            wide = gaussian_filter(draw.normal(size=(3 * shape[1], 3 * shape[2])), edge / 4)
+            field = wide[shape[1] : 2 * shape[1], shape[2] : 2 * shape[2]]
+        else:
+            field = np.exp(-((rows - draw.uniform(-1, 1)) ** 2 + (columns - draw.uniform(-1, 1)) ** 2))
+        light.append(1 + size * field / np.sqrt((field**2).mean()))
+    return np.stack(light)
+
+
+def measured(shape: tuple[int, ...], light: np.ndarray, noise: float = 0.01) -> torch.Tensor:
+    clean = np.stack([rings(shape[1:])] * shape[0]) * light
+    return torch.from_numpy((clean + noise * np.random.default_rng(0).normal(size=shape)).astype(np.float32))
+
+
+def rms(values: np.ndarray | torch.Tensor) -> float:
+    return float(np.sqrt(np.mean(np.square(np.asarray(values)))))
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_even_light_stays_as_it_is(shape):
+    for noise in (0.0, 0.01):
+        frames = measured(shape, np.ones(shape), noise)
+        found = Light.of(frames)
+        assert found.background is None
+        assert found.evened(frames) is frames
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("kind", ["slopes", "clouds", "bump"])
+def test_light_is_found_in_air_and_where_matter_is(shape, kind):
+    light = uneven(shape, kind)
+    frames = measured(shape, light)
+    found = Light.of(frames)
+    assert found.background is not None
+    off, air = found.background.factor().numpy() - light, found.air.numpy()
+    assert rms(off[air]) < 0.15 * rms(light - 1)
+    assert rms(off[~air]) < 0.4 * rms(light - 1)
+    assert rms(found.evened(frames)[found.air] - 1) == pytest.approx(0.01, rel=0.12)
+    assert Light.of(frames, LightOptions("even")).background is None
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_matter_that_is_known_leaves_the_light_and_no_more(shape):
+    """The coefficients that a fit solves for are those beside the frames that matter predicts."""
+    light = uneven(shape, "clouds")
+    frames = measured(shape, light)
+    found = Light.of(frames)
+    assert found.background is not None
+    truth = torch.from_numpy(np.stack([rings(shape[1:])] * shape[0])).float()
+    left = SolvedLight(found.background, found.evened(frames)).factor(images=truth)
+    whole = left.double() * found.background.factor()
+    assert rms(whole.numpy() - light) < 0.15 * rms(light - 1)
+    settled = found.settled(frames, truth).background
+    assert settled is not None
+    assert settled.factor().numpy() == pytest.approx(whole.numpy(), abs=2e-4)
+    field = SolvedLight(found.background, found.evened(frames)).settled(truth)
+    assert torch.allclose(field.factor(), left, atol=1e-6)
+    some = SolvedLight(found.background, found.evened(frames)).factor(torch.tensor([2, 0]), truth[[2, 0]])
+    assert torch.allclose(some, left[[2, 0]])
+    assert SolvedLight(found.background, frames).factor().eq(1).all()
+
+
+def test_what_is_unknown_is_slow_and_where_there_is_no_air():
+    shape = SHAPES[1]
+    found = Light.of(measured(shape, uneven(shape, "clouds")))
+    more = found.doubt.power() - found.noise.power()
+    assert float(more.min()) >= 0
+    assert float(more[0, 0, 0]) > 10 * float(more[0, 20, 20])
+
+
+def test_light_given_by_boxes_and_in_vain():
+    shape = (2, 40, 50)
+    rows, columns = np.mgrid[:40, :50]
+    crowded = 1 + 0.2 * np.cos(2 * np.pi * columns / 9 + rows) * np.ones(shape)
+    frames = torch.from_numpy(crowded)
+    with pytest.raises(InputError, match="--air"):
+        Light.of(frames, LightOptions("smooth"))
+    assert Light.of(frames).background is None
+    frames[:, :, :12] = 1.05
+    found = Light.of(frames, LightOptions("smooth", ((0, 40, 0, 12),)))
+    assert found.background is not None
+    assert found.background.factor()[:, :, :12].numpy() == pytest.approx(1.05, abs=0.002)
+    with pytest.raises(InputError, match="light must be"):
+        LightOptions("dim")  # type: ignore[arg-type]
