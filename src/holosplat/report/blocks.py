@@ -11,6 +11,7 @@ from ..metrics import VolumeScores
 from ..units import wavenumber
 from .content import ReportContent
 from .curves import correlation_figure, histogram_figure, history_figure
+from .explained import explained_figure
 from .figures import (
     evenly_chosen,
     grey_limits,
@@ -43,7 +44,7 @@ class Block:
 
 def make_blocks(content: ReportContent) -> list[Block]:
     """All figures of the page, in order and numbered from 1."""
-    makers = (_scene, _held_out, _projections, _slices, _correlation, _history, _histograms)
+    makers = (_scene, _held_out, _explained, _projections, _slices, _correlation, _history, _histograms)
     blocks, number = [], 0
     for block in (make(content) for make in makers):
         number += block.image is not None
@@ -97,6 +98,20 @@ def _held_out(content: ReportContent) -> Block:
         f"{views.scores.data_range[1]:.3f}."
     )
     return _drawn(heading, text, "Prediction of held-out views.", figure, "png")
+
+
+def _explained(content: ReportContent) -> Block:
+    heading, found = "Are the frames explained?", content.explained
+    if found is None:
+        return Block(heading, "The training frames were not compared with the reconstruction.")
+    figure = explained_figure(found)
+    text = (
+        f"{' '.join((found.words, *found.reasons))} "
+        "a, root mean square of what the reconstruction leaves of the training frames, by the period of its Fourier "
+        "coefficients, beside the noise, the contrast, and what a residual may have. b, the residual over what it may "
+        "have, in each view: colours end at 3."
+    )
+    return _drawn(heading, text, "What is left of the training frames.", figure, "svg")
 
 
 def _projections(content: ReportContent) -> Block:

@@ -13,6 +13,7 @@ from ..checks import InputError, positive, require, shaped
 from ..geometry import Views
 from ..metrics import ImageScores, VolumeScores, require_same_grid, robust_material_delta
 from ..volume import Volume
+from ..workflows.verdict import Verdict
 
 
 @dataclass(frozen=True)
@@ -75,6 +76,7 @@ class ReportContent:
     - held_out: test views; projections: line integrals of a few views; volume_scores: against the truth
     - material_delta: the material's δ, for surfaces and masks; None: the robust maximum of the truth, or else
       of the reconstruction
+    - explained: the verdict on the training frames; None: not judged
     - history: columns of metrics.csv, each [S]: step, seconds, loss, the loss' terms, count, val_ssim …
     - seconds: time of the reconstruction [s]
     - settings: the resolved configuration, nested or flat
@@ -91,6 +93,7 @@ class ReportContent:
     projections: ProjectedMaps | None = None
     volume_scores: VolumeScores | None = None
     material_delta: float | None = None
+    explained: Verdict | None = None
     history: Mapping[str, np.ndarray] = field(default_factory=dict)
     seconds: float | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)

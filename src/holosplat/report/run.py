@@ -48,6 +48,7 @@ def report_run(
         projections=_projections(reconstruction, scan.views, truth),
         volume_scores=evaluation.volume,
         material_delta=found.matter.delta if found.matter.single else None,
+        explained=reconstruction.verdict,
         history=folder.history(),
         seconds=sum(reconstruction.timing.values()),
         settings={"seed": config["seed"], "prior": config["prior"], **config.get("method", config.get("settings", {}))},

@@ -1,0 +1,275 @@
+"""The verdict on a run: does the reconstruction explain the frames to within their noise, and if not, why not?"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..checks import InputError
+from ..fit.causes import Cause, causes, scores
+from ..fit.loop import Fit
+from ..fit.residuals import Prediction, Residuals, residuals
+from ..fit.validation import split_validation
+from ..methods import Task
+from ..model import Alignment, LightField, Model, SolvedLight
+from ..optics.noise import noise_levels
+from ..optics.noise_model import NoiseModel
+from ..representations import Stored
+from ..scan import Scan
+
+TOO_MUCH = 1.15
+"""Residual over what is allowed (rms) from which on a band counts as unexplained."""
+SURE = 5.0
+"""Standard deviations of chance from which on something counts as seen."""
+SCATTER = 3.0
+"""Standard deviations by which a band's mean power may exceed that limit by chance."""
+FEWEST_ROWS = 11
+"""Rows and columns from which on air and grain are looked for in frames."""
+NOISELESS = 0.02
+"""Noise, as a share of the contrast, below which frames count as free of noise."""
+LARGE = {"mass": 0.1, "distance": 0.1, "shift_x": 0.3, "shift_y": 0.3}
+"""Changes (shares; pixels) that count as a fault by themselves, whatever the bands say, if they are seen."""
+BELOW = 0.8
+"""Residual over noise (rms) below which a fit has followed the noise."""
+ODD = 1.5
+"""Residual of a view over the median one (rms) from which on the view is named."""
+POWERS = ("residual", "noise", "contrast", "allowed")
+"""What residuals have the power of, by view and band."""
+MOST_VIEWS = 4
+"""Views that are named, at most."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the residual of a reconstruction says. Root mean squares by view and band, of coefficients of `rfft2`.
+
+    good: whether the frames are explained
+    words: that in one sentence
+    reasons: likely causes, one sentence each, and other remarks
+    periods: [B, 2] shortest and longest period of each band [m]; the longest of the first is infinite
+    residual, noise, contrast, allowed: [V, B] of what is left, of the frames' noise, of the frames minus one, and of
+        what a residual may have
+    tested: each change of the frames that was tested by itself: its value (mean over views), error, significance and
+        share of the excess
+    """
+
+    good: bool
+    words: str
+    reasons: tuple[str, ...]
+    periods: np.ndarray
+    residual: np.ndarray
+    noise: np.ndarray
+    contrast: np.ndarray
+    allowed: np.ndarray
+    tested: dict[str, dict[str, float]]
+
+    def lines(self, frames: str) -> list[str]:
+        """The verdict on `frames`, such as "training frames", as lines of text."""
+        return [f"{frames}: {self.words}", *(f"  {reason}" for reason in self.reasons)]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON; `from_dict` reads them."""
+        arrays = {name: _rounded(getattr(self, name)) for name in POWERS}
+        periods = [[low, None if math.isinf(high) else high] for low, high in self.periods.tolist()]
+        plain = {"good": self.good, "words": self.words, "reasons": list(self.reasons), "periods_m": periods}
+        return plain | arrays | {"tested": self.tested}
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> Verdict:
+        """The verdict that `as_dict` described; `InputError` for anything else."""
+        try:
+            periods = [[low, math.inf if high is None else high] for low, high in values["periods_m"]]
+            return cls(
+                good=bool(values["good"]),
+                words=str(values["words"]),
+                reasons=tuple(str(reason) for reason in values["reasons"]),
+                periods=np.array(periods, dtype=np.float64),
+                **{name: np.array(values[name], dtype=np.float64) for name in POWERS},
+                tested=dict(values["tested"]),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise InputError(f"a verdict must be what reconstruct wrote, but it lacks or garbles {error}.") from error
+
+
+def judge(said: Prediction, frames: Scan, noise: NoiseModel | None = None) -> Verdict:
+    """The verdict on what is said of `frames`, whose exposures the prediction has; noise: None to estimate it."""
+    measured = torch.from_numpy(frames.frames)
+    return verdict(residuals(said, measured, (noise or _noise(measured)).power()))
+
+
+def _noise(frames: torch.Tensor) -> NoiseModel:
+    """The noise of `frames`; of few rows it is taken for white, for they are too few to find air in."""
+    shape = (frames.shape[1], frames.shape[2])
+    if min(shape) < FEWEST_ROWS:
+        return NoiseModel.white_only(noise_levels(frames), shape)
+    return NoiseModel.of_frames(frames)
+
+
+def judge_run(found: Stored, fit: Fit | None, task: Task, oversample: int) -> Verdict:
+    """The verdict on the frames that were fitted, or on all training frames where nothing was.
+
+    Frames in uneven light are those that were evened; what air does not tell of the light counts as noise.
+    """
+    train = task.scan
+    if fit is None:
+        said = Prediction(found, train.exposures, oversample, backend=found.backend)
+        return judge(said, train, task.noise if task.uneven else None)
+    aside = len(fit.plan.judge.scan) if fit.plan.judge else 0
+    fitted, (alignment, light) = split_validation(train, aside)[0], _in_memory(fit.result())
+    return judge(Prediction(found, fitted.exposures, oversample, alignment, light, found.backend), fitted)
+
+
+def _in_memory(model: Model) -> tuple[Alignment | None, LightField | None]:
+    """The alignment and the light of a model, on the CPU."""
+    alignment, light = model.alignment, model.light
+    if alignment is not None:
+        alignment = alignment.with_parameters({n: p.cpu() for n, p in alignment.parameters().items()})
+    if isinstance(light, SolvedLight):
+        with torch.no_grad():
+            light = light.settled(replace(model, light=None).frames())
+    return alignment, light and replace(light, coefficients=light.coefficients.cpu(), modes=light.modes.cpu())
+
+
+def verdict(found: Residuals) -> Verdict:
+    """What residuals say, in words."""
+    counts, views = found.rings.counts, len(found.residual)
+    over = found.residual.mean(axis=0) / found.allowed.mean(axis=0)
+    limit = TOO_MUCH**2 * (1 + SCATTER * np.sqrt(2 / (counts * views)))
+    bad, single = np.flatnonzero(over > limit), scores(found)
+    faults = [name for name, size in LARGE.items() if _is_fault(single[name], size)]
+    good = not len(bad) and not faults
+    if len(bad):
+        named = causes(found)
+        reasons = _reasons(found, named, single)
+        words = _unexplained(found, bad, over)
+    elif faults:
+        reasons = tuple(f"It would be explained better with {_said(single[name])}." for name in faults)
+        words = "The frames are explained band by band, but not as a whole."
+    else:
+        reasons, words = (), _explained(found, counts)
+    return Verdict(
+        good=good,
+        words=words,
+        reasons=(*reasons, *_remarks(found, counts)),
+        periods=np.array([found.rings.periods(b) for b in range(len(counts))]),
+        **{name: np.sqrt(getattr(found, name)) for name in POWERS},
+        tested={name: _numbers(cause) for name, cause in single.items()},
+    )
+
+
+def _is_fault(cause: Cause, size: float) -> bool:
+    return abs(float(cause.value[0])) >= size and cause.significance >= SURE
+
+
+def _explained(found: Residuals, counts: np.ndarray) -> str:
+    residual, noise, contrast = (_rms(p, counts) for p in (found.residual, found.noise, found.contrast))
+    if noise < NOISELESS * contrast:
+        return f"The frames, which show no noise, are explained to {_percent(residual / contrast)} of their contrast."
+    return f"The frames are explained to within their noise: the residual is {residual / noise:.2g} of it."
+
+
+def _unexplained(found: Residuals, bad: np.ndarray, over: np.ndarray) -> str:
+    worst = int(bad[np.argmax(over[bad])])
+    first = last = worst
+    while first - 1 in bad:
+        first -= 1
+    while last + 1 in bad:
+        last += 1
+    residual, noise, contrast = (p.mean(axis=0)[worst] ** 0.5 for p in (found.residual, found.noise, found.contrast))
+    noisy = _rms(found.noise, found.rings.counts) > NOISELESS * _rms(found.contrast, found.rings.counts)
+    size = f"{residual / noise:.2g} times the noise" if noisy else f"{_percent(residual / contrast)} of the contrast"
+    wide = _band(found.rings.periods(last)[0], found.rings.periods(first)[1])
+    said = "" if first == last else f"; it is too large at all periods {wide}"
+    return (
+        f"The frames are not explained: the residual is {size} at periods {_band(*found.rings.periods(worst))}{said}."
+    )
+
+
+def _reasons(found: Residuals, named: list[Cause], single: Mapping[str, Cause]) -> tuple[str, ...]:
+    sentences = []
+    for number, cause in enumerate(named):
+        also = [] if number else [c for c in single.values() if _rivals(c, cause)]
+        either = " or ".join(_said(c) for c in (cause, *also))
+        sentences.append(
+            f"Likely cause: the frames would be explained better with {either} "
+            f"({min(cause.significance, 9999):.0f} σ; {_percent(min(cause.share, 1.0))} of what is too much)."
+        )
+    if not sentences:
+        sentences.append(
+            "None of distance, blur, light, shifts of views, mass and absorption explains it: the method's model of "
+            "the matter is too stiff (levels, bounds, smoothness), or the views do not agree with each other."
+        )
+    return tuple(sentences)
+
+
+def _rivals(one: Cause, best: Cause) -> bool:
+    """Whether a change that all views share explains nearly as much as the best: frames hardly tell them apart."""
+    return one.name != best.name and one.name not in ("light", "shifts") and one.gain > 0.8 * best.gain
+
+
+def _said(cause: Cause) -> str:
+    """A change in words."""
+    value, error = cause.value, cause.error
+    if cause.name == "light":
+        return f"uneven light in each frame, of {_percent(float(np.sqrt((value**2).sum(axis=1).mean())))} (rms)"
+    if cause.name == "shifts":
+        largest = float(np.abs(value).max())
+        return f"single views shifted (by up to {largest:.2g} px)"
+    number, size = float(value[0]), f"{abs(value[0]):.2g} ± {error[0]:.1g}"
+    return {
+        "mass": f"{_percent(abs(number))} {'more' if number > 0 else 'less'} matter",
+        "absorption": f"{_percent(abs(number))} {'more' if number > 0 else 'less'} absorption (another δ/β)",
+        "distance": f"a distance {_percent(abs(number))} {'longer' if number > 0 else 'shorter'}",
+        "blur": f"a point-spread function {'wider' if number > 0 else 'narrower'} by {abs(number) ** 0.5:.2g} px",
+        "shift_x": f"the axis of rotation {size} px to the {'left' if number > 0 else 'right'}",
+        "shift_y": f"the detector {size} px {'lower' if number > 0 else 'higher'}",
+    }[cause.name]
+
+
+def _remarks(found: Residuals, counts: np.ndarray) -> tuple[str, ...]:
+    """Single views that stand out, and a fit that followed the noise."""
+    remarks = []
+    of_view = np.sqrt((found.residual * counts).sum(axis=1) / (found.allowed * counts).sum(axis=1))
+    odd = np.flatnonzero(of_view > ODD * max(float(np.median(of_view)), TOO_MUCH / ODD))
+    if len(odd):
+        odd = odd[np.argsort(-of_view[odd])]
+        listed = ", ".join(
+            f"{i + 1} ({of_view[i] / np.median(of_view):.2g} times the median)" for i in odd[:MOST_VIEWS]
+        )
+        more = f" and {len(odd) - MOST_VIEWS} more" if len(odd) > MOST_VIEWS else ""
+        remarks.append(f"Views that stand out, counted from 1: {listed}{more}; look at their alignment and flux.")
+    residual, noise, contrast = (_rms(p, counts) for p in (found.residual, found.noise, found.contrast))
+    if noise > NOISELESS * contrast and residual < BELOW * noise:
+        remarks.append(
+            f"The residual is below the noise ({residual / noise:.2g} of it): some of the noise is in the volume, or "
+            "the frames' fine structure was taken for noise."
+        )
+    return tuple(remarks)
+
+
+def _numbers(cause: Cause) -> dict[str, float]:
+    value = cause.value if cause.value.ndim == 1 else np.sqrt((cause.value**2).sum(axis=1).mean(keepdims=True))
+    numbers = {"value": value[0], "standard_error": cause.error.mean(), "significance": cause.significance}
+    return {name: float(f"{number:.4g}") for name, number in (numbers | {"share": cause.share}).items()}
+
+
+def _rms(power: np.ndarray, counts: np.ndarray) -> float:
+    return float(np.sqrt((power.mean(axis=0) * counts).sum() / counts.sum()))
+
+
+def _band(shortest: float, longest: float) -> str:
+    low = f"{1e6 * shortest:.3g}"
+    return f"above {low} µm" if math.isinf(longest) else f"of {low} to {1e6 * longest:.3g} µm"
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"
+
+
+def _rounded(values: np.ndarray) -> list[list[float]]:
+    return [[float(f"{v:.4g}") for v in row] for row in values.tolist()]

@@ -1,0 +1,176 @@
+"""The verdict on runs: bad ones warn and name the cause, good ones do not."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.cli import holosplat, worked
+from helpers.fit_balls import MATERIAL, PIXEL
+from helpers.runs import KNOWN, SMALL
+from holosplat.beamline.simulate import simulate
+from holosplat.checks import InputError
+from holosplat.fit.residuals import Prediction, residuals
+from holosplat.geometry import Grid, Views
+from holosplat.io.nxtomo import write_scan
+from holosplat.matter import Matter
+from holosplat.model import smooth_modes
+from holosplat.representations import VoxelGrid
+from holosplat.scan import Exposures, Scan
+from holosplat.workflows.evaluate import held_out_verdict
+from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
+from holosplat.workflows.run_folder import RunFolder
+from holosplat.workflows.verdict import Verdict, judge, verdict
+
+SHAPE = (25, 32)
+
+
+def soft(scale: float = 1.0, seed: int = 1) -> VoxelGrid:
+    """Smooth bodies that end within the field."""
+    grid = Grid.centred((32, 25, 32), PIXEL)
+    z, y, x = np.meshgrid(*(axis / PIXEL for axis in grid.axes()), indexing="ij")
+    values, random = np.zeros(grid.shape), np.random.default_rng(seed)
+    for cx, cy, cz in random.uniform(-5, 5, (5, 3)):
+        r2 = (x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2
+        values += np.exp(-0.5 * r2 / random.uniform(2.0, 3.0) ** 2)
+    return VoxelGrid(torch.from_numpy(scale * values).float()[None], grid, Matter.one(*MATERIAL))
+
+
+def a_scan(obj: VoxelGrid, photons: float | None = None, count: int = 8, distance: float = 0.2) -> Scan:
+    views = Views.evenly_spaced(count, SHAPE, PIXEL)
+    return simulate(obj, Exposures.of(views, 20.0, distance, 0.3), photons_per_pixel=photons, seed=1, oversample=4)
+
+
+def on(scan: Scan, obj: VoxelGrid) -> Verdict:
+    return judge(Prediction(obj, scan.exposures, 2), scan)
+
+
+@pytest.mark.parametrize("photons", [None, 3000, 100_000])
+def test_the_truth_is_good(photons):
+    found = on(a_scan(soft(), photons), soft())
+    assert found.good, found.words
+    assert ("within their noise" in found.words) == (photons is not None)
+    assert found.reasons == ()
+
+
+def test_half_of_the_mass_gone_is_said_though_noise_is_as_large_as_the_contrast():
+    scan = a_scan(soft(0.5), 2000)
+    contrast = float(np.sqrt(np.mean((a_scan(soft(0.5)).frames - 1) ** 2)))
+    assert contrast < 2000**-0.5
+    found = on(scan, soft(0.25))
+    assert not found.good
+    assert "more matter" in " ".join(found.reasons)
+    assert found.tested["mass"]["value"] == pytest.approx(1.0, abs=0.25)
+    assert found.tested["mass"]["significance"] > 5
+
+
+def test_uneven_light_is_said():
+    scan, modes = a_scan(soft(), 5000), smooth_modes(SHAPE, 2)
+    light = torch.einsum("vk,khw->vhw", 0.007 * torch.randn(8, 9, generator=torch.Generator().manual_seed(1)), modes)
+    found = on(replace(scan, frames=(scan.frames * light.exp().numpy()).astype(np.float32)), soft())
+    assert not found.good
+    assert "times the noise at periods" in found.words
+    assert "uneven light in each frame" in found.reasons[0]
+
+
+def test_a_wrong_distance_is_said_with_its_sign():
+    scan = a_scan(soft(), 100_000)
+    wrong = replace(scan, exposures=replace(scan.exposures, distance=0.8 * scan.exposures.distance))
+    found = on(wrong, soft())
+    assert not found.good
+    assert "a distance" in found.reasons[0]
+    assert "longer" in found.reasons[0]
+    assert found.tested["distance"]["value"] == pytest.approx(0.25, abs=0.06)
+
+
+def test_a_single_view_that_stands_out_is_named():
+    scan = a_scan(soft(), 100_000)
+    frames = scan.frames.copy()
+    frames[3] = np.roll(frames[3], 3, axis=1)
+    found = on(replace(scan, frames=frames), soft())
+    assert not found.good
+    assert any("Views that stand out, counted from 1: 4 (" in reason for reason in found.reasons)
+
+
+def test_a_model_that_follows_the_noise_is_said():
+    scan = a_scan(soft(), 3000)
+    truth = a_scan(soft())
+    half = replace(scan, frames=(0.5 * (scan.frames - truth.frames) + truth.frames).astype(np.float32))
+    power = torch.full((8, SHAPE[0], SHAPE[1] // 2 + 1), 1 / 3000, dtype=torch.float64)
+    said = verdict(residuals(Prediction(soft(), scan.exposures, 2), torch.from_numpy(half.frames), power))
+    assert said.good
+    assert "below the noise (0.5" in said.reasons[0]
+
+
+def test_verdicts_survive_json_and_damage_is_refused():
+    found = on(a_scan(soft(), 3000), soft(0.5))
+    again = Verdict.from_dict(json.loads(json.dumps(found.as_dict(), allow_nan=False)))
+    assert (again.good, again.words, again.reasons, again.tested) == (
+        found.good,
+        found.words,
+        found.reasons,
+        found.tested,
+    )
+    np.testing.assert_allclose(again.residual, found.residual, rtol=1e-3)
+    np.testing.assert_array_equal(again.periods, found.periods)
+    with pytest.raises(InputError, match="a verdict must be what reconstruct wrote"):
+        Verdict.from_dict({"good": True})
+
+
+# --- runs -----------------------------------------------------------------------------------------------------
+
+
+def test_runs_carry_their_verdict(tmp_path, scan):
+    """Of a short fit of cells: in Python, summary.json and the report's object; held-out frames have their own."""
+    folder = RunFolder(tmp_path / "run")
+    done = reconstruct(scan, KNOWN, SMALL, folder=folder)
+    again = load_reconstruction(folder)
+    assert done.verdict is not None
+    assert again.verdict is not None
+    assert again.verdict.words == done.verdict.words
+    assert done.verdict.residual.shape[0] == len(scan.train())
+    held_out = held_out_verdict(again, scan)
+    assert held_out is not None
+    assert held_out.residual.shape[0] == len(scan.test())
+    assert held_out_verdict(again, scan.train()) is None
+
+
+def test_strict_runs_end_with_3_where_frames_are_not_explained(tmp_path):
+    """Uneven light: a warning and 0, with --strict 3; the same scan with even light: 0."""
+    method = ["--method", "holographic-tv", "--delta-beta", f"{MATERIAL[0] / MATERIAL[1]:.0f}"]
+    even = a_scan(soft(3.0))
+    modes = smooth_modes(SHAPE, 3)
+    light = torch.einsum("vk,khw->vhw", 0.02 * torch.randn(8, 16, generator=torch.Generator().manual_seed(1)), modes)
+    uneven = replace(even, frames=(even.frames * light.exp().numpy()).astype(np.float32))
+    outcomes = {}
+    for name, measured in (("even", even), ("uneven", uneven)):
+        write_scan(tmp_path / f"{name}.nxs", measured)
+        outcomes[name] = holosplat(
+            "reconstruct", tmp_path / f"{name}.nxs", "--out", tmp_path / name, *method, "--strict"
+        )
+    assert outcomes["uneven"].code == 3
+    assert "warning: the frames are not explained" in outcomes["uneven"].err
+    assert "training frames: The frames are not explained" in outcomes["uneven"].out
+    worked(outcomes["even"])
+    assert "warning" not in outcomes["even"].err
+    lax = worked(holosplat("reconstruct", tmp_path / "uneven.nxs", "--out", tmp_path / "lax", *method))
+    assert "warning: the frames are not explained" in lax.err
+    page = (tmp_path / "lax" / "report.html").read_text()
+    assert "Are the frames explained?" in page
+    assert "What is left of the training frames." in page
+    judged = worked(holosplat("evaluate", tmp_path / "even"))
+    assert "held-out frames: The frames are" in judged.out
+
+
+@pytest.mark.parametrize(("shape", "distance"), [((25, 32), 0.0), ((1, 32), 0.2), ((3, 33), 0.2)])
+def test_contact_frames_and_few_rows_have_a_verdict(shape, distance):
+    views = Views.evenly_spaced(6, shape, PIXEL)
+    scan = simulate(soft(3.0), Exposures.of(views, 20.0, distance, 0.3), photons_per_pixel=1e6, seed=1, oversample=4)
+    found, wrong = (judge(Prediction(soft(mass), scan.exposures, 2), scan) for mass in (3.0, 4.5))
+    assert found.good, found.words
+    assert not wrong.good
+    assert all(np.isfinite(value) for cause in wrong.tested.values() for value in cause.values())
