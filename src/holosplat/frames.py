@@ -55,6 +55,21 @@ class Picked(Frames):
         return self._frames.read(self._numbers[numbers])
 
 
+class Cropped(Frames):
+    """The rows and columns `rows`, `columns` (from start to stop) of other frames."""
+
+    def __init__(self, frames: Frames, rows: slice, columns: slice) -> None:
+        self._frames, self._rows, self._columns = frames, rows, columns
+        self.shape = (len(frames), rows.stop - rows.start, columns.stop - columns.start)
+
+    def read(self, numbers: np.ndarray) -> np.ndarray:
+        """See `Frames.read`."""
+        found = np.empty((len(numbers), *self.shape[1:]), dtype=np.float32)
+        for i, n in enumerate(numbers):  # one by one: the whole frames may be larger than memory
+            found[i] = self._frames.read(np.array([n]))[0, self._rows, self._columns]
+        return found
+
+
 class Binned(Frames):
     """Other frames on pixels `factor` times larger."""
 

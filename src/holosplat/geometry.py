@@ -118,6 +118,41 @@ class Views:
         h, w = self.shape
         return replace(self, shape=(h * factor, w * factor), pixel_size=self.pixel_size / factor)
 
+    def cropped(self, rows: slice, columns: slice) -> Views:
+        """The part of the raster from `start` to `stop` of `rows` and `columns`; the pixels stay where they are."""
+        (h, w), p = self.shape, self.pixel_size
+        moved = [0.5 * (part.start + part.stop - n) * p for part, n in ((columns, w), (rows, h))]
+        shape = (rows.stop - rows.start, columns.stop - columns.start)
+        return replace(self, shape=shape, shifts=self.shifts + np.array(moved))
+
+    def about_column(self, column: float) -> Views:
+        """The views with the rotation axis, the object's y axis, at `column` of every frame (0: middle of the first).
+
+        Errors: `InputError` for a column beyond the detector, and if the detector moves sideways from view to view.
+        """
+        width, sideways = self.shape[1], self.shifts[:, 0]
+        require(
+            -0.5 <= column <= width - 0.5,
+            f"the axis' column must be one of 0 to {width - 1}, but it is {column:g}; count columns from 0.",
+        )
+        require(
+            bool(np.allclose(sideways, sideways[:1], rtol=0, atol=1e-3 * self.pixel_size)),
+            "the scan says itself where the axis is (its detector moves sideways); leave the axis' column.",
+        )
+        shifts = self.shifts.copy()
+        shifts[:, 0] = (0.5 * (width - 1) - column) * self.pixel_size
+        return replace(self, shifts=shifts)
+
+    def turned_back(self) -> Views:
+        """The views with every rotation reversed about the object's y axis: the angles θ of a tomogram become -θ.
+
+        Errors: `InputError` for views that turn about another axis, whose rotations say their sense themselves.
+        """
+        upright = bool(np.allclose(self.rotations[:, 1], [0.0, 1.0, 0.0], rtol=0, atol=1e-6))
+        require(upright, "the sense of rotation is that about one axis, but the views have none in common; leave it.")
+        mirror = np.diag([1.0, 1.0, -1.0])
+        return replace(self, rotations=mirror @ self.rotations @ mirror)
+
     def padded(self, margin: tuple[int, int]) -> Views:
         """The raster grown by `margin = (rows, columns)` pixels on every side; centres of old pixels stay."""
         (h, w), (my, mx) = self.shape, margin
@@ -191,10 +226,12 @@ class Grid:
         object.__setattr__(self, "origin", tuple(float(v) for v in self.origin))
 
     @classmethod
-    def centred(cls, shape: tuple[int, int, int], voxel_size: float) -> Grid:
-        """A grid of cubic voxels of `voxel_size` [m], centred on the object frame's origin."""
+    def centred(
+        cls, shape: tuple[int, int, int], voxel_size: float, centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ) -> Grid:
+        """A grid of cubic voxels of `voxel_size` [m] about `centre` (x, y, z) [m], by default the object's origin."""
         z, y, x = shape
-        low_x, low_y, low_z = (-0.5 * (n - 1) * voxel_size for n in (x, y, z))
+        low_x, low_y, low_z = (c - 0.5 * (n - 1) * voxel_size for n, c in zip((x, y, z), centre))
         return cls(shape, (voxel_size, voxel_size, voxel_size), (low_x, low_y, low_z))
 
     @classmethod

@@ -25,6 +25,8 @@ from .tables import read_table
 
 ENERGY_RANGE_KEV = (0.1, 400.0)
 """Where Chantler's tables hold both f1 and f2 [keV]."""
+NAMES = "a name that `holosplat materials` lists, such as water, plasma, soft tissue or PMMA"
+"""What messages say of named materials."""
 MAX_DENSITY_G_CM3 = 30.0
 """Above osmium (22.6 g/cm³), the densest element: a higher density has a wrong unit."""
 
@@ -36,10 +38,6 @@ def _density(name: str, value: Any) -> float:
     return in_range(field, value, 1e-6, MAX_DENSITY_G_CM3, unit="g/cm³")
 
 
-def _preset_names() -> str:
-    return ", ".join(PRESETS)
-
-
 @lru_cache(maxsize=256)
 def _checked_formula(formula: str) -> str:
     if isinstance(formula, str) and xraydb.validate_formula(formula):
@@ -48,7 +46,7 @@ def _checked_formula(formula: str) -> str:
             return formula
     raise InputError(
         f"material {formula!r} must be a chemical formula of elements up to uranium, such as 'H2O' or 'SiO2' "
-        f"(mind the capitals), or one of {_preset_names()}."
+        f"(mind the capitals), or {NAMES}."
     )
 
 
@@ -176,34 +174,67 @@ water while haemoglobin absorbs as little. The cell's own ions are left out; its
 litre of cells) would add 1.9e-11 to β, so of Δβ only the smallness is certain, not the sign.
 """
 
-PRESETS: dict[str, Material] = {
-    "water": WATER,
-    "haemoglobin": HAEMOGLOBIN,
-    "hemoglobin": HAEMOGLOBIN,
-    "albumin": ALBUMIN,
-    "plasma": PLASMA,
-    "red cell": RED_CELL,
-    "red_cell": RED_CELL,
-    "rbc": RED_CELL,
-}
-"""Names that `parse_material` knows, in lower case."""
+SUBSTANCES = Path(__file__).with_name("substances.toml")
+"""Tissues, plastics, glasses, liquids and metals, each with its source."""
+
+
+@dataclass(frozen=True)
+class Named:
+    """A material with a name. aliases: other names of it; source: where its composition and density are from."""
+
+    name: str
+    material: Material
+    source: str
+    aliases: tuple[str, ...] = ()
+
+
+@lru_cache(maxsize=1)
+def named_materials() -> tuple[Named, ...]:
+    """Every material that `parse_material` knows by name: those of this module, then those of `SUBSTANCES`."""
+    cells = (
+        Named("water", WATER, "Tanaka et al. 2001, at 20 °C"),
+        Named("haemoglobin", HAEMOGLOBIN, "dry; Svedberg & Pedersen 1940", ("hemoglobin",)),
+        Named("albumin", ALBUMIN, "dry; Hunter 1966"),
+        Named("plasma", PLASMA, "blood plasma at 25 °C; Guyton & Hall, Trudnowski & Rico 1974"),
+        Named("red cell", RED_CELL, "a solution of 33 g/dL of haemoglobin", ("rbc",)),
+    )
+    of_file = [
+        Named(name, _substance(entry), entry["source"], tuple(entry.get("aliases", ())))
+        for name, entry in read_table(SUBSTANCES).items()
+    ]
+    return (*cells, *of_file)
+
+
+@lru_cache(maxsize=1)
+def _by_name() -> dict[str, Material]:
+    """Names and aliases in lower case → material."""
+    return {text.lower(): named.material for named in named_materials() for text in (named.name, *named.aliases)}
+
+
+def _substance(entry: Mapping[str, Any]) -> Material:
+    """The material of an entry of `SUBSTANCES`, whose parts may be entries themselves."""
+    if "formula" in entry:
+        return Compound(entry["formula"], entry["density"])
+    table = read_table(SUBSTANCES)
+    parts = [(_substance(table[part]) if part in table else part, share) for part, share in entry["fractions"].items()]
+    return Mixture(tuple(parts), entry["density"])
 
 
 def parse_material(text: str, density_g_cm3: float | None = None) -> Material:
-    """The material that `text` names: a preset ("plasma", any case) or a formula ("SiO2"), with its density.
+    """The material that `text` names ("plasma", any case, `named_materials`) or a formula ("SiO2"), with its density.
 
-    density_g_cm3: [g/cm³]; a preset keeps its own unless one is given, a formula needs one (`InputError`).
+    density_g_cm3: [g/cm³]; a named material keeps its own unless one is given, a formula needs one (`InputError`).
     """
     if not isinstance(text, str) or not text.strip():
-        raise InputError(f"material must be a chemical formula or one of {_preset_names()}, but it is {text!r}.")
+        raise InputError(f"material must be a chemical formula or {NAMES}, but it is {text!r}.")
     name = text.strip()
-    preset = PRESETS.get(name.lower())
-    if preset is not None:
-        return preset if density_g_cm3 is None else replace(preset, density_g_cm3=density_g_cm3)
+    named = _by_name().get(name.lower().replace("_", " "))
+    if named is not None:
+        return named if density_g_cm3 is None else replace(named, density_g_cm3=density_g_cm3)
     _checked_formula(name)
     require(
         density_g_cm3 is not None,
-        f"material {name!r} is a formula and needs its density in g/cm³; give it, or use {_preset_names()}.",
+        f"material {name!r} is a formula and needs its density in g/cm³; give it, or use {NAMES}.",
     )
     return Compound(name, density_g_cm3)  # type: ignore[arg-type]
 
@@ -211,8 +242,8 @@ def parse_material(text: str, density_g_cm3: float | None = None) -> Material:
 def read_material_table(path: str | Path) -> dict[str, Material]:
     """Materials per mesh file, from a JSON or TOML file: {file-name pattern: material}, in the file's order.
 
-    A pattern is a shell glob ("rbc*.vtk"); a material is a preset's name, or a table with `formula` (or a
-    preset's name there) and, for a formula, `density` [g/cm³]. `InputError` names the pattern at fault.
+    A pattern is a shell glob ("rbc*.vtk"); a material is a name that `parse_material` knows, or a table with `formula`
+    (or such a name there) and, for a formula, `density` [g/cm³]. `InputError` names the pattern at fault.
     """
     table = _read_table(Path(path))
     return {pattern: _table_entry(f"{path}: material of {pattern!r}", entry) for pattern, entry in table.items()}
@@ -242,7 +273,7 @@ def _table_entry(field: str, entry: Any) -> Material:
     if isinstance(entry, str):
         entry = {"formula": entry}
     if not isinstance(entry, dict) or "formula" not in entry or set(entry) - {"formula", "density"}:
-        raise InputError(f"{field} must be a preset's name or {{formula, density}}, but it is {entry!r}.")
+        raise InputError(f"{field} must be a name of a material or {{formula, density}}, but it is {entry!r}.")
     try:
         return parse_material(entry["formula"], entry.get("density"))
     except InputError as error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -12,6 +12,8 @@ from .checks import InputError, require
 from .geometry import Grid
 from .volume import Volume
 
+MatterKind = Literal["levels", "continuous"]
+"""What matter is like: of one level of δ, or several, with sharp edges, or varying smoothly."""
 LEAST_CONTRAST = 1.6
 """Two materials whose δ differ by less than this factor pass for one."""
 RATIO_RANGE = (1.0, 1e6)

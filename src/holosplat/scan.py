@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .checks import finite, in_range, require, shaped
-from .frames import Binned, Frames, binned, blocks, picked
+from .frames import Binned, Cropped, Frames, binned, blocks, picked
 from .geometry import Views
 
 ENERGY_RANGE_KEV = (0.1, 1000.0)
 PIXEL_RANGE_M = (1e-10, 1e-2)
 DISTANCE_RANGE_M = (1e-9, 1e4)
+"""Limits of a distance [m] that is not zero; at 0, in contact, there is absorption alone."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class Exposures:
     """How each of N frames was taken: poses and raster (`views`), and the physics of its beam and detector.
 
     energy_kev: [N] photon energies [keV].
-    distance: [N] effective propagation distances [m].
+    distance: [N] effective propagation distances [m]; 0: in contact, where absorption alone is seen.
     psf_sigma_px: [N] standard deviations of the Gaussian point-spread function [detector pixels].
     time: [N] seconds since the first frame.
     reference_kev: the energy [keV] for which δ and β of matter are given (None: the energy of the first frame).
@@ -46,7 +47,7 @@ class Exposures:
         for energy in (*self.energy_kev, *([] if self.reference_kev is None else [self.reference_kev])):
             in_range("energy", float(energy), *ENERGY_RANGE_KEV, unit="keV")
         for z in self.distance:
-            in_range("propagation distance", float(z), *DISTANCE_RANGE_M, unit="metres")
+            checked_distance(float(z))
         finite("psf_sigma_px", self.psf_sigma_px)
         finite("time", self.time)
         require(bool(np.all(self.psf_sigma_px >= 0)), "psf_sigma_px must not be negative; correct it.")
@@ -105,6 +106,11 @@ class Exposures:
         times = np.asarray(times, dtype=np.float64).reshape(-1)
         index = np.tile(np.arange(len(self)), len(times))
         return replace(self[index], time=np.repeat(times, len(self)))
+
+
+def checked_distance(distance: float, field: str = "propagation distance") -> float:
+    """`distance` [m] if it is 0 (in contact) or within `DISTANCE_RANGE_M`; `InputError` naming `field` otherwise."""
+    return 0.0 if distance == 0 else in_range(field, distance, *DISTANCE_RANGE_M, unit="metres")
 
 
 def far_from_edges(energy_kev: np.ndarray, reference_kev: float) -> np.ndarray:
@@ -218,6 +224,27 @@ class Scan:
         """All frames as if taken at the same time, 0."""
         exposures = replace(self.exposures, time=np.zeros(len(self)))
         return Scan.of(self.source, exposures, self.is_test, self.provenance)
+
+    def with_views(self, views: Views) -> Scan:
+        """The same frames as if taken at other poses."""
+        return Scan.of(self.source, replace(self.exposures, views=views), self.is_test, self.provenance)
+
+    def with_split(self, is_test: np.ndarray) -> Scan:
+        """The scan with the frames `is_test` [N] bool held out, and no others."""
+        return Scan.of(self.source, self.exposures, is_test, self.provenance)
+
+    def cropped(self, rows: slice, columns: slice) -> Scan:
+        """The scan on the rows and columns from `start` to `stop` (pixels); the detector's shifts say where it lies.
+
+        Errors: `InputError` unless both have a start and a stop within the frames, the start first.
+        """
+        for name, part, count in zip(("rows", "columns"), (rows, columns), self.views.shape):
+            fits = 0 <= part.start < part.stop <= count
+            require(fits, f"{name} to keep must be some of 0:{count}, but they are {part.start}:{part.stop}.")
+        whole = self.source
+        frames = Cropped(whole, rows, columns) if isinstance(whole, Frames) else whole[:, rows, columns]
+        exposures = replace(self.exposures, views=self.views.cropped(rows, columns))
+        return Scan.of(frames, exposures, self.is_test, self.provenance)
 
     def binned(self, factor: int) -> Scan:
         """The scan on pixels `factor` times larger (means of `factor × factor`); odd rows and columns are cut."""

@@ -25,6 +25,12 @@ LENGTH_UNITS = {
     "nm": 1e-9,
     "meter": 1.0,
     "metre": 1.0,
+    "millimeter": 1e-3,
+    "millimetre": 1e-3,
+    "microns": 1e-6,
+    "micrometre": 1e-6,
+    "nanometer": 1e-9,
+    "nanometre": 1e-9,
     "angstrom": 1e-10,
     "Å": 1e-10,
 }
@@ -35,6 +41,8 @@ ANGLE_UNITS = {
     "degrees": math.pi / 180,
     "°": math.pi / 180,
     "rad": 1.0,
+    "radian": 1.0,
+    "radians": 1.0,
 }
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "second": 1.0, "seconds": 1.0}
 

@@ -21,7 +21,6 @@ BAD_SCENES: dict[str, tuple[list[str], list[str]]] = {
     "no energy": (altered("--energy-kev", "0"), ["energy", "positive", "keV"]),
     "negative energy": (altered("--energy-kev", "-20"), ["energy", "positive", "-20"]),
     "energy in eV": (altered("--energy-kev", "20000"), ["energy", "20000", "unit"]),
-    "no distance": (altered("--distance", "0"), ["distance", "positive"]),
     "negative distance": (altered("--distance", "-0.1"), ["distance", "positive", "-0.1"]),
     "infinite distance": (altered("--distance", "inf"), ["distance", "positive", "inf"]),
     "pixel of no size": (altered("--pixel-size", "0"), ["pixel size", "positive"]),

@@ -15,7 +15,6 @@ from helpers.cli import (
     DETECTOR,
     MATTER,
     copied,
-    drop,
     everything_in,
     holosplat,
     in_a_shell,
@@ -48,6 +47,11 @@ def one_nan_held_out(file: h5py.File) -> None:
     file[f"{DETECTOR}/data"][3, 3, 4] = np.nan
 
 
+def no_images(file: h5py.File) -> None:
+    """Neither the detector's images nor the link to them, which would do."""
+    del file[f"{DETECTOR}/data"], file["entry/data/data"]
+
+
 BAD_SCANS: dict[str, tuple[Callable[[h5py.File], object], list[str]]] = {
     "missing energy": (
         lambda f: f.__delitem__("entry/instrument/beam/incident_energy"),
@@ -62,7 +66,7 @@ BAD_SCANS: dict[str, tuple[Callable[[h5py.File], object], list[str]]] = {
     "NaN in a held-out image": (one_nan_held_out, ["detector/data", "finite", "1 of 5376"]),
     "no training frame": (put("entry/split", np.ones(8, int)), ["training frame", "/entry/split"]),
     "a pixel of 3.2 m": (huge_pixels, ["pixel_size", "3.2", "unit"]),
-    "no images": (drop(f"{DETECTOR}/data"), ["detector/data", "missing"]),
+    "no images": (no_images, ["data", "missing"]),
     "nothing to see": (put(f"{DETECTOR}/data", np.ones((8, 24, 28))), ["no matter"]),
 }
 

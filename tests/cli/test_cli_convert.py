@@ -112,7 +112,7 @@ def test_r2_gaussian_there_and_back(scan, tmp_path, known):
         (("--to", "tiff", "--seed-points", "5"), "--seed-points goes with --to nerf-synthetic or r2-gaussian"),
         (("--to", "tiff", *MATERIAL), "a material is not needed with --to tiff"),
         (("--to", "nerf-synthetic", "--truth", "t.h5"), "--truth goes with --to r2-gaussian"),
-        (("--to", "tiff", "--energy-kev", "20"), "energy_kev: not for a source in nxtomo"),
+        (("--to", "tiff", "--black", "0.1"), "black: not for a source in nxtomo"),
         (("--to", "r2-gaussian", *MATERIAL, "--truth", "none.h5"), "no such file"),
         (("--to", "nerf-synthetic", "--camera-distance", "1"), "camera_distance must lie between"),
         (("--to", "jpeg"), "invalid choice"),
@@ -133,7 +133,7 @@ def test_nothing_is_overwritten_nor_guessed(scan, tmp_path):
     assert "must be new" in again.said
     nothing = convert(tmp_path, "--to", "nxtomo", tmp_path / "out.nxs")
     assert nothing.code == 2
-    assert "an HDF5 file (nxtomo); a folder with scan.json" in nothing.said
+    assert "an HDF5 file (nxtomo); an HDF5 file with " in nothing.said
 
 
 def test_folders_of_others_need_what_they_do_not_say(scan, tmp_path):

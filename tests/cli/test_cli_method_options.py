@@ -10,7 +10,7 @@ from tyro.conf import OmitArgPrefixes
 
 from holosplat.checks import InputError
 from holosplat.cli.options import MethodOptions
-from holosplat.methods import METHODS, Gaussians
+from holosplat.methods import METHODS, Auto, Gaussians
 from holosplat.methods.presets import preset
 from holosplat.tables import overridden, to_table
 
@@ -21,8 +21,9 @@ def chosen(*arguments: object):
     return tyro.cli(MethodOptions, args=[str(a) for a in arguments], config=(OmitArgPrefixes,)).chosen()
 
 
-def test_without_options_it_is_the_default():
-    assert chosen() == Gaussians()
+def test_without_options_it_is_auto():
+    assert chosen() == Auto()
+    assert chosen("--preset", "default") == chosen("--method", "gaussians") == Gaussians()
 
 
 @pytest.mark.parametrize("name", METHODS)
@@ -31,9 +32,10 @@ def test_every_method_has_its_name(name):
 
 
 def test_single_fields_are_set_one_after_another():
-    assert chosen("--set", "fit.schedule.steps=7", "--set", "max_start=5") == overridden(
+    assert chosen("--method", "gaussians", "--set", "fit.schedule.steps=7", "--set", "max_start=5") == overridden(
         Gaussians(), ["fit.schedule.steps=7", "max_start=5"]
     )
+    assert chosen("--set", "gaussians.fit.steps=7").gaussians.fit.schedule.steps == 7
     assert chosen("--preset", "fast", "--set", "steps=7") == overridden(preset("fast"), ["fit.schedule.steps=7"])
     assert chosen("--set", "steps=7", "--set", "steps=8", "--method", "gaussians").fit.schedule.steps == 8
     assert chosen("--method", "paganin-tv", "--set", "retrieval=ctf") == METHODS["ctf-tv"]
@@ -47,9 +49,12 @@ def test_a_file_and_a_change_of_it(tmp_path):
 
 
 def test_the_backend_is_that_of_fit_and_start():
-    found = chosen("--backend", "reference")
+    auto = chosen("--backend", "reference")
+    found = chosen("--backend", "reference", "--method", "gaussians")
+    assert auto.gaussians == found
+    assert auto.levels.volume.backend == "reference"
     assert (found.fit.backend, found.volume.backend) == ("reference", "reference")
-    assert chosen("--set", "fit.backend=reference").volume.backend == "cpu"
+    assert chosen("--set", "gaussians.fit.backend=reference").gaussians.volume.backend == "cpu"
 
 
 @pytest.mark.parametrize(
@@ -60,13 +65,14 @@ def test_the_backend_is_that_of_fit_and_start():
             "give one of --method, .*but there are --preset and --config",
         ),
         (["--preset", "fast", "--method", "voxels"], "but there are --method and --preset"),
-        (["--method", "magic"], "method must be one of gaussians, .*voxels.*but it is 'magic'"),
+        (["--method", "magic"], "method must be one of auto, gaussians, .*voxels.*but it is 'magic'"),
         (["--preset", "magic"], "preset must be one of default, fast, random, thesis, but it is 'magic'"),
         (
-            ["--set", "fit.schedule.stepz=3"],
+            ["--method", "gaussians", "--set", "fit.schedule.stepz=3"],
             r"the setting fit.schedule.stepz is not known; did you mean fit",
         ),
-        (["--set", "steps=-1"], r"fit\.schedule: steps must not be negative, but it is -1"),
+        (["--set", "fit.steps=3"], "may mean gaussians.fit.schedule.steps, surfaces.fit.schedule.steps; write one"),
+        (["--preset", "default", "--set", "steps=-1"], r"fit\.schedule: steps must not be negative, but it is -1"),
         (["--set", "steps"], "a setting must read PATH=VALUE"),
         (["--method", "voxels", "--set", "start=phase"], "the setting start is not known"),
         (["--method", "paganin-tv", "--backend", "cpu"], "the method per-view runs on the CPU only"),

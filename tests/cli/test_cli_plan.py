@@ -125,7 +125,7 @@ def test_one_range_is_enough_and_needs_no_file(tmp_path):
     [
         (["--energy-kev", -5], ["energy", "positive", "-5"]),
         (["--energy-kev", 20000], ["energy", "20000", "unit"]),
-        (["--distance", 0], ["distance", "positive"]),
+        (["--distance", -1], ["distance", "positive"]),
         (["--pixel-size", 3.2], ["pixel size", "3.2", "unit"]),
         (["--psf-sigma-px", -1], ["psf_sigma_px", "-1"]),
         (["--source-angle", "nan"], ["source_angle", "nan"]),

@@ -24,6 +24,7 @@ from holosplat.methods import (
     NeuralFields,
     NeuralFit,
     PerView,
+    SmoothVolume,
     SurfaceFit,
     Surfaces,
     Task,
@@ -45,6 +46,7 @@ QUICK: dict[str, Method] = {
     "voxels": Voxels(VOLUME, VoxelFit(coarse_steps=2, steps=4, refine=1)),
     "neural-field": NeuralFields(VOLUME, NEURAL),
     "holographic-tv": HolographicVoxels(VOLUME),
+    "volume": SmoothVolume(VOLUME, rounds=1, iterations=5),
 }
 """Every method, with options that take seconds."""
 FITTED = ("gaussians", "surfaces", "voxels", "neural-field")

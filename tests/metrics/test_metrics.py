@@ -110,7 +110,7 @@ def test_mean_and_dictionary_hold_every_frame():
         lambda: image_scores(np.zeros((0, 16, 16)), np.zeros((0, 16, 16)), (0, 1)),
         lambda: image_scores(np.zeros((1, 16, 16)), np.full((1, 16, 16), np.nan), (0, 1)),
         lambda: image_scores(np.zeros((1, 16, 16)), np.zeros((1, 16, 16)), (1, 1)),
-        lambda: structural_similarity(np.zeros((10, 40)), np.zeros((10, 40))),
+        lambda: structural_similarity(np.zeros((10, 40)), np.zeros((10, 41))),
         lambda: intensity_range(np.ones((2, 4, 4))),
         lambda: intensity_range(np.ones((0, 4, 4))),
         lambda: fourier_ring_correlation(np.zeros((4, 4)), np.zeros((4, 5))),

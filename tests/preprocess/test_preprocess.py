@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -225,6 +227,8 @@ def test_binning_is_as_coarse_as_the_weights_let_it():
     assert TotalVariationWeights(few).binning == 8
     many = EigenFlats(np.ones((H, W)), np.repeat(waves(6), 4, 0), np.ones(24), np.ones(40))
     assert TotalVariationWeights(many).binning == 4
+    two_rows = replace(few, mean=few.mean[:2], components=few.components[:, :2])
+    assert TotalVariationWeights(two_rows).binning == 1, "rows that a larger bin would leave empty"
     none = EigenFlats(np.ones((H, W)), np.empty((0, H, W)), np.empty(0), np.ones(9))
     assert TotalVariationWeights(none)(np.ones((H, W))).shape == (0,)
     with pytest.raises(InputError, match="binning must leave at least"):

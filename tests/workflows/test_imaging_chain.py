@@ -19,7 +19,8 @@ from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.cli import main
 from holosplat.io.nxtomo import read_scan, write_scan
-from holosplat.io.scan_file import DARK, FLAT, PROJECTION, open_scan
+from holosplat.io.raw_file import DARK, FLAT, PROJECTION
+from holosplat.io.scan_file import open_scan
 from holosplat.io.vtk import write_mesh
 from holosplat.optics.camera import Camera
 from holosplat.optics.illumination import Illumination
@@ -182,7 +183,7 @@ def test_the_dynamic_flat_field_leaves_less_than_a_third(shop, tmp_path):
     clean = read_scan(shop.clean).frames
     left = {}
     for name, options in {
-        "plain": CorrectionOptions("plain"),
+        "plain": CorrectionOptions("plain", "none"),
         "plain, normalised": CorrectionOptions("plain", "mean"),
         "dynamic": CorrectionOptions("dynamic"),
         "dynamic, rim": CorrectionOptions("dynamic", "rim"),
@@ -239,6 +240,8 @@ def test_frames_are_read_one_by_one(shop, tmp_path, monkeypatch):
 def test_what_cannot_be_corrected(shop, tmp_path):
     out = tmp_path / "scan.nxs"
     with pytest.raises(InputError, match="at least three flats"):
+        correct(shop.clean, out, CorrectionOptions("dynamic"))
+    with pytest.raises(InputError, match="must mark flats"):
         correct(shop.clean, out)
     with pytest.raises(InputError, match=r"must mark flats .1. in image_key, but it marks 0"):
         correct(shop.clean, out, CorrectionOptions("plain"))
@@ -295,7 +298,7 @@ def test_the_commands_do_what_they_say(shop, tmp_path):
     assert "warning" not in said
     code, said = holosplat("correct", raw, "--out", out, "--method", "dynamic")
     assert code == 0, said
-    assert "4 frames by flat fields of 5 components, normalised: mean" in said
+    assert "4 frames by flat fields of 5 components, normalised: air" in said
     assert "marked in the file, 0 found beside" in said
     code, said = holosplat("join", shop.clean, out, "--out", tmp_path / "both.nxs", "--flip", "none", "none")
     assert code == 0, said

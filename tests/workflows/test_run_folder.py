@@ -85,8 +85,8 @@ def test_a_run_folder_holds_what_was_done(scan, whole):
     summary = json.loads(whole.summary.read_text())
     assert summary["finished"] is True
     assert (summary["steps"], summary["best_step"]) == (STEPS, STEPS)
-    assert summary["detector"] == {"rows": 40, "columns": 48, "pixel_size_m": PIXEL}
-    assert summary["material"] == {"delta": CELL.delta, "beta": CELL.beta, "single": True}
+    assert summary["detector"] == {"rows": 40, "columns": 48, "pixel_size_m": PIXEL, "centre_m": [0.0, 0.0, 0.0]}
+    assert summary["material"] == {"delta": CELL.delta, "beta": CELL.beta, "single": True, "delta_told": True}
     assert (summary["method"], summary["kind"]) == ("gaussians", "gaussians")
     assert summary["size"] == f"{len(gaussians(whole)['centres'])} Gaussians"
     rows = metrics(whole)

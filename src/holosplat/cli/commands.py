@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from ..checks import InputError, in_range, require
-from .options import BeamlineOptions, MethodOptions, PriorOptions, TruthOptions
+from ..io.reading import Reading
+from .options import BeamlineOptions, LightFlags, MethodOptions, PriorOptions, TruthOptions
 from .progress import INTERRUPTED, ProgressBar
 
 if TYPE_CHECKING:
@@ -19,6 +20,10 @@ if TYPE_CHECKING:
     from ..workflows.reconstruct import Reconstruction
     from ..workflows.run_folder import RunFolder
 
+LIGHT = LightFlags()
+"""Even, unless the air of frames says otherwise."""
+UNEXPLAINED = 3
+"""Exit code of `reconstruct --strict` where frames are not explained."""
 MOST_VOXELS = 2**31
 """The largest volume that `export` writes: 16 GB for δ and β."""
 
@@ -30,7 +35,10 @@ def reconstruct(
     how: MethodOptions = MethodOptions(),
     seed: int = 0,
     resume: bool = False,
-    time_frame: int | Literal["all"] | None = None,
+    reading: Reading = Reading(),
+    *,
+    illumination: LightFlags = LIGHT,
+    strict: bool = False,
 ) -> None:
     """Reconstruct a scan by Gaussians, or by another method, into a run folder.
 
@@ -39,11 +47,11 @@ def reconstruct(
         out: Run folder to make.
         seed: Seed of everything random.
         resume: Go on with an interrupted run.
-        time_frame: Of a time-resolved scan: the time to reconstruct, counted from 0, or all if nothing moved.
+        strict: Exit with 3 where the frames are not explained to within their noise; without it, that is a warning.
     """
-    from ..io.formats import read
-    from ..io.json import write_json
-    from ..io.run_scan import at_time
+    from ..io.formats import read_as
+    from ..io.json import read_json, write_json
+    from ..io.run_scan import run_source
     from ..report.run import report_run
     from ..workflows.evaluate import evaluate as score
     from ..workflows.reconstruct import reconstruct as fit
@@ -51,22 +59,49 @@ def reconstruct(
 
     method = how.chosen()
     require(seed >= 0, f"--seed must be 0 or more, but it is {seed}.")
-    measured = at_time(read(scan), time_frame).in_memory()
+    measured = read_as(scan, reading).in_memory()
     prior = matter.prior(measured.exposures.reference_energy)
     folder = RunFolder(out)
     with ProgressBar() as bar:
-        result = fit(measured, prior, method, seed, folder=folder, resume=resume, on_progress=bar.show)
-    write_json(folder.source, {"scan": str(scan.resolve()), "time_frame": time_frame})
+        result = fit(
+            measured,
+            prior,
+            method,
+            seed,
+            matter=how.kind_of_matter(),
+            light=illumination.options(),
+            folder=folder,
+            resume=resume,
+            on_progress=bar.show,
+        )
+    write_json(folder.source, run_source(scan, reading))
     evaluation = score(result, measured, None)
     report = report_run(folder, result, measured, evaluation, None)
     _print_scores(evaluation)
+    if folder.light.is_file():
+        _say(f"light {read_json(folder.summary)['light']}, by the air of the frames: divided out ({folder.light})")
+    for line in result.choice.lines():
+        print(line)
     _say(f"{sum(result.timing.values()):.1f} s, {result.object.described}; report: {report}")
+    for line in result.verdict.lines("training frames") if result.verdict else ():
+        print(line)
+    unexplained = result.verdict is not None and not result.verdict.good
+    if unexplained:
+        _say("warning: the frames are not explained; do not trust the volume before the cause is found")
     if not result.finished:
         _say(f"interrupted, but {out} is usable; go on with --resume")
         raise SystemExit(INTERRUPTED)
+    if strict and unexplained:
+        raise SystemExit(UNEXPLAINED)
 
 
-def render(run: Positional[Path], scan: Path, out: Path, split: Literal["test", "train", "all"] = "test") -> None:
+def render(
+    run: Positional[Path],
+    scan: Path,
+    out: Path,
+    split: Literal["test", "train", "all"] = "test",
+    reading: Reading = Reading(),
+) -> None:
     """Predict the frames of a scan from a run.
 
     Args:
@@ -84,7 +119,7 @@ def render(run: Positional[Path], scan: Path, out: Path, split: Literal["test", 
     from .scans import scan_for
 
     require_writable(out)
-    result, wanted = load_reconstruction(RunFolder(run)), scan_for(RunFolder(run), scan)
+    result, wanted = load_reconstruction(RunFolder(run)), scan_for(RunFolder(run), scan, reading)
     chosen = {"test": wanted.test, "train": wanted.train, "all": lambda: wanted}[split]()
     require(len(chosen) > 0, f"{scan} has no {split} frames to render; choose another --split.")
     frames = predict(result, chosen.exposures)
@@ -151,7 +186,9 @@ def _export_volume(
     detector = read_json(folder.summary)["detector"]
     rows, columns = int(detector["rows"]), int(detector["columns"])
     edge = float(detector["pixel_size_m"]) if voxel_size is None else voxel_size
-    grid = Grid.centred(shape or (columns, rows, columns), in_range("voxel size", edge, *PIXEL_RANGE_M, unit="metres"))
+    x, y, z = (float(c) for c in detector.get("centre_m", (0.0, 0.0, 0.0)))
+    edge = in_range("voxel size", edge, *PIXEL_RANGE_M, unit="metres")
+    grid = Grid.centred(shape or (columns, rows, columns), edge, (x, y, z))
     count = math.prod(grid.shape)
     require(count <= MOST_VOXELS, f"shape must have at most {MOST_VOXELS:.0e} voxels, but it has {count:.0e}.")
     write_voxels(volume, result.object, grid)
@@ -163,6 +200,7 @@ def evaluate(
     scan: Path | None = None,
     truth: Path | None = None,
     as_json: Annotated[bool, arg(name="json")] = False,
+    reading: Reading = Reading(),
 ) -> None:
     """Score a run on held-out frames and against the true volume, which then joins its report.
 
@@ -182,7 +220,7 @@ def evaluate(
 
     folder = RunFolder(run)
     result = load_reconstruction(folder)
-    measured, true_volume = scan_for(folder, scan or folder.source_scan()), read_volume(truth) if truth else None
+    measured, true_volume = scan_for(folder, scan, reading), read_volume(truth) if truth else None
     evaluation = score(result, measured, true_volume)
     if as_json:
         print(json.dumps(evaluation.as_dict(), indent=2, allow_nan=False))
@@ -213,7 +251,8 @@ def demo(out: Path = Path("demo")) -> None:
     _say(
         f"\n$ holosplat simulate {meshes}/*.vtk {detector} --views 16 --psf-sigma-px 0.05 --out {scan} --truth {truth}"
     )
-    simulate(tuple(paths), BeamlineOptions(DETECTOR, psf_sigma_px=0.05, views=16), scan, truth=TruthOptions(truth))
+    beamline = BeamlineOptions(DETECTOR, psf_sigma_px=0.05, views=16)
+    simulate(tuple(paths), beamline=beamline, out=scan, truth=TruthOptions(truth))
     _say(f"\n$ holosplat reconstruct {scan} --material haemoglobin --out {run}")
     reconstruct(scan, run, PriorOptions("haemoglobin"))
     _say(f"\n$ holosplat evaluate {run} --truth {truth}")

@@ -13,37 +13,18 @@ from tyro.conf import Positional, arg
 
 from ..checks import InputError, require
 from ..io.folder import require_new
-from ..io.formats import ScanFormat, loader_of, read
+from ..io.formats import ScanFormat, loader_of, read_as
 from ..io.nerf_synthetic import NerfOptions, grey_range, write_nerf_synthetic
 from ..io.nxtomo import write_scan
 from ..io.png import PngKind
 from ..io.r2_gaussian import R2Options, write_r2_gaussian
+from ..io.reading import Reading
 from ..io.tiff import TiffLayout, write_tiff
 from ..io.volumes import read_volume
 from ..matter import KnownRatio, MaterialPrior
 from ..optics import retrieve_thickness
 from ..scan import Scan
 from .options import PriorOptions
-
-
-@dataclass(frozen=True)
-class ForeignOptions:
-    """What folders of other programs do not say (those that holosplat wrote say it themselves)."""
-
-    energy_kev: float | None = None
-    """Photon energy [keV]."""
-    distance: float | None = None
-    """Effective propagation distance [m]; R²-Gaussian's data have none."""
-    pixel_size: float | None = None
-    """Effective pixel size [m]."""
-    black: float | None = None
-    """Intensity of black pixels, relative to the flat field (nerf-synthetic; default 0)."""
-    white: float | None = None
-    """Intensity of white pixels, relative to the flat field (nerf-synthetic; default 1)."""
-
-    def given(self) -> dict[str, float]:
-        """Those that are said."""
-        return {name: value for name, value in vars(self).items() if value is not None}
 
 
 @dataclass(frozen=True)
@@ -84,8 +65,8 @@ def convert(
     source: Annotated[Positional[Path], arg(metavar="SOURCE")],
     out: Annotated[Positional[Path], arg(metavar="OUT")],
     to: ScanFormat,
-    foreign: ForeignOptions,
     writing: WritingOptions,
+    reading: Reading = Reading(),
     matter: PriorOptions = PriorOptions(),
 ) -> None:
     """Bring a scan into another format; what SOURCE is, its content says.
@@ -97,7 +78,7 @@ def convert(
     """
     require_new(out)
     said = writing.for_format(to)
-    scan = _read(source, foreign.given())
+    scan = _read(source, reading)
     prior = matter.prior(scan.exposures.reference_energy)
     require(not prior.fixes_ratio or to in GOES_WITH["material"], f"a material is not needed with --to {to}; leave it.")
     require(len(prior.materials) < 2, f"--to {to} takes one material; leave --second-material.")
@@ -120,9 +101,9 @@ def convert(
          f"{held_out} of them held out")  # fmt: skip
 
 
-def _read(source: Path, given: dict[str, float]) -> Scan:
-    """The scan at `source`, with what is `given` for a folder of another program."""
-    scan = read(source, given)
+def _read(source: Path, reading: Reading) -> Scan:
+    """The scan at `source`, which may be a folder of another program."""
+    scan = read_as(source, reading)
     if loader_of(source).name == "r2-gaussian":
         _say(f"{source} has no phase: transmission exp(-p) in contact, where a density of 1 has beta "
              f"{scan.provenance['beta_of_density_1']}; reconstruct it with --delta-beta 1, and read beta")  # fmt: skip

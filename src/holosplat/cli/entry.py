@@ -23,10 +23,14 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "plan",
         "Say what an experiment would see, resolve and store, and where its best distance and energy lie.",
     ),
+    "materials": (
+        "materials",
+        "List the materials that have a name, with density, δ, β and δ/β; formulas need a density instead.",
+    ),
     "grow": ("grow", "Let red cells flow through a channel, and write their meshes (VTK, µm) at every snapshot."),
     "simulate": (
         "simulate",
-        "Simulate the holograms of closed triangle meshes; with --frame-rate, of moving ones, many times over.",
+        "Simulate the holograms of closed meshes, still or moving (--frame-rate), of a volume, or of generated matter.",
     ),
     "record": (
         "imaging",
@@ -49,6 +53,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "commands",
         "Score a run on held-out frames and against the true volume, which then joins its report.",
     ),
+    "data": ("data", "Sample data of other people: list it, or fetch one into the cache (list, fetch NAME)."),
     "demo": ("commands", "Run the whole chain on generated red cells: simulate, reconstruct, evaluate, report."),
     "bench": (
         "bench",

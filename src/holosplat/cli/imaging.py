@@ -9,6 +9,7 @@ from tyro.conf import Positional
 
 from ..beamline.record import RecordingOptions
 from ..beamline.record import record as record_file
+from ..io.reading import Part, Reading
 from ..optics.camera import Camera
 from ..optics.illumination import Illumination
 from ..optics.resampling import Flip
@@ -25,6 +26,7 @@ def record(
     camera: Camera,
     light: Illumination,
     truth: Path | None = None,
+    part: Part = Part(),
 ) -> None:
     """Record a noise-free scan as raw counts: pulses of a free-electron laser, a camera, flats and darks.
 
@@ -35,7 +37,9 @@ def record(
     """
     with ProgressBar() as bar:
         done = record_file(
-            scan, out, what, camera, light, truth, lambda fraction: bar.show("recording frames", fraction, {})
+            *(scan, out, what, camera, light, truth),
+            on_progress=lambda fraction: bar.show("recording frames", fraction, {}),
+            part=part,
         )
     _say(
         f"wrote {out}: {done.projections} projections, {done.flats} flats and {done.darks} darks, {camera.bits} bits, "
@@ -49,7 +53,7 @@ def record(
         _say(f"wrote {truth}: what the frames do not say")
 
 
-def correct(raw: Positional[Path], out: Path, how: CorrectionOptions) -> None:
+def correct(raw: Positional[Path], out: Path, how: CorrectionOptions, reading: Reading = Reading()) -> None:
     """Correct raw counts by dark and flat fields into a scan of relative intensities.
 
     Args:
@@ -57,14 +61,22 @@ def correct(raw: Positional[Path], out: Path, how: CorrectionOptions) -> None:
         out: Scan file to write (NXtomo).
     """
     with ProgressBar() as bar:
-        done = correct_file(raw, out, how, lambda fraction: bar.show("correcting frames", fraction, {}))
-    flat = f"flat fields of {done.components} components" if how.method == "dynamic" else "the mean flat field"
-    _say(f"wrote {out}: {done.frames} frames by {flat}, normalised: {how.reference}")
+        done = correct_file(raw, out, how, lambda fraction: bar.show("correcting frames", fraction, {}), reading)
+    flat = f"flat fields of {done.components} components" if done.method == "dynamic" else "the mean flat field"
+    _say(f"wrote {out}: {done.frames} frames by {flat}, normalised: {done.normalised}")
+    if how.method is None and done.method == "plain":
+        _say(f"method plain, for the file has {done.flats} flats, and the dynamic one needs three")
+    if done.airless:
+        _say(f"{done.airless} of the frames show no air; they were divided by the mean light of the others")
     _say(f"filled defective pixels from their neighbours: {done.marked} marked in the file, {done.found} found beside")
 
 
 def join(
-    scans: Positional[tuple[Path, ...]], out: Path, pixel_size: float | None = None, flip: tuple[Flip, ...] = ()
+    scans: Positional[tuple[Path, ...]],
+    out: Path,
+    pixel_size: float | None = None,
+    flip: tuple[Flip, ...] = (),
+    part: Part = Part(),
 ) -> None:
     """Join scans of several beams, one file each, on one raster.
 
@@ -75,7 +87,9 @@ def join(
         flip: What each detector saw reversed, one word a file (default: what the files say themselves).
     """
     with ProgressBar() as bar:
-        joined = join_files(scans, out, pixel_size, flip, lambda fraction: bar.show("joining frames", fraction, {}))
+        joined = join_files(
+            scans, out, pixel_size, flip, lambda fraction: bar.show("joining frames", fraction, {}), part
+        )
     rows, columns = joined.views.shape
     _say(f"wrote {out}: {len(joined)} frames of {rows} × {columns} pixels of {1e6 * joined.views.pixel_size:.4g} µm")
 

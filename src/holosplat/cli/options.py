@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import UseAppendAction, arg
 
+from ..beamline.light import UnevenLight
 from ..beamline.poses import Directions, Geometry
 from ..checks import InputError, require
 
@@ -19,8 +20,9 @@ if TYPE_CHECKING:
     from ..beamline.series import SeriesFiles, Timing
     from ..beamline.simulate import Shutter, Simulation
     from ..materials import DeltaBeta
-    from ..matter import MaterialPrior
+    from ..matter import MaterialPrior, MatterKind
     from ..methods import Method
+    from ..optics.background import LightOptions
     from ..scan import Exposures
 
 
@@ -56,11 +58,11 @@ class MaterialOptions:
     """What fills the meshes."""
 
     material: str | None = None
-    """Formula, or a preset (haemoglobin, red cell, water, plasma); without --materials, haemoglobin."""
+    """Formula, or a name (holosplat materials lists them); without --materials, haemoglobin."""
     density: float | None = None
-    """Its density [g/cm³]; a preset has its own."""
+    """Its density [g/cm³]; a named one has its own."""
     medium: str | None = None
-    """Formula or preset of what surrounds the meshes; none means vacuum."""
+    """Formula or name of what surrounds the meshes; none means vacuum."""
     medium_density: float | None = None
     """The medium's density [g/cm³]."""
     materials: Path | None = None
@@ -135,11 +137,11 @@ class NoiseOptions:
     seed: int = 0
     """Seed of the noise."""
 
-    def simulation(self, shutter: Shutter) -> Simulation:
+    def simulation(self, shutter: Shutter, light: UnevenLight) -> Simulation:
         """How frames are simulated."""
         from ..beamline.simulate import Simulation
 
-        return Simulation(self.photons_per_pixel, self.seed, shutter=shutter)
+        return Simulation(self.photons_per_pixel, self.seed, shutter=shutter, light=light)
 
 
 @dataclass(frozen=True)
@@ -240,16 +242,22 @@ class MethodOptions:
     """How the reconstruction proceeds."""
 
     method: str | None = None
-    """Name of the method: gaussians (what you get without), surfaces, voxels, neural-field, holographic-tv, tikhonov-tv
-    and other pairs of phase retrieval and tomography."""
+    """Name of the method: auto (what you get without), gaussians, surfaces, volume (continuous matter),
+    voxels, neural-field, holographic-tv, tikhonov-tv and other pairs of phase retrieval and tomography."""
+    matter: Literal["auto", "levels", "continuous"] = "auto"
+    """Whether matter has levels of density with sharp edges, or is continuous; auto: the frames decide."""
     preset: str | None = None
-    """Named options of Gaussians: default (what you get without), fast, random, thesis."""
+    """Named options of Gaussians: default, fast, random, thesis."""
     config: Path | None = None
     """Or: a JSON or TOML file of options, whole or partial, such as the config.json of another run."""
     changes: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="PATH=VALUE")] = ()
     """Change one option, such as fit.schedule.steps=500 or fit.steps=500; may be given again and again."""
     backend: Literal["auto", "cpu", "cuda", "reference"] | None = None
     """What computes the fit (default: as the options say, auto); `holosplat backends` lists what there is."""
+
+    def kind_of_matter(self) -> MatterKind | None:
+        """The kind of matter, if it is told."""
+        return None if self.matter == "auto" else self.matter
 
     def chosen(self) -> Method:
         """The method that the options name; `InputError` if its backend cannot be used here."""
@@ -273,15 +281,15 @@ class PriorOptions:
     """What is known of the matter; without any of these, one material or two are found, with their δ and β."""
 
     material: str | None = None
-    """Formula or preset of the material, if known (then δ and β are)."""
+    """Formula or name of the material, if known (then δ and β are)."""
     density: float | None = None
-    """Its density [g/cm³]; a preset has its own."""
+    """Its density [g/cm³]; a named one has its own."""
     second_material: str | None = None
-    """Formula or preset of another material, where there are two."""
+    """Formula or name of another material, where there are two."""
     second_density: float | None = None
-    """Its density [g/cm³]; a preset has its own."""
+    """Its density [g/cm³]; a named one has its own."""
     medium: str | None = None
-    """Formula or preset of what surrounds them; none means vacuum."""
+    """Formula or name of what surrounds them; none means vacuum."""
     medium_density: float | None = None
     """The medium's density [g/cm³]."""
     delta_beta: float | None = None
@@ -306,3 +314,19 @@ class PriorOptions:
 
     def _known(self, name: str, density: float | None, energy_kev: float) -> DeltaBeta:
         return MaterialOptions(name, density, self.medium, self.medium_density).filling().of("", energy_kev)
+
+
+@dataclass(frozen=True)
+class LightFlags:
+    """The light beside the flat fields."""
+
+    light: Literal["auto", "even", "smooth"] = "auto"
+    """auto: smooth where the air of frames is uneven beyond its noise, else even; even: none; smooth: in any case."""
+    air: tuple[tuple[int, int, int, int], ...] = ()
+    """Boxes without matter or fringes in any frame: first row, end row, first column, end column (default: found)."""
+
+    def options(self) -> LightOptions:
+        """What is assumed of the light."""
+        from ..optics.background import LightOptions
+
+        return LightOptions(self.light, self.air)

@@ -44,11 +44,11 @@ class ObjectOptions:
     tilt_deg: float = 0.0
     """Turn of the object about x, across the beam [degrees]: a red cell is seen face-on at 0 and edge-on at 90."""
     material: str = "haemoglobin"
-    """Formula, or a preset (haemoglobin, red cell, water, plasma)."""
+    """Formula, or a name (holosplat materials lists them: haemoglobin, water, soft tissue, PMMA …)."""
     density: float | None = None
-    """Its density [g/cm³]; a preset has its own."""
+    """Its density [g/cm³]; a named one has its own."""
     medium: str | None = None
-    """Formula or preset of what surrounds it; none means vacuum."""
+    """Formula or name of what surrounds it; none means vacuum."""
     medium_density: float | None = None
     """The medium's density [g/cm³]."""
 
@@ -236,7 +236,7 @@ def _as_dict(name: str, setup: Setup, recording: Recording, planned: Plan, surve
         "object": name,
         "setup": asdict(setup),
         "recording": asdict(recording),
-        "plan": asdict(planned),
+        "plan": {group: _numbers(values) for group, values in asdict(planned).items()},
     }
     if surveyed is not None:
         found["survey"] = {
@@ -244,9 +244,16 @@ def _as_dict(name: str, setup: Setup, recording: Recording, planned: Plan, surve
             "energies_kev": surveyed.energies_kev.tolist(),
             "snr": surveyed.snr.tolist(),
             "spread_m": surveyed.spread.tolist(),
-            "table": surveyed.table(),
+            "table": [_numbers(row) for row in surveyed.table()],
         }
     return found
+
+
+def _numbers(values: dict[str, Any]) -> dict[str, Any]:
+    """Values as JSON can hold them: a Fresnel number in contact, which is infinite, as text."""
+    from ..metrics.images import json_number
+
+    return {name: json_number(value) if isinstance(value, float) else value for name, value in values.items()}
 
 
 def _write(path: Path, surveyed: Survey) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..planning.contrast import Setup
-from ..planning.plan import Motion, Plan, Recording, Sampling, Storage, Survey
+from ..planning.plan import Motion, Plan, Recording, Sampling, Storage, Survey, Waves
 
 WIDTH = 38
 MOST_ROWS = 9
@@ -35,7 +35,7 @@ def _waves(plan: Plan) -> Group:
         ("Δδ, Δβ", f"{waves.delta:.3g}, {waves.beta:.3g}"),
         ("Fresnel number, object's radius", f"{waves.fresnel_object:.3g}"),
         ("Fresnel number, pixel", f"{waves.fresnel_pixel:.3g}"),
-        ("first fringe √(λz)", f"{_length(waves.fringe)}, {waves.fringe_px:.3g} px{_sampled(waves.fringe_px)}"),
+        ("first fringe √(λz)", _fringe(waves)),
         ("largest phase shift", f"{waves.phase:.3g} rad"),
         ("largest absorption", absorbed),
         ("contrast, least to greatest", f"{waves.contrast_low:+.3g} to {waves.contrast_high:+.3g}"),
@@ -45,8 +45,11 @@ def _waves(plan: Plan) -> Group:
     return "one object", rows
 
 
-def _sampled(fringe_px: float) -> str:
-    return " (finer than two pixels: blurred)" if fringe_px < 2 else ""
+def _fringe(waves: Waves) -> str:
+    if waves.fringe == 0:
+        return "none: absorption alone"
+    blurred = " (finer than two pixels: blurred)" if waves.fringe_px < 2 else ""
+    return f"{_length(waves.fringe)}, {waves.fringe_px:.3g} px{blurred}"
 
 
 def _detection(recording: Recording, plan: Plan) -> Group:

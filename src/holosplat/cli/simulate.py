@@ -1,4 +1,4 @@
-"""`holosplat simulate`: meshes, still or moving, to a scan file, and the truth beside it."""
+"""`holosplat simulate`: meshes, still or moving, or continuous matter to a scan file, and the truth beside it."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
+from ..beamline.light import EVEN_LIGHT, UnevenLight
 from ..checks import require
 from .options import (
     BeamlineOptions,
@@ -24,6 +25,7 @@ from .options import (
 )
 from .progress import ProgressBar
 from .source import SourceOptions
+from .specimen import SpecimenOptions
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,15 +34,23 @@ if TYPE_CHECKING:
     from ..beamline.series import Timing
     from ..geometry import Views
     from ..scan import Exposures
+    from ..specimens.continuous import ContinuousScene
     from ..specimens.mesh_series import MeshSeries
     from ..specimens.scene import MeshScene
+    from ..specimens.voxel_scene import VoxelScene
+
+    Still = MeshScene | ContinuousScene | VoxelScene
+
+
+MESHES = SpecimenOptions()
+"""What is imaged unless options say otherwise."""
 
 
 @dataclass(frozen=True)
 class _Specimen:
     """What is imaged, and at which times [T] of the frames [s]; facts: what the scan file says of it."""
 
-    matter: MeshScene | MeshSeries
+    matter: Still | MeshSeries
     times: np.ndarray
     facts: dict[str, str]
 
@@ -50,38 +60,48 @@ class ExperimentOptions:
     """What an experiment does to frames beside recording them."""
 
     noise: NoiseOptions = NoiseOptions()
+    light: UnevenLight = EVEN_LIGHT
     motion: MotionOptions = MotionOptions()
     misalignment: MisalignmentOptions = MisalignmentOptions()
     source: SourceOptions = SourceOptions()
 
 
 def simulate(
-    meshes: Positional[tuple[Path, ...]],
+    files: Positional[tuple[Path, ...]] = (),
+    *,
     beamline: BeamlineOptions,
     out: Path,
-    files: MeshOptions = MeshOptions(),
+    imaged: SpecimenOptions = MESHES,
     filling: MaterialOptions = MaterialOptions(),
     experiment: ExperimentOptions = ExperimentOptions(),
     truth: TruthOptions = TruthOptions(),
 ) -> None:
-    """Simulate the holograms of closed triangle meshes; with --frame-rate, of moving ones, many times over.
+    """Simulate the holograms of closed meshes, still or moving (--frame-rate), of a volume, or of generated matter.
 
     Args:
-        meshes: VTK files (.vtk, .vtu, .vtp), one a cell; x, y, z are the object frame's, y is the rotation axis. With
-            --frame-rate: numbered snapshots (cell00_000.vtk, cell00_001.vtk …), or one collection (.pvd).
+        files: VTK files (.vtk, .vtu, .vtp), one a cell; x, y, z are the object frame's, y is the rotation axis. With
+            --frame-rate: numbered snapshots (cell00_000.vtk, cell00_001.vtk …), or one collection (.pvd). Or a volume:
+            one HDF5 file with /delta and /beta, or TIFF images. None with --specimen.
         out: Scan file to write (NXtomo).
     """
+    import numpy as np
+
     from ..beamline.series import held_out
 
-    require(len(meshes) > 0, "simulate needs at least one mesh file.")
     truth.require_usable(out)
     motion, source = experiment.motion, experiment.source
     of_source, beamline = source.facts(beamline), source.applied(beamline)
     views, filled = beamline.exposures(), filling.filling()
     true_views = experiment.misalignment.errors().true_exposures(views)
     with ProgressBar() as bar:
-        specimen = _specimen(meshes, beamline, files, filled, motion.timing(), bar)
-    times, how = specimen.times, experiment.noise.simulation(motion.shutter())
+        still = imaged.continuous(files, beamline, filled)
+        if still is None:
+            specimen = _specimen(files, beamline, imaged.meshes, filled, motion.timing(), bar)
+        else:
+            imaged.meshes.require_static()
+            require(motion.frame_rate is None, "--frame-rate is of moving meshes; leave it out.")
+            specimen = _Specimen(still, np.zeros(1), _facts_of_still(imaged, files))
+    times, how = specimen.times, experiment.noise.simulation(motion.shutter(), experiment.light)
     _warn_of_missing_field(specimen.matter, true_views.views, beamline.pixel_size)
     split = beamline.split(len(views) if motion.hold_out == "views" else len(times))
     is_test = held_out(split, len(views), len(times), motion.hold_out)
@@ -140,7 +160,14 @@ def _facts(scene: MeshScene) -> dict[str, str]:
     return {"meshes": str(len(scene.meshes)), "materials": "; ".join(found)}
 
 
-def _warn_of_missing_field(matter: MeshScene | MeshSeries, views: Views, pixel_size: float) -> None:
+def _facts_of_still(imaged: SpecimenOptions, files: tuple[Path, ...]) -> dict[str, str]:
+    generated = imaged.generated
+    if generated.specimen is None:
+        return {"volume": ", ".join(path.name for path in files[:3]) + (" …" if len(files) > 3 else "")}
+    return {"specimen": generated.specimen, "specimen_seed": str(generated.specimen_seed)}
+
+
+def _warn_of_missing_field(matter: Still | MeshSeries, views: Views, pixel_size: float) -> None:
     missing = matter.missing_field(views)
     if missing > 0:
         _say(
@@ -166,7 +193,7 @@ def _write_frames(
             bar.show("simulating views", (n + 1) / len(is_test), {})
 
 
-def _write_truth(path: Path, matter: MeshScene, views: Views) -> None:
+def _write_truth(path: Path, matter: Still, views: Views) -> None:
     from ..geometry import Grid
     from ..io.volumes import write_voxels
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..checks import require
+from ..checks import InputError, require
 from .options import BeamlineOptions
 
 if TYPE_CHECKING:
@@ -17,8 +17,12 @@ if TYPE_CHECKING:
     from ..beamline.simulate import Simulation
     from ..optics.coherence import Spectrum
     from ..scan import Exposures
+    from ..specimens.continuous import ContinuousScene
     from ..specimens.mesh_series import MeshSeries
     from ..specimens.scene import MeshScene
+    from ..specimens.voxel_scene import VoxelScene
+
+    Still = MeshScene | ContinuousScene | VoxelScene
 
 
 @dataclass(frozen=True)
@@ -71,15 +75,22 @@ class SourceOptions:
         return beamline
 
     def frames(
-        self, matter: MeshScene | MeshSeries, filling: Filling, exposures: Exposures, how: Simulation
+        self, matter: Still | MeshSeries, filling: Filling, exposures: Exposures, how: Simulation
     ) -> Iterator[np.ndarray]:
         """Frames [H, W] of `matter`, one after another."""
         from ..beamline.polychromatic import polychromatic_frames, refilled
         from ..beamline.simulate import simulated_frames
+        from ..specimens.continuous import ContinuousScene
+        from ..specimens.voxel_scene import VoxelScene
 
         light = self.light(exposures.one_energy("a simulation"))
         if light is None:
             return simulated_frames(matter, exposures, how)
+        if isinstance(matter, ContinuousScene | VoxelScene):
+            raise InputError(
+                "a spectrum needs meshes, whose materials are known at every energy; leave --bandwidth and --spectrum "
+                "out."
+            )
         return polychromatic_frames(lambda energy: refilled(matter, filling, energy), light, exposures, how)
 
     def facts(self, beamline: BeamlineOptions) -> dict[str, str]:

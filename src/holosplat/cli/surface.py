@@ -13,6 +13,7 @@ from tyro.conf import Positional
 
 from ..io.folder import atomic_folder, require_new
 from ..io.json import write_json
+from ..io.reading import Reading
 from ..io.volumes import read_volume
 from ..io.vtk import write_mesh
 from ..methods.surfaces import SurfaceOptions, oversampling, refine_surfaces
@@ -34,6 +35,7 @@ def surface(
     scan: Path | None = None,
     truth: Path | None = None,
     how: SurfaceOptions = SurfaceOptions(),
+    reading: Reading = Reading(),
 ) -> None:
     """Cut the bodies of a run out as closed surfaces, fit these to the frames, and write them as VTK files (µm).
 
@@ -46,7 +48,7 @@ def surface(
     require_new(out)
     folder = RunFolder(run)
     result = load_reconstruction(folder)
-    measured, volume = scan_for(folder, scan or folder.source_scan()), read_volume(truth) if truth else None
+    measured, volume = scan_for(folder, scan, reading), read_volume(truth) if truth else None
     if scan_hash(measured) != folder.read_config().get("scan_hash"):
         _say("this is not the scan that was reconstructed: its held-out frames may have been fitted")
     if folder.read_config().get("prior", {}).get("kind") == "free":

@@ -41,7 +41,13 @@ def split_validation(train: Scan, count: int) -> tuple[Scan, Scan]:
         count < len(train),
         f"validation_views must leave a training frame: {count} of {len(train)} are asked for.",
     )
-    chosen = np.zeros(len(train), dtype=bool)
-    if count > 0:
-        chosen[((np.arange(count) + 0.5) * len(train) / count).astype(int)] = True
+    chosen = set_aside(len(train), count)
     return train[np.flatnonzero(~chosen)], train[np.flatnonzero(chosen)]
+
+
+def set_aside(frames: int, count: int) -> np.ndarray:
+    """Which of so many training frames `split_validation` sets aside, [V] bool."""
+    chosen = np.zeros(frames, dtype=bool)
+    if count > 0:
+        chosen[((np.arange(count) + 0.5) * frames / count).astype(int)] = True
+    return chosen

@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+from .auto import Auto
 from .gaussian_options import FitOptions, GaussianRates
 from .gaussians import Gaussians, gaussian_fit
 from .ground import ExtraTerm
-from .method import Method, Stage, Task, finished, solve
+from .method import Method, Stage, Task, finished
 from .neural_field import NeuralFields, NeuralFit
 from .per_view import PerView
+from .solve import Settled, settled, solve
 from .surfaces import Extraction, SurfaceFit, SurfaceOptions, Surfaces, refine_surfaces
+from .volume import SmoothVolume
 from .voxels import HolographicVoxels, VoxelFit, Voxels
 
 METHODS: dict[str, Method] = {
+    "auto": Auto(),
     "gaussians": Gaussians(),
     "surfaces": Surfaces(),
     "voxels": Voxels(),
+    "volume": SmoothVolume(),
     "neural-field": NeuralFields(),
     "holographic-tv": HolographicVoxels(),
     "tikhonov-tv": PerView("tikhonov", "tv"),
@@ -27,6 +32,7 @@ METHODS: dict[str, Method] = {
 
 __all__ = [
     "METHODS",
+    "Auto",
     "ExtraTerm",
     "Extraction",
     "FitOptions",
@@ -37,6 +43,8 @@ __all__ = [
     "NeuralFields",
     "NeuralFit",
     "PerView",
+    "Settled",
+    "SmoothVolume",
     "Stage",
     "SurfaceFit",
     "SurfaceOptions",
@@ -47,5 +55,6 @@ __all__ = [
     "finished",
     "gaussian_fit",
     "refine_surfaces",
+    "settled",
     "solve",
 ]

@@ -73,6 +73,9 @@ class GaussianOptions:
     """What it grows by, as a share, for the share of the frames' contrast that is noise, at most to twice."""
     max_start: int = 150_000
     """Gaussians at the start, at most: their distance grows rather than their number."""
+    start_per_pixel: float = 1.5
+    """Gaussians at the start for each pixel of all frames, at most: beyond that, the insides of bulky bodies, where
+    nothing changes, get larger ones."""
     approximate_steps: int = 50
     """Steps in which the Gaussians learn the starting volume."""
     approximate_rates: GaussianRates = GaussianRates(0.02, 0.02, 0.02, 0.05)
@@ -97,6 +100,7 @@ class GaussianOptions:
         require(self.spacing_px > 0, f"spacing_px must be positive, but it is {self.spacing_px}.")
         at_least(self, 0, "approximate_steps", "spacing_noise", "filled")
         at_least(self, 1, "max_start", "random_count")
+        require(self.start_per_pixel > 0, f"start_per_pixel must be positive, but it is {self.start_per_pixel}.")
         require(
             self.most_materials in (1, 2),
             f"most_materials must be 1 or 2, but it is {self.most_materials}; no more than two can be told apart.",

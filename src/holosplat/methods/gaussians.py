@@ -16,7 +16,8 @@ from ..fit.problem import Problem, Term
 from ..fit.terms import Anisotropy, VolumeTerm
 from ..fit.validation import split_validation
 from ..geometry import Grid
-from ..matter import MaterialPrior, Matter
+from ..matter import Matter
+from ..optics.background import Light
 from ..optics.noise import noise_share
 from ..representations import GaussianCloud, Stored
 from ..scan import Scan
@@ -35,6 +36,12 @@ class Gaussians(GaussianOptions):
     def stages(self) -> tuple[Stage, ...]:
         """One: the start, and the fit."""
         return (GaussianStage(self),)
+
+    @property
+    def wants_levels(self) -> bool:
+        """Whether it matters to these options whether matter has levels."""
+        weights = self.fit.objective
+        return self.start == "phase" or weights.overfull > 0 or weights.two_levels > 0
 
     def on_backend(self, backend: Backend) -> Gaussians:
         """The same method computed by `backend`; the start runs on the CPU, or in plain torch."""
@@ -65,20 +72,22 @@ class GaussianStage:
     def fit(self, task: Task, start: Stored) -> Fit:
         """The fit of the cloud to the training frames."""
         assert isinstance(start, GaussianCloud)
-        return gaussian_fit(task.scan, start, resolved(self.options.fit, task.prior, start.matter), task.seed)
+        return gaussian_fit(task.scan, start, resolved(self.options.fit, task, start.matter), task.seed, task.uneven)
 
 
-def resolved(options: FitOptions, prior: MaterialPrior, matter: Matter) -> FitOptions:
+def resolved(options: FitOptions, task: Task, matter: Matter) -> FitOptions:
     """The options without what bounds the occupancy where nothing says what an occupancy of one is."""
-    if prior.fixes_ratio or matter.second is not None:
+    if task.bounded or (task.matter == "levels" and matter.second is not None):
         return options
     return replace(options, objective=replace(options.objective, overfull=0.0, two_levels=0.0))
 
 
-def gaussian_fit(scan: Scan, cloud: GaussianCloud, options: FitOptions, seed: int = 0) -> Fit:
-    """The fit of `cloud` to the training frames of `scan`, made ready; errors: those of `ground`."""
+def gaussian_fit(
+    scan: Scan, cloud: GaussianCloud, options: FitOptions, seed: int = 0, light: Light | None = None
+) -> Fit:
+    """The fit of `cloud` to the training frames of `scan` in uneven `light`, made ready; errors: those of `ground`."""
     backend, schedule = resolve(options.backend), options.schedule
-    base = ground(scan, cloud.on(backend), cloud.matter, options.objective, schedule, backend)
+    base = ground(scan, cloud.on(backend), cloud.matter, options.objective, schedule, backend, light=light)
     grid = Grid.of_views(scan.views)
     terms = [base.frames, *_object_terms(base, options, grid, cloud.matter), *base.extra(options.terms)]
     plan = Plan(

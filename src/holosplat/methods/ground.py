@@ -5,14 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from ..checks import InputError, require
 from ..fit.problem import Term
 from ..fit.schedule import Schedule
 from ..fit.terms import TERMS, FrameTerm, Objective
-from ..fit.validation import Judge, split_validation
+from ..fit.validation import Judge, set_aside, split_validation
 from ..matter import Matter
-from ..model import Instrument, Model
+from ..model import Instrument, Model, SolvedLight
+from ..optics.background import Light
 from ..optics.sampling import fringe_sampling
 from ..scan import Scan
 from ..volume import Object
@@ -56,11 +58,20 @@ class Ground:
 
 
 def ground(
-    scan: Scan, obj: Object, matter: Matter, objective: Objective, schedule: Schedule, backend: str, finer: int = 0
+    scan: Scan,
+    obj: Object,
+    matter: Matter,
+    objective: Objective,
+    schedule: Schedule,
+    backend: str,
+    *,
+    finer: int = 0,
+    light: Light | None = None,
 ) -> Ground:
     """The ground of a fit of `obj`, made of `matter`, to the training frames of `scan`.
 
-    backend: resolved. finer: wave samples a pixel, at least, where the schedule does not say how many. Errors:
+    backend: resolved. finer: wave samples a pixel, at least, where the schedule does not say how many. light: of these
+    frames, which were divided by it, where it is uneven; what is left of it is solved for in every step. Errors:
     `InputError` without training frames, or where they show nothing.
     """
     train, aside = split_validation(scan.train(), schedule.validation_views)
@@ -71,4 +82,12 @@ def ground(
     judge = None
     if len(aside):
         judge = Judge(aside, Instrument(aside.exposures, oversample, backend=backend), frames.low, frames.span)
-    return Ground(train, Model(obj, instrument), frames, judge)
+    return Ground(train, Model(obj, instrument, light=_solved(light, train, schedule, instrument)), frames, judge)
+
+
+def _solved(light: Light | None, train: Scan, schedule: Schedule, instrument: Instrument) -> SolvedLight | None:
+    """The light of the training frames that are not set aside, where it is uneven."""
+    if light is None or light.background is None:
+        return None
+    used = np.flatnonzero(~set_aside(len(light.background), schedule.validation_views))
+    return SolvedLight(light.background[torch.from_numpy(used)], torch.from_numpy(train.frames).to(instrument.device))

@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Protocol, runtime_checkable
 
+import torch
+
+from ..baselines.material import MaterialEstimate
 from ..fit.loop import Fit
-from ..matter import MaterialPrior
+from ..matter import MaterialPrior, MatterKind
+from ..optics.background import Light, LightOptions
+from ..optics.noise_model import NoiseModel
+from ..optics.retrieval import absorption_alone
 from ..progress import Advance, Progress
 from ..representations import KINDS, Stored
 from ..scan import Scan
@@ -17,20 +23,85 @@ def quiet(stage: str, fraction: float) -> None:
     """Progress that nobody looks at."""
 
 
+STAND_IN_RATIO = 1.0
+"""δ/β that stands for one that frames of absorption alone cannot tell."""
+
+
+def shows_no_refraction(scan: Scan) -> bool:
+    """Whether no frame could show refraction, even of the softest matter that is looked for."""
+    return bool(absorption_alone(scan.exposures, 10 ** -MaterialEstimate().highest).all())
+
+
 @dataclass(frozen=True)
 class Task:
     """What a method is given.
 
     scan: the training frames, of one time
-    prior: what is known of the matter
+    prior: what is known of the matter; where nothing is, and the frames show no refraction, δ = β stands for it: any
+        ratio explains them equally
     seed: seed of everything random
     on_progress: called with (stage, fraction done of it)
+    light: what is assumed of the light
+    lit: what the frames say of it, once `evened` has looked
+    matter: whether matter has levels, each with sharp edges, or is continuous (see `settled`)
+    delta_told: whether prior or frames say what δ is
     """
 
     scan: Scan
     prior: MaterialPrior
     seed: int = 0
     on_progress: Progress = quiet
+    light: LightOptions = field(default_factory=LightOptions)
+    lit: Light | None = None
+    matter: MatterKind = "levels"
+    delta_told: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.prior.fixes_ratio and shows_no_refraction(self.scan):
+            object.__setattr__(self, "delta_told", False)
+            object.__setattr__(self, "prior", MaterialPrior.of_ratio(STAND_IN_RATIO))
+
+    def evened(self) -> Task:
+        """The same task with frames as they would be in even light, as far as their air says what the light is.
+
+        Frames whose air is even within its noise stay as they are. Errors: those of `Light.of`.
+        """
+        if self.lit is not None:
+            return self
+        frames = torch.from_numpy(self.scan.frames)
+        found = Light.of(frames, self.light)
+        scan = self.scan
+        if found.background is not None:
+            scan = replace(scan, frames=found.evened(frames).numpy())
+        return replace(self, scan=scan, lit=found)
+
+    @property
+    def noise(self) -> NoiseModel:
+        """The noise of the frames; what is not known of uneven light counts as such."""
+        found = self.lit or Light.of(torch.from_numpy(self.scan.frames), self.light)
+        return found.doubt
+
+    @property
+    def uneven(self) -> Light | None:
+        """The light, where it is uneven."""
+        return self.lit if self.lit is not None and self.lit.background is not None else None
+
+    @property
+    def light_in_words(self) -> str:
+        """What the frames say of the light."""
+        if self.uneven is None or self.uneven.background is None:
+            return "even"
+        size = float((self.uneven.background.factor() - 1).square().mean().sqrt())
+        return f"uneven by {size:.2%}"
+
+    @property
+    def bounded(self) -> bool:
+        """Whether an occupancy cannot exceed one: matter has levels, and one ratio δ/β."""
+        return self.matter == "levels" and self.prior.fixes_ratio
+
+    def bound(self, upper: float) -> float:
+        """The bound `upper` of the occupancy where matter has levels and its δ is known, else 0 (none)."""
+        return self.prior.bound(upper) if self.matter == "levels" else 0.0
 
     def report(self, stage: str) -> Advance:
         """Progress of one stage: a function of the fraction done."""
@@ -78,9 +149,9 @@ def run_quietly(fit: Fit, report: Advance) -> Stored:
     return finished(fit)
 
 
-def solve(method: Method, task: Task) -> Stored:
+def solve_stages(method: Method, task: Task) -> Stored:
     """Run all stages of `method` in memory, without a folder; Ctrl-C is passed on."""
-    found: Stored | None = None
+    task, found = task.evened(), None
     for stage in method.stages():
         found = stage.start(task, found)
         fit = stage.fit(task, found)

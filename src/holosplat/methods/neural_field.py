@@ -25,6 +25,7 @@ from ..fit.trainable import Trainable
 from ..geometry import Grid, Views
 from ..matter import Matter
 from ..model import Model
+from ..optics.background import Light
 from ..representations import NeuralField, Stored, VoxelGrid
 from ..representations.neural_field import Network, grown
 from ..scan import Scan
@@ -139,7 +140,9 @@ class NeuralStage:
     def fit(self, task: Task, start: Stored) -> Fit | None:
         """The fit to the frames, or None for no steps."""
         assert isinstance(start, NeuralField)
-        return waves_fit(task.scan, start, self.options, task.seed) if self.options.schedule.steps else None
+        return (
+            waves_fit(task.scan, start, self.options, task.seed, task.uneven) if self.options.schedule.steps else None
+        )
 
 
 def warmed_up(task: Task, matter: Matter, thickness: Tensor, options: NeuralFit) -> NeuralField:
@@ -153,7 +156,7 @@ def warmed_up(task: Task, matter: Matter, thickness: Tensor, options: NeuralFit)
         f"thickness must have the shape of the training frames {tuple(wanted)}, but it has {tuple(thickness.shape)}.",
     )
     hull = grown(visual_hull(thickness, views, Grid.of_views(views), options.hull), options.margin)
-    upper = task.prior.bound(1.0) if matter.single else 0.0
+    upper = task.bound(1.0) if matter.single else 0.0
     field = NeuralField(Grid.of_views(views), matter, options.network, hull, task.seed, upper)
     if options.warmup_steps == 0:
         return field
@@ -177,13 +180,13 @@ def _warm_up(scan: Scan, field: NeuralField, target: Tensor, options: NeuralFit,
     return Fit(_plan(Problem(base.model, terms), schedule, options, generator), seed)
 
 
-def waves_fit(scan: Scan, field: NeuralField, options: NeuralFit, seed: int = 0) -> Fit:
+def waves_fit(scan: Scan, field: NeuralField, options: NeuralFit, seed: int = 0, light: Light | None = None) -> Fit:
     """The fit of `field` to the training frames of `scan`, made ready."""
     backend = resolve(options.backend)
     generator = torch.Generator(device(backend)).manual_seed(seed + SECOND_STAGE)
     drawn = field.on(backend)
     drawn.jitter = generator
-    base = ground(scan, drawn, field.matter, options.objective, options.schedule, backend)
+    base = ground(scan, drawn, field.matter, options.objective, options.schedule, backend, light=light)
     weight = _weight(base.frames.spectral, options) / len(base.train)
     variation = FieldVariation(weight, options.probes, generator)
     problem = Problem(base.model, (base.frames, variation, *base.extra(options.terms)))

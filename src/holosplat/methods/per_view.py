@@ -65,7 +65,7 @@ class PerViewStage:
         if how.tomography == SVMBIR:
             values = svmbir_volume(thickness, scan.views, grid, report)
         else:
-            upper = 1.0 if how.bounded and task.prior.fixes_level else None
+            upper = (task.bound(1.0) or None) if how.bounded else None
             values = TOMOGRAPHIES[how.tomography](thickness, scan.views, grid, upper, report)
         return VoxelGrid(values[None], grid, Matter.one(*material))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -44,10 +45,10 @@ def starting_cloud(task: Task, options: GaussianOptions) -> GaussianCloud:
 def _from_phase_retrieval(task: Task, options: GaussianOptions) -> GaussianCloud:
     scan, prior, backend = task.scan, task.prior, options.volume.backend
     material = assumed_material(scan, prior, task.on_progress, backend, options.estimate)
-    how = replace(options.volume, upper=options.volume.upper if prior.fixes_ratio else 0.0)
+    how = replace(options.volume, upper=options.volume.upper if task.bounded else 0.0)
 
     def retrieve(frames: Scan) -> tuple[Tensor, Grid]:
-        return holographic_tv(frames, material, how, task.on_progress)
+        return holographic_tv(frames, material, how, task.on_progress, task.uneven)
 
     volume, grid = retrieve(scan)
     shares = _shares(task, options, material, (volume, grid), retrieve)
@@ -55,7 +56,8 @@ def _from_phase_retrieval(task: Task, options: GaussianOptions) -> GaussianCloud
     spacing = _spacing_px(scan, options) * pitch
     if shares is None:
         whole = at_pitch(volume, grid, pitch)
-        cloud = cloud_from_volume(*whole, material, spacing, pitch, options.max_start, options.filled)
+        most = min(options.max_start, math.ceil(options.start_per_pixel * len(scan) * math.prod(scan.views.shape)))
+        cloud = cloud_from_volume(*whole, material, spacing, pitch, most, options.filled)
     else:
         volume, grid = shares.values, shares.grid
         whole = at_pitch(volume, grid, pitch)
@@ -73,7 +75,7 @@ def _shares(
     pixel, how = round(scan.views.pixel_size / grid.voxel_size[0]) or 1, options.two_materials
     known = prior.materials if len(prior.materials) == 2 else ()
     levels = (known[0].delta, known[1].delta) if known else None
-    if not prior.fixes_ratio and options.most_materials == 2 and not options.separate:
+    if task.matter == "levels" and not prior.fixes_ratio and options.most_materials == 2 and not options.separate:
         levels = two_levels(volume * material.delta, pixel, how)
     if levels is None:
         return None

@@ -20,6 +20,7 @@ from ..fit.terms import Objective
 from ..fit.terms.object import Bending
 from ..geometry import Grid
 from ..matter import MaterialPrior
+from ..optics.background import Light
 from ..optics.noise import noise_share
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
@@ -135,7 +136,7 @@ class SurfaceStage:
     def fit(self, task: Task, start: Stored) -> Fit:
         """The fit of the surfaces to the training frames."""
         assert isinstance(start, SurfaceMesh)
-        return surface_fit(task.scan, start, self.options.fit, task.seed)
+        return surface_fit(task.scan, start, self.options.fit, task.seed, task.uneven)
 
 
 def extract_surfaces(cloud: GaussianCloud, scan: Scan, options: Extraction = Extraction()) -> SurfaceMesh:
@@ -171,14 +172,20 @@ def refine_surfaces(
     return found
 
 
-def surface_fit(scan: Scan, start: SurfaceMesh, options: SurfaceFit = SurfaceFit(), seed: int = 0) -> Fit:
+def surface_fit(
+    scan: Scan,
+    start: SurfaceMesh,
+    options: SurfaceFit = SurfaceFit(),
+    seed: int = 0,
+    light: Light | None = None,
+) -> Fit:
     """The fit of the surfaces `start` to the training frames of `scan`, of the same triangles, made ready.
 
     Steps are Adam's in the coordinates (1 + λΔ) x, one length for all vertices (Nicolet, Jacobson & Jakob 2021, "Large
     steps in inverse rendering of geometry", section 3).
     """
     finer = oversampling(scan.train(), options)
-    base = ground(scan, start, start.matter, options.objective, options.schedule, "cpu", finer=finer)
+    base = ground(scan, start, start.matter, options.objective, options.schedule, "cpu", finer=finer, light=light)
     terms = (base.frames, *_bending(base.train, start, options.objective), *base.extra(options.terms))
     group = Group(BETAS, EPSILON, solve=_membrane(start, options.stiffness), together=True)
     plan = Plan(

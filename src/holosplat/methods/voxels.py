@@ -19,6 +19,7 @@ from ..fit.terms import Objective
 from ..fit.terms.object import VoxelVariation
 from ..geometry import Grid
 from ..matter import Matter
+from ..optics.background import Light
 from ..optics.sampling import fringe_sampling
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
@@ -54,8 +55,8 @@ class HolographicStage:
     def start(self, task: Task, before: Stored | None) -> VoxelGrid:
         """Occupancies of the one material that all matter is taken for."""
         material = assumed_material(task.scan, task.prior, task.on_progress, self.options.backend)
-        bounded = replace(self.options, upper=task.prior.bound(1.0))
-        values, grid = holographic_tv(task.scan, material, bounded, task.on_progress)
+        bounded = replace(self.options, upper=task.bound(1.0))
+        values, grid = holographic_tv(task.scan, material, bounded, task.on_progress, task.uneven)
         return VoxelGrid(values[None], grid, Matter.one(*material))
 
     def fit(self, task: Task, start: Stored) -> None:
@@ -145,12 +146,12 @@ class VoxelStage:
     def fit(self, task: Task, start: Stored) -> Fit:
         """The fit of the voxels to the training frames."""
         assert isinstance(start, VoxelGrid)
-        options = replace(self.options, upper=task.prior.bound(self.options.upper) if start.matter.single else 0.0)
+        options = replace(self.options, upper=task.bound(self.options.upper) if start.matter.single else 0.0)
         steps = self.options.coarse_steps if self.coarse else self.options.steps
-        return voxel_fit(task.scan, start, replace(options, steps=steps), task.seed)
+        return voxel_fit(task.scan, start, replace(options, steps=steps), task.seed, task.uneven)
 
 
-def voxel_fit(scan: Scan, start: VoxelGrid, options: VoxelFit, seed: int = 0) -> Fit:
+def voxel_fit(scan: Scan, start: VoxelGrid, options: VoxelFit, seed: int = 0, light: Light | None = None) -> Fit:
     """The fit of `start`, on its own grid, to the training frames of `scan`, made ready.
 
     Minimised is `mean over views of the misfit + λ/(k² V) Σ |∇u|`, k voxels a pixel and V views, so that λ does not
@@ -158,7 +159,7 @@ def voxel_fit(scan: Scan, start: VoxelGrid, options: VoxelFit, seed: int = 0) ->
     """
     refine = max(1, round(scan.views.pixel_size / start.grid.voxel_size[0]))
     schedule = replace(options.schedule, steps=options.steps)
-    base = ground(scan, start, start.matter, options.objective, schedule, "cpu", finer=refine)
+    base = ground(scan, start, start.matter, options.objective, schedule, "cpu", finer=refine, light=light)
     spectral = base.frames.spectral
     noise = 0.0 if spectral is None else spectral.noise
     weight = (options.weight + options.noise_weight * noise) / (refine**2 * len(base.train))

@@ -9,9 +9,10 @@ against the truth (Rosenthal & Henderson 2003).
 
 Rings. One frequency step is the step of the shortest side, `1 / min(n d)` for `n` samples of spacing `d`: the coarsest
 step, so that every ring has samples along each axis. (With the finer step of a long side, rings that hold samples of
-the short axis alternate with rings that do not, and the curve oscillates.) A sample of frequency `|f|` belongs to ring
-`floor(|f| / step + ½)`; rings run from 1 to the Nyquist frequency of the coarsest spacing. A square image of N pixels
-has the textbook rings 1 … ⌊N/2⌋ about the integer radii.
+the short axis alternate with rings that do not, and the curve oscillates. Sides of fewer than four samples, such as
+those of a fan of a few slices, have no rings of their own and do not count.) A sample of frequency `|f|` belongs to
+ring `floor(|f| / step + ½)`; rings run from 1 to the Nyquist frequency of the coarsest spacing. A square image of N
+pixels has the textbook rings 1 … ⌊N/2⌋ about the integer radii.
 """
 
 from __future__ import annotations
@@ -25,6 +26,9 @@ from ..checks import InputError, finite, positive, require
 
 FIXED_THRESHOLD = 0.143
 """The fixed threshold 1/7 between two half data sets (Rosenthal & Henderson 2003, J. Mol. Biol. 333, 721)."""
+
+FEWEST_SAMPLES = 4
+"""Samples of a side from which on its frequencies make rings."""
 
 
 def fourier_ring_correlation(image_a: np.ndarray, image_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -123,8 +127,14 @@ def _correlate(
     power_a, power_b = (over_rings(np.abs(s) ** 2) for s in (spectrum_a, spectrum_b))
     norm = np.sqrt(power_a) * np.sqrt(power_b)
     curve = np.divide(shared, norm, out=np.zeros_like(shared), where=norm > 0)
-    sides = np.asarray(a.shape) * (np.ones(ndim) if spacing is None else np.asarray(spacing))
-    return np.arange(1, count + 1) / float(sides.min()), curve
+    return np.arange(1, count + 1) / shortest_side(a.shape, np.ones(ndim) if spacing is None else spacing), curve
+
+
+def shortest_side(shape: Sequence[int], spacing: Sequence[float] | np.ndarray) -> float:
+    """The length of the shortest side that has `FEWEST_SAMPLES`, or of the longest where none has."""
+    sides = np.asarray(shape) * np.asarray(spacing)
+    sampled = sides[np.asarray(shape) >= FEWEST_SAMPLES]
+    return float(sampled.min() if len(sampled) else sides.max())
 
 
 def _rings(shape: tuple[int, ...], spacing: Sequence[float] | np.ndarray | None) -> tuple[np.ndarray, np.ndarray, int]:
@@ -132,7 +142,7 @@ def _rings(shape: tuple[int, ...], spacing: Sequence[float] | np.ndarray | None)
     steps = np.ones(len(shape)) if spacing is None else np.asarray(spacing, dtype=np.float64)
     if len(steps) != len(shape) or not np.all(steps > 0):
         raise InputError(f"spacing must be {len(shape)} positive numbers, one an axis, but it is {spacing}.")
-    shortest = float((np.asarray(shape) * steps).min())
+    shortest = shortest_side(shape, steps)
     last = math.floor(shortest * 0.5 / float(steps.max()) + 1e-9)
     require(
         last >= 1,

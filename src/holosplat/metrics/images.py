@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import correlate1d
+from numpy.lib.stride_tricks import sliding_window_view
 
 from ..checks import InputError, finite, require, shaped
 from .correlation import fourier_ring_correlation, half_bit_threshold, ring_counts, ring_weighted_mean
@@ -76,7 +76,7 @@ def intensity_range(train_frames: np.ndarray) -> tuple[float, float]:
 
 
 def image_scores(predicted: np.ndarray, measured: np.ndarray, data_range: tuple[float, float]) -> ImageScores:
-    """Scores of `predicted` against `measured` images, both [N, H, W] relative intensity, at least 11 × 11.
+    """Scores of `predicted` against `measured` images, both [N, H, W] relative intensity.
 
     data_range: `(low, high)` from `intensity_range` of the *training* frames. PSNR is infinite for equal
     images. Raises `InputError` when shapes differ, there is no image, a value is not finite, or the range is
@@ -108,14 +108,15 @@ def image_scores(predicted: np.ndarray, measured: np.ndarray, data_range: tuple[
 def structural_similarity(image_a: np.ndarray, image_b: np.ndarray) -> float:
     """Mean SSIM of two images [H, W] of data range 1 (Wang et al. 2004, eq. 13).
 
-    11 × 11 Gaussian window, σ = 1.5, K₁ = 0.01, K₂ = 0.03. Moments are the window's weighted ones (no N/(N-1)
-    correction), and only windows that lie wholly inside the image count, as in the authors' own code; that is
-    scikit-image with `gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1`.
-    Raises `InputError` for images smaller than the window or of different shapes.
+    11 × 11 Gaussian window (a side shorter than that has one window, of its length), σ = 1.5, K₁ = 0.01, K₂ = 0.03.
+    Moments are the window's weighted ones (no N/(N-1) correction), and only windows that lie wholly inside the image
+    count, as in the authors' own code; that is scikit-image with `gaussian_weights=True, sigma=1.5,
+    use_sample_covariance=False, data_range=1`.
+    Raises `InputError` for images of different shapes.
     """
     a, b = np.asarray(image_a, dtype=np.float64), np.asarray(image_b, dtype=np.float64)
-    if a.ndim != 2 or a.shape != b.shape or min(a.shape) < SSIM_WINDOW:
-        raise InputError(f"SSIM needs two images of one shape, at least 11 × 11, but got {a.shape} and {b.shape}.")
+    if a.ndim != 2 or a.shape != b.shape or min(a.shape) < 1:
+        raise InputError(f"SSIM needs two images of one shape, but got {a.shape} and {b.shape}.")
     mean_a, mean_b = _window(a), _window(b)
     var_a, var_b = _window(a * a) - mean_a**2, _window(b * b) - mean_b**2
     covariance = _window(a * b) - mean_a * mean_b
@@ -139,8 +140,9 @@ def json_number(value: float | None) -> float | str | None:
 
 def _window(image: np.ndarray) -> np.ndarray:
     """Gaussian-weighted local mean at the windows that lie wholly inside the image."""
-    half = SSIM_WINDOW // 2
-    weights = np.exp(-0.5 * (np.arange(-half, half + 1) / SSIM_SIGMA) ** 2)
-    weights /= weights.sum()
-    rows = correlate1d(image, weights, axis=0, mode="nearest")[half:-half]
-    return correlate1d(rows, weights, axis=1, mode="nearest")[:, half:-half]
+    for axis, length in enumerate(image.shape):
+        size = min(SSIM_WINDOW, length)
+        at = np.arange(size) - 0.5 * (size - 1)
+        weights = np.exp(-0.5 * (at / SSIM_SIGMA) ** 2)
+        image = sliding_window_view(image, size, axis) @ (weights / weights.sum())
+    return image

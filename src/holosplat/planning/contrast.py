@@ -18,7 +18,7 @@ from ..geometry import Views
 from ..materials import ENERGY_RANGE_KEV, DeltaBeta, Material
 from ..mesh import TriangleMesh
 from ..model import Instrument
-from ..scan import DISTANCE_RANGE_M, PIXEL_RANGE_M, Exposures
+from ..scan import PIXEL_RANGE_M, Exposures, checked_distance
 from ..specimens.scene import MeshScene
 from ..units import wavelength, wavenumber
 from ..volume import LineIntegrals
@@ -87,7 +87,7 @@ class Setup:
     energy_kev: float = 20.0
     """Photon energy [keV]."""
     distance: float = 0.1
-    """Effective propagation distance, in the sample plane [m]."""
+    """Effective propagation distance, in the sample plane [m]; 0: in contact."""
     pixel_size: float = 3.2e-6
     """Effective pixel size, in the sample plane [m]."""
     psf_sigma_px: float = 0.0
@@ -97,7 +97,7 @@ class Setup:
 
     def __post_init__(self) -> None:
         in_range("energy", self.energy_kev, *ENERGY_RANGE_KEV, unit="keV")
-        in_range("propagation distance", self.distance, *DISTANCE_RANGE_M, unit="metres")
+        checked_distance(self.distance)
         in_range("pixel size", self.pixel_size, *PIXEL_RANGE_M, unit="metres")
         for name, high, unit in (("psf_sigma_px", MOST_PSF_PX, "pixels"), ("source_angle", MOST_SOURCE_ANGLE, "rad")):
             value = getattr(self, name)
@@ -114,8 +114,11 @@ class Setup:
         return math.hypot(self.psf_sigma_px, self.source_angle * self.distance / self.pixel_size)
 
     def fresnel_number(self, radius: float) -> float:
-        """Fresnel number a²/(λz) of a half-width `radius` [m] (Goodman 2005, *Fourier Optics*, sect. 4.5.1)."""
-        return (radius / self.fringe) ** 2
+        """Fresnel number a²/(λz) of a half-width `radius` [m] (Goodman 2005, *Fourier Optics*, sect. 4.5.1).
+
+        It is infinite in contact.
+        """
+        return (radius / self.fringe) ** 2 if self.fringe else math.inf
 
 
 @dataclass(frozen=True)
@@ -213,7 +216,7 @@ def _raster_of(subject: Subject, setup: Setup, samples: tuple[int, int]) -> _Ras
     factor = math.ceil(pixel / max(wanted, finest))
     # Detail of frequency f travels sideways by λ z f. Beyond 4 / width the object has little detail left; short
     # of 2 / √(λz) it travels less than two fringes; and beyond 1 / pixel no detail is seen.
-    frequency = min(1 / pixel, max(4 / narrow, 2 / fringe))
+    frequency = min(1 / pixel, max(4 / narrow, 2 / fringe if fringe else math.inf))
     half = 0.5 * subject.diameter + fringe**2 * frequency + (4 + 4 * setup.blur_px) * pixel
     return _Raster(factor, 2 * factor * math.ceil(half / pixel), pixel / factor)
 

@@ -28,7 +28,8 @@ class TotalVariationWeights:
 
     def __init__(self, flats: EigenFlats, binning: int | None = None) -> None:
         area = flats.mean.size / (SAMPLES * max(len(flats), 1))
-        binning = next((b for b in BINNINGS if b**2 <= area), 1) if binning is None else binning
+        if binning is None:
+            binning = next((b for b in BINNINGS if b**2 <= area and 2 * b <= min(flats.mean.shape)), 1)
         require(binning >= 1, f"binning must be at least 1, but it is {binning}.")
         fits = min(flats.mean.shape) >= 2 * binning
         require(fits, f"binning must leave at least 2 × 2 pixels of {flats.mean.shape}, but it is {binning}.")

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool3d, interpolate, pad
+from torch.nn.functional import avg_pool3d, interpolate, max_pool3d, pad
 
 from ..checks import require
 from ..geometry import Grid, Views
@@ -24,6 +24,8 @@ NEXT_TO_NOTHING = 1e-4
 
 FILLED = 0.05
 """Share of matter from which on a block becomes a Gaussian, unless the caller says otherwise."""
+CALM = 0.2
+"""Change of a block's occupancy towards its neighbours, as a share of it, below which nothing changes there."""
 RATES = (0.02, 0.02, 0.02, 0.05)
 """Adam's first rates of centres, log-scales, quaternions and amplitudes while a cloud learns a volume, likewise."""
 
@@ -39,25 +41,25 @@ def cloud_from_volume(
 ) -> GaussianCloud:
     """A single-material cloud that approximates `occupancy` [Z, Y, X] on `grid`: one Gaussian a filled block.
 
-    Blocks have an edge of about `spacing` [m] (a whole number of voxels), or more, so that there are at most
-    `max_count`. Each block of which more than the share `filled` is matter becomes one isotropic Gaussian at its
-    centre of mass, with its mass, and with half a block as standard deviation, so that full blocks add up to a flat
-    density (rms ripple below 2 %).
+    Blocks have an edge of about `spacing` [m] (a whole number of voxels). Each block of which more than the share
+    `filled` is matter becomes one isotropic Gaussian at its centre of mass, with its mass, and with half a block as
+    standard deviation, so that full blocks add up to a flat density (rms ripple below 2 %). Where that would be more
+    than `max_count`, eight blocks in one make one Gaussian wherever nothing changes in them and beside them (`CALM`),
+    as in the inside of bulky bodies; and if they are still too many, all blocks are larger.
     material: (δ, β) of an occupancy of one; unit_length [m]: the cloud's unit, the pixel size.
     """
     voxel = grid.voxel_size[0]
     edge = max(1, round(spacing / voxel))
-    mass, centre = _block_moments(occupancy.float().clamp_min(0), edge)
-    while int((mass > filled).sum()) > max_count:
+    volume = occupancy.float().clamp_min(0)
+    mass, centre, size = _blocks(volume, edge, filled, max_count)
+    while len(mass) > max_count:
         edge += 1
-        mass, centre = _block_moments(occupancy.float().clamp_min(0), edge)
-    found = torch.nonzero(mass > filled)
-    require(len(found) > 0, "the start found no matter in the holograms; check material, energy and distance.")
-    mass, centre = mass[tuple(found.T)], centre[(slice(None), *found.T)].T
+        mass, centre, size = _blocks(volume, edge, filled, max_count)
+    require(len(mass) > 0, "the start found no matter in the holograms; check material, energy and distance.")
     position = centre * voxel + torch.tensor(grid.origin, dtype=torch.float32)
-    sigma = 0.5 * edge * voxel
-    peak = mass * (edge * voxel) ** 3 / ((2 * np.pi) ** 1.5 * sigma**3)
-    log_scales = torch.full((len(mass), 3), float(np.log(sigma / unit_length)))
+    sigma = 0.5 * size * voxel
+    peak = mass * (size * voxel) ** 3 / ((2 * np.pi) ** 1.5 * sigma**3)
+    log_scales = torch.log(sigma / unit_length)[:, None].repeat(1, 3)
     return GaussianCloud(
         (position / unit_length, log_scales, _identity(len(mass)), raw_of(peak.clamp_min(SMALLEST))[:, None]),
         unit_length,
@@ -158,6 +160,28 @@ def freed(cloud: GaussianCloud) -> GaussianCloud:
     """The same single-material cloud with δ and β free: its amplitude in both channels."""
     centres, log_scales, quaternions, raw = (p.detach().clone() for p in cloud.parameters().values())
     return cloud.replaced((centres, log_scales, quaternions, raw[:, :1].repeat(1, 2)), cloud.matter.freed())
+
+
+def _blocks(occupancy: Tensor, edge: int, filled: float, max_count: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean occupancy [N], centre of mass [N, 3] as (x, y, z) and edge [N] of the blocks that hold matter, in voxels."""
+    mass, centre = _block_moments(occupancy, edge)
+    single = mass > filled
+    if int(single.sum()) <= max_count:
+        return mass[single], centre[:, single].T, torch.full((int(single.sum()),), float(edge))
+    change = max_pool3d(mass[None], 3, 1, 1)[0] + max_pool3d(-mass[None], 3, 1, 1)[0]
+    calm = single & (change <= CALM * mass)
+    together = -max_pool3d(-calm.float()[None], 2)[0] > 0
+    inside = torch.zeros_like(calm)
+    z, y, x = (2 * n for n in together.shape)
+    inside[:z, :y, :x] = together.repeat_interleave(2, 0).repeat_interleave(2, 1).repeat_interleave(2, 2)
+    large, middle = _block_moments(occupancy, 2 * edge)
+    z, y, x = together.shape
+    large, middle, alone = large[:z, :y, :x], middle[:, :z, :y, :x], single & ~inside
+    return (
+        torch.cat([mass[alone], large[together]]),
+        torch.cat([centre[:, alone].T, middle[:, together].T]),
+        torch.cat([torch.full((int(alone.sum()),), float(edge)), torch.full((int(together.sum()),), 2.0 * edge)]),
+    )
 
 
 def _block_moments(occupancy: Tensor, edge: int) -> tuple[Tensor, Tensor]:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 
 from ..checks import require
+from ..fit.residuals import Prediction
 from ..matter import DeltaBeta
 from ..metrics import ImageScores, VolumeScores, image_scores, intensity_range, volume_scores
 from ..metrics.images import json_number
@@ -17,6 +18,7 @@ from ..representations import Stored
 from ..scan import Exposures, Scan
 from ..volume import Object, Volume
 from .reconstruct import Reconstruction
+from .verdict import Verdict, judge
 
 MOST_VOXELS = 8_000_000
 """Voxels of the volume on which the material is read off, at most."""
@@ -25,12 +27,16 @@ MOST_VOXELS = 8_000_000
 @dataclass(frozen=True)
 class MaterialFound:
     """What a reconstruction says about the matter: mass-weighted medians of δ over its volume, and of δ/β in the
-    matter; or those of the one material, or the two (`second`: the lighter one's), that it is made of."""
+    matter; or those of the one material, or the two (`second`: the lighter one's), that it is made of.
+
+    delta_told: whether prior or frames said what δ is; else `delta` stands for β.
+    """
 
     delta: float
     ratio: float
     single_material: bool
     second: DeltaBeta | None = None
+    delta_told: bool = True
 
 
 @dataclass(frozen=True)
@@ -79,25 +85,35 @@ class Scores:
 
 @dataclass(frozen=True)
 class Evaluation(Scores):
-    """Scores of a reconstruction, and the material that it found."""
+    """Scores of a reconstruction, the material that it found, and whether it explains the held-out frames (None: there
+    are none)."""
 
     material: MaterialFound
+    verdict: Verdict | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """The numbers, ready for JSON."""
         found = self.material
-        material: dict[str, Any] = _as_dict(found.delta, found.ratio) | {"single_material": found.single_material}
+        material: dict[str, Any] = _as_dict(found.delta, found.ratio) | {
+            "single_material": found.single_material,
+            "delta_told": found.delta_told,
+        }
         if found.second is not None:
             material["second"] = _as_dict(found.second.delta, found.second.ratio)
-        return super().as_dict() | {"material": material}
+        said = {} if self.verdict is None else {"verdict": self.verdict.as_dict()}
+        return super().as_dict() | {"material": material} | said
 
     def lines(self) -> list[str]:
         """The numbers as a few lines of text."""
         found = self.material
+        said = self.verdict.lines("held-out frames") if self.verdict else []
+        if not found.delta_told:
+            beta = f"material: β {found.delta / found.ratio:.3e}; δ is not told: the frames show absorption alone"
+            return [*super().lines(), *said, beta]
         kind = "one for all" if found.single_material else "found apart"
         if found.second is not None:
             kind = f"of two; the other: {_as_text(*found.second)}"
-        return [*super().lines(), f"material: {_as_text(found.delta, found.delta / found.ratio)} ({kind})"]
+        return [*super().lines(), *said, f"material: {_as_text(found.delta, found.delta / found.ratio)} ({kind})"]
 
 
 def render(reconstruction: Reconstruction, exposures: Exposures) -> np.ndarray:
@@ -129,7 +145,18 @@ def evaluate(reconstruction: Reconstruction, scan: Scan | None, truth: Volume | 
     if scan is not None:
         _require_energy(reconstruction, scan.exposures)
     scores = score_object(found, scan, truth, reconstruction.oversample, found.backend)
-    return Evaluation(scores.test, scores.train, scores.volume, scores.predicted, material_found(found))
+    material = replace(material_found(found), delta_told=reconstruction.delta_told)
+    said = held_out_verdict(reconstruction, scan) if scan is not None else None
+    return Evaluation(scores.test, scores.train, scores.volume, scores.predicted, material, said)
+
+
+def held_out_verdict(reconstruction: Reconstruction, scan: Scan) -> Verdict | None:
+    """Whether the held-out frames of `scan` are explained to within their noise; None without such frames."""
+    _require_energy(reconstruction, scan.exposures)
+    found, test = reconstruction.object, scan.test()
+    if not len(test):
+        return None
+    return judge(Prediction(found, test.exposures, reconstruction.oversample, backend=found.backend), test)
 
 
 def score_object(obj: Object, scan: Scan | None, truth: Volume | None, oversample: int, backend: str = "cpu") -> Scores:

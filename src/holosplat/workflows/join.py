@@ -13,6 +13,7 @@ from ..geometry import Views
 from ..io.atomic import require_apart, require_writable
 from ..io.formats import read
 from ..io.nxtomo import scan_writer
+from ..io.reading import Part
 from ..optics.coherence import joined_blur_px
 from ..optics.resampling import FLIPS, Flip, Resampling
 from ..progress import Advance
@@ -28,13 +29,14 @@ def join(
     pixel_size: float | None = None,
     flips: Sequence[Flip] = (),
     on_progress: Advance = lambda fraction: None,
+    part: Part = Part(),
 ) -> Exposures:
     """One scan file `out` of all frames of the scans `sources`, one a beam, in their order.
 
     Each frame is brought to pixels of `pixel_size` [m] (default: the coarsest of all), over the field that every
     detector has, about its own centre; distances, poses, shifts and times stay its own, its point-spread function is
     carried along. `flips`: for each file, what its detector saw reversed and the file does not say itself. Raw files
-    are corrected plainly, and frames keep the photon energy of their beam.
+    are corrected plainly, and frames keep the photon energy of their beam. part: what is taken of each file.
     """
     require_writable(out)
     require_apart(out, *sources)
@@ -43,7 +45,7 @@ def join(
         len(flips) in (0, len(sources)),
         f"--flip must say one of {', '.join(FLIPS)} for each of the {len(sources)} files, but it says {len(flips)}.",
     )
-    scans = [read(source) for source in sources]
+    scans = [part.of(read(source)) for source in sources]
     parts = [scan.exposures for scan in scans]
     pitch = _common_pixel(parts, pixel_size)
     shape = _common_shape(parts, pitch)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 import numpy as np
@@ -12,29 +12,36 @@ import numpy as np
 from ..backends import device_name
 from ..checks import InputError, require
 from ..fit.loop import Fit, Record
+from ..geometry import Grid
 from ..io.json import read_json, write_json
+from ..io.light import write_light
 from ..io.objects import read_object, write_object
-from ..matter import MaterialPrior
-from ..methods import Gaussians, Method, Stage, Task, finished
+from ..matter import MaterialPrior, MatterKind
+from ..methods import Auto, Gaussians, Method, Settled, Stage, Task, finished, settled
 from ..methods.presets import SCHEMA
+from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling
 from ..progress import FitProgress
 from ..representations import KINDS, Stored
 from ..scan import Scan
 from ..tables import to_table
+from .keeper import Choice, Keeper
 from .provenance import environment, scan_hash
 from .run_folder import RunFolder
+from .verdict import Verdict, judge_run
 
 CHECKPOINT_SECONDS = 20.0
-SMALLEST_FRAME = 11
-"""The window of SSIM."""
+FEWEST_COLUMNS = 11
+"""Pixels across the axis that are a field of view; rows may be as few as one."""
 FLAT_LEVELS = (0.2, 5.0)
 """Between these lies the median of frames that are relative to the flat field."""
 RESUMED_WITH = {
     "scan_hash": "scan file",
     "method": "method and settings (--method, --preset, --config, --set)",
     "prior": "material (--material, --delta-beta)",
+    "matter": "kind of matter (--matter)",
     "seed": "seed (--seed)",
+    "light": "light (--light, --air)",
 }
 """What must not change between the parts of a run, as messages call it."""
 
@@ -49,6 +56,9 @@ class Reconstruction:
     oversample: wave samples a pixel in the fit
     timing: seconds that each stage took
     finished: whether all stages came to their end
+    choice: what was decided on the way, and which state `object` is
+    delta_told: whether prior or frames say what δ is; else β alone is known, and δ = β stands for it
+    verdict: whether the training frames are explained; None for runs of versions that did not say
     """
 
     object: Stored
@@ -57,20 +67,27 @@ class Reconstruction:
     oversample: int
     timing: dict[str, float]
     finished: bool
+    choice: Choice = field(default_factory=Choice)
+    delta_told: bool = True
+    verdict: Verdict | None = None
 
 
 def reconstruct(
     scan: Scan,
     prior: MaterialPrior,
-    method: Method = Gaussians(),
+    method: Method = Auto(),
     seed: int = 0,
     *,
+    light: LightOptions | None = None,
+    matter: MatterKind | None = None,
     folder: RunFolder | None = None,
     resume: bool = False,
     on_progress: FitProgress = lambda stage, fraction, record: None,
 ) -> Reconstruction:
-    """The Object that `method` makes of the training frames of `scan`.
+    """The Object that `method` makes of the training frames of `scan`: the best of its states by these frames.
 
+    matter: whether it has levels or is continuous; None: what the frames say.
+    light: what is assumed of the light (default: even, unless air says otherwise; see `Task.evened`).
     With a `folder`, everything is written there, and a later call with `resume=True` goes on from the last
     checkpoint, with the same result as if nothing had happened. Ctrl-C (KeyboardInterrupt) ends a fit with what it has
     reached (`finished` is False); during a start there is nothing yet, and it is passed on. Errors: `InputError` for
@@ -80,8 +97,11 @@ def reconstruct(
     require_one_time(scan)
     train = scan.train()
     _check_frames(train)
-    run = _Run(Task(train, prior, seed, lambda stage, part: on_progress(stage, part, {})), method, folder, on_progress)
-    run.begin(_config(scan, prior, method, seed), resume)
+    assumed = light or LightOptions()
+    task = Task(train, prior, seed, lambda stage, part: on_progress(stage, part, {}), assumed).evened()
+    run = _Run(task, method, folder, on_progress)
+    run.begin(_config(scan, prior, method, seed, matter) | {"light": to_table(assumed)}, resume)
+    run.settle(matter)
     return run.complete()
 
 
@@ -99,8 +119,8 @@ def require_one_time(scan: Scan) -> None:
 def _check_frames(train: Scan) -> None:
     h, w = train.views.shape
     require(
-        min(h, w) >= SMALLEST_FRAME,
-        f"frames must have at least {SMALLEST_FRAME} rows and columns, but they have {h} × {w} pixels.",
+        w >= FEWEST_COLUMNS,
+        f"frames must have at least {FEWEST_COLUMNS} columns, but they are {h} × {w} pixels; take a wider part.",
     )
     level = float(np.median(train.frames))
     require(
@@ -124,7 +144,9 @@ def load_reconstruction(folder: RunFolder) -> Reconstruction:
         ) from error
     plain = summary.get("backend") == "reference"  # then it is judged without compiled kernels, too
     found = read_object(folder.result()).on("reference" if plain else "cpu")
-    return Reconstruction(found, method, energy, oversample, timing, done)
+    told = bool(summary.get("material", {}).get("delta_told", True))
+    said = Verdict.from_dict(summary["verdict"]) if "verdict" in summary else None
+    return Reconstruction(found, method, energy, oversample, timing, done, Choice.read(summary), told, said)
 
 
 @dataclass
@@ -136,12 +158,16 @@ class _Run:
     folder: RunFolder | None
     on_progress: FitProgress
     timing: dict[str, float] = field(default_factory=dict)
+    asked: str = ""
+    why: str = ""
+    _keeper: Keeper = field(init=False)
     _saved: dict[str, Any] | None = None
     _config: dict[str, Any] = field(default_factory=dict)
 
     def begin(self, config: dict[str, Any], resume: bool) -> None:
         """Look at the folder, and at what of the run is there already; writes nothing."""
-        self._config = config
+        self._config, self.asked = config, self.method.kind
+        self._keeper = Keeper(self.task.scan, mixed=isinstance(self.method, Auto))
         if self.folder is None:
             return
         if not (resume and self.folder.config.is_file()):
@@ -149,27 +175,52 @@ class _Run:
             return
         _require_same(self.folder, config)
         self._saved = self.folder.load_checkpoint()
-        self.timing |= self._saved["timing"] if self._saved else {}
+        if self._saved:
+            self.timing |= self._saved["timing"]
+            self._keeper.load(self._saved["kept"])
+
+    def settle(self, matter: MatterKind | None) -> None:
+        """Decide on the kind of matter, and on the method where that is `auto`; or do as was decided before."""
+        began = time.perf_counter()
+        if self._saved and self.folder is not None:
+            before = self.folder.read_config()["decided"]
+            found = Settled.again(self.method, before["matter"], before["why"])
+        else:
+            found = settled(self.method, self.task, matter)
+            self.timing["decision"] = time.perf_counter() - began
+        self.method, self.why = found.method, found.why
+        self.task = replace(self.task, matter=found.matter)
+        self._config["decided"] = {"method": found.method.kind, "matter": found.matter, "why": found.why}
 
     def complete(self) -> Reconstruction:
         """Run what is left of the stages."""
         found: Stored | None = None
-        stages, first, fit = self.method.stages(), int(self._saved["stage"]) if self._saved else 0, None
+        stages, first = self.method.stages(), int(self._saved["stage"]) if self._saved else 0
+        last: Fit | None = None
         for number in range(first, len(stages)):
             stage, saved = stages[number], self._saved if number == first else None
             start = _restored(saved["start"]) if saved else self._started(stage, found)
             fit = stage.fit(self.task, start)
+            oversample = fit.model.instrument.oversample if fit else 0
+            if saved is None and start is not found and (number == 0 or fit is None):
+                self._keeper.look(stage.name if number else "start", start, oversample, fitted=False)
             if fit is None:
                 found = start
                 continue
+            last = fit
             journal = _Journal(fit, number, start, self)
             complete = journal.run(saved["fit"] if saved else None)
             self.timing[stage.name] = fit.seconds
             found = cast(Stored, finished(fit))
             if not complete:
                 return self._result(found, fit, False)
-        assert found is not None
-        return self._result(found, fit, True)
+            self._keeper.look(stage.name, found, oversample)
+        assert self._keeper.best is not None
+        return self._result(self._keeper.best.object, last, True)
+
+    def kept(self) -> dict[str, Any] | None:
+        """The best of the states so far, as a checkpoint holds it."""
+        return self._keeper.state_dict()
 
     def _started(self, stage: Stage, before: Stored | None) -> Stored:
         began = time.perf_counter()
@@ -192,16 +243,28 @@ class _Run:
 
     def _result(self, found: Stored, fit: Fit | None, complete: bool) -> Reconstruction:
         exposures = self.task.scan.exposures
-        oversample = fit.model.instrument.oversample if fit else fringe_sampling(exposures)
+        best = self._keeper.best if complete else None
+        samples = best.oversample if best else fit.model.instrument.oversample if fit else 0
+        oversample = samples or fringe_sampling(exposures)
         done = Reconstruction(
-            found, self.method.kind, exposures.reference_energy, oversample, dict(self.timing), complete
+            found,
+            self.asked,
+            exposures.reference_energy,
+            oversample,
+            dict(self.timing),
+            complete,
+            Choice(self.task.matter, self.why, dict(self._keeper.judged), best.name if best else ""),
+            self.task.delta_told,
+            judge_run(found, fit, self.task, oversample),
         )
         if self.folder is not None:
             self.make_folder(found.backend)
             if fit is None:
                 self.folder.start_metrics([])
             write_object(self.folder.object, found)
-            write_json(self.folder.summary, _summary(done, fit, self.task.scan))
+            if self.task.uneven is not None and self.task.uneven.background is not None:
+                write_light(self.folder.light, self.task.uneven.background)
+            write_json(self.folder.summary, _summary(done, fit, self.task.scan) | {"light": self.task.light_in_words})
         return done
 
 
@@ -251,7 +314,13 @@ class _Journal:
         folder.append_metrics(self._pending)
         self._pending = []
         start = {"kind": self._start.kind, "state": self._start.state()}
-        state = {"stage": self._number, "start": start, "fit": self._fit.state_dict(), "timing": self._run.timing}
+        state = {
+            "stage": self._number,
+            "start": start,
+            "fit": self._fit.state_dict(),
+            "timing": self._run.timing,
+            "kept": self._run.kept(),
+        }
         folder.save_checkpoint(state)
         self._last = time.perf_counter()
 
@@ -267,6 +336,7 @@ def _summary(done: Reconstruction, fit: Fit | None, train: Scan) -> dict[str, An
     return {
         "finished": done.finished,
         "method": done.method,
+        **done.choice.as_dict(),
         "kind": done.object.kind,
         "size": done.object.described,
         "backend": backend,
@@ -275,17 +345,27 @@ def _summary(done: Reconstruction, fit: Fit | None, train: Scan) -> dict[str, An
         "stopped_early": bool(fit and fit.stopped_early),
         "best_step": (fit.best_step or fit.step) if fit else 0,
         "oversample": done.oversample,
-        "detector": {"rows": h, "columns": w, "pixel_size_m": train.views.pixel_size},
+        "detector": {
+            **{"rows": h, "columns": w, "pixel_size_m": train.views.pixel_size},
+            "centre_m": Grid.of_views(train.views).centre.tolist(),
+        },
         "energy_kev": done.energy_kev,
-        "material": {"delta": matter.delta, "beta": matter.beta, "single": matter.single},
+        "material": {
+            "delta": matter.delta,
+            "beta": matter.beta,
+            "single": matter.single,
+            "delta_told": done.delta_told,
+        },
         "second_material": second,
         "timing_s": done.timing,
+        **({"verdict": done.verdict.as_dict()} if done.verdict else {}),
     }
 
 
 def _require_same(folder: RunFolder, config: dict[str, Any]) -> None:
     """`InputError` unless the run in `folder` was started with this `config`; another machine may go on with it."""
     old, same = folder.read_config(), json.loads(json.dumps(config))
+    old.setdefault("light", json.loads(json.dumps(to_table(LightOptions()))))
     version = old.get("schema_version", 1)
     require(
         version == SCHEMA,
@@ -308,11 +388,12 @@ def _without_backends(table: Any) -> None:
             _without_backends(inner)
 
 
-def _config(scan: Scan, prior: MaterialPrior, method: Method, seed: int) -> dict[str, Any]:
+def _config(scan: Scan, prior: MaterialPrior, method: Method, seed: int, matter: MatterKind | None) -> dict[str, Any]:
     return {
         "schema_version": SCHEMA,
         "method": to_table(method),
         "prior": prior.as_dict(),
+        "matter": matter or "auto",
         "seed": seed,
         "scan_hash": scan_hash(scan),
     }

@@ -25,6 +25,7 @@ class RunFolder:
         self.metrics = self.path / "metrics.csv"
         self.checkpoint = self.path / "checkpoint.pt"
         self.object = self.path / "object.h5"
+        self.light = self.path / "light.h5"
         self.summary = self.path / "summary.json"
         self.source = self.path / "source.json"
         self.report = self.path / "report.html"

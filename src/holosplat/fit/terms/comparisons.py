@@ -8,6 +8,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
+from ...metrics.correlation import shortest_side
 from ..fidelity import reference as plain
 
 
@@ -89,7 +90,7 @@ def two_levels(density: Tensor) -> Tensor:
 @lru_cache(maxsize=8)
 def _rings(h: int, w: int, device: torch.device) -> tuple[Tensor, int]:
     """Ring index of each Fourier sample (0: the mean and beyond Nyquist), and the number of rings."""
-    shortest = min(h, w)  # a ring is one frequency step of the shorter side wide, as in metrics.correlation
+    shortest = int(shortest_side((h, w), (1.0, 1.0)))  # a ring is one frequency step of it wide
     fy, fx = (torch.fft.fftfreq(n, dtype=torch.float64) * shortest for n in (h, w))
     ring = torch.floor(torch.sqrt(fy[:, None] ** 2 + fx[None] ** 2) + (0.5 + 1e-9)).long().flatten()
     count = shortest // 2

@@ -10,6 +10,7 @@ from ...checks import require
 from ...matter import Matter
 from ...model import Instrument
 from ...optics.noise import noise_level
+from ...optics.retrieval.spectra import sensitivity
 from ...scan import Exposures, Scan
 from ...units import wavelength, wavenumber
 
@@ -20,23 +21,27 @@ NOISE_FLOOR = 5.0
 
 
 class SpectralMisfit:
-    """½ Σ (r, W r) over the pixels of each view, with `r = (√I - √I₀) / (k p δ)` and I from the full wave model.
+    """½ Σ (r, W r) over the pixels of each view, with `r = (√I - √I₀) / (k p δ s)` and I from the full wave model.
 
     Amplitudes √I have the same noise everywhere (Godard et al. 2012, eq. 9). A pixel of thickness p of the material
-    changes them by up to k p δ, so r is a thickness in pixels; δ, β: of the first material of `matter`. W divides the
-    spectrum by `H² + f²`: H = sin χ + (β/δ) cos χ is the linear response of single views (Cloetens et al. 1999, eq. 3;
-    χ = πλz f²) up to its first maximum, and 1 beyond. Without W, shapes larger than some fringes hardly count. The
-    smaller f, the larger the shapes that are fitted, and the more of the noise: f is `floor` and more where frames are
-    noisy. Errors: `InputError` for matter whose δ is not positive.
+    changes them by up to k p δ s, so r is a thickness in pixels; δ, β: of the first material of `matter`; s: 1 where
+    fringes are seen, else less (`optics.retrieval.spectra.sensitivity`). W divides the spectrum by `H² + f²`: H s =
+    sin χ + (β/δ) cos χ is the linear response of single views (Cloetens et al. 1999, eq. 3; χ = πλz f²) up to its first
+    maximum, and H = 1/s beyond. Without W, shapes larger than some fringes hardly count. The smaller f, the larger the
+    shapes that are fitted, and the more of the noise: f is `floor` and more where frames are noisy. Errors:
+    `InputError` for matter whose δ is not positive.
     """
 
     def __init__(self, train: Scan, instrument: Instrument, matter: Matter, floor: float) -> None:
         require(matter.delta > 0, f"a spectral misfit needs a material with δ > 0, but δ is {matter.delta:g}.")
         on, exposures = instrument.device, train.exposures
-        unit = wavenumber(exposures.energy_kev) * exposures.refraction(matter.delta, 0.0)[0] * train.views.pixel_size
+        ratio = matter.beta / matter.delta
+        strongest = sensitivity(exposures, ratio)
+        phase = wavenumber(exposures.energy_kev) * exposures.refraction(matter.delta, 0.0)[0] * train.views.pixel_size
+        unit = phase * strongest
         self._unit = torch.from_numpy(unit).float()[:, None, None].to(on)
         self._amplitudes = torch.from_numpy(train.frames).clamp_min(0).sqrt().to(on)
-        response = linear_response(exposures, matter.beta / matter.delta)
+        response = linear_response(exposures, ratio) / torch.from_numpy(strongest)[:, None, None]
         self.noise = noise_level(self._amplitudes) / float(unit.mean())
         """Standard deviation of r that the noise of the measured frames gives [pixels of thickness]."""
         self.floor = floor + NOISE_FLOOR * self.noise

@@ -54,14 +54,14 @@ def method_called(name: str) -> Method:
 def chosen_method(
     method: str | None, preset_name: str | None, config: Path | None, changes: Sequence[str] = ()
 ) -> Method:
-    """The method that one of the three names (a method, a preset, or a file; Gaussians without any), then changed.
+    """The method that one of the three names (a method, a preset, or a file; `auto` without any), then changed.
 
     changes: assignments `PATH=VALUE` of single fields, as `tables.overridden` has them.
     """
     if config is not None:
         found = read_method(config)
     else:
-        found = method_called(method) if method is not None else preset(preset_name or DEFAULT)
+        found = preset(preset_name) if preset_name is not None else method_called(method or "auto")
     return overridden(found, changes)
 
 

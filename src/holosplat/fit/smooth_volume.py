@@ -1,0 +1,258 @@
+"""The likeliest volume of continuous matter: whitened frames, a prior on slopes and values, and how it is found."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool3d, avg_pool3d, interpolate
+
+from ..checks import at_least, require
+from ..geometry import Grid, Views
+from ..projectors.voxels import projector_for
+from .whitened import WhitenedFrames
+
+MEMORY = 6
+"""Pairs of steps and changes of the gradient that L-BFGS remembers."""
+SUFFICIENT, SHRINK, TRIALS = 1e-4, 0.3, 12
+"""Armijo's condition: the share of the expected decrease that a step must give, what is left of one that does not, and
+after how many trials the iteration ends."""
+REFRESH = 10
+"""Iterations after which the preconditioner is made anew."""
+MATTER = 0.05
+"""Share of the largest value above which a voxel counts as matter for the preconditioner."""
+SPREAD = 0.5
+"""Standard deviation expected of each of the shares by which a volume is modulated."""
+HALVINGS = 4
+"""How often a modulation is halved at most until it lowers the misfit."""
+
+
+@dataclass(frozen=True)
+class ContinuousPrior:
+    """What is expected of continuous matter: `a Σ log(1 + (√(|∇u|² + ε²) - ε) / b) + m Σ log(1 + u / v)`.
+
+    Slopes of few voxels are large, those of most are next to nothing, and most of space is empty: logarithms, as of
+    power laws, hardly shrink what is large, where total variation takes from every edge in proportion to its height
+    (Nikolova 2005). As the misfit is in units of the noise, a and m have no unit, and hold for every noise.
+    """
+
+    slopes: float = 0.4
+    """a: exponent of the power law of slopes."""
+    slope: float = 0.02
+    """b: slope from one voxel to the next beyond which the law holds, as a share of the matter's level."""
+    rounding: float = 0.02
+    """ε: slopes below which the prior is a square, as a share of the level."""
+    values: float = 0.02
+    """m: exponent of the power law of values."""
+    value: float = 0.05
+    """v: value beyond which the law holds, as a share of the level."""
+
+    def __post_init__(self) -> None:
+        at_least(self, 0, "slopes", "values")
+        for name in ("slope", "rounding", "value"):
+            given = getattr(self, name)
+            require(given > 0, f"{name} must be positive, but it is {given}.")
+
+    def on_larger_voxels(self, factor: int) -> ContinuousPrior:
+        """The prior on voxels `factor` times larger: slopes are as much steeper, and every voxel stands for more."""
+        return ContinuousPrior(
+            self.slopes * factor, self.slope * factor, self.rounding * factor, self.values * factor**2, self.value
+        )
+
+
+class VolumeProblem:
+    """½ χ² of the frames and the prior of a volume u [Z, Y, X] ≥ 0 of one material's occupancy, on voxels of a pixel.
+
+    level: what u is about in matter, the unit of the prior's slopes and values.
+    """
+
+    def __init__(self, frames: WhitenedFrames, prior: ContinuousPrior, level: float, backend: str = "cpu") -> None:
+        require(level > 0, f"the level of the matter must be positive, but it is {level:g}.")
+        self.frames, self.prior, self.level = frames, prior, level
+        views = frames.train.views
+        pixels = Views(views.rotations, views.shifts / views.pixel_size, views.shape, 1.0)
+        self.grid = Grid.of_views(pixels)
+        self._projector = projector_for(self.grid, pixels, backend)
+        self._symbol = self._data_symbol()
+        frequencies = [torch.fft.fftfreq(n) for n in self.grid.shape[:2]] + [torch.fft.rfftfreq(self.grid.shape[2])]
+        z, y, x = (4 * torch.sin(math.pi * f).square() for f in frequencies)
+        self._laplacian = z[:, None, None] + y[:, None] + x
+
+    def lines(self, u: Tensor) -> Tensor:
+        """Line integrals [V, H, W] in pixels of path length."""
+        return self._projector.lines_out(self._projector.project(self._projector.volume_in(u)))
+
+    def backprojection(self, lines: Tensor) -> Tensor:
+        """The adjoint of `lines`."""
+        return self._projector.volume_out(self._projector.backproject(self._projector.lines_in(lines.contiguous())))
+
+    def __call__(self, u: Tensor) -> tuple[float, Tensor]:
+        """The objective and its gradient [Z, Y, X]."""
+        misfit = self.frames(self.lines(u))
+        gradient = self.backprojection(misfit.gradient)
+        return misfit.value + self.penalty(u, gradient), gradient
+
+    def penalty(self, u: Tensor, gradient: Tensor) -> float:
+        """The prior of u; its gradient is added to `gradient`."""
+        prior, level = self.prior, self.level
+        b, epsilon, v = prior.slope * level, prior.rounding * level, prior.value * level
+        size = _slopes(u, epsilon)
+        value = prior.slopes * float(((size - epsilon) / b).log1p().double().sum())
+        value += prior.values * float((u / v).log1p().double().sum())
+        pull = prior.slopes / ((b - epsilon + size) * size)
+        for axis in range(3):
+            flow = pull.narrow(axis, 0, u.shape[axis] - 1) * u.diff(dim=axis)
+            gradient.narrow(axis, 1, u.shape[axis] - 1).add_(flow)
+            gradient.narrow(axis, 0, u.shape[axis] - 1).sub_(flow)
+        gradient.add_(prior.values / (v + u))
+        return value
+
+    def preconditioner(self, u: Tensor) -> Callable[[Tensor], Tensor]:
+        """About the inverse of the second derivative at u: by spatial frequency, of the data and of mean slopes."""
+        b, epsilon = self.prior.slope * self.level, self.prior.rounding * self.level
+        size = _slopes(u, epsilon)
+        pull = self.prior.slopes / ((b - epsilon + size) * size)
+        matter = u > MATTER * u.max()
+        mean = float(pull[matter].mean()) if bool(matter.any()) else float(pull.mean())
+        least = 1e-4 * mean + 1e-6 * float(self._symbol.max())
+        inverse = 1 / (self._symbol + mean * self._laplacian + least)
+
+        def applied(gradient: Tensor) -> Tensor:
+            return torch.fft.irfftn(torch.fft.rfftn(gradient) * inverse, s=gradient.shape)
+
+        return applied
+
+    def _data_symbol(self) -> Tensor:
+        """Spectrum of the response of the data's second derivative to one full voxel in the middle."""
+        impulse, middle = torch.zeros(self.grid.shape), [n // 2 for n in self.grid.shape]
+        impulse[tuple(middle)] = 1.0
+        lines, shape = self.lines(impulse), self.frames.shape
+        curved = torch.fft.irfft2(torch.fft.rfft2(lines) * self.frames.curvature(), s=shape)
+        answer = torch.roll(self.backprojection(curved), [-m for m in middle], (0, 1, 2))
+        return torch.fft.rfftn(answer).real.clamp_min(0)
+
+
+def _slopes(u: Tensor, epsilon: float) -> Tensor:
+    """√(|∇u|² + ε²) by forward differences."""
+    square = torch.full_like(u, epsilon**2)
+    for axis in range(3):
+        square.narrow(axis, 0, u.shape[axis] - 1).add_(u.diff(dim=axis).square_())
+    return square.sqrt_()
+
+
+def descend(
+    problem: VolumeProblem, start: Tensor, iterations: int, on_progress: Callable[[float], None] = lambda f: None
+) -> tuple[Tensor, list[float]]:
+    """`iterations` of projected L-BFGS from `start` [Z, Y, X]; the volume, and the objective before and after each.
+
+    Voxels at zero that the gradient would keep there are fixed, and the others take a step of L-BFGS among themselves,
+    cut off at zero (two-metric projection: Bertsekas 1982; Nocedal & Wright 2006, algorithm 7.4, for the step, with the
+    problem's preconditioner as first inverse). The objective never rises.
+    """
+    u = start.clamp_min(0)
+    value, gradient = problem(u)
+    values, pairs = [value], list[tuple[Tensor, Tensor]]()
+    inverse = problem.preconditioner(u)
+    for done in range(iterations):
+        on_progress(done / iterations)
+        if done and done % REFRESH == 0:
+            inverse = problem.preconditioner(u)
+        free = ((u > 0) | (gradient < 0)).to(u)
+        direction = _direction(gradient, free, pairs, inverse)
+        found = _searched(problem, u, value, gradient, direction)
+        if found is None and pairs:
+            pairs.clear()
+            found = _searched(problem, u, value, gradient, _direction(gradient, free, pairs, inverse))
+        if found is None:
+            break
+        moved, value, slope = found
+        step, change = moved - u, slope - gradient
+        if float((step * change).sum()) > 0:
+            pairs = [*pairs[1 - MEMORY :], (step, change)]
+        u, gradient = moved, slope
+        values.append(value)
+    return u, values
+
+
+def _direction(
+    gradient: Tensor, free: Tensor, pairs: list[tuple[Tensor, Tensor]], inverse: Callable[[Tensor], Tensor]
+) -> Tensor:
+    """Minus the inverse second derivative, as L-BFGS knows it, times the gradient, among the free voxels."""
+    left, used = gradient * free, list[tuple[Tensor, Tensor, float, float]]()
+    for step, change in reversed(pairs):
+        s, y = step * free, change * free
+        curved = float((s * y).sum())
+        if curved > 1e-10 * float(s.norm() * y.norm()):
+            share = float((s * left).sum()) / curved
+            left = left - share * y
+            used.append((s, y, curved, share))
+    result = inverse(left) * free
+    if used:
+        _, y, curved, _ = used[0]
+        result *= curved / float((y * inverse(y)).sum())
+    for s, y, curved, share in reversed(used):
+        result = result + (share - float((y * result).sum()) / curved) * s
+    return -result if float((result * gradient).sum()) > 0 else -(inverse(gradient * free) * free)
+
+
+def _searched(
+    problem: VolumeProblem, u: Tensor, value: float, gradient: Tensor, direction: Tensor
+) -> tuple[Tensor, float, Tensor] | None:
+    """The first point of a shrinking series along the projected `direction` that lowers the objective enough."""
+    length = 1.0
+    for _ in range(TRIALS):
+        moved = (u + length * direction).clamp_min(0)
+        found, slope = problem(moved)
+        if found <= value + SUFFICIENT * min(0.0, float((gradient * (moved - u)).sum())):
+            return moved, found, slope
+        length *= SHRINK
+    return None
+
+
+def modulations(u: Tensor, level: float) -> list[Tensor]:
+    """Changes [Z, Y, X] that noise hides and a prior distorts: of all matter, of a side of it, of dense against faint
+    matter, and of a halo about it."""
+    sides = [u]
+    for axis in range(3):
+        n = u.shape[axis]
+        wave = torch.cos(math.pi * (torch.arange(n) + 0.5) / n)
+        sides.append(u * wave.reshape([-1 if a == axis else 1 for a in range(3)]))
+    return [*sides, u * (u / level - 1), _halo(u, 8), _halo(u, 4)]
+
+
+def _halo(u: Tensor, parts: int) -> Tensor:
+    """u as a volume of about `parts` cells along its longest edge shows it."""
+    edge = max(1, max(u.shape) // parts)
+    z, y, x = (max(1, round(n / edge)) for n in u.shape)
+    coarse = adaptive_avg_pool3d(u[None, None], (z, y, x))
+    coarse = avg_pool3d(coarse, 3, stride=1, padding=1, count_include_pad=False) if min(z, y, x) > 2 else coarse
+    return interpolate(coarse, size=u.shape, mode="trilinear", align_corners=False)[0, 0]
+
+
+def shares_of(problem: VolumeProblem, u: Tensor, changes: list[Tensor]) -> tuple[Tensor, Tensor]:
+    """The shares [K] of K changes that the frames of a volume u ask for, and their covariance [K, K], float64."""
+    matrix, right = problem.frames.normal_equations(problem.lines(u), [problem.lines(change) for change in changes])
+    covariance = torch.linalg.inv(matrix + torch.eye(len(right), dtype=right.dtype) / SPREAD**2)
+    return covariance @ right, covariance
+
+
+def modulated(problem: VolumeProblem, u: Tensor) -> Tensor:
+    """u with the `modulations` that its frames ask for: least squares of their misfit, without the prior.
+
+    A prior takes a share of all matter, and from what is faint most; of these few numbers the frames know enough. Each
+    is expected to be within `SPREAD`. The change is halved until the misfit falls, or left out.
+    """
+    changes = modulations(u, problem.level)
+    lines = problem.lines(u)
+    shares, _ = shares_of(problem, u, changes)
+    change = torch.stack([float(s) * c for s, c in zip(shares, changes)]).sum(dim=0)
+    before = problem.frames(lines).value
+    for _ in range(HALVINGS):
+        moved = (u + change).clamp_min(0)
+        if problem.frames(problem.lines(moved)).value < before:
+            return moved
+        change = change / 2
+    return u

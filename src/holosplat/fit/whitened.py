@@ -1,0 +1,167 @@
+"""How far predicted frames are from measured ones in units of their noise, as a function of line integrals."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+from ..matter import DeltaBeta
+from ..model import Instrument, LightField
+from ..optics.noise_model import NoiseModel
+from ..optics.retrieval.spectra import Raster, response, squared_frequency
+from ..optics.sampling import fringe_sampling
+from ..scan import Scan
+from ..units import wavelength, wavenumber
+from ..volume import LineIntegrals
+
+DARKEST = 1e-3
+"""Least intensity under a root, whose slope would have no bound."""
+FAINTEST = 1e-12
+"""Power of noise [relative intensity squared] assumed at least, of frames without contrast."""
+LEAKED = 0.002
+"""Part of the whole contrast of frames that sampled matter leaves unexplained at every spatial frequency."""
+LITTLE = 0.02
+"""Step of the derivative along a change of the line integrals, as a share of that change."""
+
+
+@dataclass(frozen=True)
+class Misfit:
+    """Value and gradient of a whitened misfit: value: ½ χ²; gradient [V, H, W]: by the line integrals in pixels."""
+
+    value: float
+    gradient: Tensor
+
+
+class WhitenedFrames:
+    """½ Σ |F[√I - √I₀]|² / P over all frames: the negative logarithm of their likelihood, I from the full wave optics.
+
+    Amplitudes √I have the same noise everywhere (Godard et al. 2012, eq. 9), half that of the intensity near one; P is
+    its power by `NoiseModel`, at each spatial frequency, with the part of the contrast that sampled matter cannot
+    explain (`model_error`) beside it, or frames without noise would be trusted without end. F is the unitary `rfft2`.
+    The unknowns are line integrals [V, H, W] of one material's occupancy, in pixels of path length.
+
+    train: the frames; material: δ > 0 and β of an occupancy of one; noise: their noise; light: a factor of each frame,
+    None for even light; voxel_px: edge of the voxels that the lines come from [pixels].
+    """
+
+    def __init__(
+        self, train: Scan, material: DeltaBeta, noise: NoiseModel, light: LightField | None = None, backend: str = "cpu"
+    ) -> None:
+        exposures = train.exposures
+        self.train, self.material = train, material
+        self.instrument = Instrument(exposures, fringe_sampling(exposures), backend=backend)
+        self.shape, self.pixel = (train.views.shape[0], train.views.shape[1]), train.views.pixel_size
+        frames = torch.from_numpy(train.frames)
+        self._amplitudes = frames.clamp_min(0).sqrt()
+        self._light = None if light is None else light.factor().detach()
+        power = noise.power()
+        error = model_error(frames, power)
+        self.power = (0.25 * (power + error + FAINTEST)).float()
+        """P [V, H, W//2 + 1], of amplitudes."""
+        self._sharp = self._sharpening()
+
+    @property
+    def count(self) -> int:
+        """How many pixels all frames have."""
+        return self._amplitudes.numel()
+
+    def curvature(self) -> Tensor:
+        """About the second derivative [V, H, W//2 + 1] by the line integrals, at each spatial frequency of `rfft2`.
+
+        That of a thin object, `(k δ p H / 2)² / P`, and of a shift of the image by a slow change of the phase, a prism:
+        `δI = (λz/2π) ∇δφ · ∇I` (from the transport of intensity, Teague 1983).
+        """
+        exposures, p = self.train.exposures, self.pixel
+        raster = Raster(self.shape, p)
+        h = response(exposures, self.material.beta / self.material.delta, raster)
+        delta = exposures.refraction(self.material.delta, 0.0)[0]
+        unit = torch.from_numpy(wavenumber(exposures.energy_kev) * delta * p)[:, None, None]
+        frames = torch.from_numpy(self.train.frames).double()
+        slope2 = torch.zeros(len(frames), dtype=torch.float64)
+        for axis in (1, 2):
+            if frames.shape[axis] > 1:
+                slope2 += frames.diff(dim=axis).square().mean(dim=(1, 2)) / p**2
+        reach = torch.from_numpy(wavelength(exposures.energy_kev) * exposures.distance)
+        shift = (reach.square() * slope2)[:, None, None] * squared_frequency(raster)
+        return (unit.square() * 0.25 * (h.square() + shift)).float() / self.power
+
+    def amplitudes(self, lines: Tensor) -> Tensor:
+        """√I [V, H, W] of line integrals [V, H, W] in pixels of path length; differentiable."""
+        (my, mx), s = self.instrument.margin, self.instrument.oversample
+        padded = pad(lines, (mx, mx, my, my)) * self.pixel
+        h, w = padded.shape[-2:]
+        spectrum = torch.fft.rfft2(padded) * self._sharp
+        if s > 1:
+            half, columns = (h + 1) // 2, w // 2 + 1
+            fine = spectrum.new_zeros(len(spectrum), h * s, w * s // 2 + 1)
+            fine[:, :half, :columns] = spectrum[:, :half]
+            fine[:, h * s - (h - half) :, :columns] = spectrum[:, half:]
+            if w % 2 == 0:
+                fine[:, :, w // 2] *= 0.5  # the highest frequency stands for both signs
+            spectrum = fine * s**2
+        waves = torch.fft.irfft2(spectrum, s=(h * s, w * s))
+        frames = self.instrument.frames(LineIntegrals(waves[:, None], (self.material,)))
+        frames = frames if self._light is None else frames * self._light
+        return frames.clamp_min(DARKEST).sqrt()
+
+    def __call__(self, lines: Tensor) -> Misfit:
+        """Misfit of line integrals [V, H, W] and its gradient."""
+        at = lines.detach().requires_grad_()
+        difference = self.amplitudes(at) - self._amplitudes
+        weighted = self.whitened(difference.detach())
+        (gradient,) = torch.autograd.grad((difference * weighted).sum(), at)
+        return Misfit(0.5 * float((difference.detach().double() * weighted).sum()), gradient)
+
+    def whitened(self, images: Tensor) -> Tensor:
+        """Images [V, H, W] with their spectra over P."""
+        return torch.fft.irfft2(torch.fft.rfft2(images) / self.power, s=self.shape)
+
+    def normal_equations(self, lines: Tensor, changes: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """`Jᵀ P⁻¹ J` [K, K] and `-gradient` [K], float64, along K changes [V, H, W] of the line integrals."""
+        with torch.no_grad():
+            now = self.amplitudes(lines)
+            slopes = [(self.amplitudes(lines + LITTLE * change) - now) / LITTLE for change in changes]
+        weighted = [self.whitened(slope).double().flatten() for slope in slopes]
+        missing = (self._amplitudes - now).double().flatten()
+        matrix = torch.stack([torch.stack([s.double().flatten() @ w for w in weighted]) for s in slopes])
+        return 0.5 * (matrix + matrix.T), torch.stack([w @ missing for w in weighted])
+
+    def _sharpening(self) -> Tensor:
+        """Factors [H', W'//2 + 1] of the padded lines' spectra that undo the blur of projected voxels.
+
+        Projectors give means over pixels of the shadows of voxels (twice a box where the projector integrates over
+        both, once along an axis whose rows match); waves are wanted as samples of what voxels are the means of once, or
+        of matter itself where the waves have finer samples, for the detector integrates over its pixels then.
+        """
+        (my, mx), s = self.instrument.margin, self.instrument.oversample
+        h, w = (n + 2 * m for n, m in zip(self.shape, (my, mx)))
+        fy, fx = torch.fft.fftfreq(h)[:, None], torch.fft.rfftfreq(w)
+        across = 1 if s == 1 else 2
+        along = across - 1 if self.train.views.shares_axis else across
+        offset = 0.5 * (s - 1) / s
+        turn = torch.exp(-2j * math.pi * offset * (fx + fy))
+        return turn / (torch.sinc(fx) ** across * torch.sinc(fy) ** along)
+
+
+def model_error(frames: Tensor, noise: Tensor) -> Tensor:
+    """Power [H, W//2 + 1] of what no sampled matter explains of frames [V, H, W], float64.
+
+    Of the contrast at a frequency f, by its mean over rings and views beyond the `noise` [V, H, W//2 + 1], it is the
+    part `1 - sinc f` that a box of one pixel takes away: so much voxels, strips and samples of waves leave in doubt.
+    Optics mixes frequencies, so that `LEAKED` of the whole contrast joins at all of them.
+    """
+    power = torch.fft.rfft2(frames.double() - 1, norm="ortho").abs().square()
+    h, w = frames.shape[1:]
+    radius = torch.hypot(torch.fft.fftfreq(h)[:, None].double(), torch.fft.rfftfreq(w).double())
+    steps = max(4, min(h, w) // 4)
+    ring = (radius * 2 * steps).round().long().clamp_max(steps).flatten()
+    signal = (power - noise).mean(dim=0).flatten()
+    means = torch.zeros(steps + 1, dtype=torch.float64).index_add(0, ring, signal)
+    means = (means / torch.bincount(ring, minlength=steps + 1).clamp_min(1)).clamp_min(0)
+    whole = float((power - noise).mean().clamp_min(0))
+    blurred = 1 - torch.sinc(radius)
+    return blurred.square() * means[ring].reshape(power.shape[1:]) + LEAKED**2 * whole

@@ -1,0 +1,121 @@
+"""The method that `reconstruct` takes by default: what suits the matter, by views that are set aside for a moment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+from ..checks import InputError
+from ..fit.loop import Fit
+from ..matter import MatterKind
+from ..representations import GaussianCloud, Stored, SurfaceMesh
+from .cross_validation import CrossValidation, MissingMatter
+from .gaussian_options import Backend
+from .gaussians import Gaussians
+from .levels import Decision, LevelTest
+from .method import Method, Stage, Task, solve_stages
+from .start import assumed_material
+from .surfaces import SurfaceOptions, SurfaceStage
+from .volume import SmoothVolume
+
+TRIAL = "trial of methods"
+
+
+@dataclass(frozen=True)
+class Auto:
+    """Matter with levels: Gaussians, and closed surfaces where there are bodies. Continuous matter: a smooth volume.
+
+    Where neither frames nor knowledge say which it is, both are tried on coarse frames without some of the views, and
+    what foretells these better is taken.
+    """
+
+    kind: ClassVar[str] = "auto"
+
+    gaussians: Gaussians = field(default_factory=Gaussians)
+    surfaces: SurfaceOptions = field(default_factory=SurfaceOptions)
+    volume: SmoothVolume = field(default_factory=SmoothVolume)
+    levels: LevelTest = field(default_factory=LevelTest)
+    """How it is decided whether matter has levels."""
+    trials: CrossValidation = field(default_factory=CrossValidation)
+    """How views are set aside for trials."""
+
+    def stages(self) -> Sequence[Stage]:
+        """Those for matter with levels; `chosen` decides."""
+        return self.suited("levels").stages()
+
+    def suited(self, matter: MatterKind) -> Method:
+        """What is done with a kind of matter."""
+        return self.volume if matter == "continuous" else Bodies(self.gaussians, self.surfaces)
+
+    def chosen(self, task: Task, decision: Decision) -> tuple[Method, Decision]:
+        """The method for `task`, of whose matter there is a `decision`; and that, if a trial has changed it."""
+        if not decision.sure and task.prior.kind != "known":
+            decision = self._tried(task, decision)
+        return self.suited(decision.matter), decision
+
+    def _tried(self, task: Task, decision: Decision) -> Decision:
+        """The decision by a trial; as it was where there are too few views for one."""
+        split = self.trials.split(task.scan)
+        if split is None:
+            return decision
+        seen, aside = split
+        judge = MissingMatter(aside, assumed_material(seen, task.prior, task.on_progress))
+        shares = dict[MatterKind, float]()
+        candidates: dict[MatterKind, Method] = {"levels": self.gaussians, "continuous": self.volume}
+        for matter, method in candidates.items():
+            task.on_progress(f"{TRIAL}: {method.kind}", 0.0)
+            shares[matter] = judge.share(solve_stages(method, replace(task, scan=seen, lit=None, matter=matter)))
+        best = min(shares, key=lambda matter: shares[matter])
+        left = " and ".join(f"{candidates[m].kind} leave {100 * share:.2g} %" for m, share in shares.items())
+        return Decision(best, f"{decision.why}; in a trial, {left} of the matter in views set aside unexplained")
+
+    def on_backend(self, backend: Backend) -> Auto:
+        """The same method whose Gaussians are computed by `backend`."""
+        plain = self.levels.on_backend("reference" if backend == "reference" else "cpu")
+        return replace(self, gaussians=self.gaussians.on_backend(backend), levels=plain)
+
+    def with_effort(self, effort: float) -> Auto:
+        """The same method with `effort` times the steps, at least one."""
+        schedule = self.surfaces.fit.schedule
+        fewer = replace(schedule, steps=max(1, round(effort * schedule.steps)))
+        surfaces = replace(self.surfaces, fit=replace(self.surfaces.fit, schedule=fewer))
+        return replace(
+            self,
+            gaussians=self.gaussians.with_effort(effort),
+            surfaces=surfaces,
+            volume=self.volume.with_effort(effort),
+        )
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """Gaussians, and surfaces where these enclose bodies of one material."""
+
+    kind: ClassVar[str] = "bodies"
+
+    gaussians: Gaussians
+    surfaces: SurfaceOptions
+
+    def stages(self) -> Sequence[Stage]:
+        """Those of the Gaussians, and the surfaces."""
+        return (*self.gaussians.stages(), SurfacesWhereClosed(self.surfaces))
+
+
+@dataclass(frozen=True)
+class SurfacesWhereClosed(SurfaceStage):
+    """Surfaces of one material of known level; where there are none, what came before stays as it is."""
+
+    def start(self, task: Task, before: Stored | None) -> Stored:  # type: ignore[override]
+        """The surfaces cut out of Gaussians, or these."""
+        assert isinstance(before, GaussianCloud)
+        if not (before.matter.single and task.bounded):
+            return before
+        try:
+            return super().start(task, before)
+        except InputError:  # no surface anywhere
+            return before
+
+    def fit(self, task: Task, start: Stored) -> Fit | None:  # type: ignore[override]
+        """The fit of the surfaces; None for Gaussians."""
+        return super().fit(task, start) if isinstance(start, SurfaceMesh) else None

@@ -1,0 +1,84 @@
+"""Views that are set aside for a moment: how well something foretells them decides what suits the matter."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..baselines.holographic_tv import Correction
+from ..checks import at_least
+from ..matter import DeltaBeta
+from ..model import Instrument, Model
+from ..optics.sampling import fringe_sampling
+from ..scan import Scan
+from ..volume import Object
+
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """How views are set aside."""
+
+    width: int = 80
+    """Frames are binned to about so many pixels at most, on which a trial takes seconds."""
+    views: int = 2
+    """Views set aside, of which the first third at most: what is left must still show the matter."""
+
+    def __post_init__(self) -> None:
+        at_least(self, 16, "width")
+        at_least(self, 1, "views")
+
+    def split(self, scan: Scan) -> tuple[Scan, Scan] | None:
+        """Binned frames of `scan` that are left, and those set aside; None with fewer than three frames."""
+        count = min(self.views, len(scan) // 3)
+        if count == 0:
+            return None
+        coarse = scan.binned(max(1, math.ceil(max(scan.views.shape) / self.width)))
+        aside = np.zeros(len(scan), dtype=bool)
+        aside[((np.arange(count) + 0.5) * len(scan) / count).astype(int)] = True
+        return coarse[np.flatnonzero(~aside)], coarse[np.flatnonzero(aside)]
+
+
+class MissingMatter:
+    """What is missing from the frames of a scan, as thickness of a material: the judge of whole volumes.
+
+    A residual of intensity is turned into the thickness that would explain it, by Wiener's inverse of each view for
+    its noise (`Correction`). So low frequencies, which hardly change a hologram, count by the matter that they stand
+    for, and those that noise hides do not count at all.
+    """
+
+    def __init__(self, scan: Scan, material: DeltaBeta) -> None:
+        self.scan = scan
+        self.measured = torch.from_numpy(scan.frames)
+        self._correction = Correction(scan, material)
+        self.whole = self.of(self.measured - 1)
+        """Mean square of all matter in the frames [m²]."""
+
+    def predicted(self, obj: Object, oversample: int = 0) -> Tensor:
+        """Frames [V, H, W] of `obj`, view by view to bound memory.
+
+        oversample: wave samples a pixel (0: as the first fringe needs).
+        """
+        exposures, samples = self.scan.exposures, oversample or fringe_sampling(self.scan.exposures)
+        backend = getattr(obj, "backend", "cpu")
+        one = (Instrument(exposures[[i]], samples, backend=backend) for i in range(len(exposures)))
+        with torch.no_grad():
+            return torch.cat([Model(obj, instrument).frames().cpu() for instrument in one])
+
+    def of(self, residual: Tensor) -> float:
+        """Mean square [m²] of the thickness that explains residuals [V, H, W] of intensity."""
+        return float(self._correction(residual).double().square().mean())
+
+    def share(self, obj: Object) -> float:
+        """Root of the part of all matter that `obj` leaves unexplained: 0 for a perfect object, about 1 for none."""
+        return self.shares(obj)[0]
+
+    def shares(self, obj: Object, oversample: int = 0) -> tuple[float, float]:
+        """The same of matter, and of the contrast of the frames. oversample: as for `predicted`."""
+        left, least = self.measured - self.predicted(obj, oversample), np.finfo(float).tiny
+        contrast = float((self.measured - 1).double().square().mean())
+        intensity = float(left.double().square().mean()) / max(contrast, least)
+        return math.sqrt(self.of(left) / max(self.whole, least)), math.sqrt(intensity)

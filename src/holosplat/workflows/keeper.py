@@ -1,0 +1,118 @@
+"""The best state of a run: what a stage ends with must explain the frames better than what came before."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+from ..matter import DeltaBeta, MatterKind
+from ..methods.cross_validation import MissingMatter
+from ..representations import KINDS, Stored
+from ..scan import Scan
+
+CLEARLY = 0.95
+"""An earlier state is kept if it leaves less than this part of the matter that a later one leaves unexplained, and no
+more of the contrast: differences in fitted frames may also be noise."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What was decided in a run.
+
+    matter: of which kind it was taken to be; why: in words; judged: share of all matter that each state leaves
+    unexplained in the training frames, by its name; kept: the name of the state that is the result, empty where the run
+    was interrupted
+    """
+
+    matter: MatterKind = "levels"
+    why: str = ""
+    judged: Mapping[str, float] = field(default_factory=dict)
+    kept: str = ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Entries of summary.json; `read` reads them."""
+        decided = {"matter": self.matter, "why": self.why}
+        return {"decided": decided, "kept": self.kept, "unexplained": dict(self.judged)}
+
+    @classmethod
+    def read(cls, summary: Mapping[str, Any]) -> Choice:
+        """What a summary.json says of it; that of older versions says nothing."""
+        decided = summary.get("decided", {})
+        matter: MatterKind = "continuous" if decided.get("matter") == "continuous" else "levels"
+        return cls(matter, str(decided.get("why", "")), summary.get("unexplained", {}), str(summary.get("kept", "")))
+
+    def lines(self) -> list[str]:
+        """The same as a few lines of text."""
+        lines = [f"matter: {self.matter} ({self.why})"] if self.why else []
+        if self.kept and len(self.judged) > 1:
+            shares = ", ".join(f"{name} {100 * share:.2g} %" for name, share in self.judged.items())
+            lines.append(f"kept: {self.kept} (matter that training frames leave unexplained: {shares})")
+        return lines
+
+
+@dataclass(frozen=True)
+class State:
+    """name: of the stage that made it, or `start`; object: what it made; oversample: wave samples a pixel; share: of
+    all matter that it leaves unexplained in the training frames; contrast: the same of their contrast."""
+
+    name: str
+    object: Stored
+    oversample: int
+    share: float
+    contrast: float
+
+
+@dataclass
+class Keeper:
+    """Looks at the states of a run on its training frames, and keeps the best one (see `MissingMatter`).
+
+    mixed: whether states of different kinds of Objects compete; else those of another kind than the latest are out, for
+    who asks for surfaces wants surfaces
+    """
+
+    train: Scan
+    mixed: bool = False
+    best: State | None = None
+    judged: dict[str, float] = field(default_factory=dict)
+    """Share of all matter that each state leaves unexplained, by its name."""
+    _judge: MissingMatter | None = None
+
+    def look(self, name: str, found: Stored, oversample: int, fitted: bool = True) -> None:
+        """Take in the latest state. What is not `fitted` is a step of the method, and takes the place of all others."""
+        if self._judge is None:
+            self._judge = MissingMatter(self.train, _material(self.best.object if self.best else found))
+        share, contrast = self._judge.shares(found, oversample)
+        self.judged[name] = share
+        best = self.best
+        rivals = best is not None and fitted and (self.mixed or best.object.kind == found.kind)
+        if best is None or not rivals or CLEARLY * share <= best.share or contrast < best.contrast:
+            self.best = State(name, found, oversample, share, contrast)
+
+    def state_dict(self) -> dict[str, Any] | None:
+        """What `load` needs; None before the first state."""
+        best = self.best
+        if best is None:
+            return None
+        return {
+            "name": best.name,
+            "kind": best.object.kind,
+            "state": best.object.state(),
+            "oversample": best.oversample,
+            "share": best.share,
+            "contrast": best.contrast,
+            "judged": dict(self.judged),
+        }
+
+    def load(self, saved: dict[str, Any] | None) -> None:
+        """Go back to a saved state."""
+        if saved is not None:
+            found = KINDS[saved["kind"]].from_state(saved["state"])
+            self.best = State(
+                saved["name"], cast(Stored, found), saved["oversample"], saved["share"], saved["contrast"]
+            )
+            self.judged = dict(saved["judged"])
+
+
+def _material(found: Stored) -> DeltaBeta:
+    return DeltaBeta(found.matter.delta, found.matter.beta)

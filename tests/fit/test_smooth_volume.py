@@ -1,0 +1,89 @@
+"""The likeliest smooth volume: the prior against its plain form, the descent, and what modulations mend."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.blobs import MATERIAL, SHAPE, blob_scan, blobs
+from holosplat.checks import InputError
+from holosplat.fit.smooth_volume import ContinuousPrior, VolumeProblem, descend, modulated, modulations
+from holosplat.fit.whitened import WhitenedFrames
+from holosplat.geometry import Grid
+from holosplat.optics.noise_model import NoiseModel
+
+PRIOR = ContinuousPrior()
+
+
+def problem(prior: ContinuousPrior = PRIOR, photons: float | None = None) -> VolumeProblem:
+    """Of six views of 25 × 31 pixels."""
+    measured = blob_scan(photons=photons)
+    noise = NoiseModel.of_frames(torch.from_numpy(measured.frames))
+    return VolumeProblem(WhitenedFrames(measured, MATERIAL, noise), prior, 1.0)
+
+
+def matter() -> torch.Tensor:
+    """The occupancy."""
+    return blobs(Grid.of_views(blob_scan().views))
+
+
+def plain(u: torch.Tensor, prior: ContinuousPrior) -> torch.Tensor:
+    """The prior in float64, written again."""
+    square = torch.zeros_like(u)
+    square[:-1] += (u[1:] - u[:-1]) ** 2
+    square[:, :-1] += (u[:, 1:] - u[:, :-1]) ** 2
+    square[:, :, :-1] += (u[:, :, 1:] - u[:, :, :-1]) ** 2
+    size = torch.sqrt(square + prior.rounding**2) - prior.rounding
+    slopes = prior.slopes * torch.log(1 + size / prior.slope).sum()
+    return slopes + prior.values * torch.log(1 + u / prior.value).sum()
+
+
+def test_the_prior_is_its_plain_form():
+    weighty = ContinuousPrior(slopes=3.0, values=0.7)
+    u = matter() + 0.1 * torch.rand(matter().shape, generator=torch.Generator().manual_seed(1))
+    at = u.double().requires_grad_()
+    expected = plain(at, weighty)
+    (slope,) = torch.autograd.grad(expected, at)
+    gradient = torch.zeros_like(u)
+    assert problem(weighty).penalty(u, gradient) == pytest.approx(float(expected.detach()), rel=1e-5)
+    np.testing.assert_allclose(gradient.numpy(), slope.numpy(), rtol=1e-4, atol=1e-4 * float(slope.abs().max()))
+
+
+def test_the_backprojection_is_the_adjoint():
+    p, g = problem(), torch.Generator().manual_seed(2)
+    u, lines = torch.rand(p.grid.shape, generator=g), torch.rand((6, *SHAPE), generator=g)
+    assert float((p.lines(u) * lines).sum()) == pytest.approx(float((u * p.backprojection(lines)).sum()), rel=1e-4)
+
+
+def test_the_descent_never_rises_and_keeps_matter_positive():
+    p = problem(photons=2000)
+    start = 0.5 * matter()
+    found, values = descend(p, start, 15)
+    assert len(values) > 5
+    assert all(after <= before for before, after in pairwise(values))
+    assert float(found.min()) >= 0
+    error = [float((u - matter()).norm() / matter().norm()) for u in (start, found)]
+    assert error[1] < 0.7 * error[0]
+
+
+def test_modulations_give_back_what_was_taken():
+    """A fifth of all matter, and more of one side, is found again in the frames."""
+    p = problem()
+    side = torch.linspace(0.7, 0.9, matter().shape[2])
+    less = matter() * side
+    mended = modulated(p, less)
+    assert float(less.sum() / matter().sum()) < 0.82
+    assert float(mended.sum() / matter().sum()) == pytest.approx(1.0, abs=0.05)
+    assert len(modulations(less, 1.0)) == 7
+
+
+def test_bad_options_are_refused():
+    with pytest.raises(InputError, match="slope must be positive"):
+        ContinuousPrior(slope=0.0)
+    with pytest.raises(InputError, match="values must"):
+        ContinuousPrior(values=-1.0)
+    with pytest.raises(InputError, match="level of the matter must be positive"):
+        VolumeProblem(problem().frames, ContinuousPrior(), 0.0)

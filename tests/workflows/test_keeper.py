@@ -1,0 +1,99 @@
+"""A run never ends worse than it began: the best of its states is kept, and said, also after a resume."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from helpers.runs import KNOWN, SMALL
+from holosplat.checks import InputError
+from holosplat.geometry import Grid
+from holosplat.io.json import read_json
+from holosplat.methods import GaussianRates, solve
+from holosplat.methods.method import Task
+from holosplat.representations import VoxelGrid
+from holosplat.workflows.keeper import Choice, Keeper
+from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
+from holosplat.workflows.run_folder import RunFolder
+
+RUINOUS = replace(SMALL, fit=replace(SMALL.fit, rates=GaussianRates(raw_amplitudes=3.0)))
+"""A fit that makes everything worse."""
+
+
+def test_a_fit_that_goes_astray_ends_with_its_start(scan, tmp_path):
+    folder = RunFolder(tmp_path / "run")
+    done = reconstruct(scan, KNOWN, RUINOUS, matter="levels", folder=folder)
+    assert done.choice.kept == "start"
+    assert done.choice.judged["start"] < done.choice.judged["fit"]
+    summary = read_json(folder.summary)
+    assert summary["kept"] == "start"
+    assert summary["decided"] == {"matter": "levels", "why": "as you say"}
+    loaded = load_reconstruction(folder)
+    assert loaded.choice == done.choice
+    assert np.array_equal(loaded.object.parameters()["centres"], done.object.parameters()["centres"])
+    assert any("kept: start" in line for line in done.choice.lines())
+
+
+def test_a_fit_that_does_well_is_kept(scan):
+    done = reconstruct(scan, KNOWN, SMALL, matter="levels")
+    assert done.choice.kept == "fit"
+    assert done.choice.judged["fit"] < done.choice.judged["start"]
+
+
+def test_what_was_kept_survives_a_resume(scan, tmp_path):
+    folder, whole = RunFolder(tmp_path / "run"), reconstruct(scan, KNOWN, RUINOUS, matter="levels")
+
+    def interrupt(stage, fraction, record):
+        if record.get("step") == 2:
+            raise KeyboardInterrupt
+
+    first = reconstruct(scan, KNOWN, RUINOUS, matter="levels", folder=folder, on_progress=interrupt)
+    assert not first.finished
+    assert first.choice.kept == ""
+    done = reconstruct(scan, KNOWN, RUINOUS, matter="levels", folder=folder, resume=True)
+    assert done.choice == whole.choice
+
+
+def test_a_slightly_worse_share_may_be_noise(scan):
+    train = scan.train()
+    found = solve(SMALL, Task(train, KNOWN), "levels")
+    keeper = Keeper(train)
+    keeper.look("start", found, 2)
+    keeper.look("fit", found, 2)
+    assert keeper.best is not None
+    assert keeper.best.name == "fit"
+
+
+def test_steps_of_a_method_and_other_kinds_are_no_rivals(scan):
+    """A worse state takes the place of a better one where it was not fitted, or is of the kind that was asked for."""
+    train = scan.train()
+    good = solve(SMALL, Task(train, KNOWN), "levels")
+    bad = good.with_parameters({"raw_amplitudes": good.parameters()["raw_amplitudes"] - 3})
+    voxels = VoxelGrid(0 * bad.density(Grid.of_views(train.views))[None, 0], Grid.of_views(train.views), good.matter)
+    for mixed, found, fitted, kept in (
+        (False, bad, True, "first"),
+        (False, bad, False, "second"),
+        (False, voxels, True, "second"),
+        (True, voxels, True, "first"),
+    ):
+        keeper = Keeper(train, mixed)
+        keeper.look("first", good, 2)
+        keeper.look("second", found, 2, fitted)
+        assert keeper.best is not None
+        assert keeper.best.name == kept
+        assert keeper.judged["second"] > keeper.judged["first"]
+
+
+def test_old_summaries_say_nothing():
+    assert Choice.read({}) == Choice()
+    assert Choice().lines() == []
+
+
+@pytest.mark.parametrize("other", ["continuous", None], ids=["told", "found"])
+def test_a_resume_needs_the_same_kind_of_matter(scan, tmp_path, other):
+    folder = RunFolder(tmp_path / "run")
+    reconstruct(scan, KNOWN, SMALL, matter="levels", folder=folder)
+    with pytest.raises(InputError, match="kind of matter"):
+        reconstruct(scan, KNOWN, SMALL, matter=other, folder=folder, resume=True)
