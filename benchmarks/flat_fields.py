@@ -22,7 +22,8 @@ from machine import commit
 
 import holosplat as hs
 from holosplat.beamline.record import RecordingOptions, record
-from holosplat.io.scan_file import PROJECTION, open_scan
+from holosplat.io.raw_file import PROJECTION
+from holosplat.io.scan_file import open_scan
 from holosplat.optics.camera import Camera, spread
 from holosplat.optics.illumination import Illumination
 from holosplat.workflows.correct import CorrectionOptions, FlatFielding, correct

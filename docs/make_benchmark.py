@@ -2,6 +2,7 @@
 
 Writes docs/benchmark_tables.md (the report's Markdown with the pictures of a few cases), docs/images/benchmark/,
 docs/data/benchmark.csv (a line for each row), and tables of means over seeds in docs/overview.md and docs/benchmark.md.
+`python docs/make_benchmark.py bench FILE.csv` writes the rows of a benchmark into that file, and nothing else.
 """
 
 from __future__ import annotations
@@ -188,4 +189,9 @@ def _shown(numbers: dict[str, float], name: str) -> str:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    if len(sys.argv) > 2:
+        write_table(
+            [read_row(path) for path in sorted(BenchFolder(Path(sys.argv[1])).rows.glob("*.json"))], Path(sys.argv[2])
+        )
+    else:
+        main(Path(sys.argv[1]))

@@ -24,7 +24,8 @@ from holosplat.beamline.misalignment import Misalignment
 from holosplat.beamline.polychromatic import polychromatic_frames, refilled
 from holosplat.beamline.record import RecordingOptions, record
 from holosplat.beamline.simulate import Simulation
-from holosplat.io.scan_file import FLAT, PROJECTION, open_scan
+from holosplat.io.raw_file import FLAT, PROJECTION
+from holosplat.io.scan_file import open_scan
 from holosplat.optics.camera import Camera
 from holosplat.optics.coherence import Spectrum, joined_blur_px, source_blur
 from holosplat.optics.detector import poisson

@@ -1,0 +1,62 @@
+"""Is matter with levels told from a continuum, in the cases of the benchmark?
+
+    python benchmarks/levels.py --out docs/data/levels.csv              # about three minutes on two cores
+
+Every case is told its own prior, and then, where that is a known material, its ratio alone. A row: the factor of the
+misfit of views set aside that a flat inside leaves (`methods.levels`), and what is decided.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import time
+from pathlib import Path
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+from machine import commit
+
+from holosplat.bench.case import case_names, load_case
+from holosplat.matter import Known, MaterialPrior
+from holosplat.methods import Task
+from holosplat.methods.levels import decide_matter
+
+COLUMNS = ("case", "seed", "prior", "factor", "matter", "sure", "seconds", "commit")
+
+
+def rows(name: str, seed: int) -> list[dict[str, object]]:
+    """What is decided of a case, by what is known of it."""
+    case, found = load_case(name, seed), list[dict[str, object]]()
+    train, priors = case.scan().train(), [case.prior]
+    if isinstance(case.prior, Known) and case.prior.material.beta:
+        priors.append(MaterialPrior.of_ratio(case.prior.material.ratio))
+    for prior in priors:
+        began = time.process_time()
+        decision = decide_matter(Task(train, prior))
+        values = (name, seed, prior.kind, f"{decision.factor:.3f}", decision.matter, decision.sure)
+        found.append(dict(zip(COLUMNS, (*values, f"{time.process_time() - began:.1f}", commit()))))
+    return found
+
+
+def main() -> None:
+    """Write the table, line by line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cases", nargs="+", default=case_names())
+    parser.add_argument("--seeds", nargs="+", type=int, default=[101])
+    parser.add_argument("--out", type=Path, required=True)
+    options = parser.parse_args()
+    with options.out.open("w", newline="") as file:
+        table = csv.DictWriter(file, COLUMNS)
+        table.writeheader()
+        for name in options.cases:
+            for seed in options.seeds:
+                for row in rows(name, seed):
+                    table.writerow(row)
+                    print(row, flush=True)
+                file.flush()
+
+
+if __name__ == "__main__":
+    main()

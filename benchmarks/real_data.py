@@ -1,0 +1,291 @@
+"""Measured data of other groups, from raw files to volumes: docs/real_data.md with its numbers and pictures.
+
+    python benchmarks/real_data.py --data FOLDER [--cases capsule tooth hair] [--methods NAME …] --work FOLDER
+
+FOLDER holds savu_24737_bin2.npz, tooth_bin2.npz and spider_hair_hologram.tiff (`holosplat data fetch`, or
+a folder of one's own); what is absent is skipped, and said to be. Each method gets frames for training, their poses,
+and a ratio δ/β or nothing. Rows go to docs/data/real_data.csv (those of other cases and methods stay), pictures to
+docs/images/real_data.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import platform
+import shlex
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import h5py
+import matplotlib
+
+matplotlib.use("Agg")
+import matplotlib.pyplot as plt
+import numpy as np
+import tifffile
+
+import holosplat as hs
+from holosplat.baselines.filtered_backprojection import filtered_backprojection
+from holosplat.bench.methods import METHODS
+from holosplat.bench.record import source_commit
+from holosplat.workflows.evaluate import score_object
+
+ROOT = Path(__file__).resolve().parents[1]
+TABLE, PICTURES = ROOT / "docs/data/real_data.csv", ROOT / "docs/images/real_data"
+FIELDS = ("case", "method", "measure", "value", "seconds", "machine", "commit")
+OPPONENTS = ("paganin-fbp", "paganin-sirt-nonneg", "paganin-tv-nonneg")
+OURS = ("holographic-tv", "gaussians", "volume", "auto")
+PREFIX = [sys.executable, "-c", "from holosplat.cli import main; main()"]
+
+
+def command(text: str, cwd: Path) -> str:
+    """Run `holosplat …` as the page shows it; what it said."""
+    print("$", text, flush=True)
+    done = subprocess.run([*PREFIX, *shlex.split(text)[1:]], cwd=cwd, capture_output=True, text=True, check=False)
+    said = done.stdout + done.stderr.split("\r")[-1]
+    if done.returncode != 0:
+        raise SystemExit(f"{text}\nfailed: {said}")
+    return said
+
+
+def write_rows(rows: list[dict[str, object]]) -> None:
+    """Put rows into the table, in the place of those of the same case, method and measure."""
+    old = []
+    if TABLE.is_file():
+        with TABLE.open(newline="", encoding="utf-8") as file:
+            old = list(csv.DictReader(file))
+    new = {(row["case"], row["method"], row["measure"]) for row in rows}
+    kept = [row for row in old if (row["case"], row["method"], row["measure"]) not in new]
+    TABLE.parent.mkdir(parents=True, exist_ok=True)
+    with TABLE.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, FIELDS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows([*kept, *rows])
+
+
+def row(case: str, method: str, scores: dict[str, float], seconds: float) -> list[dict[str, object]]:
+    """One row of the table a score."""
+    common = {"seconds": f"{seconds:.1f}", "machine": f"{platform.machine()}, 2 cores", "commit": source_commit()}
+    return [{"case": case, "method": method, "measure": k, "value": f"{v:.4f}", **common} for k, v in scores.items()]
+
+
+def exchange_file(path: Path, counts: np.ndarray, flats: np.ndarray, darks: np.ndarray, angles: np.ndarray) -> None:
+    """Raw counts as a data-exchange file (HDF5), as beamlines write it."""
+    with h5py.File(path, "w") as file:
+        file["exchange/data"], file["exchange/data_white"], file["exchange/data_dark"] = counts, flats, darks
+        file.create_dataset("exchange/theta", data=angles).attrs["units"] = "deg"
+
+
+def back_projected(scan: hs.Scan, measured: np.ndarray) -> hs.Volume:
+    """Filtered back-projection of line integrals of β, `-ln I / 2k`, [V, H, W], of every frame of `scan`."""
+    import torch
+
+    grid = hs.Grid.of_views(scan.views)
+    beta = filtered_backprojection(
+        torch.from_numpy(measured).float(), scan.views, grid, None, lambda done: None
+    ).numpy()
+    return hs.Volume(np.zeros_like(beta), beta, grid)
+
+
+def split(scan: hs.Scan, train: np.ndarray) -> hs.Scan:
+    """The scan with the frames `train` for training and all others held out."""
+    is_test = np.ones(len(scan), dtype=bool)
+    is_test[train] = False
+    return replace(scan, is_test=is_test)
+
+
+@dataclass(frozen=True)
+class Against:
+    """What a volume of few views is held against: `reference` of all views, inside `mask`."""
+
+    reference: hs.Volume
+    mask: np.ndarray
+
+    def scores(self, found: hs.Volume) -> dict[str, float]:
+        """Correlation of β and its slope (least squares through 0), over the mask."""
+        a, b = found.beta[self.mask].astype(float), self.reference.beta[self.mask].astype(float)
+        return {"correlation": float(np.corrcoef(a, b)[0, 1]), "slope": float(a @ b / (b @ b))}
+
+
+Found = dict[str, hs.Volume]
+
+
+def each_method(
+    case: str, scan: hs.Scan, prior: hs.MaterialPrior, names: list[str], judged: Callable[[hs.Volume], dict[str, float]]
+) -> Found:
+    """Run methods on the frames for training; rows into the table; the volumes."""
+    found: Found = {}
+    for name in names:
+        began = time.perf_counter()
+        try:
+            made = METHODS[name].run(scan.train(), prior, 0, lambda stage, fraction: None)
+        except hs.InputError as error:
+            print(f"{case} {name}: refused: {error}", flush=True)
+            continue
+        seconds = time.perf_counter() - began
+        scores = dict(score_object(made, scan, None, 1).test.mean)
+        volume = made.voxelise(hs.Grid.of_views(scan.views))
+        found[name] = volume
+        scores = {"held-out SSIM": scores["ssim"], **judged(volume)}
+        write_rows(row(case, name, scores, seconds))
+        print(case, name, {k: round(v, 4) for k, v in scores.items()}, f"{seconds:.0f} s", flush=True)
+    return found
+
+
+def panels(path: Path, images: dict[str, np.ndarray], columns: int, unit: str = "", same: bool = True) -> None:
+    """Images in a row or more, on one grey scale."""
+    rows = -(-len(images) // columns)
+    high, wide = next(iter(images.values())).shape
+    size = (2.4 * columns, (2.4 * min(high / wide, 2) + 0.35) * rows)
+    figure, axes = plt.subplots(rows, columns, figsize=size, squeeze=False, layout="constrained")
+    low, top = 0.0, max(float(np.quantile(i, 0.998)) for i in images.values())
+    for axis in axes.ravel():
+        axis.set_axis_off()
+    for axis, (name, image) in zip(axes.ravel(), images.items()):
+        limits = {"vmin": low, "vmax": top} if same else {"vmin": np.quantile(image, 0.002), "vmax": image.max()}
+        shown = axis.imshow(image, cmap="gray", **limits)
+        axis.set_title(name, fontsize=8)
+    if unit:
+        figure.colorbar(shown, ax=axes.ravel().tolist(), shrink=0.8, label=unit)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def attenuation(volume: hs.Volume, energy_kev: float) -> np.ndarray:
+    """µ = 2kβ [1/cm]."""
+    return 2 * hs.units.wavenumber(energy_kev) * volume.beta / 100
+
+
+def capsule(data: Path, work: Path, names: list[str]) -> None:
+    """The soft dome of a gelatine capsule: rows 0 to 27, 12 of 91 views."""
+    raw = np.load(data / "savu_24737_bin2.npz")
+    exchange_file(work / "capsule.h5", raw["counts"], raw["flat"][None], raw["dark"][None], raw["angles_deg"])
+    command(
+        "holosplat correct capsule.h5 --energy-kev 20 --distance 0 --pixel-size 42.92e-6 --axis-column 42.625 "
+        "--sense anticlockwise --crop 0:28,: --out dome.nxs",
+        work,
+    )
+    whole = hs.io.read_scan(work / "dome.nxs")
+    thickness = -np.log(np.clip(whole.frames, 1e-3, None)) / (2 * hs.units.wavenumber(20.0))
+    reference = back_projected(whole, thickness)
+    grid = reference.grid
+    x, _, z = np.meshgrid(*grid.axes(), indexing="ij")
+    inside = (np.hypot(x, z) < 0.45 * whole.views.width).transpose(2, 1, 0)
+    scan = split(whole, np.arange(0, 91, 8)[:12])
+    found = each_method(
+        "capsule dome", scan, hs.MaterialPrior.of_ratio(500.0), names, Against(reference, inside).scores
+    )
+    row_shown = 21
+    slices = {"FBP of all 91 views": reference, **found}
+    images = {name: attenuation(volume, 20.0)[:, row_shown] for name, volume in slices.items()}
+    panels(PICTURES / "dome.png", images, len(images), "µ (1/cm)")
+    frames = {
+        "divided by the flat": (raw["counts"][0].astype(float) / raw["flat"])[:28],
+        "and by its air": whole.frames[0],
+    }
+    panels(PICTURES / "dome_frames.png", frames, 2, same=False)
+
+
+def tooth(data: Path, work: Path, names: list[str]) -> None:
+    """A tooth: two rows, 15 of 181 views."""
+    raw = np.load(data / "tooth_bin2.npz")
+    exchange_file(work / "tooth.h5", raw["counts"], raw["flats"], raw["darks"], raw["angles_deg"])
+    command(
+        "holosplat correct tooth.h5 --energy-kev 20 --distance 0 --pixel-size 10e-6 --axis-column 147.25 "
+        "--sense anticlockwise --method plain --out tooth.nxs",
+        work,
+    )
+    whole = hs.io.read_scan(work / "tooth.nxs")
+    thickness = -np.log(np.clip(whole.frames, 1e-3, None)) / (2 * hs.units.wavenumber(20.0))
+    reference = back_projected(whole, thickness)
+    x, _, z = np.meshgrid(*reference.grid.axes(), indexing="ij")
+    inside = (np.hypot(x, z) < 0.45 * whole.views.width).transpose(2, 1, 0)
+    scan = split(whole, np.arange(0, 181, 12)[:15])
+    found = each_method("tooth", scan, hs.MaterialPrior.of_ratio(300.0), names, Against(reference, inside).scores)
+    slices = {"FBP of all 181 views": reference, **found}
+    images = {name: attenuation(volume, 20.0)[:, 0] for name, volume in slices.items()}
+    panels(PICTURES / "tooth.png", images, len(images), "µ (1/cm)")
+
+
+def hair(data: Path, work: Path, names: list[str]) -> None:
+    """A spider hair: phase of one hologram, by every retrieval (`names` are of volumes, and do not matter here)."""
+    import torch
+
+    from holosplat.optics.retrieval import RETRIEVALS
+
+    frame = tifffile.imread(data / "spider_hair_hologram.tiff").astype(np.float64)
+    even = frame / parabola_in_air(frame)
+    exposures = hs.Exposures.of(hs.Views.from_angles([0.0], frame.shape, 104.7e-9), 11.0, 78.88e-3)
+    delta, images = 1e-6, {"hologram": frame}
+    for name in ("paganin", "ctf", "tikhonov", "admm"):
+        began = time.perf_counter()
+        lines = RETRIEVALS[name](torch.from_numpy(even).float()[None], exposures, delta, delta / 1000)[0].numpy()
+        seconds = time.perf_counter() - began
+        phase = -hs.units.wavenumber(11.0) * delta * lines.astype(float)
+        air = np.concatenate([phase[:100], phase[-100:]])
+        phase -= np.median(air)
+        scores = {"least phase": float(np.quantile(phase, 1e-4)), "background": float(air.std())}
+        write_rows(row("spider hair", name, scores, seconds))
+        print("spider hair", name, {k: round(v, 3) for k, v in scores.items()}, f"{seconds:.0f} s", flush=True)
+        images[name] = phase
+    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(11, 3.4), layout="constrained")
+    left.imshow(frame, cmap="gray", vmin=0.7, vmax=1.4)
+    left.set_title("one hologram", fontsize=9)
+    shown = middle.imshow(images["tikhonov"], cmap="gray", vmin=-1.3, vmax=0.1)
+    middle.set_title("phase (rad), Tikhonov with positivity", fontsize=9)
+    figure.colorbar(shown, ax=middle, shrink=0.8)
+    for name in ("paganin", "ctf", "tikhonov", "admm"):
+        along = images[name][:, 395:405].mean(1)
+        right.plot(np.arange(100, 400) * 0.1047, along[100:400], label=name, lw=1)
+    right.set_xlabel("µm, across the hair at column 400")
+    right.set_ylabel("phase (rad)")
+    right.legend(fontsize=7)
+    for axis in (left, middle):
+        axis.set_axis_off()
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    figure.savefig(PICTURES / "hair.png", dpi=110)
+    plt.close(figure)
+
+
+def parabola_in_air(frame: np.ndarray) -> np.ndarray:
+    """The parabola [H, W] through a frame's air: least squares, less what lies beyond 2.5 of its deviations."""
+    y, x = (2 * (np.arange(n) + 0.5) / n - 1 for n in frame.shape)
+    x, y = np.meshgrid(x, y)
+    modes = np.stack([x**i * y**j for i in range(3) for j in range(3 - i)], -1)
+    air = np.ones(frame.shape, dtype=bool)
+    light = np.ones(frame.shape)
+    for _ in range(8):
+        light = modes @ np.linalg.lstsq(modes[air], frame[air], rcond=None)[0]
+        away = np.abs(frame / light - 1)
+        air = away < 2.5 * 1.4826 * np.median(away[air])
+    return light
+
+
+CASES = {"capsule": capsule, "tooth": tooth, "hair": hair}
+NEEDS = {"capsule": "savu_24737_bin2.npz", "tooth": "tooth_bin2.npz", "hair": "spider_hair_hologram.tiff"}
+
+
+def main() -> None:
+    """Run the cases whose data are there."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, required=True)
+    parser.add_argument("--work", type=Path, required=True)
+    parser.add_argument("--cases", nargs="*", default=list(CASES))
+    parser.add_argument("--methods", nargs="*", default=[n for n in (*OPPONENTS, *OURS) if n in METHODS])
+    wanted = parser.parse_args()
+    wanted.work.mkdir(parents=True, exist_ok=True)
+    for name in wanted.cases:
+        if (wanted.data / NEEDS[name]).is_file():
+            CASES[name](wanted.data, wanted.work, wanted.methods)
+        else:
+            print(f"{name} is skipped: {wanted.data / NEEDS[name]} is absent; fetch it or name another --data")
+
+
+if __name__ == "__main__":
+    main()
