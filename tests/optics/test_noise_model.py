@@ -133,6 +133,14 @@ def test_a_dark_body_at_the_side_is_no_air_and_a_crowded_frame_has_none():
     assert not find_air(tensor(crowded)).any()
     assert not find_air(torch.zeros(1, 20, 20)).any()
     assert not find_air(torch.ones(1, 2, 20)).any()
+    assert not find_air(torch.ones(1, 7, 10)).any()
+
+
+def test_frames_whose_last_column_alone_is_quiet_are_no_error():
+    """The finest wavelets have no value there."""
+    frame = np.array([1.05, 0.63, 0.54, 0.77, 1.11])[None].repeat(201, 0)
+    assert not find_air(tensor(frame[None])).any()
+
 
 
 @pytest.mark.parametrize("box", [(0, 0, 0, 5), (0, 5, 3, 40), (-1, 5, 0, 5)])

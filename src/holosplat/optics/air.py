@@ -35,8 +35,8 @@ BRIGHT, DARKER = 0.9, 0.85
 NOISE_LIKE, FAINT = 30.0, 0.01
 """The quietest parts are noise if their power is less than so many times that of white noise as strong as their finest
 wavelets, or less than that part of the frame's mean power; else fringes fill the frame."""
-FEWEST = 5
-"""Rows and columns that a frame must have to tell quiet from noisy parts."""
+FEWEST, SMALLEST_FRAME = 5, 900
+"""Rows and columns, and pixels, that a frame must have to tell quiet from noisy parts: eight windows."""
 LEAST_AIR = 0.03
 """Part of a frame that must be air, or there is none to go by."""
 
@@ -50,7 +50,7 @@ def find_air(frames: Tensor) -> Tensor:
     Air is quiet: the power between two scales of blur is that of the frame's quietest parts. It reaches the left or
     the right border, where the inside of a smooth body does not, and it is about as bright as the frame is anywhere.
     The frames need not be normalised, and the light may change slowly across them. Frames of fewer than `FEWEST` rows
-    or columns have none.
+    or columns, or of fewer than `SMALLEST_FRAME` pixels, have none.
     """
     return torch.from_numpy(np.stack([_air(frame) for frame in frames.detach().cpu().double().numpy()]))
 
@@ -77,7 +77,7 @@ def has_air(air: Tensor) -> Tensor:
 
 def _air(frame: np.ndarray) -> np.ndarray:
     level = float(np.median(frame))
-    if min(frame.shape) < FEWEST or level <= 0:
+    if min(frame.shape) < FEWEST or frame.size < SMALLEST_FRAME or level <= 0:
         return np.zeros(frame.shape, dtype=bool)
     power = (gaussian_filter(frame, FINE, mode="nearest") - gaussian_filter(frame, COARSE, mode="nearest")) ** 2
     smooth = gaussian_filter(frame, WINDOW, mode="nearest")
@@ -85,7 +85,8 @@ def _air(frame: np.ndarray) -> np.ndarray:
     unbound = gaussian_filter(power, WINDOW, mode="nearest")
     limit = float(np.quantile(unbound[bright], QUIET))
     noise, found = limit / QUIET_POWER, np.zeros(frame.shape, dtype=bool)
-    fine = WHITE_POWER * float(_finest(frame / level)[(unbound <= limit)[:-1, :-1]].mean())
+    quiet = _finest(frame / level)[(unbound <= limit)[:-1, :-1]]
+    fine = WHITE_POWER * float(quiet.mean()) if quiet.size else 0.0
     if noise > max(NOISE_LIKE * fine, FAINT * float(power.mean())):
         return found
     activity = gaussian_filter(np.minimum(power, CAP * noise), WINDOW, mode="nearest")
