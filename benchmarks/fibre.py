@@ -5,8 +5,8 @@
 A round fibre that ends in the frame, 1.15 rad thick, δ/β 1000, at 11 keV, 78.88 mm and 104.7 nm a pixel, as a hologram
 of a spider's hair was taken. The truth has its thickness in closed form, and its waves are sampled twice as finely as
 those of retrieval. "noise" is photon noise of 1900 photons a pixel; "uneven" has besides air of 1.02, 1.2 % of smooth
-background (correlated over 120 pixels) and 2 % of grain (3 pixels). Seeds alternate between a frame of 301 × 257 and one
-of 256 × 400 pixels, and between radii of 20 and 14 pixels.
+background (correlated over 120 pixels) and 2 % of grain (3 pixels). Seeds alternate between frames of 301 × 257 and
+256 × 400 pixels, and between radii of 20 and 14 pixels.
 """
 
 from __future__ import annotations

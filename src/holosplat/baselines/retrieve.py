@@ -24,8 +24,9 @@ EVEN_OR_NOT = LightOptions()
 ROUNDS = 2
 """How often the light of uneven frames is found anew beside the matter. The first round mends what fringes that passed
 for air did to it; on simulated fibres the error still falls in the second, and no longer in the third."""
-BODY, TOP = 0.1, 0.999
-"""Matter is where the thickness exceeds this part of its quantile TOP: less is noise or the shadow of light."""
+BODY, TOP = 0.3, 0.999
+"""Matter is where the thickness exceeds this part of its quantile TOP: less is often the shadow of uneven light. Fringes of
+thinner matter are divided out, too."""
 RIM = 3
 """How far from matter its fringes are predicted well enough to see the light beside them [pixels]."""
 
@@ -62,11 +63,12 @@ def retrieve(
         raise InputError(f"method must be one of {', '.join(RETRIEVALS)}, but it is {method!r}.")
     known = checked(frames, exposures, material.delta)
     found = Light.of(known, light)
+    air = found.air
     rounds = ROUNDS if found.background is not None and exposures.distance.all() else 0
     for done in range(rounds):
         part = _part(on_progress, done, rounds + 1)
         matter = tikhonov(found.evened(known), exposures, *material, on_progress=part)
-        found = _beside(matter, known, exposures, material, light)
+        found = _beside(matter, known, exposures, material, air)
     part = _part(on_progress, rounds, rounds + 1)
     thickness = RETRIEVALS[method](found.evened(known), exposures, *material, on_progress=part)
     phase = (-thickness / radian(exposures, material.delta)).to(thickness.dtype)
@@ -77,15 +79,14 @@ def _part(on_progress: Advance, done: int, count: int) -> Advance:
     return lambda fraction: on_progress((done + fraction) / count)
 
 
-def _beside(
-    thickness: Tensor, frames: Tensor, exposures: Exposures, material: DeltaBeta, options: LightOptions
-) -> Light:
-    """The light of frames [V, H, W] beside matter of this thickness [V, H, W], whose fringes are divided out."""
+def _beside(thickness: Tensor, frames: Tensor, exposures: Exposures, material: DeltaBeta, air: Tensor) -> Light:
+    """The light of frames [V, H, W] in air [V, H, W] bool, and beside matter of this thickness [V, H, W], whose fringes
+    are divided out."""
     ratio = frames.double() / _predicted(thickness, exposures, material).clamp_min(DARKEST)
     free = torch.from_numpy(np.stack([~_body(one) for one in thickness.detach().cpu().numpy()]))
-    air = free | options.air_of(frames) if options.air else free
-    noise = NoiseModel.of_frames(ratio, air)
-    return Light(air, noise, Background.of_air(ratio, air, noise))
+    seen = free | air
+    noise = NoiseModel.of_frames(ratio, seen)
+    return Light(seen, noise, Background.of_air(ratio, seen, noise))
 
 
 def _body(thickness: np.ndarray) -> np.ndarray:

@@ -41,7 +41,7 @@ def light_figure(views: LitViews, pixel_size: float) -> Figure:
         left = image_panel(
             axes, residual[row] / scale, (pixel_size, pixel_size), SIGNED_MAP, (-limit / scale, limit / scale)
         )
-        letter(axes, 3 * row + 2, "Measured − predicted in this light")
+        letter(axes, 3 * row + 2, "Left by light and object")
     rows = (0, len(views.labels) - 1)
     panels.bar(grey, 0, rows, "relative intensity", "both")
     panels.bar(lit, 1, rows, "light − 1 (%)", "both")
