@@ -25,8 +25,8 @@ ROUNDS = 2
 """How often the light of uneven frames is found anew beside the matter. The first round mends what fringes that passed
 for air did to it; on simulated fibres the error still falls in the second, and no longer in the third."""
 BODY, TOP = 0.3, 0.999
-"""Matter is where the thickness exceeds this part of its quantile TOP: less is often the shadow of uneven light. Fringes of
-thinner matter are divided out, too."""
+"""Matter is where the thickness exceeds this part of its quantile TOP: less is often the shadow of uneven light. The
+fringes of thinner matter are divided out, too."""
 RIM = 3
 """How far from matter its fringes are predicted well enough to see the light beside them [pixels]."""
 
