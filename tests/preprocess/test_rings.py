@@ -28,10 +28,10 @@ def test_a_pattern_is_found_beside_what_turns():
         shown = frames(pattern, noise)
         found = fixed_pattern(lambda i, shown=shown: shown[i], COUNT, 9)
         left = np.std(np.log(found) - fine)
-        assert left < 0.5 * np.std(fine)  # the median of nine columns takes some of it
+        assert left < 0.55 * np.std(fine)  # the median of nine columns takes some of it
         corrected = shown / found
         clean = frames(np.ones(SHAPE), noise)
-        assert np.std(corrected / clean - 1) < 0.5 * np.std(shown / clean - 1)
+        assert np.std(corrected / clean - 1) < 0.55 * np.std(shown / clean - 1)
 
 
 def test_without_faults_hardly_anything_is_taken():
