@@ -9,35 +9,25 @@ import numpy as np
 import pytest
 import torch
 
-from holosplat.beamline.simulate import simulate
+from helpers.soft import MATERIAL, SHAPE, cells, two_cells
 from holosplat.checks import InputError
-from holosplat.geometry import Grid, Views
-from holosplat.matter import DeltaBeta, MaterialPrior, Matter
+from holosplat.geometry import Grid
+from holosplat.matter import MaterialPrior, Matter
 from holosplat.methods import HolographicVoxels, SmoothVolume, Task, solve
 from holosplat.methods.mass import total_delta
 from holosplat.methods.volume import binning, noise_of_binned
 from holosplat.model import Instrument, Model
 from holosplat.optics.noise_model import NoiseModel
 from holosplat.representations import VoxelGrid
-from holosplat.scan import Exposures, Scan
-from holosplat.specimens.continuous import ContinuousScene
-from holosplat.specimens.soft_matter import soft_cells
+from holosplat.scan import Scan
 
-PIXEL, SHAPE = 1e-6, (41, 45)
-MATERIAL = DeltaBeta(6e-7, 4e-10)
 RATIO = MaterialPrior.of_ratio(1500.0)
-
-
-def cells() -> ContinuousScene:
-    """Two soft cells that fit the detector in every view."""
-    return soft_cells(2, (15 * PIXEL, 18 * PIXEL), (40e-6, 38e-6, 40e-6), MATERIAL, seed=3, edge=3 * PIXEL)
 
 
 @pytest.fixture(scope="module")
 def quiet() -> Scan:
     """Eight views without noise."""
-    exposures = Exposures.of(Views.evenly_spaced(8, SHAPE, PIXEL), 20.0, 0.05)
-    return simulate(cells(), exposures, is_test=np.zeros(8, dtype=bool))
+    return two_cells()
 
 
 def noisy(scan: Scan, sigma: float, seed: int) -> Scan:
