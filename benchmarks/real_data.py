@@ -200,7 +200,7 @@ def capsule(data: Path, work: Path, names: list[str]) -> None:
 
 
 def ceiling(case: str, whole: hs.Scan) -> None:
-    """Rows that say what noise leaves of held-out SSIM: each frame against the mean of its four neighbours in angle, and
+    """Rows that say what noise leaves of held-out SSIM: each frame against the mean of four neighbours in angle, and
     against back-projection of all frames, this one too, projected again."""
     import torch
 
