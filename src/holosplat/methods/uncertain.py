@@ -227,8 +227,9 @@ class Search:
             at[i] = tried[int(np.argmin([self._likely(_with(at, i, value)) for value in tried]))]
         step = np.array([2 * h / (places - 1) for h, places in zip(self.half, self.places)])
         for _ in range(NEWTON):
-            seen = [min(self._likely(_with(at, i, at[i] + s * step[i])) for s in (-1, 1)) for i in range(len(at))]
-            step = np.where(np.array(seen) - self._likely(at) > SEEN * self._temperature(), step / 2, step)
+            _, hessian = self._slopes(at, step)
+            shown = 0.5 * np.diag(hessian) * step**2 > SEEN * self._temperature()
+            step = np.where(shown, step / 2, step)
             at = self._moved(at, step)
         return at, step
 
@@ -248,17 +249,18 @@ class Search:
 
     def _slopes(self, at: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Gradient [K] and Hessian [K, K] of the misfit by differences, along half-steps within the ranges."""
-        count, middle = len(at), self._likely(at)
-        up = [self._likely(_with(at, i, at[i] + step[i])) for i in range(count)]
-        down = [self._likely(_with(at, i, at[i] - step[i])) for i in range(count)]
+        count, inside = len(at), np.clip(at, self.low + step, self.high - step)
+        middle = self._likely(inside)
+        up = [self._likely(_with(inside, i, inside[i] + step[i])) for i in range(count)]
+        down = [self._likely(_with(inside, i, inside[i] - step[i])) for i in range(count)]
         gradient, hessian = np.zeros(count), np.zeros((count, count))
         for i in range(count):
             gradient[i] = (up[i] - down[i]) / (2 * step[i])
             hessian[i, i] = (up[i] - 2 * middle + down[i]) / step[i] ** 2
             for j in range(i):
-                both = self._likely(_with(_with(at, i, at[i] + step[i]), j, at[j] + step[j]))
+                both = self._likely(_with(_with(inside, i, inside[i] + step[i]), j, inside[j] + step[j]))
                 hessian[i, j] = hessian[j, i] = (both - up[i] - up[j] + middle) / (step[i] * step[j])
-        return gradient, hessian
+        return gradient + hessian @ (at - inside), hessian
 
     def _moved(self, at: np.ndarray, step: np.ndarray) -> np.ndarray:
         """A step of Newton's method, of two steps of the differences at most, to what is likelier; or none."""
