@@ -12,6 +12,7 @@ import numpy as np
 from ..baselines.material import MaterialEstimate, estimate_ratio
 from ..checks import InputError, require
 from ..matter import DeltaBeta, Known, KnownRatio, KnownTwo, MaterialPrior
+from ..scan import Scan
 from .method import Task, shows_no_refraction
 from .profile import Profile, ProfileOptions, exposed
 
@@ -141,10 +142,9 @@ def _untold(ranges: Mapping[str, Range], middle: Mapping[str, float], why: str) 
 def told(task: Task, found: tuple[Determined, ...]) -> Task:
     """`task` with the constants that were `found`; δ and β of known materials at the new energy by
     `scan.far_from_edges`."""
-    values = {each.name: each.value for each in found}
-    if not values:
+    if not found:
         return task
-    scan = exposed(task.scan, values)
+    scan, values = placed(task.scan, found), {each.name: each.value for each in found}
     if "delta_beta" in values:
         return replace(task, scan=scan, prior=MaterialPrior.of_ratio(values["delta_beta"]), delta_told=True)
     return replace(
@@ -152,6 +152,11 @@ def told(task: Task, found: tuple[Determined, ...]) -> Task:
         scan=scan,
         prior=at_energy(task.prior, scan.exposures.reference_energy / task.scan.exposures.reference_energy),
     )
+
+
+def placed(scan: Scan, found: tuple[Determined, ...]) -> Scan:
+    """`scan` at the distance and energy that were `found`."""
+    return exposed(scan, {each.name: each.value for each in found})
 
 
 def at_energy(prior: MaterialPrior, factor: float) -> MaterialPrior:
