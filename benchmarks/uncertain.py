@@ -1,6 +1,6 @@
 """What frames say of a distance, an energy or δ/β that is known to a range only.
 
-    python benchmarks/uncertain.py --out docs/data/uncertain.csv        # about 25 minutes on one core
+    python benchmarks/uncertain.py --out docs/data/uncertain.csv        # about 20 minutes on one core
 
 A row: the constant over the true one and its interval, in cases of the benchmark with ranges that are not centred on
 the truth. Seed 7 served to choose the rules of `methods.uncertain`; reported are others.
@@ -31,7 +31,7 @@ QUESTIONS = {
     "distance and ratio": {"distance": (0.5, 3.0), "delta_beta": (0.4, 2.0)},
 }
 """Ranges over the true values."""
-CASES = ("soft12", "soft12-5000", "light12-5000", "cells8", "noise12-2000", "tissue16", "coated")
+CASES = ("soft12", "soft12-5000", "light12-5000", "cells8", "noise12-2000", "tissue16")
 
 
 def truth(case: Case) -> dict[str, float]:

@@ -11,6 +11,7 @@ from .neural_field import NeuralFields, NeuralFit
 from .per_view import PerView
 from .solve import Settled, settled, solve
 from .surfaces import Extraction, SurfaceFit, SurfaceOptions, Surfaces, refine_surfaces
+from .uncertain import Determined, Uncertain
 from .volume import SmoothVolume
 from .voxels import HolographicVoxels, VoxelFit, Voxels
 
@@ -33,6 +34,7 @@ METHODS: dict[str, Method] = {
 __all__ = [
     "METHODS",
     "Auto",
+    "Determined",
     "ExtraTerm",
     "Extraction",
     "FitOptions",
@@ -50,6 +52,7 @@ __all__ = [
     "SurfaceOptions",
     "Surfaces",
     "Task",
+    "Uncertain",
     "VoxelFit",
     "Voxels",
     "finished",
