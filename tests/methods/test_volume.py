@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -12,13 +11,10 @@ import torch
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
-from holosplat.matter import DeltaBeta, MaterialPrior, Matter
+from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import HolographicVoxels, SmoothVolume, Task, solve
-from holosplat.methods.mass import total_delta
 from holosplat.methods.volume import binning, noise_of_binned
-from holosplat.model import Instrument, Model
 from holosplat.optics.noise_model import NoiseModel
-from holosplat.representations import VoxelGrid
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.continuous import ContinuousScene
 from holosplat.specimens.soft_matter import soft_cells
@@ -69,33 +65,6 @@ def test_noise_of_half_the_contrast_keeps_the_mass(quiet):
     start, _ = judged(solve(HolographicVoxels(), Task(scan, RATIO)), scan)
     assert error < min(0.15, 0.5 * start)
     assert total == pytest.approx(1.0, abs=0.15)
-
-
-def test_the_total_is_within_its_standard_error(quiet):
-    """Over seeds of the noise, by a reconstruction that lost a tenth."""
-    contrast = float(np.sqrt(np.square(quiet.frames - 1).mean()))
-    grid = Grid.of_views(quiet.views)
-    volume = cells().voxelise(grid)
-    true = float(np.asarray(volume.delta, dtype=np.float64).sum()) * math.prod(grid.voxel_size)
-    values = torch.from_numpy(np.asarray(volume.delta)) / MATERIAL.delta
-    found = VoxelGrid(0.9 * values[None].float(), grid, Matter.one(*MATERIAL))
-    deviations = []
-    for seed in range(12):
-        scan = noisy(quiet, contrast, seed)
-        noise = NoiseModel.white_only(torch.full((8,), contrast, dtype=torch.float64), SHAPE)
-        value, error = total_delta(Model(found, Instrument(scan.exposures)), scan, noise)
-        deviations.append((value - true) / error)
-        assert 0.001 * true < error < 0.3 * true
-    assert np.sqrt(np.square(deviations).mean()) < 2.0
-    assert abs(np.mean(deviations)) < 1.2
-    assert np.std(deviations) > 0.3
-
-
-def test_a_volume_without_matter_has_no_mass(quiet):
-    grid = Grid.of_views(quiet.views)
-    empty = Model(VoxelGrid(torch.zeros(1, *grid.shape), grid, Matter.one(*MATERIAL)), Instrument(quiet.exposures))
-    with pytest.raises(InputError, match="a volume without matter"):
-        total_delta(empty, quiet, NoiseModel.of_frames(torch.from_numpy(quiet.frames)))
 
 
 def test_large_frames_are_binned(quiet):

@@ -142,7 +142,6 @@ def test_frames_whose_last_column_alone_is_quiet_are_no_error():
     assert not find_air(tensor(frame[None])).any()
 
 
-
 @pytest.mark.parametrize("box", [(0, 0, 0, 5), (0, 5, 3, 40), (-1, 5, 0, 5)])
 def test_boxes_must_lie_in_the_frame(box):
     with pytest.raises(InputError, match="--air"):

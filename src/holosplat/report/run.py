@@ -49,6 +49,7 @@ def report_run(
         volume_scores=evaluation.volume,
         material_delta=found.matter.delta if found.matter.single else None,
         explained=reconstruction.verdict,
+        total=reconstruction.total,
         history=folder.history(),
         seconds=sum(reconstruction.timing.values()),
         settings={"seed": config["seed"], "prior": config["prior"], **config.get("method", config.get("settings", {}))},

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
@@ -27,23 +26,16 @@ from ..scan import Scan
 from ..tables import to_table
 from .keeper import Choice, Keeper
 from .provenance import environment, scan_hash
+from .resuming import require_same
 from .run_folder import RunFolder
-from .verdict import Verdict, judge_run
+from .totals import TotalMatter, total_of_run
+from .verdict import Verdict, judge_run, said_of_run
 
 CHECKPOINT_SECONDS = 20.0
 FEWEST_COLUMNS = 11
 """Pixels across the axis that are a field of view; rows may be as few as one."""
 FLAT_LEVELS = (0.2, 5.0)
 """Between these lies the median of frames that are relative to the flat field."""
-RESUMED_WITH = {
-    "scan_hash": "scan file",
-    "method": "method and settings (--method, --preset, --config, --set)",
-    "prior": "material (--material, --delta-beta)",
-    "matter": "kind of matter (--matter)",
-    "seed": "seed (--seed)",
-    "light": "light (--light, --air)",
-}
-"""What must not change between the parts of a run, as messages call it."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +51,7 @@ class Reconstruction:
     choice: what was decided on the way, and which state `object` is
     delta_told: whether prior or frames say what δ is; else β alone is known, and δ = β stands for it
     verdict: whether the training frames are explained; None for runs of versions that did not say
+    total: the total δ by these frames, with its standard error; None likewise
     """
 
     object: Stored
@@ -70,6 +63,7 @@ class Reconstruction:
     choice: Choice = field(default_factory=Choice)
     delta_told: bool = True
     verdict: Verdict | None = None
+    total: TotalMatter | None = None
 
 
 def reconstruct(
@@ -146,7 +140,8 @@ def load_reconstruction(folder: RunFolder) -> Reconstruction:
     found = read_object(folder.result()).on("reference" if plain else "cpu")
     told = bool(summary.get("material", {}).get("delta_told", True))
     said = Verdict.from_dict(summary["verdict"]) if "verdict" in summary else None
-    return Reconstruction(found, method, energy, oversample, timing, done, Choice.read(summary), told, said)
+    total = TotalMatter.from_dict(summary["total"]) if "total" in summary else None
+    return Reconstruction(found, method, energy, oversample, timing, done, Choice.read(summary), told, said, total)
 
 
 @dataclass
@@ -173,7 +168,7 @@ class _Run:
         if not (resume and self.folder.config.is_file()):
             self.folder.require_new(advise_resume=not resume)
             return
-        _require_same(self.folder, config)
+        require_same(self.folder, config)
         self._saved = self.folder.load_checkpoint()
         if self._saved:
             self.timing |= self._saved["timing"]
@@ -256,6 +251,7 @@ class _Run:
             Choice(self.task.matter, self.why, dict(self._keeper.judged), best.name if best else ""),
             self.task.delta_told,
             judge_run(found, fit, self.task, oversample),
+            total_of_run(*said_of_run(found, fit, self.task, oversample), self.task),
         )
         if self.folder is not None:
             self.make_folder(found.backend)
@@ -359,33 +355,8 @@ def _summary(done: Reconstruction, fit: Fit | None, train: Scan) -> dict[str, An
         "second_material": second,
         "timing_s": done.timing,
         **({"verdict": done.verdict.as_dict()} if done.verdict else {}),
+        **({"total": done.total.as_dict()} if done.total else {}),
     }
-
-
-def _require_same(folder: RunFolder, config: dict[str, Any]) -> None:
-    """`InputError` unless the run in `folder` was started with this `config`; another machine may go on with it."""
-    old, same = folder.read_config(), json.loads(json.dumps(config))
-    old.setdefault("light", json.loads(json.dumps(to_table(LightOptions()))))
-    version = old.get("schema_version", 1)
-    require(
-        version == SCHEMA,
-        f"{folder.path} was begun by a version of holosplat whose checkpoints differ (schema {version}, now "
-        f"{SCHEMA}); start anew into another --out, with --config {folder.config}.",
-    )
-    for table in (old, same):
-        _without_backends(table.get("method", {}))
-    for key, name in RESUMED_WITH.items():
-        require(
-            old.get(key) == same[key],
-            f"--resume needs the {name} that {folder.path} was started with; use the same, or another --out.",
-        )
-
-
-def _without_backends(table: Any) -> None:
-    if isinstance(table, dict):
-        table.pop("backend", None)
-        for inner in table.values():
-            _without_backends(inner)
 
 
 def _config(scan: Scan, prior: MaterialPrior, method: Method, seed: int, matter: MatterKind | None) -> dict[str, Any]:

@@ -115,13 +115,18 @@ def judge_run(found: Stored, fit: Fit | None, task: Task, oversample: int) -> Ve
 
     Frames in uneven light are those that were evened; what air does not tell of the light counts as noise.
     """
+    said, fitted = said_of_run(found, fit, task, oversample)
+    return judge(said, fitted, task.noise if task.uneven and fit is None else None)
+
+
+def said_of_run(found: Stored, fit: Fit | None, task: Task, oversample: int) -> tuple[Prediction, Scan]:
+    """What a run says of its frames, and these: those that were fitted, or all training frames where nothing was."""
     train = task.scan
     if fit is None:
-        said = Prediction(found, train.exposures, oversample, backend=found.backend)
-        return judge(said, train, task.noise if task.uneven else None)
+        return Prediction(found, train.exposures, oversample, backend=found.backend), train
     aside = len(fit.plan.judge.scan) if fit.plan.judge else 0
     fitted, (alignment, light) = split_validation(train, aside)[0], _in_memory(fit.result())
-    return judge(Prediction(found, fitted.exposures, oversample, alignment, light, found.backend), fitted)
+    return Prediction(found, fitted.exposures, oversample, alignment, light, found.backend), fitted
 
 
 def _in_memory(model: Model) -> tuple[Alignment | None, LightField | None]:

@@ -1,0 +1,48 @@
+"""What must not change between the parts of a run."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from ..checks import require
+from ..methods.presets import SCHEMA
+from ..optics.background import LightOptions
+from ..tables import to_table
+from .run_folder import RunFolder
+
+RESUMED_WITH = {
+    "scan_hash": "scan file",
+    "method": "method and settings (--method, --preset, --config, --set)",
+    "prior": "material (--material, --delta-beta)",
+    "matter": "kind of matter (--matter)",
+    "seed": "seed (--seed)",
+    "light": "light (--light, --air)",
+}
+"""What must not change between the parts of a run, as messages call it."""
+
+
+def require_same(folder: RunFolder, config: dict[str, Any]) -> None:
+    """`InputError` unless the run in `folder` was started with this `config`; another machine may go on with it."""
+    old, same = folder.read_config(), json.loads(json.dumps(config))
+    old.setdefault("light", json.loads(json.dumps(to_table(LightOptions()))))
+    version = old.get("schema_version", 1)
+    require(
+        version == SCHEMA,
+        f"{folder.path} was begun by a version of holosplat whose checkpoints differ (schema {version}, now "
+        f"{SCHEMA}); start anew into another --out, with --config {folder.config}.",
+    )
+    for table in (old, same):
+        _without_backends(table.get("method", {}))
+    for key, name in RESUMED_WITH.items():
+        require(
+            old.get(key) == same[key],
+            f"--resume needs the {name} that {folder.path} was started with; use the same, or another --out.",
+        )
+
+
+def _without_backends(table: Any) -> None:
+    if isinstance(table, dict):
+        table.pop("backend", None)
+        for inner in table.values():
+            _without_backends(inner)
