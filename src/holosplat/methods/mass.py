@@ -75,8 +75,10 @@ def total_delta(
     require(whole > 0, "the total δ of a volume without matter has no standard error; look at its frames first.")
     level = plateau(delta.clamp_min(0))
     unit = level * math.prod(grid.voxel_size)
-    frames = WhitenedFrames(train, DeltaBeta(level, level * float(beta.double().sum()) / whole), noise)
-    ranges = _Ranges(frames, predicted)
+    material = DeltaBeta(level, level * float(beta.double().sum()) / whole)
+    backend = "reference" if found.backend == "reference" else "cpu"
+    frames = WhitenedFrames(train, material, noise, backend=backend)
+    ranges = _Ranges(frames, predicted, backend)
     limits = ranges.limits if ratio_known else ranges.limits[-1:]
     value, variance = _best(_by_range(ranges, limits, delta.clamp_min(0) / level))
     doubts = MODEL_SHARE**2 + (0.0 if ratio_known else RATIO_SHARE**2)
@@ -87,8 +89,8 @@ def total_delta(
 class _Ranges:
     """Misfits of frames in ranges of spatial frequencies; predicted: [V, H, W] at the first volume."""
 
-    def __init__(self, frames: WhitenedFrames, predicted: Tensor | None) -> None:
-        self.frames, self.problem = frames, VolumeProblem(frames, ContinuousPrior(), 1.0)
+    def __init__(self, frames: WhitenedFrames, predicted: Tensor | None, backend: str) -> None:
+        self.frames, self.problem = frames, VolumeProblem(frames, ContinuousPrior(), 1.0, backend)
         self._predicted, self._offset = predicted, torch.zeros(())
         (h, w), longest = frames.shape, max(frames.shape)
         self.radius = torch.hypot(torch.fft.fftfreq(h)[:, None], torch.fft.rfftfreq(w))
