@@ -8,13 +8,18 @@ import numpy as np
 import pytest
 import torch
 
+from holosplat.baselines.material import plateau
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
+from holosplat.fit.smooth_volume import ContinuousPrior, VolumeProblem, descend, modulated
+from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import HolographicVoxels, SmoothVolume, Task, solve
-from holosplat.methods.volume import binning, noise_of_binned
+from holosplat.methods.smooth_fit import noise_of_binned
+from holosplat.methods.volume import SmoothStage, binning
 from holosplat.optics.noise_model import NoiseModel
+from holosplat.representations import VoxelGrid
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.continuous import ContinuousScene
 from holosplat.specimens.soft_matter import soft_cells
@@ -65,6 +70,70 @@ def test_noise_of_half_the_contrast_keeps_the_mass(quiet):
     start, _ = judged(solve(HolographicVoxels(), Task(scan, RATIO)), scan)
     assert error < min(0.15, 0.5 * start)
     assert total == pytest.approx(1.0, abs=0.15)
+
+
+def plainly(scan: Scan, options: SmoothVolume) -> torch.Tensor:
+    """The volume without a fit that can be stopped: one descent after another."""
+    task = Task(scan, RATIO)
+    first = SmoothStage(options).start(task, None)
+    start = first.values[0]
+
+    def frames(factor: int) -> WhitenedFrames:
+        return WhitenedFrames(scan.binned(factor), first.matter.channels[0], noise_of_binned(task.noise, factor))
+
+    def rounds(seen: WhitenedFrames, prior: ContinuousPrior, u: torch.Tensor) -> torch.Tensor:
+        for _ in range(options.rounds):
+            problem = VolumeProblem(seen, prior, plateau(u))
+            u = modulated(problem, descend(problem, u, options.iterations)[0])
+        return u
+
+    grid = Grid.of_views(scan.binned(2).views)
+    coarse = rounds(frames(2), options.prior.on_larger_voxels(2), first.resampled(grid).values[0])
+    seen = frames(1)
+    u = VoxelGrid(coarse[None], grid, first.matter).resampled(first.grid).values[0]
+    problem, half = VolumeProblem(seen, options.prior, plateau(u)), options.iterations // 2
+    found, values = descend(problem, u, half)
+    if 2 * seen(problem.lines(found)).value > seen.count:
+        other, others = descend(problem, start, half)
+        found = other if others[-1] < values[-1] else found
+    return rounds(seen, options.prior, found)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.02])
+def test_a_fit_in_steps_is_one_descent_after_another(quiet, sigma):
+    """Bit for bit, and so is one that goes on from a saved state, wherever it was stopped."""
+    scan = noisy(quiet, sigma, 1) if sigma else quiet
+    options = SmoothVolume(coarser=(2,), rounds=2, iterations=4)
+    wanted = plainly(scan, options)
+    task = Task(scan, RATIO)
+    start = SmoothStage(options).start(task, None)
+    whole = SmoothStage(options).fit(task, start)
+    records: list[dict[str, float]] = []
+    whole.run(records.append)
+    assert torch.equal(whole.voxels.values[0], wanted)
+    assert [record["step"] for record in records] == list(range(1, whole.step + 1))
+    assert whole.finished
+    assert whole.share == pytest.approx(1.0)
+    for stop in (3, 8, 10, 12, 17):
+        first = SmoothStage(options).fit(task, start)
+        first.run(lambda record: None, until=stop)
+        assert not first.finished
+        second = SmoothStage(options).fit(task, start)
+        second.load(first.state_dict())
+        assert second.step == stop
+        second.run(lambda record: None)
+        assert torch.equal(second.voxels.values[0], wanted), stop
+
+
+def test_an_interrupted_fit_gives_what_it_has_reached(quiet):
+    """On voxels of a pixel, better than the start."""
+    task = Task(noisy(quiet, 0.02, 1), RATIO)
+    start = SmoothStage(SmoothVolume()).start(task, None)
+    fit = SmoothStage(SmoothVolume()).fit(task, start)
+    fit.run(lambda record: None, until=70)
+    assert 0 < fit.share < 1
+    assert fit.voxels.grid == start.grid
+    assert judged(fit.voxels, quiet)[0] < judged(start, quiet)[0]
 
 
 def test_large_frames_are_binned(quiet):

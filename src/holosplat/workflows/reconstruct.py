@@ -10,7 +10,7 @@ import numpy as np
 
 from ..backends import device_name
 from ..checks import InputError, require
-from ..fit.loop import Fit, Record
+from ..fit.running import Record, Running
 from ..geometry import Grid
 from ..io.json import read_json, write_json
 from ..io.light import write_light
@@ -191,12 +191,12 @@ class _Run:
         """Run what is left of the stages."""
         found: Stored | None = None
         stages, first = self.method.stages(), int(self._saved["stage"]) if self._saved else 0
-        last: Fit | None = None
+        last: Running | None = None
         for number in range(first, len(stages)):
             stage, saved = stages[number], self._saved if number == first else None
             start = _restored(saved["start"]) if saved else self._started(stage, found)
             fit = stage.fit(self.task, start)
-            oversample = fit.model.instrument.oversample if fit else 0
+            oversample = fit.oversample if fit else 0
             if saved is None and start is not found and (number == 0 or fit is None):
                 self._keeper.look(stage.name if number else "start", start, oversample, fitted=False)
             if fit is None:
@@ -229,17 +229,17 @@ class _Run:
             self.folder.create()
             write_json(self.folder.config, self._config | environment(backend))
 
-    def note_resolved(self, stage: str, fit: Fit) -> None:
+    def note_resolved(self, stage: str, fit: Running) -> None:
         """Add to config.json what the options have become in a stage: wave samples a pixel, weights and widths."""
         if self.folder is not None:
             config = self.folder.read_config()
-            found = {"oversample": fit.model.instrument.oversample, **fit.plan.problem.resolved()}
+            found = {"oversample": fit.oversample, **fit.resolved()}
             write_json(self.folder.config, config | {"resolved": config.get("resolved", {}) | {stage: found}})
 
-    def _result(self, found: Stored, fit: Fit | None, complete: bool) -> Reconstruction:
+    def _result(self, found: Stored, fit: Running | None, complete: bool) -> Reconstruction:
         exposures = self.task.scan.exposures
         best = self._keeper.best if complete else None
-        samples = best.oversample if best else fit.model.instrument.oversample if fit else 0
+        samples = best.oversample if best else fit.oversample if fit else 0
         oversample = samples or fringe_sampling(exposures)
         done = Reconstruction(
             found,
@@ -267,7 +267,7 @@ class _Run:
 class _Journal:
     """Runs one fit, and keeps metrics and checkpoints up to date while it runs."""
 
-    def __init__(self, fit: Fit, number: int, start: Stored, run: _Run) -> None:
+    def __init__(self, fit: Running, number: int, start: Stored, run: _Run) -> None:
         self._fit, self._number, self._start, self._run = fit, number, start, run
         self._pending: list[Record] = []
         self._last = time.perf_counter()
@@ -296,9 +296,8 @@ class _Journal:
         """Take in one step's record."""
         self._pending.append(record)
         fit = self._fit
-        share = fit.schedule.share(fit.step, fit.seconds)
         name = self._run.method.stages()[self._number].name
-        self._run.on_progress(name, min(1.0, share), record)
+        self._run.on_progress(name, fit.share, record)
         up_to_date = record["step"] == fit.step  # on a GPU, records come late and in batches
         if up_to_date and time.perf_counter() - self._last > CHECKPOINT_SECONDS:
             self._save()
@@ -325,7 +324,7 @@ def _restored(saved: dict[str, Any]) -> Stored:
     return KINDS[saved["kind"]].from_state(saved["state"])
 
 
-def _summary(done: Reconstruction, fit: Fit | None, train: Scan) -> dict[str, Any]:
+def _summary(done: Reconstruction, fit: Running | None, train: Scan) -> dict[str, Any]:
     (h, w), matter = train.views.shape, done.object.matter
     backend = fit.backend if fit else done.object.backend
     second = matter.second and {"delta": matter.second.delta, "beta": matter.second.beta}
