@@ -31,11 +31,13 @@ LEAST_EDGE = 12
 @dataclass(frozen=True)
 class Leg:
     """A descent. factor: edge of its voxels [pixels]; iterations: at most; kind: a round from where the one before
-    ended; or one from the coarse volume, or from the start, of which the likelier goes on."""
+    ended; or one from the coarse volume, or from the start, of which the likelier goes on; loose: how many times the
+    level that the volume has is the prior's."""
 
     factor: int
     iterations: int
     kind: Literal["round", "from coarse", "from start"] = "round"
+    loose: float = 1.0
 
     @property
     def work(self) -> float:
@@ -55,12 +57,15 @@ class SmoothPlan:
     coarser: tuple[int, ...]
     rounds: int
     iterations: int
+    loose: float
     backend: str
 
     def legs(self) -> tuple[Leg, ...]:
         """All descents: rounds on larger voxels, the choice of the likelier volume, and rounds on those of a pixel."""
         factors = [factor for factor in self.coarser if min(self.scan.views.shape) >= LEAST_EDGE * factor]
         coarse = [Leg(factor, self.iterations) for factor in factors for _ in range(self.rounds)]
+        if coarse:
+            coarse = [Leg(factors[0], self.iterations, loose=self.loose), *coarse]
         half = max(1, self.iterations // 2)
         trials = [Leg(1, half, "from coarse"), Leg(1, half, "from start")] if factors else []
         return (*coarse, *trials, *(Leg(1, self.iterations) for _ in range(self.rounds)))
@@ -176,7 +181,7 @@ class SmoothFit:
             if leg.kind == "from coarse":
                 self._volume = begun
             return False
-        self._level = plateau(u)
+        self._level = leg.loose * plateau(u)
         self._descent = Descent(self._problem(frames, leg.factor), u)
         return True
 

@@ -19,7 +19,7 @@ from .start import assumed_material
 
 
 def _start() -> HolographicTV:
-    return HolographicTV(retrieval=40, iterations=100, corrections=2, noisy=1.0, refine=1, upper=0.0)
+    return HolographicTV(noisy=1.0, refine=1, upper=0.0)
 
 
 @dataclass(frozen=True)
@@ -33,13 +33,17 @@ class SmoothVolume:
     kind: ClassVar[str] = "volume"
 
     volume: HolographicTV = field(default_factory=_start)
-    """The start: phase retrieval, total variation, and a little agreement with the frames."""
+    """The start: phase retrieval, total variation, and agreement with the frames. With fewer rounds of agreement than
+    `settling` it would end in the middle of them, on matter 1.5 times as wrong."""
     estimate: MaterialEstimate = field(default_factory=MaterialEstimate)
     """How a ratio δ/β that is not known is estimated."""
     prior: ContinuousPrior = field(default_factory=ContinuousPrior)
     """What is expected of continuous matter."""
     coarser: tuple[int, ...] = (4, 2)
     """Edges of the larger voxels [pixels] on which the fit is begun: low frequencies are found there soonest."""
+    loose: float = 10.0
+    """How many times too high the matter's level is taken in a first round, on the largest voxels. A start in noise has
+    too little matter, and a prior for so low a level wipes it out; on large voxels frames hardly need a prior."""
     rounds: int = 3
     """How often a fit is followed by the modulations that undo what the prior takes."""
     iterations: int = 20
@@ -49,7 +53,7 @@ class SmoothVolume:
 
     def __post_init__(self) -> None:
         at_least(self, 0, "rounds", "iterations")
-        at_least(self, 1, "max_voxels")
+        at_least(self, 1, "max_voxels", "loose")
         sizes = all(factor >= 2 for factor in self.coarser) and list(self.coarser) == sorted(self.coarser, reverse=True)
         require(sizes, f"coarser must be whole numbers from 2 on, the largest first, but it is {self.coarser}.")
 
@@ -75,7 +79,7 @@ class SmoothStage:
         scan = task.scan.binned(binning(task.scan, options.max_voxels))
         backend = options.volume.backend
         material = assumed_material(scan, task.prior, task.on_progress, backend, options.estimate)
-        first, grid = holographic_tv(scan, material, replace(options.volume, upper=0.0, noisy=1.0), task.on_progress)
+        first, grid = holographic_tv(scan, material, replace(options.volume, upper=0.0), task.on_progress)
         return VoxelGrid(first[None], grid, Matter.one(*material)).resampled(Grid.of_views(scan.views))
 
     def fit(self, task: Task, start: Stored) -> SmoothFit:
@@ -83,7 +87,7 @@ class SmoothStage:
         assert isinstance(start, VoxelGrid)
         options, factor = self.options, binning(task.scan, self.options.max_voxels)
         noise, backend = noise_of_binned(task.noise, factor), options.volume.backend
-        how = (options.prior, options.coarser, options.rounds, options.iterations, backend)
+        how = (options.prior, options.coarser, options.rounds, options.iterations, options.loose, backend)
         return SmoothFit(SmoothPlan(task.scan.binned(factor), start, noise, *how))
 
 
