@@ -3,21 +3,30 @@
     python benchmarks/mass.py --out docs/data/mass.csv                 # some ten minutes on one core
     python benchmarks/mass.py --cases balls --noise 0 --priors ratio --seeds 3
 
-Noise is white, of a share of the frames' contrast (rms). Matter with levels is fitted by Gaussians, continuous matter by
-a smooth volume. A row: what the volume holds and the total over the true one, the standard error as a share of the
+Noise is white, of a share of the frames' contrast (rms). Matter with levels is fitted by Gaussians, continuous matter
+by a smooth volume. A row: what the volume holds and the total over the true one, the standard error as a share of the
 total, and how many standard errors the total is off.
 """
 
 from __future__ import annotations
 
+import argparse
+import csv
+import itertools
 import math
 import os
+import platform
+import sys
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
+import torch
+from machine import commit
 
 import holosplat as hs
 from holosplat.matter import MatterKind
