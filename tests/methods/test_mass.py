@@ -91,7 +91,7 @@ def test_the_model_of_the_object_counts_rather_than_its_voxels(quiet, volume):
 
 
 def test_a_ratio_that_was_estimated_is_a_doubt(quiet, volume):
-    found = total_delta(volume, quiet, NoiseModel.of_frames(torch.from_numpy(quiet.frames)), ratio_known=False)
+    found = total_delta(volume, quiet, NoiseModel.of_frames(torch.from_numpy(quiet.frames)), ratio_doubt=RATIO_SHARE)
     assert found.share == pytest.approx(RATIO_SHARE, rel=0.1)
 
 

@@ -8,37 +8,31 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.soft import MATERIAL, PIXEL, cells, two_cells
+from holosplat.baselines import HolographicTV
 from holosplat.baselines.material import plateau
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.fit.smooth_volume import ContinuousPrior, VolumeProblem, descend, modulated
 from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid, Views
-from holosplat.matter import DeltaBeta, MaterialPrior
+from holosplat.matter import MaterialPrior
 from holosplat.methods import HolographicVoxels, SmoothVolume, Task, solve
 from holosplat.methods.smooth_fit import noise_of_binned
 from holosplat.methods.volume import SmoothStage, binning
 from holosplat.optics.noise_model import NoiseModel
 from holosplat.representations import VoxelGrid
 from holosplat.scan import Exposures, Scan
-from holosplat.specimens.continuous import ContinuousScene
-from holosplat.specimens.soft_matter import round_cell, soft_cells
+from holosplat.specimens.soft_matter import round_cell
 
-PIXEL, SHAPE = 1e-6, (41, 45)
-MATERIAL = DeltaBeta(6e-7, 4e-10)
 RATIO = MaterialPrior.of_ratio(1500.0)
-
-
-def cells() -> ContinuousScene:
-    """Two soft cells that fit the detector in every view."""
-    return soft_cells(2, (15 * PIXEL, 18 * PIXEL), (40e-6, 38e-6, 40e-6), MATERIAL, seed=3, edge=3 * PIXEL)
+QUICK = HolographicTV(retrieval=10, iterations=20, corrections=0, upper=0.0)
 
 
 @pytest.fixture(scope="module")
 def quiet() -> Scan:
     """Eight views without noise."""
-    exposures = Exposures.of(Views.evenly_spaced(8, SHAPE, PIXEL), 20.0, 0.05)
-    return simulate(cells(), exposures, is_test=np.zeros(8, dtype=bool))
+    return two_cells()
 
 
 def noisy(scan: Scan, sigma: float, seed: int) -> Scan:
@@ -118,7 +112,7 @@ def plainly(scan: Scan, options: SmoothVolume) -> torch.Tensor:
 def test_a_fit_in_steps_is_one_descent_after_another(quiet, sigma):
     """Bit for bit, and so is one that goes on from a saved state, wherever it was stopped."""
     scan = noisy(quiet, sigma, 1) if sigma else quiet
-    options = SmoothVolume(coarser=(2,), rounds=2, iterations=4)
+    options = SmoothVolume(QUICK, coarser=(2,), rounds=2, iterations=4)
     wanted = plainly(scan, options)
     task = Task(scan, RATIO)
     start = SmoothStage(options).start(task, None)

@@ -28,6 +28,7 @@ from holosplat.methods import (
     Voxels,
 )
 from holosplat.methods.mass import Total
+from holosplat.methods.uncertain import Determined
 from holosplat.report.content import ReportContent
 from holosplat.report.tables import score_tables
 from holosplat.representations import VoxelGrid
@@ -119,6 +120,20 @@ def test_large_scans_are_binned_and_thinned(scan, monkeypatch):
     assert len(many) > MOST_VIEWS
     found = total_of_run(Prediction(voxels, many.exposures, 2), many, Task(many, KNOWN))
     assert found.value == pytest.approx(true.sum() * np.prod(grid.voxel_size), rel=0.05)
+
+
+@pytest.mark.parametrize(("low", "high", "share"), [(480.0, 520.0, 0.036), (300.0, 800.0, 0.247)])
+def test_a_ratio_known_to_a_range_is_a_doubt(scan, low, high, share):
+    """A quarter of the interval of 95 % joins the error."""
+    grid, train = Grid.of_views(scan.views), scan.train()
+    true = np.asarray(scene().voxelise(grid).delta, dtype=np.float64)
+    voxels = VoxelGrid(torch.from_numpy(true / CELL.delta).float()[None], grid, Matter.one(*CELL))
+    constants = (Determined("delta_beta", CELL.ratio, low, high, (100.0, 5000.0), True),)
+    task = Task(train, MaterialPrior.of_ratio(CELL.ratio))
+    found = total_of_run(Prediction(voxels, train.exposures, 2), train, task, constants)
+    assert found.error is not None
+    assert found.value is not None
+    assert found.error / found.value == pytest.approx(share, rel=0.15)
 
 
 def test_words():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -52,6 +53,7 @@ def reconstruct(
     from ..io.formats import read_as
     from ..io.json import read_json, write_json
     from ..io.run_scan import run_source
+    from ..methods.uncertain import Uncertain
     from ..report.run import report_run
     from ..workflows.evaluate import evaluate as score
     from ..workflows.reconstruct import reconstruct as fit
@@ -59,8 +61,9 @@ def reconstruct(
 
     method = how.chosen()
     require(seed >= 0, f"--seed must be 0 or more, but it is {seed}.")
-    measured = read_as(scan, reading).in_memory()
-    prior = matter.prior(measured.exposures.reference_energy)
+    uncertain = Uncertain(**reading.told.ranges(), **matter.ranges())
+    measured = read_as(scan, replace(reading, told=reading.told.at_middle())).in_memory()
+    prior = matter.without_ranges().prior(measured.exposures.reference_energy)
     folder = RunFolder(out)
     with ProgressBar() as bar:
         result = fit(
@@ -70,16 +73,21 @@ def reconstruct(
             seed,
             matter=how.kind_of_matter(),
             light=illumination.options(),
+            uncertain=uncertain,
             folder=folder,
             resume=resume,
             on_progress=bar.show,
         )
-    write_json(folder.source, run_source(scan, reading))
+    found = {each.name: each.value for each in result.constants if each.name in reading.told.ranges()}
+    write_json(folder.source, run_source(scan, replace(reading, told=replace(reading.told, **found))))
+    measured = result.placed(measured)
     evaluation = score(result, measured, None)
     report = report_run(folder, result, measured, evaluation, None)
     _print_scores(evaluation)
     if folder.light.is_file():
         _say(f"light {read_json(folder.summary)['light']}, by the air of the frames: divided out ({folder.light})")
+    for constant in result.constants:
+        print(constant.line())
     for line in result.choice.lines():
         print(line)
     _say(f"{sum(result.timing.values()):.1f} s, {result.object.described}; report: {report}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -11,6 +11,7 @@ from tyro.conf import UseAppendAction, arg
 from ..beamline.light import UnevenLight
 from ..beamline.poses import Directions, Geometry
 from ..checks import InputError, require
+from ..io.reading import ends_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -292,11 +293,20 @@ class PriorOptions:
     """Formula or name of what surrounds them; none means vacuum."""
     medium_density: float | None = None
     """The medium's density [g/cm³]."""
-    delta_beta: float | None = None
-    """Or: only the ratio δ/β of the one material is known."""
+    delta_beta: float | str | None = None
+    """Or: only the ratio δ/β of the one material is known, or a range LOW:HIGH of it (for `reconstruct`)."""
+
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """What is said as a range, by name."""
+        return {"delta_beta": ends_of("delta_beta", self.delta_beta)} if isinstance(self.delta_beta, str) else {}
+
+    def without_ranges(self) -> PriorOptions:
+        """The same, with nothing where a range is said."""
+        require(self.material is None or self.delta_beta is None, "give --material or --delta-beta, not both.")
+        return replace(self, delta_beta=None) if self.ranges() else self
 
     def prior(self, energy_kev: float) -> MaterialPrior:
-        """The prior at `energy_kev` [keV]."""
+        """The prior at `energy_kev` [keV]. Errors: `InputError` for a range of δ/β."""
         from ..matter import MaterialPrior
 
         require(self.material is None or self.delta_beta is None, "give --material or --delta-beta, not both.")
@@ -305,6 +315,9 @@ class PriorOptions:
             stray = [f"--{name.replace('_', '-')}" for name in belongs if getattr(self, name) is not None]
             beside = " rather than --delta-beta" if self.delta_beta is not None else ""
             require(not stray, f"{', '.join(stray)} can only go with --material{beside}; add it, or leave them.")
+            if isinstance(self.delta_beta, str):
+                said = f"it is {self.delta_beta!r}; a range is for reconstruct alone."
+                raise InputError(f"--delta-beta must be one number here, but {said}")
             return MaterialPrior.unknown() if self.delta_beta is None else MaterialPrior.of_ratio(self.delta_beta)
         first = self._known(self.material, self.density, energy_kev)
         if self.second_material is None:

@@ -67,12 +67,20 @@ class ContinuousPrior:
 class VolumeProblem:
     """½ χ² of the frames and the prior of a volume u [Z, Y, X] ≥ 0 of one material's occupancy, on voxels of a pixel.
 
-    level: what u is about in matter, the unit of the prior's slopes and values.
+    level: what u is about in matter, the unit of the prior's slopes and values; support [Z, Y, X] bool: where matter
+    may be (None: anywhere), beyond which u must begin at zero, and stays there.
     """
 
-    def __init__(self, frames: WhitenedFrames, prior: ContinuousPrior, level: float, backend: str = "cpu") -> None:
+    def __init__(
+        self,
+        frames: WhitenedFrames,
+        prior: ContinuousPrior,
+        level: float,
+        backend: str = "cpu",
+        support: Tensor | None = None,
+    ) -> None:
         require(level > 0, f"the level of the matter must be positive, but it is {level:g}.")
-        self.frames, self.prior, self.level = frames, prior, level
+        self.frames, self.prior, self.level, self.support = frames, prior, level, support
         views = frames.train.views
         pixels = Views(views.rotations, views.shifts / views.pixel_size, views.shape, 1.0)
         self.grid = Grid.of_views(pixels)
@@ -94,7 +102,8 @@ class VolumeProblem:
         """The objective and its gradient [Z, Y, X]."""
         misfit = self.frames(self.lines(u))
         gradient = self.backprojection(misfit.gradient)
-        return misfit.value + self.penalty(u, gradient), gradient
+        value = misfit.value + self.penalty(u, gradient)
+        return value, gradient if self.support is None else gradient * self.support
 
     def penalty(self, u: Tensor, gradient: Tensor) -> float:
         """The prior of u; its gradient is added to `gradient`."""

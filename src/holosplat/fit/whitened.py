@@ -45,15 +45,21 @@ class WhitenedFrames:
     The unknowns are line integrals [V, H, W] of one material's occupancy, in pixels of path length.
 
     train: the frames; material: δ > 0 and β of an occupancy of one; noise: their noise; light: a factor of each frame,
-    None for even light; voxel_px: edge of the voxels that the lines come from [pixels].
+    None for even light; oversample: wave samples a pixel (0: as the first fringe needs).
     """
 
     def __init__(
-        self, train: Scan, material: DeltaBeta, noise: NoiseModel, light: LightField | None = None, backend: str = "cpu"
+        self,
+        train: Scan,
+        material: DeltaBeta,
+        noise: NoiseModel,
+        light: LightField | None = None,
+        backend: str = "cpu",
+        oversample: int = 0,
     ) -> None:
         exposures = train.exposures
         self.train, self.material = train, material
-        self.instrument = Instrument(exposures, fringe_sampling(exposures), backend=backend)
+        self.instrument = Instrument(exposures, oversample or fringe_sampling(exposures), backend=backend)
         self.shape, self.pixel = (train.views.shape[0], train.views.shape[1]), train.views.pixel_size
         frames = torch.from_numpy(train.frames)
         self._amplitudes = frames.clamp_min(0).sqrt()

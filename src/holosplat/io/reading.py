@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -25,10 +26,10 @@ OWN_WAY = ("angles", "axis_column", "sense")
 class Told:
     """What is said of a scan beside its files; it goes before what they say themselves."""
 
-    energy_kev: float | None = None
-    """Photon energy [keV] (default: as the files say)."""
-    distance: float | None = None
-    """Effective propagation distance [m] (default: as the files say)."""
+    energy_kev: float | str | None = None
+    """Photon energy [keV], or a range LOW:HIGH for `reconstruct` (default: as the files say)."""
+    distance: float | str | None = None
+    """Effective propagation distance [m], or a range LOW:HIGH for `reconstruct` (default: as the files say)."""
     pixel_size: float | None = None
     """Effective pixel size [m] (default: as the files say)."""
     angles: Path | None = None
@@ -59,8 +60,23 @@ class Told:
     white: float | None = None
     """Grey images, nerf-synthetic: intensity of white pixels, relative to the flat field (default: 1)."""
 
+    def ranges(self) -> dict[str, tuple[float, float]]:
+        """What is said as a range LOW:HIGH, by name."""
+        said = {"energy_kev": self.energy_kev, "distance": self.distance}
+        return {name: ends_of(name, value) for name, value in said.items() if isinstance(value, str)}
+
+    def at_middle(self) -> Told:
+        """The same with the geometric mean of each range."""
+        return replace(self, **{name: math.sqrt(low * high) for name, (low, high) in self.ranges().items()})
+
     def given(self) -> dict[str, Any]:
-        """The values for a loader, by name (`Loader.takes`); angles as `angles_deg` [N]."""
+        """The values for a loader, by name (`Loader.takes`); angles as `angles_deg` [N].
+
+        Errors: `InputError` for ranges.
+        """
+        for name in self.ranges():
+            option, text = f"--{name.replace('_', '-')}", getattr(self, name)
+            raise InputError(f"{option} must be one number here, but it is {text!r}; a range is for reconstruct alone.")
         said = {name: value for name, value in vars(self).items() if value is not None and name not in OWN_WAY}
         return said if self.angles is None else {**said, "angles_deg": read_angles(self.angles)}
 
@@ -133,6 +149,21 @@ class Reading:
     def over(self, other: Reading) -> Reading:
         """`other` with all that differs from the default here."""
         return Reading(replace(other.told, **_said(self.told)), replace(other.part, **_said(self.part)))
+
+
+def ends_of(name: str, text: str) -> tuple[float, float]:
+    """The range that the `text` LOW:HIGH of the option `name` says. Errors: `InputError` for anything else."""
+    words = text.split(":")
+    try:
+        low, high = (float(word) for word in words)
+    except ValueError:
+        low, high = math.nan, math.nan
+    require(
+        0 < low * high < math.inf and abs(low) < abs(high),
+        f"--{name.replace('_', '-')} must be a number, or a range LOW:HIGH of numbers above 0, the smaller one first, "
+        f"but it is {text!r}; correct it.",
+    )
+    return low, high
 
 
 def _said(kind: Told | Part) -> dict[str, Any]:

@@ -27,6 +27,8 @@ in noise (the same seeds, material or ratio known) were off by 1.5 times their s
 RATIO_SHARE = 0.4
 """Standard error, as a share of the total, where the ratio δ/β was estimated: such totals (18 runs, the same seeds)
 were off by 0.4 (rms), some by a factor of two, for as good is the estimate of the ratio."""
+DOUBTFUL = 0.1
+"""Standard error of the ratio δ/β, as a share, from which on absorption says little of the total."""
 SPREAD = 1.0
 """Standard deviation expected of each share by which a volume is modulated: a fit in noise may have lost most of it."""
 WAVES = 4
@@ -51,7 +53,7 @@ class Total:
 
 
 def total_delta(
-    found: Stored, train: Scan, noise: NoiseModel, predicted: Tensor | None = None, ratio_known: bool = True
+    found: Stored, train: Scan, noise: NoiseModel, predicted: Tensor | None = None, ratio_doubt: float = 0.0
 ) -> Total:
     """`∫ δ dV` of a reconstruction `found`, by the frames `train` that it was fitted to.
 
@@ -63,9 +65,9 @@ def total_delta(
     octaves, each from where the one before has led, and the total is that of the range with the least variance and
     squared bias, which is how much it differs from narrower ones beyond their errors (Goldenshluger & Lepski 2011).
 
-    predicted: frames [V, H, W] of `found` by its own model; None where voxels of a pixel say the same. ratio_known:
-    else low frequencies, which see the total by its absorption, are no better than the others, and all are taken at
-    once, with the doubt of `RATIO_SHARE`. The error is that of the `noise`, of shapes (`SHAPES`) and of the model
+    predicted: frames [V, H, W] of `found` by its own model; None where voxels of a pixel say the same. ratio_doubt:
+    standard error of δ/β as a share, which joins that of the total; from `DOUBTFUL` on, low frequencies, which see the
+    total by its absorption, are no better than the others, and all are taken at once. The error is that of the `noise`, of shapes (`SHAPES`) and of the model
     (`MODEL_SHARE`); it does not know of a wrong distance or energy. Errors: `InputError` for a volume without matter.
     """
     grid = Grid.of_views(train.views)
@@ -79,9 +81,9 @@ def total_delta(
     backend = "reference" if found.backend == "reference" else "cpu"
     frames = WhitenedFrames(train, material, noise, backend=backend)
     ranges = _Ranges(frames, predicted, backend)
-    limits = ranges.limits if ratio_known else ranges.limits[-1:]
+    limits = ranges.limits if ratio_doubt < DOUBTFUL else ranges.limits[-1:]
     value, variance = _best(_by_range(ranges, limits, delta.clamp_min(0) / level))
-    doubts = MODEL_SHARE**2 + (0.0 if ratio_known else RATIO_SHARE**2)
+    doubts = MODEL_SHARE**2 + ratio_doubt**2
     error = math.sqrt(SHAPES**2 * variance + doubts * value**2)
     return Total(value * unit, error * unit, float(delta.double().sum()) * math.prod(grid.voxel_size))
 

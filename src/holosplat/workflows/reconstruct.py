@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, cast
 
 import numpy as np
@@ -18,6 +18,8 @@ from ..io.objects import read_object, write_object
 from ..matter import MaterialPrior, MatterKind
 from ..methods import Auto, Gaussians, Method, Settled, Stage, Task, finished, settled
 from ..methods.presets import SCHEMA
+from ..methods.profile import exposed
+from ..methods.uncertain import Determined, Uncertain
 from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling
 from ..progress import FitProgress
@@ -52,6 +54,7 @@ class Reconstruction:
     delta_told: whether prior or frames say what δ is; else β alone is known, and δ = β stands for it
     verdict: whether the training frames are explained; None for runs of versions that did not say
     total: the total δ by these frames, with its standard error; None likewise
+    constants: what was known to a range only, or of continuous matter not at all, by the frames
     """
 
     object: Stored
@@ -64,6 +67,11 @@ class Reconstruction:
     delta_told: bool = True
     verdict: Verdict | None = None
     total: TotalMatter | None = None
+    constants: tuple[Determined, ...] = ()
+
+    def placed(self, scan: Scan) -> Scan:
+        """`scan`, as it was given to the reconstruction, at the distance and energy that were found."""
+        return exposed(scan, {each.name: each.value for each in self.constants})
 
 
 def reconstruct(
@@ -74,6 +82,7 @@ def reconstruct(
     *,
     light: LightOptions | None = None,
     matter: MatterKind | None = None,
+    uncertain: Uncertain | None = None,
     folder: RunFolder | None = None,
     resume: bool = False,
     on_progress: FitProgress = lambda stage, fraction, record: None,
@@ -82,6 +91,8 @@ def reconstruct(
 
     matter: whether it has levels or is continuous; None: what the frames say.
     light: what is assumed of the light (default: even, unless air says otherwise; see `Task.evened`).
+    uncertain: distance, energy or δ/β that are known to a range (default: nothing); `constants` of the result then says
+    what the frames say of them, and `Reconstruction.placed` gives the scan that the result belongs to.
     With a `folder`, everything is written there, and a later call with `resume=True` goes on from the last
     checkpoint, with the same result as if nothing had happened. Ctrl-C (KeyboardInterrupt) ends a fit with what it has
     reached (`finished` is False); during a start there is nothing yet, and it is passed on. Errors: `InputError` for
@@ -94,8 +105,10 @@ def reconstruct(
     assumed = light or LightOptions()
     task = Task(train, prior, seed, lambda stage, part: on_progress(stage, part, {}), assumed).evened()
     run = _Run(task, method, folder, on_progress)
-    run.begin(_config(scan, prior, method, seed, matter) | {"light": to_table(assumed)}, resume)
-    run.settle(matter)
+    ranges = uncertain or Uncertain()
+    said = {"light": to_table(assumed), "uncertain": to_table(ranges)}
+    run.begin(_config(scan, prior, method, seed, matter) | said, resume)
+    run.settle(matter, ranges)
     return run.complete()
 
 
@@ -141,7 +154,9 @@ def load_reconstruction(folder: RunFolder) -> Reconstruction:
     told = bool(summary.get("material", {}).get("delta_told", True))
     said = Verdict.from_dict(summary["verdict"]) if "verdict" in summary else None
     total = TotalMatter.from_dict(summary["total"]) if "total" in summary else None
-    return Reconstruction(found, method, energy, oversample, timing, done, Choice.read(summary), told, said, total)
+    constants = tuple(Determined.from_dict(each) for each in summary.get("constants", ()))
+    chosen = Choice.read(summary)
+    return Reconstruction(found, method, energy, oversample, timing, done, chosen, told, said, total, constants)
 
 
 @dataclass
@@ -155,6 +170,7 @@ class _Run:
     timing: dict[str, float] = field(default_factory=dict)
     asked: str = ""
     why: str = ""
+    constants: tuple[Determined, ...] = ()
     _keeper: Keeper = field(init=False)
     _saved: dict[str, Any] | None = None
     _config: dict[str, Any] = field(default_factory=dict)
@@ -174,18 +190,19 @@ class _Run:
             self.timing |= self._saved["timing"]
             self._keeper.load(self._saved["kept"])
 
-    def settle(self, matter: MatterKind | None) -> None:
-        """Decide on the kind of matter, and on the method where that is `auto`; or do as was decided before."""
+    def settle(self, matter: MatterKind | None, uncertain: Uncertain) -> None:
+        """Decide on what is uncertain, on the kind of matter, and on the method where that is `auto`; or do as was
+        decided before."""
         began = time.perf_counter()
         if self._saved and self.folder is not None:
-            before = self.folder.read_config()["decided"]
-            found = Settled.again(self.method, before["matter"], before["why"])
+            found = Settled.again(self.method, self.folder.read_config()["decided"])
         else:
-            found = settled(self.method, self.task, matter)
+            found = settled(self.method, self.task, matter, uncertain)
             self.timing["decision"] = time.perf_counter() - began
-        self.method, self.why = found.method, found.why
-        self.task = replace(self.task, matter=found.matter)
-        self._config["decided"] = {"method": found.method.kind, "matter": found.matter, "why": found.why}
+        self.method, self.why, self.constants = found.method, found.why, found.constants
+        self.task = found.task(self.task)
+        self._keeper.train = self.task.scan
+        self._config["decided"] = found.as_table()
 
     def complete(self) -> Reconstruction:
         """Run what is left of the stages."""
@@ -251,7 +268,8 @@ class _Run:
             Choice(self.task.matter, self.why, dict(self._keeper.judged), best.name if best else ""),
             self.task.delta_told,
             judge_run(found, fit, self.task, oversample),
-            total_of_run(*said_of_run(found, fit, self.task, oversample), self.task),
+            total_of_run(*said_of_run(found, fit, self.task, oversample), self.task, self.constants),
+            self.constants,
         )
         if self.folder is not None:
             self.make_folder(found.backend)
@@ -353,6 +371,7 @@ def _summary(done: Reconstruction, fit: Running | None, train: Scan) -> dict[str
         },
         "second_material": second,
         "timing_s": done.timing,
+        "constants": [to_table(each) for each in done.constants],
         **({"verdict": done.verdict.as_dict()} if done.verdict else {}),
         **({"total": done.total.as_dict()} if done.total else {}),
     }

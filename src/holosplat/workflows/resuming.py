@@ -7,6 +7,7 @@ from typing import Any
 
 from ..checks import require
 from ..methods.presets import SCHEMA
+from ..methods.uncertain import Uncertain
 from ..optics.background import LightOptions
 from ..tables import to_table
 from .run_folder import RunFolder
@@ -18,6 +19,7 @@ RESUMED_WITH = {
     "matter": "kind of matter (--matter)",
     "seed": "seed (--seed)",
     "light": "light (--light, --air)",
+    "uncertain": "ranges (--distance, --energy-kev, --delta-beta)",
 }
 """What must not change between the parts of a run, as messages call it."""
 
@@ -25,7 +27,8 @@ RESUMED_WITH = {
 def require_same(folder: RunFolder, config: dict[str, Any]) -> None:
     """`InputError` unless the run in `folder` was started with this `config`; another machine may go on with it."""
     old, same = folder.read_config(), json.loads(json.dumps(config))
-    old.setdefault("light", json.loads(json.dumps(to_table(LightOptions()))))
+    for name, default in (("light", LightOptions()), ("uncertain", Uncertain())):
+        old.setdefault(name, json.loads(json.dumps(to_table(default))))
     version = old.get("schema_version", 1)
     require(
         version == SCHEMA,

@@ -14,7 +14,8 @@ from ..checks import InputError
 from ..fit.residuals import Prediction
 from ..geometry import Grid
 from ..methods import Task
-from ..methods.mass import Total, total_delta
+from ..methods.mass import DOUBTFUL, RATIO_SHARE, Total, total_delta
+from ..methods.uncertain import Determined
 from ..methods.volume import binning, noise_of_binned
 from ..optics.noise_model import NoiseModel
 from ..representations import Stored, VoxelGrid
@@ -68,8 +69,10 @@ def _float(value: Any) -> float | None:
     return None if value is None else float(value)
 
 
-def total_of_run(said: Prediction, frames: Scan, task: Task) -> TotalMatter:
+def total_of_run(said: Prediction, frames: Scan, task: Task, constants: tuple[Determined, ...] = ()) -> TotalMatter:
     """The total δ by what a run says of the `frames` that it was fitted to, with the knowledge and noise of its `task`.
+
+    constants: what was uncertain; the doubt of δ/β is that of its interval, or `RATIO_SHARE` where it was estimated.
 
     Where the frames show no refraction and nothing is known, it is the total β.
     """
@@ -84,10 +87,20 @@ def total_of_run(said: Prediction, frames: Scan, task: Task) -> TotalMatter:
     predicted = None if _imaged_as_voxels(said, frames, factor) else _predicted(said, few, chosen).binned(factor)
     noise = noise_of_binned(_noise(task, frames)[torch.from_numpy(chosen)], factor)
     shown = None if predicted is None else torch.from_numpy(predicted.frames)
-    known = task.prior.fixes_ratio
-    total = total_delta(found, few.binned(factor), noise, shown, known)
+    doubt = _ratio_doubt(task, constants)
+    total = total_delta(found, few.binned(factor), noise, shown, doubt)
     material = task.prior.materials[0].delta if len(task.prior.materials) == 1 else None
-    return TotalMatter(quantity, total.value, total.error, total.held, in_words(total, quantity, material, known))
+    return TotalMatter(
+        quantity, total.value, total.error, total.held, in_words(total, quantity, material, doubt < DOUBTFUL)
+    )
+
+
+def _ratio_doubt(task: Task, constants: tuple[Determined, ...]) -> float:
+    """Standard error of δ/β as a share: a quarter of its interval of 95 %."""
+    for each in constants:
+        if each.name == "delta_beta":
+            return min(RATIO_SHARE, 0.25 * abs(math.log(each.high / each.low)))
+    return 0.0 if task.prior.fixes_ratio else RATIO_SHARE
 
 
 def in_words(total: Total, quantity: str, delta: float | None = None, ratio_known: bool = True) -> str:

@@ -1,0 +1,160 @@
+"""How likely frames are under constants of the experiment: the likeliest volume of coarse frames within a support.
+
+Without a support, a wrong distance or ratio δ/β leaves halos of faint matter about the body, which explain the frames
+as well; where space is known to be empty, they do not.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from scipy.ndimage import binary_dilation
+from torch import Tensor
+
+from ..baselines import HolographicTV, holographic_tv
+from ..baselines.material import plateau
+from ..checks import at_least, require
+from ..fit.smooth_volume import ContinuousPrior, VolumeProblem, descend
+from ..fit.whitened import WhitenedFrames
+from ..geometry import Grid
+from ..matter import DeltaBeta, Matter
+from ..memory import memory_kept
+from ..optics.noise_model import NoiseModel
+from ..optics.sampling import fringe_sampling
+from ..representations import VoxelGrid
+from ..scan import Scan
+from .method import Task, quiet
+from .volume import noise_of_binned
+
+UNIT_DELTA = 1e-6
+"""δ of an occupancy of one; any value does, for occupancies have no bound."""
+
+Constants = Mapping[str, float]
+"""Values of what is uncertain, by name: `distance` [m], `energy_kev` [keV], `delta_beta`."""
+
+
+@dataclass(frozen=True)
+class ProfileOptions:
+    """How the likelihood of constants is computed."""
+
+    width: int = 64
+    """Frames are binned to at most so many pixels [pixels]: a volume of them takes seconds."""
+    faint: float = 0.08
+    """Part of the matter's level from which on a voxel of the first volume belongs to the support."""
+    dilated: int = 2
+    """Voxels by which the support is wider, for rims."""
+    doubt: float = 0.01
+    """Part of the contrast (rms) that counts as noise besides: without any, a fit would not come to its end."""
+    iterations: int = 30
+    """Iterations of each of two rounds, whose second takes the level of matter from the first."""
+    start: HolographicTV = field(
+        default_factory=lambda: HolographicTV(
+            retrieval=40, iterations=100, corrections=2, noisy=1.0, refine=1, upper=0.0
+        )
+    )
+    """The volume that each fit starts from."""
+    prior: ContinuousPrior = field(default_factory=lambda: ContinuousPrior(slopes=0.1, values=0.005))
+    """What is expected of matter: less than of a volume that is to be looked at, for what is expected pulls constants
+    towards those that need fewer slopes; here the support does most."""
+
+    def __post_init__(self) -> None:
+        at_least(self, 16, "width")
+        at_least(self, 0, "dilated")
+        at_least(self, 1, "iterations")
+        require(0 < self.faint < 1, f"faint must lie between 0 and 1, but it is {self.faint:g}.")
+
+
+class Profile:
+    """-log of the likelihood of the coarse frames of a task, as a function of constants; the volume is the likeliest.
+
+    ratio: δ/β at the nominal energy, where it is not among the constants; nominal: the constants by which the support
+    is found; most: samples of waves a pixel are those that the largest of `distances` [m] and energies need, the same
+    for all constants, or the misfit would jump where their number changes.
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        ratio: float,
+        nominal: Constants,
+        corners: Sequence[Constants],
+        options: ProfileOptions = ProfileOptions(),
+    ) -> None:
+        self.options, self._ratio = options, ratio
+        factor = max(1, math.ceil(max(task.scan.views.shape) / options.width))
+        self._scan = task.scan.binned(factor)
+        contrast = torch.from_numpy(self._scan.frames - 1).double().square().mean(dim=(1, 2))
+        noise = noise_of_binned(task.noise, factor)
+        white = (noise.white.square() + options.doubt**2 * contrast).sqrt()
+        self._noise = NoiseModel(white, noise.grain, noise.width)
+        self._energy = self._scan.exposures.reference_energy
+        self._samples = max(fringe_sampling(self._exposed(c).exposures) for c in [nominal, *corners])
+        with memory_kept():
+            first = self._start(self.frames(nominal))
+        inside = (first > options.faint * plateau(first)).numpy()
+        self.support = torch.from_numpy(np.asarray(binary_dilation(inside, iterations=max(1, options.dilated))))
+        self._peak = plateau(first) / float((first * self.support).sum() / self.support.sum())
+        """The level of matter over its mean in the support. The prior's unit must not vary by chance from fit to fit,
+        as a plateau does, for the larger it is, the likelier are all slopes."""
+
+    @property
+    def count(self) -> int:
+        """Pixels in all coarse frames."""
+        return int(np.prod(self._scan.frames.shape))
+
+    def air(self) -> float:
+        """Part of all pixels whose rays pass beside the support."""
+        problem = VolumeProblem(self.frames({}), self.options.prior, 1.0, self.options.start.backend)
+        return float((problem.lines(self.support.float()) <= 0).double().mean())
+
+    @property
+    def noise_share(self) -> float:
+        """Noise over the contrast of the coarse frames (rms), 1 at most."""
+        contrast = float(np.square(self._scan.frames - 1).mean())
+        return min(1.0, math.sqrt(float(self._noise.level.square().mean()) / max(contrast, 1e-30)))
+
+    def frames(self, constants: Constants) -> WhitenedFrames:
+        """The misfit of the coarse frames under `constants`."""
+        scan = self._exposed(constants)
+        ratio = constants.get("delta_beta", self._ratio * ratio_factor(scan, self._energy))
+        material = DeltaBeta(UNIT_DELTA, UNIT_DELTA / ratio)
+        return WhitenedFrames(scan, material, self._noise, backend=self.options.start.backend, oversample=self._samples)
+
+    def _exposed(self, constants: Constants) -> Scan:
+        return exposed(self._scan, constants)
+
+    def _start(self, frames: WhitenedFrames) -> Tensor:
+        values, grid = holographic_tv(frames.train, frames.material, self.options.start, quiet)
+        whole = VoxelGrid(values[None], grid, Matter.one(*frames.material))
+        return whole.resampled(Grid.of_views(frames.train.views)).values[0]
+
+    def __call__(self, constants: Constants) -> float:
+        """½ χ² and prior of the likeliest volume in the support."""
+        with memory_kept():
+            frames, options = self.frames(constants), self.options
+            u = self._start(frames) * self.support
+            values = [frames(torch.zeros(frames.train.frames.shape)).value]
+            for _ in range(2):
+                if bool((u > 0).any()):
+                    level = self._peak * float(u.sum() / self.support.sum())
+                    problem = VolumeProblem(frames, options.prior, level, options.start.backend, self.support)
+                    u, values = descend(problem, u, options.iterations)
+            return values[-1]
+
+
+def exposed(scan: Scan, constants: Constants) -> Scan:
+    """`scan` at the distance and energy that `constants` say; δ and β hold at that energy then."""
+    changes = {name: np.full(len(scan), value) for name, value in constants.items() if name != "delta_beta"}
+    if not changes:
+        return scan
+    reference = None if "energy_kev" in changes else scan.exposures.reference_kev
+    return replace(scan, exposures=replace(scan.exposures, **changes, reference_kev=reference))
+
+
+def ratio_factor(scan: Scan, energy_kev: float) -> float:
+    """δ/β at the energy of `scan` over that at `energy_kev` [keV]: `(E/E₀)²` (see `scan.far_from_edges`)."""
+    return (scan.exposures.reference_energy / energy_kev) ** 2

@@ -1,0 +1,138 @@
+"""Constants that are known to a range: found where frames show them, and said to be open where they do not."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from helpers.blobs import blob_scan
+from helpers.soft import MATERIAL, two_cells
+from holosplat.baselines import HolographicTV
+from holosplat.checks import InputError
+from holosplat.matter import MaterialPrior
+from holosplat.methods import Task
+from holosplat.methods.profile import ProfileOptions
+from holosplat.methods.uncertain import Determined, Search, Uncertain, at_energy, determine, likeliest_ratio, told
+
+RATIO = MaterialPrior.of_ratio(MATERIAL.ratio)
+QUICK = ProfileOptions(
+    iterations=10, start=HolographicTV(retrieval=15, iterations=30, corrections=0, noisy=1.0, refine=1, upper=0.0)
+)
+
+
+@pytest.fixture(scope="module")
+def scan():
+    """Two soft cells in eight views of 41 × 45 pixels at 20 keV and 0.05 m, without noise."""
+    return two_cells()
+
+
+def test_a_distance_is_found_within_its_range(scan):
+    (found,) = determine(Task(scan, RATIO), Uncertain(distance=(0.04, 0.09)), QUICK)
+    assert found.told
+    assert found.low < 0.05 < found.high
+    assert found.value == pytest.approx(0.05, rel=0.15)
+    assert "by the frames" in found.line()
+
+
+def test_a_ratio_is_found_where_nothing_is_known(scan):
+    found = likeliest_ratio(Task(scan, MaterialPrior.unknown()), QUICK)
+    assert found.told
+    assert found.value == pytest.approx(MATERIAL.ratio, rel=0.15)
+    assert found.low < MATERIAL.ratio < found.high
+
+
+class Valley:
+    """A misfit that is a square in logarithms: one direction is steep, the other one `flat`."""
+
+    noise_share = 0.0
+
+    def __init__(self, flat: float) -> None:
+        self.flat = flat
+
+    def __call__(self, constants) -> float:
+        x, y = math.log(constants["distance"] / 0.12), math.log(constants["delta_beta"] / 1200.0)
+        return 2000 * (x - y) ** 2 + self.flat * (x + y) ** 2
+
+
+def searched(flat: float):
+    ranges = {"distance": (0.06, 0.2), "delta_beta": (500.0, 3000.0)}
+    return Search(Valley(flat), ranges, Task(blob_scan(count=2), MaterialPrior.unknown())).run()
+
+
+def test_two_constants_that_frames_tell_are_both_found():
+    distance, ratio = searched(1000.0)
+    assert distance.told
+    assert ratio.told
+    assert distance.value == pytest.approx(0.12, rel=0.02)
+    assert ratio.value == pytest.approx(1200.0, rel=0.02)
+    assert distance.low < 0.12 < distance.high < 0.14
+
+
+def test_two_constants_that_frames_tell_only_together_are_said_to_be():
+    distance, ratio = searched(0.0)
+    assert not distance.told
+    assert "only together with others: what explains them grows with δ/β" in distance.line()
+    assert distance.low < 0.12 < distance.high
+    assert ratio.value / distance.value == pytest.approx(1e4, rel=0.05)  # which is what they do tell
+
+
+def test_a_constant_beyond_its_range_is_said_to_be_at_the_end():
+    ranges = {"distance": (0.15, 0.3), "delta_beta": (1100.0, 1300.0)}
+    distance, _ = Search(Valley(3000.0), ranges, Task(blob_scan(count=2), MaterialPrior.unknown())).run()
+    assert "lower end of the range" in distance.line()
+
+
+def test_absorption_alone_tells_neither():
+    scan = blob_scan(0.0)
+    task = Task(scan, MaterialPrior.unknown())
+    assert not task.delta_told
+    for found in determine(task, Uncertain(distance=(1e-9, 5e-9), delta_beta=(500.0, 2000.0))):
+        assert not found.told
+        assert "absorption alone" in found.line()
+    given = told(task, determine(task, Uncertain(delta_beta=(500.0, 2000.0))))
+    assert given.prior.ratio == pytest.approx(1000.0)
+    assert given.delta_told
+
+
+def test_a_task_takes_what_was_found(scan):
+    found = (Determined("energy_kev", 30.0, 25.0, 35.0, (20.0, 40.0), True),)
+    task = told(Task(scan, MaterialPrior.known(MATERIAL)), found)
+    assert task.scan.exposures.reference_energy == 30.0
+    (material,) = task.prior.materials
+    assert material.delta == pytest.approx(MATERIAL.delta / 2.25)
+    assert material.beta == pytest.approx(MATERIAL.beta / 2.25**2)
+    assert told(task, ()) is task
+
+
+def test_ratios_grow_with_the_square_of_the_energy():
+    assert at_energy(RATIO, 2.0).ratio == pytest.approx(4 * RATIO.ratio)
+    unknown = MaterialPrior.unknown()
+    assert at_energy(unknown, 2.0) is unknown
+
+
+@pytest.mark.parametrize("ends", [(0.2, 0.1), (0.0, 1.0), (-1.0, 1.0), (1.0, math.inf), (math.nan, 1.0)])
+def test_ranges_go_from_a_smaller_to_a_larger_size(ends):
+    with pytest.raises(InputError, match="distance must go from a smaller"):
+        Uncertain(distance=ends)
+
+
+def test_what_cannot_be_uncertain_is_refused(scan):
+    with pytest.raises(InputError, match="delta_beta must be a range where the material is not known"):
+        determine(Task(scan, RATIO), Uncertain(delta_beta=(500.0, 2000.0)))
+    exposures = scan.exposures
+    several = np.linspace(0.1, 0.2, len(scan))
+    other = type(scan)(
+        scan.frames, type(exposures)(exposures.views, exposures.energy_kev, several, 0.0, 0.0), scan.is_test
+    )
+    with pytest.raises(InputError, match="uncertain distance must be that of all frames"):
+        determine(Task(other, RATIO), Uncertain(distance=(0.1, 0.3)))
+
+
+def test_what_was_determined_is_read_from_its_table():
+    from holosplat.tables import to_table
+
+    found = Determined("distance", 0.1, 0.09, 0.11, (0.05, 0.2), True, "a remark")
+    assert Determined.from_dict(to_table(found)) == found
+    assert Uncertain.from_table(to_table(Uncertain(distance=(0.1, 0.2)))) == Uncertain(distance=(0.1, 0.2))
