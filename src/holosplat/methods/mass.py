@@ -67,7 +67,8 @@ def total_delta(
 
     predicted: frames [V, H, W] of `found` by its own model; None where voxels of a pixel say the same. ratio_doubt:
     standard error of δ/β as a share, which joins that of the total; from `DOUBTFUL` on, low frequencies, which see the
-    total by its absorption, are no better than the others, and all are taken at once. The error is that of the `noise`, of shapes (`SHAPES`) and of the model
+    total by its absorption, are no better than the others, and all are taken at once. The error is that of the
+    `noise`, of shapes (`SHAPES`) and of the model
     (`MODEL_SHARE`); it does not know of a wrong distance or energy. Errors: `InputError` for a volume without matter.
     """
     grid = Grid.of_views(train.views)
