@@ -256,7 +256,10 @@ def _checked(hint: Any, value: Any, where: str) -> Any:
 
 
 def _one_of(kinds: list[Any], value: Any, where: str) -> Any:
-    """The table `value` as the dataclass among `kinds` that its entry `kind` names."""
+    """The table `value` as the dataclass among `kinds` that its entry `kind` names; or a text, where that may be."""
+    if not any(_is_dataclass(kind) for kind in kinds):
+        texts = isinstance(value, str) and str in kinds
+        return _plain(str if texts else kinds[0], value, where)
     require(isinstance(value, dict), f"{where} must be a table, but it is {value!r}.")
     require("kind" in value, f"{_path(where, 'kind')} is missing; add one of {', '.join(k.kind for k in kinds)}.")
     return from_table(_tagged(kinds, value["kind"], where), value, where)

@@ -88,7 +88,7 @@ def test_absorption_alone_tells_neither():
     scan = blob_scan(0.0)
     task = Task(scan, MaterialPrior.unknown())
     assert not task.delta_told
-    for found in determine(task, Uncertain(distance=(1e-9, 5e-9), delta_beta=(500.0, 2000.0))):
+    for found in determine(task, Uncertain(distance=(1e-9, 1.5e-9), delta_beta=(500.0, 2000.0))):
         assert not found.told
         assert "absorption alone" in found.line()
     given = told(task, determine(task, Uncertain(delta_beta=(500.0, 2000.0))))

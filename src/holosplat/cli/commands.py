@@ -236,7 +236,7 @@ def evaluate(
         print(json.dumps(evaluation.as_dict(), indent=2, allow_nan=False))
     else:
         _print_scores(evaluation)
-    if scan_hash(measured) != folder.read_config().get("scan_hash"):
+    if not folder.is_of(scan_hash(measured)):
         _say("this is not the scan that was reconstructed, its frames may have been fitted; report unchanged")
     elif true_volume is not None or not folder.report.exists():
         _say(f"report: {report_run(folder, result, measured, evaluation, true_volume)}")

@@ -49,7 +49,7 @@ def surface(
     folder = RunFolder(run)
     result = load_reconstruction(folder)
     measured, volume = scan_for(folder, scan, reading), read_volume(truth) if truth else None
-    if scan_hash(measured) != folder.read_config().get("scan_hash"):
+    if not folder.is_of(scan_hash(measured)):
         _say("this is not the scan that was reconstructed: its held-out frames may have been fitted")
     if folder.read_config().get("prior", {}).get("kind") == "free":
         _say("nothing was known of the matter: δ and β of the surfaces are what the run estimated")

@@ -11,12 +11,13 @@ from ..baselines import HolographicTV
 from ..checks import require
 from ..matter import KnownTwo, MatterKind
 from ..representations import Stored
+from ..scan import Scan
 from ..tables import to_table
 from .auto import Auto
 from .gaussians import Gaussians
 from .levels import Decision, LevelTest, decide_matter
 from .method import Method, Task, solve_stages
-from .uncertain import Determined, Uncertain, determine, likeliest_ratio, told
+from .uncertain import Determined, Uncertain, determine, likeliest_ratio, placed, told
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,10 @@ class Settled:
         """Plain values, which `again` takes."""
         constants = [to_table(each) for each in self.constants]
         return {"method": self.method.kind, "matter": self.matter, "why": self.why, "constants": constants}
+
+    def placed(self, scan: Scan) -> Scan:
+        """`scan` at the distance and energy that were found."""
+        return placed(scan, self.constants)
 
     def task(self, task: Task) -> Task:
         """`task` with what was settled."""

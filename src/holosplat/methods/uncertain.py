@@ -12,6 +12,7 @@ import numpy as np
 from ..baselines.material import MaterialEstimate, estimate_ratio
 from ..checks import InputError, require
 from ..matter import DeltaBeta, Known, KnownRatio, KnownTwo, MaterialPrior
+from ..scan import Scan
 from .method import Task, shows_no_refraction
 from .profile import Profile, ProfileOptions, exposed
 
@@ -141,10 +142,9 @@ def _untold(ranges: Mapping[str, Range], middle: Mapping[str, float], why: str) 
 def told(task: Task, found: tuple[Determined, ...]) -> Task:
     """`task` with the constants that were `found`; δ and β of known materials at the new energy by
     `scan.far_from_edges`."""
-    values = {each.name: each.value for each in found}
-    if not values:
+    if not found:
         return task
-    scan = exposed(task.scan, values)
+    scan, values = placed(task.scan, found), {each.name: each.value for each in found}
     if "delta_beta" in values:
         return replace(task, scan=scan, prior=MaterialPrior.of_ratio(values["delta_beta"]), delta_told=True)
     return replace(
@@ -152,6 +152,11 @@ def told(task: Task, found: tuple[Determined, ...]) -> Task:
         scan=scan,
         prior=at_energy(task.prior, scan.exposures.reference_energy / task.scan.exposures.reference_energy),
     )
+
+
+def placed(scan: Scan, found: tuple[Determined, ...]) -> Scan:
+    """`scan` at the distance and energy that were `found`."""
+    return exposed(scan, {each.name: each.value for each in found})
 
 
 def at_energy(prior: MaterialPrior, factor: float) -> MaterialPrior:
@@ -227,8 +232,9 @@ class Search:
             at[i] = tried[int(np.argmin([self._likely(_with(at, i, value)) for value in tried]))]
         step = np.array([2 * h / (places - 1) for h, places in zip(self.half, self.places)])
         for _ in range(NEWTON):
-            seen = [min(self._likely(_with(at, i, at[i] + s * step[i])) for s in (-1, 1)) for i in range(len(at))]
-            step = np.where(np.array(seen) - self._likely(at) > SEEN * self._temperature(), step / 2, step)
+            _, hessian = self._slopes(at, step)
+            shown = 0.5 * np.diag(hessian) * step**2 > SEEN * self._temperature()
+            step = np.where(shown, step / 2, step)
             at = self._moved(at, step)
         return at, step
 
@@ -248,17 +254,18 @@ class Search:
 
     def _slopes(self, at: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Gradient [K] and Hessian [K, K] of the misfit by differences, along half-steps within the ranges."""
-        count, middle = len(at), self._likely(at)
-        up = [self._likely(_with(at, i, at[i] + step[i])) for i in range(count)]
-        down = [self._likely(_with(at, i, at[i] - step[i])) for i in range(count)]
+        count, inside = len(at), np.clip(at, self.low + step, self.high - step)
+        middle = self._likely(inside)
+        up = [self._likely(_with(inside, i, inside[i] + step[i])) for i in range(count)]
+        down = [self._likely(_with(inside, i, inside[i] - step[i])) for i in range(count)]
         gradient, hessian = np.zeros(count), np.zeros((count, count))
         for i in range(count):
             gradient[i] = (up[i] - down[i]) / (2 * step[i])
             hessian[i, i] = (up[i] - 2 * middle + down[i]) / step[i] ** 2
             for j in range(i):
-                both = self._likely(_with(_with(at, i, at[i] + step[i]), j, at[j] + step[j]))
+                both = self._likely(_with(_with(inside, i, inside[i] + step[i]), j, inside[j] + step[j]))
                 hessian[i, j] = hessian[j, i] = (both - up[i] - up[j] + middle) / (step[i] * step[j])
-        return gradient, hessian
+        return gradient + hessian @ (at - inside), hessian
 
     def _moved(self, at: np.ndarray, step: np.ndarray) -> np.ndarray:
         """A step of Newton's method, of two steps of the differences at most, to what is likelier; or none."""

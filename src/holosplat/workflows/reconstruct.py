@@ -18,8 +18,7 @@ from ..io.objects import read_object, write_object
 from ..matter import MaterialPrior, MatterKind
 from ..methods import Auto, Gaussians, Method, Settled, Stage, Task, finished, settled
 from ..methods.presets import SCHEMA
-from ..methods.profile import exposed
-from ..methods.uncertain import Determined, Uncertain
+from ..methods.uncertain import Determined, Uncertain, placed
 from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling
 from ..progress import FitProgress
@@ -71,7 +70,7 @@ class Reconstruction:
 
     def placed(self, scan: Scan) -> Scan:
         """`scan`, as it was given to the reconstruction, at the distance and energy that were found."""
-        return exposed(scan, {each.name: each.value for each in self.constants})
+        return placed(scan, self.constants)
 
 
 def reconstruct(
@@ -108,7 +107,7 @@ def reconstruct(
     ranges = uncertain or Uncertain()
     said = {"light": to_table(assumed), "uncertain": to_table(ranges)}
     run.begin(_config(scan, prior, method, seed, matter) | said, resume)
-    run.settle(matter, ranges)
+    run.settle(matter, ranges, scan)
     return run.complete()
 
 
@@ -190,9 +189,9 @@ class _Run:
             self.timing |= self._saved["timing"]
             self._keeper.load(self._saved["kept"])
 
-    def settle(self, matter: MatterKind | None, uncertain: Uncertain) -> None:
+    def settle(self, matter: MatterKind | None, uncertain: Uncertain, scan: Scan) -> None:
         """Decide on what is uncertain, on the kind of matter, and on the method where that is `auto`; or do as was
-        decided before."""
+        decided before. scan: the whole one, with its test frames."""
         began = time.perf_counter()
         if self._saved and self.folder is not None:
             found = Settled.again(self.method, self.folder.read_config()["decided"])
@@ -202,7 +201,7 @@ class _Run:
         self.method, self.why, self.constants = found.method, found.why, found.constants
         self.task = found.task(self.task)
         self._keeper.train = self.task.scan
-        self._config["decided"] = found.as_table()
+        self._config["decided"] = found.as_table() | {"scan_hash": scan_hash(found.placed(scan))}
 
     def complete(self) -> Reconstruction:
         """Run what is left of the stages."""

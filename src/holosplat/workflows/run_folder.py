@@ -55,6 +55,12 @@ class RunFolder:
         """What config.json holds."""
         return read_json(self.config)
 
+    def is_of(self, fingerprint: str) -> bool:
+        """Whether a scan (`provenance.scan_hash`) is the one that was reconstructed, as it came or with the constants
+        that were found."""
+        config = self.read_config()
+        return fingerprint in (config.get("scan_hash"), config.get("decided", {}).get("scan_hash"))
+
     def source_scan(self) -> Path:
         """The scan file that was reconstructed; `InputError` if it is not known, or no longer there."""
         require(self.source.is_file(), f"{self.path} does not say which scan it is of; name it with --scan.")
