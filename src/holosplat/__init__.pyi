@@ -12,6 +12,7 @@ from . import scan as scan
 from . import specimens as specimens
 from . import volume as volume
 from . import workflows as workflows
+from .baselines.retrieve import retrieve as retrieve
 from .beamline.grow import grow as grow
 from .beamline.record import record as record
 from .beamline.simulate import simulate as simulate

@@ -16,6 +16,7 @@ from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import Auto, Gaussians, Task, settled
 from holosplat.methods.cross_validation import CrossValidation, MissingMatter
 from holosplat.methods.levels import decide_matter, flattened
+from holosplat.optics.background import Light, LightOptions
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
@@ -68,6 +69,17 @@ def test_noise_that_hides_levels_leaves_the_decision_to_what_is_known(sharp):
         "ratio": ("continuous", False),
         "known": ("levels", True),
     }
+
+
+def test_in_uneven_light_a_known_material_has_levels(soft):
+    """What a flat inside leaves may be light then; a known ratio stays what the frames say."""
+    rows = soft.frames.shape[1]
+    lit = Light.of(torch.from_numpy(soft.frames), LightOptions("smooth", ((0, rows, 0, 3),)))
+    found = decide_matter(Task(soft, MaterialPrior.known(MATERIAL), lit=lit))
+    assert (found.matter, found.sure) == ("levels", True)
+    assert "uneven light" in found.why
+    assert decide_matter(Task(soft, MaterialPrior.known(MATERIAL))).matter == "continuous"
+    assert decide_matter(Task(soft, RATIO, lit=lit)).matter == "continuous"
 
 
 def test_too_few_views_are_said(sharp):

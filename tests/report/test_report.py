@@ -176,6 +176,7 @@ def test_bare_report_says_what_is_absent(bare_page):
         "nothing to correlate",
         "No course of the fit",
         "neither a held-out view nor a truth",
+        "light of the frames was taken to be even",
     ):
         assert words in page.text
 

@@ -24,7 +24,8 @@ from .declaration import declared_names, read_declaration
 
 FOLDER = Path(__file__).with_name("cases")
 """The suite: a TOML file for each case, or for several that differ little."""
-ORDER = ("main", "thesis", "cells", "xmpi", "plasma8", "noise12", "crowded12", "two_materials8", "shells8", "foam12")
+ORDER = ("main", "thesis", "cells", "xmpi", "plasma8", "noise12", "crowded12", "sharp_light")
+ORDER += ("two_materials8", "shells8", "foam12")
 ORDER += ("soft12", "tissue16", "coated", "absorber12", "contact91")
 """How tables list the files of the suite; others follow by name."""
 

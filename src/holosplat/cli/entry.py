@@ -38,6 +38,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "correct": ("imaging", "Correct raw counts by dark and flat fields into a scan of relative intensities."),
     "join": ("imaging", "Join scans of several beams, one file each, on one raster."),
+    "retrieve": ("retrieve", "Retrieve phase and thickness of single frames, into TIFF files or HDF5."),
     "reconstruct": (
         "commands",
         "Reconstruct a scan by Gaussians, or by another method, into a run folder.",

@@ -66,6 +66,8 @@ def correct(raw: Positional[Path], out: Path, how: CorrectionOptions, reading: R
     _say(f"wrote {out}: {done.frames} frames by {flat}, normalised: {done.normalised}")
     if how.method is None and done.method == "plain":
         _say(f"method plain, for the file has {done.flats} flats, and the dynamic one needs three")
+    if done.rings:
+        _say(f"rings: a pattern of {done.rings:.2%} (rms) that all frames had in common was divided out")
     if done.airless:
         _say(f"{done.airless} of the frames show no air; they were divided by the mean light of the others")
     _say(f"filled defective pixels from their neighbours: {done.marked} marked in the file, {done.found} found beside")

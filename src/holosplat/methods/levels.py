@@ -92,6 +92,8 @@ def _decided(task: Task, free: _Misfit, flat: list[_Misfit], noisy: bool, option
     factors = [one.over(free) for one in flat[:most]]
     least, worst = min(min(f) for f in factors), min(max(f) for f in factors)
     said = f"on views set aside, matter flattened to its levels leaves {least:.3g} times the misfit of a free volume"
+    if least > options.worse and task.uneven is not None and isinstance(task.prior, Known):
+        return replace(_undecided(task, f"{said} in uneven light, of which most of it may be"), factor=least)
     if least > options.worse:
         return Decision("continuous", said, factor=least)
     if worst <= options.same and not noisy:

@@ -89,10 +89,7 @@ class Task:
     @property
     def light_in_words(self) -> str:
         """What the frames say of the light."""
-        if self.uneven is None or self.uneven.background is None:
-            return "even"
-        size = float((self.uneven.background.factor() - 1).square().mean().sqrt())
-        return f"uneven by {size:.2%}"
+        return "even" if self.uneven is None else self.uneven.in_words
 
     @property
     def bounded(self) -> bool:

@@ -32,6 +32,8 @@ SMALLEST = 0.005
 """Patches of air smaller than this part of a frame are none."""
 BRIGHT, DARKER = 0.9, 0.85
 """The quantile of the brightness that is light without matter, and the part of it below which there is matter."""
+BRIGHT_BESIDE = 0.75
+"""The same at the left and right border, if that is less: broad fringes are brighter than air, and there are fewer."""
 NOISE_LIKE, FAINT = 30.0, 0.01
 """The quietest parts are noise if their power is less than so many times that of white noise as strong as their finest
 wavelets, or less than that part of the frame's mean power; else fringes fill the frame."""
@@ -81,7 +83,7 @@ def _air(frame: np.ndarray) -> np.ndarray:
         return np.zeros(frame.shape, dtype=bool)
     power = (gaussian_filter(frame, FINE, mode="nearest") - gaussian_filter(frame, COARSE, mode="nearest")) ** 2
     smooth = gaussian_filter(frame, WINDOW, mode="nearest")
-    bright = smooth >= DARKER * np.quantile(smooth, BRIGHT)
+    bright = smooth >= DARKER * min(np.quantile(smooth, BRIGHT), np.quantile(smooth[:, [0, -1]], BRIGHT_BESIDE))
     unbound = gaussian_filter(power, WINDOW, mode="nearest")
     limit = float(np.quantile(unbound[bright], QUIET))
     noise, found = limit / QUIET_POWER, np.zeros(frame.shape, dtype=bool)

@@ -72,6 +72,13 @@ class Light:
             background = Background.of_air(frames, air, noise)
         return cls(air, noise, background)
 
+    @property
+    def in_words(self) -> str:
+        """What the frames say of the light, with its root mean square deviation from one."""
+        if self.background is None:
+            return "even"
+        return f"uneven by {float((self.background.factor() - 1).square().mean().sqrt()):.2%}"
+
     def evened(self, frames: Tensor) -> Tensor:
         """Frames [V, H, W] as they would be in even light."""
         return frames if self.background is None else (frames / self.background.factor()).to(frames.dtype)

@@ -3,6 +3,7 @@
 from .eigen_flats import EigenFlats, eigen_flats, significant
 from .flat_field import relative_intensity, unlit
 from .pixels import PixelRepair, defective_pixels
+from .rings import fixed_pattern
 from .weights import TotalVariationWeights
 
 __all__ = [
@@ -11,6 +12,7 @@ __all__ = [
     "TotalVariationWeights",
     "defective_pixels",
     "eigen_flats",
+    "fixed_pattern",
     "relative_intensity",
     "significant",
     "unlit",

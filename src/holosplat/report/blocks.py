@@ -22,6 +22,7 @@ from .figures import (
     scene_figure,
     slices_figure,
 )
+from .light import light_figure
 from .style import WIDTH, data_uri, format_length, scientific
 
 MOST_VIEWS = 4
@@ -44,7 +45,7 @@ class Block:
 
 def make_blocks(content: ReportContent) -> list[Block]:
     """All figures of the page, in order and numbered from 1."""
-    makers = (_scene, _held_out, _explained, _projections, _slices, _correlation, _history, _histograms)
+    makers = (_scene, _held_out, _explained, _light, _projections, _slices, _correlation, _history, _histograms)
     blocks, number = [], 0
     for block in (make(content) for make in makers):
         number += block.image is not None
@@ -112,6 +113,20 @@ def _explained(content: ReportContent) -> Block:
         "have, in each view: colours end at 3."
     )
     return _drawn(heading, text, "What is left of the training frames.", figure, "svg")
+
+
+def _light(content: ReportContent) -> Block:
+    heading, views = "Light", content.lit
+    if views is None:
+        return Block(heading, "The light of the frames was taken to be even.")
+    figure = light_figure(views, content.pixel_size)
+    size = [f"{100 * float(np.sqrt(np.mean(np.square(image - 1)))):.2g} %" for image in views.light]
+    text = (
+        f"By the air of the training frames their light is {views.words}. Shown are {len(views.labels)} of them, the "
+        f"light that they have beside what the reconstruction predicts (root mean square deviation from one: "
+        f"{', '.join(size)}), and what light and reconstruction together leave."
+    )
+    return _drawn(heading, text, "Uneven light.", figure, "png")
 
 
 def _projections(content: ReportContent) -> Block:

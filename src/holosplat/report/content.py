@@ -41,6 +41,26 @@ class HeldOutViews:
 
 
 @dataclass(frozen=True)
+class LitViews:
+    """Training frames in uneven light: measured, their light beside the prediction, and what even light would give.
+
+    measured, light, predicted: [T, H, W] relative intensity; labels: T texts, from `view_labels`; words: on the light
+    of all frames.
+    """
+
+    measured: np.ndarray
+    light: np.ndarray
+    predicted: np.ndarray
+    labels: tuple[str, ...]
+    words: str
+
+    def __post_init__(self) -> None:
+        measured = shaped("measured frames", np.asarray(self.measured), (len(self.labels), None, None))
+        shaped("light", np.asarray(self.light), measured.shape)
+        shaped("predicted frames", np.asarray(self.predicted), measured.shape)
+
+
+@dataclass(frozen=True)
 class ProjectedMaps:
     """Line integrals of the reconstruction, and of the truth where it is known, for a few views.
 
@@ -77,6 +97,7 @@ class ReportContent:
     - held_out: test views; projections: line integrals of a few views; volume_scores: against the truth
     - material_delta: the material's δ, for surfaces and masks; None: the robust maximum of the truth, or else
       of the reconstruction
+    - lit: training frames in uneven light; None: the light is even
     - explained: the verdict on the training frames; None: not judged
     - total: the total δ by these frames; None: not told
     - history: columns of metrics.csv, each [S]: step, seconds, loss, the loss' terms, count, val_ssim …
@@ -97,6 +118,7 @@ class ReportContent:
     material_delta: float | None = None
     explained: Verdict | None = None
     total: TotalMatter | None = None
+    lit: LitViews | None = None
     history: Mapping[str, np.ndarray] = field(default_factory=dict)
     seconds: float | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)

@@ -6,18 +6,22 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from ..geometry import Grid, Views
 from ..projectors.voxels import voxel_line_integrals
 from ..scan import Scan
 from ..volume import Volume
-from ..workflows.evaluate import Evaluation
+from ..workflows.evaluate import Evaluation, render
 from ..workflows.reconstruct import Reconstruction
 from ..workflows.run_folder import RunFolder
-from .content import HeldOutViews, ProjectedMaps, ReportContent, view_labels
+from .content import HeldOutViews, LitViews, ProjectedMaps, ReportContent, view_labels
+from .figures import evenly_chosen
 from .page import write_report
 
+MOST_LIT = 3
+"""Training frames whose light a report draws."""
 LARGEST_VOLUME = 160
 """Voxels along an edge of the volume that a report draws where no truth fixes its grid."""
 
@@ -50,6 +54,7 @@ def report_run(
         material_delta=found.matter.delta if found.matter.single else None,
         explained=reconstruction.verdict,
         total=reconstruction.total,
+        lit=_lit(reconstruction, scan, evaluation),
         history=folder.history(),
         seconds=sum(reconstruction.timing.values()),
         settings={"seed": config["seed"], "prior": config["prior"], **config.get("method", config.get("settings", {}))},
@@ -94,6 +99,20 @@ def _summary(reconstruction: Reconstruction, scan: Scan) -> str:
 
 def _drawn_grid(views: Views) -> Grid:
     return Grid.of_views(views, min(1.0, LARGEST_VOLUME / max(views.shape)))
+
+
+def _lit(reconstruction: Reconstruction, scan: Scan, evaluation: Evaluation) -> LitViews | None:
+    """A few training frames with the light that they have beside the prediction; None where light is even."""
+    light = evaluation.light
+    if light is None or light.background is None or scan.is_test.all():
+        return None
+    train = np.flatnonzero(~scan.is_test)
+    chosen = train[evenly_chosen(len(train), MOST_LIT)]
+    shown = scan[chosen]
+    predicted = render(reconstruction, shown.exposures)
+    background = light.background[torch.from_numpy(chosen)]
+    beside = background.seen_beside(torch.from_numpy(shown.frames), torch.from_numpy(predicted))
+    return LitViews(shown.frames, beside.factor().numpy(), predicted, view_labels(shown.views), light.in_words)
 
 
 def _projections(reconstruction: Reconstruction, views: Views, truth: Volume | None) -> ProjectedMaps:

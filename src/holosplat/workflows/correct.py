@@ -22,6 +22,7 @@ from ..preprocess import (
     TotalVariationWeights,
     defective_pixels,
     eigen_flats,
+    fixed_pattern,
     relative_intensity,
 )
 from ..progress import Advance
@@ -52,6 +53,9 @@ class CorrectionOptions:
     where it is uneven beyond its noise, else dynamic the mean, plain nothing)."""
     air: tuple[Box, ...] = ()
     """Boxes without matter in any frame: first row, end row, first column, end column (default: found)."""
+    rings: int | None = None
+    """Take out what all projections have in common in details finer than this odd number of columns, such as 5: noise
+    and dust of few flats, which make rings. Lines of the object along its axis go, too (default: nothing)."""
     components: int | None = None
     """Most principal components (default: as many as stand out of the noise)."""
     binning: int | None = None
@@ -73,7 +77,8 @@ class CorrectionOptions:
 @dataclass(frozen=True)
 class Corrected:
     """What was corrected: frames; defective pixels that the file marks, and that were found beside; components used;
-    the method; flats in the file; what was normalised; projections without air, which took the others' mean light."""
+    the method; flats in the file; what was normalised; projections without air, which took the others' mean light; the
+    pattern (rms) of what all frames had in common, if that was taken out."""
 
     frames: int
     marked: int
@@ -83,6 +88,7 @@ class Corrected:
     flats: int = 0
     normalised: Normalise = "none"
     airless: int = 0
+    rings: float = 0.0
 
 
 class FlatFielding:
@@ -175,6 +181,8 @@ def correct(
             "normalised": normal.what,
             "defective_pixels": f"{marked} marked, {fielding.found} found",
         }
+        if options.rings is not None:
+            described["rings"] = f"{options.rings} columns, {normal.pattern.std():.3%} (rms)"
         whole = Scan.of(_Corrected(fielding, normal), file.exposures, file.is_test, file.provenance() | described)
         scan = reading.applied(whole)
         with scan_writer(out, scan.exposures, scan.is_test, scan.provenance) as add:
@@ -182,11 +190,13 @@ def correct(
                 add(scan[[i]].frames[0])
                 on_progress(0.5 + 0.5 * (i + 1) / len(scan))
     airless = normal.light.airless if normal.light else 0
-    return Corrected(len(scan), marked, fielding.found, count, fielding.method, fielding.flats, normal.what, airless)
+    found = (marked, fielding.found, count, fielding.method, fielding.flats, normal.what, airless)
+    return Corrected(len(scan), *found, float(normal.pattern.std()))
 
 
 class Normalisation:
-    """What is brought to 1 in each frame, by `options`; what: its name; light: by air, where that is it."""
+    """What is brought to 1 in each frame, by `options`; what: its name; light: by air, where that is it; pattern: the
+    faults [H, W] of all frames that are divided out, too."""
 
     def __init__(self, fielding: FlatFielding, options: CorrectionOptions) -> None:
         """Looks at all projections once where air may be found; `InputError` where it is asked for in vain."""
@@ -202,9 +212,18 @@ class Normalisation:
         )
         otherwise: Normalise = "mean" if fielding.method == "dynamic" else "none"
         self.what: Normalise = "air" if self.light else wanted or otherwise
+        self.pattern = np.ones((1, 1))
+        if options.rings is not None:
+            numbers = fielding.file.numbers(PROJECTION)
+            self.pattern = fixed_pattern(
+                lambda i: self._evened(i, fielding(int(numbers[i]))), len(numbers), options.rings
+            )
 
     def __call__(self, number: int, frame: np.ndarray) -> np.ndarray:
         """The frame [H, W] of projection `number`, normalised."""
+        return self._evened(number, frame) / self.pattern
+
+    def _evened(self, number: int, frame: np.ndarray) -> np.ndarray:
         if self.light is not None:
             return frame / self.light.factor(number, (frame.shape[0], frame.shape[1]))
         if self.what == "none":

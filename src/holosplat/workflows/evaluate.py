@@ -14,10 +14,12 @@ from ..matter import DeltaBeta
 from ..metrics import ImageScores, VolumeScores, image_scores, intensity_range, volume_scores
 from ..metrics.images import json_number
 from ..model import Instrument, Model
+from ..optics.background import Light
 from ..representations import Stored
 from ..scan import Exposures, Scan
 from ..volume import Object, Volume
 from .reconstruct import Reconstruction
+from .run_light import light_of
 from .verdict import Verdict, judge
 
 MOST_VOXELS = 8_000_000
@@ -85,11 +87,12 @@ class Scores:
 
 @dataclass(frozen=True)
 class Evaluation(Scores):
-    """Scores of a reconstruction, the material that it found, and whether it explains the held-out frames (None: there
-    are none)."""
+    """Scores of a reconstruction, the material that it found, whether it explains the held-out frames (None: there are
+    none), and the light of all frames, in which they were compared (None: even)."""
 
     material: MaterialFound
     verdict: Verdict | None = None
+    light: Light | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """The numbers, ready for JSON."""
@@ -100,13 +103,16 @@ class Evaluation(Scores):
         }
         if found.second is not None:
             material["second"] = _as_dict(found.second.delta, found.second.ratio)
-        said = {} if self.verdict is None else {"verdict": self.verdict.as_dict()}
+        said: dict[str, Any] = {"light": self.light.in_words if self.light else "even"}
+        said |= {} if self.verdict is None else {"verdict": self.verdict.as_dict()}
         return super().as_dict() | {"material": material} | said
 
     def lines(self) -> list[str]:
         """The numbers as a few lines of text."""
         found = self.material
         said = self.verdict.lines("held-out frames") if self.verdict else []
+        if self.light is not None:
+            said = [f"light: {self.light.in_words}, by the air of each frame; predictions are compared in it", *said]
         if not found.delta_told:
             beta = f"material: β {found.delta / found.ratio:.3e}; δ is not told: the frames show absorption alone"
             return [*super().lines(), *said, beta]
@@ -139,38 +145,61 @@ def render_object(obj: Object, exposures: Exposures, oversample: int, backend: s
 def evaluate(reconstruction: Reconstruction, scan: Scan | None, truth: Volume | None) -> Evaluation:
     """Scores of `reconstruction`: on the frames of `scan`, and against `truth` on the truth's own grid.
 
-    The data range is that of the scan's training frames.
+    The data range is that of the scan's training frames. Where the light of the training frames is uneven, predictions
+    are compared in the light that each frame shows in its own air (`light_of`), held-out frames too.
     """
     found = reconstruction.object
+    lit = None
     if scan is not None:
         _require_energy(reconstruction, scan.exposures)
-    scores = score_object(found, scan, truth, reconstruction.oversample, found.backend)
+        lit = light_of(scan, reconstruction.light)
+    scores = score_object(found, scan, truth, reconstruction.oversample, found.backend, _factor(lit))
     material = replace(material_found(found), delta_told=reconstruction.delta_told)
-    said = held_out_verdict(reconstruction, scan) if scan is not None else None
-    return Evaluation(scores.test, scores.train, scores.volume, scores.predicted, material, said)
+    said = held_out_verdict(reconstruction, scan, lit) if scan is not None else None
+    return Evaluation(scores.test, scores.train, scores.volume, scores.predicted, material, said, lit)
 
 
-def held_out_verdict(reconstruction: Reconstruction, scan: Scan) -> Verdict | None:
-    """Whether the held-out frames of `scan` are explained to within their noise; None without such frames."""
+def held_out_verdict(reconstruction: Reconstruction, scan: Scan, lit: Light | None = None) -> Verdict | None:
+    """Whether the held-out frames of `scan` are explained to within their noise; None without such frames.
+
+    lit: the light of all its frames, which is divided out; what air does not tell of it counts as noise.
+    """
     _require_energy(reconstruction, scan.exposures)
-    found, test = reconstruction.object, scan.test()
+    found, test, noise = reconstruction.object, scan.test(), None
     if not len(test):
         return None
-    return judge(Prediction(found, test.exposures, reconstruction.oversample, backend=found.backend), test)
+    if lit is not None:
+        whole = replace(scan, frames=lit.evened(torch.from_numpy(scan.frames)).numpy())
+        test, noise = whole.test(), lit.doubt[np.flatnonzero(scan.is_test)]
+    return judge(Prediction(found, test.exposures, reconstruction.oversample, backend=found.backend), test, noise)
 
 
-def score_object(obj: Object, scan: Scan | None, truth: Volume | None, oversample: int, backend: str = "cpu") -> Scores:
+def _factor(lit: Light | None) -> np.ndarray | None:
+    """The light [N, H, W] of all frames of a scan, float32."""
+    return None if lit is None or lit.background is None else lit.background.factor().numpy().astype(np.float32)
+
+
+def score_object(
+    obj: Object,
+    scan: Scan | None,
+    truth: Volume | None,
+    oversample: int,
+    backend: str = "cpu",
+    light: np.ndarray | None = None,
+) -> Scores:
     """Scores of any Object: on the frames of `scan`, and against `truth` on the truth's own grid.
 
-    The data range is that of the scan's training frames; oversample, backend: as for `render_object`.
+    The data range is that of the scan's training frames; oversample, backend: as for `render_object`; light [N, H, W]:
+    of all frames of `scan`, in which predictions are compared with what was measured (default: even).
     """
     test = train = predicted = None
     if scan is not None:
         data_range = intensity_range(scan.train().frames)
-        fitted = render_object(obj, scan.train().exposures, oversample, backend)
+        lit = np.ones((len(scan), 1, 1), dtype=np.float32) if light is None else light
+        fitted = render_object(obj, scan.train().exposures, oversample, backend) * lit[~scan.is_test]
         train = image_scores(fitted, scan.train().frames, data_range)
         if len(scan.test()):
-            predicted = render_object(obj, scan.test().exposures, oversample, backend)
+            predicted = render_object(obj, scan.test().exposures, oversample, backend) * lit[scan.is_test]
             test = image_scores(predicted, scan.test().frames, data_range)
     volume = None if truth is None else volume_scores(obj.voxelise(truth.grid), truth)
     return Scores(test, train, volume, predicted)

@@ -27,8 +27,9 @@ from ..scan import Scan
 from ..tables import to_table
 from .keeper import Choice, Keeper
 from .provenance import environment, scan_hash
-from .resuming import require_same
+from .resume import require_same
 from .run_folder import RunFolder
+from .run_light import EVEN, found_in, read_light_options
 from .totals import TotalMatter, total_of_run
 from .verdict import Verdict, judge_run, said_of_run
 
@@ -54,6 +55,7 @@ class Reconstruction:
     verdict: whether the training frames are explained; None for runs of versions that did not say
     total: the total δ by these frames, with its standard error; None likewise
     constants: what was known to a range only, or of continuous matter not at all, by the frames
+    light: what is assumed of the light of other frames of the scan: smooth if that of the training frames is uneven
     """
 
     object: Stored
@@ -67,6 +69,7 @@ class Reconstruction:
     verdict: Verdict | None = None
     total: TotalMatter | None = None
     constants: tuple[Determined, ...] = ()
+    light: LightOptions = EVEN
 
     def placed(self, scan: Scan) -> Scan:
         """`scan`, as it was given to the reconstruction, at the distance and energy that were found."""
@@ -154,8 +157,8 @@ def load_reconstruction(folder: RunFolder) -> Reconstruction:
     said = Verdict.from_dict(summary["verdict"]) if "verdict" in summary else None
     total = TotalMatter.from_dict(summary["total"]) if "total" in summary else None
     constants = tuple(Determined.from_dict(each) for each in summary.get("constants", ()))
-    chosen = Choice.read(summary)
-    return Reconstruction(found, method, energy, oversample, timing, done, chosen, told, said, total, constants)
+    light, choice = read_light_options(folder.read_config(), summary), Choice.read(summary)
+    return Reconstruction(found, method, energy, oversample, timing, done, choice, told, said, total, constants, light)
 
 
 @dataclass
@@ -269,6 +272,7 @@ class _Run:
             judge_run(found, fit, self.task, oversample),
             total_of_run(*said_of_run(found, fit, self.task, oversample), self.task, self.constants),
             self.constants,
+            found_in(self.task),
         )
         if self.folder is not None:
             self.make_folder(found.backend)

@@ -1,4 +1,4 @@
-"""What must not change between the parts of a run."""
+"""Whether an interrupted run can go on: with what it was started with, and nothing else."""
 
 from __future__ import annotations
 

@@ -1,0 +1,93 @@
+"""Phase and thickness of single frames, to an HDF5 file or a folder of TIFF files (docs/formats.md)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from ..checks import require, shaped
+from ..scan import Exposures
+from .atomic import atomic_path, require_writable
+from .exposure_tables import exposure_table
+from .folder import atomic_folder, require_new
+from .json import write_json
+
+FORMAT = "holosplat phase maps 1"
+HDF5 = (".h5", ".hdf5")
+UNITS = {"phase": "rad", "thickness": "m", "light": "relative intensity"}
+
+
+@dataclass(frozen=True)
+class PhaseMaps:
+    """Maps [V, H, W] of V frames, by name: phase [rad], and perhaps thickness [m] and light (relative intensity).
+
+    exposures: how the frames were taken; facts: material, method and what else is to be known, as texts
+    """
+
+    maps: Mapping[str, np.ndarray]
+    exposures: Exposures
+    facts: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        strange = set(self.maps) - set(UNITS)
+        require("phase" in self.maps, "phase maps must hold the phase, but it is missing; add it.")
+        require(not strange, f"phase maps must be of {', '.join(UNITS)}, but there is {', '.join(strange)}; leave it.")
+        for name, images in self.maps.items():
+            shaped(name, images, (len(self.exposures), *self.exposures.views.shape))
+
+
+def is_file(path: Path) -> bool:
+    """Whether phase maps at `path` are one HDF5 file, by its name, and not a folder."""
+    return path.suffix.lower() in HDF5
+
+
+def require_place(path: Path) -> None:
+    """`InputError` unless phase maps can be written to `path`: a file in an existing folder, or a new folder."""
+    if is_file(path):
+        require_writable(path)
+    require_new(path)
+
+
+def write_phase_maps(path: Path, found: PhaseMaps) -> None:
+    """Write an HDF5 file if `path` ends on .h5 or .hdf5, else a folder: a TIFF stack a map (float32), and maps.json."""
+    if is_file(path):
+        _write_hdf5(path, found)
+        return
+    import tifffile
+
+    exposures = found.exposures
+    table = {
+        "format": FORMAT,
+        "maps": {name: {"file": f"{name}.tif", "unit": UNITS[name]} for name in found.maps},
+        "facts": dict(found.facts),
+        "pixel_size_m": exposures.views.pixel_size,
+        "energy_kev": exposures.energy_kev.tolist(),
+        "frames": [exposure_table(exposures, n) for n in range(len(exposures))],
+    }
+    how = {"photometric": "minisblack", "metadata": None}
+    with atomic_folder(path) as folder:
+        for name, images in found.maps.items():
+            text = f"{name}, {UNITS[name]}".encode()
+            tifffile.imwrite(folder / f"{name}.tif", images.astype(np.float32), description=text, **how)
+        write_json(folder / "maps.json", table)
+
+
+def _write_hdf5(path: Path, found: PhaseMaps) -> None:
+    exposures = found.exposures
+    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs["format"] = FORMAT
+        file.attrs.update(found.facts)
+        for name, images in found.maps.items():
+            file.create_dataset(name, data=images.astype(np.float32)).attrs["units"] = UNITS[name]
+        numbers = {
+            "pixel_size": (exposures.views.pixel_size, "m"),
+            "distance": (exposures.distance, "m"),
+            "energy": (exposures.energy_kev, "keV"),
+        }
+        for name, (values, unit) in numbers.items():
+            file.create_dataset(name, data=values).attrs["units"] = unit
+        file["rotations"] = exposures.views.rotations
