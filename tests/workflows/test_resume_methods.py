@@ -25,6 +25,7 @@ from holosplat.methods import (
     NeuralFields,
     NeuralFit,
     PerView,
+    SmoothVolume,
     SurfaceFit,
     Surfaces,
     VoxelFit,
@@ -45,6 +46,7 @@ CLOUD = Gaussians(
 )
 SURFACES = SurfaceFit(schedule=Schedule(steps=6, decay=0.1, views_per_step=2))
 VOXELS = VoxelFit(coarse_steps=5, steps=7)
+SMOOTH = SmoothVolume(replace(VOLUME, upper=0.0, noisy=1.0), coarser=(2,), rounds=2, iterations=4)
 FIELD = NeuralFit(
     warmup_steps=20, prune_every=2, schedule=Schedule(steps=7, views_per_step=1, validation_views=1, validate_every=2)
 )
@@ -67,6 +69,8 @@ CASES = {
     "surfaces": Case(Surfaces(gaussians=CLOUD, fit=SURFACES), "surfaces", 3, ("metrics_0.csv",)),
     "voxels, coarse": Case(Voxels(VOLUME, VOXELS), "voxels through the waves, coarse", 3, ("metrics_1.csv",)),
     "voxels": Case(Voxels(VOLUME, VOXELS), "voxels through the waves", 4, ("metrics_1.csv",)),
+    "volume, coarse": Case(SMOOTH, "smooth volume", 6),
+    "volume": Case(SMOOTH, "smooth volume", 17),
     "neural-field": Case(NeuralFields(VOLUME, FIELD), "field through the waves", 3),
 }
 
@@ -120,7 +124,8 @@ def assert_same(folder: RunFolder, whole: RunFolder, case: Case) -> None:
 def test_every_stage_has_its_metrics(case, whole):
     """Those of the last one in metrics.csv, of the others beside it."""
     assert {path.name for path in whole.path.glob("metrics*.csv")} == {"metrics.csv", *case.first}
-    steps = {"surfaces": 6, "voxels": 7, "neural-field": 7, "gaussians": 12}[load_reconstruction(whole).object.kind]
+    kind = "volume" if case.method is SMOOTH else load_reconstruction(whole).object.kind
+    steps = {"surfaces": 6, "voxels": 7, "volume": 24, "neural-field": 7, "gaussians": 12}[kind]
     assert [int(row["step"]) for row in rows(whole.metrics)] == list(range(1, steps + 1))
     assert all(float(row["loss"]) > 0 for row in rows(whole.metrics))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -157,11 +158,13 @@ def test_strict_runs_end_with_3_where_frames_are_not_explained(tmp_path):
     assert "training frames: The frames are not explained" in outcomes["uneven"].out
     worked(outcomes["even"])
     assert "warning" not in outcomes["even"].err
+    assert re.search(r"total δ \S+ m³ ± \S+ %", outcomes["even"].out)
     lax = worked(holosplat("reconstruct", tmp_path / "uneven.nxs", "--out", tmp_path / "lax", *method))
     assert "warning: the frames are not explained" in lax.err
     page = (tmp_path / "lax" / "report.html").read_text()
     assert "Are the frames explained?" in page
     assert "What is left of the training frames." in page
+    assert "what the volume holds" in page
     judged = worked(holosplat("evaluate", tmp_path / "even"))
     assert "held-out frames: The frames are" in judged.out
 

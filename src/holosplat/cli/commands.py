@@ -93,6 +93,8 @@ def reconstruct(
     _say(f"{sum(result.timing.values()):.1f} s, {result.object.described}; report: {report}")
     for line in result.verdict.lines("training frames") if result.verdict else ():
         print(line)
+    if result.total:
+        print(result.total.words)
     unexplained = result.verdict is not None and not result.verdict.good
     if unexplained:
         _say("warning: the frames are not explained; do not trust the volume before the cause is found")

@@ -25,15 +25,13 @@ from .capture import CapturedStep
 from .interrupt import interrupts_held
 from .optimiser import Leaves, Optimiser
 from .problem import Problem
+from .running import Record
 from .schedule import Schedule
 from .trainable import Trainable
 from .validation import Judge
 
 UNREAD_STEPS = 20
 """Steps on a GPU between looks at their values, each of which waits for it."""
-
-Record = dict[str, float]
-"""One row of metrics.csv."""
 
 
 class DivergedError(InputError):
@@ -149,6 +147,25 @@ class Fit:
     def finished(self) -> bool:
         """Whether the schedule is done, or the fit stopped early."""
         return self.stopped_early or self.schedule.share(self.step, self.seconds) >= 1
+
+    @property
+    def share(self) -> float:
+        """How much of the schedule is done."""
+        return min(1.0, self.schedule.share(self.step, self.seconds))
+
+    @property
+    def oversample(self) -> int:
+        """Wave samples a pixel."""
+        return self.plan.problem.model.instrument.oversample
+
+    @property
+    def aside(self) -> int:
+        """How many of the training frames are set aside for validation."""
+        return len(self.plan.judge.scan) if self.plan.judge else 0
+
+    def resolved(self) -> dict[str, Any]:
+        """What the frames' noise and the views have made of the options."""
+        return self.plan.problem.resolved()
 
     def result(self) -> Model:
         """The best model by the validation frames or the optimiser, or else the last one; it carries no gradients."""

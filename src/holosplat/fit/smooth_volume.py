@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -152,38 +153,82 @@ def _slopes(u: Tensor, epsilon: float) -> Tensor:
     return square.sqrt_()
 
 
-def descend(
-    problem: VolumeProblem, start: Tensor, iterations: int, on_progress: Callable[[float], None] = lambda f: None
-) -> tuple[Tensor, list[float]]:
-    """`iterations` of projected L-BFGS from `start` [Z, Y, X]; the volume, and the objective before and after each.
+class Descent:
+    """Projected L-BFGS from `start` [Z, Y, X], an iteration at a time; the objective never rises.
 
     Voxels at zero that the gradient would keep there are fixed, and the others take a step of L-BFGS among themselves,
     cut off at zero (two-metric projection: Bertsekas 1982; Nocedal & Wright 2006, algorithm 7.4, for the step, with the
-    problem's preconditioner as first inverse). The objective never rises.
+    problem's preconditioner as first inverse).
+
+    u: the volume; value: its objective; done: how many iterations; ended: whether none lowers the objective further.
     """
-    u = start.clamp_min(0)
-    value, gradient = problem(u)
-    values, pairs = [value], list[tuple[Tensor, Tensor]]()
-    inverse = problem.preconditioner(u)
-    for done in range(iterations):
-        on_progress(done / iterations)
-        if done and done % REFRESH == 0:
-            inverse = problem.preconditioner(u)
+
+    def __init__(self, problem: VolumeProblem, start: Tensor) -> None:
+        self.problem, self.u = problem, start.clamp_min(0)
+        self.value, self._gradient = problem(self.u)
+        self.done, self.ended = 0, False
+        self._pairs = list[tuple[Tensor, Tensor]]()
+        self._conditioned(self.u)
+
+    def _conditioned(self, at: Tensor) -> None:
+        self._anchor, self._inverse = at, self.problem.preconditioner(at)
+
+    def step(self) -> None:
+        """One iteration, if any lowers the objective."""
+        if self.done and self.done % REFRESH == 0:
+            self._conditioned(self.u)
+        u, gradient = self.u, self._gradient
         free = ((u > 0) | (gradient < 0)).to(u)
-        direction = _direction(gradient, free, pairs, inverse)
-        found = _searched(problem, u, value, gradient, direction)
-        if found is None and pairs:
-            pairs.clear()
-            found = _searched(problem, u, value, gradient, _direction(gradient, free, pairs, inverse))
+        direction = _direction(gradient, free, self._pairs, self._inverse)
+        found = _searched(self.problem, u, self.value, gradient, direction)
+        if found is None and self._pairs:
+            self._pairs = []
+            found = _searched(
+                self.problem, u, self.value, gradient, _direction(gradient, free, self._pairs, self._inverse)
+            )
         if found is None:
-            break
+            self.ended = True
+            return
         moved, value, slope = found
         step, change = moved - u, slope - gradient
         if float((step * change).sum()) > 0:
-            pairs = [*pairs[1 - MEMORY :], (step, change)]
-        u, gradient = moved, slope
-        values.append(value)
-    return u, values
+            self._pairs = [*self._pairs[1 - MEMORY :], (step, change)]
+        self.u, self._gradient, self.value = moved, slope, value
+        self.done += 1
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that `again` needs, for the same steps to the last bit."""
+        return {
+            "u": self.u,
+            "value": self.value,
+            "gradient": self._gradient,
+            "anchor": self._anchor,
+            "pairs": [list(pair) for pair in self._pairs],
+            "done": self.done,
+            "ended": self.ended,
+        }
+
+    @classmethod
+    def again(cls, problem: VolumeProblem, state: Mapping[str, Any]) -> Descent:
+        """The descent as `state_dict` left it."""
+        found = cls.__new__(cls)
+        found.problem, found.u, found.value = problem, state["u"], float(state["value"])
+        found._gradient, found.done, found.ended = state["gradient"], int(state["done"]), bool(state["ended"])
+        found._pairs = [(step, change) for step, change in state["pairs"]]
+        found._conditioned(state["anchor"])
+        return found
+
+
+def descend(problem: VolumeProblem, start: Tensor, iterations: int) -> tuple[Tensor, list[float]]:
+    """At most `iterations` of a `Descent`; the volume [Z, Y, X], and the objective before and after each."""
+    descent = Descent(problem, start)
+    values = [descent.value]
+    while descent.done < iterations:
+        descent.step()
+        if descent.ended:
+            break
+        values.append(descent.value)
+    return descent.u, values
 
 
 def _direction(

@@ -126,11 +126,22 @@ class WhitenedFrames:
         """Images [V, H, W] with their spectra over P."""
         return torch.fft.irfft2(torch.fft.rfft2(images) / self.power, s=self.shape)
 
-    def normal_equations(self, lines: Tensor, changes: list[Tensor]) -> tuple[Tensor, Tensor]:
-        """`Jᵀ P⁻¹ J` [K, K] and `-gradient` [K], float64, along K changes [V, H, W] of the line integrals."""
+    @property
+    def measured(self) -> Tensor:
+        """√I₀ [V, H, W]."""
+        return self._amplitudes
+
+    def slopes(self, lines: Tensor, changes: list[Tensor]) -> list[Tensor]:
+        """Derivatives [V, H, W] of the amplitudes at line integrals [V, H, W] along each of `changes`."""
         with torch.no_grad():
             now = self.amplitudes(lines)
-            slopes = [(self.amplitudes(lines + LITTLE * change) - now) / LITTLE for change in changes]
+            return [(self.amplitudes(lines + LITTLE * change) - now) / LITTLE for change in changes]
+
+    def normal_equations(self, lines: Tensor, changes: list[Tensor]) -> tuple[Tensor, Tensor]:
+        """`Jᵀ P⁻¹ J` [K, K] and `-gradient` [K], float64, along K changes [V, H, W] of the line integrals."""
+        slopes = self.slopes(lines, changes)
+        with torch.no_grad():
+            now = self.amplitudes(lines)
         weighted = [self.whitened(slope).double().flatten() for slope in slopes]
         missing = (self._amplitudes - now).double().flatten()
         matrix = torch.stack([torch.stack([s.double().flatten() @ w for w in weighted]) for s in slopes])

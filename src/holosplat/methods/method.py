@@ -9,7 +9,7 @@ from typing import ClassVar, Protocol, runtime_checkable
 import torch
 
 from ..baselines.material import MaterialEstimate
-from ..fit.loop import Fit
+from ..fit.running import Running
 from ..matter import MaterialPrior, MatterKind
 from ..optics.background import Light, LightOptions
 from ..optics.noise_model import NoiseModel
@@ -117,7 +117,7 @@ class Stage(Protocol):
         """The Object that this stage begins with; before: what the stage before ended with. It cannot be resumed."""
         ...
 
-    def fit(self, task: Task, start: Stored) -> Fit | None:
+    def fit(self, task: Task, start: Stored) -> Running | None:
         """The fit of `start`, made ready, or None where nothing is fitted."""
         ...
 
@@ -133,16 +133,16 @@ class Method(Protocol):
         ...
 
 
-def finished(fit: Fit) -> Stored:
+def finished(fit: Running) -> Stored:
     """The object that a fit ended with, in main memory."""
     found = fit.result().object
     assert isinstance(found, tuple(KINDS.values()))
     return found.on("reference" if fit.backend == "reference" else "cpu")
 
 
-def run_quietly(fit: Fit, report: Advance) -> Stored:
+def run_quietly(fit: Running, report: Advance) -> Stored:
     """Run a fit to its end without keeping records; what it ended with. Ctrl-C is passed on."""
-    fit.run(lambda record: report(min(1.0, fit.schedule.share(fit.step, fit.seconds))))
+    fit.run(lambda record: report(fit.share))
     return finished(fit)
 
 

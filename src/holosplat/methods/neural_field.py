@@ -14,9 +14,10 @@ from torch.nn.functional import max_pool2d
 from ..backends import device, resolve
 from ..baselines import HolographicTV
 from ..checks import at_least, require
-from ..fit.loop import Fit, Plan, Record
+from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Adam, Group, Leaves
 from ..fit.problem import Problem
+from ..fit.running import Record
 from ..fit.schedule import Schedule
 from ..fit.terms import Objective
 from ..fit.terms.field import FieldVariation, RetrievedThickness

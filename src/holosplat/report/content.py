@@ -13,6 +13,7 @@ from ..checks import InputError, positive, require, shaped
 from ..geometry import Views
 from ..metrics import ImageScores, VolumeScores, require_same_grid, robust_material_delta
 from ..volume import Volume
+from ..workflows.totals import TotalMatter
 from ..workflows.verdict import Verdict
 
 
@@ -98,6 +99,7 @@ class ReportContent:
       of the reconstruction
     - lit: training frames in uneven light; None: the light is even
     - explained: the verdict on the training frames; None: not judged
+    - total: the total δ by these frames; None: not told
     - history: columns of metrics.csv, each [S]: step, seconds, loss, the loss' terms, count, val_ssim …
     - seconds: time of the reconstruction [s]
     - settings: the resolved configuration, nested or flat
@@ -115,6 +117,7 @@ class ReportContent:
     volume_scores: VolumeScores | None = None
     material_delta: float | None = None
     explained: Verdict | None = None
+    total: TotalMatter | None = None
     lit: LitViews | None = None
     history: Mapping[str, np.ndarray] = field(default_factory=dict)
     seconds: float | None = None

@@ -53,6 +53,7 @@ def report_run(
         volume_scores=evaluation.volume,
         material_delta=found.matter.delta if found.matter.single else None,
         explained=reconstruction.verdict,
+        total=reconstruction.total,
         lit=_lit(reconstruction, scan, evaluation),
         history=folder.history(),
         seconds=sum(reconstruction.timing.values()),

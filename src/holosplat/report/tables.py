@@ -58,8 +58,9 @@ def key_figures(content: ReportContent) -> list[tuple[str, str, str]]:
 
 
 def score_tables(content: ReportContent) -> list[Table]:
-    """The scores of the volume and of each held-out view, as far as there are any."""
-    return [table for table in (_volume_table(content), _views_table(content)) if table is not None]
+    """The total δ, the scores of the volume and of each held-out view, as far as there are any."""
+    tables = (_total_table(content), _volume_table(content), _views_table(content))
+    return [table for table in tables if table is not None]
 
 
 def record_tables(content: ReportContent) -> list[Table]:
@@ -80,6 +81,21 @@ def record_tables(content: ReportContent) -> list[Table]:
     tables = [Table("Input", data)]
     tables += [Table(name, list(flatten(entries).items())) for name, entries in named.items() if entries]
     return tables
+
+
+def _total_table(content: ReportContent) -> Table | None:
+    total = content.total
+    if total is None:
+        return None
+    if total.value is None or total.error is None:
+        return Table("Total", [("by the frames", total.words)])
+    rows = [
+        (f"total {total.quantity} by the frames", f"{scientific(total.value)} m³"),
+        ("its standard error", f"{scientific(total.error, 2)} m³"),
+        ("what the volume holds", f"{scientific(total.held)} m³"),
+        ("in words", total.words),
+    ]
+    return Table("Total", rows)
 
 
 def _volume_table(content: ReportContent) -> Table | None:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..backends import device_name
 from ..checks import InputError, require
-from ..fit.loop import Fit, Record
+from ..fit.running import Record, Running
 from ..geometry import Grid
 from ..io.json import read_json, write_json
 from ..io.light import write_light
@@ -30,7 +30,8 @@ from .provenance import environment, scan_hash
 from .resume import require_same
 from .run_folder import RunFolder
 from .run_light import EVEN, found_in, read_light_options
-from .verdict import Verdict, judge_run
+from .totals import TotalMatter, total_of_run
+from .verdict import Verdict, judge_run, said_of_run
 
 CHECKPOINT_SECONDS = 20.0
 FEWEST_COLUMNS = 11
@@ -52,6 +53,7 @@ class Reconstruction:
     choice: what was decided on the way, and which state `object` is
     delta_told: whether prior or frames say what δ is; else β alone is known, and δ = β stands for it
     verdict: whether the training frames are explained; None for runs of versions that did not say
+    total: the total δ by these frames, with its standard error; None likewise
     constants: what was known to a range only, or of continuous matter not at all, by the frames
     light: what is assumed of the light of other frames of the scan: smooth if that of the training frames is uneven
     """
@@ -65,6 +67,7 @@ class Reconstruction:
     choice: Choice = field(default_factory=Choice)
     delta_told: bool = True
     verdict: Verdict | None = None
+    total: TotalMatter | None = None
     constants: tuple[Determined, ...] = ()
     light: LightOptions = EVEN
 
@@ -152,9 +155,10 @@ def load_reconstruction(folder: RunFolder) -> Reconstruction:
     found = read_object(folder.result()).on("reference" if plain else "cpu")
     told = bool(summary.get("material", {}).get("delta_told", True))
     said = Verdict.from_dict(summary["verdict"]) if "verdict" in summary else None
+    total = TotalMatter.from_dict(summary["total"]) if "total" in summary else None
     constants = tuple(Determined.from_dict(each) for each in summary.get("constants", ()))
     light, choice = read_light_options(folder.read_config(), summary), Choice.read(summary)
-    return Reconstruction(found, method, energy, oversample, timing, done, choice, told, said, constants, light)
+    return Reconstruction(found, method, energy, oversample, timing, done, choice, told, said, total, constants, light)
 
 
 @dataclass
@@ -206,12 +210,12 @@ class _Run:
         """Run what is left of the stages."""
         found: Stored | None = None
         stages, first = self.method.stages(), int(self._saved["stage"]) if self._saved else 0
-        last: Fit | None = None
+        last: Running | None = None
         for number in range(first, len(stages)):
             stage, saved = stages[number], self._saved if number == first else None
             start = _restored(saved["start"]) if saved else self._started(stage, found)
             fit = stage.fit(self.task, start)
-            oversample = fit.model.instrument.oversample if fit else 0
+            oversample = fit.oversample if fit else 0
             if saved is None and start is not found and (number == 0 or fit is None):
                 self._keeper.look(stage.name if number else "start", start, oversample, fitted=False)
             if fit is None:
@@ -244,17 +248,17 @@ class _Run:
             self.folder.create()
             write_json(self.folder.config, self._config | environment(backend))
 
-    def note_resolved(self, stage: str, fit: Fit) -> None:
+    def note_resolved(self, stage: str, fit: Running) -> None:
         """Add to config.json what the options have become in a stage: wave samples a pixel, weights and widths."""
         if self.folder is not None:
             config = self.folder.read_config()
-            found = {"oversample": fit.model.instrument.oversample, **fit.plan.problem.resolved()}
+            found = {"oversample": fit.oversample, **fit.resolved()}
             write_json(self.folder.config, config | {"resolved": config.get("resolved", {}) | {stage: found}})
 
-    def _result(self, found: Stored, fit: Fit | None, complete: bool) -> Reconstruction:
+    def _result(self, found: Stored, fit: Running | None, complete: bool) -> Reconstruction:
         exposures = self.task.scan.exposures
         best = self._keeper.best if complete else None
-        samples = best.oversample if best else fit.model.instrument.oversample if fit else 0
+        samples = best.oversample if best else fit.oversample if fit else 0
         oversample = samples or fringe_sampling(exposures)
         done = Reconstruction(
             found,
@@ -266,6 +270,7 @@ class _Run:
             Choice(self.task.matter, self.why, dict(self._keeper.judged), best.name if best else ""),
             self.task.delta_told,
             judge_run(found, fit, self.task, oversample),
+            total_of_run(*said_of_run(found, fit, self.task, oversample), self.task, self.constants),
             self.constants,
             found_in(self.task),
         )
@@ -283,7 +288,7 @@ class _Run:
 class _Journal:
     """Runs one fit, and keeps metrics and checkpoints up to date while it runs."""
 
-    def __init__(self, fit: Fit, number: int, start: Stored, run: _Run) -> None:
+    def __init__(self, fit: Running, number: int, start: Stored, run: _Run) -> None:
         self._fit, self._number, self._start, self._run = fit, number, start, run
         self._pending: list[Record] = []
         self._last = time.perf_counter()
@@ -312,9 +317,8 @@ class _Journal:
         """Take in one step's record."""
         self._pending.append(record)
         fit = self._fit
-        share = fit.schedule.share(fit.step, fit.seconds)
         name = self._run.method.stages()[self._number].name
-        self._run.on_progress(name, min(1.0, share), record)
+        self._run.on_progress(name, fit.share, record)
         up_to_date = record["step"] == fit.step  # on a GPU, records come late and in batches
         if up_to_date and time.perf_counter() - self._last > CHECKPOINT_SECONDS:
             self._save()
@@ -341,7 +345,7 @@ def _restored(saved: dict[str, Any]) -> Stored:
     return KINDS[saved["kind"]].from_state(saved["state"])
 
 
-def _summary(done: Reconstruction, fit: Fit | None, train: Scan) -> dict[str, Any]:
+def _summary(done: Reconstruction, fit: Running | None, train: Scan) -> dict[str, Any]:
     (h, w), matter = train.views.shape, done.object.matter
     backend = fit.backend if fit else done.object.backend
     second = matter.second and {"delta": matter.second.delta, "beta": matter.second.beta}
@@ -372,6 +376,7 @@ def _summary(done: Reconstruction, fit: Fit | None, train: Scan) -> dict[str, An
         "timing_s": done.timing,
         "constants": [to_table(each) for each in done.constants],
         **({"verdict": done.verdict.as_dict()} if done.verdict else {}),
+        **({"total": done.total.as_dict()} if done.total else {}),
     }
 
 

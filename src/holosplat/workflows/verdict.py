@@ -12,8 +12,8 @@ import torch
 
 from ..checks import InputError
 from ..fit.causes import Cause, causes, scores
-from ..fit.loop import Fit
 from ..fit.residuals import Prediction, Residuals, residuals
+from ..fit.running import Running
 from ..fit.validation import split_validation
 from ..methods import Task
 from ..model import Alignment, LightField, Model, SolvedLight
@@ -110,18 +110,22 @@ def _noise(frames: torch.Tensor) -> NoiseModel:
     return NoiseModel.of_frames(frames)
 
 
-def judge_run(found: Stored, fit: Fit | None, task: Task, oversample: int) -> Verdict:
+def judge_run(found: Stored, fit: Running | None, task: Task, oversample: int) -> Verdict:
     """The verdict on the frames that were fitted, or on all training frames where nothing was.
 
     Frames in uneven light are those that were evened; what air does not tell of the light counts as noise.
     """
+    said, fitted = said_of_run(found, fit, task, oversample)
+    return judge(said, fitted, task.noise if task.uneven and said.light is None else None)
+
+
+def said_of_run(found: Stored, fit: Running | None, task: Task, oversample: int) -> tuple[Prediction, Scan]:
+    """What a run says of its frames, and these: those that were fitted, or all training frames where nothing was."""
     train = task.scan
     if fit is None:
-        said = Prediction(found, train.exposures, oversample, backend=found.backend)
-        return judge(said, train, task.noise if task.uneven else None)
-    aside = len(fit.plan.judge.scan) if fit.plan.judge else 0
-    fitted, (alignment, light) = split_validation(train, aside)[0], _in_memory(fit.result())
-    return judge(Prediction(found, fitted.exposures, oversample, alignment, light, found.backend), fitted)
+        return Prediction(found, train.exposures, oversample, backend=found.backend), train
+    fitted, (alignment, light) = split_validation(train, fit.aside)[0], _in_memory(fit.result())
+    return Prediction(found, fitted.exposures, oversample, alignment, light, found.backend), fitted
 
 
 def _in_memory(model: Model) -> tuple[Alignment | None, LightField | None]:

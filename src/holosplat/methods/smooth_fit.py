@@ -1,0 +1,253 @@
+"""The fit of a smooth volume: descents on large voxels, then on those of a pixel, that can be stopped and resumed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from ..baselines.material import plateau
+from ..fit.interrupt import interrupts_held
+from ..fit.loop import DivergedError
+from ..fit.running import Record
+from ..fit.smooth_volume import ContinuousPrior, Descent, VolumeProblem, modulated
+from ..fit.whitened import WhitenedFrames
+from ..geometry import Grid
+from ..memory import memory_kept
+from ..model import Instrument, Model
+from ..optics.noise_model import NoiseModel
+from ..optics.sampling import fringe_sampling
+from ..representations import VoxelGrid
+from ..scan import Scan
+
+LEAST_EDGE = 12
+"""Pixels along a frame's shorter side that larger ones must leave, or the fit is not begun on them."""
+
+
+@dataclass(frozen=True)
+class Leg:
+    """A descent. factor: edge of its voxels [pixels]; iterations: at most; kind: a round from where the one before
+    ended; or one from the coarse volume, or from the start, of which the likelier goes on; loose: how many times the
+    level that the volume has is the prior's."""
+
+    factor: int
+    iterations: int
+    kind: Literal["round", "from coarse", "from start"] = "round"
+    loose: float = 1.0
+
+    @property
+    def work(self) -> float:
+        """What it takes, in iterations on voxels of a pixel."""
+        return (self.iterations + 1) / self.factor**3
+
+
+@dataclass(frozen=True)
+class SmoothPlan:
+    """What a smooth volume is fitted to and how. scan: its frames; begun: the start, on voxels of a pixel; noise: of
+    the frames; the others are the options of `SmoothVolume`."""
+
+    scan: Scan
+    begun: VoxelGrid
+    noise: NoiseModel
+    prior: ContinuousPrior
+    coarser: tuple[int, ...]
+    rounds: int
+    iterations: int
+    loose: float
+    backend: str
+
+    def legs(self) -> tuple[Leg, ...]:
+        """All descents: rounds on larger voxels, the choice of the likelier volume, and rounds on those of a pixel."""
+        factors = [factor for factor in self.coarser if min(self.scan.views.shape) >= LEAST_EDGE * factor]
+        coarse = [Leg(factor, self.iterations) for factor in factors for _ in range(self.rounds)]
+        if coarse:
+            coarse = [Leg(factors[0], self.iterations, loose=self.loose), *coarse]
+        half = max(1, self.iterations // 2)
+        trials = [Leg(1, half, "from coarse"), Leg(1, half, "from start")] if factors else []
+        return (*coarse, *trials, *(Leg(1, self.iterations) for _ in range(self.rounds)))
+
+    def frames(self, factor: int) -> WhitenedFrames:
+        """The frames on pixels `factor` times larger, in units of their noise."""
+        noise, material = noise_of_binned(self.noise, factor), self.begun.matter.channels[0]
+        return WhitenedFrames(self.scan.binned(factor), material, noise, backend=self.backend)
+
+
+class SmoothFit:
+    """A smooth volume in progress, as a run asks of every fit (`fit.running`)."""
+
+    aside = 0
+    stopped_early = False
+    best_step = 0
+
+    def __init__(self, plan: SmoothPlan) -> None:
+        self.plan, self.backend = plan, plan.backend
+        self.step, self.seconds = 0, 0.0
+        self._legs, self._leg = plan.legs(), 0
+        self._volume = plan.begun
+        self._rival: tuple[Tensor, float] | None = None
+        self._level = 0.0
+        self._descent: Descent | None = None
+        self._frames: tuple[int, WhitenedFrames] | None = None
+
+    @property
+    def oversample(self) -> int:
+        """Wave samples a pixel."""
+        return fringe_sampling(self.plan.scan.exposures)
+
+    @property
+    def finished(self) -> bool:
+        """Whether all legs are done."""
+        return self._leg == len(self._legs)
+
+    @property
+    def share(self) -> float:
+        """How much of the work is done."""
+        work = [leg.work for leg in self._legs]
+        done = sum(work[: self._leg])
+        if self._descent is not None and not self.finished:
+            done += work[self._leg] * self._descent.done / (self._legs[self._leg].iterations + 1)
+        return done / max(sum(work), 1e-30)
+
+    @property
+    def voxels(self) -> VoxelGrid:
+        """The volume as it is now, on voxels of a pixel."""
+        found = self._volume
+        if self._descent is not None:
+            found = found.with_parameters({"values": self._descent.u[None]})
+        grid = self.plan.begun.grid
+        return found if found.grid == grid else found.resampled(grid)
+
+    def result(self) -> Model:
+        """The model of the volume as it is now."""
+        return Model(self.voxels, Instrument(self.plan.scan.exposures, self.oversample, backend=self.backend))
+
+    def resolved(self) -> dict[str, Any]:
+        """What the options have become."""
+        return {"voxels_px": sorted({leg.factor for leg in self._legs}, reverse=True)}
+
+    def columns(self) -> list[str]:
+        """Names of what a record holds."""
+        return ["step", "seconds", "loss", "voxel_px"]
+
+    def run(self, on_record: Callable[[Record], None], until: int | None = None) -> None:
+        """Advance to the end (or to step `until`), with one record an iteration; Ctrl-C is passed on between two."""
+        with memory_kept(), interrupts_held() as release:
+            while not self.finished and (until is None or self.step < until):
+                started = time.perf_counter()
+                value = self._advance()
+                self.seconds += time.perf_counter() - started
+                if value is not None:
+                    on_record(value | {"seconds": self.seconds})
+                release()
+
+    def _advance(self) -> Record | None:
+        """One iteration of the leg that is under way, begun and ended where it is time; its record."""
+        leg = self._legs[self._leg]
+        if self._descent is None and not self._begin(leg):
+            self._leg += 1
+            return None
+        assert self._descent is not None
+        descent, record = self._descent, None
+        if descent.done < leg.iterations:
+            before = descent.done
+            descent.step()
+            if descent.done > before:
+                self.step += 1
+                record = {"step": self.step, "loss": descent.value, "voxel_px": leg.factor}
+                if not torch.isfinite(torch.tensor(descent.value)):
+                    raise DivergedError(self.step)
+        if descent.ended or descent.done >= leg.iterations:
+            self._end(leg, descent)
+        return record
+
+    def _begin(self, leg: Leg) -> bool:
+        """Make the descent of a leg; False where there is nothing to be done."""
+        frames = self._frames_of(leg.factor)
+        begun = self.plan.begun
+        if leg.kind == "from start":
+            if self._rival is None:
+                return False
+            self._descent = Descent(self._problem(frames, leg.factor), begun.values[0])
+            return True
+        grid = begun.grid if leg.factor == 1 else Grid.of_views(frames.train.views)
+        if self._volume.grid != grid:
+            self._volume = self._volume.resampled(grid)
+        u = self._volume.values[0]
+        if not bool((u > 0).any()):  # the frames show nothing but noise
+            if leg.kind == "from coarse":
+                self._volume = begun
+            return False
+        self._level = leg.loose * plateau(u)
+        self._descent = Descent(self._problem(frames, leg.factor), u)
+        return True
+
+    def _end(self, leg: Leg, descent: Descent) -> None:
+        """Take in what a descent has found.
+
+        Low frequencies, of which noisy frames say little, converge on large voxels first: the coarse volume goes on if
+        it explains its frames to within their noise after half a round, or else the likelier one. Without noise, the
+        details that large voxels lack disturb them, and the start is nearer.
+        """
+        problem, u, self._rival = descent.problem, descent.u, self._rival if leg.kind == "from start" else None
+        if leg.kind == "round":
+            u = modulated(problem, u)
+        elif leg.kind == "from coarse":
+            if 2 * problem.frames(problem.lines(u)).value > problem.frames.count:
+                self._rival = (u, descent.value)
+        elif self._rival is not None:
+            other, value = self._rival
+            u, self._rival = (u if descent.value < value else other), None
+        self._volume = self._volume.with_parameters({"values": u[None]})
+        self._descent = None
+        self._leg += 1
+
+    def _problem(self, frames: WhitenedFrames, factor: int) -> VolumeProblem:
+        prior = self.plan.prior if factor == 1 else self.plan.prior.on_larger_voxels(factor)
+        return VolumeProblem(frames, prior, self._level, self.plan.backend)
+
+    def _frames_of(self, factor: int) -> WhitenedFrames:
+        if self._frames is None or self._frames[0] != factor:
+            self._frames = factor, self.plan.frames(factor)
+        return self._frames[1]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that `load` needs to go on as if nothing had happened."""
+        return {
+            "step": self.step,
+            "seconds": self.seconds,
+            "leg": self._leg,
+            "volume": self._volume.state(),
+            "level": self._level,
+            "rival": None if self._rival is None else list(self._rival),
+            "descent": None if self._descent is None else self._descent.state_dict(),
+        }
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Go back to a saved state."""
+        self.step, self.seconds = int(state["step"]), float(state["seconds"])
+        self._leg, self._level = int(state["leg"]), float(state["level"])
+        self._volume = VoxelGrid.from_state(state["volume"])
+        self._rival = None if state["rival"] is None else (state["rival"][0], float(state["rival"][1]))
+        self._descent = None
+        if state["descent"] is not None:
+            factor = self._legs[self._leg].factor
+            self._descent = Descent.again(self._problem(self._frames_of(factor), factor), state["descent"])
+
+
+def noise_of_binned(noise: NoiseModel, factor: int) -> NoiseModel:
+    """The noise of frames whose pixels are means of `factor` × `factor`, by that of the frames.
+
+    Grain is taken to be smooth: what binning folds back of it counts as none.
+    """
+    if factor == 1:
+        return noise
+    h, w = noise.shape
+    rows, columns = h // factor, w // factor
+    at_rows = torch.round(torch.fft.fftfreq(rows, 1 / rows) * h / (rows * factor)).long()
+    at_columns = torch.round(torch.arange(columns // 2 + 1) * w / (columns * factor)).long()
+    grain = noise.grain[:, at_rows][:, :, at_columns.clamp_max(noise.grain.shape[2] - 1)] / factor**2
+    return NoiseModel(noise.white / factor, grain, columns)
