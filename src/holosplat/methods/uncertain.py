@@ -29,7 +29,8 @@ SEEN = 4.0
 """Differences of the misfit, in units of what is due to chance, from which on half a step still shows some."""
 SYSTEMATIC, NOISY = 0.03, 0.4
 """Standard error of the logarithm of a constant beside that of the likelihood: of voxels, binning and support; and what
-is added to it times the root of the noise over the contrast, for the more noise, the more do expectations count."""
+is added to it times the root of the noise over the contrast, for the more noise, the more do expectations count. Of
+several constants together each has twice as much: what tells them apart is finer than what tells one."""
 TOLD = 0.7
 """A constant is told by the frames if its standard error is less than this part of what the range left open."""
 LIKELY_RATIOS = (56.0, 18_000.0)
@@ -289,7 +290,8 @@ class Search:
 
     def _said(self, at: np.ndarray, hessian: np.ndarray) -> tuple[Determined, ...]:
         values, vectors = np.linalg.eigh(hessian / self._temperature())
-        systematic = (SYSTEMATIC + NOISY * math.sqrt(self.profile.noise_share)) ** 2
+        several = 2 if len(at) > 1 else 1
+        systematic = (several * (SYSTEMATIC + NOISY * math.sqrt(self.profile.noise_share))) ** 2
         known = (vectors / (1 / np.maximum(values, 1e-9) + systematic)) @ vectors.T
         covariance = np.linalg.inv(known + np.diag(self.half**-2))
         at = self.middle + covariance @ known @ (at - self.middle)
