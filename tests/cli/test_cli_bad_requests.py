@@ -175,15 +175,25 @@ def test_a_truth_that_cannot_be_written_is_refused_before_the_scan_is_made(shop,
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--preset", "fast", "--material", "haemoglobin", "--seed", "5"], ["--resume", "settings"]),
-        (["--material", "haemoglobin", "--config", "quick.json", "--seed", "6"], ["--resume", "seed"]),
-        (["--material", "water", "--config", "quick.json", "--seed", "5"], ["--resume", "material"]),
+        (
+            ["--preset", "fast", "--material", "haemoglobin", "--seed", "5"],
+            ["--resume", "settings"],
+        ),
+        (
+            ["--material", "haemoglobin", "--matter", "levels", "--config", "quick.json", "--seed", "6"],
+            ["--resume", "seed"],
+        ),
+        (
+            ["--material", "water", "--matter", "levels", "--config", "quick.json", "--seed", "5"],
+            ["--resume", "material"],
+        ),
     ],
 )
 def test_resuming_with_other_options_is_refused(shop, options, words):
     before = everything_in(shop.run)
     with contextlib.chdir(shop.path):
-        refused(holosplat("reconstruct", shop.scan, "--out", shop.run, "--resume", *options), *words)
+        same = ("--out", shop.run, "--resume", "--matter", "levels")
+        refused(holosplat("reconstruct", shop.scan, *same, *options), *words)
     assert everything_in(shop.run) == before
 
 

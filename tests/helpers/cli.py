@@ -98,8 +98,8 @@ def simulate(shop: Workshop, *options: object) -> Outcome:
 
 
 def known(shop: Workshop) -> list[object]:
-    """The material, and the quick settings."""
-    return ["--material", "haemoglobin", "--config", shop.quick]
+    """The material, that it has levels, and the quick settings."""
+    return ["--material", "haemoglobin", "--matter", "levels", "--config", shop.quick]
 
 
 def copied(source: Path, folder: Path, change: Callable[[h5py.File], object]) -> Path:

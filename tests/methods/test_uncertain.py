@@ -24,8 +24,8 @@ QUICK = ProfileOptions(
 
 @pytest.fixture(scope="module")
 def scan():
-    """Two soft cells in eight views of 41 × 45 pixels at 20 keV and 0.05 m, without noise."""
-    return two_cells()
+    """Two soft cells in five views of 41 × 45 pixels at 20 keV and 0.05 m, without noise."""
+    return two_cells(5)
 
 
 def test_a_distance_is_found_within_its_range(scan):

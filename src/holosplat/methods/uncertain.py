@@ -294,7 +294,7 @@ class Search:
         systematic = (several * (SYSTEMATIC + NOISY * math.sqrt(self.profile.noise_share))) ** 2
         known = (vectors / (1 / np.maximum(values, 1e-9) + systematic)) @ vectors.T
         covariance = np.linalg.inv(known + np.diag(self.half**-2))
-        at = self.middle + covariance @ known @ (at - self.middle)
+        likeliest, at = at, self.middle + covariance @ known @ (at - self.middle)
         error = np.sqrt(np.diag(covariance))
         found = []
         for i, (name, given) in enumerate(self.ranges.items()):
@@ -302,7 +302,7 @@ class Search:
             ends = np.clip([at[i] - 2 * error[i], at[i] + 2 * error[i]], self.low[i], self.high[i])
             first, last = (float(end) for end in self.sign[i] * np.exp(ends))
             value = float(self.sign[i] * math.exp(at[i]))
-            remark = self._at_an_end(at, i) if told else self._joined(covariance, i)
+            remark = self._at_an_end(likeliest, i) if told else self._joined(covariance, i)
             found.append(Determined(name, value, *_sorted((first, last)), given, told, remark))
         return tuple(found)
 
