@@ -86,6 +86,19 @@ def reconstruct(
     _print_scores(evaluation)
     if folder.light.is_file():
         _say(f"light {read_json(folder.summary)['light']}, by the air of the frames: divided out ({folder.light})")
+    _print_result(result, report)
+    unexplained = result.verdict is not None and not result.verdict.good
+    if unexplained:
+        _say("warning: the frames are not explained; do not trust the volume before the cause is found")
+    if not result.finished:
+        _say(f"interrupted, but {out} is usable; go on with --resume")
+        raise SystemExit(INTERRUPTED)
+    if strict and unexplained:
+        raise SystemExit(UNEXPLAINED)
+
+
+def _print_result(result: Reconstruction, report: Path) -> None:
+    """What was found and decided, and whether it explains the frames."""
     for constant in result.constants:
         print(constant.line())
     for line in result.choice.lines():
@@ -95,14 +108,6 @@ def reconstruct(
         print(line)
     if result.total:
         print(result.total.words)
-    unexplained = result.verdict is not None and not result.verdict.good
-    if unexplained:
-        _say("warning: the frames are not explained; do not trust the volume before the cause is found")
-    if not result.finished:
-        _say(f"interrupted, but {out} is usable; go on with --resume")
-        raise SystemExit(INTERRUPTED)
-    if strict and unexplained:
-        raise SystemExit(UNEXPLAINED)
 
 
 def render(
