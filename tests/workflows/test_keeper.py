@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from helpers.runs import KNOWN, SMALL
+from helpers.soft import two_cells
 from holosplat.checks import InputError
 from holosplat.geometry import Grid
 from holosplat.io.json import read_json
-from holosplat.methods import GaussianRates, solve
+from holosplat.matter import MaterialPrior
+from holosplat.methods import GaussianRates, SmoothVolume, solve
 from holosplat.methods.method import Task
 from holosplat.representations import VoxelGrid
 from holosplat.workflows.keeper import Choice, Keeper
@@ -97,3 +99,12 @@ def test_a_resume_needs_the_same_kind_of_matter(scan, tmp_path, other):
     reconstruct(scan, KNOWN, SMALL, matter="levels", folder=folder)
     with pytest.raises(InputError, match="kind of matter"):
         reconstruct(scan, KNOWN, SMALL, matter=other, folder=folder, resume=True)
+
+
+def test_a_smooth_volume_is_not_given_up_for_a_start_that_fits_the_noise():
+    """The start explains noisy training frames better, and is nevertheless further from the truth."""
+    scan = two_cells()
+    frames = np.random.default_rng(1).normal(scan.frames, 0.5 * float(np.std(scan.frames)))
+    noisy = replace(scan, frames=frames.astype(np.float32))
+    found = reconstruct(noisy, MaterialPrior.of_ratio(1500.0), SmoothVolume(iterations=4), matter="continuous")
+    assert found.choice.kept == "smooth volume"

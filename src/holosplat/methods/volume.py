@@ -72,6 +72,8 @@ class SmoothStage:
 
     options: SmoothVolume
     name: str = "smooth volume"
+    likelier: ClassVar[bool] = True
+    """Its fit is likelier than its start, by what noise and prior say; frames alone prefer a start that fits noise."""
 
     def start(self, task: Task, before: Stored | None) -> VoxelGrid:
         """A first volume: δ in units of the known material's, or of the estimated one's."""

@@ -228,7 +228,7 @@ class _Run:
             found = cast(Stored, finished(fit))
             if not complete:
                 return self._result(found, fit, False)
-            self._keeper.look(stage.name, found, oversample)
+            self._keeper.look(stage.name, found, oversample, fitted=not getattr(stage, "likelier", False))
         assert self._keeper.best is not None
         return self._result(self._keeper.best.object, last, True)
 
