@@ -13,9 +13,9 @@ from ..geometry import Grid
 from ..matter import Matter
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
+from .assumed import assumed_material
 from .method import Stage, Task
 from .smooth_fit import SmoothFit, SmoothPlan, noise_of_binned
-from .start import assumed_material
 
 
 def _start() -> HolographicTV:
