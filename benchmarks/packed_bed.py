@@ -1,4 +1,4 @@
-"""A packed bed in a quartz tube, of 8, 4 and 2 measured views, against its segmentation: a section of docs/real_data.md.
+"""A packed bed in a quartz tube, of 8, 4 and 2 measured views, against its segmentation (docs/real_data.md).
 
     python benchmarks/packed_bed.py --data FOLDER --work FOLDER
 
@@ -85,7 +85,7 @@ class Misfit:
     def place(self, solid: np.ndarray) -> tuple[int, int, int]:
         """Where frames, beside still light, show the solid: the move (z, y, x) of least misfit."""
         steps = (-2, -1, 0, 1, 2)
-        flat = min(((self(moved(solid, (z, 0, x)))[1], z, x) for z in steps for x in steps))
+        flat = min((self(moved(solid, (z, 0, x)))[1], z, x) for z in steps for x in steps)
         return min((self(moved(solid, (flat[1], y, flat[2])))[1], (flat[1], y, flat[2])) for y in (-1, 0, 1))[1]
 
 

@@ -1,4 +1,4 @@
-"""Light that is the same in all views, found beside the matter; matter that lies near the axis; weights by the misfit."""
+"""Light that is the same in all views, found beside matter; matter near the axis; weights by the misfit."""
 
 from __future__ import annotations
 

@@ -55,6 +55,8 @@ def test_other_tubes_are_refused(text, words):
 
 
 def test_a_tube_needs_an_axis():
-    views = Views.from_rotations(rotation_tilted(np.array([0.0, 30.0, 70.0]), np.array([0.0, 20.0, -40.0])), SHAPE, 1e-4)
+    views = Views.from_rotations(
+        rotation_tilted(np.array([0.0, 30.0, 70.0]), np.array([0.0, 20.0, -40.0])), SHAPE, 1e-4
+    )
     with pytest.raises(InputError, match="one axis"):
         TUBE.transmission(views)

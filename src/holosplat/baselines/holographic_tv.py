@@ -67,15 +67,29 @@ class HolographicTV:
     could pass for matter everywhere. A known material, whose bound tells matter from light, finds it best. There are
     then no rounds."""
     misfit: float = 0.0
-    """Weight of total variation on the retrieved thickness as a multiple of what 60 steps leave unexplained (rms), where
-    that is more than half a pixel: about 2 where frames have systematic errors (0: always half a pixel)."""
+    """Weight of total variation on the retrieved thickness as a multiple of what 60 steps leave unexplained (rms),
+    where that is more than half a pixel: about 2 where frames have systematic errors (0: always half a pixel)."""
     inside: float = 0.0
     """Distance from the axis within which matter lies [m], such as the inner radius of a tube (0: anywhere)."""
     backend: Literal["cpu", "reference"] = "cpu"
     """What computes it: the compiled kernels, or plain torch, which is slow."""
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "weight", "corrections", "inner", "few_views", "settling", "noisy", "refine", "upper", "still_light", "misfit", "inside")
+        at_least(
+            self,
+            0,
+            "weight",
+            "corrections",
+            "inner",
+            "few_views",
+            "settling",
+            "noisy",
+            "refine",
+            "upper",
+            "still_light",
+            "misfit",
+            "inside",
+        )
         at_least(self, 1, "retrieval", "iterations", "max_voxels")
 
 

@@ -164,8 +164,8 @@ class StillLight:
     """Smooth light that is the same in all views, as an unknown of a `PrimalDual` that needs no steps of its own.
 
     With residuals r and weights w the data term is `min_c ½ Σ w (r - M c)²`, M the modes in every view. Its conjugate
-    is that of `½ Σ w r²`, and infinite but for duals q with `Mᵀ q = 0`. So the proximal map in the metric of the steps σ
-    is that without light, `q / s` with `s = 1 + σ/w`, less `(σ/s) M c`, where c makes `Mᵀ q` vanish.
+    is that of `½ Σ w r²`, and infinite but for duals q with `Mᵀ q = 0`. So the proximal map in the metric of the steps
+    σ is that without light, `q / s` with `s = 1 + σ/w`, less `(σ/s) M c`, where c makes `Mᵀ q` vanish.
     """
 
     def __init__(self, solver: PrimalDual, modes: Tensor) -> None:

@@ -42,9 +42,9 @@ class TotalVariation:
     """Options. weight: of total variation, in pixels of path length; first: iterations with all frequencies of the
     lines trusted alike; iterations: those after, with each trusted by its misfit; discount: how much, as the power of
     the misfit's spectrum (0: not at all, 1: as for noise of that spectrum); still_light: half waves up to which light
-    that is the same in all views is unknown, but for its mean (0: it is even); misfit: weight of total variation as a multiple of the
-    misfit (rms) of the first iterations, where that is more; inside: distance from the axis within which matter lies, in
-    pixels (0: anywhere).
+    that is the same in all views is unknown, but for its mean (0: it is even); misfit: weight of total variation as a
+    multiple of the misfit (rms) of the first iterations, where that is more; inside: distance from the axis within
+    which matter lies, in pixels (0: anywhere).
     """
 
     weight: float = 0.5

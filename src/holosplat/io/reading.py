@@ -57,8 +57,8 @@ class Told:
     sense: Sense = "clockwise"
     """How the object turns as the angle grows, seen from above (row 0 at the top, the beam going away)."""
     tube: str | None = None
-    """INNER:OUTER:ATTENUATION of a tube about the axis whose wall is divided out: its diameters [m] and µ [1/m], such as
-    4e-3:4.5e-3:200."""
+    """INNER:OUTER:ATTENUATION of a tube about the axis whose wall is divided out: its diameters [m] and µ [1/m], such
+    as 4e-3:4.5e-3:200."""
     black: float | None = None
     """Grey images, nerf-synthetic: intensity of black pixels, relative to the flat field (default: 0)."""
     white: float | None = None
