@@ -251,7 +251,7 @@ def whole_capsule(data: Path, work: Path, names: list[str]) -> None:
     found = each_method("whole capsule", scan, hs.MaterialPrior.of_ratio(500.0), names, judged)
     slices = {"FBP of all 91 views": reference, **found}
     images = {name: attenuation(v, 20.0)[scan.views.shape[1] // 2] for name, v in slices.items()}
-    low = {f"{name}, soft": np.clip(image, 0, 0.6) for name, image in images.items()}
+    low = {f"{name}, soft": np.clip(image, 0, 2.0) for name, image in images.items()}
     panels(PICTURES / "whole.png", images, len(images), "µ (1/cm)")
     panels(PICTURES / "whole_soft.png", low, len(low), "µ (1/cm)")
 

@@ -17,6 +17,7 @@ from holosplat.geometry import Grid, Views
 from holosplat.metrics import dice
 from holosplat.optics.modes import smooth_modes
 from holosplat.projectors.voxels import SliceProjector
+from holosplat.units import wavenumber
 
 SHAPE, COUNT = (5, 31), 9
 DISCS = ((-5.0, 3.0, 6.0), (7.0, -4.0, 4.0))
@@ -95,7 +96,7 @@ def test_total_variation_weighs_as_much_as_the_misfit_asks():
 def test_frames_in_contact_say_which_light_a_flat_left():
     """From frames to a volume: intensities in contact, whose light differs by a third from the flat."""
     pixel, material = 2e-5, hs.DeltaBeta(1e-6, 1e-9)
-    mu = 2 * hs.units.wavenumber(20.0) * material.beta
+    mu = 2 * wavenumber(20.0) * material.beta
     exposures = hs.Exposures.of(replace(views(), pixel_size=pixel), 20.0, 0.0)
     frames = torch.exp(-mu * pixel * (lines() + light())).numpy()
     scan = hs.Scan(frames, exposures, np.zeros(COUNT, dtype=bool))

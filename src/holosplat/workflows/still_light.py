@@ -49,8 +49,9 @@ def still_light(scan: Scan, prior: MaterialPrior, options: StillLight, on_progre
     Their matter is made by phase retrieval and total variation, with an occupancy of at most one where `prior` knows
     the material; smooth light is an unknown of that. The light is then the geometric mean of measured over predicted
     frames: matter that turns is in other pixels in every frame, and averages out. What all frames show in the same
-    pixels is taken for light, also of matter that is round about the axis and is not in the volume. Errors: `InputError`
-    for fewer than `FEWEST` frames.
+    pixels is taken for light, also of matter that is round about the axis and is not in the volume.
+
+    Errors: `InputError` for fewer than `FEWEST` frames.
     """
     train = scan.train()
     require(len(train) >= FEWEST, f"still light needs at least {FEWEST} frames for training, but there is one.")
