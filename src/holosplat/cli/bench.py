@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Annotated
@@ -22,13 +22,22 @@ FIRST_SEED = 101
 """Options were tuned on scenes of seeds below 100."""
 
 
+@dataclass(frozen=True)
+class Folders:
+    """What cases need that is not generated."""
+
+    snapshots: Path | None = None
+    """Folder of simulated cells (VTK files) for the cases that have them; without, cells are generated."""
+    data: Path | None = None
+    """Folder of measured data, for the cases that need them (default: they are fetched)."""
+
+
 def run(
     cases: tuple[str, ...] = (),
     methods: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (FIRST_SEED,),
     out: Path = Path("bench"),
-    snapshots: Path | None = None,
-    data: Path | None = None,
+    folders: Folders = Folders(),
     retry: bool = False,
     list_only: Annotated[bool, arg(name="list")] = False,
 ) -> None:
@@ -40,8 +49,6 @@ def run(
         methods: Names of methods (default: all).
         seeds: Seeds of scenes and noise; options were tuned on seeds below 100.
         out: Folder of the benchmark, new or to go on with.
-        snapshots: Folder of simulated cells (VTK files) for the cases that have them; without, cells are generated.
-        data: Folder of measured data, for the cases that need them (default: they are fetched).
         retry: Run again what failed.
         list_only: Only list cases and methods.
     """
@@ -58,15 +65,15 @@ def run(
     wanted = {name: METHODS[name] for name in chosen("--methods", methods, list(METHODS))}
     files = [name for name in cases if ".toml" in name]
     listed = [name for name in cases if name not in files]
-    known = [*case_names(), *(MEASURED if listed or data else ())]
+    known = [*case_names(), *(MEASURED if listed or folders.data else ())]
     sources = {name: name for name in chosen("--cases", listed, known)} if listed or not files else {}
-    sources = _at_hand(sources, data)
-    sources |= {load_case(file, min(seeds, default=0), snapshots).name: file for file in files}
+    sources = _at_hand(sources, folders.data)
+    sources |= {load_case(file, min(seeds, default=0), folders.snapshots).name: file for file in files}
 
     def load(name: str, seed: int) -> Case | MeasuredCase:
         if name in MEASURED:
-            return replace(MEASURED[name], folder=data, seed=seed)
-        return load_case(sources[name], seed, snapshots)
+            return replace(MEASURED[name], folder=folders.data, seed=seed)
+        return load_case(sources[name], seed, folders.snapshots)
 
     suite = Suite(list(sources), sorted(set(seeds)), wanted, REFERENCES, load)
     folder = BenchFolder(out)
