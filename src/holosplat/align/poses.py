@@ -48,14 +48,16 @@ class Uncertain:
             value = getattr(self, name)
             require(value <= most, f"uncertain {name} must be {most:g} at most, but it is {value:g}; correct it.")
 
-    def deviations(self, pixels: float) -> Tensor:
-        """Standard deviations [7] of `NUMBERS`, on pixels `pixels` times larger."""
-        turn, roll = np.deg2rad([self.angle, self.roll])
+    def deviations(self, pixels: float, turning: bool = True) -> Tensor:
+        """Standard deviations [7] of `NUMBERS`, on pixels `pixels` times larger; turning: whether turns are free."""
+        turn, roll = np.deg2rad([self.angle, self.roll]) * turning
         across = self.shift / pixels
         distance = self.distance or BLUR_AS_DISTANCE
         return torch.tensor([across, across, turn, turn, roll, distance, self.flux], dtype=torch.float64)
 
 
+TURNING = 30
+"""Pixels along a frame's shorter side from which on turns are looked for: on larger pixels there are shifts alone."""
 BLUR_AS_DISTANCE = 0.02
 """Share of the distance that is free where the distance is known: it takes up what the edges of voxels are too soft
 for, which would else be taken for something else. What is found of it is forgotten."""
@@ -169,7 +171,8 @@ class PoseSearch:
         here = predicted(volume, grid, found, self.material, oversample)
         lit = self.numbers[:, FLUX].exp()[:, None, None].float()
         here = replace(here, frames=lit * here.frames, derivatives=lit[:, None] * here.derivatives)
-        expected = self.options.uncertain.deviations(pixels)
+        turning = min(found.views.shape) >= TURNING
+        expected = self.options.uncertain.deviations(pixels, turning)
         moved = step(frames, here, self.numbers / scales, expected, self.options.blur)
         self.numbers = moved.numbers * scales
         self.covariances = moved.covariances * scales[:, None] * scales

@@ -125,7 +125,8 @@ def align_views(
         changes(found, scan.exposures),
         errors[:, :6] * np.array([1, 1, *[np.rad2deg(1)] * 3, told]),
         np.exp(search.numbers[:, FLUX].numpy()) - 1,
-        *shares,
+        shares[0],
+        shares[1],
         tuple(words),
     )
 
