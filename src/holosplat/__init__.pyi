@@ -1,3 +1,4 @@
+from . import align as align
 from . import beamline as beamline
 from . import io as io
 from . import materials as materials

@@ -27,6 +27,7 @@ TIERS = (
     ("io",),
     ("fit", "baselines"),
     ("methods",),
+    ("align",),
     ("workflows", "beamline", "planning"),
     ("report",),
     ("bench",),

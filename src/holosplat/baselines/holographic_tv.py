@@ -63,12 +63,35 @@ class HolographicTV:
     """Coarser voxels rather than more than this many."""
     upper: float = 1.0
     """Bound of the occupancy (0: none)."""
+    still_light: int = 0
+    """Half waves across a frame up to which light that is the same in all frames, such as what a missing flat field has
+    left, is unknown and found beside the matter (0: there is none). Its mean is taken to be right, for in few views it
+    could pass for matter everywhere. A known material, whose bound tells matter from light, finds it best. There are
+    then no rounds."""
+    misfit: float = 0.0
+    """Weight of total variation on the retrieved thickness as a multiple of what 60 steps leave unexplained (rms),
+    where that is more than half a pixel: about 2 where frames have systematic errors (0: always half a pixel)."""
+    inside: float = 0.0
+    """Distance from the axis within which matter lies [m], such as the inner radius of a tube (0: anywhere)."""
     backend: Literal["cpu", "reference"] = "cpu"
     """What computes it: the compiled kernels, or plain torch, which is slow."""
 
     def __post_init__(self) -> None:
         at_least(
-            self, 0, "weight", "relit", "corrections", "inner", "few_views", "settling", "noisy", "refine", "upper"
+            self,
+            0,
+            "weight",
+            "relit",
+            "corrections",
+            "inner",
+            "few_views",
+            "settling",
+            "noisy",
+            "refine",
+            "upper",
+            "still_light",
+            "misfit",
+            "inside",
         )
         at_least(self, 1, "retrieval", "iterations", "max_voxels")
 
@@ -91,12 +114,12 @@ def _holographic_tv(
     noise = noise_share(torch.from_numpy(scan.frames))
     scan, refine, factor = _working_resolution(scan, options)
     light = light if light is None or factor == 1 else light.part(torch.arange(len(scan)), factor)
-    if light is None or light.background is None:
+    if light is None or light.background is None or options.still_light:  # still light is an unknown of tomography
         solver = _tomography(scan, material, options, on_progress)
     else:
         scan, light, solver = _settled(scan, material, options, on_progress, light)
     alone = absorption_alone(scan.exposures, material.beta / material.delta)  # then retrieval left nothing to correct
-    if options.corrections == 0 or noise > options.noisy or alone.all():
+    if options.corrections == 0 or options.still_light or noise > options.noisy or alone.all():
         return solver.volume, Grid.of_views(scan.views)
     return _agree(scan, material, solver, options, refine, on_progress, light)
 
@@ -109,7 +132,9 @@ def _tomography(scan: Scan, material: DeltaBeta, options: HolographicTV, on_prog
     lines = tikhonov(frames, scan.exposures, *material, options=how, on_progress=report)
     rays = rays_of(lines, scan.views, Grid.of_views(scan.views), options.backend)
     first = min(TotalVariation.first, options.iterations)
-    steps = TotalVariation(first=first, iterations=options.iterations - first)
+    known = {"still_light": options.still_light, "misfit": options.misfit}
+    inside = options.inside / scan.views.pixel_size
+    steps = TotalVariation(first=first, iterations=options.iterations - first, inside=inside, **known)
     weights = photons_left(lines, scan.exposures, material)
     return tv_solver(rays, options.upper or None, steps, partial(on_progress, "tomography"), options.backend, weights)
 

@@ -37,6 +37,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Record a noise-free scan as raw counts: pulses of a free-electron laser, a camera, flats and darks.",
     ),
     "correct": ("imaging", "Correct raw counts by dark and flat fields into a scan of relative intensities."),
+    "align": ("align", "Find where the beams of a scan really are, and write the same frames with other exposures."),
     "join": ("imaging", "Join scans of several beams, one file each, on one raster."),
     "retrieve": ("retrieve", "Retrieve phase and thickness of single frames, into TIFF files or HDF5."),
     "reconstruct": (

@@ -1,0 +1,7 @@
+"""Where beams really are, from the frames alone: the axis of turning objects, and the poses of single views."""
+
+from __future__ import annotations
+
+from ..lazy import exports
+
+__getattr__, __dir__, __all__ = exports(__name__, __file__)

@@ -1,0 +1,152 @@
+"""The axis of a turning object, from projections alone: its column, and how it leans sideways."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+
+from ..checks import at_least, in_range, require
+from ..geometry import Views
+from ..optics.background import LightOptions
+from ..progress import Advance
+from ..scan import Exposures, Scan
+from .axis_search import Search
+from .combine import Estimate
+from .consistency import Sinograms
+from .shadows import EVEN_OR_NOT, shadows
+
+STEP = 0.25
+"""Distance of the places that are tried [columns]; a parabola finds the place between them."""
+SURE = 3.0
+"""Standard errors from which on a lean is believed, and put into the exposures."""
+LEAST_LEAN_PX = 0.1
+"""Sideways reach of a lean over the frame's height that matters [pixels]."""
+FINE_REACH = 4
+"""How far beside the place that a coarse search finds a fine one looks [columns]."""
+FEWEST_VIEWS = 6
+"""Fewer views than this leave nothing to judge an axis by."""
+
+
+@dataclass(frozen=True)
+class AxisOptions:
+    """How the axis of a turning object is looked for."""
+
+    within: float = 0.3
+    """How far from where the scan says it is, as a share of the frames' width."""
+    bands: int = 16
+    """Rows are averaged to so many slices at most: enough for a lean, and neighbouring rows differ little."""
+    columns: int = 512
+    """Columns are averaged to so many at most; the place is found to some hundredths of one."""
+    views: int = 256
+    """Views that are looked at, at most, evenly spread: more add little and take time."""
+
+    def __post_init__(self) -> None:
+        in_range("within", self.within, 0.01, 0.5)
+        at_least(self, 1, "bands")
+        at_least(self, 32, "columns")
+        at_least(self, FEWEST_VIEWS, "views")
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Where the axis of a turning object is.
+
+    offset: from where the scan said it is, at the middle of the object frame, along the columns [pixels]
+    lean: of the axis in the image, columns a row; positive: further right further down; None: too few rows
+    column: of the axis in the frames' middle row, 0 the middle of the first one; of the first view
+    """
+
+    offset: Estimate
+    lean: Estimate | None
+    column: float
+    rows: int
+
+    @cached_property
+    def leans(self) -> bool:
+        """Whether the axis leans, beyond doubt and by as much as matters."""
+        lean = self.lean
+        return lean is not None and abs(lean.value) > max(SURE * lean.error, LEAST_LEAN_PX / self.rows)
+
+    def applied(self, exposures: Exposures) -> Exposures:
+        """The exposures with the axis where it is: detector shifts, and a roll `ω_z = -atan(lean)` where it leans."""
+        views, p = exposures.views, exposures.views.pixel_size
+        rotations = views.rotations
+        if self.leans and self.lean is not None:
+            angle = -np.arctan(self.lean.value)
+            c, s = np.cos(angle), np.sin(angle)
+            rotations = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]) @ rotations
+        shifts = views.shifts - np.array([self.offset.value * p, 0.0])
+        return replace(exposures, views=replace(views, rotations=rotations, shifts=shifts))
+
+    def lines(self) -> list[str]:
+        """What was found, in words."""
+        moved = f"{self.offset.value:+.3f} from the scan's"
+        said = [f"axis at column {self.column:.3f} ± {self.offset.error:.3f} ({moved})"]
+        if self.lean is None:
+            said.append("lean of the axis: the frames have too few rows to tell")
+        else:
+            degrees = np.rad2deg(np.arctan([self.lean.value, self.lean.error]))
+            used = "" if self.leans else "; not beyond doubt, left as the scan says"
+            said.append(f"lean of the axis {degrees[0]:+.3f}° ± {degrees[1]:.3f}°{used}")
+        said.append(
+            "sense of rotation: parallel beams cannot tell it, for the mirrored object that turns the other way gives "
+            "the same frames; it stays as the scan says"
+        )
+        return said
+
+
+def find_axis(
+    scan: Scan,
+    options: AxisOptions = AxisOptions(),
+    *,
+    ratio: float | None = None,
+    light: LightOptions = EVEN_OR_NOT,
+    on_progress: Advance = lambda fraction: None,
+) -> Axis:
+    """The axis of the object that turns in `scan`, from the consistency of its projections.
+
+    ratio: δ/β, if it is known. Errors: `InputError` for views that turn about no common axis, for fewer than
+    `FEWEST_VIEWS`, and where no place within the field is better than those beside it.
+    """
+    sinograms = sinograms_of(scan, options, ratio, light)
+    width, columns = scan.views.shape[1], sinograms.values.shape[-1]
+    factor, pitch = max(1, columns // 64), scan.views.shape[1] / columns
+    first = Search.of(
+        sinograms.binned(factor), 0.0, options.within * width, 0.5 * factor * pitch, lambda f: on_progress(0.5 * f)
+    )
+    near, lean = first.likeliest()
+    reach = (2 * factor + FINE_REACH) * pitch + abs(lean) * 0.5 * float(np.ptp(sinograms.heights))
+    fine = Search.of(sinograms, near, reach, STEP * pitch, lambda f: on_progress(0.5 + 0.5 * f))
+    offset, leaning = fine.found(lean)
+    middle = 0.5 * (width - 1) - float(scan.views.shifts[0, 0]) / scan.views.pixel_size
+    return Axis(offset, leaning, middle + offset.value, scan.views.shape[0])
+
+
+def sinograms_of(scan: Scan, options: AxisOptions, ratio: float | None, light: LightOptions) -> Sinograms:
+    """The sinograms of `scan`, in bands of rows; errors: those of `find_axis`."""
+    views = scan.views
+    require(
+        views.shares_axis,
+        "the axis is that of views which turn about the object's y axis alone, but these do not; align without "
+        "--axis-only.",
+    )
+    chosen = np.unique(np.linspace(0, len(scan) - 1, min(len(scan), options.views)).round().astype(int))
+    require(
+        len(chosen) >= FEWEST_VIEWS,
+        f"an axis needs {FEWEST_VIEWS} views at least, but there are {len(chosen)}; align without --axis-only.",
+    )
+    scan, (h, w), p = scan[chosen], views.shape, views.pixel_size
+    images = shadows(scan, ratio, light).numpy()
+    edges = np.linspace(0, h, min(options.bands, h) + 1).round().astype(int)
+    values = np.stack([images[:, a:b].mean(1) for a, b in pairwise(edges)], axis=1)
+    heights = 0.5 * (edges[:-1] + edges[1:]) - h / 2 + views.shifts[0, 1] / p
+    sideways = scan.views.shifts[:, :1] / p
+    positions = np.arange(w) + 0.5 - w / 2 + (sideways[:1] if np.ptp(sideways) < 1e-9 else sideways)
+    return Sinograms(values, _angles(scan.views), positions, heights).binned(max(1, -(-w // options.columns)))
+
+
+def _angles(views: Views) -> np.ndarray:
+    return np.arctan2(views.rotations[:, 0, 2], views.rotations[:, 0, 0])
