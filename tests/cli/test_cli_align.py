@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from helpers.cli import holosplat, refused, worked
+from helpers.cli import FORMULA, holosplat, refused, worked
 from helpers.contact import PIXEL, contact_scan
 from holosplat.io.nxtomo import read_scan, write_scan
 
@@ -44,10 +45,34 @@ def test_a_first_guess_may_be_given(turning, tmp_path):
     assert read_scan(out).views.shape == (21, 49)
 
 
+def test_single_views_are_moved_and_told(shop, tmp_path):
+    """Of the shared scan, whose views are said to be moved by a pixel."""
+    scan = read_scan(shop.scan)
+    moved = scan.views.shifts + scan.views.pixel_size * np.array([1.0, 0]) * (-1.0) ** np.arange(len(scan))[:, None]
+    path, out, table = (tmp_path / name for name in ("moved.nxs", "aligned.nxs", "views.csv"))
+    write_scan(path, scan.with_views(replace(scan.views, shifts=moved)))
+    known = ("--material", FORMULA, "--density", "1.335")
+    unsure = ("--uncertain-shift", 2, "--uncertain-angle", 0, "--uncertain-roll", 0)
+    done = worked(holosplat("align", path, *known, *unsure, "--table", table, "--out", out))
+    assert "changes of the plan" in done.out
+    found = read_scan(out)
+    np.testing.assert_array_equal(found.frames, scan.frames)
+    np.testing.assert_allclose(found.views.rotations, scan.views.rotations, atol=1e-9)
+    away = [np.abs(np.diff((shifts - scan.views.shifts)[:, 0])).mean() for shifts in (moved, found.views.shifts)]
+    before, after = away
+    assert after < 0.5 * before
+    rows = list(csv.DictReader(table.open()))
+    assert len(rows) == len(scan)
+    assert float(rows[0]["after"]) < float(rows[0]["before"])
+    assert found.provenance["aligned"].startswith("changes of the plan")
+
+
 def test_requests_that_cannot_be_met_are_refused(turning, tmp_path):
     path, scan = turning
     out = tmp_path / "aligned.nxs"
     refused(holosplat("align", path, "--axis-only", "--out", path), "name another file")
+    refused(holosplat("align", path, "--axis-only", "--table", tmp_path / "t.csv", "--out", out), "--table")
+    refused(holosplat("align", path, "--uncertain-shift", -1, "--out", out), "shift")
     few = tmp_path / "few.nxs"
     write_scan(few, scan[[0, 1, 2]])
     refused(holosplat("align", few, "--axis-only", "--out", out), "6 views")

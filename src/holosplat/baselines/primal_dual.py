@@ -72,6 +72,8 @@ class PrimalDual:
         self._gradient_dual = self._array.new_zeros(3, *self._array.shape)
         self._damping: Tensor | None = None
         self._softening = 1 + self._dual_step
+        self._inside: Tensor | None = None
+        self._still: StillLight | None = None
 
     @property
     def volume(self) -> Tensor:
@@ -111,6 +113,27 @@ class PrimalDual:
         """From now on the data term is `½ Σ w (A u - b)²`, w > 0 for each ray [V, H, W]; 1 is how it begins."""
         self._softening = 1 + self._dual_step / self.projector.lines_in(weights)
 
+    def set_weight(self, weight: float) -> None:
+        """From now on λ is `weight`."""
+        self.radius = weight / self.coupling
+
+    def keep_inside(self, inside: Tensor) -> None:
+        """From now on the volume is zero but for the voxels `inside` [Z, Y, X] bool."""
+        self._inside = self.projector.volume_in(inside.float())
+
+    def with_still_light(self, modes: Tensor) -> None:
+        """From now on the lines may hold any sum of `modes` [K, H, W] that is the same in all views: still light.
+
+        The data term is its least over such sums. `weigh` and the steps' lengths must be settled before.
+        """
+        self._still = StillLight(self, modes)
+
+    def still_light(self, images: Tensor) -> Tensor:
+        """What all line integrals [V, H, W] hold beside the volume, of the modes of `with_still_light`: [H, W]."""
+        if self._still is None:
+            return images.new_zeros(images.shape[1:])
+        return self._still.of(images - self.lines())
+
     def run(self, images: Tensor, iterations: int) -> None:
         """`iterations` more steps towards the volume that explains the line integrals [V, H, W]."""
         lines = self.projector.lines_in(images)
@@ -122,6 +145,8 @@ class PrimalDual:
         ascended = self._residual_dual + self._dual_step * difference
         if self._damping is None:
             self._residual_dual = ascended / self._softening
+            if self._still is not None:
+                self._still.take_out_of(self._residual_dual)
         else:
             spectrum = torch.fft.rfft2(ascended, norm="ortho") * self._damping
             self._residual_dual = torch.fft.irfft2(spectrum, s=ascended.shape[-2:], norm="ortho")
@@ -130,3 +155,37 @@ class PrimalDual:
         slope = self.projector.backproject(self._residual_dual)
         tau, arrays = self._primal_step, (self._array, self._extrapolated)
         self._steps.descend(slope, tau, self._gradient_dual, self.coupling, self.upper, *arrays)
+        if self._inside is not None:
+            for array in arrays:
+                array.mul_(self._inside)
+
+
+class StillLight:
+    """Smooth light that is the same in all views, as an unknown of a `PrimalDual` that needs no steps of its own.
+
+    With residuals r and weights w the data term is `min_c ½ Σ w (r - M c)²`, M the modes in every view. Its conjugate
+    is that of `½ Σ w r²`, and infinite but for duals q with `Mᵀ q = 0`. So the proximal map in the metric of the steps
+    σ is that without light, `q / s` with `s = 1 + σ/w`, less `(σ/s) M c`, where c makes `Mᵀ q` vanish.
+    """
+
+    def __init__(self, solver: PrimalDual, modes: Tensor) -> None:
+        self._projector, self._modes = solver.projector, modes.flatten(1).double()
+        self._shape = modes.shape[1:]
+        path, softening = 1 / solver._dual_step, solver._softening.expand_as(solver._residual_dual)
+        trust = 1 / (path.expand_as(softening) * softening)
+        self._trust = solver.projector.lines_out(trust)
+        count = self._trust.double().sum(dim=0).flatten()
+        self._inverse = torch.linalg.pinv((self._modes * count) @ self._modes.T)
+        means = torch.full_like(count, len(self._trust))
+        self._plain = torch.linalg.pinv((self._modes * means) @ self._modes.T)
+
+    def of(self, lines: Tensor) -> Tensor:
+        """The sum of modes [H, W] that is nearest to lines [V, H, W] in the mean."""
+        total = lines.double().sum(dim=0).flatten()
+        return ((self._plain @ (self._modes @ total)) @ self._modes).reshape(self._shape).float()
+
+    def take_out_of(self, dual: Tensor) -> None:
+        """Make the sum over views of the duals, in the projector's order, orthogonal to all modes; in place."""
+        total = self._projector.lines_out(dual).double().sum(dim=0).flatten()
+        light = ((self._inverse @ (self._modes @ total)) @ self._modes).reshape(self._shape).float()
+        dual.sub_(self._projector.lines_in(self._trust * light))

@@ -13,6 +13,7 @@ from ..checks import at_least
 from ..geometry import Grid, Views
 from ..memory import memory_kept
 from ..metrics.correlation import shortest_side
+from ..optics.modes import smooth_modes
 from ..progress import Advance
 from .algebraic import Algebraic, art, sirt
 from .filtered_backprojection import filtered_backprojection
@@ -40,16 +41,22 @@ def sirt_nonnegative(lines: Tensor, views: Views, grid: Grid, upper: float | Non
 class TotalVariation:
     """Options. weight: of total variation, in pixels of path length; first: iterations with all frequencies of the
     lines trusted alike; iterations: those after, with each trusted by its misfit; discount: how much, as the power of
-    the misfit's spectrum (0: not at all, 1: as for noise of that spectrum).
+    the misfit's spectrum (0: not at all, 1: as for noise of that spectrum); still_light: half waves up to which light
+    that is the same in all views is unknown, but for its mean (0: it is even); misfit: weight of total variation as a
+    multiple of the misfit (rms) of the first iterations, where that is more; inside: distance from the axis within
+    which matter lies, in pixels (0: anywhere).
     """
 
     weight: float = 0.5
     first: int = 60
     iterations: int = 100
     discount: float = 0.5
+    still_light: int = 0
+    misfit: float = 0.0
+    inside: float = 0.0
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "weight", "first", "iterations", "discount")
+        at_least(self, 0, "weight", "first", "iterations", "discount", "still_light", "misfit", "inside")
 
 
 def total_variation(
@@ -81,19 +88,36 @@ def tv_solver(
 ) -> PrimalDual:
     """The solver of `total_variation` after its last iteration, for those who go on from there.
 
-    weights: trust in each ray [V, H, W], above 0; with them, frequencies are trusted alike to the end.
+    weights: trust in each ray [V, H, W], above 0; with them, or with still light, frequencies are trusted alike to the
+    end.
     """
     start, coupling = torch.zeros(rays.grid.shape), 1 / rays.refine**2
     solver = PrimalDual(rays.projector, start, options.weight, checked_upper(upper), coupling, backend)
     if weights is not None:
         solver.weigh(weights)
+    if options.inside > 0:
+        solver.keep_inside(near_axis(rays.grid, options.inside))
+    if options.still_light > 0:
+        solver.with_still_light(smooth_modes(rays.views.shape, options.still_light)[1:])
+    alike = weights is not None or options.still_light > 0
     images, total = rays.projector.lines_out(rays.measured), options.first + options.iterations
     for done in range(total):
         on_progress(done / total)
-        if done == options.first and options.discount > 0 and weights is None:
+        if done == options.first and options.discount > 0 and not alike:
             solver.discount(misfit_spectrum(rays, solver.lines() - images) ** options.discount)
+        if done == options.first and options.misfit > 0:
+            missing = images - solver.lines()
+            rms = float((missing - solver.still_light(images)).square().mean().sqrt())
+            solver.set_weight(max(options.weight, options.misfit * rms))
         solver.run(images, 1)
     return solver
+
+
+def near_axis(grid: Grid, distance: float) -> Tensor:
+    """Voxels [Z, Y, X] bool whose centres are nearer to the y axis than `distance`, in the grid's unit of length."""
+    x, y, z = (torch.from_numpy(axis) for axis in grid.axes())
+    near = torch.hypot(z[:, None, None], x[None, None, :]) < distance
+    return near.expand(len(z), len(y), len(x))
 
 
 def misfit_spectrum(rays: Rays, misfit: Tensor) -> Tensor:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import sys
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
@@ -13,50 +16,109 @@ from ..matter import Known, KnownRatio, MaterialPrior
 from .options import LightFlags, PriorOptions
 from .progress import ProgressBar
 
+if TYPE_CHECKING:
+    from ..align import AlignedViews, PoseOptions
+    from ..optics.background import LightOptions
+    from ..scan import Exposures, Scan
+
 LIGHT = LightFlags()
 """Even, unless the air of frames says otherwise."""
+
+
+@dataclass(frozen=True)
+class UncertainOptions:
+    """How far off the plan each view may be: standard deviations. 0 keeps it as planned."""
+
+    uncertain_shift: float = 2.0
+    """Detector's shifts along rows and columns [pixels]."""
+    uncertain_angle: float = 1.0
+    """Turns about the two axes across the beam [degrees]."""
+    uncertain_roll: float = 1.0
+    """Turns about the beam [degrees]."""
+    uncertain_distance: float = 0.0
+    """Distance, as a share of it: only where fringes are resolved."""
+
+    def options(self) -> PoseOptions:
+        """The options of the search."""
+        from ..align import PoseOptions, Uncertain
+
+        shift, angle, roll, distance = vars(self).values()
+        return PoseOptions(Uncertain(shift, angle, roll, distance))
 
 
 def align(
     scan: Positional[Path],
     out: Path,
     matter: PriorOptions = PriorOptions(),
-    axis_only: bool = False,
+    unknown: UncertainOptions = UncertainOptions(),
     reading: Reading = Reading(),
     *,
     illumination: LightFlags = LIGHT,
+    axis_only: bool = False,
+    table: Path | None = None,
 ) -> None:
     """Find where the beams of a scan really are, and write the same frames with other exposures.
 
     Args:
         scan: Scan: a file (NXtomo), or a folder (tiff, nerf-synthetic, r2-gaussian, or a run's).
         out: Scan file to write (NXtomo).
-        axis_only: The object turns about one axis; find its column, and how it leans in the image.
+        axis_only: The object turns about one axis; find its column, and how it leans in the image, in seconds.
+        table: Also write what was found of each view, with errors (CSV).
     """
-    from ..align import find_axis
     from ..io.atomic import require_apart, require_writable
     from ..io.formats import read_as
     from ..io.nxtomo import write_scan
     from ..scan import Scan
 
-    require(axis_only, "align finds the axis of turning objects so far; add --axis-only.")
-    require_writable(out)
-    require_apart(out, scan)
+    for path in (out, *([table] if table else [])):
+        require_writable(path)
+        require_apart(path, scan)
+    require(table is None or not axis_only, "--table is of single views; leave it, or --axis-only.")
     measured = read_as(scan, reading).in_memory()
     prior = matter.prior(measured.exposures.reference_energy)
-    with ProgressBar() as bar:
-        axis = find_axis(
-            measured,
-            ratio=_ratio(prior),
-            light=illumination.options(),
-            on_progress=lambda fraction: bar.show("axis", fraction, {}),
-        )
-    lines = axis.lines()
+    if axis_only:
+        lines, exposures = _axis(measured, prior, illumination.options())
+    else:
+        lines, exposures = _views(measured, prior, unknown.options(), illumination.options(), table)
     for line in lines:
         print(line)
-    facts = measured.provenance | {"aligned": "; ".join(lines)}
-    write_scan(out, Scan.of(measured.source, axis.applied(measured.exposures), measured.is_test, facts))
-    print(f"wrote {out}: the same {len(measured)} frames, with the axis where it is", file=sys.stderr)
+    facts = measured.provenance | {"aligned": lines[0]}
+    write_scan(out, Scan.of(measured.source, exposures, measured.is_test, facts))
+    print(f"wrote {out}: the same {len(measured)} frames, with other exposures", file=sys.stderr)
+
+
+def _axis(scan: Scan, prior: MaterialPrior, light: LightOptions) -> tuple[list[str], Exposures]:
+    from ..align import find_axis
+
+    with ProgressBar() as bar:
+        show = bar.show
+        axis = find_axis(scan, ratio=_ratio(prior), light=light, on_progress=lambda done: show("axis", done, {}))
+    return axis.lines(), axis.applied(scan.exposures)
+
+
+def _views(
+    scan: Scan, prior: MaterialPrior, options: PoseOptions, light: LightOptions, table: Path | None
+) -> tuple[list[str], Exposures]:
+    from ..align import align_views
+
+    with ProgressBar() as bar:
+        show = bar.show
+        found = align_views(scan, prior, options, light=light, on_progress=lambda stage, done: show(stage, done, {}))
+    if table is not None:
+        _write_table(table, found)
+    return found.lines(), found.exposures
+
+
+def _write_table(path: Path, found: AlignedViews) -> None:
+    """A row for each view."""
+    names = ("shift_x_px", "shift_y_px", "turn_x_deg", "turn_y_deg", "roll_deg", "distance_share")
+    header = ["view", *names, *(f"error_{name}" for name in names), "flux", "before", "after"]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        for v in range(len(found.changes)):
+            last = (found.flux[v], found.before[v], found.after[v])
+            writer.writerow([v, *(f"{value:.6g}" for value in (*found.changes[v], *found.errors[v], *last))])
 
 
 def _ratio(prior: MaterialPrior) -> float | None:

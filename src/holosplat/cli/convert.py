@@ -22,9 +22,12 @@ from ..io.reading import Reading
 from ..io.tiff import TiffLayout, write_tiff
 from ..io.volumes import read_volume
 from ..matter import KnownRatio, MaterialPrior
+from ..methods.method import STAND_IN_RATIO, shows_no_refraction
 from ..optics import retrieve_thickness
 from ..scan import Scan
+from ..workflows.still_light import StillLight, evened
 from .options import PriorOptions
+from .progress import ProgressBar
 
 
 @dataclass(frozen=True)
@@ -50,6 +53,33 @@ class WritingOptions:
         return said
 
 
+@dataclass(frozen=True)
+class EveningOptions:
+    """Light that is the same in all frames."""
+
+    still_light: int | None = None
+    """Divide out what all frames for training have in common beside the matter that they show: light of up to so many
+    half waves across a frame, such as 4, or any pattern (0) (default: nothing)."""
+    inside: float | None = None
+    """With it: distance from the axis within which matter lies [m] (default: anywhere)."""
+
+    def applied(self, scan: Scan, prior: MaterialPrior) -> Scan:
+        """The scan without such light."""
+        require(self.still_light is not None or self.inside is None, "--inside needs --still-light.")
+        if self.still_light is None:
+            return scan
+        require(
+            prior.fixes_ratio or shows_no_refraction(scan),
+            "--still-light needs --material or --delta-beta, by which matter is told from light.",
+        )
+        prior = prior if prior.fixes_ratio else MaterialPrior.of_ratio(STAND_IN_RATIO)
+        with ProgressBar() as bar:
+            options = StillLight(self.still_light, self.inside or 0.0)
+            found = evened(scan, prior, options, lambda stage, fraction: bar.show(stage, fraction, {}))
+        _say(f"still light: {found.provenance['still_light']}")
+        return found
+
+
 GOES_WITH: dict[str, tuple[ScanFormat, ...]] = {
     "png": ("nerf-synthetic",),
     "camera_distance": ("nerf-synthetic",),
@@ -68,6 +98,7 @@ def convert(
     writing: WritingOptions,
     reading: Reading = Reading(),
     matter: PriorOptions = PriorOptions(),
+    evening: EveningOptions = EveningOptions(),
 ) -> None:
     """Bring a scan into another format; what SOURCE is, its content says.
 
@@ -80,8 +111,10 @@ def convert(
     said = writing.for_format(to)
     scan = _read(source, reading)
     prior = matter.prior(scan.exposures.reference_energy)
-    require(not prior.fixes_ratio or to in GOES_WITH["material"], f"a material is not needed with --to {to}; leave it.")
+    wanted = evening.still_light is not None or to in GOES_WITH["material"]
+    require(not prior.fixes_ratio or wanted, f"a material is not needed with --to {to}; leave it.")
     require(len(prior.materials) < 2, f"--to {to} takes one material; leave --second-material.")
+    scan = evening.applied(scan, prior)
     if to == "nxtomo":
         require(not out.is_dir(), f"{out} must be a file to write, but it is a folder; add a file name.")
         write_scan(out, scan)

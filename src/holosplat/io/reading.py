@@ -11,6 +11,7 @@ import numpy as np
 
 from ..checks import InputError, finite, require
 from ..tables import from_table, to_table
+from .tube import Tube
 
 if TYPE_CHECKING:
     from ..geometry import Views
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 
 Sense = Literal["clockwise", "anticlockwise"]
 
-OWN_WAY = ("angles", "axis_column", "sense")
+OWN_WAY = ("angles", "axis_column", "sense", "tube")
 """Fields of `Told` that no loader takes by their own name."""
 
 
@@ -55,6 +56,9 @@ class Told:
     the middle)."""
     sense: Sense = "clockwise"
     """How the object turns as the angle grows, seen from above (row 0 at the top, the beam going away)."""
+    tube: str | None = None
+    """INNER:OUTER:ATTENUATION of a tube about the axis whose wall is divided out: its diameters [m] and µ [1/m], such
+    as 4e-3:4.5e-3:200."""
     black: float | None = None
     """Grey images, nerf-synthetic: intensity of black pixels, relative to the flat field (default: 0)."""
     white: float | None = None
@@ -131,7 +135,8 @@ class Reading:
     def applied(self, scan: Scan) -> Scan:
         """A scan that a loader has read, with its axis and sense of rotation, and cut to the part that is taken."""
         views = self.told.placed(scan.views)
-        return self.part.of(scan if views is scan.views else scan.with_views(views))
+        scan = scan if views is scan.views else scan.with_views(views)
+        return self.part.of(scan if self.told.tube is None else Tube.parsed(self.told.tube).taken_out_of(scan))
 
     def as_table(self) -> dict[str, Any]:
         """What differs from the default, by field, ready for JSON; paths are absolute. `time_frame` is not there."""

@@ -27,8 +27,13 @@ from ..scan import Scan
 EXPLAINED = 0.95
 """χ² a pixel above which a volume does not explain its frames to within their noise; where prior and frames agree it is
 below one, for the volume follows some of the noise."""
+EMPTY = 1.2
+"""χ² a pixel up to which an empty volume is taken for the truth, as the noise is known to some per cent only."""
 WEAKEST = 1 / 16
 """Share of the prior's exponents that is left at least."""
+WORTH = 0.5
+"""Share of what is unexplained beyond noise that half a prior must take away; if it does not, light or constants are at
+fault, and the volume before stands."""
 LEAST_EDGE = 12
 """Pixels along a frame's shorter side that larger ones must leave, or the fit is not begun on them."""
 
@@ -77,7 +82,7 @@ class SmoothPlan:
 
     def frames(self, factor: int) -> WhitenedFrames:
         """The frames on pixels `factor` times larger, in units of their noise."""
-        noise, material = noise_of_binned(self.noise, factor), self.begun.matter.channels[0]
+        noise, material = self.noise.binned(factor), self.begun.matter.channels[0]
         return WhitenedFrames(self.scan.binned(factor), material, noise, backend=self.backend)
 
 
@@ -95,7 +100,8 @@ class SmoothFit:
         self._volume = plan.begun
         self._rival: tuple[Tensor, float] | None = None
         self._level = 0.0
-        self._strength = 1.0
+        self._strength, self._settled = 1.0, False
+        self._stronger: tuple[VoxelGrid, float] | None = None
         self._descent: Descent | None = None
         self._frames: tuple[int, WhitenedFrames] | None = None
 
@@ -200,36 +206,45 @@ class SmoothFit:
 
         How strong a prior noise allows depends on how many views and how much matter there are; so it is halved where
         it wipes out all matter, and where voxels of a pixel do not explain the frames to within their noise
-        (Morozov's discrepancy principle, 1966).
+        (Morozov's discrepancy principle, 1966), as long as that helps.
         """
         problem, u = descent.problem, descent.u
         self._descent = None
         unexplained = 2 * problem.frames(problem.lines(u)).value / problem.frames.count
-        if self._too_strong(u, unexplained) and self._weakened():
-            self._leg, self._volume, self._rival = 0, self.plan.begun, None
-            return
-        if leg.kind == "round":
+        if leg.kind == "round" and bool((u > 0).any()):
             u = modulated(problem, u)
         elif leg.kind == "from coarse" and unexplained > 1:
             self._rival = (u, descent.value)
         elif leg.kind == "from start" and self._rival is not None:
             other, value = self._rival
             u, self._rival = (u if descent.value < value else other), None
-        self._volume = self._volume.with_parameters({"values": u[None]})
-        self._leg += 1
+        found = self._volume.with_parameters({"values": u[None]})
+        if not self._weakened(found, unexplained):
+            self._volume, self._leg = found, self._leg + 1
 
-    def _too_strong(self, u: Tensor, unexplained: float) -> bool:
-        """Whether the prior wiped out all matter, or the last rounds say that it hides some; a first one is often not
-        at its end yet."""
-        late = self._leg >= len(self._legs) - max(1, self.plan.rounds - 1)
-        return not bool((u > 0).any()) or (late and unexplained > EXPLAINED)
-
-    def _weakened(self) -> bool:
-        """Whether the prior could be halved, for it was too strong for the frames."""
-        if self._strength <= WEAKEST:
+    def _weakened(self, found: VoxelGrid, unexplained: float) -> bool:
+        """Whether the fit goes elsewhere than on: back to its start with half the prior, or back to a stronger one."""
+        if not bool((found.values > 0).any()):
+            if unexplained <= EMPTY or self._strength <= WEAKEST:
+                return False
+            self._again(self._strength / 2)
+            return True
+        late = self._leg >= len(self._legs) - max(1, self.plan.rounds - 1)  # a first round is often not at its end yet
+        if not late or self._settled:
             return False
-        self._strength /= 2
-        return True
+        if self._stronger is not None and unexplained - 1 > WORTH * (self._stronger[1] - 1):
+            (self._volume, _), self._strength, self._settled = self._stronger, 2 * self._strength, True
+            self._leg += 1
+            return True
+        self._settled = unexplained <= EXPLAINED or self._strength <= WEAKEST
+        if not self._settled:
+            self._stronger = (found, unexplained)
+            self._again(self._strength / 2)
+        return not self._settled
+
+    def _again(self, strength: float) -> None:
+        """Begin anew with a prior of that `strength`."""
+        self._leg, self._volume, self._rival, self._strength = 0, self.plan.begun, None, strength
 
     def _problem(self, frames: WhitenedFrames, factor: int) -> VolumeProblem:
         prior = self.plan.prior.weakened(self._strength)
@@ -248,6 +263,8 @@ class SmoothFit:
             "seconds": self.seconds,
             "leg": self._leg,
             "strength": self._strength,
+            "settled": self._settled,
+            "stronger": self._stronger and [self._stronger[0].state(), self._stronger[1]],
             "volume": self._volume.state(),
             "level": self._level,
             "rival": None if self._rival is None else list(self._rival),
@@ -258,24 +275,11 @@ class SmoothFit:
         """Go back to a saved state."""
         self.step, self.seconds = int(state["step"]), float(state["seconds"])
         self._leg, self._level, self._strength = int(state["leg"]), float(state["level"]), float(state["strength"])
+        self._settled, before = bool(state["settled"]), state["stronger"]
+        self._stronger = before and (VoxelGrid.from_state(before[0]), float(before[1]))
         self._volume = VoxelGrid.from_state(state["volume"])
         self._rival = None if state["rival"] is None else (state["rival"][0], float(state["rival"][1]))
         self._descent = None
         if state["descent"] is not None:
             factor = self._legs[self._leg].factor
             self._descent = Descent.again(self._problem(self._frames_of(factor), factor), state["descent"])
-
-
-def noise_of_binned(noise: NoiseModel, factor: int) -> NoiseModel:
-    """The noise of frames whose pixels are means of `factor` × `factor`, by that of the frames.
-
-    Grain is taken to be smooth: what binning folds back of it counts as none.
-    """
-    if factor == 1:
-        return noise
-    h, w = noise.shape
-    rows, columns = h // factor, w // factor
-    at_rows = torch.round(torch.fft.fftfreq(rows, 1 / rows) * h / (rows * factor)).long()
-    at_columns = torch.round(torch.arange(columns // 2 + 1) * w / (columns * factor)).long()
-    grain = noise.grain[:, at_rows][:, :, at_columns.clamp_max(noise.grain.shape[2] - 1)] / factor**2
-    return NoiseModel(noise.white / factor, grain, columns)

@@ -1,0 +1,51 @@
+"""One damped Gauss–Newton step of the numbers of every view, beside what is expected of them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from .derivatives import Predicted
+
+
+@dataclass(frozen=True)
+class Step:
+    """numbers: [V, K] after the step; covariances: [V, K, K] of them, by frames and prior, for a known volume."""
+
+    numbers: Tensor
+    covariances: Tensor
+
+
+def step(measured: Tensor, found: Predicted, numbers: Tensor, expected: Tensor, blur: float) -> Step:
+    """The likeliest numbers near the present ones (Levenberg 1944, with the prior as damping); float64.
+
+    measured: frames [V, H, W]; found: at `numbers` [V, K], flux included; expected: [K] standard deviations of the
+    numbers about zero, 0 for those that stay; blur: standard deviation of a Gaussian [pixels] by which images are
+    compared. The noise of a view is what it leaves unexplained, as it is after that blur: this many independent pixels.
+    """
+    free = expected > 0
+    missing = blurred(measured - found.frames, blur).flatten(1).double()
+    columns = blurred(found.derivatives[:, free], blur).flatten(2).double()
+    independent = 1 / (4 * math.pi * blur**2)
+    scale = independent / missing.square().mean(1).clamp_min(1e-18)
+    information = torch.einsum("vip,vjp->vij", columns, columns) * scale[:, None, None]
+    slope = torch.einsum("vip,vp->vi", columns, missing) * scale[:, None]
+    prior = expected[free] ** -2
+    covariances = torch.linalg.inv(information + torch.diag(prior))
+    moved = torch.einsum("vij,vj->vi", covariances, slope - prior * numbers[:, free])
+    after = numbers.clone()
+    after[:, free] += moved
+    whole = torch.zeros(*numbers.shape, numbers.shape[1], dtype=numbers.dtype)
+    places = torch.nonzero(free)[:, 0]
+    whole[:, places[:, None], places] = covariances
+    return Step(after, whole)
+
+
+def blurred(images: Tensor, sigma: float) -> Tensor:
+    """Images [..., H, W] convolved with a Gaussian of `sigma` [pixels], periodically."""
+    h, w = images.shape[-2:]
+    squares = torch.fft.fftfreq(h)[:, None] ** 2 + torch.fft.rfftfreq(w) ** 2
+    return torch.fft.irfft2(torch.fft.rfft2(images) * torch.exp(-2 * math.pi**2 * sigma**2 * squares), s=(h, w))

@@ -1,0 +1,178 @@
+"""Where each view really is, by its frames: a volume and the poses in turn, on ever smaller pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from ..baselines.primal_dual import PrimalDual
+from ..checks import at_least, in_range, require
+from ..geometry import Grid
+from ..matter import DeltaBeta
+from ..model import Alignment
+from ..optics.retrieval import Tikhonov, tikhonov
+from ..optics.sampling import fringe_sampling
+from ..progress import Advance
+from ..projectors.voxels import LatticeProjector
+from ..scan import Exposures, Scan
+from .derivatives import NUMBERS, in_pixels, predicted
+from .newton import step
+
+SHIFT, TURN, DISTANCE, FLUX = slice(0, 2), slice(2, 5), 5, 6
+"""Places of the numbers of `NUMBERS`."""
+
+
+@dataclass(frozen=True)
+class Uncertain:
+    """Standard deviations of what is not known of each view; 0: it is as planned."""
+
+    shift: float = 2.0
+    """Detector's shifts along rows and columns [pixels]."""
+    angle: float = 1.0
+    """Turns about the two axes across the beam [degrees]."""
+    roll: float = 1.0
+    """Turns about the beam [degrees]."""
+    distance: float = 0.0
+    """Propagation distance, as a share of it. Only fringes that are resolved tell it: a longer distance sharpens edges
+    as voxels blur them."""
+    flux: float = 0.02
+    """Flux of a frame beside the flat field's, as a share of it."""
+
+    def __post_init__(self) -> None:
+        at_least(self, 0, "shift", "angle", "roll", "distance", "flux")
+        for name, most in (("shift", 100.0), ("angle", 20.0), ("roll", 20.0), ("distance", 0.5), ("flux", 0.5)):
+            value = getattr(self, name)
+            require(value <= most, f"uncertain {name} must be {most:g} at most, but it is {value:g}; correct it.")
+
+    def deviations(self, pixels: float, turning: bool = True) -> Tensor:
+        """Standard deviations [7] of `NUMBERS`, on pixels `pixels` times larger; turning: whether turns are free."""
+        turn, roll = np.deg2rad([self.angle, self.roll]) * turning
+        across = self.shift / pixels
+        distance = self.distance or BLUR_AS_DISTANCE
+        return torch.tensor([across, across, turn, turn, roll, distance, self.flux], dtype=torch.float64)
+
+
+TURNING = 30
+"""Pixels along a frame's shorter side from which on turns are looked for: on larger pixels there are shifts alone."""
+BLUR_AS_DISTANCE = 0.02
+"""Share of the distance that is free where the distance is known: it takes up what the edges of voxels are too soft
+for, which would else be taken for something else. What is found of it is forgotten."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """pixels: edge of the pixels [detector pixels]; rounds: of volume and poses in turn."""
+
+    pixels: int
+    rounds: int
+
+
+@dataclass(frozen=True)
+class PoseOptions:
+    """How poses are looked for."""
+
+    uncertain: Uncertain = field(default_factory=Uncertain)
+    """What is not known, and by how much."""
+    rounds: int = 8
+    """Rounds of volume and poses on each size of pixels."""
+    least_side: int = 16
+    """Pixels along a frame's shorter side on the largest pixels, which catch the largest errors."""
+    max_voxels: int = 4_000_000
+    """Pixels are not smaller than allow so many voxels; shifts are found to some hundredths of such a pixel."""
+    blur: float = 1.0
+    """Frames are compared after a Gaussian of this standard deviation [pixels]: details of a pixel's size depend on
+    the voxels' raster."""
+    weight: float = 0.5
+    """Weight of total variation in the volume [pixels of path length]."""
+    steps: int = 8
+    """Primal–dual steps of the volume a round."""
+    first: int = 40
+    """Steps of the first volume."""
+    retrieval: int = 40
+    """Steps of the phase retrieval."""
+
+    def __post_init__(self) -> None:
+        at_least(self, 1, "rounds", "max_voxels", "steps", "first", "retrieval")
+        at_least(self, 4, "least_side")
+        at_least(self, 0, "weight")
+        in_range("blur", self.blur, 0.3, 10.0, unit="pixels")
+
+    def levels(self, shape: tuple[int, int]) -> tuple[Level, ...]:
+        """From the largest pixels to the smallest, by powers of two."""
+        h, w = shape
+        finest = 1
+        while w * w * h / finest**3 > self.max_voxels:
+            finest *= 2
+        sizes = [finest]
+        while min(shape) // (2 * sizes[-1]) >= self.least_side and 0.5 * sizes[-1] < max(self.uncertain.shift, 1.0):
+            sizes.append(2 * sizes[-1])
+        return tuple(Level(size, self.rounds) for size in reversed(sizes))
+
+
+class PoseSearch:
+    """Poses and a volume in progress. The volume is that of the training frames; poses are found of all frames."""
+
+    def __init__(self, scan: Scan, material: DeltaBeta, options: PoseOptions, upper: float | None) -> None:
+        self.scan, self.material, self.options, self.upper = scan, material, options, upper
+        count = len(scan)
+        self.numbers = torch.zeros(count, len(NUMBERS), dtype=torch.float64)
+        self.covariances = torch.zeros(count, len(NUMBERS), len(NUMBERS), dtype=torch.float64)
+        self._solver: PrimalDual | None = None
+
+    def exposures(self, planned: Exposures) -> Exposures:
+        """Planned exposures, on pixels of any size, corrected by the numbers as they are now."""
+        pixels = planned.views.pixel_size / self.scan.views.pixel_size
+        stretches = self.numbers[:, DISTANCE].exp() - 1
+        alignment = Alignment(self.numbers[:, TURN], self.numbers[:, SHIFT] / pixels, stretches)
+        return alignment.exposures(planned)
+
+    def run(self, level: Level, on_progress: Advance) -> None:
+        """All rounds of a level."""
+        scan = self.scan.binned(level.pixels)
+        train = np.flatnonzero(~scan.is_test)
+        planned, pixel = scan.exposures, scan.views.pixel_size
+        frames, oversample = torch.from_numpy(scan.frames), fringe_sampling(planned)
+        how = Tikhonov(iterations=self.options.retrieval)
+        distances = self.exposures(planned).distance if self.options.uncertain.distance else planned.distance
+        known = replace(planned, distance=distances)[train]
+        retrieved = tikhonov(frames[train], known, *self.material, options=how) / pixel
+        grid = Grid.of_views(in_pixels(planned.views))
+        for done in range(level.rounds):
+            found = self.exposures(planned)
+            self._improve_volume(LatticeProjector(grid, in_pixels(found.views)[train]), grid, retrieved)
+            assert self._solver is not None
+            self._move(self._solver.volume, grid, found, frames, oversample)
+            on_progress((done + 1) / level.rounds)
+
+    def _improve_volume(self, projector: LatticeProjector, grid: Grid, retrieved: Tensor) -> None:
+        """Some steps of total-variation tomography in the poses as they are now."""
+        options, before = self.options, self._solver
+        if before is None:
+            self._solver = PrimalDual(projector, torch.zeros(grid.shape), options.weight, self.upper)
+            self._solver.run(retrieved, options.first)
+            return
+        if before.volume.shape == torch.Size(grid.shape):
+            self._solver = before.on_finer(projector, 1, options.weight)
+        else:
+            finer = interpolate(before.volume[None, None], size=grid.shape, mode="trilinear", align_corners=False)
+            self._solver = PrimalDual(projector, finer[0, 0], options.weight, self.upper)
+            self._solver.run(retrieved, options.first - options.steps)
+        self._solver.run(retrieved, options.steps)
+
+    def _move(self, volume: Tensor, grid: Grid, found: Exposures, frames: Tensor, oversample: int) -> None:
+        """One step of all numbers."""
+        pixels = round(found.views.pixel_size / self.scan.views.pixel_size)
+        scales = torch.ones(len(NUMBERS), dtype=torch.float64)
+        scales[SHIFT] = pixels
+        here = predicted(volume, grid, found, self.material, oversample)
+        lit = self.numbers[:, FLUX].exp()[:, None, None].float()
+        here = replace(here, frames=lit * here.frames, derivatives=lit[:, None] * here.derivatives)
+        turning = min(found.views.shape) >= TURNING
+        expected = self.options.uncertain.deviations(pixels, turning)
+        moved = step(frames, here, self.numbers / scales, expected, self.options.blur)
+        self.numbers = moved.numbers * scales
+        self.covariances = moved.covariances * scales[:, None] * scales

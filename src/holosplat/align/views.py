@@ -1,0 +1,178 @@
+"""`align_views`: a scan in, exposures as the frames say they are out, with errors and what the frames cannot tell."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from ..baselines.primal_dual import PrimalDual
+from ..checks import require
+from ..geometry import Grid
+from ..matter import Known, MaterialPrior
+from ..methods.start import assumed_material
+from ..optics.background import Light, LightOptions
+from ..optics.retrieval import Tikhonov, tikhonov
+from ..optics.sampling import fringe_sampling
+from ..progress import Progress
+from ..projectors.voxels import LatticeProjector
+from ..scan import Exposures, Scan
+from .derivatives import in_pixels, predicted
+from .gauge import moved_onto
+from .poses import DISTANCE, FLUX, PoseOptions, PoseSearch
+from .shadows import EVEN_OR_NOT
+
+DEFAULT = PoseOptions()
+FEWEST = 2
+"""Training views below which there is nothing to agree on."""
+FEW = 6
+"""Training views below which turns across the beam pass for the depth of matter, and stay as planned."""
+ACCURACY = {"shift": 0.06, "angle": 0.12, "roll": 0.06, "distance": 0.02}
+"""Rms errors of what is found [smallest pixels, degrees, share] on sharp cells whose geometry is known without errors
+(docs/data/alignment.csv): a plan that differs by less is as good, and kept."""
+KINDS = {"shift": (0, 1), "angle": (2, 3), "roll": (4,), "distance": (DISTANCE,)}
+"""Places of the numbers of each kind."""
+
+
+@dataclass(frozen=True)
+class AlignedViews:
+    """Where V views are.
+
+    exposures: those of the scan, corrected
+    changes: [V, 6] of the plan, all views moved together as near to it as can be: shifts x, y [pixels], turns about x,
+        y, z of the lab [degrees], share of the distance
+    errors: [V, 6] their standard errors
+    flux: [V] of each frame, beside one
+    before, after: [V] rms of what a volume leaves unexplained of each frame, as a share of its contrast, with the
+        planned and with the found exposures
+    words: what was kept as planned, and why
+    """
+
+    exposures: Exposures
+    changes: np.ndarray
+    errors: np.ndarray
+    flux: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    words: tuple[str, ...]
+
+    def lines(self) -> list[str]:
+        """What was found, in words, and a table of the views."""
+        root = np.sqrt(np.square(self.changes).mean(0))
+        said = [
+            f"changes of the plan (rms): shifts {np.hypot(root[0], root[1]) / np.sqrt(2):.3f} pixels, turns across the "
+            f"beam {np.hypot(root[2], root[3]) / np.sqrt(2):.3f}°, roll {root[4]:.3f}°, distance {root[5]:.2%}",
+            f"unexplained share of the contrast: {_rms(self.before):.3f} as planned, {_rms(self.after):.3f} now",
+            *self.words,
+            "view  shift x        shift y        turn x           turn y           roll             unexplained",
+        ]
+        for v, (change, error) in enumerate(zip(self.changes, self.errors)):
+            shifts = "  ".join(f"{change[k]:+6.2f} ± {error[k]:.2f}" for k in (0, 1))
+            turns = "  ".join(f"{change[k]:+6.3f}° ± {error[k]:.3f}" for k in (2, 3, 4))
+            said.append(f"{v:4d}  {shifts}  {turns}  {self.before[v]:.3f} → {self.after[v]:.3f}")
+        return said
+
+
+def align_views(
+    scan: Scan,
+    prior: MaterialPrior,
+    options: PoseOptions = DEFAULT,
+    *,
+    light: LightOptions = EVEN_OR_NOT,
+    on_progress: Progress = lambda stage, fraction: None,
+) -> AlignedViews:
+    """Where the views of `scan`, frames of one time, really are.
+
+    The volume is that of the training frames; frames that are held out only tell where they are themselves. A motion of
+    the whole object, which no frame can tell, is chosen so that the mean turn and the mean shift are those planned.
+    What differs from the plan by less than the accuracy that was measured (`ACCURACY`) stays as planned.
+
+    prior: what is known of the matter; where its δ is not, the occupancy has no bound. Errors: `InputError` for frames
+    of several times, and for fewer than two training frames.
+    """
+    require(not scan.is_series, "align needs frames of one time; choose one with --time-frame.")
+    count = int((~scan.is_test).sum())
+    require(count >= FEWEST, f"align needs {FEWEST} training frames at least, but there are {count}.")
+    frames = torch.from_numpy(scan.frames)
+    scan = replace(scan, frames=Light.of(frames, light).evened(frames).numpy())
+    material = assumed_material(scan.train(), prior, on_progress)
+    upper = 1.0 if isinstance(prior, Known) else None
+    words = list[str]()
+    if count < FEW and options.uncertain.angle > 0:
+        options = replace(options, uncertain=replace(options.uncertain, angle=0.0))
+        words.append(f"turns across the beam are as planned: {count} views cannot tell them from the matter's depth")
+    search, levels = PoseSearch(scan, material, options, upper), options.levels(scan.views.shape)
+    for level in levels:
+        name = f"alignment, pixels of {level.pixels}"
+        search.run(level, lambda fraction, name=name: on_progress(name, fraction))
+    trained = torch.from_numpy(~scan.is_test)
+    told = float(options.uncertain.distance > 0)
+    search.numbers[:, DISTANCE] = told * (search.numbers[:, DISTANCE] - search.numbers[trained, DISTANCE].mean())
+    errors = search.covariances.diagonal(dim1=1, dim2=2).clamp_min(0).sqrt().numpy()
+    words += _kept(search, scan.exposures, levels[-1].pixels)
+    found = search.exposures(scan.exposures)
+    found = replace(found, views=moved_onto(found.views, scan.views))
+    of = max(levels[-1].pixels, 2 if min(scan.views.shape) >= 2 * options.least_side else 1)
+    shares = []
+    for done, exposures in enumerate((scan.exposures, found)):
+        on_progress("alignment, before and after", 0.5 * done)
+        shares.append(unexplained(scan.with_views(exposures.views), exposures, search, of))
+    on_progress("alignment, before and after", 1.0)
+    return AlignedViews(
+        found,
+        changes(found, scan.exposures),
+        errors[:, :6] * np.array([1, 1, *[np.rad2deg(1)] * 3, told]),
+        np.exp(search.numbers[:, FLUX].numpy()) - 1,
+        shares[0],
+        shares[1],
+        tuple(words),
+    )
+
+
+def changes(found: Exposures, planned: Exposures) -> np.ndarray:
+    """[V, 6]: shifts x, y [pixels], turns about x, y, z of the lab [degrees], and share of the distance."""
+    turns = np.einsum("vij,vkj->vik", found.views.rotations, planned.views.rotations)
+    degrees = Rotation.from_matrix(turns).as_rotvec(degrees=True)
+    shifts = (found.views.shifts - planned.views.shifts) / planned.views.pixel_size
+    near = np.where(planned.distance > 0, planned.distance, 1.0)
+    stretch = (found.distance - planned.distance) / near
+    return np.concatenate([shifts, degrees, stretch[:, None]], axis=1)
+
+
+def _kept(search: PoseSearch, planned: Exposures, pixels: int) -> list[str]:
+    """Puts kinds of numbers that differ from the plan by no more than they are known back to it; says which."""
+    found = search.exposures(planned)
+    moved = changes(replace(found, views=moved_onto(found.views, planned.views)), planned)
+    words, uncertain = [], search.options.uncertain
+    for kind, places in KINDS.items():
+        if getattr(uncertain, kind) == 0:
+            continue
+        limit = ACCURACY[kind] * (pixels if kind == "shift" else 1)
+        if np.sqrt(np.square(moved[:, list(places)]).mean()) < limit:
+            search.numbers[:, list(places)] = 0
+            words.append(f"{kind} is as planned: the frames agree with it to within the accuracy of {limit:g}")
+    return words
+
+
+def unexplained(scan: Scan, exposures: Exposures, search: PoseSearch, pixels: int) -> np.ndarray:
+    """Rms [V] of what a new volume in `exposures` leaves unexplained, as a share of each frame's contrast.
+
+    On pixels `pixels` times larger; the same for all exposures that are compared.
+    """
+    scan = Scan(scan.frames, exposures, scan.is_test).binned(pixels)
+    frames, train, options = torch.from_numpy(scan.frames), np.flatnonzero(~scan.is_test), search.options
+    how = Tikhonov(iterations=options.retrieval)
+    lines = tikhonov(frames[train], scan.exposures[train], *search.material, options=how) / scan.views.pixel_size
+    views = in_pixels(scan.views)
+    grid = Grid.of_views(views)
+    solver = PrimalDual(LatticeProjector(grid, views[train]), torch.zeros(grid.shape), options.weight, search.upper)
+    solver.run(lines, 2 * options.first)
+    images = predicted(solver.volume, grid, scan.exposures, search.material, fringe_sampling(scan.exposures)).frames
+    left = (frames - images).square().mean((1, 2)).sqrt() / frames.std(dim=(1, 2)).clamp_min(1e-12)
+    return left.double().numpy()
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))

@@ -1,0 +1,100 @@
+"""Still light: what all frames have in common beside the matter that they show, as where a flat field is missing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..baselines import HolographicTV, holographic_tv
+from ..checks import require
+from ..frames import Frames
+from ..matter import MaterialPrior, Matter
+from ..methods.start import assumed_material
+from ..model import measure
+from ..optics.modes import smooth_modes
+from ..optics.sampling import fringe_sampling
+from ..progress import Progress
+from ..representations import VoxelGrid
+from ..scan import Scan
+
+FEWEST = 2
+"""Frames for training that still light takes: one frame's light cannot be told from its matter."""
+DARKEST = 0.01
+"""Relative intensity below which a pixel counts as so bright: its logarithm has no meaning."""
+
+
+@dataclass(frozen=True)
+class StillLight:
+    """How still light is found."""
+
+    order: int
+    """Half waves across a frame up to which light changes, such as 4; its mean is taken to be right. 0: any pattern,
+    pixel by pixel, which takes views enough for errors of the volume to differ from one to another."""
+    inside: float = 0.0
+    """Distance from the axis within which matter lies [m] (0: anywhere)."""
+    misfit: float = 3.0
+    """Weight of total variation, as `HolographicTV.misfit`; smooth light only."""
+    iterations: int = 300
+    """Steps of tomography."""
+
+    def __post_init__(self) -> None:
+        require(0 <= self.order <= 32, f"still light must have 0 to 32 half waves, but it has {self.order}.")
+        require(self.inside >= 0, f"matter must lie within 0 m or more, but it is {self.inside:g} m.")
+
+
+def still_light(scan: Scan, prior: MaterialPrior, options: StillLight, on_progress: Progress) -> np.ndarray:
+    """The light [H, W], relative to the flat field, that the training frames of `scan` have in common.
+
+    Their matter is made by phase retrieval and total variation, with an occupancy of at most one where `prior` knows
+    the material; smooth light is an unknown of that. The light is then the geometric mean of measured over predicted
+    frames: matter that turns is in other pixels in every frame, and averages out. What all frames show in the same
+    pixels is taken for light, also of matter that is round about the axis and is not in the volume.
+
+    Errors: `InputError` for fewer than `FEWEST` frames.
+    """
+    train = scan.train()
+    require(len(train) >= FEWEST, f"still light needs at least {FEWEST} frames for training, but there is one.")
+    material = assumed_material(train, prior, on_progress)
+    how = HolographicTV(
+        iterations=options.iterations if options.order else HolographicTV.iterations,
+        still_light=options.order,
+        misfit=options.misfit if options.order else 0.0,
+        inside=options.inside,
+        upper=prior.bound(1.0),
+    )
+    values, grid = holographic_tv(train, material, how, on_progress)
+    found = VoxelGrid(values[None], grid, Matter.one(*material))
+    predicted = measure(found, train.exposures, fringe_sampling(train.exposures)).detach().numpy()
+    logarithms = [np.log(np.maximum(frames, DARKEST)).astype(np.float64) for frames in (train.frames, predicted)]
+    mean = (logarithms[0] - logarithms[1]).mean(axis=0)
+    if options.order:
+        modes = smooth_modes(scan.views.shape, options.order)[1:].flatten(1).double().numpy()
+        mean = (np.linalg.lstsq(modes.T, mean.ravel(), rcond=None)[0] @ modes).reshape(mean.shape)
+    return np.exp(mean).astype(np.float32)
+
+
+def evened(
+    scan: Scan,
+    prior: MaterialPrior,
+    options: StillLight,
+    on_progress: Progress = lambda stage, fraction: None,
+) -> Scan:
+    """The scan with all its frames, held-out ones too, divided by the `still_light` of those for training."""
+    light = still_light(scan, prior, options, on_progress)
+    source = scan.source
+    frames = _Evened(source, light) if isinstance(source, Frames) else source / light
+    said = {"still_light": f"{np.log(light).std():.2%} (rms), order {options.order}, divided out"}
+    return Scan.of(frames, scan.exposures, scan.is_test, scan.provenance | said)
+
+
+class _Evened(Frames):
+    """Other frames, divided by `light` [H, W] when they are read."""
+
+    def __init__(self, frames: Frames, light: np.ndarray) -> None:
+        self._frames, self._light = frames, light
+        self.shape = frames.shape
+
+    def read(self, numbers: np.ndarray) -> np.ndarray:
+        """See `Frames.read`."""
+        return self._frames.read(numbers) / self._light

@@ -1,0 +1,214 @@
+"""Poses of single views: derivatives, steps, the common motion, and scans of balls whose poses are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from torch.nn.functional import interpolate, pad
+
+from helpers.discs import ball_lines
+from holosplat.align import AlignedViews, PoseOptions, Uncertain, align_views
+from holosplat.align.derivatives import NUMBERS, Predicted, projections
+from holosplat.align.gauge import moved_onto
+from holosplat.align.newton import blurred, step
+from holosplat.beamline.misalignment import Misalignment
+from holosplat.checks import InputError
+from holosplat.geometry import Grid, Views
+from holosplat.matter import DeltaBeta, MaterialPrior
+from holosplat.model import Instrument
+from holosplat.scan import Exposures, Scan
+from holosplat.volume import LineIntegrals
+
+MATERIAL = DeltaBeta(5e-7, 5e-10)
+PIXEL, SHAPE = 3.2e-6, (35, 41)
+BALLS = ((6.4, -5.6, 2.4, 4.8), (-8.0, 2.4, 6.4, 4.0), (1.6, 7.2, -8.8, 4.0), (-5.6, -8.8, -6.4, 3.2)) + (
+    (10.4, 4.8, 4.8, 3.2),
+    (-1.6, 0.8, -1.6, 2.8),
+    (3.2, -10.4, 9.6, 2.4),
+    (-11.2, 9.6, -2.4, 2.4),
+)
+"""x, y, z and radius [pixels]."""
+
+
+def scan_of(errors: Misalignment, count: int = 12, test_every: int = 4) -> tuple[Scan, Exposures]:
+    """Frames of balls, from chords, said to be of the planned exposures; and the true exposures."""
+    planned = Exposures.of(Views.evenly_spaced(count, SHAPE, PIXEL), 20.0, 0.1, 0.3)
+    true = errors.true_exposures(planned)
+    instrument = Instrument(true, 2)
+    lines = sum(ball_lines(true.views.refined(2), tuple(2 * v for v in ball), 2) for ball in BALLS)
+    my, mx = (2 * m for m in instrument.margin)
+    assert isinstance(lines, torch.Tensor)
+    wide = pad(lines, (mx, mx, my, my))[:, None]
+    frames = instrument.frames(LineIntegrals(wide, ((MATERIAL.delta, MATERIAL.beta),)))
+    held_out = np.arange(count) % test_every == test_every - 1
+    return Scan(frames.numpy(), planned, held_out), true
+
+
+def apart(found: Exposures, true: Exposures) -> tuple[float, float, float]:
+    """Rms errors but for a motion of the whole object: shifts [pixels], turns across the beam, and roll [degrees]."""
+    moved = moved_onto(found.views, true.views)
+    turns = np.einsum("vij,vkj->vik", moved.rotations, true.views.rotations)
+    degrees = Rotation.from_matrix(turns).as_rotvec(degrees=True)
+    shifts = (moved.shifts - true.views.shifts) / PIXEL
+    across, roll = degrees[:, :2], degrees[:, 2]
+    return float(np.sqrt((shifts**2).mean())), float(np.sqrt((across**2).mean())), float(np.sqrt((roll**2).mean()))
+
+
+@pytest.fixture(scope="module")
+def misaligned() -> tuple[Scan, Exposures, AlignedViews]:
+    scan, true = scan_of(Misalignment(1.0, 0.6, 0.0, seed=2))
+    return scan, true, align_views(scan, MaterialPrior.known(MATERIAL))
+
+
+def test_shifts_turns_and_roll_of_every_view_are_found(misaligned):
+    """Of held-out views, too."""
+    scan, true, found = misaligned
+    before, after = apart(scan.exposures, true), apart(found.exposures, true)
+    assert min(before) > 0.25
+    assert after[0] < 0.1
+    assert after[1] < 0.35
+    assert after[2] < 0.2
+    assert all(a < 0.5 * b for a, b in zip(after, before))
+
+
+def test_what_is_left_falls_and_is_told(misaligned):
+    scan, _, found = misaligned
+    assert found.after.mean() < 0.8 * found.before.mean()
+    assert found.words == ()
+    text = "\n".join(found.lines())
+    assert "rms" in text
+    assert len(found.lines()) == 3 + len(scan)
+    moved = moved_onto(found.exposures.views, scan.views)
+    np.testing.assert_allclose(moved.shifts, found.exposures.views.shifts, atol=1e-3 * PIXEL)
+    np.testing.assert_allclose(moved.rotations, found.exposures.views.rotations, atol=1e-6)
+    np.testing.assert_array_equal(found.exposures.distance, scan.exposures.distance)
+
+
+def test_the_errors_are_those_that_are_said(misaligned):
+    """To within a factor of four, on matter so small."""
+    _, true, found = misaligned
+    shift, turn, roll = apart(found.exposures, true)
+    said = np.sqrt(np.square(found.errors).mean(0))
+    for error, stated in ((shift, said[:2].mean()), (turn, said[2:4].mean()), (roll, said[4])):
+        assert 0.25 < error / stated < 4
+
+
+def test_what_is_said_to_be_known_stays():
+    scan, _ = scan_of(Misalignment(1.0, 0.6, 0.0, seed=2), 8)
+    options = PoseOptions(Uncertain(shift=1.0, angle=0.0, roll=0.0), rounds=2)
+    found = align_views(scan, MaterialPrior.known(MATERIAL), options)
+    np.testing.assert_allclose(found.exposures.views.rotations, scan.views.rotations, atol=1e-12)
+    assert np.abs(found.changes[:, :2]).max() > 0.3
+    assert np.abs(found.changes[:, 2:]).max() < 1e-9
+
+
+def test_a_good_plan_is_kept():
+    """It loses nothing, for what differs by less than can be known is put back."""
+    scan, _ = scan_of(Misalignment())
+    found = align_views(scan, MaterialPrior.known(MATERIAL))
+    kept = [word.split(" is as planned")[0] for word in found.words]
+    assert "shift" in kept
+    np.testing.assert_allclose(found.exposures.views.shifts, scan.views.shifts, atol=1e-9 * PIXEL)
+
+
+def test_few_views_do_not_tell_turns_from_depth():
+    scan, _ = scan_of(Misalignment(0.5, 0.3, 0.0, seed=1), 6, 3)
+    found = align_views(scan, MaterialPrior.known(MATERIAL), PoseOptions(rounds=1))
+    assert any("4 views cannot tell" in word for word in found.words)
+    with pytest.raises(InputError, match="2 training frames"):
+        align_views(scan[[0, 2]].with_split(np.array([False, True])), MaterialPrior.known(MATERIAL))
+    with pytest.raises(InputError, match="shift"):
+        Uncertain(shift=-1.0)
+
+
+PLACES, WIDTH = ((4.0, -3.0, 5.0), (-6.0, 2.0, 1.0)), 3.0
+"""Centres and standard deviation of round Gaussians [pixels]."""
+
+
+def gaussians(views: Views) -> np.ndarray:
+    """Their line integrals [V, H, W], blurred by the voxels' hats of variance 1/6."""
+    (h, w), variance = views.shape, WIDTH**2 + 1 / 6
+    x, y = np.arange(w) + 0.5 - w / 2, np.arange(h)[:, None] + 0.5 - h / 2
+    mass = (2 * np.pi) ** 1.5 * WIDTH**3 / (2 * np.pi * variance)
+    images = []
+    for rotation, shift in zip(views.rotations, views.shifts):
+        at = [rotation[:2] @ np.array(place) - shift for place in PLACES]
+        images.append(sum(mass * np.exp(-((x - a) ** 2 + (y - b) ** 2) / (2 * variance)) for a, b in at))
+    return np.array(images)
+
+
+def smooth(images: np.ndarray) -> np.ndarray:
+    """Without the ripple of the lattice, as the fit sees them."""
+    return blurred(torch.from_numpy(images).double(), 1.0).numpy()
+
+
+@pytest.mark.parametrize("number", range(5))
+def test_derivatives_of_projections_are_those_of_gaussians(number):
+    views = Views(
+        Rotation.random(3, rng=np.random.default_rng(3)).as_matrix(),
+        np.array([[1.0, -2], [0, 0], [0.5, 3]]),
+        (31, 37),
+        1.0,
+    )
+    grid = Grid.centred((41, 35, 39), 1.0)
+    x, y, z = grid.axes()
+    volume = sum(
+        np.exp(-((x - a) ** 2 + (y[:, None] - b) ** 2 + (z[:, None, None] - c) ** 2) / (2 * WIDTH**2))
+        for a, b, c in PLACES
+    )
+
+    def moved(size: float) -> Views:
+        shifts, turn = views.shifts.copy(), np.zeros(3)
+        if number < 2:
+            shifts[:, number] += size
+        else:
+            turn[number - 2] = size
+        return replace(views, rotations=Rotation.from_rotvec(turn).as_matrix() @ views.rotations, shifts=shifts)
+
+    wanted = smooth((gaussians(moved(1e-3)) - gaussians(moved(-1e-3))) / 2e-3)
+    lines, slopes = projections(torch.from_numpy(volume).float(), grid, views)
+    np.testing.assert_allclose(smooth(lines.numpy()), smooth(gaussians(views)), atol=0.02 * gaussians(views).max())
+    found = smooth(slopes[:, number].numpy())
+    assert np.linalg.norm(found - wanted) < 0.1 * np.linalg.norm(wanted)
+    assert (found * wanted).sum() / (wanted**2).sum() == pytest.approx(1, abs=0.04)
+
+
+def test_a_step_solves_a_linear_problem_and_the_prior_holds_back():
+    r = torch.Generator().manual_seed(1)
+    coarse = torch.randn(2, len(NUMBERS), 7, 9, generator=r)
+    columns = interpolate(coarse, size=(35, 45), mode="bilinear")
+    true = torch.linspace(-1, 1, 2 * len(NUMBERS)).reshape(2, -1).double()
+    measured = torch.einsum("vk,vkhw->vhw", true.float(), columns) + 1e-3 * torch.randn(2, 35, 45, generator=r)
+    here, nothing = Predicted(torch.zeros(2, 35, 45), columns), torch.zeros_like(true)
+    wide = torch.full((len(NUMBERS),), 10.0, dtype=torch.float64)
+    first = step(measured, here, nothing, wide, 1.0)
+    then = Predicted(torch.einsum("vk,vkhw->vhw", first.numbers.float(), columns), columns)
+    second = step(measured, then, first.numbers, wide, 1.0)
+    torch.testing.assert_close(second.numbers, true, atol=2e-3, rtol=0)
+    assert float(((second.numbers - true) ** 2 / second.covariances.diagonal(dim1=1, dim2=2)).mean()) < 4
+    held = wide.clone()
+    held[2] = 0
+    kept = step(measured, here, nothing, held, 1.0)
+    assert not kept.numbers[:, 2].any()
+    assert not kept.covariances[:, 2].any()
+    narrow = step(measured, here, nothing, torch.full_like(wide, 1e-6), 1.0)
+    assert float(narrow.numbers.abs().max()) < 1e-3
+
+
+def test_a_motion_of_the_whole_object_is_taken_away():
+    views = Views(
+        Rotation.random(5, rng=np.random.default_rng(1)).as_matrix(),
+        np.random.default_rng(0).normal(size=(5, 2)),
+        (9, 11),
+        1.0,
+    )
+    turn, motion = Rotation.from_rotvec([0.1, -0.2, 0.05]).as_matrix(), np.array([0.3, -1.0, 2.0])
+    rotations = views.rotations @ turn
+    moved = replace(views, rotations=rotations, shifts=views.shifts + rotations[:, :2] @ motion)
+    back = moved_onto(moved, views)
+    np.testing.assert_allclose(back.rotations, views.rotations, atol=1e-9)
+    np.testing.assert_allclose(back.shifts, views.shifts, atol=1e-9)
