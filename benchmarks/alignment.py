@@ -27,7 +27,7 @@ from holosplat.bench.record import source_commit
 
 USUAL = Uncertain()
 TABLE = Path(__file__).resolve().parents[1] / "docs/data/alignment.csv"
-FIELDS = (
+FIELDS: tuple[str, ...] = (
     "case",
     "scene",
     "seed",
