@@ -1,6 +1,6 @@
 """Measured data of other groups, from raw files to volumes: docs/real_data.md with its numbers and pictures.
 
-    python benchmarks/real_data.py --data FOLDER --work FOLDER [--cases capsule whole fine tooth hair] [--methods NAME]
+    python benchmarks/real_data.py --data FOLDER --work FOLDER [--cases NAME …] [--methods NAME …]
 
 FOLDER holds savu_24737_bin2.npz, tooth_bin2.npz and spider_hair_hologram.tiff (`holosplat data fetch`, or
 a folder of one's own); what is absent is skipped, and said to be. Each method gets frames for training, their poses,
@@ -237,6 +237,25 @@ def capsule(data: Path, work: Path, names: list[str]) -> None:
     panels(PICTURES / "dome_frames.png", frames, 3, same=False)
 
 
+def more_views(data: Path, work: Path, names: list[str]) -> None:
+    """The dome by more of the 91 views, and what the frames' misfit has in common: what bounds held-out SSIM."""
+    measured, prior = corrected_capsule(data, work, "0:28,:", "dome.nxs"), hs.MaterialPrior.of_ratio(500.0)
+    for step in (8, 4, 2):
+        scan = split(measured, np.arange(0, 91, step))
+        made = METHODS["volume"].run(scan.train(), prior, 0, lambda stage, fraction: None)
+        missing = measured.frames - measure(made, measured.exposures).detach().numpy()
+        common = [missing[which].mean(axis=0) for which in (~scan.is_test, scan.is_test)]
+        scores = {
+            **held_out(made, scan, scan),
+            "misfit of held-out frames": float(missing[scan.is_test].std()),
+            "the same in all": float(common[1].std()),
+            "correlation of that with training": float(np.corrcoef(common[0].ravel(), common[1].ravel())[0, 1]),
+        }
+        count = int((~scan.is_test).sum())
+        write_rows(row(f"capsule dome, {count} views", "volume", scores, 0.0))
+        print(count, {name: round(value, 4) for name, value in scores.items()}, flush=True)
+
+
 def whole_capsule(data: Path, work: Path, names: list[str]) -> None:
     """All rows of the capsule, metal and soft matter side by side: 12 of 91 views."""
     scan = corrected_capsule(data, work, ":,:", "whole.nxs")
@@ -346,8 +365,15 @@ def hair(data: Path, work: Path, names: list[str]) -> None:
     plt.close(figure)
 
 
-CASES = {"capsule": capsule, "whole": whole_capsule, "fine": fine_dome, "tooth": tooth, "hair": hair}
-NEEDS = dict.fromkeys(("capsule", "whole", "fine"), "savu_24737_bin2.npz") | {
+CASES = {
+    "capsule": capsule,
+    "more": more_views,
+    "whole": whole_capsule,
+    "fine": fine_dome,
+    "tooth": tooth,
+    "hair": hair,
+}
+NEEDS = dict.fromkeys(("capsule", "more", "whole", "fine"), "savu_24737_bin2.npz") | {
     "tooth": "tooth_bin2.npz",
     "hair": "spider_hair_hologram.tiff",
 }

@@ -12,6 +12,7 @@ from helpers.bench_shop import SHAPES, Recorder, fail, make_case, suite
 from helpers.cli import holosplat as run_command
 from holosplat.bench import record
 from holosplat.bench.folder import BenchFolder
+from holosplat.bench.measured import MEASURED
 from holosplat.bench.run import chosen, run_suite
 
 # --- names and folders --------------------------------------------------------------------------------------
@@ -85,7 +86,15 @@ def shop(recorder, monkeypatch) -> Recorder:
 def test_the_command_runs_lists_and_reports(shop, tmp_path):
     code, out, _ = holosplat("bench", "run", "--list")
     assert code == 0
-    assert [line.split()[0] for line in out.splitlines()] == ["cases:", "round", "wide", "methods:", "one", "two"]
+    assert [line.split()[0] for line in out.splitlines()] == [
+        "cases:",
+        "round",
+        "wide",
+        *MEASURED,
+        "methods:",
+        "one",
+        "two",
+    ]
     folder = tmp_path / "bench"
     command = ("bench", "run", "--cases", "round", "wide", "--methods", "two", "--seeds", 3, "--out", folder)
     code, _, err = holosplat(*command)
@@ -107,7 +116,7 @@ def test_a_case_of_ones_own_is_a_file(shop, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (("--cases", "main99"), "--cases must be among round, wide, but main99"),
+        (("--cases", "main99"), "--cases must be among round, wide, capsule-dome, capsule, tooth, but main99"),
         (("--methods", "magic"), "--methods must be among one, two, but magic"),
         (("--seeds", "-3"), "seeds must be 0 or more"),
     ],

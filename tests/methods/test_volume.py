@@ -18,7 +18,6 @@ from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid, Views
 from holosplat.matter import MaterialPrior
 from holosplat.methods import HolographicVoxels, SmoothVolume, Task, solve
-from holosplat.methods.smooth_fit import noise_of_binned
 from holosplat.methods.volume import SmoothStage, binning
 from holosplat.optics.noise_model import NoiseModel
 from holosplat.representations import VoxelGrid
@@ -88,7 +87,7 @@ def plainly(scan: Scan, options: SmoothVolume) -> torch.Tensor:
     start = first.values[0]
 
     def frames(factor: int) -> WhitenedFrames:
-        return WhitenedFrames(scan.binned(factor), first.matter.channels[0], noise_of_binned(task.noise, factor))
+        return WhitenedFrames(scan.binned(factor), first.matter.channels[0], task.noise.binned(factor))
 
     def rounds(seen: WhitenedFrames, prior: ContinuousPrior, u: torch.Tensor, loose: float = 0.0) -> torch.Tensor:
         for factor in [loose] * (loose > 0) + [1.0] * options.rounds:
@@ -171,7 +170,7 @@ def test_noise_of_binned_frames_is_that_of_their_means():
     noise = NoiseModel(torch.full((1,), 0.3, dtype=torch.float64), (shape**2)[None], 30)
     binned = frames.reshape(400, 12, 2, 15, 2).mean(dim=(2, 4))
     power = torch.fft.rfft2(binned, norm="ortho").abs().square().mean(dim=0)
-    found = noise_of_binned(noise, 2)
+    found = noise.binned(2)
     assert found.shape == (12, 15)
     low = (slice(0, 3), slice(0, 3))
     np.testing.assert_allclose(found.power()[0][low].numpy(), power[low].numpy(), rtol=0.3)

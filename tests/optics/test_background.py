@@ -7,9 +7,12 @@ import pytest
 import torch
 from scipy.ndimage import gaussian_filter
 
+from holosplat.beamline.light import correlated_field
 from holosplat.checks import InputError
 from holosplat.model import SolvedLight
 from holosplat.optics.background import Light, LightOptions
+from holosplat.optics.noise_model import NoiseModel
+from holosplat.scan import binned
 
 SHAPES = [(5, 72, 72), (4, 61, 90)]
 
@@ -97,6 +100,56 @@ def test_what_is_unknown_is_slow_and_where_there_is_no_air():
     more = found.doubt.power() - found.noise.power()
     assert float(more.min()) >= 0
     assert float(more[0, 0, 0]) > 10 * float(more[0, 20, 20])
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_steep_light_is_not_taken_for_grain(shape):
+    """Noise is what is left when light is divided out; what passes for grain hides the light that is left."""
+    draw = np.random.default_rng(1)
+    light = 1 + 0.03 * np.stack([correlated_field(shape[1:], 12.0, draw) for _ in range(shape[0])])
+    frames = measured(shape, light, 0.007)
+    found = Light.of(frames, LightOptions(air=((0, shape[1], 0, 18), (0, shape[1], shape[2] - 18, shape[2]))))
+    assert found.background is not None
+    assert NoiseModel.of_frames(frames, found.air).has_grain
+    assert not found.noise.has_grain
+    assert rms((found.background.factor().numpy() - light)[found.air.numpy()]) < 0.25 * 0.007
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_matter_that_is_predicted_in_air_does_not_change_the_light(shape):
+    frames = measured(shape, uneven(shape, "clouds"))
+    found = Light.of(frames)
+    assert found.background is not None
+    truth = torch.from_numpy(np.stack([rings(shape[1:])] * shape[0])).float()
+    truth = torch.where(found.air, 1.0, truth)
+    hazy = torch.where(found.air, 0.98, truth)
+    evened = found.evened(frames)
+    solved = SolvedLight(found.background, evened, found.air)
+    assert torch.equal(solved.factor(images=hazy), solved.factor(images=truth))
+    assert not torch.equal(SolvedLight(found.background, evened).factor(images=hazy), solved.factor(images=truth))
+    light, beside = found.settled(frames, hazy), found.settled(frames, truth)
+    assert light.background is not None
+    assert beside.background is not None
+    assert torch.equal(light.background.coefficients, beside.background.coefficients)
+    assert light.misfit(frames, truth) < 0.8 * light.misfit(frames, hazy)
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_light_of_some_binned_frames_is_that_of_all(shape, factor):
+    frames = measured(shape, uneven(shape, "clouds"))
+    found = Light.of(frames)
+    part = found.part(torch.tensor([3, 1]), factor)
+    assert found.background is not None
+    assert part.background is not None
+    want = torch.from_numpy(binned(found.background.factor().numpy(), factor))[[3, 1]]
+    assert part.background.factor().numpy() == pytest.approx(want.numpy(), abs=3e-4)
+    assert part.air.shape == want.shape
+    assert part.air.equal(torch.from_numpy(binned(found.air.double().numpy(), factor) > 0.999)[[3, 1]])
+    assert part.noise.white.numpy() == pytest.approx(found.noise.white[[3, 1]].numpy() / factor)
+    doubts = (one.background.covariances.diagonal(dim1=1, dim2=2).sum(dim=1) for one in (part, found) if one.background)
+    ours, whole = doubts
+    assert ours.numpy() == pytest.approx(whole[[3, 1]].numpy(), rel=0.1)
 
 
 def test_light_given_by_boxes_and_in_vain():

@@ -8,7 +8,7 @@ frequencies that only consistency between views can mend.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
 
@@ -45,6 +45,8 @@ class HolographicTV:
     """Primal–dual steps on the retrieved thickness."""
     weight: float = 0.3
     """Weight of total variation while the volume is made to agree with the holograms, in pixels of path length."""
+    relit: int = 3
+    """Rounds at most in which uneven light is found anew beside the volume; the first does most."""
     corrections: int = 6
     """Rounds of agreement (0: none)."""
     inner: int = 12
@@ -79,6 +81,7 @@ class HolographicTV:
             self,
             0,
             "weight",
+            "relit",
             "corrections",
             "inner",
             "few_views",
@@ -109,10 +112,12 @@ def _holographic_tv(
     scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress, light: Light | None
 ) -> tuple[Tensor, Grid]:
     noise = noise_share(torch.from_numpy(scan.frames))
-    whole = scan.views.shape
-    scan, refine = _working_resolution(scan, options)
-    light = light if scan.views.shape == whole else None  # binned frames are many: their light is known well
-    solver = _tomography(scan, material, options, on_progress)
+    scan, refine, factor = _working_resolution(scan, options)
+    light = light if light is None or factor == 1 else light.part(torch.arange(len(scan)), factor)
+    if light is None or light.background is None or options.still_light:  # still light is an unknown of tomography
+        solver = _tomography(scan, material, options, on_progress)
+    else:
+        scan, light, solver = _settled(scan, material, options, on_progress, light)
     alone = absorption_alone(scan.exposures, material.beta / material.delta)  # then retrieval left nothing to correct
     if options.corrections == 0 or options.still_light or noise > options.noisy or alone.all():
         return solver.volume, Grid.of_views(scan.views)
@@ -134,6 +139,34 @@ def _tomography(scan: Scan, material: DeltaBeta, options: HolographicTV, on_prog
     return tv_solver(rays, options.upper or None, steps, partial(on_progress, "tomography"), options.backend, weights)
 
 
+def _settled(
+    scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress, light: Light
+) -> tuple[Scan, Light, PrimalDual]:
+    """The frames in better light, that light, and their volume.
+
+    Air does not say what the light is behind bodies. What it misses there passes for faint matter, but differs between
+    views, so that no volume explains it all: the rest, at the light's frequencies, is light. Of all rounds the one
+    counts whose volume and light explain the frames best; where noise hides the shadows of bodies that is the first.
+    """
+    assert light.background is not None
+    measured = (torch.from_numpy(scan.frames) * light.background.factor()).float()
+    samples = fringe_sampling(scan.exposures)
+    instrument = Instrument(scan.exposures, samples, backend=options.backend)
+    best, least = None, float("inf")
+    for _ in range(1 + options.relit):
+        scan = replace(scan, frames=light.evened(measured).numpy())
+        solver = _tomography(scan, material, options, on_progress)
+        lines = refined(solver.lines(), samples) * scan.views.pixel_size
+        predicted = frames_of(instrument, lines, material).detach()
+        after = light.settled(measured, predicted)
+        misfit = after.misfit(measured, predicted)
+        if best is not None and misfit >= least:
+            break
+        best, least, light = (scan, light, solver), misfit, after
+    assert best is not None
+    return best
+
+
 def _agree(
     scan: Scan,
     material: DeltaBeta,
@@ -152,7 +185,7 @@ def _agree(
     """
     frames, pitch, views = torch.from_numpy(scan.frames), scan.views.pixel_size, _in_pixels(scan.views)
     correction = Correction(scan, material)
-    beside = None if light is None or light.background is None else SolvedLight(light.background, frames)
+    beside = None if light is None or light.background is None else SolvedLight(light.background, frames, light.air)
     finer = math.ceil(fringe_sampling(scan.exposures) / refine)
     instrument = Instrument(scan.exposures, refine * finer, backend=options.backend)
     grid = Grid.of_views(views, refine)
@@ -196,8 +229,8 @@ class Correction:
         return (-filtered(wide, self._inverse)[crop] * self._radian).float()
 
 
-def _working_resolution(scan: Scan, options: HolographicTV) -> tuple[Scan, int]:
-    """The scan, binned if its voxels would be too many, and the voxels along a pixel's edge."""
+def _working_resolution(scan: Scan, options: HolographicTV) -> tuple[Scan, int, int]:
+    """The scan, binned if its voxels would be too many; its voxels and the frames' pixels along an edge."""
     refine = options.refine or fringe_sampling(scan.exposures)
     h, w = scan.views.shape
     while refine > 1 and w * w * h * refine**3 > options.max_voxels:
@@ -205,7 +238,7 @@ def _working_resolution(scan: Scan, options: HolographicTV) -> tuple[Scan, int]:
     factor = 1
     while w * w * h / factor**3 > options.max_voxels:
         factor += 1
-    return scan.binned(factor), refine
+    return scan.binned(factor), refine, factor
 
 
 def _in_pixels(views: Views) -> Views:

@@ -19,16 +19,17 @@ from ..specimens.scene import MeshScene
 from ..volume import Volume
 from ..workflows.provenance import scan_hash
 from .case import Case
+from .measured import MeasuredCase
 
 
-def prepared(case: Case, folder: Path) -> tuple[Scan, Volume]:
-    """The scan and the true volume of `case`: those in `folder`, or else simulated and written there.
+def prepared(case: Case | MeasuredCase, folder: Path) -> tuple[Scan, Volume]:
+    """The scan and the true volume of `case`: those in `folder`, or else simulated, or corrected, and written there.
 
     `InputError` if the folder holds another case of that name, or frames that were changed. What is returned was
     read from the files in either way, so that a benchmark that goes on sees the same bytes as one that begins.
     """
     record, scan_file, truth_file = (folder / name for name in ("case.json", "scan.nxs", "truth.h5"))
-    mark = fingerprint(case)
+    mark = case.fingerprint() if isinstance(case, MeasuredCase) else fingerprint(case)
     if record.is_file():
         require(
             read_json(record).get("fingerprint") == mark,
@@ -41,7 +42,8 @@ def prepared(case: Case, folder: Path) -> tuple[Scan, Volume]:
         write_volume(truth_file, case.truth())
     scan, truth = read_scan(scan_file), read_volume(truth_file)
     if not record.is_file():  # last, so that a folder with it is complete
-        write_json(record, {**described(case), "fingerprint": mark, "scan_hash": scan_hash(scan)})
+        facts = case.described(scan) if isinstance(case, MeasuredCase) else described(case)
+        write_json(record, {**facts, "fingerprint": mark, "scan_hash": scan_hash(scan)})
     whole = read_json(record)["scan_hash"] == scan_hash(scan)
     require(whole, f"{scan_file} is not the scan that was simulated, its frames were changed; choose another --out.")
     return scan, truth

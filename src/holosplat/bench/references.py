@@ -16,6 +16,7 @@ from ..progress import Progress
 from ..representations.voxels import VoxelGrid
 from ..volume import Object, Volume
 from .case import Case
+from .measured import MeasuredCase
 
 
 @dataclass(frozen=True)
@@ -25,10 +26,10 @@ class Reference:
 
     name: str
     summary: str
-    run: Callable[[Case, Volume, Progress], Object]
+    run: Callable[[Case | MeasuredCase, Volume, Progress], Object]
 
 
-def truth_on_voxels(case: Case, truth: Volume, on_progress: Progress) -> VoxelGrid:
+def truth_on_voxels(case: Case | MeasuredCase, truth: Volume, on_progress: Progress) -> VoxelGrid:
     """The true volume itself: what voxels of one pixel can hold, at their best."""
     on_progress("truth on voxels", 0.0)
     scales = [float(np.abs(values).max()) for values in (truth.delta, truth.beta)]
@@ -36,12 +37,13 @@ def truth_on_voxels(case: Case, truth: Volume, on_progress: Progress) -> VoxelGr
     return VoxelGrid(torch.from_numpy(np.stack(channels)), truth.grid, Matter.free(*scales))
 
 
-def tv_of_true_lines(case: Case, truth: Volume, on_progress: Progress) -> VoxelGrid:
+def tv_of_true_lines(case: Case | MeasuredCase, truth: Volume, on_progress: Progress) -> VoxelGrid:
     """Total-variation tomography from the true thickness in the training views: phase retrieval without error."""
     require(
-        case.prior.fixes_level,
+        isinstance(case, Case) and case.prior.fixes_level,
         "the true thickness needs a known material, but methods are told of none here.",
     )
+    assert isinstance(case, Case)
     views = case.exposures.views[np.flatnonzero(~case.is_test)]
     material = case.prior.materials[0]
     _, projected_delta = case.scene.project(views)

@@ -20,6 +20,7 @@ from ..workflows.evaluate import Scores, score_object
 from ..workflows.provenance import environment, scan_hash
 from .case import Case
 from .folder import BenchFolder
+from .measured import MeasuredCase, agreement
 from .method import Method
 from .pictures import TRUTH, Arrays, method_picture, truth_picture
 from .prepare import prepared
@@ -41,7 +42,7 @@ class Suite:
     seeds: Sequence[int]
     methods: Mapping[str, Method]
     references: Mapping[str, Reference]
-    load: Callable[[str, int], Case]
+    load: Callable[[str, int], Case | MeasuredCase]
 
     def __post_init__(self) -> None:
         for what, chosen in (("cases", self.cases), ("methods", self.methods), ("seeds", self.seeds)):
@@ -120,7 +121,7 @@ class _Stored(Protocol):
 class _Bench:
     """A case made ready: what methods are given, and what their results are held against."""
 
-    case: Case
+    case: Case | MeasuredCase
     scan: Scan
     truth: Volume
     picture: Arrays
@@ -128,7 +129,7 @@ class _Bench:
     on_progress: Progress
 
     @classmethod
-    def of(cls, case: Case, folder: BenchFolder, on_progress: Progress) -> _Bench:
+    def of(cls, case: Case | MeasuredCase, folder: BenchFolder, on_progress: Progress) -> _Bench:
         scan, truth = prepared(case, folder.case(case.name, case.seed))
         picture = truth_picture(scan, truth)
         folder.write_picture(case.name, case.seed, TRUTH, picture)
@@ -152,6 +153,8 @@ class _Bench:
             scores, picture = self._judged(found)
             size = found.stored_bytes if isinstance(found, _Stored) else None
             row = replace(row, status="done", stored_bytes=size, **_numbers(scores))
+            if isinstance(self.case, MeasuredCase):
+                row.volume.update(agreement(found.voxelise(self.truth.grid), self.truth))
         except InputError as error:
             row = replace(row, reason=str(error))
         except Exception as error:  # one method's fault must not take the others' results
@@ -188,7 +191,7 @@ def _of_reference(reference: Reference, bench: _Bench) -> Callable[[Progress], O
     return lambda on_progress: reference.run(bench.case, bench.truth, on_progress)
 
 
-def _of_method(method: Method, train: Scan, case: Case) -> Callable[[Progress], Object]:
+def _of_method(method: Method, train: Scan, case: Case | MeasuredCase) -> Callable[[Progress], Object]:
     return lambda on_progress: method.run(train, case.prior, case.seed, on_progress)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Annotated
@@ -21,43 +22,58 @@ FIRST_SEED = 101
 """Options were tuned on scenes of seeds below 100."""
 
 
+@dataclass(frozen=True)
+class Folders:
+    """What cases need that is not generated."""
+
+    snapshots: Path | None = None
+    """Folder of simulated cells (VTK files) for the cases that have them; without, cells are generated."""
+    data: Path | None = None
+    """Folder of measured data, for the cases that need them (default: they are fetched)."""
+
+
 def run(
     cases: tuple[str, ...] = (),
     methods: tuple[str, ...] = (),
     seeds: tuple[int, ...] = (FIRST_SEED,),
     out: Path = Path("bench"),
-    snapshots: Path | None = None,
+    folders: Folders = Folders(),
     retry: bool = False,
     list_only: Annotated[bool, arg(name="list")] = False,
 ) -> None:
     """Run methods on cases; rows that are there already are kept, so an interrupted benchmark goes on.
 
     Args:
-        cases: Names of cases, or TOML files of your own (FILE.toml, or FILE.toml:VARIANT) (default: all).
+        cases: Names of cases, or TOML files of your own (FILE.toml, or FILE.toml:VARIANT) (default: all; measured ones
+            only with --data).
         methods: Names of methods (default: all).
         seeds: Seeds of scenes and noise; options were tuned on seeds below 100.
         out: Folder of the benchmark, new or to go on with.
-        snapshots: Folder of simulated cells (VTK files) for the cases that have them; without, cells are generated.
         retry: Run again what failed.
         list_only: Only list cases and methods.
     """
     from ..bench.case import Case, case_names, load_case
     from ..bench.folder import BenchFolder
+    from ..bench.measured import MEASURED, MeasuredCase
     from ..bench.methods import METHODS
     from ..bench.references import REFERENCES
     from ..bench.run import Suite, chosen, run_suite
 
     if list_only:
-        _list(case_names(), METHODS)
+        _list([*case_names(), *MEASURED], METHODS)
         return
     wanted = {name: METHODS[name] for name in chosen("--methods", methods, list(METHODS))}
     files = [name for name in cases if ".toml" in name]
     listed = [name for name in cases if name not in files]
-    sources = {name: name for name in chosen("--cases", listed, case_names())} if listed or not files else {}
-    sources |= {load_case(file, min(seeds, default=0), snapshots).name: file for file in files}
+    known = [*case_names(), *(MEASURED if listed or folders.data else ())]
+    sources = {name: name for name in chosen("--cases", listed, known)} if listed or not files else {}
+    sources = _at_hand(sources, folders.data)
+    sources |= {load_case(file, min(seeds, default=0), folders.snapshots).name: file for file in files}
 
-    def load(name: str, seed: int) -> Case:
-        return load_case(sources[name], seed, snapshots)
+    def load(name: str, seed: int) -> Case | MeasuredCase:
+        if name in MEASURED:
+            return replace(MEASURED[name], folder=folders.data, seed=seed)
+        return load_case(sources[name], seed, folders.snapshots)
 
     suite = Suite(list(sources), sorted(set(seeds)), wanted, REFERENCES, load)
     folder = BenchFolder(out)
@@ -130,6 +146,16 @@ def _outcome(row: Row) -> str:
         f"SSIM {row.test['ssim']:.4f}, FRCM {row.test['frcm']:.4f}, Dice {row.volume['dice']:.4f}, "
         f"relative error of δ {row.volume['relative_error_delta']:.4f}, {row.seconds:.1f} s"
     )
+
+
+def _at_hand(sources: dict[str, str], data: Path | None) -> dict[str, str]:
+    """The cases whose data are at hand; of the others it is said that they are skipped, and why."""
+    from ..bench.measured import MEASURED, missing_data
+
+    missing = missing_data(tuple(name for name in sources if name in MEASURED), data)
+    for name, why in missing.items():
+        _say(f"{name} is skipped, for its data are not at hand (--data FOLDER): {why}")
+    return {name: source for name, source in sources.items() if name not in missing}
 
 
 def _list(cases: list[str], methods: Mapping[str, Method]) -> None:

@@ -65,7 +65,8 @@ class Auto:
         candidates: dict[MatterKind, Method] = {"levels": self.gaussians, "continuous": self.volume}
         for matter, method in candidates.items():
             task.on_progress(f"{TRIAL}: {method.kind}", 0.0)
-            shares[matter] = judge.share(solve_stages(method, replace(task, scan=seen, lit=None, matter=matter)))
+            trial = replace(task, scan=seen, lit=self.trials.light(task.scan, task.lit), matter=matter)
+            shares[matter] = judge.share(solve_stages(method, trial))
         best = min(shares, key=lambda matter: shares[matter])
         left = " and ".join(f"{candidates[m].kind} leave {100 * share:.2g} %" for m, share in shares.items())
         return Decision(best, f"{decision.why}; in a trial, {left} of the matter in views set aside unexplained")

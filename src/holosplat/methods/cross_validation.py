@@ -13,8 +13,9 @@ from ..baselines.holographic_tv import Correction
 from ..checks import at_least
 from ..matter import DeltaBeta
 from ..model import Instrument, Model
+from ..optics.background import Light
 from ..optics.sampling import fringe_sampling
-from ..scan import Scan
+from ..scan import Exposures, Scan
 from ..volume import Object
 
 
@@ -33,13 +34,34 @@ class CrossValidation:
 
     def split(self, scan: Scan) -> tuple[Scan, Scan] | None:
         """Binned frames of `scan` that are left, and those set aside; None with fewer than three frames."""
-        count = min(self.views, len(scan) // 3)
-        if count == 0:
+        aside = self._aside(len(scan))
+        if not aside.any():
             return None
-        coarse = scan.binned(max(1, math.ceil(max(scan.views.shape) / self.width)))
-        aside = np.zeros(len(scan), dtype=bool)
-        aside[((np.arange(count) + 0.5) * len(scan) / count).astype(int)] = True
+        coarse = scan.binned(self._factor(scan))
         return coarse[np.flatnonzero(~aside)], coarse[np.flatnonzero(aside)]
+
+    def light(self, scan: Scan, light: Light | None) -> Light | None:
+        """The light of the frames of `scan` that are left, by that of all."""
+        left = torch.from_numpy(np.flatnonzero(~self._aside(len(scan))))
+        return None if light is None else light.part(left, self._factor(scan))
+
+    def _aside(self, count: int) -> np.ndarray:
+        """Which of `count` frames are set aside, [V] bool."""
+        some, aside = min(self.views, count // 3), np.zeros(count, dtype=bool)
+        aside[((np.arange(some) + 0.5) * count / max(some, 1)).astype(int)] = True
+        return aside
+
+    def _factor(self, scan: Scan) -> int:
+        return max(1, math.ceil(max(scan.views.shape) / self.width))
+
+
+def predicted_frames(exposures: Exposures, obj: Object, oversample: int = 0) -> Tensor:
+    """Frames [V, H, W] of `obj`, view by view to bound memory; oversample: wave samples a pixel (0: as the first fringe
+    needs)."""
+    samples, backend = oversample or fringe_sampling(exposures), getattr(obj, "backend", "cpu")
+    one = (Instrument(exposures[[i]], samples, backend=backend) for i in range(len(exposures)))
+    with torch.no_grad():
+        return torch.cat([Model(obj, instrument).frames().cpu() for instrument in one])
 
 
 class MissingMatter:
@@ -62,11 +84,7 @@ class MissingMatter:
 
         oversample: wave samples a pixel (0: as the first fringe needs).
         """
-        exposures, samples = self.scan.exposures, oversample or fringe_sampling(self.scan.exposures)
-        backend = getattr(obj, "backend", "cpu")
-        one = (Instrument(exposures[[i]], samples, backend=backend) for i in range(len(exposures)))
-        with torch.no_grad():
-            return torch.cat([Model(obj, instrument).frames().cpu() for instrument in one])
+        return predicted_frames(self.scan.exposures, obj, oversample)
 
     def of(self, residual: Tensor) -> float:
         """Mean square [m²] of the thickness that explains residuals [V, H, W] of intensity."""

@@ -89,5 +89,6 @@ def _solved(light: Light | None, train: Scan, schedule: Schedule, instrument: In
     """The light of the training frames that are not set aside, where it is uneven."""
     if light is None or light.background is None:
         return None
-    used = np.flatnonzero(~set_aside(len(light.background), schedule.validation_views))
-    return SolvedLight(light.background[torch.from_numpy(used)], torch.from_numpy(train.frames).to(instrument.device))
+    used = torch.from_numpy(np.flatnonzero(~set_aside(len(light.background), schedule.validation_views)))
+    frames = torch.from_numpy(train.frames).to(instrument.device)
+    return SolvedLight(light.background[used], frames, light.air[used])

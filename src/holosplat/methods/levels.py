@@ -76,7 +76,8 @@ def decide_matter(task: Task, options: LevelTest = LevelTest()) -> Decision:
     task.on_progress(STAGE, 0.0)
     seen, aside = split
     material = assumed_material(seen, task.prior, task.on_progress, options.volume.backend)
-    values, grid = holographic_tv(seen, material, replace(options.volume, upper=0.0), task.on_progress)
+    light = options.validation.light(task.scan, task.uneven)
+    values, grid = holographic_tv(seen, material, replace(options.volume, upper=0.0), task.on_progress, light)
     matter, judge = Matter.one(*material), MissingMatter(aside, material)
     backend = options.volume.backend
     free = _Misfit.of(judge, VoxelGrid(values[None], grid, matter).on(backend))

@@ -28,7 +28,6 @@ from ..optics.sampling import fringe_sampling
 from ..representations import VoxelGrid
 from ..scan import Scan
 from .method import Task, quiet
-from .volume import noise_of_binned
 
 UNIT_DELTA = 1e-6
 """δ of an occupancy of one; any value does, for occupancies have no bound."""
@@ -88,7 +87,7 @@ class Profile:
         factor = max(1, math.ceil(max(task.scan.views.shape) / options.width))
         self._scan = task.scan.binned(factor)
         contrast = torch.from_numpy(self._scan.frames - 1).double().square().mean(dim=(1, 2))
-        noise = noise_of_binned(task.noise, factor)
+        noise = task.noise.binned(factor)
         white = (noise.white.square() + options.doubt**2 * contrast).sqrt()
         self._noise = NoiseModel(white, noise.grain, noise.width)
         self._energy = self._scan.exposures.reference_energy

@@ -72,7 +72,7 @@ class SmoothPlan:
 
     def frames(self, factor: int) -> WhitenedFrames:
         """The frames on pixels `factor` times larger, in units of their noise."""
-        noise, material = noise_of_binned(self.noise, factor), self.begun.matter.channels[0]
+        noise, material = self.noise.binned(factor), self.begun.matter.channels[0]
         return WhitenedFrames(self.scan.binned(factor), material, noise, backend=self.backend)
 
 
@@ -236,18 +236,3 @@ class SmoothFit:
         if state["descent"] is not None:
             factor = self._legs[self._leg].factor
             self._descent = Descent.again(self._problem(self._frames_of(factor), factor), state["descent"])
-
-
-def noise_of_binned(noise: NoiseModel, factor: int) -> NoiseModel:
-    """The noise of frames whose pixels are means of `factor` × `factor`, by that of the frames.
-
-    Grain is taken to be smooth: what binning folds back of it counts as none.
-    """
-    if factor == 1:
-        return noise
-    h, w = noise.shape
-    rows, columns = h // factor, w // factor
-    at_rows = torch.round(torch.fft.fftfreq(rows, 1 / rows) * h / (rows * factor)).long()
-    at_columns = torch.round(torch.arange(columns // 2 + 1) * w / (columns * factor)).long()
-    grain = noise.grain[:, at_rows][:, :, at_columns.clamp_max(noise.grain.shape[2] - 1)] / factor**2
-    return NoiseModel(noise.white / factor, grain, columns)

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
+import torch
+
 from ..baselines import HolographicTV, holographic_tv
 from ..baselines.material import MaterialEstimate
 from ..checks import at_least, require
@@ -13,8 +15,9 @@ from ..geometry import Grid
 from ..matter import Matter
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
+from .cross_validation import predicted_frames
 from .method import Stage, Task
-from .smooth_fit import SmoothFit, SmoothPlan, noise_of_binned
+from .smooth_fit import SmoothFit, SmoothPlan
 from .start import assumed_material
 
 
@@ -78,19 +81,31 @@ class SmoothStage:
     def start(self, task: Task, before: Stored | None) -> VoxelGrid:
         """A first volume: δ in units of the known material's, or of the estimated one's."""
         options = self.options
-        scan = task.scan.binned(binning(task.scan, options.max_voxels))
+        factor = binning(task.scan, options.max_voxels)
+        scan, light = task.scan.binned(factor), task.uneven and task.uneven.part(torch.arange(len(task.scan)), factor)
         backend = options.volume.backend
         material = assumed_material(scan, task.prior, task.on_progress, backend, options.estimate)
-        first, grid = holographic_tv(scan, material, replace(options.volume, upper=0.0), task.on_progress)
+        first, grid = holographic_tv(scan, material, replace(options.volume, upper=0.0), task.on_progress, light)
         return VoxelGrid(first[None], grid, Matter.one(*material)).resampled(Grid.of_views(scan.views))
 
     def fit(self, task: Task, start: Stored) -> SmoothFit:
         """The fit to the training frames, from larger voxels on."""
         assert isinstance(start, VoxelGrid)
         options, factor = self.options, binning(task.scan, self.options.max_voxels)
-        noise, backend = noise_of_binned(task.noise, factor), options.volume.backend
+        noise, backend = task.noise.binned(factor), options.volume.backend
         how = (options.prior, options.coarser, options.rounds, options.iterations, options.loose, backend)
-        return SmoothFit(SmoothPlan(task.scan.binned(factor), start, noise, *how))
+        return SmoothFit(SmoothPlan(_beside(task, start).binned(factor), start, noise, *how))
+
+
+def _beside(task: Task, start: VoxelGrid) -> Scan:
+    """The frames in the light that they have beside `start`, where that explains them better."""
+    if task.uneven is None or task.uneven.background is None:
+        return task.scan
+    light, measured = task.uneven, (torch.from_numpy(task.scan.frames) * task.uneven.background.factor()).float()
+    predicted = predicted_frames(task.scan.exposures, start)
+    after = light.settled(measured, predicted)
+    better = after.misfit(measured, predicted) < light.misfit(measured, predicted)
+    return replace(task.scan, frames=after.evened(measured).numpy()) if better else task.scan
 
 
 def binning(scan: Scan, most: int) -> int:

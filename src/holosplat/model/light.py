@@ -62,16 +62,19 @@ class SolvedLight:
     In every step its coefficients c solve `(MᵀM/p + T⁻¹) c = Mᵀ log(measured / images) / p - T⁻¹ b`: a ridge regression
     on the modes M, for noise of power p at their frequencies, and a prior of variances T about -b where the frames were
     divided by `exp(Σ b m)` before. The light is thus eliminated ("variable projection", Golub & Pereyra 1973), and
-    gradients by the matter are right without going through it, for c is at its optimum.
+    gradients by the matter are right without going through it, for c is at its optimum. Air shows the light whatever
+    matter is predicted there: faint matter all over the field would otherwise pass for light, and light for it.
     """
 
-    def __init__(self, background: Background, measured: Tensor) -> None:
-        """background: the light that the frames `measured` [V, h, w] were divided by, on whose device this computes."""
+    def __init__(self, background: Background, measured: Tensor, air: Tensor | None = None) -> None:
+        """background: the light that the frames `measured` [V, h, w] were divided by, on whose device this computes;
+        air: where they show no matter [V, h, w] bool (None: nowhere)."""
         on = measured.device
         modes = background.modes()
         flat = modes.double().flatten(1)
         gain = posterior_covariance((flat @ flat.T)[None], background.variances, background.powers)
         self._modes, self._measured = modes.to(on), measured
+        self._air = torch.zeros_like(measured, dtype=torch.bool) if air is None else air.to(on)
         self._gain = (gain / background.powers[:, None, None]).float().to(on)
         pull = background.coefficients / background.variances
         self._before = torch.einsum("vkl,vl->vk", gain, pull).float().to(on)
@@ -81,11 +84,12 @@ class SolvedLight:
 
     def coefficients(self, images: Tensor, index: Tensor | None = None) -> Tensor:
         """The coefficients [V, K] beside `images` [V, h, w] of even light, of all frames or of those of `index`."""
-        measured, gain, before = self._measured, self._gain, self._before
+        measured, air, gain, before = self._measured, self._air, self._gain, self._before
         if index is not None:
-            measured, gain, before = (part.index_select(0, index) for part in (measured, gain, before))
+            measured, air, gain, before = (part.index_select(0, index) for part in (measured, air, gain, before))
+        images = torch.where(air, 1.0, images.detach())
         seen = (measured > DARKEST) & (images > DARKEST)
-        ratio = torch.where(seen, measured.clamp_min(DARKEST) / images.detach().clamp_min(DARKEST), 1.0).log()
+        ratio = torch.where(seen, measured.clamp_min(DARKEST) / images.clamp_min(DARKEST), 1.0).log()
         right = torch.einsum("vhw,khw->vk", ratio, self._modes)
         return torch.einsum("vkl,vl->vk", gain, right) - before
 

@@ -22,6 +22,9 @@ ROUNDS = 30
 UNEVEN, SEEN = 6.0, 0.07
 """Light is uneven if the squares of its lowest modes in air exceed those of noise by so many of their deviations, and
 it is so large a part of the frames' contrast."""
+GRAINY, HALVED = 4, 0.5
+"""Rounds, at most, in which light is divided out and the noise of the rest gives better light. Grain that falls below
+this part of what it was may still be steep light; true grain stays as it is, and there is one round."""
 FAINTEST = 1e-4
 """Noise [relative intensity] assumed at least: light is not known better."""
 DARKEST = 0.05
@@ -66,10 +69,14 @@ class Light:
         air = options.air_of(frames)
         noise = NoiseModel.of_frames(frames, air)
         background = _found(frames, noise, air, options.kind)
-        if background is not None and not options.air:  # without steep light more of the air is seen to be quiet
-            air = find_air(frames / background.factor()) | air
-            noise = NoiseModel.of_frames(frames, air)
+        for _ in range(GRAINY if background is not None else 0):
+            assert background is not None
+            even, grain = frames / background.factor(), noise.grain_level
+            air = air if options.air else find_air(even) | air  # without steep light more of it is seen to be quiet
+            noise = NoiseModel.of_frames(even, air)
             background = Background.of_air(frames, air, noise)
+            if noise.grain_level >= HALVED * grain:  # it is grain, and not steep light
+                break
         return cls(air, noise, background)
 
     @property
@@ -89,9 +96,31 @@ class Light:
         return self.noise if self.background is None else self.noise.with_more(self.background.doubt(self.air))
 
     def settled(self, frames: Tensor, predicted: Tensor) -> Light:
-        """The same where matter predicts these frames [V, H, W] in even light, and `frames` were measured."""
+        """The same where matter predicts these frames [V, H, W] in even light, and `frames` were measured.
+
+        In air no matter is believed: faint matter all over the field, which light has become, is not matter.
+        """
         known = self.background
-        return self if known is None else replace(self, background=known.seen_beside(frames, predicted))
+        if known is None:
+            return self
+        return replace(self, background=known.seen_beside(frames, torch.where(self.air, 1.0, predicted)))
+
+    def part(self, index: Tensor, factor: int = 1) -> Light:
+        """The light of frames number `index`, and on pixels `factor` times larger, cut as `Scan.binned` cuts them."""
+        air, known = self.air[index], self.background
+        rows, columns = (slice((n % factor) // 2, (n % factor) // 2 + n // factor * factor) for n in air.shape[1:])
+        coarse = air[:, rows, columns].unflatten(2, (-1, factor)).unflatten(1, (-1, factor)).all(dim=4).all(dim=2)
+        if known is not None:
+            known = known[index] if factor == 1 else known[index].binned(rows, columns, factor)
+        return Light(coarse, self.noise[index].binned(factor), known)
+
+    def misfit(self, frames: Tensor, predicted: Tensor) -> float:
+        """χ² of measured frames [V, H, W] beside those predicted in even light, and of the light for its prior."""
+        known = self.background
+        factor = 1.0 if known is None else known.factor()
+        left = (frames - predicted * factor).double().square().sum(dim=(1, 2)) / _lowest_power(self.noise)
+        of_light = 0.0 if known is None else float((known.coefficients.square() / known.variances).sum())
+        return float(left.sum()) + of_light
 
 
 @dataclass(frozen=True)
@@ -147,6 +176,18 @@ class Background:
             covariances=self.covariances[index],
             powers=self.powers[index],
         )
+
+    def binned(self, rows: slice, columns: slice, factor: int) -> Background:
+        """The light of these rows and columns on pixels `factor` times larger, as modes of the coarse frames.
+
+        Modes are orthonormal there, so that `c' = M' B Mᵀ c`, B the mean over pixels.
+        """
+        old = smooth_modes(self.shape, ORDER).double()[:, rows, columns]
+        coarse = torch.nn.functional.avg_pool2d(old, factor)
+        shape = (coarse.shape[-2], coarse.shape[-1])
+        change = _modes(shape) @ coarse.flatten(1).T / coarse[0].numel()
+        covariances = change @ self.covariances @ change.T
+        return Background(self.coefficients @ change.T, covariances, self.variances, self.powers / factor**2, shape)
 
     def modes(self, device: torch.device | str = "cpu") -> Tensor:
         """The modes [K, H, W], float32."""

@@ -66,6 +66,20 @@ class NoiseModel:
         """The noise of some of the frames."""
         return NoiseModel(self.white[index], self.grain[index], self.width)
 
+    def binned(self, factor: int) -> NoiseModel:
+        """The noise of frames whose pixels are means of `factor` × `factor`, by that of the frames.
+
+        Grain is taken to be smooth: what binning folds back of it counts as none.
+        """
+        if factor == 1:
+            return self
+        h, w = self.shape
+        rows, columns = h // factor, w // factor
+        at_rows = torch.round(torch.fft.fftfreq(rows, 1 / rows) * h / (rows * factor)).long()
+        at_columns = torch.round(torch.arange(columns // 2 + 1) * w / (columns * factor)).long()
+        grain = self.grain[:, at_rows][:, :, at_columns.clamp_max(self.grain.shape[2] - 1)] / factor**2
+        return NoiseModel(self.white / factor, grain, columns)
+
     @classmethod
     def white_only(cls, white: Tensor, shape: tuple[int, int]) -> NoiseModel:
         """White noise [V] on frames of `shape` (H, W), without grain."""
@@ -100,6 +114,11 @@ class NoiseModel:
     def has_grain(self) -> bool:
         """Whether any of the noise is correlated."""
         return bool((self.grain > 0).any())
+
+    @property
+    def grain_level(self) -> float:
+        """Standard deviation of the grain, the mean of all frames."""
+        return float(_mean_power(self.grain, self.shape).mean().sqrt())
 
     @property
     def level(self) -> Tensor:

@@ -16,7 +16,7 @@ from ..geometry import Grid
 from ..methods import Task
 from ..methods.mass import DOUBTFUL, RATIO_SHARE, Total, total_delta
 from ..methods.uncertain import Determined
-from ..methods.volume import binning, noise_of_binned
+from ..methods.volume import binning
 from ..optics.noise_model import NoiseModel
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
@@ -85,7 +85,7 @@ def total_of_run(said: Prediction, frames: Scan, task: Task, constants: tuple[De
     factor = binning(frames, MOST_VOXELS)
     few = frames[chosen]
     predicted = None if _imaged_as_voxels(said, frames, factor) else _predicted(said, few, chosen).binned(factor)
-    noise = noise_of_binned(_noise(task, frames)[torch.from_numpy(chosen)], factor)
+    noise = _noise(task, frames)[torch.from_numpy(chosen)].binned(factor)
     shown = None if predicted is None else torch.from_numpy(predicted.frames)
     doubt = _ratio_doubt(task, constants)
     total = total_delta(found, few.binned(factor), noise, shown, doubt)
