@@ -98,7 +98,7 @@ def rows_of(name: str, experiment: Experiment) -> list[dict[str, object]]:
 
 def main() -> None:
     """Run cases; rows of others stay."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--cases", nargs="*", default=list(CASES))
     wanted = parser.parse_args().cases
     for name in wanted:
