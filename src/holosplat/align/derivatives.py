@@ -19,8 +19,6 @@ from ..scan import Exposures
 NUMBERS = ("shift x", "shift y", "turn x", "turn y", "roll", "distance", "flux")
 """What each view has: shifts [pixels], turns about the lab's axes [rad], and the logarithms of the distance over the
 planned one and of the flux."""
-POSE = 5
-"""How many of them move the projection."""
 SMALL = (0.05, 0.05, 1e-3, 1e-3, 1e-3)
 """Steps along derivatives of line integrals by which those of frames are taken."""
 STRETCH = 0.02

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -19,6 +20,7 @@ from ..optics.sampling import fringe_sampling
 from ..progress import Advance
 from ..projectors.voxels import LatticeProjector
 from ..scan import Exposures, Scan
+from .coarse import shifts_by_mass
 from .derivatives import NUMBERS, in_pixels, predicted
 from .newton import step
 
@@ -89,26 +91,35 @@ class PoseOptions:
     weight: float = 0.5
     """Weight of total variation in the volume [pixels of path length]."""
     steps: int = 8
-    """Primal–dual steps of the volume a round."""
+    """Primal–dual steps of the volume a round, for `few_views` or more."""
     first: int = 40
-    """Steps of the first volume."""
+    """Steps of the first volume, likewise."""
+    few_views: int = 10
+    """With fewer training views than this there are more steps: total variation has more to fill in, and where it has
+    not, a volume takes any pose."""
+    by_mass: float = 2.0
+    """Uncertain shifts [pixels] beyond which centres of mass give the first ones: they are good to a pixel or two."""
     retrieval: int = 40
     """Steps of the phase retrieval."""
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "rounds", "max_voxels", "steps", "first", "retrieval")
+        at_least(self, 1, "rounds", "max_voxels", "steps", "first", "retrieval", "few_views")
         at_least(self, 4, "least_side")
         at_least(self, 0, "weight")
         in_range("blur", self.blur, 0.3, 10.0, unit="pixels")
 
-    def levels(self, shape: tuple[int, int]) -> tuple[Level, ...]:
-        """From the largest pixels to the smallest, by powers of two."""
-        h, w = shape
+    def levels(self, shape: tuple[int, int], views: int) -> tuple[Level, ...]:
+        """From the largest pixels to the smallest, by powers of two, of frames of this shape.
+
+        views: for training; few of them say nothing of the matter on large pixels.
+        """
+        (h, w), reach = shape, min(max(self.uncertain.shift, 1.0), self.by_mass)
+        largest = reach if views < self.few_views // 2 else 2 * reach
         finest = 1
         while w * w * h / finest**3 > self.max_voxels:
             finest *= 2
         sizes = [finest]
-        while min(shape) // (2 * sizes[-1]) >= self.least_side and 0.5 * sizes[-1] < max(self.uncertain.shift, 1.0):
+        while min(shape) // (2 * sizes[-1]) >= self.least_side and sizes[-1] < largest:
             sizes.append(2 * sizes[-1])
         return tuple(Level(size, self.rounds) for size in reversed(sizes))
 
@@ -122,6 +133,9 @@ class PoseSearch:
         self.numbers = torch.zeros(count, len(NUMBERS), dtype=torch.float64)
         self.covariances = torch.zeros(count, len(NUMBERS), len(NUMBERS), dtype=torch.float64)
         self._solver: PrimalDual | None = None
+        self._more = max(1.0, options.few_views / int((~scan.is_test).sum()))
+        if options.uncertain.shift > options.by_mass:
+            self.begin()
 
     def exposures(self, planned: Exposures) -> Exposures:
         """Planned exposures, on pixels of any size, corrected by the numbers as they are now."""
@@ -129,6 +143,19 @@ class PoseSearch:
         stretches = self.numbers[:, DISTANCE].exp() - 1
         alignment = Alignment(self.numbers[:, TURN], self.numbers[:, SHIFT] / pixels, stretches)
         return alignment.exposures(planned)
+
+    def levels(self) -> tuple[Level, ...]:
+        """All levels, in their order."""
+        return self.options.levels(self.scan.views.shape, int((~self.scan.is_test).sum()))
+
+    def begin(self) -> None:
+        """Shifts by centres of mass, for a start; turns and distances as planned."""
+        scan = self.scan.binned(self.levels()[0].pixels)
+        how = Tikhonov(iterations=self.options.retrieval)
+        thickness = tikhonov(torch.from_numpy(scan.frames), scan.exposures, *self.material, options=how)
+        shifts = shifts_by_mass(thickness.double().numpy(), scan.views)
+        pixels = scan.views.pixel_size / self.scan.views.pixel_size
+        self.numbers[:, SHIFT] = torch.from_numpy(shifts) * pixels
 
     def run(self, level: Level, on_progress: Advance) -> None:
         """All rounds of a level."""
@@ -151,17 +178,18 @@ class PoseSearch:
     def _improve_volume(self, projector: LatticeProjector, grid: Grid, retrieved: Tensor) -> None:
         """Some steps of total-variation tomography in the poses as they are now."""
         options, before = self.options, self._solver
+        first, steps = (math.ceil(self._more * count) for count in (options.first, options.steps))
         if before is None:
             self._solver = PrimalDual(projector, torch.zeros(grid.shape), options.weight, self.upper)
-            self._solver.run(retrieved, options.first)
+            self._solver.run(retrieved, first)
             return
         if before.volume.shape == torch.Size(grid.shape):
             self._solver = before.on_finer(projector, 1, options.weight)
         else:
             finer = interpolate(before.volume[None, None], size=grid.shape, mode="trilinear", align_corners=False)
             self._solver = PrimalDual(projector, finer[0, 0], options.weight, self.upper)
-            self._solver.run(retrieved, options.first - options.steps)
-        self._solver.run(retrieved, options.steps)
+            self._solver.run(retrieved, max(0, first - steps))
+        self._solver.run(retrieved, steps)
 
     def _move(self, volume: Tensor, grid: Grid, found: Exposures, frames: Tensor, oversample: int) -> None:
         """One step of all numbers."""

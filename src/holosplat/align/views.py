@@ -19,6 +19,7 @@ from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..projectors.voxels import LatticeProjector
 from ..scan import Exposures, Scan
+from .coarse import mirrored
 from .derivatives import in_pixels, predicted
 from .gauge import moved_onto
 from .poses import DISTANCE, FLUX, PoseOptions, PoseSearch
@@ -27,7 +28,9 @@ from .shadows import EVEN_OR_NOT
 DEFAULT = PoseOptions()
 FEWEST = 2
 """Training views below which there is nothing to agree on."""
-FEW = 6
+STRAY = 1.35
+"""A view that leaves so many times as much unexplained as the middle one does not fit with the others."""
+FEW = 4
 """Training views below which turns across the beam pass for the depth of matter, and stay as planned."""
 ACCURACY = {"shift": 0.06, "angle": 0.12, "roll": 0.06, "distance": 0.02}
 """Rms errors of what is found [smallest pixels, degrees, share] on sharp cells whose geometry is known without errors
@@ -103,7 +106,8 @@ def align_views(
     if count < FEW and options.uncertain.angle > 0:
         options = replace(options, uncertain=replace(options.uncertain, angle=0.0))
         words.append(f"turns across the beam are as planned: {count} views cannot tell them from the matter's depth")
-    search, levels = PoseSearch(scan, material, options, upper), options.levels(scan.views.shape)
+    search = PoseSearch(scan, material, options, upper)
+    levels = search.levels()
     for level in levels:
         name = f"alignment, pixels of {level.pixels}"
         search.run(level, lambda fraction, name=name: on_progress(name, fraction))
@@ -115,18 +119,21 @@ def align_views(
     found = search.exposures(scan.exposures)
     found = replace(found, views=moved_onto(found.views, scan.views))
     of = max(levels[-1].pixels, 2 if min(scan.views.shape) >= 2 * options.least_side else 1)
-    shares = []
-    for done, exposures in enumerate((scan.exposures, found)):
-        on_progress("alignment, before and after", 0.5 * done)
-        shares.append(unexplained(scan.with_views(exposures.views), exposures, search, of))
+    on_progress("alignment, before and after", 0.0)
+    before, after = (Judged.of(scan, exposures, search, of) for exposures in (scan.exposures, found))
     on_progress("alignment, before and after", 1.0)
+    judges = scan.is_test if scan.is_test.any() else ~scan.is_test  # few frames for training agree with any poses
+    if _rms(after.left[judges]) > _rms(before.left[judges]):
+        found, after = scan.exposures, before
+        words.append("all is as planned: what was found explains the frames no better")
+    words += _doubts(after)
     return AlignedViews(
         found,
         changes(found, scan.exposures),
         errors[:, :6] * np.array([1, 1, *[np.rad2deg(1)] * 3, told]),
         np.exp(search.numbers[:, FLUX].numpy()) - 1,
-        shares[0],
-        shares[1],
+        before.left,
+        after.left,
         tuple(words),
     )
 
@@ -156,22 +163,45 @@ def _kept(search: PoseSearch, planned: Exposures, pixels: int) -> list[str]:
     return words
 
 
-def unexplained(scan: Scan, exposures: Exposures, search: PoseSearch, pixels: int) -> np.ndarray:
-    """Rms [V] of what a new volume in `exposures` leaves unexplained, as a share of each frame's contrast.
+@dataclass(frozen=True)
+class Judged:
+    """What a new volume in some exposures leaves unexplained.
 
-    On pixels `pixels` times larger; the same for all exposures that are compared.
+    left: [V] rms, as a share of each frame's contrast
+    mirrors: [V] which mirror image of a frame fits much better than itself, or ""
     """
-    scan = Scan(scan.frames, exposures, scan.is_test).binned(pixels)
-    frames, train, options = torch.from_numpy(scan.frames), np.flatnonzero(~scan.is_test), search.options
-    how = Tikhonov(iterations=options.retrieval)
-    lines = tikhonov(frames[train], scan.exposures[train], *search.material, options=how) / scan.views.pixel_size
-    views = in_pixels(scan.views)
-    grid = Grid.of_views(views)
-    solver = PrimalDual(LatticeProjector(grid, views[train]), torch.zeros(grid.shape), options.weight, search.upper)
-    solver.run(lines, 2 * options.first)
-    images = predicted(solver.volume, grid, scan.exposures, search.material, fringe_sampling(scan.exposures)).frames
-    left = (frames - images).square().mean((1, 2)).sqrt() / frames.std(dim=(1, 2)).clamp_min(1e-12)
-    return left.double().numpy()
+
+    left: np.ndarray
+    mirrors: list[str]
+
+    @classmethod
+    def of(cls, scan: Scan, exposures: Exposures, search: PoseSearch, pixels: int) -> Judged:
+        """On pixels `pixels` times larger; the same for all exposures that are compared."""
+        scan = Scan(scan.frames, exposures, scan.is_test).binned(pixels)
+        frames, train, options = torch.from_numpy(scan.frames), np.flatnonzero(~scan.is_test), search.options
+        how = Tikhonov(iterations=options.retrieval)
+        lines = tikhonov(frames[train], scan.exposures[train], *search.material, options=how) / scan.views.pixel_size
+        views = in_pixels(scan.views)
+        grid = Grid.of_views(views)
+        solver = PrimalDual(LatticeProjector(grid, views[train]), torch.zeros(grid.shape), options.weight, search.upper)
+        solver.run(lines, 2 * options.first)
+        images = predicted(solver.volume, grid, scan.exposures, search.material, fringe_sampling(scan.exposures)).frames
+        left = (frames - images).square().mean((1, 2)).sqrt() / frames.std(dim=(1, 2)).clamp_min(1e-12)
+        return cls(left.double().numpy(), mirrored(frames, images))
+
+
+def _doubts(judged: Judged) -> list[str]:
+    """Views that do not fit with the others, in words."""
+    words = [
+        f"view {v} looks mirrored: reverse its {'columns' if side == 'x' else 'rows' if side == 'y' else 'both axes'}"
+        for v, side in enumerate(judged.mirrors)
+        if side
+    ]
+    limit = STRAY * float(np.median(judged.left))
+    lost = [str(v) for v in np.flatnonzero(judged.left > limit) if not judged.mirrors[v]]
+    if lost:
+        words.append(f"explained much worse than the others, do not trust them: views {', '.join(lost)}")
+    return words
 
 
 def _rms(values: np.ndarray) -> float:
