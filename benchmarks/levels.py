@@ -34,7 +34,7 @@ def rows(name: str, seed: int) -> list[dict[str, object]]:
         priors.append(MaterialPrior.of_ratio(case.prior.material.ratio))
     for prior in priors:
         began = time.process_time()
-        decision = decide_matter(Task(train, prior))
+        decision = decide_matter(Task(train, prior).evened())
         values = (name, seed, prior.kind, f"{decision.factor:.3f}", decision.matter, decision.sure)
         found.append(dict(zip(COLUMNS, (*values, f"{time.process_time() - began:.1f}", commit()))))
     return found

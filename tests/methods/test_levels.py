@@ -13,9 +13,9 @@ from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.geometry import Views
 from holosplat.matter import DeltaBeta, MaterialPrior
-from holosplat.methods import Auto, Gaussians, Task, settled
+from holosplat.methods import Auto, Gaussians, Task, levels, settled
 from holosplat.methods.cross_validation import CrossValidation, MissingMatter
-from holosplat.methods.levels import decide_matter, flattened
+from holosplat.methods.levels import LevelTest, decide_matter, flattened
 from holosplat.optics.background import Light, LightOptions
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import random_cells
@@ -80,6 +80,25 @@ def test_in_uneven_light_a_known_material_has_levels(soft):
     assert "uneven light" in found.why
     assert decide_matter(Task(soft, MaterialPrior.known(MATERIAL))).matter == "continuous"
     assert decide_matter(Task(soft, RATIO, lit=lit)).matter == "continuous"
+
+
+def test_the_first_volume_is_made_in_the_light_of_its_frames(sharp, monkeypatch):
+    """Those that are left, on the pixels that they are binned to."""
+    rows, seen = sharp.frames.shape[1], []
+    lit = Light.of(torch.from_numpy(sharp.frames), LightOptions("smooth", ((0, rows, 0, 3),)))
+    split = CrossValidation(width=26)
+    made = levels.holographic_tv
+
+    def noted(scan, material, options, on_progress, light):
+        seen.append((scan, light))
+        return made(scan, material, options, on_progress, light)
+
+    monkeypatch.setattr(levels, "holographic_tv", noted)
+    decide_matter(Task(sharp, KNOWN, lit=lit), LevelTest(validation=split))
+    ((scan, light),) = seen
+    left, _ = split.split(sharp)
+    np.testing.assert_array_equal(scan.frames, left.frames)
+    assert light.background.factor().shape == left.frames.shape
 
 
 def test_too_few_views_are_said(sharp):
