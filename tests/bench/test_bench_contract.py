@@ -20,6 +20,8 @@ PITCH = 1e-6
 SHAPE = (24, 31)
 QUICK = methods(effort=0.05) | {"neural-field": methods(effort=0.25)["neural-field"]}
 """The same methods with a small part of their steps: the contract is about form, not about quality."""
+QUICKER = methods(effort=0.05)
+"""With a still smaller part, where finite numbers are all that is asked for."""
 NEEDS = {"paganin-svmbir": "svmbir"}
 """Methods that need a package of the extra `bench`."""
 
@@ -158,7 +160,7 @@ def test_unequal_views_are_used_or_refused(method):
 
     views = hs.Views.from_rotations(Rotation.random(5, rng=3).as_matrix(), SHAPE, PITCH)
     scan = hs.simulate(SCENE, hs.Exposures.of(views, 20.0, 0.02), oversample=2, is_test=np.arange(5) == 4)
-    found = result_or_reason(method, scan)
+    found = result_or_reason(QUICKER[method.name], scan)
     if isinstance(found, str):
         assert "axis" in found
         return
