@@ -107,7 +107,7 @@ def measured(experiment: Experiment) -> tuple[Case, hs.Scan, hs.Exposures]:
     return case, hs.Scan(frames.astype(np.float32), case.exposures, case.is_test)[chosen], true[chosen]
 
 
-def rows_of(name: str, experiment: Experiment, moments: list[str]) -> list[Row]:
+def rows_of(name: str, experiment: Experiment, moments: list[str], commit: str) -> list[Row]:
     """Errors of training and of held-out views, before and after; scores of volumes at `moments`."""
     case, scan, true = measured(experiment)
     began = time.perf_counter()
@@ -116,7 +116,7 @@ def rows_of(name: str, experiment: Experiment, moments: list[str]) -> list[Row]:
     print(*found.words, sep="\n", flush=True)
     placed = {"planned": scan.exposures, "aligned": found.exposures, "true": true}
     rows, said = list[Row](), {"case": name, "scene": experiment.scene, "seed": experiment.errors.seed}
-    said |= {"machine": f"{platform.machine()}, one core of two", "commit": source_commit()}
+    said |= {"machine": f"{platform.machine()}, one core of two", "commit": commit}
     for moment in ("planned", "aligned"):
         for views, index in (("training", ~scan.is_test), ("all", np.ones(len(scan), dtype=bool))):
             chosen = np.flatnonzero(index)
@@ -150,8 +150,9 @@ def main() -> None:
     parser.add_argument("--cases", nargs="*", default=list(CASES))
     parser.add_argument("--moments", nargs="*", default=["aligned"], choices=["planned", "aligned", "true"])
     wanted = parser.parse_args()
+    commit = source_commit()  # before the table is written, which is part of the tree
     for name in wanted.cases:
-        new = rows_of(name, CASES[name], wanted.moments)
+        new = rows_of(name, CASES[name], wanted.moments, commit)
         old = []
         if TABLE.is_file():
             with TABLE.open(newline="", encoding="utf-8") as file:
