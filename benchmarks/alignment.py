@@ -115,7 +115,8 @@ def rows_of(name: str, experiment: Experiment, moments: list[str], commit: str) 
     seconds = time.perf_counter() - began
     print(*found.words, sep="\n", flush=True)
     placed = {"planned": scan.exposures, "aligned": found.exposures, "true": true}
-    rows, said = list[Row](), {"case": name, "scene": experiment.scene, "seed": experiment.errors.seed}
+    rows = list[Row]()
+    said: Row = {"case": name, "scene": experiment.scene, "seed": experiment.errors.seed}
     said |= {"machine": f"{platform.machine()}, one core of two", "commit": commit}
     for moment in ("planned", "aligned"):
         for views, index in (("training", ~scan.is_test), ("all", np.ones(len(scan), dtype=bool))):
@@ -140,7 +141,7 @@ def volume_row(case: Case, scan: hs.Scan, exposures: hs.Exposures, true: hs.Expo
     seconds = time.perf_counter() - began
     truth = case.truth()
     scores = volume_scores(done.object.voxelise(truth.grid), truth)
-    numbers = {"error_delta": f"{scores.relative_error_delta:.4f}", "dice": f"{scores.dice:.4f}"}
+    numbers: Row = {"error_delta": f"{scores.relative_error_delta:.4f}", "dice": f"{scores.dice:.4f}"}
     return {"method": f"{method} ({done.object.kind})", "seconds": f"{seconds:.0f}"} | numbers
 
 

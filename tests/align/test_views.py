@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from torch.nn.functional import interpolate, pad
+from torch.nn.functional import interpolate
 
 from helpers.discs import ball_lines
+from helpers.misaligned_balls import BALLS, MATERIAL, PIXEL, scan_of
 from holosplat.align import AlignedViews, PoseOptions, Uncertain, align_views
 from holosplat.align.coarse import mirrored, shifts_by_mass
 from holosplat.align.derivatives import NUMBERS, Predicted, projections
@@ -19,36 +20,11 @@ from holosplat.align.newton import blurred, step
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
-from holosplat.matter import DeltaBeta, MaterialPrior
-from holosplat.model import Instrument
+from holosplat.matter import MaterialPrior
 from holosplat.scan import Exposures, Scan
-from holosplat.volume import LineIntegrals
 
-MATERIAL = DeltaBeta(5e-7, 5e-10)
-PIXEL, SHAPE = 3.2e-6, (35, 41)
-BALLS = ((6.4, -5.6, 2.4, 4.8), (-8.0, 2.4, 6.4, 4.0), (1.6, 7.2, -8.8, 4.0), (-5.6, -8.8, -6.4, 3.2)) + (
-    (10.4, 4.8, 4.8, 3.2),
-    (-1.6, 0.8, -1.6, 2.8),
-    (3.2, -10.4, 9.6, 2.4),
-    (-11.2, 9.6, -2.4, 2.4),
-)
-"""x, y, z and radius [pixels]."""
 QUICK = PoseOptions(rounds=2, retrieval=15, first=20)
 """Options of tests that do not ask how near the poses come."""
-
-
-def scan_of(errors: Misalignment, count: int = 12, test_every: int = 4) -> tuple[Scan, Exposures]:
-    """Frames of balls, from chords, said to be of the planned exposures; and the true exposures."""
-    planned = Exposures.of(Views.evenly_spaced(count, SHAPE, PIXEL), 20.0, 0.1, 0.3)
-    true = errors.true_exposures(planned)
-    instrument = Instrument(true, 2)
-    lines = sum(ball_lines(true.views.refined(2), tuple(2 * v for v in ball), 2) for ball in BALLS)
-    my, mx = (2 * m for m in instrument.margin)
-    assert isinstance(lines, torch.Tensor)
-    wide = pad(lines, (mx, mx, my, my))[:, None]
-    frames = instrument.frames(LineIntegrals(wide, ((MATERIAL.delta, MATERIAL.beta),)))
-    held_out = np.arange(count) % test_every == test_every - 1
-    return Scan(frames.numpy(), planned, held_out), true
 
 
 def apart(found: Exposures, true: Exposures) -> tuple[float, float, float]:

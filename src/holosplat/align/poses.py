@@ -171,7 +171,7 @@ class PoseSearch:
             found = self.exposures(planned)
             self._improve_volume(LatticeProjector(grid, in_pixels(found.views)[train]), grid, retrieved)
             assert self._solver is not None
-            self._move(self._solver.volume, grid, found, frames, oversample)
+            self.move(self._solver.volume, grid, found, frames, oversample)
             on_progress((done + 1) / level.rounds)
 
     def thickness(self, scan: Scan, exposures: Exposures) -> Tensor:
@@ -206,8 +206,8 @@ class PoseSearch:
             self._solver.run(retrieved, max(0, first - steps))
         self._solver.run(retrieved, steps)
 
-    def _move(self, volume: Tensor, grid: Grid, found: Exposures, frames: Tensor, oversample: int) -> None:
-        """One step of all numbers."""
+    def move(self, volume: Tensor, grid: Grid, found: Exposures, frames: Tensor, oversample: int) -> None:
+        """One step of all numbers beside `volume` on `grid` (lengths in pixels); found: exposures as they are now."""
         pixels = round(found.views.pixel_size / self.scan.views.pixel_size)
         scales = torch.ones(len(NUMBERS), dtype=torch.float64)
         scales[SHIFT] = pixels
