@@ -22,8 +22,8 @@ from holosplat.baselines import holographic_tv
 from holosplat.baselines.two_materials import Levels, best_levels
 from holosplat.bench.case import Case, case_names, load_case
 from holosplat.matter import MaterialPrior
+from holosplat.methods.assumed import assumed_material
 from holosplat.methods.presets import preset
-from holosplat.methods.start import assumed_material
 
 
 def levels_of(case: Case) -> Levels:

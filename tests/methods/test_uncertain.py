@@ -135,4 +135,3 @@ def test_what_was_determined_is_read_from_its_table():
 
     found = Determined("distance", 0.1, 0.09, 0.11, (0.05, 0.2), True, "a remark")
     assert Determined.from_dict(to_table(found)) == found
-    assert Uncertain.from_table(to_table(Uncertain(distance=(0.1, 0.2)))) == Uncertain(distance=(0.1, 0.2))

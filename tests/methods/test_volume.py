@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -16,13 +17,15 @@ from holosplat.checks import InputError
 from holosplat.fit.smooth_volume import ContinuousPrior, VolumeProblem, descend, modulated
 from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid, Views
-from holosplat.matter import MaterialPrior
-from holosplat.methods import HolographicVoxels, SmoothVolume, Task, solve
+from holosplat.matter import DeltaBeta, MaterialPrior
+from holosplat.methods import HolographicVoxels, SmoothVolume, Task, smooth_fit, solve
+from holosplat.methods.smooth_fit import SmoothFit
 from holosplat.methods.volume import SmoothStage, binning
 from holosplat.optics.noise_model import NoiseModel
 from holosplat.representations import VoxelGrid
 from holosplat.scan import Exposures, Scan
-from holosplat.specimens.soft_matter import round_cell
+from holosplat.specimens.soft_matter import round_cell, tissue
+from holosplat.volume import Object
 
 RATIO = MaterialPrior.of_ratio(1500.0)
 QUICK = HolographicTV(retrieval=10, iterations=20, corrections=0, upper=0.0)
@@ -80,6 +83,69 @@ def test_noise_wipes_nothing_out():
     assert totals[1] == pytest.approx(1.0, abs=0.25)
 
 
+def tissue_in_noise(noise: float, moved: int = 0) -> tuple[Scan, float]:
+    """Eight views of tissue, moved by up to so many pixels, in noise of that share of their contrast; ∫ δ [m³]."""
+    views = Views.evenly_spaced(8, (25, 28), PIXEL)
+    h, w = (n * PIXEL for n in views.shape)
+    truth = tissue((0.85 * w, 0.85 * h, 0.85 * w), DeltaBeta(1.2e-7, 8e-11), seed=3)
+    scan = simulate(truth, Exposures.of(views, 20.0, 0.1), is_test=np.zeros(8, dtype=bool))
+    steps = np.random.default_rng(2).integers(-moved, moved + 1, (8, 2))
+    frames = np.stack([np.roll(frame, step, (0, 1)) for frame, step in zip(scan.frames, steps)])
+    scan = replace(scan, frames=frames)
+    return noisy(scan, noise * float(np.sqrt(np.square(scan.frames - 1).mean())), 1), total_of(truth, scan)
+
+
+def total_of(found: Object, scan: Scan) -> float:
+    """∫ δ dV [m³]."""
+    return float(np.asarray(found.voxelise(Grid.of_views(scan.views)).delta, dtype=np.float64).sum()) * PIXEL**3
+
+
+def begun(scan: Scan) -> SmoothFit:
+    """The fit of a smooth volume, at its start."""
+    stage, task = SmoothStage(SmoothVolume()), Task(scan, RATIO, matter="continuous")
+    return stage.fit(task, stage.start(task, None))
+
+
+def fitted(scan: Scan) -> SmoothFit:
+    """The fit at its end."""
+    fit = begun(scan)
+    fit.run(lambda record: None)
+    return fit
+
+
+def test_a_prior_that_hides_matter_is_weakened_and_a_stopped_fit_goes_on_with_it(monkeypatch):
+    """Tissue fills the field in noise of its contrast: the whole prior leaves a fifth less of it."""
+    scan, true = tissue_in_noise(1.0)
+    whole, first, second = fitted(scan), begun(scan), begun(scan)
+    assert whole.resolved()["prior_share"] < 0.5
+    assert total_of(whole.voxels, scan) == pytest.approx(true, rel=0.1)
+    first.run(lambda record: None, until=whole.step - 5)
+    second.load(first.state_dict())
+    second.run(lambda record: None)
+    assert torch.equal(second.voxels.values, whole.voxels.values)
+    assert second.resolved() == whole.resolved()
+    monkeypatch.setattr(smooth_fit, "EXPLAINED", math.inf)
+    assert total_of(fitted(scan).voxels, scan) < 0.85 * true
+
+
+def test_a_prior_stays_where_a_weaker_one_explains_no_more(monkeypatch):
+    """Of frames that are not where they say."""
+    scan, _ = tissue_in_noise(0.1, moved=3)
+    found = fitted(scan)
+    assert found.resolved()["prior_share"] == 1
+    monkeypatch.setattr(smooth_fit, "EXPLAINED", math.inf)
+    alone = fitted(scan)
+    assert alone.step < found.step
+
+
+def test_noise_alone_is_no_matter():
+    frames = np.random.default_rng(5).normal(1.0, 0.05, (8, 25, 28)).astype(np.float32)
+    scan = Scan(frames, Exposures.of(Views.evenly_spaced(8, (25, 28), PIXEL), 20.0, 0.1), np.zeros(8, dtype=bool))
+    fit = fitted(scan)
+    assert fit.resolved()["prior_share"] == 1
+    assert not fit.voxels.values.any()
+
+
 def plainly(scan: Scan, options: SmoothVolume) -> torch.Tensor:
     """The volume without a fit that can be stopped: one descent after another."""
     task = Task(scan, RATIO)
@@ -108,8 +174,9 @@ def plainly(scan: Scan, options: SmoothVolume) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("sigma", [0.0, 0.02])
-def test_a_fit_in_steps_is_one_descent_after_another(quiet, sigma):
+def test_a_fit_in_steps_is_one_descent_after_another(quiet, sigma, monkeypatch):
     """Bit for bit, and so is one that goes on from a saved state, wherever it was stopped."""
+    monkeypatch.setattr(smooth_fit, "EXPLAINED", math.inf)  # so short a fit explains nothing
     scan = noisy(quiet, sigma, 1) if sigma else quiet
     options = SmoothVolume(QUICK, coarser=(2,), rounds=2, iterations=2)
     wanted = plainly(scan, options)

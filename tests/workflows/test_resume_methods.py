@@ -125,7 +125,7 @@ def test_every_stage_has_its_metrics(case, whole):
     """Those of the last one in metrics.csv, of the others beside it."""
     assert {path.name for path in whole.path.glob("metrics*.csv")} == {"metrics.csv", *case.first}
     kind = "volume" if case.method is SMOOTH else load_reconstruction(whole).object.kind
-    steps = {"surfaces": 6, "voxels": 7, "volume": 24, "neural-field": 7, "gaussians": 12}[kind]
+    steps = {"surfaces": 6, "voxels": 7, "volume": 48, "neural-field": 7, "gaussians": 12}[kind]
     assert [int(row["step"]) for row in rows(whole.metrics)] == list(range(1, steps + 1))
     assert all(float(row["loss"]) > 0 for row in rows(whole.metrics))
 

@@ -12,7 +12,7 @@ from ..baselines.primal_dual import PrimalDual
 from ..checks import require
 from ..geometry import Grid
 from ..matter import Known, MaterialPrior
-from ..methods.start import assumed_material
+from ..methods.assumed import assumed_material
 from ..optics.background import Light, LightOptions
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress

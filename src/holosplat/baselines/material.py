@@ -102,6 +102,20 @@ def plateau(occupancy: Tensor) -> float:
     return float(values[int(torch.searchsorted(mass, 0.5 * mass[-1]))])
 
 
+def level_of(occupancy: Tensor) -> float:
+    """The level [units of `occupancy`] of matter with one level beside a faint haze, both in [Z, Y, X] ≥ 0.
+
+    The `plateau` of the denser of the two classes whose means differ most for their numbers (Otsu 1979): of small
+    bodies in a large field, haze may have more mass.
+    """
+    values = occupancy.double().flatten().sort(descending=True).values
+    require(bool(values[0] > 0), "an empty volume has no level; look at its frames first.")
+    count = torch.arange(1, len(values), dtype=values.dtype)
+    upper = values.cumsum(0)[:-1]
+    between = (upper * len(values) - values.sum() * count).square() / (count * (len(values) - count))
+    return plateau(occupancy * (occupancy >= values[int(between.argmax())]))
+
+
 def _trial_volume(scan: Scan, ratio: float, backend: Backend, options: MaterialEstimate) -> Tensor:
     """Occupancy by Paganin's retrieval and a little total variation, not negative and without an upper bound."""
     lines = paganin(torch.from_numpy(scan.frames), scan.exposures, TRIAL_DELTA, TRIAL_DELTA / ratio)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -56,6 +56,10 @@ class ContinuousPrior:
         for name in ("slope", "rounding", "value"):
             given = getattr(self, name)
             require(given > 0, f"{name} must be positive, but it is {given}.")
+
+    def weakened(self, share: float) -> ContinuousPrior:
+        """The prior with `share` of its exponents."""
+        return replace(self, slopes=share * self.slopes, values=share * self.values)
 
     def on_larger_voxels(self, factor: int) -> ContinuousPrior:
         """The prior on voxels `factor` times larger: slopes are as much steeper, and every voxel stands for more."""

@@ -10,12 +10,12 @@ from ..checks import InputError
 from ..fit.loop import Fit
 from ..matter import MatterKind
 from ..representations import GaussianCloud, Stored, SurfaceMesh
+from .assumed import assumed_material
 from .cross_validation import CrossValidation, MissingMatter
 from .gaussian_options import Backend
 from .gaussians import Gaussians
 from .levels import Decision, LevelTest
 from .method import Method, Stage, Task, solve_stages
-from .start import assumed_material
 from .surfaces import SurfaceOptions, SurfaceStage
 from .volume import SmoothVolume
 

@@ -24,9 +24,9 @@ from ..checks import at_least
 from ..matter import Known, KnownRatio, KnownTwo, Matter, MatterKind
 from ..optics.noise import noise_share
 from ..representations import VoxelGrid
+from .assumed import assumed_material
 from .cross_validation import CrossValidation, MissingMatter
 from .method import Task
-from .start import assumed_material
 
 STAGE = "levels or continuous matter"
 

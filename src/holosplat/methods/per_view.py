@@ -13,8 +13,8 @@ from ..geometry import Grid
 from ..matter import Matter
 from ..optics.retrieval import RETRIEVALS
 from ..representations import Stored, VoxelGrid
+from .assumed import assumed_material
 from .method import Stage, Task
-from .start import assumed_material
 from .svmbir import svmbir_volume
 
 SVMBIR = "svmbir"

@@ -71,8 +71,8 @@ class Profile:
     """-log of the likelihood of the coarse frames of a task, as a function of constants; the volume is the likeliest.
 
     ratio: δ/β at the nominal energy, where it is not among the constants; nominal: the constants by which the support
-    is found; most: samples of waves a pixel are those that the largest of `distances` [m] and energies need, the same
-    for all constants, or the misfit would jump where their number changes.
+    is found; corners: constants whose fringes may be the finest, or the widest: samples of waves a pixel are those that
+    they need, the same for all constants, or the misfit would jump where their number changes.
     """
 
     def __init__(
@@ -99,11 +99,6 @@ class Profile:
         self._peak = plateau(first) / float((first * self.support).sum() / self.support.sum())
         """The level of matter over its mean in the support. The prior's unit must not vary by chance from fit to fit,
         as a plateau does, for the larger it is, the likelier are all slopes."""
-
-    @property
-    def count(self) -> int:
-        """Pixels in all coarse frames."""
-        return int(np.prod(self._scan.frames.shape))
 
     def air(self) -> float:
         """Part of all pixels whose rays pass beside the support."""

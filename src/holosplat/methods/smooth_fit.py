@@ -24,6 +24,16 @@ from ..optics.sampling import fringe_sampling
 from ..representations import VoxelGrid
 from ..scan import Scan
 
+EXPLAINED = 0.95
+"""χ² a pixel above which a volume does not explain its frames to within their noise; where prior and frames agree it is
+below one, for the volume follows some of the noise."""
+EMPTY = 1.2
+"""χ² a pixel up to which an empty volume is taken for the truth, as the noise is known to some per cent only."""
+WEAKEST = 1 / 16
+"""Share of the prior's exponents that is left at least."""
+WORTH = 0.5
+"""Share of what is unexplained beyond noise that half a prior must take away; if it does not, light or constants are at
+fault, and the volume before stands."""
 LEAST_EDGE = 12
 """Pixels along a frame's shorter side that larger ones must leave, or the fit is not begun on them."""
 
@@ -90,6 +100,8 @@ class SmoothFit:
         self._volume = plan.begun
         self._rival: tuple[Tensor, float] | None = None
         self._level = 0.0
+        self._strength, self._settled = 1.0, False
+        self._stronger: tuple[VoxelGrid, float] | None = None
         self._descent: Descent | None = None
         self._frames: tuple[int, WhitenedFrames] | None = None
 
@@ -127,7 +139,7 @@ class SmoothFit:
 
     def resolved(self) -> dict[str, Any]:
         """What the options have become."""
-        return {"voxels_px": sorted({leg.factor for leg in self._legs}, reverse=True)}
+        return {"voxels_px": sorted({leg.factor for leg in self._legs}, reverse=True), "prior_share": self._strength}
 
     def columns(self) -> list[str]:
         """Names of what a record holds."""
@@ -191,22 +203,52 @@ class SmoothFit:
         Low frequencies, of which noisy frames say little, converge on large voxels first: the coarse volume goes on if
         it explains its frames to within their noise after half a round, or else the likelier one. Without noise, the
         details that large voxels lack disturb them, and the start is nearer.
+
+        How strong a prior noise allows depends on how many views and how much matter there are; so it is halved where
+        it wipes out all matter, and where voxels of a pixel do not explain the frames to within their noise
+        (Morozov's discrepancy principle, 1966), as long as that helps.
         """
-        problem, u, self._rival = descent.problem, descent.u, self._rival if leg.kind == "from start" else None
-        if leg.kind == "round":
+        problem, u = descent.problem, descent.u
+        self._descent = None
+        unexplained = 2 * problem.frames(problem.lines(u)).value / problem.frames.count
+        if leg.kind == "round" and bool((u > 0).any()):
             u = modulated(problem, u)
-        elif leg.kind == "from coarse":
-            if 2 * problem.frames(problem.lines(u)).value > problem.frames.count:
-                self._rival = (u, descent.value)
-        elif self._rival is not None:
+        elif leg.kind == "from coarse" and unexplained > 1:
+            self._rival = (u, descent.value)
+        elif leg.kind == "from start" and self._rival is not None:
             other, value = self._rival
             u, self._rival = (u if descent.value < value else other), None
-        self._volume = self._volume.with_parameters({"values": u[None]})
-        self._descent = None
-        self._leg += 1
+        found = self._volume.with_parameters({"values": u[None]})
+        if not self._weakened(found, unexplained):
+            self._volume, self._leg = found, self._leg + 1
+
+    def _weakened(self, found: VoxelGrid, unexplained: float) -> bool:
+        """Whether the fit goes elsewhere than on: back to its start with half the prior, or back to a stronger one."""
+        if not bool((found.values > 0).any()):
+            if unexplained <= EMPTY or self._strength <= WEAKEST:
+                return False
+            self._again(self._strength / 2)
+            return True
+        late = self._leg >= len(self._legs) - max(1, self.plan.rounds - 1)  # a first round is often not at its end yet
+        if not late or self._settled:
+            return False
+        if self._stronger is not None and unexplained - 1 > WORTH * (self._stronger[1] - 1):
+            (self._volume, _), self._strength, self._settled = self._stronger, 2 * self._strength, True
+            self._leg += 1
+            return True
+        self._settled = unexplained <= EXPLAINED or self._strength <= WEAKEST
+        if not self._settled:
+            self._stronger = (found, unexplained)
+            self._again(self._strength / 2)
+        return not self._settled
+
+    def _again(self, strength: float) -> None:
+        """Begin anew with a prior of that `strength`."""
+        self._leg, self._volume, self._rival, self._strength = 0, self.plan.begun, None, strength
 
     def _problem(self, frames: WhitenedFrames, factor: int) -> VolumeProblem:
-        prior = self.plan.prior if factor == 1 else self.plan.prior.on_larger_voxels(factor)
+        prior = self.plan.prior.weakened(self._strength)
+        prior = prior if factor == 1 else prior.on_larger_voxels(factor)
         return VolumeProblem(frames, prior, self._level, self.plan.backend)
 
     def _frames_of(self, factor: int) -> WhitenedFrames:
@@ -220,6 +262,9 @@ class SmoothFit:
             "step": self.step,
             "seconds": self.seconds,
             "leg": self._leg,
+            "strength": self._strength,
+            "settled": self._settled,
+            "stronger": self._stronger and [self._stronger[0].state(), self._stronger[1]],
             "volume": self._volume.state(),
             "level": self._level,
             "rival": None if self._rival is None else list(self._rival),
@@ -229,7 +274,9 @@ class SmoothFit:
     def load(self, state: dict[str, Any]) -> None:
         """Go back to a saved state."""
         self.step, self.seconds = int(state["step"]), float(state["seconds"])
-        self._leg, self._level = int(state["leg"]), float(state["level"])
+        self._leg, self._level, self._strength = int(state["leg"]), float(state["level"]), float(state["strength"])
+        self._settled, before = bool(state["settled"]), state["stronger"]
+        self._stronger = before and (VoxelGrid.from_state(before[0]), float(before[1]))
         self._volume = VoxelGrid.from_state(state["volume"])
         self._rival = None if state["rival"] is None else (state["rival"][0], float(state["rival"][1]))
         self._descent = None

@@ -11,14 +11,12 @@ import torch
 from torch import Tensor
 
 from ..baselines import holographic_tv
-from ..baselines.material import DEFAULT, Backend, MaterialEstimate, estimate_delta, estimate_ratio
 from ..baselines.two_materials import Shares, absorption, at_one_ratio, told_apart, two_levels
 from ..geometry import Grid
 from ..materials import WATER
-from ..matter import DeltaBeta, KnownRatio, MaterialPrior, Matter
+from ..matter import DeltaBeta, KnownRatio, Matter
 from ..optics.noise import noise_share
 from ..optics.retrieval import retrieve_thickness
-from ..progress import Progress
 from ..representations import (
     GaussianCloud,
     approximate,
@@ -31,6 +29,7 @@ from ..representations import (
 from ..scan import Scan
 from .gaussian_options import GaussianOptions
 from .method import Task
+from .sharp_level import material_of_levels
 
 Retrieve = Callable[[Scan], tuple[Tensor, Grid]]
 """Occupancy [Z, Y, X] and its grid, by a scan."""
@@ -44,7 +43,7 @@ def starting_cloud(task: Task, options: GaussianOptions) -> GaussianCloud:
 
 def _from_phase_retrieval(task: Task, options: GaussianOptions) -> GaussianCloud:
     scan, prior, backend = task.scan, task.prior, options.volume.backend
-    material = assumed_material(scan, prior, task.on_progress, backend, options.estimate)
+    material = material_of_levels(task, backend, options.estimate)
     how = replace(options.volume, upper=options.volume.upper if task.bounded else 0.0)
 
     def retrieve(frames: Scan) -> tuple[Tensor, Grid]:
@@ -93,27 +92,6 @@ def _shares(
 def _spacing_px(scan: Scan, options: GaussianOptions) -> float:
     """Distance between Gaussians [pixels]: few large ones follow the noise less than many small ones."""
     return options.spacing_px * min(2.0, 1 + options.spacing_noise * noise_share(torch.from_numpy(scan.frames)))
-
-
-def assumed_material(
-    scan: Scan,
-    prior: MaterialPrior,
-    on_progress: Progress,
-    backend: Backend = "cpu",
-    options: MaterialEstimate = DEFAULT,
-) -> DeltaBeta:
-    """δ and β of one material for all matter: as known, or as the training frames `scan` suggest.
-
-    Where two are known, it has the δ of the denser, and the ratio of an equal mixture.
-    """
-    if len(prior.materials) == 2:
-        (denser, dark), (lighter, bright) = prior.materials
-        return DeltaBeta(denser, denser * (dark + bright) / (denser + lighter))
-    if prior.materials:
-        return prior.materials[0]
-    ratio = prior.ratio if isinstance(prior, KnownRatio) else estimate_ratio(scan, on_progress, backend, options)
-    delta = estimate_delta(scan, ratio, on_progress, backend, options)
-    return DeltaBeta(delta, delta / ratio)
 
 
 def _random(task: Task, options: GaussianOptions) -> GaussianCloud:

@@ -71,11 +71,6 @@ class Uncertain:
         """The geometric mean of each range."""
         return {name: math.copysign(math.sqrt(low * high), low) for name, (low, high) in self.given().items()}
 
-    @classmethod
-    def from_table(cls, table: Mapping[str, Any]) -> Uncertain:
-        """The ranges that `tables.to_table` described."""
-        return cls(**{name: (float(pair[0]), float(pair[1])) for name, pair in table.items() if pair is not None})
-
 
 @dataclass(frozen=True)
 class Determined:

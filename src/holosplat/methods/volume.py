@@ -15,10 +15,10 @@ from ..geometry import Grid
 from ..matter import Matter
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
+from .assumed import assumed_material
 from .cross_validation import predicted_frames
 from .method import Stage, Task
 from .smooth_fit import SmoothFit, SmoothPlan
-from .start import assumed_material
 
 
 def _start() -> HolographicTV:

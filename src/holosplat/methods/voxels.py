@@ -23,9 +23,9 @@ from ..optics.background import Light
 from ..optics.sampling import fringe_sampling
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
+from .assumed import assumed_material
 from .ground import ExtraTerm, ground
 from .method import Stage, Task
-from .start import assumed_material
 
 ABSORPTION_REACH = 10.0
 """How much longer than those of δ the steps of a free β are, in units of the material's. At equal lengths β would not

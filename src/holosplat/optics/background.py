@@ -27,6 +27,8 @@ GRAINY, HALVED = 4, 0.5
 this part of what it was may still be steep light; true grain stays as it is, and there is one round."""
 FAINTEST = 1e-4
 """Noise [relative intensity] assumed at least: light is not known better."""
+OUTER = 0.1
+"""Part of the columns at either side in which light must be uneven, too."""
 DARKEST = 0.05
 """Relative intensity below which frames say nothing of the light."""
 
@@ -218,11 +220,20 @@ class Background:
 def is_uneven(frames: Tensor, air: Tensor, noise: NoiseModel) -> bool:
     """Whether the light of relative frames [V, H, W] is uneven in their air [V, H, W] bool, beyond their noise.
 
-    The level of the frames counts as light; it is even where it is one. Without air there is no saying: False.
+    The level of the frames counts as light; it is even where it is one. Without air there is no saying: False. Noise as
+    strong as the contrast hides the edge of a body, whose shadow then passes for air: bodies are in the middle, and so
+    light must be uneven in the air of the outer columns, too, where there is such air.
     """
-    usable = has_air(air)
-    if not bool(usable.any()):
-        return False
+    usable, width = has_air(air), frames.shape[-1]
+    rim, outer = torch.zeros(width, dtype=torch.bool), max(1, round(OUTER * width))
+    rim[:outer] = rim[-outer:] = True
+    beside = usable & (air & rim).any(dim=2).any(dim=1)
+    sure = bool(usable.any()) and _surely_uneven(frames, air, noise, usable)
+    return sure and (not bool(beside.any()) or _surely_uneven(frames, air & rim, noise, beside))
+
+
+def _surely_uneven(frames: Tensor, air: Tensor, noise: NoiseModel, usable: Tensor) -> bool:
+    """The same of the frames that are usable [V] bool, some at least; noise counts by the modes' degrees of freedom."""
     lit, seen = frames[usable].double(), air[usable].double()
     modes = smooth_modes((frames.shape[1], frames.shape[2]), LOWEST).double().flatten(1)
     normal, right = _sums((lit - 1).flatten(1), seen.flatten(1), modes)
@@ -231,9 +242,9 @@ def is_uneven(frames: Tensor, air: Tensor, noise: NoiseModel) -> bool:
     power = _lowest_power(noise)[usable]
     squares = float(((found * right).sum(dim=1) / power.clamp_min(1e-30)).sum())
     freedom = float(right.numel())
-    size = ((found @ modes).reshape(lit.shape) * seen).square().sum() / seen.sum()
-    contrast = (lit - 1).square().mean()
-    return squares > freedom + UNEVEN * (2 * freedom) ** 0.5 and bool(size > SEEN**2 * contrast)
+    size = float((((found @ modes).reshape(lit.shape) * seen).square().sum() - len(modes) * power.sum()) / seen.sum())
+    contrast = float((lit - 1).square().mean())
+    return squares > freedom + UNEVEN * (2 * freedom) ** 0.5 and size > SEEN**2 * contrast
 
 
 def _found(frames: Tensor, noise: NoiseModel, air: Tensor, kind: Kind) -> Background | None:

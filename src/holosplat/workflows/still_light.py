@@ -10,7 +10,7 @@ from ..baselines import HolographicTV, holographic_tv
 from ..checks import require
 from ..frames import Frames
 from ..matter import MaterialPrior, Matter
-from ..methods.start import assumed_material
+from ..methods.assumed import assumed_material
 from ..model import measure
 from ..optics.modes import smooth_modes
 from ..optics.sampling import fringe_sampling

@@ -1,0 +1,29 @@
+"""The one material that stands for all matter in a first volume."""
+
+from __future__ import annotations
+
+from ..baselines.material import DEFAULT, Backend, MaterialEstimate, estimate_delta, estimate_ratio
+from ..matter import DeltaBeta, KnownRatio, MaterialPrior
+from ..progress import Progress
+from ..scan import Scan
+
+
+def assumed_material(
+    scan: Scan,
+    prior: MaterialPrior,
+    on_progress: Progress,
+    backend: Backend = "cpu",
+    options: MaterialEstimate = DEFAULT,
+) -> DeltaBeta:
+    """δ and β of one material for all matter: as known, or as the training frames `scan` suggest.
+
+    Where two are known, it has the δ of the denser, and the ratio of an equal mixture.
+    """
+    if len(prior.materials) == 2:
+        (denser, dark), (lighter, bright) = prior.materials
+        return DeltaBeta(denser, denser * (dark + bright) / (denser + lighter))
+    if prior.materials:
+        return prior.materials[0]
+    ratio = prior.ratio if isinstance(prior, KnownRatio) else estimate_ratio(scan, on_progress, backend, options)
+    delta = estimate_delta(scan, ratio, on_progress, backend, options)
+    return DeltaBeta(delta, delta / ratio)

@@ -1,0 +1,62 @@
+"""The level of sharp matter in noise, where its ratio δ/β is known alone."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from holosplat.baselines.material import estimate_delta, level_of, plateau
+from holosplat.beamline.simulate import simulate
+from holosplat.checks import InputError
+from holosplat.geometry import Views
+from holosplat.matter import DeltaBeta, MaterialPrior
+from holosplat.methods import Task
+from holosplat.methods.sharp_level import material_of_levels
+from holosplat.scan import Exposures, Scan
+from holosplat.specimens import MeshScene
+from holosplat.specimens.capsules import place_capsules
+
+PIXEL = 1e-6
+WATER = DeltaBeta(6e-7, 4e-10)
+
+
+@pytest.fixture(scope="module")
+def noisy() -> Scan:
+    """Four capsules in noise of 0.4 of their contrast."""
+    box = (29 * PIXEL, 27 * PIXEL, 29 * PIXEL)
+    meshes = [c.outer(name=f"{i}") for i, c in enumerate(place_capsules((8 * PIXEL, 11 * PIXEL), 4, box, PIXEL, 3))]
+    exposures = Exposures.of(Views.evenly_spaced(8, (31, 33), PIXEL), 20.0, 0.03)
+    scan = simulate(MeshScene.of_one_material(meshes, WATER), exposures, is_test=np.zeros(8, dtype=bool))
+    sigma = 0.4 * float(np.sqrt(np.square(scan.frames - 1).mean()))
+    counts = np.random.default_rng(1).poisson(scan.frames / sigma**2)
+    return replace(scan, frames=(counts * sigma**2).astype(np.float32))
+
+
+def test_noise_takes_nothing_off_the_level(noisy):
+    """As it does by tomography."""
+    said = set()
+    task = Task(noisy, MaterialPrior.of_ratio(WATER.ratio), on_progress=lambda stage, part: said.add(stage))
+    found = material_of_levels(task)
+    assert found.delta == pytest.approx(WATER.delta, rel=0.1)
+    assert found.ratio == pytest.approx(WATER.ratio)
+    assert estimate_delta(noisy, WATER.ratio, task.on_progress) < 0.8 * WATER.delta
+    assert "level of the matter" in said
+
+
+def test_a_known_level_is_taken(noisy):
+    known = DeltaBeta(5e-7, 4e-10)
+    assert material_of_levels(Task(noisy, MaterialPrior.known(known))) == known
+
+
+def test_the_level_is_that_of_the_denser_class():
+    """However much haze there is; within the class it is the mass-weighted median."""
+    bodies, haze = torch.tensor([0.8] * 10 + [1.0] * 30 + [1.1] * 5), torch.full((2000,), 0.05)
+    volume = torch.cat([haze, bodies]).reshape(5, 409, 1)
+    assert level_of(volume) == 1
+    assert plateau(volume) == pytest.approx(0.05)
+    assert level_of(volume[:, torch.randperm(409)]) == 1
+    with pytest.raises(InputError, match="empty volume has no level"):
+        level_of(torch.zeros(3, 4, 5))
