@@ -17,7 +17,7 @@ from ..io.light import write_light
 from ..io.objects import read_object, write_object
 from ..matter import MaterialPrior, MatterKind
 from ..methods import Auto, Gaussians, Method, Settled, Stage, Task, finished, settled
-from ..methods.uncertain import Determined, Uncertain, placed
+from ..methods.uncertain import Determined, Uncertain
 from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling
 from ..progress import FitProgress
@@ -26,6 +26,7 @@ from ..scan import Scan
 from ..tables import to_table
 from .keeper import Choice, Keeper
 from .provenance import environment, scan_hash
+from .reconstruction import Reconstruction
 from .refine import (
     keep_geometry,
     read_geometry,
@@ -36,7 +37,7 @@ from .refine import (
 )
 from .resume import require_same
 from .run_folder import RunFolder
-from .run_light import EVEN, found_in, read_light_options
+from .run_light import found_in, read_light_options
 from .run_record import config_of, summary_of
 from .totals import TotalMatter, total_of_run
 from .verdict import Verdict, judge_run, said_of_run
@@ -46,45 +47,6 @@ FEWEST_COLUMNS = 11
 """Pixels across the axis that are a field of view; rows may be as few as one."""
 FLAT_LEVELS = (0.2, 5.0)
 """Between these lies the median of frames that are relative to the flat field."""
-
-
-@dataclass(frozen=True)
-class Reconstruction:
-    """What a method made of a scan.
-
-    object: the matter, of any kind
-    method: name of the method
-    energy_kev: photon energy [keV] at which δ and β hold
-    oversample: wave samples a pixel in the fit
-    timing: seconds that each stage took
-    finished: whether all stages came to their end
-    choice: what was decided on the way, and which state `object` is
-    delta_told: whether prior or frames say what δ is; else β alone is known, and δ = β stands for it
-    verdict: whether the training frames are explained; None for runs of versions that did not say
-    total: the total δ by these frames, with its standard error; None likewise
-    constants: what was known to a range only, or of continuous matter not at all, by the frames
-    light: what is assumed of the light of other frames of the scan: smooth if that of the training frames is uneven
-    geometry: where the frames were found to be; None: they are taken to be where the scan says
-    """
-
-    object: Stored
-    method: str
-    energy_kev: float
-    oversample: int
-    timing: dict[str, float]
-    finished: bool
-    choice: Choice = field(default_factory=Choice)
-    delta_told: bool = True
-    verdict: Verdict | None = None
-    total: TotalMatter | None = None
-    constants: tuple[Determined, ...] = ()
-    light: LightOptions = EVEN
-    geometry: Geometry | None = None
-
-    def placed(self, scan: Scan) -> Scan:
-        """`scan`, as it was given to the reconstruction, at the distance and energy, or in the poses, that were
-        found."""
-        return placed(self.geometry.applied(scan) if self.geometry else scan, self.constants)
 
 
 def reconstruct(

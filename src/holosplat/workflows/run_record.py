@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..backends import device_name
 from ..fit.running import Running
@@ -13,9 +13,7 @@ from ..methods.presets import SCHEMA
 from ..scan import Scan
 from ..tables import to_table
 from .provenance import scan_hash
-
-if TYPE_CHECKING:
-    from .reconstruct import Reconstruction
+from .reconstruction import Reconstruction
 
 
 def summary_of(done: Reconstruction, fit: Running | None, train: Scan) -> dict[str, Any]:
