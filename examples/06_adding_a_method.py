@@ -44,7 +44,7 @@ class Thresholded:
 
 
 if __name__ == "__main__":
-    views = hs.Views.evenly_spaced(12, shape=(64, 64), pixel_size=0.5e-6)
+    views = hs.Views.evenly_spaced(12, shape=(48, 48), pixel_size=0.65e-6)
     material = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
     scene = hs.MeshScene.of_one_material(hs.specimens.random_cells(4, box=(views.width,) * 3, seed=6), material)
     scan = hs.simulate(scene, hs.Exposures.of(views, energy_kev=20.0, distance=0.1))

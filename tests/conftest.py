@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # threads that spin starve whoever shares the cores
@@ -76,6 +77,15 @@ def _on_the_cpu(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch)
 def _one_thread() -> None:
     """Torch takes one thread: the problems of the tests are small."""
     torch.set_num_threads(1)
+
+
+@pytest.fixture
+def undrawn_reports() -> Iterator[None]:
+    """Reports of runs have their text, and blank figures; see `helpers.pictures`."""
+    from helpers.pictures import undrawn
+
+    with undrawn():
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -362,6 +362,7 @@ def test_frames_of_a_cloud_of_two_go_through_the_same_optics(scan):
 # --- command line -------------------------------------------------------------------------------------------
 
 
+@pytest.mark.usefixtures("undrawn_reports")
 def test_two_materials_are_named_on_the_command_line(scan, tmp_path):
     write_scan(tmp_path / "scan.nxs", scan)
     run = tmp_path / "run"

@@ -25,3 +25,8 @@ def shop(tmp_path_factory) -> Workshop:
     worked(simulate(made, "--views", 8, "--out", made.scan, "--truth", made.truth))
     worked(holosplat("reconstruct", made.scan, "--out", made.run, *known(made), "--seed", 5))
     return made
+
+
+@pytest.fixture(autouse=True)
+def _undrawn(undrawn_reports: None) -> None:
+    """Tests of the commands do not draw the figures of reports. The shop's run, which is made before, has them."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import json
 import os
@@ -42,8 +43,11 @@ def test_every_command_explains_itself(command):
     assert "--out" in outcome.out or "--volume" in outcome.out or "--truth" in outcome.out
 
 
-def test_the_whole_chain_as_processes(shop, tmp_path):
-    """simulate, reconstruct with a preset, render, export, evaluate: files in, files out, nothing else."""
+def test_the_whole_chain(shop, tmp_path):
+    """simulate, reconstruct with a preset, render, export, evaluate: files in, files out, nothing else.
+
+    The first two run as processes, the others within this one.
+    """
     cells = [os.path.relpath(cell, tmp_path) for cell in shop.cells]
     options = [*MATTER, *BEAM, "--views", 8, "--psf-sigma-px", 0.3, "--photons-per-pixel", 20000, "--seed", 3]
     worked(in_a_shell("simulate", *cells, *options, "--out", "scan.nxs", "--truth", "truth.h5", cwd=tmp_path))
@@ -54,10 +58,10 @@ def test_the_whole_chain_as_processes(shop, tmp_path):
     )
     assert "held-out frames: SSIM" in worked(fitted).out
     assert "report: RUN/report.html" in fitted.err
-    worked(in_a_shell("render", "RUN", "--scan", "scan.nxs", "--out", "predicted.nxs", cwd=tmp_path))
-    worked(in_a_shell("export", "RUN", "--volume", "volume.h5", cwd=tmp_path))
-    scored = in_a_shell("evaluate", "RUN", "--truth", "truth.h5", "--json", cwd=tmp_path)
-    scores = json.loads(worked(scored).out)
+    with contextlib.chdir(tmp_path):
+        worked(holosplat("render", "RUN", "--scan", "scan.nxs", "--out", "predicted.nxs"))
+        worked(holosplat("export", "RUN", "--volume", "volume.h5"))
+        scores = json.loads(worked(holosplat("evaluate", "RUN", "--truth", "truth.h5", "--json")).out)
     assert scores["ssim"] > 0.8
     assert scores["dice"] > 0.9
     worked(holosplat("evaluate", tmp_path / "RUN"))  # it knows its scan from any folder
@@ -84,7 +88,7 @@ def test_the_demo_runs_the_chain_and_shows_its_commands(shop, tmp_path, monkeypa
     """Here on the two small cells."""
     monkeypatch.setattr(demo, "DETECTOR", (ROWS, COLUMNS))
     monkeypatch.setattr(demo, "write_demo_meshes", lambda folder: [Path(shutil.copy(c, folder)) for c in shop.cells])
-    monkeypatch.setattr("holosplat.methods.presets.preset", lambda name: QUICK)
+    monkeypatch.setattr("holosplat.methods.presets.chosen_method", lambda *said: QUICK)
     outcome = worked(holosplat("demo", "--out", tmp_path / "demo"))
     found = {path.name for path in (tmp_path / "demo").iterdir()}
     assert found == {"meshes", "scan.nxs", "truth.h5", "run"}

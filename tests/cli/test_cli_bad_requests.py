@@ -106,18 +106,18 @@ def test_files_that_are_no_scans_are_refused(shop, tmp_path, name, content, word
 
 
 def test_bad_input_in_a_shell_gives_one_line_and_no_traceback(shop, tmp_path):
-    """As people meet it: the process ends with 2 and stderr is that line alone."""
-    truncated(shop.scan, tmp_path)
-    for arguments, word in (
-        (["reconstruct", "scan.nxs", "--out", "run"], "truncated"),
-        (["evaluate", "nowhere"], "nowhere"),
-        (["simulate", shop.cells[0], *MATTER, *BEAM, "--views", 0, "--out", "o.nxs"], "views"),
+    """As people meet it: the process ends with 2 and stderr is that line alone. Two more, within this process."""
+    scan = truncated(shop.scan, tmp_path)
+    views = ["simulate", shop.cells[0], *MATTER, *BEAM, "--views", 0, "--out", tmp_path / "o.nxs"]
+    for outcome, word in (
+        (in_a_shell("reconstruct", "scan.nxs", "--out", "run", cwd=tmp_path), "truncated"),
+        (holosplat("evaluate", tmp_path / "nowhere"), "nowhere"),
+        (holosplat(*views), "views"),
     ):
-        outcome = in_a_shell(*arguments, cwd=tmp_path)
         refused(outcome, word)
         assert len(outcome.err.strip().splitlines()) == 1
         assert outcome.out == ""
-    assert [path.name for path in tmp_path.iterdir()] == ["scan.nxs"]
+    assert list(tmp_path.iterdir()) == [scan]
 
 
 BAD_REQUESTS: dict[str, tuple[list[str], list[str]]] = {

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from helpers.cli import COLUMNS, PIXEL, ROWS, holosplat, refused, worked
+from helpers.pictures import undrawn
 from holosplat.geometry import Grid
 from holosplat.io.nxtomo import read_scan
 from holosplat.io.volumes import read_volume
@@ -49,7 +50,8 @@ def run(shop, method, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp(method) / "run"
     changes = [word for change in QUICK[method] for word in ("--set", change)]
     options = ["--method", method, *changes, "--material", "haemoglobin", "--seed", 2]
-    done = worked(holosplat("reconstruct", shop.scan, "--out", out, *options))
+    with undrawn():
+        done = worked(holosplat("reconstruct", shop.scan, "--out", out, *options))
     assert "held-out frames: SSIM" in done.out
     assert f"report: {out / 'report.html'}" in done.err
     return out

@@ -122,9 +122,10 @@ def test_a_run_finds_its_scan_or_asks_for_it(shop, tmp_path):
 
 def test_ctrl_c_leaves_a_usable_run_that_goes_on(shop, tmp_path):
     """Exit code 130, a result and its report; --resume ends the fit."""
-    long = replace(QUICK, fit=replace(QUICK.fit, schedule=Schedule(steps=400)))
+    long = replace(QUICK, fit=replace(QUICK.fit, schedule=Schedule(steps=200)))
     (tmp_path / "long.json").write_text(json.dumps(to_table(long)))
-    arguments = ["reconstruct", shop.scan, "--out", "run", "--material", "haemoglobin", "--config", "long.json"]
+    known_to_have_levels = ["--material", "haemoglobin", "--matter", "levels"]
+    arguments = ["reconstruct", shop.scan, "--out", "run", *known_to_have_levels, "--config", "long.json"]
     log = tmp_path / "stderr"
     with log.open("w") as stderr:
         process = subprocess.Popen(
@@ -140,7 +141,7 @@ def test_ctrl_c_leaves_a_usable_run_that_goes_on(shop, tmp_path):
     assert "--resume" in log.read_text()
     assert "held-out frames" in out
     summary = json.loads((tmp_path / "run/summary.json").read_text())
-    assert (summary["finished"], 0 < summary["steps"] < 400) == (False, True)
+    assert (summary["finished"], 0 < summary["steps"] < 200) == (False, True)
     assert (tmp_path / "run/report.html").is_file()
     worked(holosplat("evaluate", tmp_path / "run"))
     other = holosplat("reconstruct", shop.scan, "--out", tmp_path / "run", *known(shop), "--resume")

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import os
 import re
+import runpy
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -20,11 +22,36 @@ from holosplat.workflows.run_folder import RunFolder
 EXAMPLES = Path(__file__).resolve().parents[2] / "examples"
 
 
-def run_example(name: str, *arguments: str, cwd: Path) -> str:
-    """What the example prints; it must end well and say nothing on stderr."""
+QUIETLY = (DeprecationWarning, PendingDeprecationWarning, ImportWarning, ResourceWarning)
+"""Warnings that Python does not show of its own accord."""
+
+
+@pytest.fixture
+def run_example(tmp_path, monkeypatch, capfd, recwarn) -> Callable[..., str]:
+    """Runs an example in `tmp_path` as its own program within this process; gives what it prints.
+
+    It must end well and say nothing on stderr.
+    """
+
+    def run(name: str, *arguments: str) -> str:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr(sys, "argv", [name, *arguments])
+        recwarn.clear()
+        plt.switch_backend("agg")
+        runpy.run_path(str(EXAMPLES / name), run_name="__main__")
+        printed, complaints = capfd.readouterr()
+        plt.close("all")
+        assert complaints == ""
+        assert [str(w.message) for w in recwarn if not issubclass(w.category, QUIETLY)] == []
+        return printed
+
+    return run
+
+
+def in_a_process(name: str, *arguments: str, cwd: Path) -> str:
+    """What the example prints as a process; it must end well and say nothing on stderr."""
     command = [sys.executable, str(EXAMPLES / name), *arguments]
-    quiet = os.environ | {"MPLBACKEND": "Agg"}
-    done = subprocess.run(command, cwd=cwd, env=quiet, capture_output=True, text=True, timeout=400)
+    done = subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=400)
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     return done.stdout
@@ -46,7 +73,7 @@ def test_every_example_is_tested_and_short():
 
 def test_simulate_and_reconstruct(tmp_path):
     """Scores of held-out views and of the volume are printed; scan, run and volume are there to be read."""
-    printed = run_example("01_simulate_and_reconstruct.py", "results/first", cwd=tmp_path)
+    printed = in_a_process("01_simulate_and_reconstruct.py", "results/first", cwd=tmp_path)
     out = tmp_path / "results/first"
     ssim, frcm = (float(v) for v in re.findall(r"held-out frames: SSIM ([\d.]+), FRCM ([\d.]+)", printed)[0])
     dice = float(re.findall(r"volume: Dice ([\d.]+)", printed)[0])
@@ -68,9 +95,9 @@ def numbers(pattern: str, printed: str) -> list[float]:
     return [float(value) for value in re.findall(pattern, printed)]
 
 
-def test_own_meshes(tmp_path):
+def test_own_meshes(run_example, tmp_path):
     """Meshes of other programs become a scan file and a volume with their three bodies."""
-    printed = run_example("02_own_meshes.py", "out", cwd=tmp_path)
+    printed = run_example("02_own_meshes.py", "out")
     assert "3 meshes" in printed
     assert numbers(r"volume: Dice ([\d.]+)", printed)[0] > 0.97
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
@@ -82,9 +109,9 @@ def test_own_meshes(tmp_path):
     }
 
 
-def test_unknown_material(tmp_path):
+def test_unknown_material(run_example):
     """The known material gives the best volume; with nothing known the ratio is within a fifth of the true one."""
-    printed = run_example("03_unknown_material.py", "out", cwd=tmp_path)
+    printed = run_example("03_unknown_material.py", "out")
     errors = numbers(r"error of δ ([\d.]+)", printed)
     assert errors[0] == min(errors) < 0.09
     assert errors[2] < 0.1
@@ -92,26 +119,26 @@ def test_unknown_material(tmp_path):
     assert found == pytest.approx(true, rel=0.2, abs=0)
 
 
-def test_noise(tmp_path):
+def test_noise(run_example):
     """Scores fall with the photons, and cells are still found in the fewest."""
-    printed = run_example("04_noise.py", "out", cwd=tmp_path)
+    printed = run_example("04_noise.py", "out")
     scores = numbers(r"SSIM ([\d.]+)", printed)
     assert scores == sorted(scores, reverse=True)
     assert numbers(r"Dice ([\d.]+)", printed)[2] > 0.8
 
 
-def test_surfaces(tmp_path):
+def test_surfaces(run_example, tmp_path):
     """Surfaces have a much smaller error than the Gaussians, and are written as closed bodies."""
-    printed = run_example("05_surfaces.py", "out", cwd=tmp_path)
+    printed = run_example("05_surfaces.py", "out")
     gaussians, surfaces = numbers(r"error of δ ([\d.]+)", printed)
     assert surfaces < 0.6 * gaussians
     (bodies,) = read_meshes([tmp_path / "out/bodies.vtk"], "um")
     assert f"{len(bodies.vertices)} vertices" in printed
 
 
-def test_adding_a_method(tmp_path):
+def test_adding_a_method(run_example):
     """The method of the example finds the cells, with another result than the method that it builds on."""
-    printed = run_example("06_adding_a_method.py", cwd=tmp_path)
+    printed = run_example("06_adding_a_method.py")
     kinds = re.findall(r"^([\w-]+):$", printed, re.MULTILINE)
     assert kinds == ["per-view", "thresholded", "gaussians"]
     errors = dict(zip(kinds, numbers(r"relative error of δ ([\d.]+)", printed)))

@@ -140,6 +140,7 @@ def test_runs_carry_their_verdict(tmp_path, scan):
     assert held_out_verdict(again, scan.train()) is None
 
 
+@pytest.mark.usefixtures("undrawn_reports")
 def test_strict_runs_end_with_3_where_frames_are_not_explained(tmp_path):
     """Uneven light: a warning and 0, with --strict 3; the same scan with even light: 0."""
     method = ["--method", "holographic-tv", "--delta-beta", f"{MATERIAL[0] / MATERIAL[1]:.0f}"]

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..checks import InputError, require
 from ..frames import Frames
-from ..geometry import Views
-from ..scan import Scan
+
+if TYPE_CHECKING:
+    from ..geometry import Views
+    from ..scan import Scan
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,7 @@ class Tube:
         source, light = scan.source, self.transmission(scan.views)[:, None, :].astype(np.float32)
         frames = _WithoutTube(source, light) if isinstance(source, Frames) else source / light
         said = {"tube": f"{self.inner:g} m to {self.outer:g} m, {self.attenuation:g} per metre, divided out"}
-        return Scan.of(frames, scan.exposures, scan.is_test, scan.provenance | said)
+        return scan.of(frames, scan.exposures, scan.is_test, scan.provenance | said)
 
 
 class _WithoutTube(Frames):
