@@ -1,9 +1,11 @@
 """How well `align` finds the poses of views that are not where they are said to be: docs/data/alignment.csv.
 
     python benchmarks/alignment.py [--cases NAME …]
+    python benchmarks/alignment.py --cases "volume 12" "volume 4" --moments planned aligned true
 
 Scenes of the benchmark (sharp cells) are simulated with errors of each view that are known, and aligned; errors are
-those after the best motion of the whole object.
+those after the best motion of the whole object. Cases called "volume …" are also reconstructed, and their volumes
+compared with the truth: in the planned, the found, and the true exposures.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ import argparse
 import csv
 import platform
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,11 +24,14 @@ import holosplat as hs
 from holosplat.align import PoseOptions, Uncertain, align_views
 from holosplat.align.gauge import moved_onto
 from holosplat.beamline.misalignment import Misalignment
-from holosplat.bench.case import load_case
+from holosplat.bench.case import Case, load_case
 from holosplat.bench.record import source_commit
+from holosplat.methods import Auto, Gaussians, Method
+from holosplat.metrics import volume_scores
 
 USUAL = Uncertain()
 TABLE = Path(__file__).resolve().parents[1] / "docs/data/alignment.csv"
+Row = dict[str, object]
 FIELDS: tuple[str, ...] = (
     "case",
     "scene",
@@ -39,25 +44,44 @@ FIELDS: tuple[str, ...] = (
     "seconds",
     "machine",
     "commit",
+    "method",
+    "error_delta",
+    "dice",
 )
 
 
 @dataclass(frozen=True)
 class Experiment:
-    """A scene, the errors of its views, and what `align` is told of these. photons: a pixel, None for no noise."""
+    """A scene, the errors of its views, and what `align` is told of these.
+
+    photons: a pixel, None for no noise; held_out: frames that are held out at most; methods: whose volumes are scored.
+    The seed of the scene is that of the errors where there are methods.
+    """
 
     scene: str
     errors: Misalignment
     photons: float | None = None
     uncertain: Uncertain = USUAL
+    held_out: int = 4
+    methods: tuple[str, ...] = ()
+
+    def scene_seed(self) -> int:
+        """Seed of the scene: those of poses alone are of one scene."""
+        return self.errors.seed if self.methods else 0
 
 
+METHODS: dict[str, Method] = {"gaussians": Gaussians(), "auto": Auto()}
+BOTH = ("gaussians", "auto")
 CASES = {
     "1 px, 0.6°": Experiment("main12", Misalignment(1.0, 0.6, 0.02, 0)),
     "1 px, 0.6°, other errors": Experiment("main12", Misalignment(1.0, 0.6, 0.02, 1)),
     "1 px, 0.6°, 4 views": Experiment("main4", Misalignment(1.0, 0.6, 0.02, 0)),
     "5 px, 1°, 2000 photons": Experiment("main12", Misalignment(5.0, 1.0, 0.05, 1), 2000.0, Uncertain(shift=5.0)),
     "perfect": Experiment("main12", Misalignment()),
+    "volume 12": Experiment("main12", Misalignment(1.0, 0.6, 0.02, 7), methods=BOTH),
+    "volume 12, other errors": Experiment("main12", Misalignment(1.0, 0.6, 0.02, 8), methods=("auto",)),
+    "volume 4": Experiment("main4", Misalignment(1.0, 0.6, 0.02, 7), held_out=2, methods=BOTH),
+    "volume 4, other errors": Experiment("main4", Misalignment(1.0, 0.6, 0.02, 8), held_out=2, methods=BOTH),
 }
 
 
@@ -71,44 +95,71 @@ def rms_errors(found: hs.Exposures, true: hs.Exposures) -> tuple[float, float, f
     return shift, across, roll
 
 
-def rows_of(name: str, experiment: Experiment) -> list[dict[str, object]]:
-    """Errors of training and of held-out views, before and after."""
-    case = load_case(experiment.scene, 0)
+def measured(experiment: Experiment) -> tuple[Case, hs.Scan, hs.Exposures]:
+    """The case, its scan with the planned exposures, and the true ones."""
+    case = load_case(experiment.scene, experiment.scene_seed())
     true = experiment.errors.true_exposures(case.exposures)
     scan = hs.simulate(case.scene, true, seed=0, is_test=case.is_test)
     frames = scan.frames
     if experiment.photons is not None:
         frames = np.random.default_rng(0).poisson(frames * experiment.photons) / experiment.photons
-    scan = hs.Scan(frames.astype(np.float32), case.exposures, case.is_test)
+    chosen = np.sort([*np.flatnonzero(~case.is_test), *np.flatnonzero(case.is_test)[: experiment.held_out]])
+    return case, hs.Scan(frames.astype(np.float32), case.exposures, case.is_test)[chosen], true[chosen]
+
+
+def rows_of(name: str, experiment: Experiment, moments: list[str], commit: str) -> list[Row]:
+    """Errors of training and of held-out views, before and after; scores of volumes at `moments`."""
+    case, scan, true = measured(experiment)
     began = time.perf_counter()
     found = align_views(scan, case.prior, PoseOptions(experiment.uncertain))
     seconds = time.perf_counter() - began
-    rows: list[dict[str, object]] = []
-    common = (f"{platform.machine()}, one core of two", source_commit())
-    for moment, exposures in (("planned", case.exposures), ("aligned", found.exposures)):
-        for views, index in (("training", ~case.is_test), ("all", np.ones(len(scan), dtype=bool))):
-            errors = rms_errors(exposures[np.flatnonzero(index)], true[np.flatnonzero(index)])
-            said = (name, experiment.scene, experiment.errors.seed, views, moment)
-            values = (*said, *(f"{error:.4f}" for error in errors), f"{seconds:.0f}", *common)
-            rows.append({str(field): value for field, value in zip(FIELDS, values, strict=True)})
-            print(*values, flush=True)
     print(*found.words, sep="\n", flush=True)
+    placed = {"planned": scan.exposures, "aligned": found.exposures, "true": true}
+    rows = list[Row]()
+    said: Row = {"case": name, "scene": experiment.scene, "seed": experiment.errors.seed}
+    said |= {"machine": f"{platform.machine()}, one core of two", "commit": commit}
+    for moment in ("planned", "aligned"):
+        for views, index in (("training", ~scan.is_test), ("all", np.ones(len(scan), dtype=bool))):
+            chosen = np.flatnonzero(index)
+            errors = rms_errors(placed[moment][chosen], true[chosen])
+            values = {key: f"{e:.4f}" for key, e in zip(("shift_px", "across_deg", "roll_deg"), errors, strict=True)}
+            rows.append(said | {"views": views, "moment": moment, "seconds": f"{seconds:.0f}"} | values)
+            print(rows[-1], flush=True)
+    for method in experiment.methods:
+        for moment in moments:
+            score = volume_row(case, scan, placed[moment], true, method)
+            rows.append(said | {"views": "volume", "moment": moment, "method": method} | score)
+            print(rows[-1], flush=True)
     return rows
+
+
+def volume_row(case: Case, scan: hs.Scan, exposures: hs.Exposures, true: hs.Exposures, method: str) -> Row:
+    """Scores of a volume in some exposures, which are first moved, all together, as near to the true ones as can be."""
+    moved = replace(exposures, views=moved_onto(exposures.views, true.views))
+    began = time.perf_counter()
+    done = hs.reconstruct(hs.Scan(scan.frames, moved, scan.is_test), case.prior, METHODS[method])
+    seconds = time.perf_counter() - began
+    truth = case.truth()
+    scores = volume_scores(done.object.voxelise(truth.grid), truth)
+    numbers: Row = {"error_delta": f"{scores.relative_error_delta:.4f}", "dice": f"{scores.dice:.4f}"}
+    return {"method": f"{method} ({done.object.kind})", "seconds": f"{seconds:.0f}"} | numbers
 
 
 def main() -> None:
     """Run cases; rows of others stay."""
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--cases", nargs="*", default=list(CASES))
-    wanted = parser.parse_args().cases
-    for name in wanted:
-        new = rows_of(name, CASES[name])
+    parser.add_argument("--moments", nargs="*", default=["aligned"], choices=["planned", "aligned", "true"])
+    wanted = parser.parse_args()
+    commit = source_commit()  # before the table is written, which is part of the tree
+    for name in wanted.cases:
+        new = rows_of(name, CASES[name], wanted.moments, commit)
         old = []
         if TABLE.is_file():
             with TABLE.open(newline="", encoding="utf-8") as file:
                 old = [row for row in csv.DictReader(file) if row["case"] != name]
         with TABLE.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, FIELDS, lineterminator="\n")
+            writer = csv.DictWriter(file, FIELDS, restval="", lineterminator="\n")
             writer.writeheader()
             writer.writerows([*old, *new])
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,36 +10,24 @@ import pytest
 import torch
 
 import holosplat as hs
+from helpers.contract import MATERIAL, PITCH, QUICK, SCENE, SHAPE, run, two_balls, usable
+from helpers.decisions import decided_once
 from holosplat.bench.method import Method
-from holosplat.bench.methods import METHODS, methods
+from holosplat.bench.methods import METHODS
 from holosplat.model import Instrument, Model
-from holosplat.specimens.red_cells import icosphere
-
-MATERIAL = hs.DeltaBeta(2e-7, 2e-10)
-PITCH = 1e-6
-SHAPE = (24, 31)
-QUICK = methods(effort=0.05) | {"neural-field": methods(effort=0.25)["neural-field"]}
-"""The same methods with a small part of their steps: the contract is about form, not about quality."""
-QUICKER = methods(effort=0.05)
-"""With a still smaller part, where finite numbers are all that is asked for."""
-NEEDS = {"paganin-svmbir": "svmbir"}
-"""Methods that need a package of the extra `bench`."""
 
 
-def ball(centre: tuple[float, float, float], radius: float) -> hs.TriangleMesh:
-    """A ball [pixels]."""
-    vertices, faces = icosphere(3)
-    return hs.TriangleMesh(PITCH * (radius * vertices + np.array(centre)), faces)
-
-
-SCENE = hs.MeshScene.of_one_material([ball((-6, 2, 3), 5), ball((7, -3, -4), 4)], MATERIAL)
+@pytest.fixture(scope="module", autouse=True)
+def _decided_once() -> Iterator[None]:
+    """All methods ask the same of the same frames: whether their matter has levels."""
+    with decided_once() as made:
+        yield
+    assert len(made) < len(METHODS)
 
 
 @pytest.fixture(scope="module")
 def scan() -> hs.Scan:
-    """Six training frames of two balls, and two held out."""
-    exposures = hs.Exposures.of(hs.Views.evenly_spaced(8, SHAPE, PITCH), 20.0, 0.02)
-    return hs.simulate(SCENE, exposures, oversample=2)
+    return two_balls()
 
 
 @dataclass
@@ -56,26 +44,10 @@ def results() -> dict[str, Made]:
     return {}
 
 
-def run(method: Method, scan: hs.Scan, seed: int = 0, prior: hs.MaterialPrior | None = None) -> hs.Object:
-    known = hs.MaterialPrior.known(MATERIAL)
-    return method.run(scan.train(), prior or known, seed, lambda stage, fraction: None)
-
-
-def result_or_reason(method: Method, scan: hs.Scan, prior: hs.MaterialPrior | None = None) -> hs.Object | str:
-    """What the method makes of the scan, or why it cannot."""
-    try:
-        return run(method, scan, prior=prior)
-    except hs.InputError as error:
-        return str(error)
-
-
 @pytest.fixture(params=list(METHODS))
 def method(request) -> Method:
     """Each method, if what it needs is installed."""
-    package = NEEDS.get(request.param)
-    if package and importlib.util.find_spec(package) is None:
-        pytest.skip(f"{package} is not installed")
-    return QUICK[request.param]
+    return usable(request.param, QUICK)
 
 
 @pytest.fixture
@@ -141,27 +113,3 @@ def test_a_method_repeats_itself(method, result, scan):
 def test_a_method_reports_its_progress(made):
     assert made.told
     assert all(stage and 0 <= part <= 1 for stage, part in made.told)
-
-
-@pytest.mark.parametrize("kind", ["ratio", "free"])
-def test_a_method_does_without_the_material_or_says_why_not(method, scan, kind):
-    prior = hs.MaterialPrior.of_ratio(MATERIAL.ratio) if kind == "ratio" else hs.MaterialPrior.unknown()
-    found = result_or_reason(method, scan, prior)
-    if isinstance(found, str):
-        assert "material" in found
-        return
-    volume = found.voxelise(hs.Grid.of_views(scan.views))
-    assert np.abs(volume.delta).max() > 0.1 * MATERIAL.delta
-
-
-def test_unequal_views_are_used_or_refused(method):
-    """Poses about no common axis: a result, or the reason why there is none."""
-    from scipy.spatial.transform import Rotation
-
-    views = hs.Views.from_rotations(Rotation.random(5, rng=3).as_matrix(), SHAPE, PITCH)
-    scan = hs.simulate(SCENE, hs.Exposures.of(views, 20.0, 0.02), oversample=2, is_test=np.arange(5) == 4)
-    found = result_or_reason(QUICKER[method.name], scan)
-    if isinstance(found, str):
-        assert "axis" in found
-        return
-    assert np.isfinite(found.voxelise(hs.Grid.of_views(scan.views)).delta).all()

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import csv
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from helpers.cli import FORMULA, holosplat, refused, worked
+import holosplat as hs
+from helpers.cli import FORMULA, QUICK, holosplat, known, refused, worked
 from helpers.contact import PIXEL, contact_scan
+from holosplat.align import PoseOptions, Uncertain
+from holosplat.cli.options import PriorOptions
 from holosplat.io.nxtomo import read_scan, write_scan
+from holosplat.workflows.run_folder import RunFolder
 
 BALLS = ((7.0, -3.0, 4.0, 6.0, 2e-9), (-9.0, 4.0, 5.0, 5.0, 3e-9), (2.0, 6.0, -9.0, 4.0, 4e-9))
 
@@ -45,20 +50,65 @@ def test_a_first_guess_may_be_given(turning, tmp_path):
     assert read_scan(out).views.shape == (21, 49)
 
 
+def moved(shop, path):
+    """The shared scan at `path`, whose views are said to be moved by a pixel, and how far they are."""
+    scan = read_scan(shop.scan)
+    shifts = scan.views.shifts + scan.views.pixel_size * np.array([1.0, 0]) * (-1.0) ** np.arange(len(scan))[:, None]
+    write_scan(path, scan.with_views(replace(scan.views, shifts=shifts)))
+    return path
+
+
+def test_a_run_refines_its_geometry_and_keeps_it(shop, tmp_path):
+    """Training frames before the fit, held-out ones after it; what reads the run knows where its frames are."""
+    path, run, frames = moved(shop, tmp_path / "moved.nxs"), tmp_path / "run", tmp_path / "frames.nxs"
+    how = ("--refine", "shifts", "--seed", 5)
+    done = worked(holosplat("reconstruct", path, "--out", run, *known(shop), *how))
+    assert "shifts refined" in done.out
+    planned, true = read_scan(path), read_scan(shop.scan)
+    geometry = json.loads((run / "summary.json").read_text())["geometry"]
+    found = np.array(geometry["shifts"])
+    for chosen in (~true.is_test, true.is_test):
+        before, after = (np.ptp((shifts - true.views.shifts)[chosen, 0]) for shifts in (planned.views.shifts, found))
+        assert after < 0.5 * max(before, true.views.pixel_size)
+    np.testing.assert_allclose(geometry["rotations"], true.views.rotations, atol=1e-9)
+    assert "Geometry beside the plan" in (run / "report.html").read_text()
+    assert "not the scan" not in worked(holosplat("evaluate", run, "--json")).err
+    worked(holosplat("render", run, "--scan", path, "--split", "all", "--out", frames))
+    np.testing.assert_allclose(read_scan(frames).views.shifts, found, atol=1e-12)
+    refine = PoseOptions(Uncertain(angle=0.0, roll=0.0))
+    options = {"matter": "levels", "refine": refine, "folder": RunFolder(run), "resume": True}
+    again = hs.reconstruct(
+        planned, PriorOptions("haemoglobin").prior(planned.exposures.reference_energy), QUICK, 5, **options
+    )
+    np.testing.assert_array_equal(again.placed(planned).views.shifts, found)
+    refused(holosplat("reconstruct", path, "--out", run, *known(shop), "--seed", 5, "--resume"), "refinement")
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--refine", "tilt"), "tilt"),
+        (("--uncertain-shift", 3), "--refine"),
+        (("--refine", "shifts", "--distance", "0.05:0.2"), "distance"),
+    ],
+)
+def test_refinements_that_make_no_sense_are_refused(shop, tmp_path, options, said):
+    refused(holosplat("reconstruct", shop.scan, "--out", tmp_path / "run", *known(shop), *options), said)
+
+
 def test_single_views_are_moved_and_told(shop, tmp_path):
     """Of the shared scan, whose views are said to be moved by a pixel."""
     scan = read_scan(shop.scan)
-    moved = scan.views.shifts + scan.views.pixel_size * np.array([1.0, 0]) * (-1.0) ** np.arange(len(scan))[:, None]
     path, out, table = (tmp_path / name for name in ("moved.nxs", "aligned.nxs", "views.csv"))
-    write_scan(path, scan.with_views(replace(scan.views, shifts=moved)))
-    known = ("--material", FORMULA, "--density", "1.335")
+    planned = read_scan(moved(shop, path)).views.shifts
+    matter = ("--material", FORMULA, "--density", "1.335")
     unsure = ("--uncertain-shift", 2, "--uncertain-angle", 0, "--uncertain-roll", 0)
-    done = worked(holosplat("align", path, *known, *unsure, "--table", table, "--out", out))
+    done = worked(holosplat("align", path, *matter, *unsure, "--table", table, "--out", out))
     assert "changes of the plan" in done.out
     found = read_scan(out)
     np.testing.assert_array_equal(found.frames, scan.frames)
     np.testing.assert_allclose(found.views.rotations, scan.views.rotations, atol=1e-9)
-    away = [np.abs(np.diff((shifts - scan.views.shifts)[:, 0])).mean() for shifts in (moved, found.views.shifts)]
+    away = [np.abs(np.diff((shifts - scan.views.shifts)[:, 0])).mean() for shifts in (planned, found.views.shifts)]
     before, after = away
     assert after < 0.5 * before
     rows = list(csv.DictReader(table.open()))

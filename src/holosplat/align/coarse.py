@@ -21,14 +21,17 @@ def shifts_by_mass(thickness: np.ndarray, views: Views) -> np.ndarray:
     projection of the centre of mass (the moment of order one, Helgason 1980); the point is that which asks for the
     least shifts.
     """
-    (h, w), pixel = views.shape, views.pixel_size
-    mass = thickness.sum((1, 2))
-    at_x = (thickness.sum(1) @ (np.arange(w) + 0.5 - w / 2)) / mass
-    at_y = (thickness.sum(2) @ (np.arange(h) + 0.5 - h / 2)) / mass
-    seen = np.stack([at_x, at_y], axis=1) + views.shifts / pixel
+    seen = centres_of_mass(thickness) + views.shifts / views.pixel_size
     design = views.rotations[:, :2].reshape(-1, 3)
     point = np.linalg.lstsq(design, seen.reshape(-1), rcond=1e-9)[0]
     return (design @ point).reshape(-1, 2) - seen
+
+
+def centres_of_mass(images: np.ndarray) -> np.ndarray:
+    """Centres of mass [V, 2] (x, y) [pixels] of images [V, H, W], from the middle of the image."""
+    h, w = images.shape[1:]
+    at_x, at_y = images.sum(1) @ (np.arange(w) + 0.5 - w / 2), images.sum(2) @ (np.arange(h) + 0.5 - h / 2)
+    return np.stack([at_x, at_y], axis=1) / images.sum((1, 2))[:, None]
 
 
 def mirrored(frames: Tensor, predicted: Tensor) -> list[str]:

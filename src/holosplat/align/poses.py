@@ -133,6 +133,7 @@ class PoseSearch:
         self.numbers = torch.zeros(count, len(NUMBERS), dtype=torch.float64)
         self.covariances = torch.zeros(count, len(NUMBERS), len(NUMBERS), dtype=torch.float64)
         self._solver: PrimalDual | None = None
+        self._retrieved = dict[int, Tensor]()
         self._more = max(1.0, options.few_views / int((~scan.is_test).sum()))
         if options.uncertain.shift > options.by_mass:
             self.begin()
@@ -163,17 +164,31 @@ class PoseSearch:
         train = np.flatnonzero(~scan.is_test)
         planned, pixel = scan.exposures, scan.views.pixel_size
         frames, oversample = torch.from_numpy(scan.frames), fringe_sampling(planned)
-        how = Tikhonov(iterations=self.options.retrieval)
         distances = self.exposures(planned).distance if self.options.uncertain.distance else planned.distance
-        known = replace(planned, distance=distances)[train]
-        retrieved = tikhonov(frames[train], known, *self.material, options=how) / pixel
+        retrieved = self.thickness(scan, replace(planned, distance=distances)) / pixel
         grid = Grid.of_views(in_pixels(planned.views))
         for done in range(level.rounds):
             found = self.exposures(planned)
             self._improve_volume(LatticeProjector(grid, in_pixels(found.views)[train]), grid, retrieved)
             assert self._solver is not None
-            self._move(self._solver.volume, grid, found, frames, oversample)
+            self.move(self._solver.volume, grid, found, frames, oversample)
             on_progress((done + 1) / level.rounds)
+
+    def thickness(self, scan: Scan, exposures: Exposures) -> Tensor:
+        """Retrieved thickness [m] of the training frames of `scan`, on pixels of any size, in `exposures`.
+
+        Poses do not matter to it, distances do: at those planned it is kept for later.
+        """
+        pixels = round(scan.views.pixel_size / self.scan.views.pixel_size)
+        as_planned = np.array_equal(exposures.distance, self.scan.exposures.distance)
+        if as_planned and pixels in self._retrieved:
+            return self._retrieved[pixels]
+        train, how = np.flatnonzero(~scan.is_test), Tikhonov(iterations=self.options.retrieval)
+        frames = torch.from_numpy(scan.frames)[train]
+        found = tikhonov(frames, exposures[train], *self.material, options=how)
+        if as_planned:
+            self._retrieved[pixels] = found
+        return found
 
     def _improve_volume(self, projector: LatticeProjector, grid: Grid, retrieved: Tensor) -> None:
         """Some steps of total-variation tomography in the poses as they are now."""
@@ -191,8 +206,8 @@ class PoseSearch:
             self._solver.run(retrieved, max(0, first - steps))
         self._solver.run(retrieved, steps)
 
-    def _move(self, volume: Tensor, grid: Grid, found: Exposures, frames: Tensor, oversample: int) -> None:
-        """One step of all numbers."""
+    def move(self, volume: Tensor, grid: Grid, found: Exposures, frames: Tensor, oversample: int) -> None:
+        """One step of all numbers beside `volume` on `grid` (lengths in pixels); found: exposures as they are now."""
         pixels = round(found.views.pixel_size / self.scan.views.pixel_size)
         scales = torch.ones(len(NUMBERS), dtype=torch.float64)
         scales[SHIFT] = pixels

@@ -14,7 +14,6 @@ from ..geometry import Grid
 from ..matter import Known, MaterialPrior
 from ..methods.assumed import assumed_material
 from ..optics.background import Light, LightOptions
-from ..optics.retrieval import Tikhonov, tikhonov
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..projectors.voxels import LatticeProjector
@@ -179,8 +178,7 @@ class Judged:
         """On pixels `pixels` times larger; the same for all exposures that are compared."""
         scan = Scan(scan.frames, exposures, scan.is_test).binned(pixels)
         frames, train, options = torch.from_numpy(scan.frames), np.flatnonzero(~scan.is_test), search.options
-        how = Tikhonov(iterations=options.retrieval)
-        lines = tikhonov(frames[train], scan.exposures[train], *search.material, options=how) / scan.views.pixel_size
+        lines = search.thickness(scan, scan.exposures) / scan.views.pixel_size
         views = in_pixels(scan.views)
         grid = Grid.of_views(views)
         solver = PrimalDual(LatticeProjector(grid, views[train]), torch.zeros(grid.shape), options.weight, search.upper)

@@ -46,6 +46,36 @@ class UncertainOptions:
         return PoseOptions(Uncertain(shift, angle, roll, distance))
 
 
+@dataclass(frozen=True)
+class RefineOptions:
+    """Beams that may be elsewhere than the scan says."""
+
+    refine: str | None = None
+    """What is found of each frame beside the matter: shifts, angles, roll, distance, with commas between (default:
+    nothing, the beams are where the scan says)."""
+    uncertain_shift: float = 2.0
+    """Standard deviation of the detector's shifts along rows and columns [pixels]."""
+    uncertain_angle: float = 1.0
+    """Standard deviation of turns about the two axes across the beam [degrees]."""
+    uncertain_roll: float = 1.0
+    """Standard deviation of turns about the beam [degrees]."""
+    uncertain_distance: float = 0.02
+    """Standard deviation of the distance, as a share of it."""
+
+    def options(self) -> PoseOptions | None:
+        """The options of the search; None where nothing is to be refined. Errors: `InputError` for other names."""
+        sizes = {name.removeprefix("uncertain_"): value for name, value in vars(self).items() if name != "refine"}
+        if self.refine is None:
+            usual = vars(RefineOptions())
+            changed = [name.replace("_", "-") for name, value in vars(self).items() if value != usual[name]]
+            require(not changed, f"--{', --'.join(changed)} go with --refine, which says what is uncertain; add it.")
+            return None
+        from ..align import PoseOptions, Uncertain
+        from ..align.geometry import wanted
+
+        return PoseOptions(wanted(self.refine, Uncertain(**sizes)))
+
+
 def align(
     scan: Positional[Path],
     out: Path,

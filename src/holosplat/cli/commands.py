@@ -13,6 +13,7 @@ from tyro.conf import Positional, arg
 
 from ..checks import InputError, in_range, require
 from ..io.reading import Reading
+from .align import RefineOptions
 from .options import BeamlineOptions, LightFlags, MethodOptions, PriorOptions, TruthOptions
 from .progress import INTERRUPTED, ProgressBar
 
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 LIGHT = LightFlags()
 """Even, unless the air of frames says otherwise."""
+AS_PLANNED = RefineOptions()
+"""Beams are where the scan says."""
 UNEXPLAINED = 3
 """Exit code of `reconstruct --strict` where frames are not explained."""
 MOST_VOXELS = 2**31
@@ -39,6 +42,7 @@ def reconstruct(
     reading: Reading = Reading(),
     *,
     illumination: LightFlags = LIGHT,
+    geometry: RefineOptions = AS_PLANNED,
     strict: bool = False,
 ) -> None:
     """Reconstruct a scan by Gaussians, or by another method, into a run folder.
@@ -61,7 +65,7 @@ def reconstruct(
 
     method = how.chosen()
     require(seed >= 0, f"--seed must be 0 or more, but it is {seed}.")
-    uncertain = Uncertain(**reading.told.ranges(), **matter.ranges())
+    uncertain, refine = Uncertain(**reading.told.ranges(), **matter.ranges()), geometry.options()
     measured = read_as(scan, replace(reading, told=reading.told.at_middle())).in_memory()
     prior = matter.without_ranges().prior(measured.exposures.reference_energy)
     folder = RunFolder(out)
@@ -74,6 +78,7 @@ def reconstruct(
             matter=how.kind_of_matter(),
             light=illumination.options(),
             uncertain=uncertain,
+            refine=refine,
             folder=folder,
             resume=resume,
             on_progress=bar.show,
@@ -101,6 +106,8 @@ def _print_result(result: Reconstruction, report: Path) -> None:
     """What was found and decided, and whether it explains the frames."""
     for constant in result.constants:
         print(constant.line())
+    for line in result.geometry.lines() if result.geometry else ():
+        print(line)
     for line in result.choice.lines():
         print(line)
     _say(f"{sum(result.timing.values()):.1f} s, {result.object.described}; report: {report}")

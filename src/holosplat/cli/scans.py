@@ -9,13 +9,15 @@ from ..io.reading import Reading, at_time
 from ..io.run_scan import run_reading
 from ..scan import Scan
 from ..workflows.reconstruct import require_one_time
+from ..workflows.refine import where_found
 from ..workflows.run_folder import RunFolder
 
 
 def scan_for(folder: RunFolder, scan: Path | None, reading: Reading) -> Scan:
     """A scan to compare a run with: of a time-resolved one, the frames of the time that the run is of.
 
-    scan: None is the run's own, read as the run did, but for what `reading` says otherwise.
+    scan: None is the run's own, read as the run did, but for what `reading` says otherwise. Where the run refined the
+    geometry, its own frames are where it found them.
     """
     own = run_reading(folder.path) if folder.source.is_file() else Reading()
     if scan is None:
@@ -26,4 +28,4 @@ def scan_for(folder: RunFolder, scan: Path | None, reading: Reading) -> Scan:
             found = at_time(found, own.part.time_frame)
     if found.is_series:
         require_one_time(found)
-    return found.in_memory()
+    return where_found(folder, found.in_memory())

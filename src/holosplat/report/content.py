@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..align.geometry import Geometry
 from ..checks import InputError, positive, require, shaped
 from ..geometry import Views
 from ..metrics import ImageScores, VolumeScores, require_same_grid, robust_material_delta
@@ -100,6 +101,7 @@ class ReportContent:
     - lit: training frames in uneven light; None: the light is even
     - explained: the verdict on the training frames; None: not judged
     - total: the total δ by these frames; None: not told
+    - geometry: where the frames were found to be; None: as the scan says
     - history: columns of metrics.csv, each [S]: step, seconds, loss, the loss' terms, count, val_ssim …
     - seconds: time of the reconstruction [s]
     - settings: the resolved configuration, nested or flat
@@ -118,6 +120,7 @@ class ReportContent:
     material_delta: float | None = None
     explained: Verdict | None = None
     total: TotalMatter | None = None
+    geometry: Geometry | None = None
     lit: LitViews | None = None
     history: Mapping[str, np.ndarray] = field(default_factory=dict)
     seconds: float | None = None

@@ -54,6 +54,7 @@ def report_run(
         material_delta=found.matter.delta if found.matter.single else None,
         explained=reconstruction.verdict,
         total=reconstruction.total,
+        geometry=reconstruction.geometry,
         lit=_lit(reconstruction, scan, evaluation),
         history=folder.history(),
         seconds=sum(reconstruction.timing.values()),

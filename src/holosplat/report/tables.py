@@ -58,8 +58,8 @@ def key_figures(content: ReportContent) -> list[tuple[str, str, str]]:
 
 
 def score_tables(content: ReportContent) -> list[Table]:
-    """The total δ, the scores of the volume and of each held-out view, as far as there are any."""
-    tables = (_total_table(content), _volume_table(content), _views_table(content))
+    """The total δ, the scores of the volume and of each held-out view, and the geometry, as far as there are any."""
+    tables = (_total_table(content), _volume_table(content), _views_table(content), _geometry_table(content))
     return [table for table in tables if table is not None]
 
 
@@ -137,6 +137,22 @@ def _views_table(content: ReportContent) -> Table | None:
     means = (f"{mean['ssim']:.4f}", f"{mean['frcm']:.4f}", f"{mean['psnr']:.2f}", f"{mean['l1']:.4f}")
     head = ("view", "SSIM", "FRCM", "PSNR (dB)", "L1")
     return Table("Held-out views", [*rows, ("mean", *means)], head)
+
+
+def _geometry_table(content: ReportContent) -> Table | None:
+    """What was found of each frame beside the plan, and what is unexplained of it before and after."""
+    found = content.geometry
+    if found is None:
+        return None
+    rows = []
+    for v, (change, error) in enumerate(zip(found.changes, found.errors)):
+        numbers = [f"{change[k]:+.2f} ± {error[k]:.2f}" for k in (0, 1)]
+        numbers += [f"{change[k]:+.3f} ± {error[k]:.3f}" for k in (2, 3, 4)]
+        name = f"{v} (held out)" if found.held_out[v] else str(v)
+        left = f"{found.before[v]:.3f} → {found.after[v]:.3f}"
+        rows.append((name, *(n.replace("-", "−") for n in numbers), percent(change[5]), left))
+    head = ("frame", "shift x (px)", "shift y (px)", "turn x (°)", "turn y (°)", "roll (°)", "distance", "unexplained")
+    return Table("Geometry beside the plan", rows, head)
 
 
 def percent(value: float | None) -> str:

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 import numpy as np
 
-from ..backends import device_name
+from ..align.geometry import Geometry
+from ..align.poses import PoseOptions
 from ..checks import InputError, require
 from ..fit.running import Record, Running
-from ..geometry import Grid
 from ..io.json import read_json, write_json
 from ..io.light import write_light
 from ..io.objects import read_object, write_object
 from ..matter import MaterialPrior, MatterKind
 from ..methods import Auto, Gaussians, Method, Settled, Stage, Task, finished, settled
-from ..methods.presets import SCHEMA
-from ..methods.uncertain import Determined, Uncertain, placed
+from ..methods.uncertain import Determined, Uncertain
 from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling
 from ..progress import FitProgress
@@ -27,9 +26,19 @@ from ..scan import Scan
 from ..tables import to_table
 from .keeper import Choice, Keeper
 from .provenance import environment, scan_hash
+from .reconstruction import Reconstruction
+from .refine import (
+    keep_geometry,
+    read_geometry,
+    require_compatible,
+    saved_geometry,
+    trained_geometry,
+    with_held_out,
+)
 from .resume import require_same
 from .run_folder import RunFolder
-from .run_light import EVEN, found_in, read_light_options
+from .run_light import found_in, read_light_options
+from .run_record import config_of, summary_of
 from .totals import TotalMatter, total_of_run
 from .verdict import Verdict, judge_run, said_of_run
 
@@ -38,42 +47,6 @@ FEWEST_COLUMNS = 11
 """Pixels across the axis that are a field of view; rows may be as few as one."""
 FLAT_LEVELS = (0.2, 5.0)
 """Between these lies the median of frames that are relative to the flat field."""
-
-
-@dataclass(frozen=True)
-class Reconstruction:
-    """What a method made of a scan.
-
-    object: the matter, of any kind
-    method: name of the method
-    energy_kev: photon energy [keV] at which δ and β hold
-    oversample: wave samples a pixel in the fit
-    timing: seconds that each stage took
-    finished: whether all stages came to their end
-    choice: what was decided on the way, and which state `object` is
-    delta_told: whether prior or frames say what δ is; else β alone is known, and δ = β stands for it
-    verdict: whether the training frames are explained; None for runs of versions that did not say
-    total: the total δ by these frames, with its standard error; None likewise
-    constants: what was known to a range only, or of continuous matter not at all, by the frames
-    light: what is assumed of the light of other frames of the scan: smooth if that of the training frames is uneven
-    """
-
-    object: Stored
-    method: str
-    energy_kev: float
-    oversample: int
-    timing: dict[str, float]
-    finished: bool
-    choice: Choice = field(default_factory=Choice)
-    delta_told: bool = True
-    verdict: Verdict | None = None
-    total: TotalMatter | None = None
-    constants: tuple[Determined, ...] = ()
-    light: LightOptions = EVEN
-
-    def placed(self, scan: Scan) -> Scan:
-        """`scan`, as it was given to the reconstruction, at the distance and energy that were found."""
-        return placed(scan, self.constants)
 
 
 def reconstruct(
@@ -85,6 +58,7 @@ def reconstruct(
     light: LightOptions | None = None,
     matter: MatterKind | None = None,
     uncertain: Uncertain | None = None,
+    refine: PoseOptions | None = None,
     folder: RunFolder | None = None,
     resume: bool = False,
     on_progress: FitProgress = lambda stage, fraction, record: None,
@@ -95,6 +69,8 @@ def reconstruct(
     light: what is assumed of the light (default: even, unless air says otherwise; see `Task.evened`).
     uncertain: distance, energy or δ/β that are known to a range (default: nothing); `constants` of the result then says
     what the frames say of them, and `Reconstruction.placed` gives the scan that the result belongs to.
+    refine: where frames are is found, too, those for training before the matter, held-out ones beside the finished
+    matter (default: they are where the scan says); `geometry` of the result, and again `placed`.
     With a `folder`, everything is written there, and a later call with `resume=True` goes on from the last
     checkpoint, with the same result as if nothing had happened. Ctrl-C (KeyboardInterrupt) ends a fit with what it has
     reached (`finished` is False); during a start there is nothing yet, and it is passed on. Errors: `InputError` for
@@ -102,16 +78,43 @@ def reconstruct(
     for what the method cannot do.
     """
     require_one_time(scan)
+    _check_frames(scan.train())
+    assumed, ranges, planned = light or LightOptions(), uncertain or Uncertain(), scan
+    said = {"light": to_table(assumed), "uncertain": to_table(ranges), "refine": refine and to_table(refine)}
+    config = config_of(scan, prior, method, seed, matter) | said
+
+    def tell(stage: str, part: float) -> None:
+        on_progress(stage, part, {})
+
+    geometry = None
+    if refine is not None:
+        require_compatible(ranges)
+        _look_at(folder, config, resume)
+        geometry = saved_geometry(folder, resume) or trained_geometry(scan, prior, refine, assumed, tell)
+        scan = geometry.applied(scan)
     train = scan.train()
-    _check_frames(train)
-    assumed = light or LightOptions()
-    task = Task(train, prior, seed, lambda stage, part: on_progress(stage, part, {}), assumed).evened()
+    task = Task(train, prior, seed, tell, assumed).evened()
     run = _Run(task, method, folder, on_progress)
-    ranges = uncertain or Uncertain()
-    said = {"light": to_table(assumed), "uncertain": to_table(ranges)}
-    run.begin(_config(scan, prior, method, seed, matter) | said, resume)
-    run.settle(matter, ranges, scan)
-    return run.complete()
+    run.begin(config, resume)
+    run.settle(matter, ranges, scan, geometry)
+    done = run.complete()
+    if refine is None or geometry is None:
+        return done
+    geometry = with_held_out(geometry, planned, done.object, refine, done.light, tell)
+    if folder is not None:
+        keep_geometry(folder, geometry, planned)
+    return replace(done, geometry=geometry)
+
+
+def _look_at(folder: RunFolder | None, config: dict[str, Any], resume: bool) -> bool:
+    """Whether a run in `folder` goes on. `InputError` for a folder that does not fit."""
+    if folder is None:
+        return False
+    if resume and folder.config.is_file():
+        require_same(folder, config)
+        return True
+    folder.require_new(advise_resume=not resume)
+    return False
 
 
 def require_one_time(scan: Scan) -> None:
@@ -158,7 +161,8 @@ def load_reconstruction(folder: RunFolder) -> Reconstruction:
     total = TotalMatter.from_dict(summary["total"]) if "total" in summary else None
     constants = tuple(Determined.from_dict(each) for each in summary.get("constants", ()))
     light, choice = read_light_options(folder.read_config(), summary), Choice.read(summary)
-    return Reconstruction(found, method, energy, oversample, timing, done, choice, told, said, total, constants, light)
+    told_of = (choice, told, said, total, constants, light, read_geometry(summary))
+    return Reconstruction(found, method, energy, oversample, timing, done, *told_of)
 
 
 @dataclass
@@ -181,20 +185,18 @@ class _Run:
         """Look at the folder, and at what of the run is there already; writes nothing."""
         self._config, self.asked = config, self.method.kind
         self._keeper = Keeper(self.task.scan, mixed=isinstance(self.method, Auto))
-        if self.folder is None:
+        if self.folder is None or not _look_at(self.folder, config, resume):
             return
-        if not (resume and self.folder.config.is_file()):
-            self.folder.require_new(advise_resume=not resume)
-            return
-        require_same(self.folder, config)
         self._saved = self.folder.load_checkpoint()
         if self._saved:
             self.timing |= self._saved["timing"]
             self._keeper.load(self._saved["kept"])
 
-    def settle(self, matter: MatterKind | None, uncertain: Uncertain, scan: Scan) -> None:
+    def settle(
+        self, matter: MatterKind | None, uncertain: Uncertain, scan: Scan, geometry: Geometry | None = None
+    ) -> None:
         """Decide on what is uncertain, on the kind of matter, and on the method where that is `auto`; or do as was
-        decided before. scan: the whole one, with its test frames."""
+        decided before. scan: the whole one, with its test frames, in the `geometry` of its training frames."""
         began = time.perf_counter()
         if self._saved and self.folder is not None:
             found = Settled.again(self.method, self.folder.read_config()["decided"])
@@ -204,7 +206,8 @@ class _Run:
         self.method, self.why, self.constants = found.method, found.why, found.constants
         self.task = found.task(self.task)
         self._keeper.train = self.task.scan
-        self._config["decided"] = found.as_table() | {"scan_hash": scan_hash(found.placed(scan))}
+        where = {} if geometry is None else {"geometry": geometry.as_dict()}
+        self._config["decided"] = found.as_table() | {"scan_hash": scan_hash(found.placed(scan))} | where
 
     def complete(self) -> Reconstruction:
         """Run what is left of the stages."""
@@ -281,7 +284,7 @@ class _Run:
             write_object(self.folder.object, found)
             if self.task.uneven is not None and self.task.uneven.background is not None:
                 write_light(self.folder.light, self.task.uneven.background)
-            write_json(self.folder.summary, _summary(done, fit, self.task.scan) | {"light": self.task.light_in_words})
+            write_json(self.folder.summary, summary_of(done, fit, self.task.scan) | {"light": self.task.light_in_words})
         return done
 
 
@@ -343,49 +346,3 @@ class _Journal:
 
 def _restored(saved: dict[str, Any]) -> Stored:
     return KINDS[saved["kind"]].from_state(saved["state"])
-
-
-def _summary(done: Reconstruction, fit: Running | None, train: Scan) -> dict[str, Any]:
-    (h, w), matter = train.views.shape, done.object.matter
-    backend = fit.backend if fit else done.object.backend
-    second = matter.second and {"delta": matter.second.delta, "beta": matter.second.beta}
-    return {
-        "finished": done.finished,
-        "method": done.method,
-        **done.choice.as_dict(),
-        "kind": done.object.kind,
-        "size": done.object.described,
-        "backend": backend,
-        "device": device_name(backend),
-        "steps": fit.step if fit else 0,
-        "stopped_early": bool(fit and fit.stopped_early),
-        "best_step": (fit.best_step or fit.step) if fit else 0,
-        "oversample": done.oversample,
-        "detector": {
-            **{"rows": h, "columns": w, "pixel_size_m": train.views.pixel_size},
-            "centre_m": Grid.of_views(train.views).centre.tolist(),
-        },
-        "energy_kev": done.energy_kev,
-        "material": {
-            "delta": matter.delta,
-            "beta": matter.beta,
-            "single": matter.single,
-            "delta_told": done.delta_told,
-        },
-        "second_material": second,
-        "timing_s": done.timing,
-        "constants": [to_table(each) for each in done.constants],
-        **({"verdict": done.verdict.as_dict()} if done.verdict else {}),
-        **({"total": done.total.as_dict()} if done.total else {}),
-    }
-
-
-def _config(scan: Scan, prior: MaterialPrior, method: Method, seed: int, matter: MatterKind | None) -> dict[str, Any]:
-    return {
-        "schema_version": SCHEMA,
-        "method": to_table(method),
-        "prior": prior.as_dict(),
-        "matter": matter or "auto",
-        "seed": seed,
-        "scan_hash": scan_hash(scan),
-    }

@@ -20,6 +20,7 @@ RESUMED_WITH = {
     "seed": "seed (--seed)",
     "light": "light (--light, --air)",
     "uncertain": "ranges (--distance, --energy-kev, --delta-beta)",
+    "refine": "refinement (--refine, --uncertain-…)",
 }
 """What must not change between the parts of a run, as messages call it."""
 
@@ -29,6 +30,7 @@ def require_same(folder: RunFolder, config: dict[str, Any]) -> None:
     old, same = folder.read_config(), json.loads(json.dumps(config))
     for name, default in (("light", LightOptions()), ("uncertain", Uncertain())):
         old.setdefault(name, json.loads(json.dumps(to_table(default))))
+    old.setdefault("refine", None)
     version = old.get("schema_version", 1)
     require(
         version == SCHEMA,

@@ -1,0 +1,101 @@
+"""`reconstruct` of beams that are not where they say: poses of training frames before the matter, of held-out after."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..align.geometry import Geometry
+from ..align.held_out import place_frames
+from ..align.poses import PoseOptions
+from ..align.views import KINDS, align_views
+from ..checks import require
+from ..io.json import read_json, write_json
+from ..matter import MaterialPrior
+from ..methods.uncertain import Uncertain
+from ..optics.background import LightOptions
+from ..progress import Progress
+from ..representations import Stored
+from ..scan import Scan
+from .provenance import scan_hash
+from .run_folder import RunFolder
+from .run_light import light_of
+
+STILL = 1e-6
+"""Changes [pixels, degrees, share] of the training frames below which their kind stays as planned for all frames."""
+
+
+def require_compatible(ranges: Uncertain) -> None:
+    """`InputError` where the constants of the frames themselves are uncertain, too."""
+    stray = [name for name in ("distance", "energy_kev") if name in ranges.given()]
+    require(
+        not stray,
+        f"--refine needs the distance and energy of the plan, but {' and '.join(stray)} is said as a range; give "
+        "one of them, and refine the distance after that.",
+    )
+
+
+def trained_geometry(
+    scan: Scan, prior: MaterialPrior, options: PoseOptions, light: LightOptions, on_progress: Progress
+) -> Geometry:
+    """Where the training frames of `scan` are, by themselves alone; held-out ones are as planned."""
+    found = align_views(scan.train(), prior, options, light=light, on_progress=on_progress)
+    return Geometry.of_training(scan, found, options.uncertain)
+
+
+def saved_geometry(folder: RunFolder | None, resume: bool) -> Geometry | None:
+    """That of a run that goes on; None where there is none yet."""
+    if folder is None or not resume or not folder.config.is_file():
+        return None
+    table = folder.read_config().get("decided", {}).get("geometry")
+    return None if table is None else Geometry.from_dict(table)
+
+
+def with_held_out(
+    geometry: Geometry, scan: Scan, found: Stored, options: PoseOptions, light: LightOptions, on_progress: Progress
+) -> Geometry:
+    """`geometry` with the held-out frames of the planned `scan` where the matter that was `found` puts them.
+
+    What stayed as planned for all training frames stays so here. light: what is assumed of that of other frames.
+    """
+    at = np.flatnonzero(scan.is_test)
+    moved = {name: _moved(geometry.changes[~scan.is_test], KINDS[name]) for name in KINDS}
+    if not len(at) or not any(moved.values()):
+        return geometry
+    lit = light_of(scan, light)
+    if lit is not None:
+        scan = replace(scan, frames=lit.evened(torch.from_numpy(scan.frames)).numpy())
+    uncertain = replace(options.uncertain, **{name: 0.0 for name, free in moved.items() if not free})
+    return geometry.with_frames(at, place_frames(found, scan[at], replace(options, uncertain=uncertain), on_progress))
+
+
+def _moved(changes: np.ndarray, places: tuple[int, ...]) -> bool:
+    return bool(np.abs(changes[:, list(places)]).max() > STILL)
+
+
+def read_geometry(summary: Mapping[str, Any]) -> Geometry | None:
+    """That of a run's summary.json; None where nothing was refined."""
+    table = summary.get("geometry")
+    return None if table is None else Geometry.from_dict(table)
+
+
+def keep_geometry(folder: RunFolder, geometry: Geometry, scan: Scan) -> None:
+    """Write `geometry` into the folder of a finished run, and what the planned `scan` is with it."""
+    write_json(folder.summary, read_json(folder.summary) | {"geometry": geometry.as_dict()})
+    config = folder.read_config()
+    decided = config["decided"] | {"scan_hash": scan_hash(geometry.applied(scan))}
+    write_json(folder.config, config | {"decided": decided})
+
+
+def where_found(folder: RunFolder, scan: Scan) -> Scan:
+    """`scan` with the exposures that the run in `folder` found, if it is the one that was reconstructed, as planned."""
+    if not folder.summary.is_file():
+        return scan
+    geometry = read_geometry(read_json(folder.summary))
+    if geometry is None or scan_hash(scan) != folder.read_config().get("scan_hash"):
+        return scan
+    return geometry.applied(scan)

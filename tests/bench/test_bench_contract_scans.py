@@ -1,0 +1,64 @@
+"""The contract of methods, where less is known or views are unequal: a result, or the reason why there is none."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import holosplat as hs
+from helpers.contract import MATERIAL, PITCH, QUICK, QUICKER, SCENE, SHAPE, run, two_balls, usable
+from helpers.decisions import decided_once
+from holosplat.bench.method import Method
+from holosplat.bench.methods import METHODS
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _decided_once() -> Iterator[None]:
+    """All methods ask the same of the same frames: whether their matter has levels."""
+    with decided_once() as made:
+        yield
+    assert len(made) < len(METHODS)
+
+
+@pytest.fixture(scope="module")
+def scan() -> hs.Scan:
+    return two_balls()
+
+
+@pytest.fixture(scope="module")
+def unequal() -> hs.Scan:
+    """Four training frames with poses about no common axis, and one held out."""
+    views = hs.Views.from_rotations(Rotation.random(5, rng=3).as_matrix(), SHAPE, PITCH)
+    return hs.simulate(SCENE, hs.Exposures.of(views, 20.0, 0.02), oversample=2, is_test=np.arange(5) == 4)
+
+
+def result_or_reason(method: Method, scan: hs.Scan, prior: hs.MaterialPrior | None = None) -> hs.Object | str:
+    """What the method makes of the scan, or why it cannot."""
+    try:
+        return run(method, scan, prior=prior)
+    except hs.InputError as error:
+        return str(error)
+
+
+@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("kind", ["ratio", "free"])
+def test_a_method_does_without_the_material_or_says_why_not(name, scan, kind):
+    prior = hs.MaterialPrior.of_ratio(MATERIAL.ratio) if kind == "ratio" else hs.MaterialPrior.unknown()
+    found = result_or_reason(usable(name, QUICK), scan, prior)
+    if isinstance(found, str):
+        assert "material" in found
+        return
+    volume = found.voxelise(hs.Grid.of_views(scan.views))
+    assert np.abs(volume.delta).max() > 0.1 * MATERIAL.delta
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_unequal_views_are_used_or_refused(name, unequal):
+    found = result_or_reason(usable(name, QUICKER), unequal)
+    if isinstance(found, str):
+        assert "axis" in found
+        return
+    assert np.isfinite(found.voxelise(hs.Grid.of_views(unequal.views)).delta).all()

@@ -1,0 +1,51 @@
+"""What the tests of the contract of methods share: two balls, and the methods in a few steps."""
+
+from __future__ import annotations
+
+import importlib.util
+
+import numpy as np
+import pytest
+
+import holosplat as hs
+from holosplat.bench.method import Method
+from holosplat.bench.methods import methods
+from holosplat.specimens.red_cells import icosphere
+
+MATERIAL = hs.DeltaBeta(2e-7, 2e-10)
+PITCH = 1e-6
+SHAPE = (24, 31)
+QUICK = methods(effort=0.05) | {"neural-field": methods(effort=0.25)["neural-field"]}
+"""The same methods with a small part of their steps: the contract is about form, not about quality."""
+QUICKER = methods(effort=0.05)
+"""With a still smaller part, where finite numbers are all that is asked for."""
+NEEDS = {"paganin-svmbir": "svmbir"}
+"""Methods that need a package of the extra `bench`."""
+
+
+def ball(centre: tuple[float, float, float], radius: float) -> hs.TriangleMesh:
+    """A ball [pixels]."""
+    vertices, faces = icosphere(3)
+    return hs.TriangleMesh(PITCH * (radius * vertices + np.array(centre)), faces)
+
+
+SCENE = hs.MeshScene.of_one_material([ball((-6, 2, 3), 5), ball((7, -3, -4), 4)], MATERIAL)
+
+
+def two_balls() -> hs.Scan:
+    """Six training frames of two balls, and two held out."""
+    exposures = hs.Exposures.of(hs.Views.evenly_spaced(8, SHAPE, PITCH), 20.0, 0.02)
+    return hs.simulate(SCENE, exposures, oversample=2)
+
+
+def usable(name: str, methods: dict[str, Method]) -> Method:
+    """The method, if what it needs is installed; else the test is skipped."""
+    package = NEEDS.get(name)
+    if package and importlib.util.find_spec(package) is None:
+        pytest.skip(f"{package} is not installed")
+    return methods[name]
+
+
+def run(method: Method, scan: hs.Scan, seed: int = 0, prior: hs.MaterialPrior | None = None) -> hs.Object:
+    known = hs.MaterialPrior.known(MATERIAL)
+    return method.run(scan.train(), prior or known, seed, lambda stage, fraction: None)
