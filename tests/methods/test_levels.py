@@ -71,6 +71,17 @@ def test_noise_that_hides_levels_leaves_the_decision_to_what_is_known(sharp):
     }
 
 
+def test_in_noise_a_flat_inside_should_do_good(soft, sharp):
+    """If it does harm, matter is continuous; of what is known to have a level that is noise."""
+    rng = np.random.default_rng(1)
+    for scan, matter in ((soft, "continuous"), (sharp, "undecided")):
+        noise = 0.5 * float(np.sqrt(np.square(scan.frames - 1).mean()))
+        hidden = replace(scan, frames=scan.frames + rng.normal(0, noise, scan.frames.shape).astype(np.float32))
+        found = decide_matter(Task(hidden, RATIO))
+        assert (found.matter if found.sure else "undecided") == matter
+        assert decide_matter(Task(hidden, MaterialPrior.known(MATERIAL))).matter == "levels"
+
+
 def test_in_uneven_light_a_known_material_has_levels(soft):
     """What a flat inside leaves may be light then; a known ratio stays what the frames say."""
     rows = soft.frames.shape[1]

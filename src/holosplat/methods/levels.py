@@ -40,7 +40,8 @@ class LevelTest:
     same: float = 1.02
     """Factor up to which a flat inside does no harm, and matter has levels."""
     noisy: float = 0.35
-    """Share of noise from which on a flat inside that does no harm says nothing: there, flattening is denoising."""
+    """Share of noise from which on a flat inside that does no harm says nothing: there, flattening is denoising. One
+    that does harm all the same says that matter is continuous."""
     validation: CrossValidation = field(default_factory=CrossValidation)
     """How views are set aside."""
     volume: HolographicTV = field(default_factory=lambda: HolographicTV(upper=0.0, refine=1))
@@ -97,6 +98,10 @@ def _decided(task: Task, free: _Misfit, flat: list[_Misfit], noisy: bool, option
         return replace(_undecided(task, f"{said} in uneven light, of which most of it may be"), factor=least)
     if least > options.worse:
         return Decision("continuous", said, factor=least)
+    if least > options.same and noisy and not isinstance(task.prior, Known):
+        return Decision(
+            "continuous", f"{said}, and in noise it should leave less, for it takes noise away", factor=least
+        )
     if worst <= options.same and not noisy:
         return Decision("levels", said, factor=least)
     return replace(_undecided(task, said), factor=least)
