@@ -12,12 +12,12 @@ from tyro.conf import Positional
 
 from ..checks import require
 from ..io.reading import Reading
-from ..matter import Known, KnownRatio, MaterialPrior
 from .options import LightFlags, PriorOptions
 from .progress import ProgressBar
 
 if TYPE_CHECKING:
     from ..align import AlignedViews, PoseOptions
+    from ..matter import MaterialPrior
     from ..optics.background import LightOptions
     from ..scan import Exposures, Scan
 
@@ -153,6 +153,8 @@ def _write_table(path: Path, found: AlignedViews) -> None:
 
 def _ratio(prior: MaterialPrior) -> float | None:
     """δ/β, where it is known and positive."""
+    from ..matter import Known, KnownRatio
+
     if isinstance(prior, KnownRatio):
         return prior.ratio
     if isinstance(prior, Known) and prior.materials[0].beta > 0:
