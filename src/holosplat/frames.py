@@ -85,6 +85,24 @@ class Binned(Frames):
         return found
 
 
+class Divided(Frames):
+    """Other frames over `light`, [1, H, W] for all or [N, H or 1, W] for each."""
+
+    def __init__(self, frames: Frames, light: np.ndarray) -> None:
+        self._frames, self._light = frames, light
+        self.shape = frames.shape
+
+    def read(self, numbers: np.ndarray) -> np.ndarray:
+        """See `Frames.read`."""
+        light = self._light if len(self._light) == 1 else self._light[numbers]
+        return self._frames.read(numbers) / light
+
+
+def divided(frames: np.ndarray | Frames, light: np.ndarray) -> np.ndarray | Frames:
+    """Frames over `light`, as `Divided`: of an array at once, of others when they are read."""
+    return frames / light if isinstance(frames, np.ndarray) else Divided(frames, light)
+
+
 def picked(frames: np.ndarray | Frames, index: Index) -> np.ndarray | Frames:
     """The frames `index` [K]: of an array the array's own, of others those that will be read."""
     return frames[index] if isinstance(frames, np.ndarray) else Picked(frames, index)

@@ -1,12 +1,32 @@
-"""A recorder of what a method is given."""
+"""What tests of the benchmark share: a recorder of what a method is given, and the frames of the contract."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import pytest
 
+import holosplat as hs
 from helpers.bench_shop import Recorder
+from helpers.contract import two_balls
+from helpers.decisions import decided_once
+from holosplat.bench.methods import METHODS
 
 
 @pytest.fixture
 def recorder() -> Recorder:
     return Recorder()
+
+
+@pytest.fixture(scope="module")
+def scan() -> hs.Scan:
+    """The frames of the contract of methods."""
+    return two_balls()
+
+
+@pytest.fixture(scope="module")
+def decided() -> Iterator[None]:
+    """All methods ask the same of the same frames: whether their matter has levels."""
+    with decided_once() as made:
+        yield
+    assert len(made) < len(METHODS)

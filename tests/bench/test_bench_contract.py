@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,24 +9,12 @@ import pytest
 import torch
 
 import holosplat as hs
-from helpers.contract import MATERIAL, PITCH, QUICK, SCENE, SHAPE, run, two_balls, usable
-from helpers.decisions import decided_once
+from helpers.contract import MATERIAL, PITCH, QUICK, SCENE, SHAPE, run, usable
 from holosplat.bench.method import Method
 from holosplat.bench.methods import METHODS
 from holosplat.model import Instrument, Model
 
-
-@pytest.fixture(scope="module", autouse=True)
-def _decided_once() -> Iterator[None]:
-    """All methods ask the same of the same frames: whether their matter has levels."""
-    with decided_once() as made:
-        yield
-    assert len(made) < len(METHODS)
-
-
-@pytest.fixture(scope="module")
-def scan() -> hs.Scan:
-    return two_balls()
+pytestmark = pytest.mark.usefixtures("decided")
 
 
 @dataclass

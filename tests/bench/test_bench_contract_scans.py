@@ -2,30 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
-from helpers.contract import MATERIAL, PITCH, QUICK, QUICKER, SCENE, SHAPE, run, two_balls, usable
-from helpers.decisions import decided_once
+from helpers.contract import MATERIAL, PITCH, QUICK, QUICKER, SCENE, SHAPE, run, usable
 from holosplat.bench.method import Method
 from holosplat.bench.methods import METHODS
 
-
-@pytest.fixture(scope="module", autouse=True)
-def _decided_once() -> Iterator[None]:
-    """All methods ask the same of the same frames: whether their matter has levels."""
-    with decided_once() as made:
-        yield
-    assert len(made) < len(METHODS)
-
-
-@pytest.fixture(scope="module")
-def scan() -> hs.Scan:
-    return two_balls()
+pytestmark = pytest.mark.usefixtures("decided")
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..checks import InputError, require
-from ..frames import Frames
+from ..frames import divided
 
 if TYPE_CHECKING:
     from ..geometry import Views
@@ -58,19 +58,6 @@ class Tube:
 
     def taken_out_of(self, scan: Scan) -> Scan:
         """The scan as if without the tube, whose light is divided out of every frame."""
-        source, light = scan.source, self.transmission(scan.views)[:, None, :].astype(np.float32)
-        frames = _WithoutTube(source, light) if isinstance(source, Frames) else source / light
+        frames = divided(scan.source, self.transmission(scan.views)[:, None, :].astype(np.float32))
         said = {"tube": f"{self.inner:g} m to {self.outer:g} m, {self.attenuation:g} per metre, divided out"}
         return scan.of(frames, scan.exposures, scan.is_test, scan.provenance | said)
-
-
-class _WithoutTube(Frames):
-    """Other frames, divided by `light` [N, 1, W] when they are read."""
-
-    def __init__(self, frames: Frames, light: np.ndarray) -> None:
-        self._frames, self._light = frames, light
-        self.shape = frames.shape
-
-    def read(self, numbers: np.ndarray) -> np.ndarray:
-        """See `Frames.read`."""
-        return self._frames.read(numbers) / self._light[numbers]

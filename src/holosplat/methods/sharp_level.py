@@ -15,10 +15,10 @@ def material_of_levels(task: Task, backend: Backend = "cpu", options: MaterialEs
     """The `assumed_material` of a task; where a level bounds its matter and has to be found, that of the likeliest
     volume.
 
-    Tomography takes noise off its volume, and with it much of the level: it has 0.8 of it left in noise of a fifth of
-    the contrast, and half in noise of half of it. The likeliest volume under noise and prior (`SmoothVolume`, on
-    frames of at most `options.width` pixels) keeps it, for its prior hardly shrinks what is large
-    (docs/data/level.csv). Where that volume is empty, the material is that of tomography.
+    Tomography takes noise off its volume, and with it a tenth to a third of the level in noise of a fifth of the
+    contrast, and a third to a half in noise of half of it. The likeliest volume under noise and prior
+    (`SmoothVolume`, on frames of at most `options.width` pixels) keeps it, for its prior hardly shrinks what is
+    large (docs/data/level.csv). Where that volume is empty, the material is that of tomography.
     """
     material = assumed_material(task.scan, task.prior, task.on_progress, backend, options)
     if not (task.bounded and isinstance(task.prior, KnownRatio)):

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..baselines import HolographicTV, holographic_tv
 from ..checks import require
-from ..frames import Frames
+from ..frames import divided
 from ..matter import MaterialPrior, Matter
 from ..methods.assumed import assumed_material
 from ..model import measure
@@ -82,19 +82,5 @@ def evened(
 ) -> Scan:
     """The scan with all its frames, held-out ones too, divided by the `still_light` of those for training."""
     light = still_light(scan, prior, options, on_progress)
-    source = scan.source
-    frames = _Evened(source, light) if isinstance(source, Frames) else source / light
     said = {"still_light": f"{np.log(light).std():.2%} (rms), order {options.order}, divided out"}
-    return Scan.of(frames, scan.exposures, scan.is_test, scan.provenance | said)
-
-
-class _Evened(Frames):
-    """Other frames, divided by `light` [H, W] when they are read."""
-
-    def __init__(self, frames: Frames, light: np.ndarray) -> None:
-        self._frames, self._light = frames, light
-        self.shape = frames.shape
-
-    def read(self, numbers: np.ndarray) -> np.ndarray:
-        """See `Frames.read`."""
-        return self._frames.read(numbers) / self._light
+    return Scan.of(divided(scan.source, light[None]), scan.exposures, scan.is_test, scan.provenance | said)
