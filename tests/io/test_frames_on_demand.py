@@ -15,7 +15,7 @@ import pytest
 import holosplat.frames as frames_module
 import holosplat.io.raw_file as raw_file
 from holosplat.checks import InputError
-from holosplat.frames import Binned, Frames, Picked
+from holosplat.frames import Binned, Frames, Picked, divided
 from holosplat.geometry import Views, rotation_y
 from holosplat.io.nxtomo import RawLayout, read_scan, scan_writer, write_scan
 from holosplat.scan import Exposures, Scan
@@ -189,3 +189,14 @@ def test_picked_and_binned_frames_can_be_stacked(stored):
     twice = Picked(Picked(source, slice(2, None, 2)), np.array([3, 1]))
     np.testing.assert_array_equal(np.asarray(twice), wanted[[8, 4]])
     np.testing.assert_array_equal(Binned(twice, 3)[:], a_series()[[8, 4]].binned(3).frames)
+
+
+@pytest.mark.parametrize("shape", [(1, *SHAPE), (N, *SHAPE), (N, 1, SHAPE[1])], ids=["still", "each", "by column"])
+def test_frames_are_divided_by_the_light_of_their_numbers(stored, shape):
+    light = np.random.default_rng(1).uniform(0.5, 2, shape).astype(np.float32)
+    series, found = a_series(), divided(read_scan(stored).source, light)
+    assert isinstance(found, Frames)
+    whole = divided(series.frames, light)
+    np.testing.assert_array_equal(whole, series.frames / light)
+    np.testing.assert_array_equal(found[[7, 2]], whole[[7, 2]])
+    np.testing.assert_array_equal(np.asarray(found), whole)
