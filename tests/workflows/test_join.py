@@ -53,9 +53,9 @@ def beams(folder: Path) -> tuple[Path, Path]:
     return paths
 
 
-def test_beams_are_joined_on_the_coarsest_pixels_of_the_common_field(tmp_path):
+def test_beams_are_joined_on_pixels_of_one_size_over_the_common_field(tmp_path):
     paths = beams(tmp_path)
-    join(paths, tmp_path / "scan.nxs", flips=("none", "columns"))
+    join(paths, tmp_path / "scan.nxs", PIXEL, ("none", "columns"))
     found = read_scan(tmp_path / "scan.nxs")
     assert (found.views.shape, found.views.pixel_size) == ((62, 75), PIXEL)
     assert found.exposures.distance.tolist() == [0.1] * 4 + [0.15] * 2

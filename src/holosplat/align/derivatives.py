@@ -38,7 +38,7 @@ def predicted(volume: Tensor, grid: Grid, exposures: Exposures, material: DeltaB
 
     Derivatives by the pose are those of `projections`, carried through the wave optics by small differences.
     """
-    pixel = exposures.views.pixel_size
+    pixel = exposures.views.finest
     lines, slopes = projections(volume, grid, in_pixels(exposures.views))
     instrument = Instrument(exposures, oversample)
 
@@ -86,5 +86,5 @@ def slopes(images: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def in_pixels(views: Views) -> Views:
-    """The same views with the pixel as the unit of length."""
-    return Views(views.rotations, views.shifts / views.pixel_size, views.shape, 1.0)
+    """The same views with the (smallest) pixel as the unit of length."""
+    return views.in_units_of(views.finest)
