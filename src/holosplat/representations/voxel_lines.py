@@ -15,8 +15,8 @@ from ..geometry import Grid, Poses, Views
 from ..projectors.voxels import LatticeProjector, SliceProjector
 
 SAME = 0.9
-"""Share of the pitch that pixels may have with voxels as on pixels of the pitch: views that are found to be magnified by
-some per cent keep their voxels."""
+"""Share of the pitch that pixels may have with voxels as on pixels of the pitch: views that are found to be magnified
+by some per cent keep their voxels."""
 
 Axis = tuple[int, float, float]
 """A row of cells: their count, their size [m], and the centre of the first one [m]."""
