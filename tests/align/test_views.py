@@ -16,7 +16,7 @@ from holosplat.align import AlignedViews, PoseOptions, Uncertain, align_views
 from holosplat.align.coarse import mirrored, shifts_by_mass
 from holosplat.align.derivatives import NUMBERS, Predicted, projections
 from holosplat.align.gauge import moved_onto
-from holosplat.align.newton import blurred, step
+from holosplat.align.newton import Normal, blurred, step
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
@@ -216,17 +216,17 @@ def test_a_step_solves_a_linear_problem_and_the_prior_holds_back():
     measured = torch.einsum("vk,vkhw->vhw", true.float(), columns) + 1e-3 * torch.randn(2, 35, 45, generator=r)
     here, nothing = Predicted(torch.zeros(2, 35, 45), columns), torch.zeros_like(true)
     wide = torch.full((len(NUMBERS),), 10.0, dtype=torch.float64)
-    first = step(measured, here, nothing, wide, 1.0)
+    first = step(Normal.of(measured, here, 1.0), nothing, wide)
     then = Predicted(torch.einsum("vk,vkhw->vhw", first.numbers.float(), columns), columns)
-    second = step(measured, then, first.numbers, wide, 1.0)
+    second = step(Normal.of(measured, then, 1.0), first.numbers, wide)
     torch.testing.assert_close(second.numbers, true, atol=2e-3, rtol=0)
     assert float(((second.numbers - true) ** 2 / second.covariances.diagonal(dim1=1, dim2=2)).mean()) < 4
     held = wide.clone()
     held[2] = 0
-    kept = step(measured, here, nothing, held, 1.0)
+    kept = step(Normal.of(measured, here, 1.0), nothing, held)
     assert not kept.numbers[:, 2].any()
     assert not kept.covariances[:, 2].any()
-    narrow = step(measured, here, nothing, torch.full_like(wide, 1e-6), 1.0)
+    narrow = step(Normal.of(measured, here, 1.0), nothing, torch.full_like(wide, 1e-6))
     assert float(narrow.numbers.abs().max()) < 1e-3
 
 

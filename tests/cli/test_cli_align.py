@@ -99,11 +99,12 @@ def test_refinements_that_make_no_sense_are_refused(shop, tmp_path, options, sai
 def test_single_views_are_moved_and_told(shop, tmp_path):
     """Of the shared scan, whose views are said to be moved by a pixel."""
     scan = read_scan(shop.scan)
-    path, out, table = (tmp_path / name for name in ("moved.nxs", "aligned.nxs", "views.csv"))
+    path, out, table, beams = (tmp_path / name for name in ("moved.nxs", "aligned.nxs", "views.csv", "geometry.toml"))
     planned = read_scan(moved(shop, path)).views.shifts
     matter = ("--material", FORMULA, "--density", "1.335")
     unsure = ("--uncertain-shift", 2, "--uncertain-angle", 0, "--uncertain-roll", 0)
-    done = worked(holosplat("align", path, *matter, *unsure, "--table", table, "--out", out))
+    written = ("--table", table, "--geometry-out", beams, "--out", out)
+    done = worked(holosplat("align", path, *matter, *unsure, *written))
     assert "changes of the plan" in done.out
     found = read_scan(out)
     np.testing.assert_array_equal(found.frames, scan.frames)
@@ -115,6 +116,21 @@ def test_single_views_are_moved_and_told(shop, tmp_path):
     assert len(rows) == len(scan)
     assert float(rows[0]["after"]) < float(rows[0]["before"])
     assert found.provenance["aligned"].startswith("changes of the plan")
+    worked(holosplat("convert", path, tmp_path / "there.nxs", "--to", "nxtomo", "--exposures", beams))
+    there = read_scan(tmp_path / "there.nxs")
+    np.testing.assert_allclose(there.views.shifts, found.views.shifts, atol=1e-15)
+    np.testing.assert_allclose(there.views.rotations, found.views.rotations, atol=1e-15)
+
+
+def test_the_geometry_of_a_part_is_that_of_whole_frames(turning, tmp_path):
+    """It is found on larger pixels of fewer rows and columns, and serves the whole scan."""
+    (path, true), beams, out = turning, tmp_path / "geometry.toml", tmp_path / "whole.nxs"
+    part = ("--crop", "2:22,4:46", "--bin", 2)
+    worked(holosplat("align", path, "--axis-only", *part, "--geometry-out", beams, "--out", tmp_path / "part.nxs"))
+    worked(holosplat("convert", path, out, "--to", "nxtomo", "--exposures", beams))
+    np.testing.assert_allclose(read_scan(out).views.shifts, true.views.shifts, atol=0.1 * PIXEL)
+    few = ("--views", "0:36:2", "--geometry-out", beams)
+    refused(holosplat("align", path, "--axis-only", *few, "--out", tmp_path / "few.nxs"), "--geometry-out", "--views")
 
 
 def test_requests_that_cannot_be_met_are_refused(turning, tmp_path):

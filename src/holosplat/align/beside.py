@@ -14,7 +14,7 @@ from ..progress import Advance
 from ..representations import Stored
 from ..scan import Exposures
 from .derivatives import NUMBERS, Predicted
-from .newton import Step, step
+from .newton import Normal, Step, step
 
 SMALL = (0.05, 0.05, 1e-3, 1e-3, 1e-3, 0.01)
 """Steps by which derivatives of frames are taken: shifts [pixels], turns [rad], logarithm of the distance."""
@@ -70,7 +70,8 @@ class Beside:
         """
         found = Step(numbers, torch.zeros(len(numbers), len(NUMBERS), len(NUMBERS), dtype=torch.float64))
         for done in range(max(1, steps)):
-            moved = step(measured, self.predicted(found.numbers), found.numbers, expected, BLUR)
+            normal = Normal.of(measured, self.predicted(found.numbers), BLUR)
+            moved = step(normal, found.numbers, expected)
             found = moved if steps else replace(moved, numbers=numbers)
             tell((done + 1) / max(1, steps))
         return found

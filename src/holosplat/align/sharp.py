@@ -77,7 +77,7 @@ def sharpened(scan: Scan, numbers: Tensor, start: SurfaceMesh, search: PoseOptio
     found = numbers.clone()
     found[train, :FLUX] = numbers_of(model.alignment.exposures(begin.exposures), scan.exposures[train])
     beside = Beside(model.object, scan.exposures, oversampling(begin, options))
-    expected = uncertain.deviations(1.0)
+    expected = uncertain.deviations()
     expected[DISTANCE] = uncertain.distance
     moved = beside.placed(frames, found, expected, tell=lambda part: on_progress(FITTED + (1 - FITTED) * part))
     after = moved.numbers.clone()

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import csv
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
 from ..checks import require
-from ..io.reading import Reading
+from ..io.reading import Part, Reading
 from .options import LightFlags, PriorOptions
 from .progress import ProgressBar
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from ..align import AlignedViews, PoseOptions
     from ..matter import MaterialPrior
     from ..optics.background import LightOptions
@@ -86,6 +88,7 @@ def align(
     illumination: LightFlags = LIGHT,
     axis_only: bool = False,
     table: Path | None = None,
+    geometry_out: Path | None = None,
 ) -> None:
     """Find where the beams of a scan really are, and write the same frames with other exposures.
 
@@ -94,24 +97,32 @@ def align(
         out: Scan file to write (NXtomo).
         axis_only: The object turns about one axis; find its column, and how it leans in the image, in seconds.
         table: Also write what was found of each view, with errors (CSV).
+        geometry_out: Also write the geometry of all beams (TOML), which --exposures takes for other scans of them.
     """
     from ..io.atomic import require_apart, require_writable
     from ..io.formats import read_as
     from ..io.nxtomo import write_scan
     from ..scan import Scan
 
-    for path in (out, *([table] if table else [])):
+    for path in (out, *([table] if table else []), *([geometry_out] if geometry_out else [])):
         require_writable(path)
         require_apart(path, scan)
     require(table is None or not axis_only, "--table is of single views; leave it, or --axis-only.")
+    require(geometry_out is None or reading.part.views is None, "--geometry-out is of all frames; leave --views.")
     measured = read_as(scan, reading).in_memory()
     prior = matter.prior(measured.exposures.reference_energy)
+    errors = None
     if axis_only:
         lines, exposures = _axis(measured, prior, illumination.options())
     else:
-        lines, exposures = _views(measured, prior, unknown.options(), illumination.options(), table)
+        found = _views(measured, prior, unknown.options(), illumination.options())
+        lines, exposures, errors = found.lines(), found.exposures, found.errors
+        if table is not None:
+            _write_table(table, found)
     for line in lines:
         print(line)
+    if geometry_out is not None:
+        _write_geometry(geometry_out, scan, reading, measured, exposures, errors, lines[0])
     facts = measured.provenance | {"aligned": lines[0]}
     write_scan(out, Scan.of(measured.source, exposures, measured.is_test, facts))
     print(f"wrote {out}: the same {len(measured)} frames, with other exposures", file=sys.stderr)
@@ -126,17 +137,31 @@ def _axis(scan: Scan, prior: MaterialPrior, light: LightOptions) -> tuple[list[s
     return axis.lines(), axis.applied(scan.exposures)
 
 
-def _views(
-    scan: Scan, prior: MaterialPrior, options: PoseOptions, light: LightOptions, table: Path | None
-) -> tuple[list[str], Exposures]:
+def _views(scan: Scan, prior: MaterialPrior, options: PoseOptions, light: LightOptions) -> AlignedViews:
     from ..align import align_views
 
     with ProgressBar() as bar:
         show = bar.show
-        found = align_views(scan, prior, options, light=light, on_progress=lambda stage, done: show(stage, done, {}))
-    if table is not None:
-        _write_table(table, found)
-    return found.lines(), found.exposures
+        return align_views(scan, prior, options, light=light, on_progress=lambda stage, done: show(stage, done, {}))
+
+
+def _write_geometry(
+    path: Path, source: Path, reading: Reading, measured: Scan, found: Exposures, errors: np.ndarray | None, said: str
+) -> None:
+    """That of whole frames: `found` is that of `measured`, which may be cut and have larger pixels."""
+    from ..io.beams import Beams, write_beams
+    from ..io.formats import read_as
+
+    whole = read_as(source, replace(reading, part=Part(time_frame=reading.part.time_frame))).exposures
+    shifts = whole.views.shifts + found.views.shifts - measured.views.shifts
+    views = replace(whole.views, rotations=found.views.rotations, shifts=shifts)
+    if errors is not None:
+        larger = measured.views.pixel_size / whole.views.pixel_size
+        errors = errors * [larger, larger, 1, 1, 1, 1]
+    origin = {"scan": str(source), "aligned": said}
+    beams = Beams.of(replace(whole, views=views, distance=found.distance), errors, origin)
+    write_beams(path, beams)
+    print(f"wrote {path}: the geometry of {len(beams)} beams, for --exposures", file=sys.stderr)
 
 
 def _write_table(path: Path, found: AlignedViews) -> None:

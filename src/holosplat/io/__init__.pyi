@@ -1,3 +1,6 @@
+from .beams import Beams as Beams
+from .beams import read_beams as read_beams
+from .beams import write_beams as write_beams
 from .formats import read as read
 from .nxtomo import read_scan as read_scan
 from .nxtomo import scan_writer as scan_writer

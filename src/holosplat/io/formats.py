@@ -44,7 +44,7 @@ def read(path: str | Path, given: Mapping[str, Any] | None = None) -> Scan:
 
 def read_as(path: str | Path, reading: Reading) -> Scan:
     """The scan at `path`, as `read`, with what is said of it beside its files, and cut to the part that is taken."""
-    return reading.applied(read(path, reading.told.given()))
+    return reading.applied(read(path, reading.told.given(loader_of(path).takes)))
 
 
 @contextmanager

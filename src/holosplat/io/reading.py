@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -14,12 +15,12 @@ from ..tables import from_table, to_table
 from .tube import Tube
 
 if TYPE_CHECKING:
-    from ..geometry import Views
     from ..scan import Scan
+    from .beams import Beams
 
 Sense = Literal["clockwise", "anticlockwise"]
 
-OWN_WAY = ("angles", "axis_column", "sense", "tube")
+OWN_WAY = ("angles", "axis_column", "sense", "tube", "exposures")
 """Fields of `Told` that no loader takes by their own name."""
 
 
@@ -35,6 +36,9 @@ class Told:
     """Effective pixel size [m] (default: as the files say)."""
     angles: Path | None = None
     """Text file of the frames' angles [degrees], one a line (default: as the files say)."""
+    exposures: Path | None = None
+    """geometry.toml of the beams, as align and calibrate write it, which goes before what files say: a view for each
+    frame, or for each frame of every time (default: as the files say)."""
     flats: Path | None = None
     """Images without the object: a file (TIFF, PNG, .npy) or a folder of them (default: as the files have them)."""
     darks: Path | None = None
@@ -73,22 +77,40 @@ class Told:
         """The same with the geometric mean of each range."""
         return replace(self, **{name: math.sqrt(low * high) for name, (low, high) in self.ranges().items()})
 
-    def given(self) -> dict[str, Any]:
+    def given(self, takes: Sequence[str] = ()) -> dict[str, Any]:
         """The values for a loader, by name (`Loader.takes`); angles as `angles_deg` [N].
 
-        Errors: `InputError` for ranges.
+        takes: what the loader would take from --exposures, too. Errors: `InputError` for ranges.
         """
         for name in self.ranges():
             option, text = f"--{name.replace('_', '-')}", getattr(self, name)
             raise InputError(f"{option} must be one number here, but it is {text!r}; a range is for reconstruct alone.")
         said = {name: value for name, value in vars(self).items() if value is not None and name not in OWN_WAY}
+        beams = self._beams()
+        said |= {name: value for name, value in (beams.scalars() if beams else {}).items() if name in takes}
         return said if self.angles is None else {**said, "angles_deg": read_angles(self.angles)}
 
-    def placed(self, views: Views) -> Views:
-        """The views with the rotation axis and the sense of rotation that are said."""
+    def placed(self, scan: Scan) -> Scan:
+        """The scan in the exposures of --exposures, or with the axis and the sense of rotation that are said."""
+        if (beams := self._beams()) is not None:
+            return beams.applied(scan)
+        views = scan.views
         if self.axis_column is not None:
             views = views.about_column(self.axis_column)
-        return views if self.sense == "clockwise" else views.turned_back()
+        views = views if self.sense == "clockwise" else views.turned_back()
+        return scan if views is scan.views else scan.with_views(views)
+
+    def _beams(self) -> Beams | None:
+        """What --exposures names. Errors: `InputError` for options that say the same."""
+        if self.exposures is None:
+            return None
+        from .beams import read_beams  # needs torch, which reading an option does not
+
+        beams, usual = read_beams(self.exposures), Told()
+        twice = ["axis_column", "sense", *beams.scalars()]
+        for name in (name for name in twice if getattr(self, name) != getattr(usual, name)):
+            raise InputError(f"--exposures {self.exposures} says it already; leave --{name.replace('_', '-')}.")
+        return beams
 
 
 @dataclass(frozen=True)
@@ -134,8 +156,7 @@ class Reading:
 
     def applied(self, scan: Scan) -> Scan:
         """A scan that a loader has read, with its axis and sense of rotation, and cut to the part that is taken."""
-        views = self.told.placed(scan.views)
-        scan = scan if views is scan.views else scan.with_views(views)
+        scan = self.told.placed(scan)
         return self.part.of(scan if self.told.tube is None else Tube.parsed(self.told.tube).taken_out_of(scan))
 
     def as_table(self) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from .loader import Loader, folder_with
 from .reading import Reading
 from .table import Table
 
-SOURCE = "source.json"
+SOURCE, SUMMARY = "source.json", "summary.json"
 
 ReadAs = Callable[[Path, Reading], Scan]
 """Opens a scan of any format, read in a certain way."""
@@ -36,13 +36,27 @@ def run_source(scan: Path, reading: Reading) -> dict[str, object]:
 def read_run_scan(path: str | Path, read_as: ReadAs) -> Scan:
     """The scan of the run folder `path`, read as the run read it: its frames of the time that the run is of, too.
 
-    Errors: `InputError` when the scan is no longer there or cannot be read.
+    Where the run refined the geometry, its frames are where it found them. Errors: `InputError` when the scan is no
+    longer there or cannot be read.
     """
     table = Table.read(Path(path) / SOURCE)
     scan = Path(table.text("scan"))
     there = scan.exists() and scan.resolve() != Path(path).resolve()
     require(there, f"{table.label('scan')} must name the run's scan, but {scan} is not there or none; name another.")
-    return read_as(scan, run_reading(path))
+    return _where_found(Path(path) / SUMMARY, read_as(scan, run_reading(path)))
+
+
+def _where_found(summary: Path, scan: Scan) -> Scan:
+    """`scan` with the exposures that `summary` has, if the run found any; errors: `InputError` for other frames."""
+    found = Table.read(summary).values.get("geometry") if summary.is_file() else None
+    if found is None:
+        return scan
+    table, n = Table(summary, found, "geometry."), len(scan)
+    rotations, shifts = table.numbers("rotations", (n, 3, 3)), table.numbers("shifts", (n, 2))
+    planned = scan.exposures
+    views = replace(planned.views, rotations=rotations, shifts=shifts)
+    exposures = replace(planned, views=views, distance=table.numbers("distance", (n,)))
+    return Scan.of(scan.source, exposures, scan.is_test, scan.provenance)
 
 
 def loader(read_as: ReadAs) -> Loader:

@@ -1,0 +1,232 @@
+"""`geometry.toml`: where beams look from, in a file that people read and write, for any scan of these beams."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..checks import InputError, require, shaped
+from ..geometry import Views, rotation_tilted
+from ..scan import Exposures, Scan
+from ..tables import from_table, read_table
+from .atomic import atomic_path
+
+FORMAT = "holosplat geometry 1"
+ERRORS = ("shift_px", "turn_deg", "distance_share")
+
+Pair = tuple[float, float]
+Triple = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class ViewErrors:
+    """Standard errors of what was found of a view."""
+
+    shift_px: Pair = (0.0, 0.0)
+    """Shifts along rows and columns [pixels]."""
+    turn_deg: Triple = (0.0, 0.0, 0.0)
+    """Turns about x and y, across the beam, and z, the roll [degrees]."""
+    distance_share: float = 0.0
+    """Distance, as a share of it."""
+
+
+@dataclass(frozen=True)
+class BeamView:
+    """One view of the file, an entry `[[view]]`; what is left out stays as the scan says."""
+
+    rotation: tuple[Triple, Triple, Triple] | None = None
+    """Rows of R, `x_lab = R x_obj`."""
+    angle_deg: float | None = None
+    """Or: the angle about y [degrees]."""
+    tilt_deg: float | None = None
+    """With it: how far the beam leaves the plane normal to y [degrees]."""
+    shift_m: Pair | None = None
+    """Detector's shift (sx, sy) [m]."""
+    shift_px: Pair | None = None
+    """Or: the shift [pixels]."""
+    distance_m: float | None = None
+    """Effective propagation distance [m]."""
+    energy_kev: float | None = None
+    """Photon energy [keV]."""
+    pixel_size_m: float | None = None
+    """Effective pixel size [m], of all views or of none."""
+    error: ViewErrors | None = None
+    """Standard errors, which are kept and not used."""
+
+    def __post_init__(self) -> None:
+        given = (self.rotation is not None) + (self.angle_deg is not None)
+        require(given == 1, "a view must have either rotation or angle_deg; give one of the two.")
+        require(self.tilt_deg is None or self.angle_deg is not None, "tilt_deg goes with angle_deg; give both.")
+        require(self.shift_m is None or self.shift_px is None, "a view has shift_m or shift_px; leave one of the two.")
+
+    def matrix(self) -> np.ndarray:
+        """R [3, 3]."""
+        if self.angle_deg is not None:
+            return rotation_tilted([self.angle_deg], [self.tilt_deg or 0.0])[0]
+        return np.array(self.rotation)
+
+
+@dataclass(frozen=True)
+class _File:
+    """What the file holds beside `made_by`."""
+
+    format: str
+    view: tuple[BeamView, ...] = ()
+
+
+@dataclass(frozen=True)
+class Beams:
+    """The geometry of V beams; made_by: texts on its origin, by name."""
+
+    view: tuple[BeamView, ...]
+    format: str = FORMAT
+    made_by: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        require(self.format == FORMAT, f"format must be {FORMAT!r}, but it is {self.format!r}; correct it.")
+        require(len(self.view) > 0, "there must be a table [[view]] for each beam, but there is none.")
+        sizes = {each.pixel_size_m for each in self.view}
+        require(len(sizes) == 1, "pixel_size_m must be the same for all views, or for none; make it one.")
+        Views.from_rotations(np.array([each.matrix() for each in self.view]), (1, 1), 1.0)
+
+    def __len__(self) -> int:
+        return len(self.view)
+
+    @classmethod
+    def of(
+        cls, exposures: Exposures, errors: np.ndarray | None = None, made_by: Mapping[str, str] | None = None
+    ) -> Beams:
+        """Those of `exposures` [V]; errors: [V, 6] standard errors of shifts x, y [pixels], turns about x, y, z
+        [degrees], and the distance as a share of it."""
+        known = None if errors is None else shaped("errors", np.asarray(errors), (len(exposures), 6)).tolist()
+        views = []
+        for v in range(len(exposures)):
+            rows = exposures.views.rotations[v].tolist()
+            shift, told = exposures.views.shifts[v].tolist(), None
+            if known is not None:
+                told = ViewErrors((known[v][0], known[v][1]), (known[v][2], known[v][3], known[v][4]), known[v][5])
+            rotation = (_triple(rows[0]), _triple(rows[1]), _triple(rows[2]))
+            distance, energy = float(exposures.distance[v]), float(exposures.energy_kev[v])
+            views.append(
+                BeamView(rotation, shift_m=(shift[0], shift[1]), distance_m=distance, energy_kev=energy, error=told)
+            )
+        return cls(tuple(views), made_by=dict(made_by or {}))
+
+    def with_pixel_size(self, pixel_size: float) -> Beams:
+        """The same with a pixel size [m] that scans then take from here."""
+        return replace(self, view=tuple(replace(each, pixel_size_m=pixel_size) for each in self.view))
+
+    def said(self, name: str) -> np.ndarray | None:
+        """The numbers `name` [V] if all views have them; None if none has. Errors: `InputError` where some have."""
+        values = [getattr(each, name) for each in self.view]
+        have = [v for v, value in enumerate(values) if value is not None]
+        if not have:
+            return None
+        lacking = next((v for v in range(len(self)) if v not in have), None)
+        require(lacking is None, f"view[{lacking}].{name} is missing, which view[{have[0]}] has; add it, or leave all.")
+        return np.array(values, dtype=np.float64)
+
+    def scalars(self) -> dict[str, float]:
+        """What is said in place of --energy-kev, --distance and --pixel-size: the first view's, by name."""
+        names = {"energy_kev": "energy_kev", "distance": "distance_m", "pixel_size": "pixel_size_m"}
+        found = {name: self.said(field) for name, field in names.items()}
+        return {name: float(values[0]) for name, values in found.items() if values is not None}
+
+    def applied(self, scan: Scan) -> Scan:
+        """The same frames in these exposures: one a frame, or one a frame of every time.
+
+        Errors: `InputError` for another number of frames.
+        """
+        index, planned = self._index(scan), scan.exposures
+        pixels, metres, in_pixels = (self.said(name) for name in ("pixel_size_m", "shift_m", "shift_px"))
+        pixel = planned.views.pixel_size if pixels is None else float(pixels[0])
+        rotations = np.array([each.matrix() for each in self.view])[index]
+        moved = metres if in_pixels is None else pixel * in_pixels
+        shifts = planned.views.shifts if moved is None else moved[index]
+        views = replace(planned.views, rotations=rotations, shifts=shifts, pixel_size=pixel)
+        distance, energy = self.said("distance_m"), self.said("energy_kev")
+        exposures = replace(
+            planned,
+            views=views,
+            distance=planned.distance if distance is None else distance[index],
+            energy_kev=planned.energy_kev if energy is None else energy[index],
+        )
+        return Scan.of(scan.source, exposures, scan.is_test, scan.provenance)
+
+    def _index(self, scan: Scan) -> np.ndarray:
+        """[N] which view each frame of `scan` is."""
+        count, times = len(self), scan.exposures.time
+        if len(scan) == count:
+            return np.arange(count)
+        found = np.zeros(len(scan), dtype=int)
+        for time in scan.instants:
+            at = np.flatnonzero(times == time)
+            require(
+                len(at) == count,
+                f"the geometry must have a view for each of the {len(scan)} frames, or for each of the {len(at)} of "
+                f"every time, but it has {count}; take that of this scan.",
+            )
+            found[at] = np.arange(count)
+        return found
+
+    def text(self) -> str:
+        """The file's content."""
+        lines = ["# Where beams look from (docs/formats.md); lengths in metres.", f'format = "{FORMAT}"']
+        if self.made_by:
+            lines += ["", "[made_by]", *(f"{name} = {_quoted(text)}" for name, text in self.made_by.items())]
+        for v, each in enumerate(self.view):
+            lines += ["", f"[[view]]  # {v}"]
+            for name, value in vars(each).items():
+                if value is None:
+                    continue
+                if isinstance(value, ViewErrors):
+                    inner = ", ".join(f"{key} = {_number(getattr(value, key), '.3g')}" for key in ERRORS)
+                    lines.append(f"error = {{ {inner} }}")
+                else:
+                    lines.append(f"{name} = {_number(value)}")
+        return "\n".join(lines) + "\n"
+
+
+def read_beams(path: str | Path) -> Beams:
+    """The geometry in the file at `path`. Errors: `InputError` that names the file and what is amiss in it."""
+    table = read_table(Path(path))
+    origin = table.pop("made_by", {})
+    texts = isinstance(origin, dict) and all(isinstance(text, str) for text in origin.values())
+    require(texts, f"{path}: made_by must be a table of texts, but it is {origin!r}.")
+    require("format" in table, f"{path}: format is missing; a file of a geometry begins with format = {FORMAT!r}.")
+    try:
+        found = from_table(_File, table)
+        beams = Beams(found.view, found.format, origin)
+        for name in ("shift_m", "shift_px", "distance_m", "energy_kev"):
+            beams.said(name)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    return beams
+
+
+def write_beams(path: str | Path, beams: Beams) -> None:
+    """Write a geometry as TOML; floats are kept exactly."""
+    with atomic_path(path) as temporary:
+        temporary.write_text(beams.text(), encoding="utf-8")
+
+
+def _triple(row: list[float]) -> Triple:
+    return row[0], row[1], row[2]
+
+
+def _quoted(text: str) -> str:
+    escaped = text.replace("\\", "\\\\").replace('"', '\\"')
+    return '"' + "".join(c if c.isprintable() else " " for c in escaped) + '"'
+
+
+def _number(value: Any, form: str | None = None) -> str:
+    """A number, or nested tuples of them, as TOML has them."""
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(_number(each, form) for each in value) + "]"
+    number = float(value)
+    text = repr(number) if form is None else format(number, form)
+    return text if any(c in text for c in ".en") else f"{text}.0"
