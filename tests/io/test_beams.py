@@ -35,7 +35,7 @@ def scan_at(planned: Exposures) -> Scan:
 
 
 def test_a_geometry_comes_back_exactly(tmp_path):
-    errors = np.arange(6.0 * V).reshape(V, 6) / 1024
+    errors = np.arange(7.0 * V).reshape(V, 7) / 1024
     written = Beams.of(exposures(), errors, {"aligned": 'by "hand" \\ eye'})
     write_beams(tmp_path / "geometry.toml", written)
     found = read_beams(tmp_path / "geometry.toml")

@@ -16,7 +16,7 @@ from ..tables import from_table, read_table
 from .atomic import atomic_path
 
 FORMAT = "holosplat geometry 1"
-ERRORS = ("shift_px", "turn_deg", "distance_share")
+ERRORS = ("shift_px", "turn_deg", "distance_share", "magnification_share")
 
 Pair = tuple[float, float]
 Triple = tuple[float, float, float]
@@ -32,6 +32,8 @@ class ViewErrors:
     """Turns about x and y, across the beam, and z, the roll [degrees]."""
     distance_share: float = 0.0
     """Distance, as a share of it."""
+    magnification_share: float = 0.0
+    """Magnification, as a share of it."""
 
 
 @dataclass(frozen=True)
@@ -98,15 +100,16 @@ class Beams:
     def of(
         cls, exposures: Exposures, errors: np.ndarray | None = None, made_by: Mapping[str, str] | None = None
     ) -> Beams:
-        """Those of `exposures` [V]; errors: [V, 6] standard errors of shifts x, y [pixels], turns about x, y, z
-        [degrees], and the distance as a share of it."""
-        known = None if errors is None else shaped("errors", np.asarray(errors), (len(exposures), 6)).tolist()
+        """Those of `exposures` [V]; errors: [V, 7] standard errors of shifts x, y [pixels], turns about x, y, z
+        [degrees], and of distance and magnification as shares of them."""
+        known = None if errors is None else shaped("errors", np.asarray(errors), (len(exposures), 7)).tolist()
         views = []
         for v in range(len(exposures)):
             rows = exposures.views.rotations[v].tolist()
             shift, told = exposures.views.shifts[v].tolist(), None
             if known is not None:
-                told = ViewErrors((known[v][0], known[v][1]), (known[v][2], known[v][3], known[v][4]), known[v][5])
+                x, y, *turns, distance, larger = known[v]
+                told = ViewErrors((x, y), _triple(turns), distance, larger)
             rotation = (_triple(rows[0]), _triple(rows[1]), _triple(rows[2]))
             distance, energy = float(exposures.distance[v]), float(exposures.energy_kev[v])
             pixel = None if exposures.views.has_one_pixel else float(exposures.views.pixel_sizes[v])
