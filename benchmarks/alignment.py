@@ -4,8 +4,8 @@
     python benchmarks/alignment.py --cases "volume 12" "volume 4" --moments planned aligned true
 
 Scenes of the benchmark (sharp cells) are simulated with errors of each view that are known, and aligned; errors are
-those after the best motion of the whole object; magnifications are beside their mean. Cases called "volume …" are also reconstructed, and their volumes
-compared with the truth: in the planned, the found, and the true exposures.
+those after the best motion of the whole object, magnifications beside their mean. Cases called "volume …" are also
+reconstructed, and their volumes compared with the truth: in the planned, the found, and the true exposures.
 """
 
 from __future__ import annotations

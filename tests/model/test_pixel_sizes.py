@@ -13,6 +13,7 @@ from torch import Tensor
 
 from helpers.bumpy import DELTA, surfaces
 from helpers.voxels import pronounced
+from holosplat.checks import InputError
 from holosplat.geometry import Grid, Poses, Views
 from holosplat.matter import DeltaBeta, Matter
 from holosplat.mesh import TriangleMesh
@@ -142,6 +143,13 @@ def test_line_integrals_of_a_gaussian_are_its_closed_form():
         assert float((lines[v] - torch.from_numpy(wanted)).abs().max()) < 0.01 * wanted.max()
 
 
+def test_pixels_of_a_crop_stay_where_they_are():
+    found, views = a_cloud("reference"), beams()
+    rows, columns = slice(2, 17), slice(5, 28)
+    whole, part = delta_lines(found, views), delta_lines(found, views.cropped(rows, columns))
+    torch.testing.assert_close(part, whole[:, rows, columns], rtol=1e-9, atol=1e-9 * float(whole.max()))
+
+
 def exposed(views: Views) -> Exposures:
     taken = Exposures.of(views, 20.0, 0.05, 0.4)
     return replace(
@@ -182,6 +190,24 @@ def test_magnification_has_the_gradient_of_differences(name):
         ends = [[t.detach() + (s * steepest if t is tensor else 0) for t in asked] for s in (size, -size)]
         slope = float(value(*ends[0]) - value(*ends[1])) / (2 * size)
         assert slope == pytest.approx(float(gradient.norm()), rel=0.03)
+
+
+def test_pixel_sizes_that_make_no_sense_are_refused():
+    views = beams()
+    for sizes, said in (
+        (PIXEL * np.array([1.0, -1.0, 1.0]), "pixel size must be a positive"),
+        (PIXEL * np.ones(2), "pixel size must have the shape"),
+    ):
+        with pytest.raises(InputError, match=said):
+            Views.of_pixels(views.rotations, views.shifts, SHAPE, sizes)
+    with pytest.raises(InputError, match="pixel scales must be above zero"):
+        replace(views, scales=np.array([1.0, 0.0, 1.0]))
+    with pytest.raises(InputError, match="pixel size must lie between"):
+        Exposures.of(replace(views, scales=np.array([1.0, 1.0, 1e6])), 20.0, 0.1)
+    same = Views.of_pixels(views.rotations, views.shifts, SHAPE, np.full(3, 1.5 * PIXEL))
+    assert same.fingerprint() == Views(views.rotations, views.shifts, SHAPE, 1.5 * PIXEL).fingerprint()
+    assert views[[1]].pixel_size == pytest.approx(1.5 * PIXEL)
+    assert (views.finest, views.width) == pytest.approx((PIXEL, 29 * PIXEL))
 
 
 def test_alignment_magnifies():
