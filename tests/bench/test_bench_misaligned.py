@@ -84,7 +84,7 @@ def test_a_result_is_judged_where_it_lies(case, scan):
     np.testing.assert_array_equal(placed.is_test, scan.is_test)
 
 
-def test_views_are_brought_nearer_by_mass_and_nearer_still_by_reprojection(case, scan):
+def test_views_are_brought_nearer_by_mass_and_rolled_by_reprojection(case, scan):
     train, true = scan.train(), case.true_exposures()[np.flatnonzero(~scan.is_test)].views
 
     def away(views: hs.Views) -> tuple[float, float]:
@@ -95,10 +95,9 @@ def test_views_are_brought_nearer_by_mass_and_nearer_still_by_reprojection(case,
     planned = away(train.views)
     mass = away(by_mass(train, case.prior, lambda *_: None).views)
     reprojected = away(by_reprojection(train, case.prior, lambda *_: None, rounds=2).views)
-    print(planned, mass, reprojected)
     assert mass[0] < 0.4 * planned[0]
     assert reprojected[0] < 0.4 * planned[0]
-    assert mass[1] == pytest.approx(planned[1], abs=0.2)
+    assert reprojected[1] < 0.6 * planned[1]
 
 
 def test_methods_on_aligned_views_are_the_others_with_an_aligner():

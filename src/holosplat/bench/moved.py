@@ -69,7 +69,7 @@ def _step(
     """
     back = (points - translation) @ rotation + 0.5 * (np.array(still.shape[::-1]) - 1)
     moved = map_coordinates(still, np.moveaxis(back[..., ::-1], -1, 0), order=1)
-    slopes = np.stack(np.gradient(moved)[::-1], axis=-1)
+    slopes = np.stack([np.asarray(np.gradient(moved, axis=axis)) for axis in (2, 1, 0)], axis=-1)
     near = (slopes**2).sum(-1) > 0
     slopes, missing, at = slopes[near], (target - moved)[near], points[near]
     columns = -np.concatenate([np.cross(at, slopes), slopes], axis=1)

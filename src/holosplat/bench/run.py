@@ -152,7 +152,7 @@ class _Bench:
         gc.collect()  # of the method before
         try:
             with memory_growth() as growth:
-                before = self.aligned[job.aligner][1] if job.aligner in self.aligned else 0.0
+                before = self.aligned[job.aligner][1] if job.aligner and job.aligner in self.aligned else 0.0
                 began = time.perf_counter() - before
                 found = job.produce(lambda what, fraction: self.on_progress(stage + what, fraction))
                 row = replace(row, seconds=time.perf_counter() - began, memory_bytes=growth())
