@@ -5,10 +5,39 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from .derivatives import Predicted
+
+
+@dataclass(frozen=True)
+class Normal:
+    """What frames say of K numbers of each of V views, near the present ones; sums of it are of many frames of a view.
+
+    information: [V, K, K], the Hessian of half the squared residuals over their noise
+    slope: [V, K], how fast these fall along each number
+    """
+
+    information: Tensor
+    slope: Tensor
+
+    @classmethod
+    def of(cls, measured: Tensor, found: Predicted, blur: float) -> Normal:
+        """measured: frames [V, H, W]; found: at the present numbers, flux included; blur: standard deviation of a
+        Gaussian [pixels] by which images are compared. The noise of a view is what it leaves unexplained, as it is
+        after that blur: this many independent pixels."""
+        missing = blurred(measured - found.frames, blur).flatten(1).double()
+        columns = blurred(found.derivatives, blur).flatten(2).double()
+        independent = 1 / (4 * math.pi * blur**2)
+        scale = independent / missing.square().mean(1).clamp_min(1e-18)
+        information = torch.einsum("vip,vjp->vij", columns, columns) * scale[:, None, None]
+        return cls(information, torch.einsum("vip,vp->vi", columns, missing) * scale[:, None])
+
+    def in_units(self, scales: Tensor) -> Normal:
+        """The same for numbers `scales` [K] times larger."""
+        return Normal(self.information / (scales[:, None] * scales), self.slope / scales)
 
 
 @dataclass(frozen=True)
@@ -19,20 +48,13 @@ class Step:
     covariances: Tensor
 
 
-def step(measured: Tensor, found: Predicted, numbers: Tensor, expected: Tensor, blur: float) -> Step:
+def step(normal: Normal, numbers: Tensor, expected: Tensor) -> Step:
     """The likeliest numbers near the present ones (Levenberg 1944, with the prior as damping); float64.
 
-    measured: frames [V, H, W]; found: at `numbers` [V, K], flux included; expected: [K] standard deviations of the
-    numbers about zero, 0 for those that stay; blur: standard deviation of a Gaussian [pixels] by which images are
-    compared. The noise of a view is what it leaves unexplained, as it is after that blur: this many independent pixels.
+    numbers: [V, K]; expected: [K] standard deviations of the numbers about zero, 0 for those that stay.
     """
     free = expected > 0
-    missing = blurred(measured - found.frames, blur).flatten(1).double()
-    columns = blurred(found.derivatives[:, free], blur).flatten(2).double()
-    independent = 1 / (4 * math.pi * blur**2)
-    scale = independent / missing.square().mean(1).clamp_min(1e-18)
-    information = torch.einsum("vip,vjp->vij", columns, columns) * scale[:, None, None]
-    slope = torch.einsum("vip,vp->vi", columns, missing) * scale[:, None]
+    information, slope = normal.information[:, free][:, :, free], normal.slope[:, free]
     prior = expected[free] ** -2
     covariances = torch.linalg.inv(information + torch.diag(prior))
     moved = torch.einsum("vij,vj->vi", covariances, slope - prior * numbers[:, free])
@@ -49,3 +71,9 @@ def blurred(images: Tensor, sigma: float) -> Tensor:
     h, w = images.shape[-2:]
     squares = torch.fft.fftfreq(h)[:, None] ** 2 + torch.fft.rfftfreq(w) ** 2
     return torch.fft.irfft2(torch.fft.rfft2(images) * torch.exp(-2 * math.pi**2 * sigma**2 * squares), s=(h, w))
+
+
+def unexplained(measured: Tensor, images: Tensor) -> np.ndarray:
+    """[V] rms of what images [V, H, W] leave of frames, as a share of each frame's contrast."""
+    left = (measured - images).square().mean((1, 2)).sqrt() / measured.std(dim=(1, 2)).clamp_min(1e-12)
+    return left.double().numpy()

@@ -12,6 +12,7 @@ from torch.nn.functional import interpolate
 
 from ..baselines.primal_dual import PrimalDual
 from ..checks import at_least, in_range, require
+from ..fit.freedom import Freedom
 from ..geometry import Grid
 from ..matter import DeltaBeta
 from ..model import Alignment
@@ -22,7 +23,7 @@ from ..projectors.voxels import LatticeProjector
 from ..scan import Exposures, Scan
 from .coarse import shifts_by_mass
 from .derivatives import NUMBERS, in_pixels, predicted
-from .newton import step
+from .newton import Normal, step, unexplained
 
 SHIFT, TURN, DISTANCE, FLUX = slice(0, 2), slice(2, 5), 5, 6
 """Places of the numbers of `NUMBERS`."""
@@ -39,7 +40,7 @@ class Uncertain:
     roll: float = 1.0
     """Turns about the beam [degrees]."""
     distance: float = 0.0
-    """Propagation distance, as a share of it. Only fringes that are resolved tell it: a longer distance sharpens edges
+    """Propagation distance, as a share of it. Only matter with sharp edges tells it: a longer distance sharpens edges
     as voxels blur them."""
     flux: float = 0.02
     """Flux of a frame beside the flat field's, as a share of it."""
@@ -50,12 +51,16 @@ class Uncertain:
             value = getattr(self, name)
             require(value <= most, f"uncertain {name} must be {most:g} at most, but it is {value:g}; correct it.")
 
-    def deviations(self, pixels: float, turning: bool = True) -> Tensor:
-        """Standard deviations [7] of `NUMBERS`, on pixels `pixels` times larger; turning: whether turns are free."""
+    def deviations(self, turning: bool = True) -> Tensor:
+        """Standard deviations [7] of `NUMBERS`, shifts in detector pixels; turning: whether turns are free."""
         turn, roll = np.deg2rad([self.angle, self.roll]) * turning
-        across = self.shift / pixels
         distance = self.distance or BLUR_AS_DISTANCE
-        return torch.tensor([across, across, turn, turn, roll, distance, self.flux], dtype=torch.float64)
+        return torch.tensor([self.shift, self.shift, turn, turn, roll, distance, self.flux], dtype=torch.float64)
+
+    def freedom(self, so_far: np.ndarray) -> Freedom:
+        """The same for a fit of matter and geometry; so_far: [V, 6] changes of the plan [pixels, rad, share]."""
+        angle, roll = np.deg2rad([self.angle, self.roll])
+        return Freedom(self.shift, float(angle), float(roll), self.distance, so_far)
 
 
 TURNING = 30
@@ -101,11 +106,14 @@ class PoseOptions:
     """Uncertain shifts [pixels] beyond which centres of mass give the first ones: they are good to a pixel or two."""
     retrieval: int = 40
     """Steps of the phase retrieval."""
+    edges: int = 60
+    """Steps of surfaces with the geometry free, after the voxels, where matter has one known density: poses of cells
+    settle in fifty (0: none)."""
 
     def __post_init__(self) -> None:
         at_least(self, 1, "rounds", "max_voxels", "steps", "first", "retrieval", "few_views")
         at_least(self, 4, "least_side")
-        at_least(self, 0, "weight")
+        at_least(self, 0, "weight", "edges")
         in_range("blur", self.blur, 0.3, 10.0, unit="pixels")
 
     def levels(self, shape: tuple[int, int], views: int) -> tuple[Level, ...]:
@@ -127,7 +135,10 @@ class PoseOptions:
 class PoseSearch:
     """Poses and a volume in progress. The volume is that of the training frames; poses are found of all frames."""
 
-    def __init__(self, scan: Scan, material: DeltaBeta, options: PoseOptions, upper: float | None) -> None:
+    def __init__(
+        self, scan: Scan, material: DeltaBeta, options: PoseOptions, upper: float | None, *, begin: bool = True
+    ) -> None:
+        """upper: bound of occupancies; begin: whether large shifts begin with centres of mass."""
         self.scan, self.material, self.options, self.upper = scan, material, options, upper
         count = len(scan)
         self.numbers = torch.zeros(count, len(NUMBERS), dtype=torch.float64)
@@ -135,7 +146,7 @@ class PoseSearch:
         self._solver: PrimalDual | None = None
         self._retrieved = dict[int, Tensor]()
         self._more = max(1.0, options.few_views / int((~scan.is_test).sum()))
-        if options.uncertain.shift > options.by_mass:
+        if begin and options.uncertain.shift > options.by_mass:
             self.begin()
 
     def exposures(self, planned: Exposures) -> Exposures:
@@ -158,21 +169,40 @@ class PoseSearch:
         pixels = scan.views.pixel_size / self.scan.views.pixel_size
         self.numbers[:, SHIFT] = torch.from_numpy(shifts) * pixels
 
+    @property
+    def volume(self) -> Tensor:
+        """Occupancies [Z, Y, X] of the level that was run last."""
+        assert self._solver is not None
+        return self._solver.volume
+
+    def unexplained(self, scan: Scan) -> np.ndarray:
+        """[V] what the volume leaves of the frames of `scan`, on its pixels, as a share of their contrast."""
+        grid, found = Grid.of_views(in_pixels(scan.views)), self.exposures(scan.exposures)
+        images = predicted(self.volume, grid, found, self.material, fringe_sampling(scan.exposures)).frames
+        return unexplained(torch.from_numpy(scan.frames), self.numbers[:, FLUX].exp().float()[:, None, None] * images)
+
     def run(self, level: Level, on_progress: Advance) -> None:
         """All rounds of a level."""
-        scan = self.scan.binned(level.pixels)
-        train = np.flatnonzero(~scan.is_test)
-        planned, pixel = scan.exposures, scan.views.pixel_size
-        frames, oversample = torch.from_numpy(scan.frames), fringe_sampling(planned)
-        distances = self.exposures(planned).distance if self.options.uncertain.distance else planned.distance
-        retrieved = self.thickness(scan, replace(planned, distance=distances)) / pixel
-        grid = Grid.of_views(in_pixels(planned.views))
+        at = self.prepared(level)
         for done in range(level.rounds):
-            found = self.exposures(planned)
-            self._improve_volume(LatticeProjector(grid, in_pixels(found.views)[train]), grid, retrieved)
-            assert self._solver is not None
-            self.move(self._solver.volume, grid, found, frames, oversample)
+            self.solve(self.looked(at), at.shape)
             on_progress((done + 1) / level.rounds)
+
+    def prepared(self, level: Level) -> Prepared:
+        """What the rounds of a level need."""
+        scan = self.scan.binned(level.pixels)
+        planned = scan.exposures
+        retrieved = self.thickness(scan, planned) / scan.views.pixel_size
+        grid = Grid.of_views(in_pixels(planned.views))
+        return Prepared(scan, retrieved, grid, fringe_sampling(planned))
+
+    def looked(self, at: Prepared) -> Normal:
+        """Some steps of the volume, and what the frames then say of the numbers."""
+        found = self.exposures(at.scan.exposures)
+        train = np.flatnonzero(~at.scan.is_test)
+        self._improve_volume(LatticeProjector(at.grid, in_pixels(found.views)[train]), at.grid, at.retrieved)
+        assert self._solver is not None
+        return self.normal(self._solver.volume, at.grid, found, torch.from_numpy(at.scan.frames), at.oversample)
 
     def thickness(self, scan: Scan, exposures: Exposures) -> Tensor:
         """Retrieved thickness [m] of the training frames of `scan`, on pixels of any size, in `exposures`.
@@ -208,14 +238,34 @@ class PoseSearch:
 
     def move(self, volume: Tensor, grid: Grid, found: Exposures, frames: Tensor, oversample: int) -> None:
         """One step of all numbers beside `volume` on `grid` (lengths in pixels); found: exposures as they are now."""
-        pixels = round(found.views.pixel_size / self.scan.views.pixel_size)
+        self.solve(self.normal(volume, grid, found, frames, oversample), found.views.shape)
+
+    def normal(self, volume: Tensor, grid: Grid, found: Exposures, frames: Tensor, oversample: int) -> Normal:
+        """What frames [V, H, W] say of the numbers (shifts in detector pixels), beside `volume` on `grid`."""
         scales = torch.ones(len(NUMBERS), dtype=torch.float64)
-        scales[SHIFT] = pixels
+        scales[SHIFT] = round(found.views.pixel_size / self.scan.views.pixel_size)
         here = predicted(volume, grid, found, self.material, oversample)
         lit = self.numbers[:, FLUX].exp()[:, None, None].float()
         here = replace(here, frames=lit * here.frames, derivatives=lit[:, None] * here.derivatives)
-        turning = min(found.views.shape) >= TURNING
-        expected = self.options.uncertain.deviations(pixels, turning)
-        moved = step(frames, here, self.numbers / scales, expected, self.options.blur)
-        self.numbers = moved.numbers * scales
-        self.covariances = moved.covariances * scales[:, None] * scales
+        return Normal.of(frames, here, self.options.blur).in_units(scales)
+
+    def solve(self, normal: Normal, shape: tuple[int, int]) -> None:
+        """One step of all numbers; shape: of the frames that say `normal`."""
+        moved = step(normal, self.numbers, self.options.uncertain.deviations(min(shape) >= TURNING))
+        self.numbers, self.covariances = moved.numbers, moved.covariances
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A level's frames, their retrieved thickness [pixels] (of those for training), the volume's grid (lengths in
+    pixels), and samples along a pixel."""
+
+    scan: Scan
+    retrieved: Tensor
+    grid: Grid
+    oversample: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the frames."""
+        return self.scan.views.shape
