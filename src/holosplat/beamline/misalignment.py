@@ -62,3 +62,7 @@ class Misalignment:
             views=replace(views, rotations=rotations, shifts=views.shifts + shifts, scales=scales),
             distance=nominal.distance * stretched,
         )
+
+
+AS_PLANNED = Misalignment()
+"""No errors."""
