@@ -157,11 +157,13 @@ def _write_geometry(
     from ..io.formats import read_as
 
     whole = read_as(source, replace(reading, part=Part(time_frame=reading.part.time_frame))).exposures
-    shifts = whole.views.shifts + found.views.shifts - measured.views.shifts
-    views = replace(whole.views, rotations=found.views.rotations, shifts=shifts)
+    scales = found.views.relative / measured.views.relative
+    shifts = found.views.shifts - scales[:, None] * (measured.views.shifts - whole.views.shifts)
+    scales = whole.views.relative * scales
+    views = replace(whole.views, rotations=found.views.rotations, shifts=shifts, scales=scales)
     if errors is not None:
-        larger = measured.views.pixel_size / whole.views.pixel_size
-        errors = errors * [larger, larger, 1, 1, 1, 1]
+        larger = measured.views.pitch / whole.views.pitch
+        errors = errors * [larger, larger, 1, 1, 1, 1, 1]
     origin = {"scan": str(source), "aligned": said}
     beams = Beams.of(replace(whole, views=views, distance=found.distance), errors, origin)
     write_beams(path, beams)
