@@ -50,11 +50,37 @@ class Uncertain:
             value = getattr(self, name)
             require(value <= most, f"uncertain {name} must be {most:g} at most, but it is {value:g}; correct it.")
 
+    def pose(self, pixels: float = 1.0) -> np.ndarray:
+        """Standard deviations [5] of shifts [pixels that are so many times larger] and turns about x, y, z [rad]."""
+        turns = np.deg2rad([self.angle, self.angle, self.roll])
+        return np.array([self.shift / pixels, self.shift / pixels, *turns])
+
     def deviations(self, turning: bool = True) -> Tensor:
         """Standard deviations [7] of `NUMBERS`, shifts in detector pixels; turning: whether turns are free."""
         turn, roll = np.deg2rad([self.angle, self.roll]) * turning
         distance = self.distance or BLUR_AS_DISTANCE
         return torch.tensor([self.shift, self.shift, turn, turn, roll, distance, self.flux], dtype=torch.float64)
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Standard deviations of how far each beam of a series goes from the first time to the last; 0: it stays."""
+
+    shift: float = 0.0
+    """Detector's shifts along rows and columns [pixels]."""
+    angle: float = 0.0
+    """Turns about all three axes [degrees]."""
+
+    def __post_init__(self) -> None:
+        at_least(self, 0, "shift", "angle")
+        for name, most in (("shift", 100.0), ("angle", 20.0)):
+            value = getattr(self, name)
+            require(value <= most, f"drift {name} must be {most:g} at most, but it is {value:g}; correct it.")
+
+    def pose(self, pixels: float = 1.0) -> np.ndarray:
+        """Standard deviations [5] of half the way, by which the ends differ from the middle, as `Uncertain.pose`."""
+        half = 0.5 * np.array([self.shift / pixels, np.deg2rad(self.angle)])
+        return half[[0, 0, 1, 1, 1]]
 
 
 TURNING = 30
@@ -100,9 +126,13 @@ class PoseOptions:
     """Uncertain shifts [pixels] beyond which centres of mass give the first ones: they are good to a pixel or two."""
     retrieval: int = 40
     """Steps of the phase retrieval."""
+    times: int = 8
+    """Times of a series that are used at most: those that say most, evenly spread."""
+    drift: Drift = field(default_factory=Drift)
+    """How far the beams of a series may drift."""
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "rounds", "max_voxels", "steps", "first", "retrieval", "few_views")
+        at_least(self, 1, "rounds", "max_voxels", "steps", "first", "retrieval", "few_views", "times")
         at_least(self, 4, "least_side")
         at_least(self, 0, "weight")
         in_range("blur", self.blur, 0.3, 10.0, unit="pixels")

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from ..align import AlignedViews, PoseOptions
+    from ..frames import Frames
     from ..matter import MaterialPrior
     from ..optics.background import LightOptions
     from ..scan import Exposures, Scan
@@ -39,13 +40,18 @@ class UncertainOptions:
     """Turns about the beam [degrees]."""
     uncertain_distance: float = 0.0
     """Distance, as a share of it: only where fringes are resolved."""
+    drift_shift: float = 0.0
+    """Of a series: how far each beam's shifts drift from the first time to the last [pixels]."""
+    drift_angle: float = 0.0
+    """Of a series: how far each beam turns from the first time to the last [degrees]."""
 
     def options(self) -> PoseOptions:
         """The options of the search."""
-        from ..align import PoseOptions, Uncertain
+        from ..align import Drift, PoseOptions, Uncertain
 
-        shift, angle, roll, distance = vars(self).values()
-        return PoseOptions(Uncertain(shift, angle, roll, distance))
+        shift, angle, roll, distance = list(vars(self).values())[:4]
+        drift = Drift(self.drift_shift, self.drift_angle)
+        return PoseOptions(Uncertain(shift, angle, roll, distance), drift=drift)
 
 
 @dataclass(frozen=True)
@@ -111,12 +117,13 @@ def align(
     require(geometry_out is None or reading.part.views is None, "--geometry-out is of all frames; leave --views.")
     measured = read_as(scan, reading).in_memory()
     prior = matter.prior(measured.exposures.reference_energy)
-    errors = None
+    errors, frames = None, measured.source
     if axis_only:
         lines, exposures = _axis(measured, prior, illumination.options())
     else:
         found = _views(measured, prior, unknown.options(), illumination.options())
         lines, exposures, errors = found.lines(), found.exposures, found.errors
+        frames = _upright(found, measured)
         if table is not None:
             _write_table(table, found)
     for line in lines:
@@ -124,7 +131,7 @@ def align(
     if geometry_out is not None:
         _write_geometry(geometry_out, scan, reading, measured, exposures, errors, lines[0])
     facts = measured.provenance | {"aligned": lines[0]}
-    write_scan(out, Scan.of(measured.source, exposures, measured.is_test, facts))
+    write_scan(out, Scan.of(frames, exposures, measured.is_test, facts))
     print(f"wrote {out}: the same {len(measured)} frames, with other exposures", file=sys.stderr)
 
 
@@ -162,6 +169,15 @@ def _write_geometry(
     beams = Beams.of(replace(whole, views=views, distance=found.distance), errors, origin)
     write_beams(path, beams)
     print(f"wrote {path}: the geometry of {len(beams)} beams, for --exposures", file=sys.stderr)
+
+
+def _upright(found: AlignedViews, scan: Scan) -> np.ndarray | Frames:
+    """The frames that the exposures found are of: those of reversed beams are turned back."""
+    from ..align import AlignedBeams
+
+    if isinstance(found, AlignedBeams) and any(found.sides):
+        return found.upright(scan.frames)
+    return scan.source
 
 
 def _write_table(path: Path, found: AlignedViews) -> None:
