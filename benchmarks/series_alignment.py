@@ -41,9 +41,9 @@ MATERIAL = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
 
 @dataclass(frozen=True)
 class Experiment:
-    """geometry: which beams; errors: theirs; photons: a pixel, None for no noise; travel: of the fastest cells [m], more
-    than 14 µm of it passes the edges of the field; drift: of shifts in the errors [pixels]; volumes: whether they are
-    scored."""
+    """geometry: which beams; errors: theirs; photons: a pixel, None for no noise; travel: of the fastest cells [m], of
+    which more than 14 µm pass the edges of the field; drift: of shifts in the errors [pixels]; volumes: whether they
+    are scored."""
 
     geometry: Geometry
     errors: Misalignment

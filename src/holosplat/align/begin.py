@@ -101,19 +101,22 @@ def begun(images: Images, expected: np.ndarray, drifts: np.ndarray, few: bool) -
     planned = images.estimate(RowPrior.of(np.zeros_like(expected), len(everything)), everything)
     held = expected * (np.arange(len(expected)) != ANGLE) if few else expected
     images, sides, first = _upright(images, train, RowPrior.of(held, len(train)))
-    told, free = Told.of(first, images.views[train], expected), held
+    told, free = Told.of(first.information, images.views[train], expected), held
     if few and len(told.ratios) and told.ratios[0] >= FIRMLY:
         free = expected
-    prior = replace(RowPrior.of(free, len(train)), drifts=drifts * (free > 0), begin=first.numbers)
+    prior = replace(
+        RowPrior.of(free, len(train)), drifts=drifts * (free > 0), begin=np.stack([first.numbers, first.rates])
+    )
     found = images.estimate(prior, train)
-    told = Told.of(found, images.views[train], expected)
+    told = Told.of(found.information, images.views[train], expected)
     whole = images.estimate(_of_others(found, free, images.is_test), everything)
-    errors, rates, rate_errors = _errors(whole), np.zeros_like(whole.numbers), np.zeros((len(images.views), len(free)))
-    errors[train], rates[train], rate_errors[train] = told.errors, found.rates, _errors(found, 1)
+    errors, rate_errors = _errors(whole), np.zeros((len(images.views), len(free)))
+    errors[train] = told.errors
+    rate_errors[train] = Told.of(found.rate_information, images.views[train], prior.drifts).errors
     errors[:, free == 0] = expected[free == 0]
     return Begun(
         whole.numbers[:, : len(free)],
-        rates[:, : len(free)],
+        whole.rates[:, : len(free)],
         errors,
         rate_errors,
         planned.before,
@@ -126,14 +129,14 @@ def begun(images: Images, expected: np.ndarray, drifts: np.ndarray, few: bool) -
 
 def _of_others(found: RowEstimate, free: np.ndarray, is_test: np.ndarray) -> RowPrior:
     """The prior of all views of which those for training are as `found`."""
-    begin = np.zeros((len(is_test), found.numbers.shape[1]))
-    begin[~is_test] = found.numbers
+    begin = np.zeros((2, len(is_test), found.numbers.shape[1]))
+    begin[:, ~is_test] = found.numbers, found.rates
     return RowPrior(np.where(is_test[:, None], free, 0.0), np.zeros(len(free)), begin)
 
 
-def _errors(found: RowEstimate, of_rates: int = 0) -> np.ndarray:
-    """[V, 5] by the covariance, of numbers or of rates."""
-    variances = np.diag(found.covariance).reshape(2, len(found.numbers), -1)[of_rates, :, :FACTOR]
+def _errors(found: RowEstimate) -> np.ndarray:
+    """[V, 5] of the numbers by the covariance."""
+    variances = np.diag(found.covariance).reshape(2, len(found.numbers), -1)[0, :, :FACTOR]
     return np.sqrt(np.maximum(variances, 0))
 
 

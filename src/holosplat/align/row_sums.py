@@ -3,7 +3,7 @@
 Beams normal to the object's y axis all look through the same slices. Of a slice with mass F and first moment G [2],
 each view's row has the mass F and the first moment `n · G`, with n the direction of its columns in the slice (Helgason
 1980; Ludwig 1966: the moments of order 0 and 1 of the Radon transform). Of two or three beams there are no other
-conditions on what a slice of values of any sign can show, so that this is all that they tell without knowing the matter.
+conditions on what a slice of values of any sign can show: without knowing the matter, this is all that they tell.
 """
 
 from __future__ import annotations
@@ -26,6 +26,8 @@ BLUR = 1.0
 """Standard deviation of a Gaussian along columns [pixels]: the slopes of rows are differences of neighbours."""
 ROUNDS, FIRST = 8, 3
 """Steps, and how many of them find shifts alone, without which turns are nonsense."""
+ALIKE = 8
+"""Neighbouring rows whose errors may be alike: retrieval spreads them over fringes."""
 FLAT = np.deg2rad(0.1)
 """Beams that leave their plane by less [rad] lie in it."""
 
@@ -60,7 +62,7 @@ class RowPrior:
 
     expected: [V, 5] standard deviations about zero of shifts [pixels] and turns [rad]; 0: as they begin
     drifts: [5] of half of what they change by from the first time to the last, likewise
-    begin: [V, 6] numbers to begin with
+    begin: [2, V, 6] numbers and rates to begin with
     """
 
     expected: np.ndarray
@@ -70,7 +72,7 @@ class RowPrior:
     @classmethod
     def of(cls, expected: np.ndarray, count: int) -> RowPrior:
         """The same [5] for all `count` views, that do not drift, from the plan on."""
-        return cls(np.tile(expected, (count, 1)), np.zeros(COUNT - 1), np.zeros((count, COUNT)))
+        return cls(np.tile(expected, (count, 1)), np.zeros(COUNT - 1), np.zeros((2, count, COUNT)))
 
     def deviations(self, shifts_alone: bool) -> np.ndarray:
         """[2, V, 6] of numbers and rates; turns are free later than shifts."""
@@ -87,7 +89,7 @@ class RowEstimate:
     """What rows of V views say.
 
     numbers, rates: [V, 6] of `COUNT`, at the middle of the times, and how much more at their end
-    information: [V · 6, V · 6] of the numbers, without what is expected
+    information, rate_information: [V · 6, V · 6] of either, without what is expected
     covariance: [2 · V · 6, 2 · V · 6] of numbers and rates, with it; 0 for those that stay
     before, after: [V] rms of what the view's rows have against being of one object, as a share of all rows' moments
     """
@@ -95,6 +97,7 @@ class RowEstimate:
     numbers: np.ndarray
     rates: np.ndarray
     information: np.ndarray
+    rate_information: np.ndarray
     covariance: np.ndarray
     before: np.ndarray
     after: np.ndarray
@@ -106,18 +109,18 @@ def by_rows(images: np.ndarray, views: Views, prior: RowPrior, when: np.ndarray)
     views: planned, in one plane, lengths in pixels; when: [T] times from -1 to 1. Damped Gauss–Newton steps, as
     `newton.step`; motions in the image's plane are undone in the images, the others are small.
     """
-    angles, width, count = plane_angles(views), images.shape[-1], len(views)
+    angles, width, half = plane_angles(views), images.shape[-1], len(views) * COUNT
     assert angles is not None
     weights = (width**-0.5, (12 / width**3) ** 0.5)
     stack = _Stack(gaussian_filter1d(images / images.std(), BLUR, axis=2), views.shifts, angles, weights, when)
-    both = np.stack([prior.begin, np.zeros_like(prior.begin)])
+    both = prior.begin
     residuals, columns = stack.at(both)
     before = stack.by_view(residuals)
     covariance = np.zeros((both.size, both.size))
     for done in range(ROUNDS if prior.expected.any() else 0):
         deviations = prior.deviations(done < FIRST).reshape(-1)
         free = deviations > 0
-        information, noise = columns.T @ columns, max(float(np.mean(residuals**2)), 1e-18)
+        information, noise = columns.T @ columns, _noise(residuals, images.shape[2])
         hessian = information[np.ix_(free, free)] / noise + np.diag(deviations[free] ** -2)
         step = np.zeros(free.size)
         slope = (columns.T @ residuals)[free] / noise - both.reshape(-1)[free] / deviations[free] ** 2
@@ -127,9 +130,17 @@ def by_rows(images: np.ndarray, views: Views, prior: RowPrior, when: np.ndarray)
         residuals, columns = stack.at(both)
         covariance = np.zeros((both.size, both.size))
         covariance[np.ix_(free, free)] = np.linalg.inv(hessian)
-    noise = max(float(np.mean(residuals**2)), 1e-18)
-    own = columns[:, : count * COUNT]
-    return RowEstimate(both[0], both[1], own.T @ own / noise, covariance, before, stack.by_view(residuals))
+    noise = _noise(residuals, images.shape[2])
+    own, moving = (columns[:, part].T @ columns[:, part] / noise for part in (slice(half), slice(half, None)))
+    return RowEstimate(both[0], both[1], own, moving, covariance, before, stack.by_view(residuals))
+
+
+def _noise(residuals: np.ndarray, height: int) -> float:
+    """The variance of residuals [R] of frames of `height` rows, as if rows were independent: by sums of neighbours."""
+    size = min(ALIKE, height)
+    rows = residuals.reshape(-1, height)[:, : height - height % size]
+    sums = rows.reshape(len(rows), -1, size).sum(2)
+    return max(float(np.mean(sums**2)) / size, float(np.mean(residuals**2)), 1e-18)
 
 
 @dataclass(frozen=True)

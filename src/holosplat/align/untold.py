@@ -7,13 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..geometry import Views
-from .row_sums import COUNT, FACTOR, RETRIEVED, RowEstimate
+from .row_sums import COUNT, FACTOR, RETRIEVED
 
 NAMES = ("shift x", "shift y", "turn x", "turn y", "roll")
 NOTHING = 1.0
 """Information, in units of the prior's, below which frames say less of a combination than was known before."""
 ANGLES = 0.9
 """Share of turns about the axis that all beams are normal to, from which a combination is called an angle."""
+STRETCHED = (
+    "frames of no object tell the angle between two beams, for an object that is stretched explains them as well: it is "
+    "as planned"
+)
+UNTOLD = "rows say too little of the angles between beams: they are as planned"
 PART = 0.35
 """Numbers whose part in a combination is less than this share of the largest are not named."""
 
@@ -32,10 +37,11 @@ class Told:
     combinations: np.ndarray
 
     @classmethod
-    def of(cls, estimate: RowEstimate, views: Views, expected: np.ndarray) -> Told:
-        """views: planned, lengths in pixels; expected: [5] standard deviations, 0 for what is known."""
+    def of(cls, information: np.ndarray, views: Views, expected: np.ndarray) -> Told:
+        """information: [V · 6, V · 6] of a `RowEstimate`; views: planned, lengths in pixels; expected: [5] standard
+        deviations, 0 for what is known."""
         count = len(views)
-        whole = estimate.information + np.diag(np.tile([0.0] * FACTOR + [RETRIEVED**-2], count))
+        whole = information + np.diag(np.tile([0.0] * FACTOR + [RETRIEVED**-2], count))
         places = np.arange(count * COUNT).reshape(count, COUNT)
         free = np.tile(expected > 0, count)
         ours, factors = places[:, :FACTOR].reshape(-1)[free], places[:, FACTOR]
@@ -52,18 +58,14 @@ class Told:
     def words(self, held: float) -> list[str]:
         """Combinations that are as planned, for frames say nothing of them; angles between beams also where frames say
         less than `held` of them."""
+        shares = (self.combinations[:, :, 3] ** 2).sum(1) / (self.combinations**2).sum((1, 2)).clip(1e-12)
         said = []
-        for ratio, part in zip(self.ratios, self.combinations):
-            angle = bool((part[:, 3] ** 2).sum() > ANGLES * (part**2).sum())
-            if ratio >= (held if angle else NOTHING):
-                continue
+        if (self.ratios < held)[shares > ANGLES].any():
+            said.append(STRETCHED if self.combinations.shape[1] == 2 else UNTOLD)
+        for part in self.combinations[(self.ratios < NOTHING) & (shares <= ANGLES)]:
             named = np.argwhere(np.abs(part) > PART * np.abs(part).max())
             which = ", ".join(f"{NAMES[k]} of view {v} ({part[v, k]:+.2f})" for v, k in named)
-            what = f"the angle between beams, {which}," if angle else which
-            why = (
-                "an object that is stretched explains them as well" if ratio < NOTHING else "they say too little of it"
-            )
-            said.append(f"frames cannot tell {what} and it is as planned: {why}")
+            said.append(f"rows say less than is known of this combination, which is nearly as planned: {which}")
         return said
 
 
