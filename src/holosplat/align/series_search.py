@@ -52,12 +52,12 @@ class SeriesSearch:
         turning = min(prepared[0].shape) >= TURNING
         done, whole = 0, level.rounds * len(self.moments)
         for _ in range(level.rounds):
-            sums = _Sums(len(self.numbers))
-            for search, at, moment in zip(self._placed(), prepared, self.moments):
-                sums.add(search.looked(at), moment)
+            said = list[Normal]()
+            for search, at in zip(self._placed(), prepared):
+                said.append(search.looked(at))
                 done += 1
                 on_progress(done / whole)
-            self._solve(sums, turning)
+            self.solve(said, turning)
 
     def _placed(self) -> list[PoseSearch]:
         """The searches of all times, with the beams' numbers as they are now."""
@@ -65,8 +65,11 @@ class SeriesSearch:
             search.numbers = (self.numbers + moment.when * self.rates)[torch.from_numpy(moment.beams)]
         return self.searches
 
-    def _solve(self, sums: _Sums, turning: bool) -> None:
-        """One damped step of numbers and rates together, as `newton.step` of one time."""
+    def solve(self, said: Sequence[Normal], turning: bool) -> None:
+        """One damped step of numbers and rates together, as `newton.step` of one time, by what all times say."""
+        sums = _Sums(len(self.numbers))
+        for normal, moment in zip(said, self.moments):
+            sums.add(normal, moment)
         drift = torch.zeros(len(NUMBERS), dtype=torch.float64)
         drift[:5] = torch.from_numpy(self.options.drift.pose()) * torch.tensor([1, 1, turning, turning, turning])
         here = self.options.uncertain.deviations(turning)

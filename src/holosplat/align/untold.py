@@ -15,8 +15,8 @@ NOTHING = 1.0
 ANGLES = 0.9
 """Share of turns about the axis that all beams are normal to, from which a combination is called an angle."""
 STRETCHED = (
-    "frames of no object tell the angle between two beams, for an object that is stretched explains them as well: it is "
-    "as planned"
+    "frames of no object tell the angle between two beams, for an object that is stretched explains them as well: "
+    "it is as planned"
 )
 UNTOLD = "rows say too little of the angles between beams: they are as planned"
 PART = 0.35
