@@ -78,6 +78,21 @@ def test_two_constants_that_frames_tell_only_together_are_said_to_be():
     assert ratio.value / distance.value == pytest.approx(1e4, rel=0.05)  # which is what they do tell
 
 
+def test_where_a_misfit_levels_off_the_interval_says_so():
+    def levels_off(
+        constants,
+    ) -> float:  # as those of pure phase, which larger ratios all explain
+        x = math.log(constants["delta_beta"] / 1200.0)
+        return 2000.0 * x**2 if x < 0 else min(2000.0 * x**2, 1.0)
+
+    levels_off.noise_share = 0.0
+    ranges = {"delta_beta": (60.0, 20_000.0)}
+    found = Search(levels_off, ranges, Task(blob_scan(count=2), MaterialPrior.unknown())).run()[0]
+    assert 600 < found.low < 1200
+    assert found.high == pytest.approx(20_000.0)
+    assert found.told
+
+
 def test_a_constant_beyond_its_range_is_said_to_be_at_the_end():
     ranges = {"distance": (0.15, 0.3), "delta_beta": (1100.0, 1300.0)}
     distance, _ = Search(Valley(3000.0), ranges, Task(blob_scan(count=2), MaterialPrior.unknown())).run()

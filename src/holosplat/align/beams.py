@@ -30,6 +30,7 @@ JUDGED = 3
 
 
 ACROSS = "shifts across two beams are as planned: they are a motion of the whole object, which loses nothing"
+DISTANCES = "distances are as planned: rows and voxels cannot tell them; align a single time, of four beams or more"
 DEGREES = np.array([1, 1, *[np.pi / 180] * 3, 1])
 """Units of `changes` in those of `NUMBERS`."""
 
@@ -154,6 +155,8 @@ def align_beams(
             found.words.append("matter passes the edges of the field: rows of different beams are not compared")
         reversed_ = [(b, side) for b, side in enumerate(start.sides) if side]
         found.words.extend(f"beam {b} is reversed along {side}: its frames were turned back" for b, side in reversed_)
+    if options.uncertain.distance > 0:
+        found.words.append(DISTANCES)
     found = _kept(_without_doubtful_drift(found, options), beams.planned, options)
     if (found.numbers.any() or found.rates.any()) and np.mean(found.after**2) > np.mean(found.before**2):
         found = replace(found, numbers=0 * found.numbers, rates=0 * found.rates, after=found.before)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -70,3 +71,9 @@ def blurred(images: Tensor, sigma: float) -> Tensor:
     h, w = images.shape[-2:]
     squares = torch.fft.fftfreq(h)[:, None] ** 2 + torch.fft.rfftfreq(w) ** 2
     return torch.fft.irfft2(torch.fft.rfft2(images) * torch.exp(-2 * math.pi**2 * sigma**2 * squares), s=(h, w))
+
+
+def unexplained(measured: Tensor, images: Tensor) -> np.ndarray:
+    """[V] rms of what images [V, H, W] leave of frames, as a share of each frame's contrast."""
+    left = (measured - images).square().mean((1, 2)).sqrt() / measured.std(dim=(1, 2)).clamp_min(1e-12)
+    return left.double().numpy()

@@ -12,6 +12,7 @@ from torch.nn.functional import interpolate
 
 from ..baselines.primal_dual import PrimalDual
 from ..checks import at_least, in_range, require
+from ..fit.freedom import Freedom
 from ..geometry import Grid
 from ..matter import DeltaBeta
 from ..model import Alignment
@@ -22,7 +23,7 @@ from ..projectors.voxels import LatticeProjector
 from ..scan import Exposures, Scan
 from .coarse import shifts_by_mass
 from .derivatives import NUMBERS, in_pixels, predicted
-from .newton import Normal, step
+from .newton import Normal, step, unexplained
 
 SHIFT, TURN, DISTANCE, FLUX = slice(0, 2), slice(2, 5), 5, 6
 """Places of the numbers of `NUMBERS`."""
@@ -39,7 +40,7 @@ class Uncertain:
     roll: float = 1.0
     """Turns about the beam [degrees]."""
     distance: float = 0.0
-    """Propagation distance, as a share of it. Only fringes that are resolved tell it: a longer distance sharpens edges
+    """Propagation distance, as a share of it. Only matter with sharp edges tells it: a longer distance sharpens edges
     as voxels blur them."""
     flux: float = 0.02
     """Flux of a frame beside the flat field's, as a share of it."""
@@ -60,6 +61,11 @@ class Uncertain:
         turn, roll = np.deg2rad([self.angle, self.roll]) * turning
         distance = self.distance or BLUR_AS_DISTANCE
         return torch.tensor([self.shift, self.shift, turn, turn, roll, distance, self.flux], dtype=torch.float64)
+
+    def freedom(self, so_far: np.ndarray) -> Freedom:
+        """The same for a fit of matter and geometry; so_far: [V, 6] changes of the plan [pixels, rad, share]."""
+        angle, roll = np.deg2rad([self.angle, self.roll])
+        return Freedom(self.shift, float(angle), float(roll), self.distance, so_far)
 
 
 @dataclass(frozen=True)
@@ -130,11 +136,14 @@ class PoseOptions:
     """Times of a series that are used at most: those that say most, evenly spread."""
     drift: Drift = field(default_factory=Drift)
     """How far the beams of a series may drift."""
+    edges: int = 60
+    """Steps of surfaces with the geometry free, after the voxels, where matter has one known density: poses of cells
+    settle in fifty (0: none)."""
 
     def __post_init__(self) -> None:
         at_least(self, 1, "rounds", "max_voxels", "steps", "first", "retrieval", "few_views", "times")
         at_least(self, 4, "least_side")
-        at_least(self, 0, "weight")
+        at_least(self, 0, "weight", "edges")
         in_range("blur", self.blur, 0.3, 10.0, unit="pixels")
 
     def levels(self, shape: tuple[int, int], views: int) -> tuple[Level, ...]:
@@ -190,6 +199,18 @@ class PoseSearch:
         pixels = scan.views.pixel_size / self.scan.views.pixel_size
         self.numbers[:, SHIFT] = torch.from_numpy(shifts) * pixels
 
+    @property
+    def volume(self) -> Tensor:
+        """Occupancies [Z, Y, X] of the level that was run last."""
+        assert self._solver is not None
+        return self._solver.volume
+
+    def unexplained(self, scan: Scan) -> np.ndarray:
+        """[V] what the volume leaves of the frames of `scan`, on its pixels, as a share of their contrast."""
+        grid, found = Grid.of_views(in_pixels(scan.views)), self.exposures(scan.exposures)
+        images = predicted(self.volume, grid, found, self.material, fringe_sampling(scan.exposures)).frames
+        return unexplained(torch.from_numpy(scan.frames), self.numbers[:, FLUX].exp().float()[:, None, None] * images)
+
     def run(self, level: Level, on_progress: Advance) -> None:
         """All rounds of a level."""
         at = self.prepared(level)
@@ -198,11 +219,10 @@ class PoseSearch:
             on_progress((done + 1) / level.rounds)
 
     def prepared(self, level: Level) -> Prepared:
-        """What the rounds of a level need; distances are those of the present numbers."""
+        """What the rounds of a level need."""
         scan = self.scan.binned(level.pixels)
         planned = scan.exposures
-        distances = self.exposures(planned).distance if self.options.uncertain.distance else planned.distance
-        retrieved = self.thickness(scan, replace(planned, distance=distances)) / scan.views.pixel_size
+        retrieved = self.thickness(scan, planned) / scan.views.pixel_size
         grid = Grid.of_views(in_pixels(planned.views))
         return Prepared(scan, retrieved, grid, fringe_sampling(planned))
 

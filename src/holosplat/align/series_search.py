@@ -42,9 +42,9 @@ class SeriesSearch:
             self._held[[place, place + len(NUMBERS)]] = 0
 
     def forget_distance(self) -> None:
-        """Distances beside their mean, or as planned where that is what is known of them."""
-        told = float(self.options.uncertain.distance > 0)
-        self.numbers[:, DISTANCE] = told * (self.numbers[:, DISTANCE] - self.numbers[:, DISTANCE].mean())
+        """Distances as planned: what voxels find of them is what their edges are too soft for."""
+        self.numbers[:, DISTANCE] = 0
+        self.rates[:, DISTANCE] = 0
 
     def run(self, level: Level, on_progress: Advance) -> None:
         """All rounds of a level: the volumes of all times, then one step of the beams' numbers."""

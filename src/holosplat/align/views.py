@@ -21,19 +21,27 @@ from ..scan import Exposures, Scan
 from .coarse import mirrored
 from .derivatives import in_pixels, predicted
 from .gauge import moved_onto
-from .poses import DISTANCE, FLUX, PoseOptions, PoseSearch
+from .poses import DISTANCE, FLUX, SHIFT, PoseOptions, PoseSearch
 from .shadows import EVEN_OR_NOT
+from .sharp import believed, sharpened, surfaces_of
 
 DEFAULT = PoseOptions()
+SHARP = "alignment, sharp edges"
 FEWEST = 2
 """Training views below which there is nothing to agree on."""
 STRAY = 1.35
 """A view that leaves so many times as much unexplained as the middle one does not fit with the others."""
 FEW = 4
 """Training views below which turns across the beam pass for the depth of matter, and stay as planned."""
-ACCURACY = {"shift": 0.06, "angle": 0.12, "roll": 0.06, "distance": 0.02}
-"""Rms errors of what is found [smallest pixels, degrees, share] on sharp cells whose geometry is known without errors
+ACCURACY = {"shift": 0.06, "angle": 0.12, "roll": 0.06}
+"""Rms errors of what voxels find [smallest pixels, degrees] on sharp cells whose geometry is known without errors
 (docs/data/alignment.csv): a plan that differs by less is as good, and kept."""
+SHARP_ACCURACY = {"shift": 0.01, "angle": 0.03, "roll": 0.02, "distance": 0.01}
+"""The same of what surfaces find."""
+UNTOLD = (
+    "distances are as planned: the matter shows no sharp edges of a known density, and a longer distance sharpens "
+    "fringes as such edges would"
+)
 KINDS = {"shift": (0, 1), "angle": (2, 3), "roll": (4,), "distance": (DISTANCE,)}
 """Places of the numbers of each kind."""
 
@@ -109,11 +117,13 @@ def align_still(
     for level in levels:
         name = f"alignment, pixels of {level.pixels}"
         search.run(level, lambda fraction, name=name: on_progress(name, fraction))
-    trained = torch.from_numpy(~scan.is_test)
-    told = float(options.uncertain.distance > 0)
-    search.numbers[:, DISTANCE] = told * (search.numbers[:, DISTANCE] - search.numbers[trained, DISTANCE].mean())
+    forget_distance(search)
+    sharp = by_edges(search, levels[-1].pixels, on_progress)
+    told = float(options.uncertain.distance > 0 and sharp)
+    if options.uncertain.distance > 0 and not sharp:
+        words.append(UNTOLD)
     errors = search.covariances.diagonal(dim1=1, dim2=2).clamp_min(0).sqrt().numpy()
-    words += _kept(search, scan.exposures, levels[-1].pixels)
+    words += _kept(search, scan.exposures, levels[-1].pixels, sharp)
     found = search.exposures(scan.exposures)
     found = replace(found, views=moved_onto(found.views, scan.views))
     of = max(levels[-1].pixels, 2 if min(scan.views.shape) >= 2 * options.least_side else 1)
@@ -146,15 +156,40 @@ def changes(found: Exposures, planned: Exposures) -> np.ndarray:
     return np.concatenate([shifts, degrees, stretch[:, None]], axis=1)
 
 
-def _kept(search: PoseSearch, planned: Exposures, pixels: int) -> list[str]:
+def forget_distance(search: PoseSearch) -> None:
+    """Distances as planned: what voxels find of them is what their edges are too soft for."""
+    search.numbers[:, DISTANCE] = 0
+    search.covariances[:, DISTANCE] = search.covariances[:, :, DISTANCE] = 0
+
+
+def by_edges(search: PoseSearch, pixels: int, on_progress: Progress) -> bool:
+    """Whether surfaces explain the frames better than voxels of `pixels`; if so, the numbers become theirs."""
+    scan = search.scan.binned(pixels)
+    options = search.options
+    wanted = options.edges > 0 and any(getattr(options.uncertain, kind) > 0 for kind in KINDS)
+    start = surfaces_of(search.volume, scan, search.material) if wanted and search.upper == 1.0 else None
+    if start is None:
+        return False
+    scales = torch.ones(search.numbers.shape[1], dtype=torch.float64)
+    scales[SHIFT] = pixels
+    here = replace(options, uncertain=replace(options.uncertain, shift=options.uncertain.shift / pixels))
+    found = sharpened(scan, search.numbers / scales, start, here, lambda part: on_progress(SHARP, part))
+    if not believed(scan, found.left, search.unexplained(scan)):
+        return False
+    search.numbers, search.covariances = found.step.numbers * scales, found.step.covariances * scales[:, None] * scales
+    return True
+
+
+def _kept(search: PoseSearch, planned: Exposures, pixels: int, sharp: bool) -> list[str]:
     """Puts kinds of numbers that differ from the plan by no more than they are known back to it; says which."""
+    accuracy = SHARP_ACCURACY if sharp else ACCURACY
     found = search.exposures(planned)
     moved = changes(replace(found, views=moved_onto(found.views, planned.views)), planned)
     words, uncertain = [], search.options.uncertain
     for kind, places in KINDS.items():
-        if getattr(uncertain, kind) == 0:
+        if getattr(uncertain, kind) == 0 or kind not in accuracy:
             continue
-        limit = ACCURACY[kind] * (pixels if kind == "shift" else 1)
+        limit = accuracy[kind] * (pixels if kind == "shift" else 1)
         if np.sqrt(np.square(moved[:, list(places)]).mean()) < limit:
             search.numbers[:, list(places)] = 0
             words.append(f"{kind} is as planned: the frames agree with it to within the accuracy of {limit:g}")

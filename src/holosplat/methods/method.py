@@ -9,6 +9,7 @@ from typing import ClassVar, Protocol, runtime_checkable
 import torch
 
 from ..baselines.material import MaterialEstimate
+from ..fit.freedom import Freedom
 from ..fit.running import Running
 from ..matter import MaterialPrior, MatterKind
 from ..optics.background import Light, LightOptions
@@ -45,6 +46,7 @@ class Task:
     lit: what the frames say of it, once `evened` has looked
     matter: whether matter has levels, each with sharp edges, or is continuous (see `settled`)
     delta_told: whether prior or frames say what δ is
+    freedom: of where the frames are, which fits then find, too; None: they are where the scan says
     """
 
     scan: Scan
@@ -55,6 +57,7 @@ class Task:
     lit: Light | None = None
     matter: MatterKind = "levels"
     delta_told: bool = True
+    freedom: Freedom | None = None
 
     def __post_init__(self) -> None:
         if not self.prior.fixes_ratio and shows_no_refraction(self.scan):

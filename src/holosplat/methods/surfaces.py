@@ -12,6 +12,7 @@ from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from ..checks import at_least, in_range, positive, require
+from ..fit.freedom import Freedom, freed
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Adam, Group
 from ..fit.problem import Problem, Term
@@ -136,7 +137,7 @@ class SurfaceStage:
     def fit(self, task: Task, start: Stored) -> Fit:
         """The fit of the surfaces to the training frames."""
         assert isinstance(start, SurfaceMesh)
-        return surface_fit(task.scan, start, self.options.fit, task.seed, task.uneven)
+        return surface_fit(task.scan, start, self.options.fit, task.seed, task.uneven, task.freedom)
 
 
 def extract_surfaces(cloud: GaussianCloud, scan: Scan, options: Extraction = Extraction()) -> SurfaceMesh:
@@ -178,11 +179,12 @@ def surface_fit(
     options: SurfaceFit = SurfaceFit(),
     seed: int = 0,
     light: Light | None = None,
+    freedom: Freedom | None = None,
 ) -> Fit:
     """The fit of the surfaces `start` to the training frames of `scan`, of the same triangles, made ready.
 
-    Steps are Adam's in the coordinates (1 + λΔ) x, one length for all vertices (Nicolet, Jacobson & Jakob 2021, "Large
-    steps in inverse rendering of geometry", section 3).
+    freedom: of where these frames are, which is then fitted, too. Steps are Adam's in the coordinates (1 + λΔ) x, one
+    length for all vertices (Nicolet, Jacobson & Jakob 2021, "Large steps in inverse rendering of geometry", section 3).
     """
     finer = oversampling(scan.train(), options)
     base = ground(scan, start, start.matter, options.objective, options.schedule, "cpu", finer=finer, light=light)
@@ -195,7 +197,7 @@ def surface_fit(
         rates=lambda factor, step: {VERTICES: options.rate * factor},
         judge=base.judge,
     )
-    return Fit(plan, seed)
+    return Fit(freed(plan, freedom, base.train), seed)
 
 
 def oversampling(scan: Scan, options: SurfaceFit = SurfaceFit()) -> int:

@@ -33,6 +33,8 @@ is added to it times the root of the noise over the contrast, for the more noise
 several constants together each has twice as much: what tells them apart is finer than what tells one."""
 TOLD = 0.7
 """A constant is told by the frames if its standard error is less than this part of what the range left open."""
+LIKELY = 2.0
+"""Difference of -log of the probability up to which a constant lies within its interval, of about 95 %."""
 LIKELY_RATIOS = (56.0, 18_000.0)
 """δ/β that matter may have of which nothing is known: heavy elements at low energy, soft matter at high energy."""
 ENOUGH_AIR = 0.1
@@ -290,16 +292,26 @@ class Search:
         known = (vectors / (1 / np.maximum(values, 1e-9) + systematic)) @ vectors.T
         covariance = np.linalg.inv(known + np.diag(self.half**-2))
         likeliest, at = at, self.middle + covariance @ known @ (at - self.middle)
-        error = np.sqrt(np.diag(covariance))
+        error, tried = np.sqrt(np.diag(covariance)), self._about_as_likely()
         found = []
         for i, (name, given) in enumerate(self.ranges.items()):
-            told = bool(error[i] < TOLD * self.half[i])
             ends = np.clip([at[i] - 2 * error[i], at[i] + 2 * error[i]], self.low[i], self.high[i])
+            ends = np.array([min(ends[0], tried[:, i].min()), max(ends[1], tried[:, i].max())])
+            told = bool(error[i] < TOLD * self.half[i] and ends[1] - ends[0] < 2 * self.half[i])
             first, last = (float(end) for end in self.sign[i] * np.exp(ends))
             value = float(self.sign[i] * math.exp(at[i]))
             remark = self._at_an_end(likeliest, i) if told else self._joined(covariance, i)
             found.append(Determined(name, value, *_sorted((first, last)), given, told, remark))
         return tuple(found)
+
+    def _about_as_likely(self) -> np.ndarray:
+        """The constants [T, K] that were tried and may be as well, the likeliest among them.
+
+        A second derivative does not describe a misfit that levels off, as that of ever larger δ/β.
+        """
+        places = np.array(list(self._values))
+        costs = np.array([self._cost(place) for place in places])
+        return places[costs <= costs.min() + LIKELY]
 
     def _at_an_end(self, at: np.ndarray, i: int) -> str:
         near = 0.02 * self.half[i]

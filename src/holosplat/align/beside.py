@@ -1,0 +1,93 @@
+"""Where frames are beside matter of any kind that stays as it is: its own projections, moved by small steps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from ..model import Alignment, Instrument, Model
+from ..progress import Advance
+from ..representations import Stored
+from ..scan import Exposures
+from .derivatives import NUMBERS, Predicted
+from .newton import Normal, Step, step
+
+SMALL = (0.05, 0.05, 1e-3, 1e-3, 1e-3, 0.01)
+"""Steps by which derivatives of frames are taken: shifts [pixels], turns [rad], logarithm of the distance."""
+BLUR = 0.5
+"""Frames are compared after a Gaussian of this standard deviation [pixels]: edges are sharp."""
+STEPS = 3
+"""Newton's steps, from poses that are right to some tenths of a pixel."""
+
+
+def aligned(numbers: Tensor) -> Alignment:
+    """The corrections that `numbers` [V, 7] of `NUMBERS` are."""
+    return Alignment(numbers[:, 2:5], numbers[:, :2], numbers[:, 5].exp() - 1)
+
+
+def numbers_of(found: Exposures, planned: Exposures) -> Tensor:
+    """[V, 6] shifts [pixels], turns [rad], and logarithm of the distance, that make `planned` exposures `found`."""
+    turns = np.einsum("vij,vkj->vik", found.views.rotations, planned.views.rotations)
+    shifts = (found.views.shifts - planned.views.shifts) / planned.views.pixel_size
+    near = np.where(planned.distance > 0, found.distance / np.where(planned.distance > 0, planned.distance, 1), 1)
+    vectors = Rotation.from_matrix(turns).as_rotvec()
+    return torch.from_numpy(np.concatenate([shifts, vectors, np.log(near)[:, None]], axis=1))
+
+
+class Beside:
+    """Frames of `matter`, and how they change with the numbers of `planned` exposures."""
+
+    def __init__(self, matter: Stored, planned: Exposures, oversample: int) -> None:
+        self._parts = [
+            Model(matter, Instrument(planned[[v]], oversample, backend=matter.backend)) for v in range(len(planned))
+        ]
+
+    def predicted(self, numbers: Tensor) -> Predicted:
+        """Frames at `numbers` [V, 7], and their derivatives by one-sided differences; view by view to bound memory."""
+        views = [_one(part, numbers[[v]]) for v, part in enumerate(self._parts)]
+        return Predicted(torch.stack([frame for frame, _ in views]), torch.stack([slopes for _, slopes in views]))
+
+    def frames(self, numbers: Tensor) -> Tensor:
+        """Frames [V, H, W] at `numbers`."""
+        with torch.no_grad():
+            return torch.stack([_frame(part, numbers[[v]]) for v, part in enumerate(self._parts)])
+
+    def placed(
+        self,
+        measured: Tensor,
+        numbers: Tensor,
+        expected: Tensor,
+        steps: int = STEPS,
+        tell: Advance = lambda part: None,
+    ) -> Step:
+        """The numbers of `measured` frames [V, H, W] after some steps from `numbers`, with their covariances.
+
+        expected: standard deviations [7] about the plan, 0 for what stays. No steps at all: covariances where they are.
+        """
+        found = Step(numbers, torch.zeros(len(numbers), len(NUMBERS), len(NUMBERS), dtype=torch.float64))
+        for done in range(max(1, steps)):
+            normal = Normal.of(measured, self.predicted(found.numbers), BLUR)
+            moved = step(normal, found.numbers, expected)
+            found = moved if steps else replace(moved, numbers=numbers)
+            tell((done + 1) / max(1, steps))
+        return found
+
+
+@torch.no_grad()
+def _one(model: Model, numbers: Tensor) -> tuple[Tensor, Tensor]:
+    """The frame [H, W] of one view, and its derivatives [7, H, W]."""
+    here, slopes = _frame(model, numbers), list[Tensor]()
+    for k, small in enumerate(SMALL):
+        moved = numbers.clone()
+        moved[:, k] += small
+        slopes.append((_frame(model, moved) - here) / small)
+    return here, torch.stack([*slopes, here])
+
+
+def _frame(model: Model, numbers: Tensor) -> Tensor:
+    frames = replace(model, alignment=aligned(numbers)).frames()[0].cpu()
+    return frames * float(numbers[0, -1].exp())

@@ -1,0 +1,107 @@
+"""Poses and distances by matter with sharp edges: closed surfaces cut out of the voxels, fitted with the geometry free.
+
+Voxels have soft edges, and a distance that is too long sharpens fringes just as sharper edges would. Surfaces have none
+of that freedom: where they explain the frames, they tell the distance, and poses several times better.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..checks import InputError
+from ..fit.freedom import Freedom, mean_distance_error
+from ..fit.schedule import Schedule
+from ..geometry import Grid
+from ..matter import DeltaBeta, Matter
+from ..methods.surfaces import SurfaceFit, oversampling, surface_fit
+from ..optics.noise import noise_levels
+from ..progress import Advance
+from ..representations import SurfaceMesh, isosurface
+from ..scan import Exposures, Scan
+from .beside import Beside, aligned, numbers_of
+from .newton import Step, unexplained
+from .poses import DISTANCE, FLUX, PoseOptions
+
+DECAY = 0.3
+"""Share of the rates that is left at the last step: distances settle slowly in noise."""
+FITTED = 0.7
+"""Share of the time that the fit takes; placing frames takes the rest."""
+SHARPER = 0.7
+"""Surfaces are believed if they leave less than this part unexplained of what voxels leave, noise apart."""
+
+
+@dataclass(frozen=True)
+class Sharpened:
+    """step: numbers [V, 7] of all frames beside the plan, and their covariances beside the surfaces; left: [V] what
+    surfaces leave unexplained of each frame; surfaces: in the poses that were found."""
+
+    step: Step
+    left: np.ndarray
+    surfaces: SurfaceMesh
+
+
+def surfaces_of(volume: Tensor, scan: Scan, material: DeltaBeta) -> SurfaceMesh | None:
+    """Closed surfaces where occupancies `volume` on the field of view of `scan` cross a half; None where none do."""
+    try:
+        mesh = isosurface(volume.numpy(), Grid.of_views(scan.views))
+    except InputError:
+        return None
+    unit = scan.views.pixel_size
+    return SurfaceMesh(
+        torch.from_numpy(mesh.vertices / unit), torch.from_numpy(mesh.faces), unit, Matter.one(*material)
+    )
+
+
+def sharpened(scan: Scan, numbers: Tensor, start: SurfaceMesh, search: PoseOptions, on_progress: Advance) -> Sharpened:
+    """All frames of `scan` beside surfaces that are fitted to those for training, from `start` and `numbers` [V, 7] on.
+
+    numbers: of `NUMBERS` beside the exposures of `scan`, shifts in its pixels, as those of `search`. Held-out frames
+    are placed beside the finished surfaces.
+    """
+    train, test = np.flatnonzero(~scan.is_test), np.flatnonzero(scan.is_test)
+    options = SurfaceFit(schedule=Schedule(steps=search.edges, decay=DECAY))
+    frames, lit = torch.from_numpy(scan.frames), numbers[:, FLUX].exp().float()[:, None, None]
+    begin = replace(scan, frames=(frames / lit).numpy(), exposures=aligned(numbers).exposures(scan.exposures))[train]
+    uncertain = search.uncertain
+    freedom = uncertain.freedom(numbers[train, :FLUX].numpy())
+    fit = surface_fit(begin, start, options, freedom=freedom)
+    fit.run(lambda record: on_progress(FITTED * fit.share))
+    model = fit.result()
+    assert isinstance(model.object, SurfaceMesh)
+    assert model.alignment is not None
+    found = numbers.clone()
+    found[train, :FLUX] = numbers_of(model.alignment.exposures(begin.exposures), scan.exposures[train])
+    beside = Beside(model.object, scan.exposures, oversampling(begin, options))
+    expected = uncertain.deviations()
+    expected[DISTANCE] = uncertain.distance
+    moved = beside.placed(frames, found, expected, tell=lambda part: on_progress(FITTED + (1 - FITTED) * part))
+    after = moved.numbers.clone()
+    if not freedom.tells_mean(begin.exposures):  # these are moved by what the mean of the others was kept from
+        away = (after[train, DISTANCE] - found[train, DISTANCE]).mean()
+        after[test, DISTANCE] = 0.0 if len(train) < search.few_views else after[test, DISTANCE] - away
+    after[train, :FLUX] = found[train, :FLUX]
+    covariances = moved.covariances.clone()
+    if uncertain.distance > 0:
+        covariances[:, DISTANCE, DISTANCE] += mean_error(freedom, begin.exposures) ** 2
+    return Sharpened(Step(after, covariances), unexplained(frames, beside.frames(after)), model.object)
+
+
+def mean_error(freedom: Freedom, exposures: Exposures) -> float:
+    """Standard error of the mean distance, as a share: what sampling does, or what the plan leaves open."""
+    return min(mean_distance_error(exposures), freedom.distance / math.sqrt(len(freedom)))
+
+
+def believed(scan: Scan, by_surfaces: np.ndarray, by_voxels: np.ndarray) -> bool:
+    """Whether surfaces explain the training frames of `scan` so much better than voxels that its matter has edges.
+
+    by_surfaces, by_voxels: [V] rms of what they leave, as a share of each frame's contrast; noise counts for neither.
+    """
+    frames = torch.from_numpy(scan.frames)
+    noise = (noise_levels(frames) / frames.std(dim=(1, 2)).double().clamp_min(1e-12)).numpy()
+    sharp, soft = (float(np.maximum(left**2 - noise**2, 0)[~scan.is_test].sum()) for left in (by_surfaces, by_voxels))
+    return sharp < SHARPER**2 * soft

@@ -1,0 +1,203 @@
+"""Where beams are, as numbers of a fit beside its object: which are free, what is expected of them, and the gauge."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..checks import shaped
+from ..geometry import Views
+from ..model import Alignment, Model
+from ..optics.noise import noise_levels
+from ..optics.sampling import fringes
+from ..scan import Exposures, Scan
+from .batch import Batch
+from .loop import Plan
+from .optimiser import Leaves
+from .problem import Part
+from .running import Record
+from .trainable import Trainable
+from .validation import set_aside
+
+RATE_PX = 0.05
+"""First steps of shifts, and of turns at the edge of the field [pixels]: what voxels leave is found in some twenty."""
+RATE_SHARE = 0.25
+"""First steps of distances, as a share of their uncertainty."""
+LEAST_LEFT = 0.001
+"""Mean loss of a fit without noise, in units of the frames' range: sharp cells end with so much."""
+ROUNDED = 1 / 3
+"""Loss over the negative logarithm of the likelihood, in standard deviations of the noise: `√(r² + c²) - c` with c of
+three of them is `r² / 2c`."""
+SAMPLED = 0.015
+"""Share by which sampling shifts the mean distance where the first fringe is a pixel wide; it falls with the square of
+the width (docs/data/alignment.csv)."""
+
+
+@dataclass(frozen=True)
+class Freedom:
+    """What is not known of V views, as standard deviations; 0: it stays as it is.
+
+    shift [pixels], angle (turns about the axes across the beam) [rad], roll [rad], distance [share]
+    so_far: [V, 6] how far the views are from the plan already: shifts x, y [pixels], turns about x, y, z of the lab
+        [rad], share of the distance
+    """
+
+    shift: float
+    angle: float
+    roll: float
+    distance: float
+    so_far: np.ndarray
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "so_far", shaped("so_far", np.asarray(self.so_far), (len(self.so_far), 6)))
+
+    def __len__(self) -> int:
+        return len(self.so_far)
+
+    def __bool__(self) -> bool:
+        return max(self.shift, self.angle, self.roll, self.distance) > 0
+
+    def __getitem__(self, index: np.ndarray) -> Freedom:
+        return replace(self, so_far=self.so_far[index])
+
+    def deviations(self) -> np.ndarray:
+        """[6] of each of the numbers of a view."""
+        return np.array([self.shift, self.shift, self.angle, self.angle, self.roll, self.distance])
+
+    def alignment(self, device: torch.device | str = "cpu") -> Alignment:
+        """No correction yet, with room for what is free."""
+        turns = self.angle > 0 or self.roll > 0
+        names = {"turns": turns, "shifts": self.shift > 0, "stretches": self.distance > 0}
+        return Alignment.planned(len(self), *(name for name, free in names.items() if free), device=device)
+
+    def tells_mean(self, exposures: Exposures) -> bool:
+        """Whether frames tell the mean distance better than the plan does (see `SAMPLED`)."""
+        return mean_distance_error(exposures) < self.distance / np.sqrt(len(self))
+
+
+def mean_distance_error(exposures: Exposures) -> float:
+    """By how much a fit finds all distances too short or too long together, as a share: its waves are sampled."""
+    width = float(np.mean(fringes(exposures))) / exposures.views.pixel_size
+    return SAMPLED / max(width, 1e-3) ** 2
+
+
+def freed(plan: Plan, freedom: Freedom | None, train: Scan) -> Plan:
+    """`plan` with the geometry of its frames `train` as free as `freedom` says; as it is where nothing is free.
+
+    freedom: of these frames and those that are set aside for validation, which stay where they are.
+    Steps are Adam's, with the rates' decay; the prior is that of `Freedom`, and what no frame can tell is kept
+    (`Gauge`).
+    """
+    if not freedom:
+        return plan
+    if len(freedom) > len(train):
+        freedom = freedom[~set_aside(len(freedom), len(freedom) - len(train))]
+    model, exposures = plan.problem.model, train.exposures
+    alignment = freedom.alignment(model.instrument.device)
+    (h, w), frames = exposures.views.shape, torch.from_numpy(train.frames)
+    level = max(ROUNDED * float(noise_levels(frames).mean() / (frames.max() - frames.min())), LEAST_LEFT)
+    own = {
+        "alignment.shifts": RATE_PX,
+        "alignment.turns": RATE_PX / (0.5 * max(h, w)),
+        "alignment.stretches": RATE_SHARE * freedom.distance,
+    }
+    expected = Expected(freedom, level / (h * w * len(train)), model.instrument.device)
+
+    def rates(factor: float, step: int) -> Mapping[str, float]:
+        return {**plan.rates(factor, step), **{name: rate * factor for name, rate in own.items()}}
+
+    problem = replace(plan.problem, model=replace(model, alignment=alignment), terms=(*plan.problem.terms, expected))
+    return replace(plan, problem=problem, rates=rates, events=(*plan.events, Gauge(freedom, exposures)))
+
+
+class Expected:
+    """The term of what is expected of the geometry: half the sum of squares of its numbers in their deviations."""
+
+    names = ("geometry",)
+
+    def __init__(self, freedom: Freedom, weight: float, device: torch.device) -> None:
+        """weight: of one number; that of a fit whose data term is a mean over pixels."""
+        self._weight = weight
+        places = {"shifts": [0, 1], "turns": [2, 3, 4], "stretches": [5]}
+        deviations = freedom.deviations()
+        self._parts = {
+            f"alignment.{name}": tuple(
+                torch.from_numpy(part).to(device)
+                for part in (freedom.so_far[:, at], np.where(deviations[at] > 0, deviations[at], np.inf))
+            )
+            for name, at in places.items()
+        }
+
+    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+        """The one part."""
+        parameters, total = model.parameters(), list[Tensor]()
+        for name, (so_far, deviations) in self._parts.items():
+            if name in parameters:
+                away = parameters[name].reshape(so_far.shape) + so_far
+                total.append((away / deviations).square().sum())
+        return [Part("geometry", self._weight, (0.5 * torch.stack(total).sum()).float())]
+
+
+class Gauge:
+    """What no frame tells stays: a motion and a turn of the whole object, and a mean distance that sampling would move.
+
+    An event of a fit: gradients and numbers are projected onto what changes frames. What is not free has no gradient.
+    """
+
+    def __init__(self, freedom: Freedom, exposures: Exposures) -> None:
+        free = freedom.deviations() > 0
+        views, count = exposures.views, len(exposures)
+        ones = np.full((count, 1), 0 if freedom.tells_mean(exposures) else 1.0)
+        self._projections = {
+            "alignment.shifts": projection(views.rotations[:, :2].reshape(-1, 3), np.tile(free[:2], count)),
+            "alignment.turns": projection(_turns(views), np.tile(free[2:5], count)),
+            "alignment.stretches": projection(ones, np.tile(free[5:], count)),
+        }
+
+    def _each(self, leaves: Leaves, of: Callable[[Tensor], Tensor | None]) -> None:
+        for name, kept in self._projections.items():
+            values = of(leaves[name]) if name in leaves else None
+            if values is not None:
+                values.copy_((kept.to(values) @ values.flatten()).reshape(values.shape))
+
+    def on_gradients(self, leaves: Leaves) -> None:
+        """Gradients along what no frame tells are chance."""
+        self._each(leaves, lambda leaf: leaf.grad)
+
+    def after_step(self, trainable: Trainable, step: int, steps: int, generator: torch.Generator) -> bool:
+        """Adam's steps have their own length for each number, and leave the projection."""
+        self._each(trainable.leaves, lambda leaf: leaf.detach())
+        return False
+
+    def columns(self, model: Model) -> Record:
+        """None."""
+        return {}
+
+    def state_dict(self) -> dict[str, Any]:
+        """It has no state."""
+        return {}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """It has no state."""
+
+
+def _turns(views: Views) -> np.ndarray:
+    """[3V, 3] turns of the views about the lab's axes by a turn of the object: `ω = R w`."""
+    return views.rotations.reshape(-1, 3)
+
+
+def projection(motions: np.ndarray, free: np.ndarray) -> Tensor:
+    """[N, N] float64: takes out of N numbers those that are not `free` [N], and the `motions` [N, K] that move none of
+    these."""
+    if not free.all():
+        _, sizes, ways = np.linalg.svd(motions[~free], full_matrices=True)
+        rank = int((sizes > 1e-6 * max(1.0, sizes.max(initial=0.0))).sum())
+        motions = motions @ ways[rank:].T
+    basis, sizes, _ = np.linalg.svd(np.where(free[:, None], motions, 0.0), full_matrices=False)
+    basis = basis[:, sizes > 1e-6 * max(1.0, sizes.max(initial=0.0))]
+    return torch.from_numpy(np.diag(free.astype(float)) - basis @ basis.T)
