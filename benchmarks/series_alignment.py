@@ -2,9 +2,9 @@
 
     python benchmarks/series_alignment.py [--cases NAME …] [--times 3 8 13] [--moments planned aligned true]
 
-Red cells flow and turn in three or two beams (`simulate --geometry xmpi_3beam`, `xmpi_2beam`), whose geometry is wrong by
-errors that are known and the same at all 16 times. Volumes of some of the times are reconstructed in the planned, the
-found and the true exposures, each moved as a whole as near to the true ones as can be, and compared with the truth.
+Red cells flow and turn in three or two beams (`simulate --geometry xmpi_3beam`, `xmpi_2beam`), whose geometry is wrong
+by errors that are known and the same at all 16 times. Volumes of some of the times are reconstructed in the planned,
+the found and the true exposures, each moved as a whole as near to the true ones as can be, and compared with the truth.
 """
 
 from __future__ import annotations

@@ -40,7 +40,9 @@ def series(planned: Exposures, errors: Misalignment, times: int, drift: float = 
     true = errors.true_exposures(planned).repeated(np.arange(times) * 1e-3)
     when = np.linspace(-1, 1, times)
     shifts = true.views.shifts.copy()
-    shifts[:, 1] += 0.25 * drift * PIXEL * np.repeat(when, len(planned)) * np.tile(np.resize([1.0, -1.0], len(planned)), times)
+    shifts[:, 1] += (
+        0.25 * drift * PIXEL * np.repeat(when, len(planned)) * np.tile(np.resize([1.0, -1.0], len(planned)), times)
+    )
     true = replace(true, views=replace(true.views, shifts=shifts))
     frames = []
     for n in range(len(true)):

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from ..checks import require
 from ..matter import DeltaBeta, Known, MaterialPrior
 from ..methods.assumed import assumed_material
 from ..model import Alignment
@@ -82,6 +83,18 @@ class AlignedBeams(AlignedViews):
             if side:
                 turned[n] = np.flip(frames[n], SIDES[side])
         return turned
+
+    def lasting(self) -> np.ndarray:
+        """[B] the first frames of all beams, whose exposures are those of the others.
+
+        Errors: `InputError` for a drift, for reversed beams, and for frames that are not in the beams' order.
+        """
+        require(not self.drift.any(), "--geometry-out is of beams that stay, but these drift; leave it, or the drift.")
+        require(not any(self.sides), "--geometry-out is of frames as they are, but some are reversed; turn them first.")
+        count = len(self.beams)
+        in_order = np.array_equal(self.of_frame, np.arange(len(self.of_frame)) % count)
+        require(in_order, "--geometry-out is of beams that come in one order at all times; leave it.")
+        return np.arange(count)
 
     def lines(self) -> list[str]:
         """What was found, in words, and a table of the beams."""

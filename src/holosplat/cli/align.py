@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     import numpy as np
 
     from ..align import AlignedViews, PoseOptions
-    from ..frames import Frames
     from ..matter import MaterialPrior
     from ..optics.background import LightOptions
     from ..scan import Exposures, Scan
@@ -105,6 +104,9 @@ def align(
         table: Also write what was found of each view, with errors (CSV).
         geometry_out: Also write the geometry of all beams (TOML), which --exposures takes for other scans of them.
     """
+    import numpy as np
+
+    from ..align import AlignedBeams
     from ..io.atomic import require_apart, require_writable
     from ..io.formats import read_as
     from ..io.nxtomo import write_scan
@@ -117,19 +119,22 @@ def align(
     require(geometry_out is None or reading.part.views is None, "--geometry-out is of all frames; leave --views.")
     measured = read_as(scan, reading).in_memory()
     prior = matter.prior(measured.exposures.reference_energy)
-    errors, frames = None, measured.source
+    errors, frames, lasting = None, measured.source, np.arange(len(measured))
     if axis_only:
         lines, exposures = _axis(measured, prior, illumination.options())
     else:
         found = _views(measured, prior, unknown.options(), illumination.options())
         lines, exposures, errors = found.lines(), found.exposures, found.errors
-        frames = _upright(found, measured)
+        if isinstance(found, AlignedBeams):
+            frames = found.upright(measured.frames) if any(found.sides) else frames
+            lasting = lasting if geometry_out is None else found.lasting()
         if table is not None:
             _write_table(table, found)
     for line in lines:
         print(line)
     if geometry_out is not None:
-        _write_geometry(geometry_out, scan, reading, measured, exposures, errors, lines[0])
+        told = errors if errors is None else errors[lasting]
+        _write_geometry(geometry_out, scan, reading, (measured.exposures[lasting], exposures[lasting]), told, lines[0])
     facts = measured.provenance | {"aligned": lines[0]}
     write_scan(out, Scan.of(frames, exposures, measured.is_test, facts))
     print(f"wrote {out}: the same {len(measured)} frames, with other exposures", file=sys.stderr)
@@ -153,13 +158,16 @@ def _views(scan: Scan, prior: MaterialPrior, options: PoseOptions, light: LightO
 
 
 def _write_geometry(
-    path: Path, source: Path, reading: Reading, measured: Scan, found: Exposures, errors: np.ndarray | None, said: str
+    path: Path, source: Path, reading: Reading, moved: tuple[Exposures, Exposures], errors: np.ndarray | None, said: str
 ) -> None:
-    """That of whole frames: `found` is that of `measured`, which may be cut and have larger pixels."""
+    """That of whole frames: `moved` are the exposures before and after, of frames that may be cut and have larger
+    pixels; of a series, those of one time."""
     from ..io.beams import Beams, write_beams
     from ..io.formats import read_as
 
+    measured, found = moved
     whole = read_as(source, replace(reading, part=Part(time_frame=reading.part.time_frame))).exposures
+    whole = whole[: len(found)]
     shifts = whole.views.shifts + found.views.shifts - measured.views.shifts
     views = replace(whole.views, rotations=found.views.rotations, shifts=shifts)
     if errors is not None:
@@ -169,15 +177,6 @@ def _write_geometry(
     beams = Beams.of(replace(whole, views=views, distance=found.distance), errors, origin)
     write_beams(path, beams)
     print(f"wrote {path}: the geometry of {len(beams)} beams, for --exposures", file=sys.stderr)
-
-
-def _upright(found: AlignedViews, scan: Scan) -> np.ndarray | Frames:
-    """The frames that the exposures found are of: those of reversed beams are turned back."""
-    from ..align import AlignedBeams
-
-    if isinstance(found, AlignedBeams) and any(found.sides):
-        return found.upright(scan.frames)
-    return scan.source
 
 
 def _write_table(path: Path, found: AlignedViews) -> None:
