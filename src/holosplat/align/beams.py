@@ -147,16 +147,18 @@ def align_beams(
     moments = [_evened(moment, light) for moment in chosen_moments(scan, beams, options.times, FEWEST)]
     times = np.array([moment.time for moment in moments])
     material = assumed_material(moments[len(moments) // 2].scan.train(), prior, on_progress)
-    few = int((~moments[0].scan.is_test).sum()) < FEW
+    count = int((~moments[0].scan.is_test).sum())
+    few = count < FEW
     pixels = PoseSearch(moments[0].scan, material, options, None, begin=False).levels()[-1].pixels
     on_progress("rows", 0.0)
     start = _rows(moments, len(beams), material, options, few, pixels)
     on_progress("rows", 1.0)
     if start is not None:
         moments = [_turned_back(moment, start.sides) for moment in moments]
-    if start is not None and few and start.believed:
+    by_rows = start is not None and few and start.believed
+    if start is not None and by_rows:
         found = _by_rows(start, pixels)
-        if int((~moments[0].scan.is_test).sum()) == FEWEST:
+        if count == FEWEST:
             found.words.append(ACROSS)
     else:
         search = SeriesSearch(moments, len(beams), material, options, 1.0 if isinstance(prior, Known) else None)
@@ -171,7 +173,8 @@ def align_beams(
     if options.uncertain.distance > 0:
         found.words.append(DISTANCES)
     found = _kept(_without_doubtful_drift(found, options), beams.planned, options)
-    if (found.numbers.any() or found.rates.any()) and np.mean(found.after**2) > np.mean(found.before**2):
+    telling = by_rows or count >= options.few_views  # volumes of few frames agree with any poses
+    if telling and (found.numbers.any() or found.rates.any()) and np.mean(found.after**2) > np.mean(found.before**2):
         found = replace(found, numbers=0 * found.numbers, rates=0 * found.rates, after=found.before)
         found.words.append("all is as planned: what was found explains the frames no better")
     return _placed(scan, beams, found, times, start.sides if start else ("",) * len(beams))

@@ -145,11 +145,11 @@ def _upright(images: Images, train: np.ndarray, prior: RowPrior) -> tuple[Images
 
     One view after another is reversed, that which makes rows agree best; the later one of two that are as good. Masses
     of rows tell which are upside down. Columns that are reversed turn the signs of first moments; with two views, any
-    two agree.
+    two agree. Nothing is looked for where matter passes the edges, and rows need not agree.
     """
     sides, found = [""] * len(images.views), images.estimate(prior, train)
     kinds = tuple(SIDES) if len(train) > 2 else ("y",)
-    for _ in range(len(train) // 2):
+    for _ in range(0 if images.passing() else len(train) // 2):
         left = float(np.sqrt(np.mean(found.after**2)))
         if left < SMALL:
             break
