@@ -4,8 +4,8 @@
     python benchmarks/alignment.py --cases "volume 12" "volume 4" --moments planned aligned true
 
 Scenes of the benchmark (sharp cells) are simulated with errors of each view that are known, and aligned; errors are
-those after the best motion of the whole object. Cases called "volume …" are also reconstructed, and their volumes
-compared with the truth: in the planned, the found, and the true exposures.
+those after the best motion of the whole object, magnifications beside their mean. Cases called "volume …" are also
+reconstructed, and their volumes compared with the truth: in the planned, the found, and the true exposures.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ FIELDS: tuple[str, ...] = (
     "shift_px",
     "across_deg",
     "roll_deg",
+    "magnification",
     "seconds",
     "machine",
     "commit",
@@ -78,6 +79,13 @@ CASES = {
     "1 px, 0.6°, 4 views": Experiment("main4", Misalignment(1.0, 0.6, 0.02, 0)),
     "5 px, 1°, 2000 photons": Experiment("main12", Misalignment(5.0, 1.0, 0.05, 1), 2000.0, Uncertain(shift=5.0)),
     "perfect": Experiment("main12", Misalignment()),
+    "1 px, 0.6°, 1 % magnification": Experiment(
+        "main12", Misalignment(1.0, 0.6, 0.0, 0, magnification=0.01), uncertain=Uncertain(magnification=0.01)
+    ),
+    "1 px, 0.6°, 0.5 % magnification": Experiment(
+        "main12", Misalignment(1.0, 0.6, 0.0, 1, magnification=0.005), uncertain=Uncertain(magnification=0.01)
+    ),
+    "perfect, magnification free": Experiment("main12", Misalignment(), uncertain=Uncertain(magnification=0.01)),
     "volume 12": Experiment("main12", Misalignment(1.0, 0.6, 0.02, 7), methods=BOTH),
     "volume 12, other errors": Experiment("main12", Misalignment(1.0, 0.6, 0.02, 8), methods=("auto",)),
     "volume 4": Experiment("main4", Misalignment(1.0, 0.6, 0.02, 7), held_out=2, methods=BOTH),
@@ -85,14 +93,15 @@ CASES = {
 }
 
 
-def rms_errors(found: hs.Exposures, true: hs.Exposures) -> tuple[float, float, float]:
-    """Rms errors: shifts [pixels], turns across the beam and roll [degrees]."""
-    moved, pixel = moved_onto(found.views, true.views), true.views.pixel_size
+def rms_errors(found: hs.Exposures, true: hs.Exposures) -> tuple[float, float, float, float]:
+    """Rms errors: shifts [pixels], turns across the beam and roll [degrees], and magnification beside its mean."""
+    moved, pixel = moved_onto(found.views, true.views), true.views.pixel_sizes[:, None]
+    larger = np.log(true.views.pixel_sizes / found.views.pixel_sizes)
     turns = np.einsum("vij,vkj->vik", moved.rotations, true.views.rotations)
     degrees = Rotation.from_matrix(turns).as_rotvec(degrees=True)
-    parts = ((moved.shifts - true.views.shifts) / pixel, degrees[:, :2], degrees[:, 2])
-    shift, across, roll = (float(np.sqrt(np.square(part).mean())) for part in parts)
-    return shift, across, roll
+    parts = ((moved.shifts - true.views.shifts) / pixel, degrees[:, :2], degrees[:, 2], larger - larger.mean())
+    shift, across, roll, magnification = (float(np.sqrt(np.square(part).mean())) for part in parts)
+    return shift, across, roll, magnification
 
 
 def measured(experiment: Experiment) -> tuple[Case, hs.Scan, hs.Exposures]:
@@ -122,7 +131,8 @@ def rows_of(name: str, experiment: Experiment, moments: list[str], commit: str) 
         for views, index in (("training", ~scan.is_test), ("all", np.ones(len(scan), dtype=bool))):
             chosen = np.flatnonzero(index)
             errors = rms_errors(placed[moment][chosen], true[chosen])
-            values = {key: f"{e:.4f}" for key, e in zip(("shift_px", "across_deg", "roll_deg"), errors, strict=True)}
+            names = ("shift_px", "across_deg", "roll_deg", "magnification")
+            values = {key: f"{e:.5f}" if key == "magnification" else f"{e:.4f}" for key, e in zip(names, errors)}
             rows.append(said | {"views": views, "moment": moment, "seconds": f"{seconds:.0f}"} | values)
             print(rows[-1], flush=True)
     for method in experiment.methods:

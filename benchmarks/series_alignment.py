@@ -121,7 +121,7 @@ def rows_of(name: str, experiment: Experiment, times: list[int], moments: list[s
             for t in range(TIMES)
         ]
         means = np.sqrt(np.square(per_time).mean(0))
-        values = {key: f"{e:.4f}" for key, e in zip(("shift_px", "across_deg", "roll_deg"), means, strict=True)}
+        values = {key: f"{e:.4f}" for key, e in zip(("shift_px", "across_deg", "roll_deg"), means)}
         rows.append(said | {"views": "all", "moment": moment, "seconds": f"{seconds:.0f}"} | values)
         print(rows[-1], flush=True)
     for moment in moments if experiment.volumes else []:

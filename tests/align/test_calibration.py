@@ -24,6 +24,7 @@ from holosplat.specimens.red_cells import icosphere
 
 PIXEL, SHAPE = 1e-6, (45, 48)
 MATERIAL = hs.DeltaBeta(5e-7, 5e-10)
+QUICK = CalibrationOptions(retrieval=0)
 KNOWN = hs.MaterialPrior.known(MATERIAL)
 BEADS = np.array([[9, -8, 3], [-10, 5, 7], [2, 10, -11], [-5, -11, -8]], dtype=float)
 
@@ -59,7 +60,7 @@ def with_mesh() -> tuple[Calibrated, hs.Exposures]:
     turn = Rotation.from_rotvec([0.7, -0.4, 1.9]).as_matrix()
     there = body.transformed(turn, PIXEL * np.array([2, -1, 1.5]) - turn @ centre_of_mass(body))
     scan = frames_of(hs.MeshScene.of_one_material([there], MATERIAL), true, planned())
-    return calibrate(scan, KNOWN, body), true
+    return calibrate(scan, KNOWN, body, QUICK), true
 
 
 def test_a_phantom_tells_the_geometry_to_the_bars(with_mesh):
@@ -71,7 +72,7 @@ def test_a_phantom_tells_the_geometry_to_the_bars(with_mesh):
     assert errors[4] < 0.05
     assert errors[5] < 0.006
     before = np.abs(changes(replace(planned(), views=moved_onto(planned().views, true.views)), true)).max(0)
-    assert (before > [0.5, 0.5, 0.3, 0.3, 0.2, 0.01]).all()
+    assert (before[:6] > [0.5, 0.5, 0.3, 0.3, 0.2, 0.01]).all()
     assert found.words == ()
     assert len(found.lines()) == 6
 
@@ -90,7 +91,7 @@ def test_the_common_motion_goes_to_the_phantom(with_mesh):
 def test_beads_in_unknown_places_tell_it_too():
     """Ten times better than the bars; and where the beads are, but for a motion of all."""
     true = Misalignment(1.0, 0.6, 0.02, 3).true_exposures(planned())
-    found = calibrate(frames_of(beads(BEADS), true, planned()), KNOWN, 4.0 * PIXEL)
+    found = calibrate(frames_of(beads(BEADS), true, planned()), KNOWN, 4.0 * PIXEL, QUICK)
     assert len(found.phantom) == len(BEADS)
     errors = worst(found, true)
     assert errors[:2].max() < 0.005
@@ -104,7 +105,7 @@ def test_one_bead_tells_no_turns_and_a_pixel_may_be_told():
     """What is not told stays as planned, and is said. The pixel is said to be 3 % larger than it is."""
     said = planned(1.03 * PIXEL)
     scan = frames_of(beads(BEADS[:1], 6.0), planned(), said)
-    options = CalibrationOptions(Uncertain(5.0, 1.0, 1.0, 0.05), pixel=0.05)
+    options = CalibrationOptions(Uncertain(5.0, 1.0, 1.0, 0.05), pixel=0.05, retrieval=0)
     found = calibrate(scan, KNOWN, 6.0 * PIXEL, options)
     assert "one bead looks the same" in found.words[0]
     np.testing.assert_allclose(found.exposures.views.rotations, said.views.rotations, atol=1e-9)
@@ -130,7 +131,7 @@ def test_derivatives_are_those_of_the_frames():
 
     nudge = np.zeros((4, 3))
     nudge[2, 1] = 0.1 * PIXEL
-    wide = replace(exposures.views, pixel_size=PIXEL * 1.01), replace(exposures.views, pixel_size=PIXEL / 1.01)
+    wide = replace(exposures.views, pitch=PIXEL * 1.01), replace(exposures.views, pitch=PIXEL / 1.01)
     pairs = (
         (here.of_views[:, 3], seen(phantom, turned(0.005)) - seen(phantom, turned(-0.005)), 0.01),
         (here.of_all[7], seen(phantom.shifted(nudge), exposures) - seen(phantom.shifted(-nudge), exposures), 0.2),
@@ -149,11 +150,11 @@ def test_numbers_that_do_not_matter_keep_what_was_expected():
     rng = torch.Generator().manual_seed(0)
     phantom, exposures = Phantom.of_beads(PIXEL * BEADS, 4.0 * PIXEL), planned()
     here = linearised(phantom, exposures, MATERIAL, 1, False)
-    truth = 0.01 * torch.randn(4, 7, generator=rng, dtype=torch.float64)
-    truth[:, 4] = 0
+    truth = 0.01 * torch.randn(4, 8, generator=rng, dtype=torch.float64)
+    truth[:, [4, 6]] = 0
     frames = here.frames + torch.einsum("vk,vkhw->vhw", truth, here.of_views)
-    numbers = (torch.zeros(4, 7, dtype=torch.float64), torch.zeros(12, dtype=torch.float64))
-    wide = (torch.tensor([9.0, 9, 9, 9, 0, 9, 9], dtype=torch.float64), torch.zeros(12, dtype=torch.float64))
+    numbers = (torch.zeros(4, 8, dtype=torch.float64), torch.zeros(12, dtype=torch.float64))
+    wide = (torch.tensor([9.0, 9, 9, 9, 0, 9, 0, 9], dtype=torch.float64), torch.zeros(12, dtype=torch.float64))
     after = solved(frames, here, numbers, wide, 1.0)
     torch.testing.assert_close(after.of_views, truth, atol=1e-4, rtol=1e-2)
     assert not after.of_views[:, 4].any()
@@ -178,4 +179,4 @@ def test_what_cannot_be_calibrated_is_refused(change, said):
     scan = frames_of(beads(BEADS[:2]), planned(), planned())
     given = {"prior": KNOWN, "body": 4.0 * PIXEL} | change
     with pytest.raises(hs.InputError, match=said):
-        calibrate(scan, given["prior"], given["body"])
+        calibrate(scan, given["prior"], given["body"], QUICK)

@@ -115,6 +115,7 @@ def test_the_times_normal_equations_are_those_of_numbers_and_rates(three):
     r = torch.Generator().manual_seed(0)
     numbers, rates = (1e-2 * torch.randn(3, len(NUMBERS), generator=r, dtype=torch.float64) for _ in range(2))
     rates[:, 5:] = 0
+    numbers[:, 6] = 0
     information = 1e12 * torch.eye(len(NUMBERS), dtype=torch.float64).repeat(3, 1, 1)
     said = [1e12 * (numbers + moment.when * rates) for moment in moments]
     search.solve([Normal(information, slope) for slope in said], turning=True)

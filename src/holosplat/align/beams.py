@@ -17,6 +17,7 @@ from ..progress import Progress
 from ..scan import Exposures, Scan
 from .begin import Begun, Images, begun
 from .coarse import SIDES
+from .derivatives import NUMBERS
 from .gauge import moved_onto
 from .moments import Beams, Moment, chosen_moments, whens
 from .poses import DISTANCE, FLUX, SHIFT, TURN, PoseOptions, PoseSearch
@@ -31,8 +32,8 @@ JUDGED = 3
 
 
 ACROSS = "shifts across two beams are as planned: they are a motion of the whole object, which loses nothing"
-DISTANCES = "distances are as planned: rows and voxels cannot tell them; align a single time, of four beams or more"
-DEGREES = np.array([1, 1, *[np.pi / 180] * 3, 1])
+DISTANCES = "distances and magnifications are as planned: rows and voxels cannot tell them; align a single time"
+DEGREES = np.array([1, 1, *[np.pi / 180] * 3, 1, 1])
 """Units of `changes` in those of `NUMBERS`."""
 
 
@@ -40,7 +41,7 @@ DEGREES = np.array([1, 1, *[np.pi / 180] * 3, 1])
 class Found:
     """What was found of B beams.
 
-    numbers, rates: [B, 7] of `NUMBERS` at the middle of the series, and how much more at its end
+    numbers, rates: [B, 8] of `NUMBERS` at the middle of the series, and how much more at its end
     errors, rate_errors: [B, 5] of those of the pose
     before, after: [B] of what `measure` says
     pixels: of the images they were found on; words: about it
@@ -63,7 +64,7 @@ class AlignedBeams(AlignedViews):
     frame's beam.
 
     sides: [N] which mirror image each frame is, and was turned back from, or ""
-    of_frame: [N] which of the B beams each frame is of; beams: [B, 6] their changes at the middle of the series
+    of_frame: [N] which of the B beams each frame is of; beams: [B, 7] their changes at the middle of the series
     drift: [B, 5] shifts [pixels] and turns [degrees] from the first time to the last; drift_errors: [B, 5]
     times: [T] that were used [s]; measure: what before and after are
     """
@@ -143,7 +144,8 @@ def align_beams(
     time, and none unless it is beyond doubt. Errors: `InputError` for beams of a series that are never seen twice, and
     for fewer than two training frames of a time.
     """
-    beams = Beams.of(scan)
+    beams, held = Beams.of(scan), options.uncertain.distance > 0 or options.uncertain.magnification > 0
+    options = replace(options, uncertain=replace(options.uncertain, distance=0.0, magnification=0.0))
     moments = [_evened(moment, light) for moment in chosen_moments(scan, beams, options.times, FEWEST)]
     times = np.array([moment.time for moment in moments])
     material = assumed_material(moments[len(moments) // 2].scan.train(), prior, on_progress)
@@ -170,7 +172,7 @@ def align_beams(
             found.words.append("matter passes the edges of the field: rows of different beams are not compared")
         reversed_ = [(b, side) for b, side in enumerate(start.sides) if side]
         found.words.extend(f"beam {b} is reversed along {side}: its frames were turned back" for b, side in reversed_)
-    if options.uncertain.distance > 0:
+    if held:
         found.words.append(DISTANCES)
     found = _kept(_without_doubtful_drift(found, options), beams.planned, options)
     telling = by_rows or count >= options.few_views  # volumes of few frames agree with any poses
@@ -210,7 +212,7 @@ def _rows(
 def _by_rows(start: Begun, pixels: int) -> Found:
     """The numbers of rows, for detector pixels."""
     scales = np.array([pixels, pixels, 1, 1, 1])
-    numbers, rates = (np.pad(scales * part, ((0, 0), (0, 2))) for part in (start.numbers, start.rates))
+    numbers, rates = (np.pad(scales * part, ((0, 0), (0, len(NUMBERS) - 5))) for part in (start.numbers, start.rates))
     errors, rate_errors = scales * start.errors, scales * start.rate_errors
     measure = "rows disagree by this share of their moments"
     return Found(numbers, rates, errors, rate_errors, start.before, start.after, measure, pixels, list(start.words))
@@ -269,7 +271,7 @@ def _judged(search: SeriesSearch, planned: Exposures, found: Found) -> np.ndarra
 
 
 def _exposures(numbers: np.ndarray, planned: Exposures) -> Exposures:
-    """Planned exposures [N] with numbers [N, 7] of `NUMBERS`."""
+    """Planned exposures [N] with numbers [N, 8] of `NUMBERS`."""
     turns, shifts, distance = (torch.from_numpy(numbers[:, at].copy()) for at in (TURN, SHIFT, DISTANCE))
     return Alignment(turns, shifts, distance.exp() - 1).exposures(planned)
 
@@ -307,9 +309,8 @@ def _placed(scan: Scan, beams: Beams, found: Found, times: np.ndarray, sides: tu
     of_frames = middle[which]
     of_frames[:, :5] += 0.5 * whens(scan.exposures.time)[:, None] * drift[which]
     numbers = np.pad(of_frames * DEGREES, ((0, 0), (0, 1)))
-    numbers[:, DISTANCE] = np.log1p(of_frames[:, 5])
     exposures = _exposures(numbers, scan.exposures)
-    errors = np.pad(found.errors, ((0, 0), (0, 1))) / DEGREES
+    errors = np.pad(found.errors, ((0, 0), (0, 2))) / DEGREES
     return AlignedBeams(
         exposures,
         of_frames,
@@ -329,7 +330,7 @@ def _placed(scan: Scan, beams: Beams, found: Found, times: np.ndarray, sides: tu
 
 
 def _moved(numbers: np.ndarray, planned: Exposures) -> np.ndarray:
-    """Changes [B, 6] of the plan, all beams moved together as near to it as can be."""
+    """Changes [B, 7] of the plan, all beams moved together as near to it as can be."""
     found = _exposures(numbers, planned)
     return changes(replace(found, views=moved_onto(found.views, planned.views)), planned)
 

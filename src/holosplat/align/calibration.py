@@ -14,11 +14,12 @@ from ..matter import Known, MaterialPrior
 from ..mesh import TriangleMesh
 from ..model import Alignment, Instrument
 from ..optics.background import Light, LightOptions
-from ..optics.retrieval import paganin, tikhonov
+from ..optics.retrieval import Tikhonov, paganin, tikhonov
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..scan import Exposures, Scan
 from .coarse import shifts_by_mass
+from .derivatives import NUMBERS
 from .gauge import moved_onto
 from .phantom import Phantom
 from .phantom_fit import STEPS, Linear, linearised, solved
@@ -59,10 +60,16 @@ class CalibrationOptions:
     most_pixels: int = 400_000
     """Pixels of all frames, on the smallest pixels: larger frames are binned, and shifts found to a part of that."""
 
+    retrieval: int = 20
+    """Steps of the phase retrieval that a first place needs; 0: Paganin's filter, which will do without noise."""
+
     def __post_init__(self) -> None:
         at_least(self, 1, "rounds", "most_pixels")
         at_least(self, 8, "least_side")
-        at_least(self, 0, "pixel")
+        at_least(self, 0, "pixel", "retrieval")
+        require(
+            self.uncertain.magnification == 0, "calibrate finds one pixel size of all views; leave magnification 0."
+        )
         require(self.pixel <= 0.2, f"uncertain pixel size must be 0.2 at most, but it is {self.pixel:g}; correct it.")
         in_range("blur", self.blur, 0.3, 10.0, unit="pixels")
 
@@ -83,7 +90,7 @@ DEFAULT = CalibrationOptions()
 class Calibrated:
     """Where V views are.
 
-    exposures: those of the scan, corrected; changes, errors: [V, 6] of the plan, as in `AlignedViews`
+    exposures: those of the scan, corrected; changes, errors: [V, 7] of the plan, as in `AlignedViews`
     pixel_size: [m], and its standard error as a share of it, 0 where it was known
     phantom: where its bodies are, in the object frame
     left: [V] rms of what is unexplained of each frame, as a share of its contrast; words: what was not told
@@ -148,14 +155,14 @@ def calibrate(
 
 
 class _Search:
-    """A calibration in progress: numbers [V, 7] of the views beside the plan, of smallest pixels, and the phantom."""
+    """A calibration in progress: numbers [V, 8] of the views beside the plan, of smallest pixels, and the phantom."""
 
     def __init__(self, scan: Scan, prior: Known, phantom: Phantom, options: CalibrationOptions) -> None:
         self.scan, self.material, self.phantom, self.options = scan, prior.material, phantom, options
         self.bins = options.bins(len(scan), scan.views.shape)
-        self.numbers = torch.zeros(len(scan), 7, dtype=torch.float64)
+        self.numbers = torch.zeros(len(scan), len(NUMBERS), dtype=torch.float64)
         self.size = 0.0
-        self.errors, self.size_error = np.zeros((len(scan), 6)), 0.0
+        self.errors, self.size_error = np.zeros((len(scan), FLUX)), 0.0
         self.left = np.zeros(len(scan))
 
     @classmethod
@@ -167,14 +174,14 @@ class _Search:
             on_progress("first pose", 0.0)
             pixels = options.bins(len(scan), scan.views.shape)[0]
             coarse = scan.binned(pixels)
-            phantom, shifts = placed(Phantom.of_mesh(body), _thickness(coarse, prior), coarse.views)
+            phantom, shifts = placed(Phantom.of_mesh(body), _thickness(coarse, prior, options), coarse.views)
             search = cls(scan, prior, phantom, options)
             search.numbers[:, SHIFT] = torch.from_numpy(shifts * pixels)
             return search
         on_progress("beads", 0.0)
         pixels = options.bins(len(scan), scan.views.shape)[-1]
         fine = scan.binned(pixels)
-        thickness = _thickness(fine, prior)
+        thickness = _thickness(fine, prior, options)
         shifts = shifts_by_mass(thickness, fine.views)
         views = replace(fine.views, shifts=fine.views.shifts + shifts * fine.views.pixel_size)
         centres = find_beads(torch.from_numpy(thickness).float(), views, body)
@@ -198,7 +205,7 @@ class _Search:
             self.numbers[:, TURN], self.numbers[:, SHIFT] / pixels, self.numbers[:, DISTANCE].exp() - 1
         )
         found, larger = alignment.exposures(planned), float(np.exp(self.size))
-        views = replace(found.views, pixel_size=found.views.pixel_size * larger, shifts=found.views.shifts * larger)
+        views = replace(found.views, pitch=found.views.pitch * larger, shifts=found.views.shifts * larger)
         return replace(found, views=views)
 
     def step(self, pixels: int) -> None:
@@ -214,7 +221,7 @@ class _Search:
             found = replace(found, frames=finer.frames(lines).detach().double())
         lit = self.numbers[:, FLUX].exp()[:, None, None]
         found = Linear(lit * found.frames, lit[:, None] * found.of_views, lit * found.of_all)
-        scales = torch.ones(7, dtype=torch.float64)
+        scales = torch.ones(len(NUMBERS), dtype=torch.float64)
         scales[SHIFT] = pixels
         of_views = uncertain.deviations() / scales
         of_views[DISTANCE] = uncertain.distance if exposures.distance.all() else 0.0
@@ -237,7 +244,7 @@ class _Search:
         """Errors of the numbers, and what is unexplained."""
         deviations = covariances.diagonal().clamp_min(0).sqrt()
         own = (deviations[len(deviations) - self.numbers.numel() :].reshape(self.numbers.shape) * scales).numpy()
-        self.errors = own[:, :6] * np.array([1, 1, *[np.rad2deg(1)] * 3, 1])
+        self.errors = own[:, :FLUX] * np.array([1, 1, *[np.rad2deg(1)] * 3, 1, 1])
         self.size_error = float(deviations[places]) if self.options.pixel > 0 else 0.0
         left = (frames - seen).square().mean((1, 2)).sqrt() / frames.std(dim=(1, 2)).clamp_min(1e-12)
         self.left = left.double().numpy()
@@ -267,7 +274,7 @@ class _Search:
                 which = "any view" if len(untold) == len(self.scan) else f"views {', '.join(untold)}"
                 words.append(f"{NAMES[kind]}: not told by the frames for {which}; near the plan")
         size = self.scan.views.pixel_size * float(np.exp(self.size))
-        compared = replace(exposures, views=replace(exposures.views, pixel_size=self.scan.views.pixel_size))
+        compared = replace(exposures, views=replace(exposures.views, pitch=self.scan.views.pitch))
         return Calibrated(
             exposures,
             changes(compared, self.scan.exposures),
@@ -279,9 +286,12 @@ class _Search:
         )
 
 
-def _thickness(scan: Scan, prior: Known) -> np.ndarray:
+def _thickness(scan: Scan, prior: Known, options: CalibrationOptions) -> np.ndarray:
     """Retrieved thickness [V, H, W] [m], without what is faint."""
     frames = torch.from_numpy(scan.frames)
-    retrieve = paganin if prior.material.beta > 0 and scan.exposures.distance.all() else tikhonov
-    found = retrieve(frames, scan.exposures, *prior.material).double().numpy()
+    if options.retrieval:
+        how = Tikhonov(iterations=options.retrieval)
+        found = tikhonov(frames, scan.exposures, *prior.material, options=how).double().numpy()
+    else:
+        found = paganin(frames, scan.exposures, *prior.material).double().numpy()
     return np.where(found > FAINT * found.max(axis=(1, 2), keepdims=True), found, 0.0)

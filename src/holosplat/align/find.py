@@ -24,10 +24,11 @@ def align_views(
     """Where the views of `scan` really are, from the frames alone.
 
     Series have one geometry for all times, and two or three beams in one plane what their rows tell (`align_beams`);
-    all other scans what a volume tells (`align_still`). Errors: `InputError` for fewer than two training frames of a
-    time, and for series whose beams are never seen twice.
+    all other scans, and distances, what a volume tells (`align_still`). Errors: `InputError` for fewer than two
+    training frames of a time, and for series whose beams are never seen twice.
     """
     train = ~scan.is_test
-    few = bool(train.any()) and int(train.sum()) < FEW and plane_angles(scan.views) is not None
+    posed = options.uncertain.distance == 0 and options.uncertain.magnification == 0
+    few = posed and bool(train.any()) and int(train.sum()) < FEW and plane_angles(scan.views) is not None
     how = align_beams if scan.is_series or few else align_still
     return how(scan, prior, options, light=light, on_progress=on_progress)

@@ -54,14 +54,14 @@ def place_frames(
     worse = after > before
     search.numbers[torch.from_numpy(worse)] = 0
     exposures = search.exposures(scan.exposures)
-    errors = search.covariances.diagonal(dim1=1, dim2=2).clamp_min(0).sqrt().numpy()[:, :6]
+    errors = search.covariances.diagonal(dim1=1, dim2=2).clamp_min(0).sqrt().numpy()[:, :FLUX]
     words = [
         f"held-out frame {k} of {len(scan)} is as planned: no pose explains it better" for k in np.flatnonzero(worse)
     ]
     return AlignedViews(
         exposures,
         changes(exposures, scan.exposures),
-        errors * np.array([1, 1, *[np.rad2deg(1)] * 3, float(told)]) * ~worse[:, None],
+        errors * np.array([1, 1, *[np.rad2deg(1)] * 3, float(told), 1]) * ~worse[:, None],
         np.exp(search.numbers[:, FLUX].numpy()) - 1,
         before,
         np.minimum(before, after),

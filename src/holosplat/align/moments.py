@@ -37,7 +37,8 @@ class Beams:
         table = np.concatenate(
             [
                 views.rotations.reshape(len(exposures), 9) / ALIKE,
-                views.shifts / views.pixel_size / ALIKE,
+                views.shifts / views.pixel_sizes[:, None] / ALIKE,
+                views.pixel_sizes[:, None] / views.pixel_sizes[0] / ALIKE,
                 np.stack([exposures.distance, exposures.energy_kev], axis=1) / (ALIKE * exposures.energy_kev[0]),
                 exposures.psf_sigma_px[:, None] / ALIKE,
             ],

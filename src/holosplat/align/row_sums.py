@@ -32,8 +32,15 @@ FLAT = np.deg2rad(0.1)
 """Beams that leave their plane by less [rad] lie in it."""
 
 
+EVEN = 1e-6
+"""Pixel sizes that differ by a smaller share are equal."""
+
+
 def plane_angles(views: Views) -> np.ndarray | None:
-    """Angles [V] [rad] about the object's y axis; None unless all beams are normal to it, and see it upright."""
+    """Angles [V] [rad] about the object's y axis; None unless all beams are normal to it, see it upright, and
+    have pixels of one size."""
+    if np.ptp(views.pixel_sizes) > EVEN * views.pixel_sizes.max():
+        return None
     if np.abs(views.rotations[:, 1] - np.array([0.0, 1.0, 0.0])).max() > FLAT:
         return None
     return np.arctan2(views.rotations[:, 0, 2], views.rotations[:, 0, 0])

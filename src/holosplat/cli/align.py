@@ -37,6 +37,8 @@ class UncertainOptions:
     """Turns about the two axes across the beam [degrees]."""
     uncertain_roll: float = 1.0
     """Turns about the beam [degrees]."""
+    uncertain_magnification: float = 0.0
+    """Magnification, as a share of it; that of all training frames together is as planned."""
     uncertain_distance: float = 0.0
     """Distance, as a share of it: only where fringes are resolved."""
     drift_shift: float = 0.0
@@ -48,9 +50,8 @@ class UncertainOptions:
         """The options of the search."""
         from ..align import Drift, PoseOptions, Uncertain
 
-        shift, angle, roll, distance = list(vars(self).values())[:4]
-        drift = Drift(self.drift_shift, self.drift_angle)
-        return PoseOptions(Uncertain(shift, angle, roll, distance), drift=drift)
+        sizes = {name.removeprefix("uncertain_"): value for name, value in vars(self).items() if "drift" not in name}
+        return PoseOptions(Uncertain(**sizes), drift=Drift(self.drift_shift, self.drift_angle))
 
 
 @dataclass(frozen=True)
@@ -58,14 +59,16 @@ class RefineOptions:
     """Beams that may be elsewhere than the scan says."""
 
     refine: str | None = None
-    """What is found of each frame beside the matter: shifts, angles, roll, distance, with commas between (default:
-    nothing, the beams are where the scan says)."""
+    """What is found of each frame beside the matter: shifts, angles, roll, distance, magnification, with commas between
+    (default: nothing, the beams are where the scan says)."""
     uncertain_shift: float = 2.0
     """Standard deviation of the detector's shifts along rows and columns [pixels]."""
     uncertain_angle: float = 1.0
     """Standard deviation of turns about the two axes across the beam [degrees]."""
     uncertain_roll: float = 1.0
     """Standard deviation of turns about the beam [degrees]."""
+    uncertain_magnification: float = 0.01
+    """Standard deviation of the magnification, as a share of it."""
     uncertain_distance: float = 0.02
     """Standard deviation of the distance, as a share of it."""
 
@@ -172,7 +175,7 @@ def _write_geometry(
     views = replace(whole.views, rotations=found.views.rotations, shifts=shifts)
     if errors is not None:
         larger = measured.views.pixel_size / whole.views.pixel_size
-        errors = errors * [larger, larger, 1, 1, 1, 1]
+        errors = errors * [larger, larger, 1, 1, 1, 1, 1]
     origin = {"scan": str(source), "aligned": said}
     beams = Beams.of(replace(whole, views=views, distance=found.distance), errors, origin)
     write_beams(path, beams)
@@ -181,7 +184,15 @@ def _write_geometry(
 
 def _write_table(path: Path, found: AlignedViews) -> None:
     """A row for each view."""
-    names = ("shift_x_px", "shift_y_px", "turn_x_deg", "turn_y_deg", "roll_deg", "distance_share")
+    names = (
+        "shift_x_px",
+        "shift_y_px",
+        "turn_x_deg",
+        "turn_y_deg",
+        "roll_deg",
+        "distance_share",
+        "magnification_share",
+    )
     header = ["view", *names, *(f"error_{name}" for name in names), "flux", "before", "after"]
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
