@@ -18,7 +18,7 @@ from ..optics.sampling import fringes
 from ..scan import Exposures, Scan
 from .batch import Batch
 from .loop import Plan
-from .optimiser import Leaves
+from .optimiser import Adam, Apart, Leaves, Optimiser
 from .problem import Part
 from .running import Record
 from .trainable import Trainable
@@ -36,6 +36,9 @@ three of them is `r² / 2c`."""
 SAMPLED = 0.015
 """Share by which sampling shifts the mean distance where the first fringe is a pixel wide; it falls with the square of
 the width (docs/data/alignment.csv)."""
+
+PLACES = {"shifts": [0, 1], "turns": [2, 3, 4], "stretches": [5]}
+"""Places of the corrections of `Alignment` among the numbers of a view."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,16 @@ class Freedom:
         names = {"turns": turns, "shifts": self.shift > 0, "stretches": self.distance > 0}
         return Alignment.planned(len(self), *(name for name, free in names.items() if free), device=device)
 
+    def after(self, alignment: Alignment) -> Freedom:
+        """The same of views that a fit has moved on; those that it had set aside are where they were."""
+        so_far = self.so_far.copy()
+        fitted = np.flatnonzero(_fitted(len(self), len(alignment)))
+        for name, at in PLACES.items():
+            numbers = alignment.parameters().get(name)
+            if numbers is not None:
+                so_far[fitted[:, None], at] += numbers.detach().cpu().numpy().reshape(len(fitted), -1)
+        return replace(self, so_far=so_far)
+
     def tells_mean(self, exposures: Exposures) -> bool:
         """Whether frames tell the mean distance better than the plan does (see `SAMPLED`)."""
         return mean_distance_error(exposures) < self.distance / np.sqrt(len(self))
@@ -84,6 +97,22 @@ def mean_distance_error(exposures: Exposures) -> float:
     """By how much a fit finds all distances too short or too long together, as a share: its waves are sampled."""
     width = float(np.mean(fringes(exposures))) / exposures.views.pixel_size
     return SAMPLED / max(width, 1e-3) ** 2
+
+
+def _fitted(count: int, used: int) -> np.ndarray:
+    """Which of `count` views a fit of `used` of them looks at, [V] bool: the others are set aside for validation."""
+    return ~set_aside(count, count - used)
+
+
+def moved(exposures: Exposures, alignment: Alignment) -> Exposures:
+    """`exposures` [V] where a fit has found them; those that it had set aside are where they were."""
+    fitted = np.flatnonzero(_fitted(len(exposures), len(alignment)))
+    found = alignment.exposures(exposures[fitted])
+    rotations, shifts, distance = exposures.views.rotations.copy(), exposures.views.shifts.copy(), exposures.distance
+    rotations[fitted], shifts[fitted] = found.views.rotations, found.views.shifts
+    distance = distance.copy()
+    distance[fitted] = found.distance
+    return replace(exposures, views=replace(exposures.views, rotations=rotations, shifts=shifts), distance=distance)
 
 
 def freed(plan: Plan, freedom: Freedom | None, train: Scan) -> Plan:
@@ -96,7 +125,7 @@ def freed(plan: Plan, freedom: Freedom | None, train: Scan) -> Plan:
     if not freedom:
         return plan
     if len(freedom) > len(train):
-        freedom = freedom[~set_aside(len(freedom), len(freedom) - len(train))]
+        freedom = freedom[_fitted(len(freedom), len(train))]
     model, exposures = plan.problem.model, train.exposures
     alignment = freedom.alignment(model.instrument.device)
     (h, w), frames = exposures.views.shape, torch.from_numpy(train.frames)
@@ -112,7 +141,13 @@ def freed(plan: Plan, freedom: Freedom | None, train: Scan) -> Plan:
         return {**plan.rates(factor, step), **{name: rate * factor for name, rate in own.items()}}
 
     problem = replace(plan.problem, model=replace(model, alignment=alignment), terms=(*plan.problem.terms, expected))
-    return replace(plan, problem=problem, rates=rates, events=(*plan.events, Gauge(freedom, exposures)))
+
+    def optimiser(leaves: Leaves) -> Optimiser:
+        return Apart(leaves, "alignment.", lambda own: Adam(own, model.instrument.backend), plan.optimiser)
+
+    return replace(
+        plan, problem=problem, rates=rates, optimiser=optimiser, events=(*plan.events, Gauge(freedom, exposures))
+    )
 
 
 class Expected:
@@ -123,14 +158,13 @@ class Expected:
     def __init__(self, freedom: Freedom, weight: float, device: torch.device) -> None:
         """weight: of one number; that of a fit whose data term is a mean over pixels."""
         self._weight = weight
-        places = {"shifts": [0, 1], "turns": [2, 3, 4], "stretches": [5]}
         deviations = freedom.deviations()
         self._parts = {
             f"alignment.{name}": tuple(
                 torch.from_numpy(part).to(device)
                 for part in (freedom.so_far[:, at], np.where(deviations[at] > 0, deviations[at], np.inf))
             )
-            for name, at in places.items()
+            for name, at in PLACES.items()
         }
 
     def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
