@@ -48,6 +48,7 @@ class Freedom:
     shift [pixels], angle (turns about the axes across the beam) [rad], roll [rad], distance [share]
     so_far: [V, 6] how far the views are from the plan already: shifts x, y [pixels], turns about x, y, z of the lab
         [rad], share of the distance
+    edges: whether the matter is fitted with sharp edges of one known density; soft matter takes any mean distance
     """
 
     shift: float
@@ -55,6 +56,7 @@ class Freedom:
     roll: float
     distance: float
     so_far: np.ndarray
+    edges: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "so_far", shaped("so_far", np.asarray(self.so_far), (len(self.so_far), 6)))
@@ -90,7 +92,7 @@ class Freedom:
 
     def tells_mean(self, exposures: Exposures) -> bool:
         """Whether frames tell the mean distance better than the plan does (see `SAMPLED`)."""
-        return mean_distance_error(exposures) < self.distance / np.sqrt(len(self))
+        return self.edges and mean_distance_error(exposures) < self.distance / np.sqrt(len(self))
 
 
 def mean_distance_error(exposures: Exposures) -> float:
