@@ -246,6 +246,14 @@ class Scan:
         exposures = replace(self.exposures, views=self.views.cropped(rows, columns))
         return Scan.of(frames, exposures, self.is_test, self.provenance)
 
+    def coarsened(self, factor: int) -> Scan:
+        """The scan on pixels `factor` times larger, or as large as its rows and columns allow."""
+        return self.binned(self.largest_binning(factor))
+
+    def largest_binning(self, factor: int) -> int:
+        """`factor`, or the number of rows or of columns where there are fewer: a fan of slices has few rows."""
+        return min(factor, *self.views.shape)
+
     def binned(self, factor: int) -> Scan:
         """The scan on pixels `factor` times larger (means of `factor × factor`); odd rows and columns are cut."""
         if factor == 1:

@@ -17,6 +17,7 @@ from holosplat.align.coarse import mirrored, shifts_by_mass
 from holosplat.align.derivatives import NUMBERS, Predicted, projections
 from holosplat.align.gauge import moved_onto
 from holosplat.align.newton import Normal, blurred, step
+from holosplat.align.views import Judged
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
@@ -144,6 +145,18 @@ def test_a_mirrored_beam_is_reported(misaligned):
     options = replace(QUICK, uncertain=Uncertain(shift=0.2, angle=0.0, roll=0.0), rounds=1)
     found = align_views(known, MaterialPrior.known(MATERIAL), options)
     assert [word for word in found.words if "mirrored" in word] == ["view 3 looks mirrored: reverse its columns"]
+
+
+@pytest.mark.parametrize(("enough", "kept"), [(10, True), (4, False)])
+def test_few_training_frames_do_not_judge_what_was_found(monkeypatch, enough, kept):
+    """They agree with any poses, so that what is left of them says nothing; of enough frames it does."""
+    left = iter([1.0, 1.1])
+    worse = classmethod(lambda _, scan, *__: Judged(np.full(len(scan), next(left)), [""] * len(scan)))
+    monkeypatch.setattr(Judged, "of", worse)
+    scan, _ = scan_of(Misalignment(1.0, 0.0, 0.0, seed=2), 5, 6)
+    options = replace(QUICK, uncertain=Uncertain(angle=0.0, roll=0.0), rounds=1, few_views=enough)
+    found = align_views(scan, MaterialPrior.known(MATERIAL), options)
+    assert found.changes.any() == kept
 
 
 def test_few_views_do_not_tell_turns_from_depth():

@@ -26,13 +26,13 @@ SLOW = ("crowded12",)
 NAMES = (
     ["main12", "main4", "thesis16", "thesis8", "cells4", "cells6", "cells8", "cells12", "xmpi4", "two_beam"]
     + ["plasma8-1e3", "plasma8-1e4", "plasma8-1e5", "noise12-500", "noise12-2000", "noise12-10000", "crowded12"]
-    + ["sharp-even", "sharp-light", "sharp-drift"]
+    + ["sharp-even", "sharp-light", "sharp-drift", "misaligned12", "misaligned4"]
     + ["two_materials8", "shells8", "foam12", "soft12", "soft12-5000", "light12-5000", "drift", "tissue16", "coated"]
     + ["absorber12", "contact91", "resolution"]
 )
 APART = {"contact91": 0.9}
 """Degrees between held-out views and those for training, where these are closer than 4° to each other."""
-MOST_VOXELS = {"main12": 2.1e6, "main4": 2.1e6}
+MOST_VOXELS = dict.fromkeys(("main12", "main4", "misaligned12", "misaligned4"), 2.1e6)
 
 
 def near(value, rel=1e-6, abs=0.0):

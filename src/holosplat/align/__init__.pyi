@@ -1,6 +1,9 @@
 from .axis import Axis as Axis
 from .axis import AxisOptions as AxisOptions
 from .axis import find_axis as find_axis
+from .calibration import Calibrated as Calibrated
+from .calibration import CalibrationOptions as CalibrationOptions
+from .calibration import calibrate as calibrate
 from .poses import PoseOptions as PoseOptions
 from .poses import Uncertain as Uncertain
 from .views import AlignedViews as AlignedViews

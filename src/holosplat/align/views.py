@@ -131,8 +131,9 @@ def align_views(
     on_progress("alignment, before and after", 0.0)
     before, after = (Judged.of(scan, exposures, search, of) for exposures in (scan.exposures, found))
     on_progress("alignment, before and after", 1.0)
-    judges = scan.is_test if scan.is_test.any() else ~scan.is_test  # few frames for training agree with any poses
-    if _rms(after.left[judges]) > _rms(before.left[judges]):
+    judges = scan.is_test if scan.is_test.any() else ~scan.is_test
+    telling = scan.is_test.any() or count >= options.few_views  # few frames for training agree with any poses
+    if telling and _rms(after.left[judges]) > _rms(before.left[judges]):
         found, after = scan.exposures, before
         words.append("all is as planned: what was found explains the frames no better")
     words += _doubts(after)

@@ -236,7 +236,7 @@ def _working_resolution(scan: Scan, options: HolographicTV) -> tuple[Scan, int, 
     while refine > 1 and w * w * h * refine**3 > options.max_voxels:
         refine -= 1
     factor = 1
-    while w * w * h / factor**3 > options.max_voxels:
+    while w * w * h / factor**3 > options.max_voxels and factor < min(h, w):
         factor += 1
     return scan.binned(factor), refine, factor
 

@@ -63,7 +63,7 @@ def estimate_ratio(
     `plateau` is taken (the first such peak, from low ratios on), and refined by a parabola on a logarithmic
     scale. Good to a factor of about two; photon noise pulls it down.
     """
-    coarse = scan.binned(max(1, round(scan.views.shape[1] / options.width)))
+    coarse = scan.coarsened(max(1, round(scan.views.shape[1] / options.width)))
     ratios = np.logspace(options.lowest, options.highest, options.tried)
     levels = np.empty(len(ratios))
     for i, ratio in enumerate(ratios):
@@ -90,7 +90,7 @@ def estimate_delta(
 ) -> float:
     """δ of the one material in `scan` whose δ/β is `ratio`: the plateau of a non-negative tomography."""
     on_progress("estimate of delta", 0.0)
-    coarse = scan.binned(max(1, round(scan.views.shape[1] / (2 * options.width))))
+    coarse = scan.coarsened(max(1, round(scan.views.shape[1] / (2 * options.width))))
     return plateau(_trial_volume(coarse, ratio, backend, options)) * TRIAL_DELTA
 
 

@@ -57,3 +57,7 @@ class Misalignment:
             views=replace(views, rotations=rotations, shifts=views.shifts + shifts),
             distance=nominal.distance * stretched,
         )
+
+
+AS_PLANNED = Misalignment()
+"""No errors."""

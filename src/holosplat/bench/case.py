@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..beamline.light import EVEN_LIGHT, UnevenLight
+from ..beamline.misalignment import AS_PLANNED, Misalignment
 from ..beamline.simulate import simulate
 from ..checks import InputError, require, shaped
 from ..geometry import Grid
@@ -25,7 +26,7 @@ from .declaration import declared_names, read_declaration
 FOLDER = Path(__file__).with_name("cases")
 """The suite: a TOML file for each case, or for several that differ little."""
 ORDER = ("main", "thesis", "cells", "xmpi", "plasma8", "noise12", "crowded12", "sharp_light")
-ORDER += ("two_materials8", "shells8", "foam12")
+ORDER += ("misaligned", "two_materials8", "shells8", "foam12")
 ORDER += ("soft12", "tissue16", "coated", "absorber12", "contact91")
 """How tables list the files of the suite; others follow by name."""
 
@@ -35,7 +36,8 @@ class Case:
     """name: of the case; seed: of its scene and its noise; scene: the truth; exposures: N frames; is_test: [N] bool,
     those held out; prior: what every method is told of the matter; photons: a pixel, None without noise; summary: one
     line about the case; specimen: what the scene is, in words; balls: those of a resolution phantom, mesh by mesh;
-    light: how it differs from the flat field on the frames for training."""
+    light: how it differs from the flat field on the frames for training; misalignment: errors of the exposures, drawn
+    with `seed` added to their own. Methods are told the planned `exposures`; frames are taken in the true ones."""
 
     name: str
     seed: int
@@ -48,6 +50,7 @@ class Case:
     specimen: str = ""
     balls: tuple[Ball, ...] = ()
     light: UnevenLight = EVEN_LIGHT
+    misalignment: Misalignment = AS_PLANNED
 
     def __post_init__(self) -> None:
         require(self.seed >= 0, f"seed must be 0 or more, but it is {self.seed}.")
@@ -67,7 +70,8 @@ class Case:
 
         Held-out ones have even light and no noise.
         """
-        clean = simulate(self.scene, self.exposures, seed=self.seed, is_test=self.is_test)
+        clean = simulate(self.scene, self.true_exposures(), seed=self.seed, is_test=self.is_test)
+        clean = replace(clean, exposures=self.exposures)
         said = {"case": self.name, "specimen": self.specimen}
         if self.photons is None and self.light.is_even:
             return replace(clean, provenance=clean.provenance | said)
@@ -84,6 +88,12 @@ class Case:
         photons = {} if self.photons is None else {"photons_per_pixel": f"{self.photons:g}"}
         said |= photons | self.light.facts() | {"held_out_frames": "noise-free"}
         return replace(clean, frames=frames, provenance=clean.provenance | said)
+
+    def true_exposures(self) -> Exposures:
+        """Where the frames are taken."""
+        if not self.misalignment:
+            return self.exposures
+        return replace(self.misalignment, seed=self.misalignment.seed + self.seed).true_exposures(self.exposures)
 
     def truth(self) -> Volume:
         """The true δ and β on the field of view, at the detector's pitch."""
@@ -123,6 +133,7 @@ def load_case(name: str | Path, seed: int = 0, snapshots: Path | None = None) ->
         specimen=text,
         balls=balls,
         light=declared.light,
+        misalignment=declared.misalignment,
     )
 
 

@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from ..beamline.light import EVEN_LIGHT, UnevenLight
+from ..beamline.misalignment import AS_PLANNED, Misalignment
 from ..checks import InputError, in_range, require
 from ..geometry import Views, rotation_tilted, rotation_y
 from ..materials import DeltaBeta, parse_material
@@ -153,7 +154,7 @@ class Listed:
 class Declaration:
     """A case without its seed. summary: one line about it; photons: mean counts a pixel of a frame for training, or
     none for frames without noise; prior: what methods are told of `matter.material` against the medium; light: how it
-    differs from the flat field on frames for training."""
+    differs from the flat field on frames for training; misalignment: how far beams are from where methods are told."""
 
     summary: str
     specimen: Specimen
@@ -164,6 +165,7 @@ class Declaration:
     prior: Literal["known", "ratio", "free"]
     photons: float | None = None
     light: UnevenLight = EVEN_LIGHT
+    misalignment: Misalignment = AS_PLANNED
 
     def __post_init__(self) -> None:
         core, wanted = self.matter.core is not None, self.specimen.has_core

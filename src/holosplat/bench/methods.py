@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from ..methods import Auto, Gaussians, HolographicVoxels, NeuralFields, PerView, SmoothVolume, Surfaces, Voxels
 from ..methods.per_view import SVMBIR
 from ..methods.presets import preset
+from .aligners import ALIGNERS
 from .method import Method
 
 PER_VIEW = "phase retrieval of each view, then tomography"
@@ -104,3 +107,24 @@ def _through_waves(effort: float) -> list[Method]:
 
 METHODS = methods()
 """Name → method, in the order of the tables."""
+ON_ALIGNED = {
+    "paganin-tv": ("mass", "reprojection"),
+    "tikhonov-tv": ("mass", "reprojection", "align"),
+    **dict.fromkeys(("voxels-waves", "gaussians", "surfaces", "auto"), ("align",)),
+}
+"""The methods that also run on views which were aligned before, and how."""
+
+
+def aligned(table: Mapping[str, Method]) -> dict[str, Method]:
+    """Name → method of `ON_ALIGNED`, such as `tikhonov-tv+mass`."""
+    found = {}
+    for name, ways in ON_ALIGNED.items():
+        for way in ways:
+            said, aligner = ALIGNERS[way]
+            both, summary = f"{name}+{way}", f"{table[name].summary}; {said}"
+            found[both] = replace(table[name], name=both, summary=summary, aligner=aligner)
+    return found
+
+
+ALIGNED = aligned(METHODS)
+"""Methods that are run where they are named, for cases whose beams are not where they should be."""

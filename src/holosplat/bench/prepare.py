@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,8 @@ def fingerprint(case: Case) -> str:
     digest.update(repr((numbers, _matter(case.scene))).encode())
     if not case.light.is_even:
         digest.update(repr(case.light).encode())
+    if case.misalignment:
+        digest.update(repr(case.misalignment).encode())
     return digest.hexdigest()[:16]
 
 
@@ -100,5 +103,6 @@ def described(case: Case) -> dict[str, Any]:
         "shares_axis": views.shares_axis,
         "photons": case.photons,
         "light": case.light.facts(),
+        **({"misalignment": asdict(case.misalignment)} if case.misalignment else {}),
         "prior": case.prior.as_dict(),
     }

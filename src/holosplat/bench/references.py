@@ -44,7 +44,7 @@ def tv_of_true_lines(case: Case | MeasuredCase, truth: Volume, on_progress: Prog
         "the true thickness needs a known material, but methods are told of none here.",
     )
     assert isinstance(case, Case)
-    views = case.exposures.views[np.flatnonzero(~case.is_test)]
+    views = case.true_exposures().views[np.flatnonzero(~case.is_test)]
     material = case.prior.materials[0]
     _, projected_delta = case.scene.project(views)
     lines = (projected_delta / material.delta).float()

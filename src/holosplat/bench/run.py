@@ -5,23 +5,26 @@ from __future__ import annotations
 import gc
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from typing import Protocol, runtime_checkable
+from typing import Protocol, cast, runtime_checkable
 
 from ..backends import resolve
 from ..checks import InputError, require
 from ..metrics import resolution
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
+from ..representations import Stored
 from ..scan import Scan
 from ..volume import Object, Volume
 from ..workflows.evaluate import Scores, score_object
 from ..workflows.provenance import environment, scan_hash
+from .aligners import Aligner
 from .case import Case
 from .folder import BenchFolder
 from .measured import MeasuredCase, agreement
 from .method import Method
+from .moved import judged_with
 from .pictures import TRUTH, Arrays, method_picture, truth_picture
 from .prepare import prepared
 from .record import memory_growth, source_commit
@@ -109,6 +112,7 @@ class _Job:
     summary: str
     place: int
     produce: Callable[[Progress], Object]
+    aligner: Aligner | None = None
 
 
 @runtime_checkable
@@ -127,6 +131,8 @@ class _Bench:
     picture: Arrays
     blank: Row
     on_progress: Progress
+    aligned: dict[Aligner, tuple[Scan, float]] = field(default_factory=dict)
+    """Training frames that an aligner has placed, and its seconds: methods that share it need it once."""
 
     @classmethod
     def of(cls, case: Case | MeasuredCase, folder: BenchFolder, on_progress: Progress) -> _Bench:
@@ -146,11 +152,12 @@ class _Bench:
         gc.collect()  # of the method before
         try:
             with memory_growth() as growth:
-                began = time.perf_counter()
+                before = self.aligned[job.aligner][1] if job.aligner and job.aligner in self.aligned else 0.0
+                began = time.perf_counter() - before
                 found = job.produce(lambda what, fraction: self.on_progress(stage + what, fraction))
                 row = replace(row, seconds=time.perf_counter() - began, memory_bytes=growth())
             self.on_progress(stage + "scores", 0.0)
-            scores, picture = self._judged(found)
+            scores, picture = self._judged(found, stage)
             size = found.stored_bytes if isinstance(found, _Stored) else None
             row = replace(row, status="done", stored_bytes=size, **_numbers(scores))
             if isinstance(self.case, MeasuredCase):
@@ -162,9 +169,13 @@ class _Bench:
             row = replace(row, reason=": ".join([type(error).__name__, *lines[-1:]]))
         return replace(row, when=datetime.now(UTC).isoformat(timespec="seconds")), picture
 
-    def _judged(self, found: Object) -> tuple[Scores, Arrays]:
-        oversample = fringe_sampling(self.scan.exposures)
-        scores = score_object(found, self.scan, self.truth, oversample)
+    def _judged(self, found: Object, stage: str) -> tuple[Scores, Arrays]:
+        oversample, scan, truth = fringe_sampling(self.scan.exposures), self.scan, self.truth
+        if isinstance(self.case, Case) and self.case.misalignment:
+            say = self.on_progress
+            told = lambda what, fraction: say(stage + what, fraction)  # noqa: E731
+            scan, truth = judged_with(self.case, cast(Stored, found), scan, truth, told)
+        scores = score_object(found, scan, truth, oversample)
         volume = found.voxelise(self.truth.grid)
         picture = method_picture(volume, scores, self.picture)
         if self.case.balls:
@@ -184,15 +195,27 @@ def _jobs(suite: Suite, bench: _Bench, wanted: Sequence[str]) -> Iterator[_Job]:
             yield _Job(name, REFERENCE, reference.summary, place, _of_reference(reference, bench))
     for place, (name, method) in enumerate(suite.methods.items()):
         if name in wanted:
-            yield _Job(name, method.family, method.summary, place, _of_method(method, train, case))
+            yield _Job(
+                name, method.family, method.summary, place, _of_method(method, train, case, bench), method.aligner
+            )
 
 
 def _of_reference(reference: Reference, bench: _Bench) -> Callable[[Progress], Object]:
     return lambda on_progress: reference.run(bench.case, bench.truth, on_progress)
 
 
-def _of_method(method: Method, train: Scan, case: Case | MeasuredCase) -> Callable[[Progress], Object]:
-    return lambda on_progress: method.run(train, case.prior, case.seed, on_progress)
+def _of_method(method: Method, train: Scan, case: Case | MeasuredCase, bench: _Bench) -> Callable[[Progress], Object]:
+    def produce(on_progress: Progress) -> Object:
+        scan, aligner = train, method.aligner
+        if aligner is not None:
+            if aligner not in bench.aligned:
+                began = time.perf_counter()
+                found = aligner(train, case.prior, on_progress)
+                bench.aligned[aligner] = found, time.perf_counter() - began
+            scan = bench.aligned[aligner][0]
+        return replace(method, aligner=None).run(scan, case.prior, case.seed, on_progress)
+
+    return produce
 
 
 def _numbers(scores: Scores) -> dict[str, dict[str, float | None]]:

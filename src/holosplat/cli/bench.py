@@ -46,7 +46,7 @@ def run(
     Args:
         cases: Names of cases, or TOML files of your own (FILE.toml, or FILE.toml:VARIANT) (default: all; measured ones
             only with --data).
-        methods: Names of methods (default: all).
+        methods: Names of methods (default: all but those that align views first, such as tikhonov-tv+mass).
         seeds: Seeds of scenes and noise; options were tuned on seeds below 100.
         out: Folder of the benchmark, new or to go on with.
         retry: Run again what failed.
@@ -55,14 +55,15 @@ def run(
     from ..bench.case import Case, case_names, load_case
     from ..bench.folder import BenchFolder
     from ..bench.measured import MEASURED, MeasuredCase
-    from ..bench.methods import METHODS
+    from ..bench.methods import ALIGNED, METHODS
     from ..bench.references import REFERENCES
     from ..bench.run import Suite, chosen, run_suite
 
     if list_only:
-        _list([*case_names(), *MEASURED], METHODS)
+        _list([*case_names(), *MEASURED], METHODS | ALIGNED)
         return
-    wanted = {name: METHODS[name] for name in chosen("--methods", methods, list(METHODS))}
+    table = METHODS | ALIGNED
+    wanted = {name: table[name] for name in chosen("--methods", methods or list(METHODS), list(table))}
     files = [name for name in cases if ".toml" in name]
     listed = [name for name in cases if name not in files]
     known = [*case_names(), *(MEASURED if listed or folders.data else ())]

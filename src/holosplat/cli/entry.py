@@ -38,6 +38,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "correct": ("imaging", "Correct raw counts by dark and flat fields into a scan of relative intensities."),
     "align": ("align", "Find where the beams of a scan really are, and write the same frames with other exposures."),
+    "calibrate": (
+        "calibrate",
+        "Find where beams are by frames of a phantom of known shape, or of beads, for --exposures of other commands.",
+    ),
     "join": ("imaging", "Join scans of several beams, one file each, on one raster."),
     "retrieve": ("retrieve", "Retrieve phase and thickness of single frames, into TIFF files or HDF5."),
     "reconstruct": (

@@ -53,6 +53,8 @@ class Rings:
         inner = [nyquist / 2**k for k in range(32) if nyquist / 2**k > 1.5 * lowest][::-1]
         edges = np.array([0.0, lowest, *inner, *([corner] if inner and corner > 1.0001 * nyquist else [])])
         band = torch.bucketize(radius, torch.from_numpy(edges[1:-1] * (1 + 1e-9)))
+        held = torch.bincount(band.flatten(), minlength=len(edges) - 1) > 0  # frames of few rows leave bands empty
+        edges, band = np.append(edges[:-1][held.numpy()], edges[-1]), (held.cumsum(0) - 1)[band]
         weight = torch.full_like(radius, 2.0)
         weight[:, 0] = 1
         if w % 2 == 0:

@@ -1,5 +1,7 @@
 """Triangle meshes from and to VTK files: legacy and XML, POLYDATA and UNSTRUCTURED_GRID, one body a file.
 
+STL, PLY and OBJ files are read by name, too.
+
 VTK's readers return the readable part of a damaged file and complain on stderr; here their complaints are collected and
 become one `InputError`.
 """
@@ -9,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +26,12 @@ from .vtk_guard import cells_fault, legacy_fault
 SUFFIXES = (".vtk", ".vtu", ".vtp")
 MERGE_TOLERANCE = 1e-6
 """Vertices closer than this fraction of the mesh's diagonal are one vertex, written several times."""
+SOLIDS = {
+    ".stl": ("vtkIOGeometry", "vtkSTLReader"),
+    ".ply": ("vtkIOPLY", "vtkPLYReader"),
+    ".obj": ("vtkIOGeometry", "vtkOBJReader"),
+}
+"""Formats of solid bodies beside VTK's own: their modules and readers in VTK."""
 STRIP = 6
 FLAT_CELLS = (5, STRIP, 7, 9)
 """VTK's numbers of flat cells whose corners run around the rim or along the strip: triangle to quad."""
@@ -112,7 +121,7 @@ def _read_mesh(path: Path, factor: float) -> TriangleMesh:
 
 
 def _damaged(path: Path, reason: str) -> InputError:
-    return InputError(f"{path} must be a complete VTK file, but it is truncated or damaged: {reason}.")
+    return InputError(f"{path} must be a complete mesh file, but it is truncated or damaged: {reason}.")
 
 
 def _read_data(path: Path) -> Any:
@@ -124,6 +133,8 @@ def _read_data(path: Path) -> Any:
         content = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path} must be a readable file, but reading it failed: {error}.") from None
+    if path.suffix.lower() in SOLIDS:
+        return _read_solid(path, content)
     xml = re.search(rb"<VTKFile[^>]*?\btype\s*=\s*[\"'](\w+)[\"']", content[:4096])
     kind = xml[1].decode() if xml else "legacy" if content.startswith(b"# vtk DataFile") else "none"
     readers = {
@@ -139,6 +150,20 @@ def _read_data(path: Path) -> Any:
     if fault := "" if xml else legacy_fault(content):
         raise _damaged(path, fault)
     reader = readers[kind]()
+    reader.SetFileName(str(path))
+    reader.Update()
+    return reader.GetOutput()
+
+
+def _read_solid(path: Path, content: bytes) -> Any:
+    """The data set of an STL, PLY or OBJ file; VTK does not see where a binary STL file was cut off."""
+    suffix = path.suffix.lower()
+    if suffix == ".stl" and not content.lstrip().startswith(b"solid"):
+        wanted = 84 + 50 * int.from_bytes(content[80:84], "little")
+        if len(content) < wanted:
+            raise _damaged(path, f"it has {len(content)} bytes of {wanted}")
+    module, name = SOLIDS[suffix]
+    reader = getattr(import_module(f"vtkmodules.{module}"), name)()
     reader.SetFileName(str(path))
     reader.Update()
     return reader.GetOutput()

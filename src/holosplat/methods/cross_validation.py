@@ -52,7 +52,7 @@ class CrossValidation:
         return aside
 
     def _factor(self, scan: Scan) -> int:
-        return max(1, math.ceil(max(scan.views.shape) / self.width))
+        return scan.largest_binning(math.ceil(max(scan.views.shape) / self.width))
 
 
 def predicted_frames(exposures: Exposures, obj: Object, oversample: int = 0) -> Tensor:

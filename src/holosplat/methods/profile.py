@@ -84,7 +84,7 @@ class Profile:
         options: ProfileOptions = ProfileOptions(),
     ) -> None:
         self.options, self._ratio = options, ratio
-        factor = max(1, math.ceil(max(task.scan.views.shape) / options.width))
+        factor = task.scan.largest_binning(math.ceil(max(task.scan.views.shape) / options.width))
         self._scan = task.scan.binned(factor)
         contrast = torch.from_numpy(self._scan.frames - 1).double().square().mean(dim=(1, 2))
         noise = task.noise.binned(factor)

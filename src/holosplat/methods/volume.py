@@ -109,9 +109,9 @@ def _beside(task: Task, start: VoxelGrid) -> Scan:
 
 
 def binning(scan: Scan, most: int) -> int:
-    """How many pixels along an edge are joined, so that voxels of their size are at most `most`."""
+    """How many pixels along an edge are joined, so that voxels of their size are at most `most`; at most all rows."""
     h, w = scan.views.shape
     factor = 1
-    while w * w * h / factor**3 > most:
+    while w * w * h / factor**3 > most and factor < min(h, w):
         factor += 1
     return factor

@@ -166,7 +166,7 @@ def _blocks(occupancy: Tensor, edge: int, filled: float, max_count: int) -> tupl
     """Mean occupancy [N], centre of mass [N, 3] as (x, y, z) and edge [N] of the blocks that hold matter, in voxels."""
     mass, centre = _block_moments(occupancy, edge)
     single = mass > filled
-    if int(single.sum()) <= max_count:
+    if int(single.sum()) <= max_count or min(mass.shape) < 2:  # a slice by itself has no larger blocks
         return mass[single], centre[:, single].T, torch.full((int(single.sum()),), float(edge))
     change = max_pool3d(mass[None], 3, 1, 1)[0] + max_pool3d(-mass[None], 3, 1, 1)[0]
     calm = single & (change <= CALM * mass)

@@ -35,7 +35,7 @@ class AirLight:
         outside the frames.
         """
         first = frame(0)
-        factor = max(1, math.ceil(max(first.shape) / LONGEST))
+        factor = min(math.ceil(max(first.shape) / LONGEST), *first.shape)
         binned = np.stack([_binned(first if i == 0 else frame(i), factor) for i in range(count)])
         options = LightOptions("smooth" if asked else "auto", tuple(_shrunk(box, factor, first.shape) for box in air))
         frames = torch.from_numpy(binned)
