@@ -4,9 +4,10 @@
     python benchmarks/alignment.py --cases "volume 12" "volume 4" --moments planned aligned refined true
 
 Scenes of the benchmark (sharp cells) are simulated with errors of each view that are known, and aligned; errors are
-those after the best motion of the whole object. `distance` is the rms relative error of the distances, `mean_distance`
-that of their mean. Cases with methods are also reconstructed, and their volumes compared with the truth: in the planned
-and found (`aligned`) and true exposures, and with the geometry free in the fit, too (`refined`, as --refine does).
+those after the best motion of the whole object, magnifications beside their mean. `distance` is the rms relative error
+of the distances, `mean_distance` that of their mean. Cases with methods are also reconstructed, and their volumes
+compared with the truth: in the planned and found (`aligned`) and true exposures, and with the geometry free in the fit,
+too (`refined`, as --refine does).
 """
 
 from __future__ import annotations
@@ -45,6 +46,7 @@ FIELDS: tuple[str, ...] = (
     "shift_px",
     "across_deg",
     "roll_deg",
+    "magnification",
     "seconds",
     "machine",
     "commit",
@@ -94,6 +96,13 @@ CASES = {
     "fine pixels": Experiment(FINE, Misalignment(1.0, 0.6, 0.02, 3)),
     "fine pixels, 2000 photons": Experiment(FINE, Misalignment(1.0, 0.6, 0.02, 3), 2000.0),
     "soft cells": Experiment("soft12", Misalignment(1.0, 0.6, 0.02, 4)),
+    "1 px, 0.6°, 1 % magnification": Experiment(
+        "main12", Misalignment(1.0, 0.6, 0.0, 0, magnification=0.01), uncertain=Uncertain(magnification=0.01)
+    ),
+    "1 px, 0.6°, 0.5 % magnification": Experiment(
+        "main12", Misalignment(1.0, 0.6, 0.0, 1, magnification=0.005), uncertain=Uncertain(magnification=0.01)
+    ),
+    "perfect, magnification free": Experiment("main12", Misalignment(), uncertain=Uncertain(magnification=0.01)),
     "volume 12": Experiment("main12", Misalignment(1.0, 0.6, 0.02, 7), methods=BOTH),
     "volume 12, other errors": Experiment("main12", Misalignment(1.0, 0.6, 0.02, 8), methods=("auto",)),
     "volume 4": Experiment("main4", Misalignment(1.0, 0.6, 0.02, 7), held_out=2, methods=BOTH),
@@ -101,14 +110,15 @@ CASES = {
 }
 
 
-def rms_errors(found: hs.Exposures, true: hs.Exposures) -> tuple[float, float, float]:
-    """Rms errors: shifts [pixels], turns across the beam and roll [degrees]."""
-    moved, pixel = moved_onto(found.views, true.views), true.views.pixel_size
+def rms_errors(found: hs.Exposures, true: hs.Exposures) -> tuple[float, float, float, float]:
+    """Rms errors: shifts [pixels], turns across the beam and roll [degrees], and magnification beside its mean."""
+    moved, pixel = moved_onto(found.views, true.views), true.views.pixel_sizes[:, None]
+    larger = np.log(true.views.pixel_sizes / found.views.pixel_sizes)
     turns = np.einsum("vij,vkj->vik", moved.rotations, true.views.rotations)
     degrees = Rotation.from_matrix(turns).as_rotvec(degrees=True)
-    parts = ((moved.shifts - true.views.shifts) / pixel, degrees[:, :2], degrees[:, 2])
-    shift, across, roll = (float(np.sqrt(np.square(part).mean())) for part in parts)
-    return shift, across, roll
+    parts = ((moved.shifts - true.views.shifts) / pixel, degrees[:, :2], degrees[:, 2], larger - larger.mean())
+    shift, across, roll, magnification = (float(np.sqrt(np.square(part).mean())) for part in parts)
+    return shift, across, roll, magnification
 
 
 def distance_errors(found: hs.Exposures, true: hs.Exposures) -> tuple[float, float]:
@@ -144,7 +154,8 @@ def rows_of(name: str, experiment: Experiment, moments: list[str], commit: str) 
         for views, index in (("training", ~scan.is_test), ("all", np.ones(len(scan), dtype=bool))):
             chosen = np.flatnonzero(index)
             errors = rms_errors(placed[moment][chosen], true[chosen])
-            values = {key: f"{e:.4f}" for key, e in zip(("shift_px", "across_deg", "roll_deg"), errors, strict=True)}
+            names = ("shift_px", "across_deg", "roll_deg", "magnification")
+            values = {key: f"{e:.5f}" if key == "magnification" else f"{e:.4f}" for key, e in zip(names, errors)}
             away = distance_errors(placed[moment][chosen], true[chosen])
             values |= {key: f"{e:.4f}" for key, e in zip(("distance", "mean_distance"), away, strict=True)}
             values |= {"seconds": f"{seconds:.0f}", "cpu_seconds": f"{worked:.0f}"}

@@ -278,7 +278,7 @@ def whole_capsule(data: Path, work: Path, names: list[str]) -> None:
 def fine_dome(data: Path, work: Path, names: list[str]) -> None:
     """The time that the dome would take as it was recorded, 40 rows of 160 pixels: rows 0 to 19, pixels halved."""
     scan = corrected_capsule(data, work, "0:20,:", "top.nxs")
-    views = replace(scan.views, shape=(40, 160), pixel_size=scan.views.pixel_size / 2)
+    views = replace(scan.views, shape=(40, 160), pitch=scan.views.pixel_size / 2)
     exposures = replace(scan.exposures, views=views)
     frames = scan.frames.repeat(2, axis=1).repeat(2, axis=2)
     fine = hs.Scan(frames, exposures, scan.is_test)

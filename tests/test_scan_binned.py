@@ -18,18 +18,19 @@ from holosplat.scan import Exposures, Scan
 @pytest.mark.parametrize("factor", [2, 3])
 @pytest.mark.parametrize("shape", [(36, 42), (37, 41), (38, 43), (41, 37)])
 def test_binned_pixels_are_where_they_say(shape, factor):
-    """A known Gaussian: its lines, binned, are its lines on the binned scan's own views."""
+    """A known Gaussian: its lines, binned, are its lines on the binned scan's own views, whatever their pixels."""
     centre, sigma = torch.tensor([[3.3, -2.2, 1.4]]), torch.full((1, 3), np.log(4.0))
     one = GaussianCloud(
         (centre, sigma, torch.tensor([[1.0, 0, 0, 0]]), raw_of(torch.tensor([[0.7]]))), PIXEL, Matter.one(1e-6, 1e-9)
     )
     shifts = PIXEL * np.array([[0, 0], [1.3, -0.6], [-0.4, 2.1]])
-    views = Views(rotation_y([0, 40, 110]), shifts, shape, PIXEL)
+    sizes = PIXEL * np.array([1.0, 1.2, 1.1])
+    views = Views.of_pixels(rotation_y([0, 40, 110]), shifts, shape, sizes)
     frames = one.project(views)[1].numpy() / 1e-6
     exposures = Exposures.of(views, 20.0, 0.1, 0.6)
     small = Scan(frames, exposures, np.array([False, True, False]), {"from": "here"}).binned(factor)
     assert small.frames.shape[1:] == small.views.shape == (shape[0] // factor, shape[1] // factor)
-    assert small.views.pixel_size == pytest.approx(factor * PIXEL)
+    assert small.views.pixel_sizes == pytest.approx(factor * sizes)
     wanted = one.project(small.views)[1].numpy() / 1e-6
     np.testing.assert_allclose(small.frames, wanted, rtol=0, atol=0.01 * wanted.max())
     np.testing.assert_allclose(small.exposures.psf_sigma_px, 0.6 / factor)

@@ -43,18 +43,23 @@ def rotation_tilted(angles_deg: np.ndarray | list[float], tilts_deg: np.ndarray 
 
 @dataclass(frozen=True)
 class Views:
-    """V parallel-beam views on one detector raster.
+    """V parallel-beam views on detectors of one shape.
 
     rotations: [V, 3, 3], `x_lab = R x_obj`.
     shifts: [V, 2] detector shifts `(sx, sy)` [m].
     shape: `(H, W)` pixels.
-    pixel_size: pitch `p` [m] of square pixels.
+    pitch: `p` [m], the length of one for what is said in pixels; the pixel size where all views have the same.
+    scales: [V] pixel sizes of the views over `pitch` (None: all one). Pixels are square.
+
+    In units of its own pixel, a view of pixels `s p` is one of pixels `p` with the matrix `R / s` and the shift
+    `(sx, sy) / s`. `pixel_size` is for users that know one pixel size only: it refuses views of several.
     """
 
     rotations: np.ndarray
     shifts: np.ndarray
     shape: tuple[int, int]
-    pixel_size: float
+    pitch: float
+    scales: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         rotations = finite("view rotation", np.asarray(self.rotations, dtype=np.float64))
@@ -69,16 +74,35 @@ class Views:
         object.__setattr__(self, "rotations", rotations)
         object.__setattr__(self, "shifts", shifts)
         object.__setattr__(self, "shape", (int(self.shape[0]), int(self.shape[1])))
-        object.__setattr__(self, "pixel_size", positive("pixel size", self.pixel_size, "metres"))
+        object.__setattr__(self, "pitch", positive("pixel size", self.pitch, "metres"))
+        scales = np.ones(len(rotations)) if self.scales is None else np.asarray(self.scales, dtype=np.float64)
+        shaped("pixel scale", finite("pixel scale", scales), (len(rotations),))
+        require(bool((scales > 0).all()), "pixel scales must be above zero, but one is not; correct it.")
+        object.__setattr__(self, "scales", scales)
 
     @classmethod
-    def from_rotations(cls, rotations: np.ndarray, shape: tuple[int, int], pixel_size: float) -> Views:
-        """Views of any orientation without detector shifts: rotations [V, 3, 3], pixel_size [m]."""
-        return cls(rotations, np.zeros((len(rotations), 2)), shape, pixel_size)
+    def of_pixels(
+        cls, rotations: np.ndarray, shifts: np.ndarray, shape: tuple[int, int], pixel_size: float | np.ndarray
+    ) -> Views:
+        """Views with one pixel size [m] or one for each, [V]; the pitch is the smallest."""
+        sizes = np.asarray(pixel_size, dtype=np.float64)
+        for size in sizes.reshape(-1):
+            positive("pixel size", float(size), "metres")
+        if sizes.ndim == 0 or (len(sizes) > 0 and bool((sizes == sizes[0]).all()) and len(sizes) == len(rotations)):
+            return cls(rotations, shifts, shape, float(sizes.reshape(-1)[0]))
+        shaped("pixel size", sizes, (len(rotations),))
+        return cls(rotations, shifts, shape, float(sizes.min(initial=np.inf)), sizes / sizes.min(initial=np.inf))
 
     @classmethod
-    def from_angles(cls, angles_deg: np.ndarray | list[float], shape: tuple[int, int], pixel_size: float) -> Views:
-        """Tomographic views: angles [V] in degrees about the y axis, pixel_size [m]."""
+    def from_rotations(cls, rotations: np.ndarray, shape: tuple[int, int], pixel_size: float | np.ndarray) -> Views:
+        """Views of any orientation without detector shifts: rotations [V, 3, 3], pixel_size [m], one or [V]."""
+        return cls.of_pixels(rotations, np.zeros((len(rotations), 2)), shape, pixel_size)
+
+    @classmethod
+    def from_angles(
+        cls, angles_deg: np.ndarray | list[float], shape: tuple[int, int], pixel_size: float | np.ndarray
+    ) -> Views:
+        """Tomographic views: angles [V] in degrees about the y axis, pixel_size [m], one or [V]."""
         return cls.from_rotations(rotation_y(angles_deg), shape, pixel_size)
 
     @classmethod
@@ -92,38 +116,82 @@ class Views:
 
     def fingerprint(self) -> bytes:
         """Equal for equal views, different for different ones."""
-        return self.rotations.tobytes() + self.shifts.tobytes() + repr((self.shape, self.pixel_size)).encode()
+        where = self.rotations.tobytes() + self.shifts.tobytes() + self.relative.tobytes()
+        return where + repr((self.shape, self.pitch)).encode()
 
     def __getitem__(self, index: np.ndarray | list[int] | slice) -> Views:
-        return replace(self, rotations=self.rotations[index], shifts=self.shifts[index])
+        return replace(self, rotations=self.rotations[index], shifts=self.shifts[index], scales=self.relative[index])
+
+    @property
+    def relative(self) -> np.ndarray:
+        """`scales` [V], which are always there."""
+        assert self.scales is not None
+        return self.scales
+
+    @property
+    def pixel_sizes(self) -> np.ndarray:
+        """Pixel sizes [V] [m]."""
+        return self.pitch * self.relative
+
+    @property
+    def has_one_pixel(self) -> bool:
+        """Whether all views have the same pixel size."""
+        return bool((self.relative == self.relative[:1]).all())
+
+    @property
+    def pixel_size(self) -> float:
+        """The pixel size [m] of all views; `InputError` where they have several."""
+        sizes = self.pixel_sizes
+        if not self.has_one_pixel:
+            raise InputError(
+                f"this needs views of one pixel size, but theirs go from {1e6 * sizes.min():.6g} to "
+                f"{1e6 * sizes.max():.6g} µm; choose those of one (--views), or bring all to one raster "
+                "(holosplat join --pixel-size)."
+            )
+        return float(sizes[0]) if len(sizes) else self.pitch
+
+    @property
+    def finest(self) -> float:
+        """The smallest pixel size [m] of the views."""
+        return float(self.pixel_sizes.min()) if len(self) else self.pitch
 
     @property
     def width(self) -> float:
-        """Width of the field of view [m]."""
-        return self.shape[1] * self.pixel_size
+        """Width of the field of view [m]; of the smallest one, if pixel sizes differ."""
+        return self.shape[1] * self.finest
 
     @property
     def height(self) -> float:
-        """Height of the field of view [m]."""
-        return self.shape[0] * self.pixel_size
+        """Height of the field of view [m]; of the smallest one, if pixel sizes differ."""
+        return self.shape[0] * self.finest
+
+    @property
+    def fields(self) -> np.ndarray:
+        """Widths and heights [V, 2] [m] of the fields of view."""
+        return self.pixel_sizes[:, None] * np.array(self.shape[::-1])
 
     @property
     def shares_axis(self) -> bool:
-        """Whether every view turns about the object's y axis only (one rotation axis, slices decouple)."""
+        """Whether every view turns about the object's y axis only, on pixels of one size: slices then decouple."""
         y = np.array([0.0, 1.0, 0.0])
-        return bool(np.allclose(self.rotations[:, 1], y) and np.allclose(self.shifts[:, 1], self.shifts[:1, 1]))
+        upright = np.allclose(self.rotations[:, 1], y) and np.allclose(self.shifts[:, 1], self.shifts[:1, 1])
+        return bool(upright) and self.has_one_pixel
+
+    def in_units_of(self, length: float) -> Views:
+        """The same views with `length` [m] as the unit of length."""
+        return replace(self, shifts=self.shifts / length, pitch=self.pitch / length)
 
     def refined(self, factor: int) -> Views:
         """The same field of view on a raster `factor` times finer."""
         h, w = self.shape
-        return replace(self, shape=(h * factor, w * factor), pixel_size=self.pixel_size / factor)
+        return replace(self, shape=(h * factor, w * factor), pitch=self.pitch / factor)
 
     def cropped(self, rows: slice, columns: slice) -> Views:
         """The part of the raster from `start` to `stop` of `rows` and `columns`; the pixels stay where they are."""
-        (h, w), p = self.shape, self.pixel_size
+        (h, w), p = self.shape, self.pixel_sizes
         moved = [0.5 * (part.start + part.stop - n) * p for part, n in ((columns, w), (rows, h))]
         shape = (rows.stop - rows.start, columns.stop - columns.start)
-        return replace(self, shape=shape, shifts=self.shifts + np.array(moved))
+        return replace(self, shape=shape, shifts=self.shifts + np.stack(moved, axis=1))
 
     def about_column(self, column: float) -> Views:
         """The views with the rotation axis, the object's y axis, at `column` of every frame (0: middle of the first).
@@ -136,11 +204,11 @@ class Views:
             f"the axis' column must be one of 0 to {width - 1}, but it is {column:g}; count columns from 0.",
         )
         require(
-            bool(np.allclose(sideways, sideways[:1], rtol=0, atol=1e-3 * self.pixel_size)),
+            bool(np.allclose(sideways, sideways[:1], rtol=0, atol=1e-3 * self.finest)),
             "the scan says itself where the axis is (its detector moves sideways); leave the axis' column.",
         )
         shifts = self.shifts.copy()
-        shifts[:, 0] = (0.5 * (width - 1) - column) * self.pixel_size
+        shifts[:, 0] = (0.5 * (width - 1) - column) * self.pixel_sizes
         return replace(self, shifts=shifts)
 
     def turned_back(self) -> Views:
@@ -166,39 +234,61 @@ class Poses:
     rotations: [V, 3, 3] float64.
     shifts: [V, 2] float64, detector shifts `(sx, sy)` [m].
     shape: `(H, W)` pixels.
-    pixel_size: pitch of square pixels [m].
+    pitch: of square pixels [m].
+    scales: [V] float64, pixel sizes over `pitch`, as in `Views`; None where all are one.
 
-    Rotations and shifts may require gradients, which projections then give them.
+    Rotations, shifts and scales may require gradients, which projections then give them.
     """
 
     rotations: torch.Tensor
     shifts: torch.Tensor
     shape: tuple[int, int]
-    pixel_size: float
+    pitch: float
+    scales: torch.Tensor | None = None
 
     @classmethod
     def of(cls, views: Views, device: torch.device | str = "cpu") -> Poses:
         """The poses of `views` on `device`."""
-        arrays = (np.ascontiguousarray(a) for a in (views.rotations, views.shifts))
-        rotations, shifts = (torch.from_numpy(a).to(device) for a in arrays)
-        return cls(rotations, shifts, views.shape, views.pixel_size)
+        arrays = (np.ascontiguousarray(a) for a in (views.rotations, views.shifts, views.relative))
+        rotations, shifts, scales = (torch.from_numpy(a).to(device) for a in arrays)
+        alike = bool((views.relative == 1).all())
+        return cls(rotations, shifts, views.shape, views.pitch, None if alike else scales)
 
     def __len__(self) -> int:
         return len(self.rotations)
 
     @property
     def requires_grad(self) -> bool:
-        """Whether gradients of the rotations or of the shifts are asked for."""
-        return self.rotations.requires_grad or self.shifts.requires_grad
+        """Whether gradients of the rotations, of the shifts or of the scales are asked for."""
+        scales = self.scales is not None and self.scales.requires_grad
+        return self.rotations.requires_grad or self.shifts.requires_grad or scales
+
+    @property
+    def matrices(self) -> torch.Tensor:
+        """`R / s` [V, 3, 3]: points of the object frame to the lab's, in units where each view's pixel is `pitch`."""
+        return self.rotations if self.scales is None else self.rotations / self.scales[:, None, None]
+
+    @property
+    def offsets(self) -> torch.Tensor:
+        """The shifts [V, 2] in the same units [m]."""
+        return self.shifts if self.scales is None else self.shifts / self.scales[:, None]
+
+    @property
+    def finest(self) -> float:
+        """The smallest pixel size [m]; waits for a GPU where sizes differ."""
+        return self.pitch if self.scales is None or not len(self) else self.pitch * float(self.scales.detach().min())
 
     def views(self) -> Views:
         """The same poses as `Views`, without gradients."""
         rotations, shifts = (array.detach().cpu().numpy() for array in (self.rotations, self.shifts))
-        return Views(rotations, shifts, self.shape, self.pixel_size)
+        scales = None if self.scales is None else self.scales.detach().cpu().numpy()
+        return Views(rotations, shifts, self.shape, self.pitch, scales)
 
     def __getitem__(self, index: torch.Tensor) -> Poses:
         """The poses `index` [K], an integer tensor on the same device."""
-        return replace(self, rotations=self.rotations.index_select(0, index), shifts=self.shifts.index_select(0, index))
+        scales = None if self.scales is None else self.scales.index_select(0, index)
+        rotations, shifts = self.rotations.index_select(0, index), self.shifts.index_select(0, index)
+        return replace(self, rotations=rotations, shifts=shifts, scales=scales)
 
 
 @dataclass(frozen=True)
@@ -236,14 +326,14 @@ class Grid:
 
     @classmethod
     def of_views(cls, views: Views, refine: float = 1) -> Grid:
-        """The views' field of view at pixel pitch (divided by `refine`): Z = X = W, Y = H.
+        """The views' field of view at pixel pitch (divided by `refine`): Z = X = W, Y = H; of the smallest pixels.
 
         It is centred where the (shifted) detectors look: at the point nearest to all their axes.
         """
         h, w = (round(n * refine) for n in views.shape)
-        grid = cls.centred((w, h, w), views.pixel_size / refine)
+        grid = cls.centred((w, h, w), views.finest / refine)
         centre = np.linalg.lstsq(views.rotations[:, :2].reshape(-1, 3), views.shifts.reshape(-1), rcond=1e-6)[0]
-        if np.abs(centre).max() < 1e-6 * views.pixel_size:
+        if np.abs(centre).max() < 1e-6 * views.finest:
             return grid
         x, y, z = (float(o + c) for o, c in zip(grid.origin, centre))
         return replace(grid, origin=(x, y, z))

@@ -40,7 +40,8 @@ class Exposures:
 
     def __post_init__(self) -> None:
         count = len(self.views)
-        in_range("pixel size", self.views.pixel_size, *PIXEL_RANGE_M, unit="metres")
+        for size in np.unique(self.views.pixel_sizes):
+            in_range("pixel size", float(size), *PIXEL_RANGE_M, unit="metres")
         for name in ("energy_kev", "distance", "psf_sigma_px", "time"):
             array = np.broadcast_to(np.asarray(getattr(self, name), dtype=np.float64), (count,))
             object.__setattr__(self, name, array.copy())
@@ -76,6 +77,19 @@ class Exposures:
     def has_one_energy(self) -> bool:
         """Whether all frames have the same photon energy."""
         return bool((self.energy_kev == self.energy_kev[:1]).all())
+
+    @property
+    def optical(self) -> Exposures:
+        """The same optics on one raster of the views' pitch p; itself where all pixels are alike.
+
+        Of a pixel `s p` waves know only λz/(s p)²: frames look the same on pixels p at the distance z/s². For what
+        looks at waves and frames alone; where matter is, these exposures do not say.
+        """
+        scales = self.views.relative
+        if (scales == 1).all():
+            return self
+        views = replace(self.views, scales=None)
+        return replace(self, views=views, distance=self.distance / scales**2)
 
     @property
     def reference_energy(self) -> float:
@@ -264,8 +278,8 @@ class Scan:
         views = replace(
             self.views,
             shape=(h, w),
-            pixel_size=self.views.pixel_size * factor,
-            shifts=self.views.shifts - 0.5 * odd * self.views.pixel_size,
+            pitch=self.views.pitch * factor,
+            shifts=self.views.shifts - 0.5 * odd * self.views.pixel_sizes[:, None],
         )
         exposures = replace(self.exposures, views=views, psf_sigma_px=self.exposures.psf_sigma_px / factor)
         return Scan.of(frames, exposures, self.is_test, self.provenance)

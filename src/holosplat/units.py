@@ -72,3 +72,9 @@ def wavelength(energy_kev: Energy) -> Energy:
 def wavenumber(energy_kev: Energy) -> Energy:
     """Wavenumber k = 2π/λ [rad/m] of photons of `energy_kev` [keV]."""
     return 2 * math.pi / wavelength(energy_kev)
+
+
+def span(values: np.ndarray) -> str:
+    """The least and the greatest of `values` in words, to four digits; one number where these are the same."""
+    low, high = (f"{value:.4g}" for value in (values.min(), values.max()))
+    return low if low == high else f"{low} to {high}"

@@ -60,7 +60,7 @@ def test_frames_that_are_where_they_should_be_stay_near():
 def test_a_geometry_goes_into_files_and_onto_scans():
     scan, true = scan_of(Misalignment(1.0, 0.6, 0.0, seed=3), 4, 2)
     train = np.flatnonzero(~scan.is_test)
-    there = (np.full((2, 6), 0.5), np.full((2, 6), 0.1), np.zeros(2), np.full(2, 0.2), np.full(2, 0.1), ("kept",))
+    there = (np.full((2, 7), 0.5), np.full((2, 7), 0.1), np.zeros(2), np.full(2, 0.2), np.full(2, 0.1), ("kept",))
     found = AlignedViews(true[train], *there)
     geometry = Geometry.of_training(scan, found, Uncertain(angle=0.0))
     again = Geometry.from_dict(json.loads(json.dumps(geometry.as_dict())))

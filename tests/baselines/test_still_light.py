@@ -97,7 +97,7 @@ def test_frames_in_contact_say_which_light_a_flat_left():
     """From frames to a volume: intensities in contact, whose light differs by a third from the flat."""
     pixel, material = 2e-5, hs.DeltaBeta(1e-6, 1e-9)
     mu = 2 * wavenumber(20.0) * material.beta
-    exposures = hs.Exposures.of(replace(views(), pixel_size=pixel), 20.0, 0.0)
+    exposures = hs.Exposures.of(replace(views(), pitch=pixel), 20.0, 0.0)
     frames = torch.exp(-mu * pixel * (lines() + light())).numpy()
     scan = hs.Scan(frames, exposures, np.zeros(COUNT, dtype=bool))
     options = HolographicTV(iterations=300, still_light=2, misfit=2.0, inside=12 * pixel)

@@ -83,7 +83,7 @@ def test_a_method_finds_the_matter_where_it_is(result, scan):
 
 def test_a_method_is_right_whatever_the_unit_of_length(method, result, scan):
     """Ten times larger, with δ and β a tenth and the same Fresnel number, the occupancy is the same."""
-    views = replace(scan.views, pixel_size=10 * PITCH)
+    views = replace(scan.views, pitch=10 * PITCH)
     exposures = replace(scan.exposures, views=views, distance=100 * scan.exposures.distance)
     prior = hs.MaterialPrior.known(hs.DeltaBeta(MATERIAL.delta / 10, MATERIAL.beta / 10))
     larger = run(method, replace(scan, exposures=exposures), prior=prior)

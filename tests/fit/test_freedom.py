@@ -39,7 +39,7 @@ def misaligned(distance: float = 0.1) -> tuple[Scan, Exposures]:
 
 
 def free(count: int = 5, **known: float) -> Freedom:
-    return replace(Freedom(1.0, 0.02, 0.02, 0.03, np.zeros((count, 6)), edges=True), **known)
+    return replace(Freedom(1.0, 0.02, 0.02, 0.03, np.zeros((count, 7)), edges=True), **known)
 
 
 OPTIONS = SurfaceFit(schedule=Schedule(steps=30, oversample=3, decay=0.2))
@@ -131,12 +131,12 @@ def test_projections_take_out_common_motions_alone():
 
 def test_what_is_expected_counts_from_the_plan():
     """Half the squares of all numbers in their deviations, those found before included; of fixed ones nothing."""
-    so_far = np.array([[2.0, 0, 0, 0, 0.04, 0], [0, 0, 0, 0, 0, 0.06]])
-    known = Freedom(2.0, 0.0, 0.02, 0.03, so_far)
+    so_far = np.array([[2.0, 0, 0, 0, 0.04, 0, 0], [0, 0, 0, 0, 0, 0.06, 0.05]])
+    known = Freedom(2.0, 0.0, 0.02, 0.03, so_far, 0.01)
     exposures = Exposures.of(Views(ANY[:2], np.zeros((2, 2)), SHAPE, PIXEL), 20.0, 0.1)
-    model = Model(matter(1), Instrument(exposures), Alignment.planned(2, "shifts", "turns", "stretches"))
+    model = Model(matter(1), Instrument(exposures), Alignment.planned(2, "shifts", "turns", "stretches", "magnified"))
     (part,) = Expected(known, 0.5, torch.device("cpu"))(model, Batch(None, torch.zeros(3), torch.zeros(()), 0))
-    assert float(part.value) == pytest.approx(0.5 * (1 + 4 + 4))
+    assert float(part.value) == pytest.approx(0.5 * (1 + 4 + 4 + 25))
     assert part.weight == 0.5
     with pytest.raises(InputError, match="so_far"):
         Freedom(1.0, 0.0, 0.0, 0.0, np.zeros((3, 5)))

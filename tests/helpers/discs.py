@@ -36,12 +36,12 @@ def anyhow(count=8, shape=(21, 25)) -> Views:
 
 def ball_lines(views: Views, ball=BALL, fine=6) -> Tensor:
     """Thickness [V, H, W] in metres of a ball: chords, averaged over pixels."""
-    pitch, (h, w) = views.pixel_size, views.shape
+    pitch, (h, w) = views.pitch, views.shape
     i, j = ((np.arange(n * fine) + 0.5) / fine - n / 2 for n in (h, w))
     images = []
-    for rotation, shift in zip(views.rotations, views.shifts / pitch):
+    for rotation, shift, edge in zip(views.rotations, views.shifts / pitch, views.relative):
         x, y = (rotation @ np.array(ball[:3]))[:2] - shift
-        chord = 2 * np.sqrt(np.clip(ball[3] ** 2 - (j - x) ** 2 - (i[:, None] - y) ** 2, 0, None))
+        chord = 2 * np.sqrt(np.clip(ball[3] ** 2 - (edge * j - x) ** 2 - (edge * i[:, None] - y) ** 2, 0, None))
         images.append(chord.reshape(h, fine, w, fine).mean((1, 3)))
     return torch.from_numpy(pitch * np.stack(images)).float()
 

@@ -35,7 +35,7 @@ def scan_at(planned: Exposures) -> Scan:
 
 
 def test_a_geometry_comes_back_exactly(tmp_path):
-    errors = np.arange(6.0 * V).reshape(V, 6) / 1024
+    errors = np.arange(7.0 * V).reshape(V, 7) / 1024
     written = Beams.of(exposures(), errors, {"aligned": 'by "hand" \\ eye'})
     write_beams(tmp_path / "geometry.toml", written)
     found = read_beams(tmp_path / "geometry.toml")
@@ -111,7 +111,7 @@ GOOD = 'format = "holosplat geometry 1"\n[[view]]\nangle_deg = 0.0\ndistance_m =
         (GOOD + "shift_m = [0, 0, 0]", "view\\[1\\].shift_m must have 2 entries"),
         (GOOD + "shift_m = [0, 0]\nshift_px = [0, 0]", "leave one of the two"),
         (GOOD.replace("angle_deg = 1.0", "rotation = [[1, 0, 0], [0, 1, 0], [0, 0, -1]]"), "proper rotation"),
-        (GOOD + "pixel_size_m = 1e-6", "pixel_size_m must be the same"),
+        (GOOD + "distance_m = 1.0\npixel_size_m = 1e-6", r"view\[0\].pixel_size_m is missing"),
         (GOOD.replace("angle_deg = 1.0", "angle_deg = 'x'"), "must be a number"),
         ("made_by = 3", "made_by must be a table of texts"),
         ("[[view", "must be valid TOML"),

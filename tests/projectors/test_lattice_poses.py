@@ -100,7 +100,7 @@ def blob(grid: Grid, centre: Tensor, width: float) -> Tensor:
 
 def weighted_chords(poses: Poses, centre: Tensor, width: float, image: Tensor) -> Tensor:
     """Σ image × the blob's line integrals, in closed form; for any matrix A of two rows its covariance is σ² A Aᵀ."""
-    (h, w), p, across = poses.shape, poses.pixel_size, poses.rotations[:, :2]
+    (h, w), p, across = poses.shape, poses.pitch, poses.rotations[:, :2]
     at = across @ centre - poses.shifts
     x = ((torch.arange(w).double() + 0.5 - 0.5 * w) * p - at[:, 0, None, None]).expand(-1, h, -1)
     y = (((torch.arange(h).double() + 0.5 - 0.5 * h) * p)[:, None] - at[:, 1, None, None]).expand(-1, -1, w)

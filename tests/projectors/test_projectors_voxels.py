@@ -68,7 +68,7 @@ def test_compiled_projectors_have_an_exact_adjoint(projector):
 def test_the_lattice_equals_its_float64_twin(views, threads):
     """On grids in pixels and in metres; voxels at odd places, some of them beyond the detector."""
     volume, metre = randoms(*CUBIC.shape), 2.5e-7
-    scaled = replace(views, pixel_size=metre, shifts=views.shifts * metre)
+    scaled = replace(views, pitch=metre, shifts=views.shifts * metre)
     grid = replace(CUBIC, voxel_size=(0.9 * metre,) * 3, origin=tuple(metre * o for o in CUBIC.origin))
     truth = lattice_reference(volume, CUBIC, views)
     torch.set_num_threads(threads)

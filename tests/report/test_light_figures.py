@@ -32,7 +32,7 @@ def test_what_light_and_prediction_leave_is_drawn():
 def test_phase_is_drawn_beside_even_light():
     """Of five frames three are drawn: the first, the middle and the last."""
     phase = -np.linspace(0, 1, 28) * np.arange(1.0, 6)[:, None, None] * np.ones((20, 1))
-    axes = phase_figure(1 + 0.1 * phase, None, phase, tuple("abcde"), PITCH).axes
+    axes = phase_figure(1 + 0.1 * phase, None, phase, tuple("abcde"), np.full(5, PITCH)).axes
     assert all((image(one) == 0).all() for one in axes[3:6])
     for one, number in zip(axes[6:9], (0, 2, 4)):
         np.testing.assert_array_equal(image(one), phase[number])

@@ -42,7 +42,7 @@ def a_scan(factor: np.ndarray) -> hs.Scan:
     projector = SliceProjector(grid, views)
     solid = torch.from_numpy(np.asarray(inside, dtype=np.float32).transpose(2, 1, 0).copy())
     lines = projector.lines_out(projector.project(projector.volume_in(solid))).numpy() * PIXEL
-    exposures = hs.Exposures.of(replace(views, pixel_size=PIXEL), 20.0, 0.0)
+    exposures = hs.Exposures.of(replace(views, pitch=PIXEL), 20.0, 0.0)
     frames = np.exp(-2 * wavenumber(20.0) * MATERIAL.beta * lines)
     return hs.Scan(frames * factor, exposures, HELD_OUT)
 

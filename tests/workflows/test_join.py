@@ -12,6 +12,7 @@ from helpers.imaging import PIXEL, SHAPE, cells, rms, taken
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.io.nxtomo import read_scan, write_scan
+from holosplat.io.reading import Part
 from holosplat.optics.resampling import Resampling
 from holosplat.scan import Scan
 from holosplat.workflows.join import join
@@ -53,9 +54,9 @@ def beams(folder: Path) -> tuple[Path, Path]:
     return paths
 
 
-def test_beams_are_joined_on_the_coarsest_pixels_of_the_common_field(tmp_path):
+def test_beams_are_joined_on_pixels_of_one_size_over_the_common_field(tmp_path):
     paths = beams(tmp_path)
-    join(paths, tmp_path / "scan.nxs", flips=("none", "columns"))
+    join(paths, tmp_path / "scan.nxs", PIXEL, ("none", "columns"))
     found = read_scan(tmp_path / "scan.nxs")
     assert (found.views.shape, found.views.pixel_size) == ((62, 75), PIXEL)
     assert found.exposures.distance.tolist() == [0.1] * 4 + [0.15] * 2
@@ -88,6 +89,21 @@ def test_beams_of_different_energies_keep_their_own(tmp_path):
     found = read_scan(tmp_path / "scan.nxs").exposures
     assert found.energy_kev.tolist() == [20.0] * 4 + [17.0] * 4
     assert found.reference_energy == 20.0
+
+
+def test_beams_of_several_pixel_sizes_stay_as_they_are(tmp_path):
+    """Bit for bit, each with its own pixel; of other shapes after a crop."""
+    a, b = (read_scan(path) for path in beams(tmp_path))
+    paths = tmp_path / "a.nxs", tmp_path / "b.nxs"
+    joined = join(paths, tmp_path / "scan.nxs", part=Part(crop="1:61,2:72"))
+    found = read_scan(tmp_path / "scan.nxs")
+    assert found.views.shape == joined.views.shape == (60, 70)
+    assert found.views.pixel_sizes == pytest.approx([PIXEL] * 4 + [2.5e-6] * 2, rel=1e-15)
+    np.testing.assert_array_equal(found.frames, np.concatenate([s.frames[:, 1:61, 2:72] for s in (a, b)]))
+    np.testing.assert_allclose(found.views.shifts[5], b.views[[1]].cropped(slice(1, 61), slice(2, 72)).shifts[0])
+    assert found.exposures.psf_sigma_px.tolist() == [0.9] * 4 + [1.2] * 2
+    with pytest.raises(InputError, match=r"they have .* × .* and 80 × 96; cut all to one shape \(--crop"):
+        join(paths, tmp_path / "other.nxs")
 
 
 def test_what_cannot_be_joined(tmp_path):

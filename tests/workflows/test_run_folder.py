@@ -315,7 +315,7 @@ def test_the_scans_fingerprint_sees_everything_that_counts(scan):
         replace(scan, exposures=replace(exposures, distance=exposures.distance * 1.01)),
         replace(scan, exposures=replace(exposures, psf_sigma_px=exposures.psf_sigma_px + 0.1)),
         replace(scan, exposures=replace(exposures, views=replace(views, shifts=views.shifts + 1e-9))),
-        replace(scan, exposures=replace(exposures, views=replace(views, pixel_size=3.3e-6))),
+        replace(scan, exposures=replace(exposures, views=replace(views, pitch=3.3e-6))),
         replace(scan, exposures=replace(exposures, views=views[[1, 0, 2, 3, 4, 5, 6, 7]])),
     ]
     prints = [scan_hash(s) for s in (scan, *others)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,8 +17,9 @@ from ..scan import Exposures
 from .derivatives import NUMBERS, Predicted
 from .newton import Normal, Step, step
 
-SMALL = (0.05, 0.05, 1e-3, 1e-3, 1e-3, 0.01)
-"""Steps by which derivatives of frames are taken: shifts [pixels], turns [rad], logarithm of the distance."""
+SMALL = (0.05, 0.05, 1e-3, 1e-3, 1e-3, 0.01, 1e-3)
+"""Steps by which derivatives of frames are taken: shifts [pixels], turns [rad], logarithms of distance and
+magnification."""
 BLUR = 0.5
 """Frames are compared after a Gaussian of this standard deviation [pixels]: edges are sharp."""
 STEPS = 3
@@ -25,17 +27,20 @@ STEPS = 3
 
 
 def aligned(numbers: Tensor) -> Alignment:
-    """The corrections that `numbers` [V, 7] of `NUMBERS` are."""
-    return Alignment(numbers[:, 2:5], numbers[:, :2], numbers[:, 5].exp() - 1)
+    """The corrections that `numbers` [V, 8] of `NUMBERS` are."""
+    magnified = numbers[:, 6].exp() - 1 if bool((numbers[:, 6] != 0).any()) else None
+    return Alignment(numbers[:, 2:5], numbers[:, :2], numbers[:, 5].exp() - 1, magnified=magnified)
 
 
 def numbers_of(found: Exposures, planned: Exposures) -> Tensor:
-    """[V, 6] shifts [pixels], turns [rad], and logarithm of the distance, that make `planned` exposures `found`."""
+    """[V, 7] shifts [pixels], turns [rad], and logarithms of distance and magnification, that make `planned` exposures
+    `found`."""
     turns = np.einsum("vij,vkj->vik", found.views.rotations, planned.views.rotations)
-    shifts = (found.views.shifts - planned.views.shifts) / planned.views.pixel_size
+    shifts = (found.views.shifts - planned.views.shifts) / planned.views.pixel_sizes[:, None]
     near = np.where(planned.distance > 0, found.distance / np.where(planned.distance > 0, planned.distance, 1), 1)
     vectors = Rotation.from_matrix(turns).as_rotvec()
-    return torch.from_numpy(np.concatenate([shifts, vectors, np.log(near)[:, None]], axis=1))
+    larger = np.log(planned.views.pixel_sizes / found.views.pixel_sizes)
+    return torch.from_numpy(np.concatenate([shifts, vectors, np.log(near)[:, None], larger[:, None]], axis=1))
 
 
 class Beside:
@@ -46,9 +51,13 @@ class Beside:
             Model(matter, Instrument(planned[[v]], oversample, backend=matter.backend)) for v in range(len(planned))
         ]
 
-    def predicted(self, numbers: Tensor) -> Predicted:
-        """Frames at `numbers` [V, 7], and their derivatives by one-sided differences; view by view to bound memory."""
-        views = [_one(part, numbers[[v]]) for v, part in enumerate(self._parts)]
+    def predicted(self, numbers: Tensor, magnified: bool = False) -> Predicted:
+        """Frames at `numbers` [V, 8], and their derivatives by one-sided differences; view by view to bound memory.
+
+        magnified: whether the derivative by the magnification is asked for, else it is zero.
+        """
+        steps = SMALL if magnified else SMALL[:-1]
+        views = [_one(part, numbers[[v]], steps) for v, part in enumerate(self._parts)]
         return Predicted(torch.stack([frame for frame, _ in views]), torch.stack([slopes for _, slopes in views]))
 
     def frames(self, numbers: Tensor) -> Tensor:
@@ -66,11 +75,11 @@ class Beside:
     ) -> Step:
         """The numbers of `measured` frames [V, H, W] after some steps from `numbers`, with their covariances.
 
-        expected: standard deviations [7] about the plan, 0 for what stays. No steps at all: covariances where they are.
+        expected: standard deviations [8] about the plan, 0 for what stays. No steps at all: covariances where they are.
         """
         found = Step(numbers, torch.zeros(len(numbers), len(NUMBERS), len(NUMBERS), dtype=torch.float64))
         for done in range(max(1, steps)):
-            normal = Normal.of(measured, self.predicted(found.numbers), BLUR)
+            normal = Normal.of(measured, self.predicted(found.numbers, bool(expected[6] > 0)), BLUR)
             moved = step(normal, found.numbers, expected)
             found = moved if steps else replace(moved, numbers=numbers)
             tell((done + 1) / max(1, steps))
@@ -78,13 +87,14 @@ class Beside:
 
 
 @torch.no_grad()
-def _one(model: Model, numbers: Tensor) -> tuple[Tensor, Tensor]:
-    """The frame [H, W] of one view, and its derivatives [7, H, W]."""
+def _one(model: Model, numbers: Tensor, steps: Sequence[float]) -> tuple[Tensor, Tensor]:
+    """The frame [H, W] of one view, and its derivatives [8, H, W]."""
     here, slopes = _frame(model, numbers), list[Tensor]()
-    for k, small in enumerate(SMALL):
+    for k, small in enumerate(steps):
         moved = numbers.clone()
         moved[:, k] += small
         slopes.append((_frame(model, moved) - here) / small)
+    slopes += [torch.zeros_like(here)] * (len(SMALL) - len(steps))
     return here, torch.stack([*slopes, here])
 
 

@@ -19,6 +19,7 @@ from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..scan import Exposures, Scan
 from .coarse import shifts_by_mass
+from .derivatives import NUMBERS
 from .gauge import moved_onto
 from .phantom import Phantom
 from .phantom_fit import STEPS, Linear, linearised, solved
@@ -63,6 +64,9 @@ class CalibrationOptions:
         at_least(self, 1, "rounds", "most_pixels")
         at_least(self, 8, "least_side")
         at_least(self, 0, "pixel")
+        require(
+            self.uncertain.magnification == 0, "calibrate finds one pixel size of all views; leave magnification 0."
+        )
         require(self.pixel <= 0.2, f"uncertain pixel size must be 0.2 at most, but it is {self.pixel:g}; correct it.")
         in_range("blur", self.blur, 0.3, 10.0, unit="pixels")
 
@@ -83,7 +87,7 @@ DEFAULT = CalibrationOptions()
 class Calibrated:
     """Where V views are.
 
-    exposures: those of the scan, corrected; changes, errors: [V, 6] of the plan, as in `AlignedViews`
+    exposures: those of the scan, corrected; changes, errors: [V, 7] of the plan, as in `AlignedViews`
     pixel_size: [m], and its standard error as a share of it, 0 where it was known
     phantom: where its bodies are, in the object frame
     left: [V] rms of what is unexplained of each frame, as a share of its contrast; words: what was not told
@@ -148,14 +152,14 @@ def calibrate(
 
 
 class _Search:
-    """A calibration in progress: numbers [V, 7] of the views beside the plan, of smallest pixels, and the phantom."""
+    """A calibration in progress: numbers [V, 8] of the views beside the plan, of smallest pixels, and the phantom."""
 
     def __init__(self, scan: Scan, prior: Known, phantom: Phantom, options: CalibrationOptions) -> None:
         self.scan, self.material, self.phantom, self.options = scan, prior.material, phantom, options
         self.bins = options.bins(len(scan), scan.views.shape)
-        self.numbers = torch.zeros(len(scan), 7, dtype=torch.float64)
+        self.numbers = torch.zeros(len(scan), len(NUMBERS), dtype=torch.float64)
         self.size = 0.0
-        self.errors, self.size_error = np.zeros((len(scan), 6)), 0.0
+        self.errors, self.size_error = np.zeros((len(scan), FLUX)), 0.0
         self.left = np.zeros(len(scan))
 
     @classmethod
@@ -198,7 +202,7 @@ class _Search:
             self.numbers[:, TURN], self.numbers[:, SHIFT] / pixels, self.numbers[:, DISTANCE].exp() - 1
         )
         found, larger = alignment.exposures(planned), float(np.exp(self.size))
-        views = replace(found.views, pixel_size=found.views.pixel_size * larger, shifts=found.views.shifts * larger)
+        views = replace(found.views, pitch=found.views.pitch * larger, shifts=found.views.shifts * larger)
         return replace(found, views=views)
 
     def step(self, pixels: int) -> None:
@@ -214,7 +218,7 @@ class _Search:
             found = replace(found, frames=finer.frames(lines).detach().double())
         lit = self.numbers[:, FLUX].exp()[:, None, None]
         found = Linear(lit * found.frames, lit[:, None] * found.of_views, lit * found.of_all)
-        scales = torch.ones(7, dtype=torch.float64)
+        scales = torch.ones(len(NUMBERS), dtype=torch.float64)
         scales[SHIFT] = pixels
         of_views = uncertain.deviations() / scales
         of_views[DISTANCE] = uncertain.distance if exposures.distance.all() else 0.0
@@ -237,7 +241,7 @@ class _Search:
         """Errors of the numbers, and what is unexplained."""
         deviations = covariances.diagonal().clamp_min(0).sqrt()
         own = (deviations[len(deviations) - self.numbers.numel() :].reshape(self.numbers.shape) * scales).numpy()
-        self.errors = own[:, :6] * np.array([1, 1, *[np.rad2deg(1)] * 3, 1])
+        self.errors = own[:, :FLUX] * np.array([1, 1, *[np.rad2deg(1)] * 3, 1, 1])
         self.size_error = float(deviations[places]) if self.options.pixel > 0 else 0.0
         left = (frames - seen).square().mean((1, 2)).sqrt() / frames.std(dim=(1, 2)).clamp_min(1e-12)
         self.left = left.double().numpy()
@@ -267,7 +271,7 @@ class _Search:
                 which = "any view" if len(untold) == len(self.scan) else f"views {', '.join(untold)}"
                 words.append(f"{NAMES[kind]}: not told by the frames for {which}; near the plan")
         size = self.scan.views.pixel_size * float(np.exp(self.size))
-        compared = replace(exposures, views=replace(exposures.views, pixel_size=self.scan.views.pixel_size))
+        compared = replace(exposures, views=replace(exposures.views, pitch=self.scan.views.pitch))
         return Calibrated(
             exposures,
             changes(compared, self.scan.exposures),

@@ -21,10 +21,11 @@ def shifts_by_mass(thickness: np.ndarray, views: Views) -> np.ndarray:
     projection of the centre of mass (the moment of order one, Helgason 1980); the point is that which asks for the
     least shifts.
     """
-    seen = centres_of_mass(thickness) + views.shifts / views.pixel_size
+    edges = views.relative[:, None]
+    seen = centres_of_mass(thickness) + views.shifts / views.pixel_sizes[:, None]
     design = views.rotations[:, :2].reshape(-1, 3)
-    point = np.linalg.lstsq(design, seen.reshape(-1), rcond=1e-9)[0]
-    return (design @ point).reshape(-1, 2) - seen
+    point = np.linalg.lstsq(design, (seen * edges).reshape(-1), rcond=1e-9)[0]
+    return (design @ point).reshape(-1, 2) / edges - seen
 
 
 def centres_of_mass(images: np.ndarray) -> np.ndarray:

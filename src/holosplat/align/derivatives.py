@@ -16,10 +16,10 @@ from ..model import Instrument
 from ..projectors.voxels import LatticeProjector
 from ..scan import Exposures
 
-NUMBERS = ("shift x", "shift y", "turn x", "turn y", "roll", "distance", "flux")
-"""What each view has: shifts [pixels], turns about the lab's axes [rad], and the logarithms of the distance over the
-planned one and of the flux."""
-SMALL = (0.05, 0.05, 1e-3, 1e-3, 1e-3)
+NUMBERS = ("shift x", "shift y", "turn x", "turn y", "roll", "distance", "magnification", "flux")
+"""What each view has: shifts [pixels], turns about the lab's axes [rad], and the logarithms of the distance and the
+magnification over the planned ones, and of the flux."""
+SMALL = (0.05, 0.05, 1e-3, 1e-3, 1e-3, 1e-3)
 """Steps along derivatives of line integrals by which those of frames are taken."""
 STRETCH = 0.02
 """Share of the distance by which the derivative by its logarithm is taken."""
@@ -27,18 +27,27 @@ STRETCH = 0.02
 
 @dataclass(frozen=True)
 class Predicted:
-    """Frames [V, H, W] of a volume, and their derivatives [V, 7, H, W] by the numbers of `NUMBERS`."""
+    """Frames [V, H, W] of a volume, and their derivatives [V, 8, H, W] by the numbers of `NUMBERS`."""
 
     frames: Tensor
     derivatives: Tensor
 
 
-def predicted(volume: Tensor, grid: Grid, exposures: Exposures, material: DeltaBeta, oversample: int) -> Predicted:
-    """The frames of occupancies `volume` [Z, Y, X] on `grid` (lengths in pixels) in `exposures`.
+def predicted(
+    volume: Tensor,
+    grid: Grid,
+    exposures: Exposures,
+    material: DeltaBeta,
+    oversample: int,
+    magnified: bool = False,
+) -> Predicted:
+    """The frames of occupancies `volume` [Z, Y, X] on `grid` (lengths in pixels of the views' pitch) in `exposures`.
 
-    Derivatives by the pose are those of `projections`, carried through the wave optics by small differences.
+    Derivatives by the pose are those of `projections`, carried through the wave optics by small differences. A view
+    that is magnified has smaller pixels p: its line integrals change as `projections` says, and its waves as those of
+    a distance that grows with 1/p². magnified: whether this is asked for; else that derivative is zero.
     """
-    pixel = exposures.views.pixel_size
+    pixel = exposures.views.pitch
     lines, slopes = projections(volume, grid, in_pixels(exposures.views))
     instrument = Instrument(exposures, oversample)
 
@@ -48,16 +57,20 @@ def predicted(volume: Tensor, grid: Grid, exposures: Exposures, material: DeltaB
         return frames_of(through, images * pixel, material).detach()
 
     here = frames(lines)
-    columns = [(frames(lines + step * slopes[:, k]) - here) / step for k, step in enumerate(SMALL)]
+    wanted = SMALL if magnified else SMALL[:-1]
+    columns = [(frames(lines + step * slopes[:, k]) - here) / step for k, step in enumerate(wanted)]
     farther = Instrument(replace(exposures, distance=exposures.distance * (1 + STRETCH)), oversample)
-    columns += [(frames(lines, farther) - here) / np.log1p(STRETCH), here]
+    by_distance = (frames(lines, farther) - here) / np.log1p(STRETCH)
+    scaled = columns.pop() + 2 * by_distance if magnified else torch.zeros_like(here)
+    columns += [by_distance, scaled, here]
     return Predicted(here, torch.stack(columns, dim=1))
 
 
 def projections(volume: Tensor, grid: Grid, views: Views) -> tuple[Tensor, Tensor]:
-    """Line integrals [V, H, W] [pixels] of `volume` [Z, Y, X], and their derivatives [V, 5, H, W] by the pose.
+    """Line integrals [V, H, W] [pixels] of `volume` [Z, Y, X], and their derivatives [V, 6, H, W] by the pose.
 
-    By shifts of the detector [1/pixel] and turns about the lab's axes [1/rad], which are those of `model.Alignment`.
+    By shifts of the detector [1/pixel of the view], turns about the lab's axes [1/rad], which are those of
+    `model.Alignment`, and the logarithm of the magnification, which moves the centres of pixels towards the middle.
     A turn about x moves matter at depth z by `-ω z` along y, and matter at y along the beam, which no line integral
     sees: so the derivative is that of the first moment `m = ∫ z f dz` along y; likewise about y. A turn about the beam
     turns the image. Derivatives along the image are central differences.
@@ -69,12 +82,14 @@ def projections(volume: Tensor, grid: Grid, views: Views) -> tuple[Tensor, Tenso
     along = torch.from_numpy(views.rotations[:, 2]).float()
     moments = sum(along[:, k, None, None] * part for k, part in enumerate(parts))
     assert isinstance(moments, Tensor)
+    edges = torch.from_numpy(views.pixel_sizes).float()[:, None, None]
     (across, down), (moment_across, moment_down) = slopes(lines), slopes(moments)
-    (h, w), shifts = views.shape, torch.from_numpy(views.shifts).float()
-    at_x = (torch.arange(w) + 0.5 - w / 2)[None, None] + shifts[:, 0, None, None]
-    at_y = (torch.arange(h) + 0.5 - h / 2)[None, :, None] + shifts[:, 1, None, None]
-    rolled = at_y * across - at_x * down
-    return lines, torch.stack([across, down, moment_down, -moment_across, rolled], dim=1)
+    (h, w), shifts = views.shape, torch.from_numpy(views.shifts).float()[:, :, None, None] / edges[:, None]
+    from_x, from_y = (torch.arange(w) + 0.5 - w / 2)[None, None], (torch.arange(h) + 0.5 - h / 2)[None, :, None]
+    rolled = (from_y + shifts[:, 1]) * across - (from_x + shifts[:, 0]) * down
+    magnified = -from_x * across - from_y * down
+    turned = (moment_down / edges, -moment_across / edges)
+    return lines, torch.stack([across, down, *turned, rolled, magnified], dim=1)
 
 
 def slopes(images: Tensor) -> tuple[Tensor, Tensor]:
@@ -86,5 +101,5 @@ def slopes(images: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def in_pixels(views: Views) -> Views:
-    """The same views with the pixel as the unit of length."""
-    return Views(views.rotations, views.shifts / views.pixel_size, views.shape, 1.0)
+    """The same views with the pitch as the unit of length."""
+    return views.in_units_of(views.pitch)

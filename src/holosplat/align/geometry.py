@@ -13,7 +13,13 @@ from ..scan import Scan
 from .poses import Uncertain
 from .views import AlignedViews
 
-REFINED = {"shifts": "shift", "angles": "angle", "roll": "roll", "distance": "distance"}
+REFINED = {
+    "shifts": "shift",
+    "angles": "angle",
+    "roll": "roll",
+    "distance": "distance",
+    "magnification": "magnification",
+}
 """What may be refined, by the name of its field in `Uncertain`."""
 TEXTS = ("refined", "words")
 
@@ -22,8 +28,8 @@ TEXTS = ("refined", "words")
 class Geometry:
     """Where V frames are: those for training by a volume of their own, those held out by the finished volume.
 
-    rotations [V, 3, 3], shifts [V, 2] [m], distance [V] [m]: as found
-    changes, errors: [V, 6] of the plan, as in `AlignedViews`
+    rotations [V, 3, 3], shifts [V, 2] [m], distance [V] [m], pixel_sizes [V] [m]: as found
+    changes, errors: [V, 7] of the plan, as in `AlignedViews`
     held_out: [V] bool
     before, after: [V] rms of what a volume leaves unexplained of each frame, as a share of its contrast
     refined: what was looked for; words: what stayed as planned, and why
@@ -32,6 +38,7 @@ class Geometry:
     rotations: np.ndarray
     shifts: np.ndarray
     distance: np.ndarray
+    pixel_sizes: np.ndarray
     changes: np.ndarray
     errors: np.ndarray
     held_out: np.ndarray
@@ -42,7 +49,7 @@ class Geometry:
 
     def __post_init__(self) -> None:
         count = len(self.rotations)
-        ends = {"rotations": (3, 3), "shifts": (2,), "changes": (6,), "errors": (6,)}
+        ends = {"rotations": (3, 3), "shifts": (2,), "changes": (7,), "errors": (7,)}
         for each in fields(self):
             if each.name not in TEXTS:
                 array = np.asarray(getattr(self, each.name), dtype=bool if each.name == "held_out" else np.float64)
@@ -58,8 +65,9 @@ class Geometry:
             planned.views.rotations,
             planned.views.shifts,
             planned.distance,
-            np.zeros((count, 6)),
-            np.zeros((count, 6)),
+            planned.views.pixel_sizes,
+            np.zeros((count, 7)),
+            np.zeros((count, 7)),
             scan.is_test,
             np.zeros(count),
             np.zeros(count),
@@ -75,6 +83,7 @@ class Geometry:
             "rotations": views.rotations,
             "shifts": views.shifts,
             "distance": found.exposures.distance,
+            "pixel_sizes": views.pixel_sizes,
             **{name: getattr(found, name) for name in ("changes", "errors", "before", "after")},
         }
         changed = {}
@@ -90,7 +99,8 @@ class Geometry:
             f"the geometry is that of {len(self.rotations)} frames, but the scan has {len(scan)}; take its run's.",
         )
         planned = scan.exposures
-        views = replace(planned.views, rotations=self.rotations, shifts=self.shifts)
+        scales = self.pixel_sizes / planned.views.pitch
+        views = replace(planned.views, rotations=self.rotations, shifts=self.shifts, scales=scales)
         return Scan.of(
             scan.source, replace(planned, views=views, distance=self.distance), scan.is_test, scan.provenance
         )
@@ -122,7 +132,8 @@ class Geometry:
                 left = [np.sqrt(np.square(part[at]).mean()) for part in (self.before, self.after)]
                 said += (
                     f" {name} {shift:.3f} pixels, {across:.3f}° across the beam, {root[4]:.3f}° about it, "
-                    f"{root[5]:.2%} of the distance (unexplained {left[0]:.3f} → {left[1]:.3f});"
+                    f"{root[5]:.2%} of the distance, {root[6]:.2%} of the magnification "
+                    f"(unexplained {left[0]:.3f} → {left[1]:.3f});"
                 )
         return [said.rstrip(";"), *self.words]
 

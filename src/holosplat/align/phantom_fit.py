@@ -27,8 +27,9 @@ NUDGE = 0.05
 
 @dataclass(frozen=True)
 class Linear:
-    """Frames [V, H, W] of a phantom, and their derivatives: of_views [V, 7, H, W] by the `NUMBERS` of each view, of_all
-    [K, V, H, W] by the places of free bodies [pixels] and, last, the logarithm of the pixel size."""
+    """Frames [V, H, W] of a phantom, and their derivatives: of_views [V, 8, H, W] by the `NUMBERS` of each view (zero
+    by the magnification, for there is one of all), of_all [K, V, H, W] by the places of free bodies [pixels] and, last,
+    the logarithm of the pixel size."""
 
     frames: Tensor
     of_views: Tensor
@@ -53,7 +54,7 @@ def linearised(phantom: Phantom, exposures: Exposures, material: DeltaBeta, over
         poses = Alignment(**{name: changed}).poses(instrument.poses, pitch)
         columns.append((seen(matter.project(poses).channels) - here) / step)
     farther = Instrument(replace(exposures, distance=exposures.distance * math.exp(STRETCH)), oversample)
-    columns += [(seen(lines.channels, farther) - here) / STRETCH, here]
+    columns += [(seen(lines.channels, farther) - here) / STRETCH, torch.zeros_like(here), here]
     others = []
     for n in range(len(phantom) if phantom.free else 0):
         before = phantom.surfaces(material, pitch, [n]).project(instrument.poses).channels
@@ -63,7 +64,7 @@ def linearised(phantom: Phantom, exposures: Exposures, material: DeltaBeta, over
             after = phantom.shifted(by).surfaces(material, pitch, [n]).project(instrument.poses).channels
             others.append((seen(lines.channels + after - before) - here) / NUDGE)
     if pixel:
-        views = replace(exposures.views, pixel_size=pitch * math.exp(STRETCH))
+        views = replace(exposures.views, pitch=pitch * math.exp(STRETCH))
         views = replace(views, shifts=views.shifts * math.exp(STRETCH))
         larger = Instrument(replace(exposures, views=views), oversample)
         there = phantom.surfaces(material, views.pixel_size).project(larger.poses)
@@ -74,7 +75,7 @@ def linearised(phantom: Phantom, exposures: Exposures, material: DeltaBeta, over
 
 @dataclass(frozen=True)
 class Solution:
-    """of_views: [V, 7] and of_all: [K] after a step; covariances: [K + 7 V] squared, those of all first."""
+    """of_views: [V, 8] and of_all: [K] after a step; covariances: [K + 8 V] squared, those of all first."""
 
     of_views: Tensor
     of_all: Tensor
@@ -86,7 +87,7 @@ def solved(
 ) -> Solution:
     """One Gauss–Newton step of all numbers together, damped by what is expected of them.
 
-    measured: [V, H, W]; numbers: of views [V, 7] and of all [K], now; expected: [7] and [K] standard deviations about
+    measured: [V, H, W]; numbers: of views [V, 8] and of all [K], now; expected: [8] and [K] standard deviations about
     zero, 0 for those that stay. The noise of a view is what it leaves unexplained after a Gaussian of `blur` [pixels].
     """
     views, count = len(measured), len(numbers[1])

@@ -25,7 +25,7 @@ from .coarse import shifts_by_mass
 from .derivatives import NUMBERS, in_pixels, predicted
 from .newton import Normal, step, unexplained
 
-SHIFT, TURN, DISTANCE, FLUX = slice(0, 2), slice(2, 5), 5, 6
+SHIFT, TURN, DISTANCE, MAGNIFICATION, FLUX = slice(0, 2), slice(2, 5), 5, 6, 7
 """Places of the numbers of `NUMBERS`."""
 
 
@@ -44,23 +44,28 @@ class Uncertain:
     as voxels blur them."""
     flux: float = 0.02
     """Flux of a frame beside the flat field's, as a share of it."""
+    magnification: float = 0.0
+    """Magnification, as a share of it: that of the training frames together is as planned."""
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "shift", "angle", "roll", "distance", "flux")
-        for name, most in (("shift", 100.0), ("angle", 20.0), ("roll", 20.0), ("distance", 0.5), ("flux", 0.5)):
+        limits = {"shift": 100.0, "angle": 20.0, "roll": 20.0, "distance": 0.5, "flux": 0.5, "magnification": 0.1}
+        at_least(self, 0, *limits)
+        for name, most in limits.items():
             value = getattr(self, name)
             require(value <= most, f"uncertain {name} must be {most:g} at most, but it is {value:g}; correct it.")
 
     def deviations(self, turning: bool = True) -> Tensor:
-        """Standard deviations [7] of `NUMBERS`, shifts in detector pixels; turning: whether turns are free."""
+        """Standard deviations [8] of `NUMBERS`, shifts in detector pixels; turning: whether turns and magnification,
+        which act far from the middle, are free."""
         turn, roll = np.deg2rad([self.angle, self.roll]) * turning
         distance = self.distance or BLUR_AS_DISTANCE
-        return torch.tensor([self.shift, self.shift, turn, turn, roll, distance, self.flux], dtype=torch.float64)
+        found = [self.shift, self.shift, turn, turn, roll, distance, self.magnification * turning, self.flux]
+        return torch.tensor(found, dtype=torch.float64)
 
     def freedom(self, so_far: np.ndarray) -> Freedom:
-        """The same for a fit of matter and geometry; so_far: [V, 6] changes of the plan [pixels, rad, share]."""
+        """The same for a fit of matter and geometry; so_far: [V, 7] changes of the plan [pixels, rad, shares]."""
         angle, roll = np.deg2rad([self.angle, self.roll])
-        return Freedom(self.shift, float(angle), float(roll), self.distance, so_far)
+        return Freedom(self.shift, float(angle), float(roll), self.distance, so_far, self.magnification)
 
 
 TURNING = 30
@@ -156,9 +161,11 @@ class PoseSearch:
 
     def exposures(self, planned: Exposures) -> Exposures:
         """Planned exposures, on pixels of any size, corrected by the numbers as they are now."""
-        pixels = planned.views.pixel_size / self.scan.views.pixel_size
+        pixels = planned.views.pitch / self.scan.views.pitch
         stretches = self.numbers[:, DISTANCE].exp() - 1
-        alignment = Alignment(self.numbers[:, TURN], self.numbers[:, SHIFT] / pixels, stretches)
+        magnified = self.numbers[:, MAGNIFICATION].exp() - 1 if self.options.uncertain.magnification > 0 else None
+        shifts = self.numbers[:, SHIFT] / pixels
+        alignment = Alignment(self.numbers[:, TURN], shifts, stretches, magnified=magnified)
         return alignment.exposures(planned)
 
     def levels(self) -> tuple[Level, ...]:
@@ -171,7 +178,7 @@ class PoseSearch:
         how = Tikhonov(iterations=self.options.retrieval)
         thickness = tikhonov(torch.from_numpy(scan.frames), scan.exposures, *self.material, options=how)
         shifts = shifts_by_mass(thickness.double().numpy(), scan.views)
-        pixels = scan.views.pixel_size / self.scan.views.pixel_size
+        pixels = scan.views.pitch / self.scan.views.pitch
         self.numbers[:, SHIFT] = torch.from_numpy(shifts) * pixels
 
     @property
@@ -189,9 +196,11 @@ class PoseSearch:
     def run(self, level: Level, on_progress: Advance) -> None:
         """The rounds of a level, until shifts have settled, or their steps fall no longer."""
         at, last = self.prepared(level), math.inf
+        trained = torch.from_numpy(~self.scan.is_test)
         for done in range(level.rounds):
             before = self.numbers[:, SHIFT].clone()
             self.solve(self.looked(at), at.shape)
+            self.numbers[:, MAGNIFICATION] -= self.numbers[trained, MAGNIFICATION].mean()
             moved = float((self.numbers[:, SHIFT] - before).square().mean().sqrt()) / level.pixels
             on_progress((done + 1) / level.rounds)
             if moved < (NEAR if self.edges_follow else SETTLED) or moved > SLOWER * last:
@@ -208,7 +217,7 @@ class PoseSearch:
         """What the rounds of a level need."""
         scan = self.scan.binned(level.pixels)
         planned = scan.exposures
-        retrieved = self.thickness(scan, planned) / scan.views.pixel_size
+        retrieved = self.thickness(scan, planned) / scan.views.pitch
         grid = Grid.of_views(in_pixels(planned.views))
         return Prepared(scan, retrieved, grid, fringe_sampling(planned))
 
@@ -223,10 +232,10 @@ class PoseSearch:
     def thickness(self, scan: Scan, exposures: Exposures) -> Tensor:
         """Retrieved thickness [m] of the training frames of `scan`, on pixels of any size, in `exposures`.
 
-        Poses do not matter to it, distances do: at those planned it is kept for later.
+        Poses do not matter to it, distances and pixels do: at those planned it is kept for later.
         """
-        pixels = round(scan.views.pixel_size / self.scan.views.pixel_size)
-        as_planned = np.array_equal(exposures.distance, self.scan.exposures.distance)
+        pixels = round(scan.views.pitch / self.scan.views.pitch)
+        as_planned = np.array_equal(exposures.optical.distance, self.scan.exposures.optical.distance)
         if as_planned and pixels in self._retrieved:
             return self._retrieved[pixels]
         train, how = np.flatnonzero(~scan.is_test), Tikhonov(iterations=self.options.retrieval)
@@ -259,8 +268,9 @@ class PoseSearch:
     def normal(self, volume: Tensor, grid: Grid, found: Exposures, frames: Tensor, oversample: int) -> Normal:
         """What frames [V, H, W] say of the numbers (shifts in detector pixels), beside `volume` on `grid`."""
         scales = torch.ones(len(NUMBERS), dtype=torch.float64)
-        scales[SHIFT] = round(found.views.pixel_size / self.scan.views.pixel_size)
-        here = predicted(volume, grid, found, self.material, oversample)
+        scales[SHIFT] = round(found.views.pitch / self.scan.views.pitch)
+        magnified = self.options.uncertain.magnification > 0
+        here = predicted(volume, grid, found, self.material, oversample, magnified)
         lit = self.numbers[:, FLUX].exp()[:, None, None].float()
         here = replace(here, frames=lit * here.frames, derivatives=lit[:, None] * here.derivatives)
         return Normal.of(frames, here, self.options.blur).in_units(scales)

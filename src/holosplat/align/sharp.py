@@ -37,7 +37,7 @@ SHARPER = 0.7
 
 @dataclass(frozen=True)
 class Sharpened:
-    """step: numbers [V, 7] of all frames beside the plan, and their covariances beside the surfaces; left: [V] what
+    """step: numbers [V, 8] of all frames beside the plan, and their covariances beside the surfaces; left: [V] what
     surfaces leave unexplained of each frame; surfaces: in the poses that were found."""
 
     step: Step
@@ -51,14 +51,14 @@ def surfaces_of(volume: Tensor, scan: Scan, material: DeltaBeta) -> SurfaceMesh 
         mesh = isosurface(volume.numpy(), Grid.of_views(scan.views))
     except InputError:
         return None
-    unit = scan.views.pixel_size
+    unit = scan.views.finest
     return SurfaceMesh(
         torch.from_numpy(mesh.vertices / unit), torch.from_numpy(mesh.faces), unit, Matter.one(*material)
     )
 
 
 def sharpened(scan: Scan, numbers: Tensor, start: SurfaceMesh, search: PoseOptions, on_progress: Advance) -> Sharpened:
-    """All frames of `scan` beside surfaces that are fitted to those for training, from `start` and `numbers` [V, 7] on.
+    """All frames of `scan` beside surfaces that are fitted to those for training, from `start` and `numbers` [V, 8] on.
 
     numbers: of `NUMBERS` beside the exposures of `scan`, shifts in its pixels, as those of `search`. Held-out frames
     are placed beside the finished surfaces.

@@ -22,7 +22,7 @@ from ..scan import Exposures, Scan
 from .coarse import mirrored
 from .derivatives import in_pixels, predicted
 from .gauge import moved_onto
-from .poses import DISTANCE, FLUX, SHIFT, PoseOptions, PoseSearch
+from .poses import DISTANCE, FLUX, MAGNIFICATION, SHIFT, PoseOptions, PoseSearch
 from .shadows import EVEN_OR_NOT
 from .sharp import believed, sharpened, surfaces_of
 
@@ -43,7 +43,7 @@ UNTOLD = (
     "distances are as planned: the matter shows no sharp edges of a known density, and a longer distance sharpens "
     "fringes as such edges would"
 )
-KINDS = {"shift": (0, 1), "angle": (2, 3), "roll": (4,), "distance": (DISTANCE,)}
+KINDS = {"shift": (0, 1), "angle": (2, 3), "roll": (4,), "distance": (DISTANCE,), "magnification": (MAGNIFICATION,)}
 """Places of the numbers of each kind."""
 
 
@@ -52,9 +52,9 @@ class AlignedViews:
     """Where V views are.
 
     exposures: those of the scan, corrected
-    changes: [V, 6] of the plan, all views moved together as near to it as can be: shifts x, y [pixels], turns about x,
-        y, z of the lab [degrees], share of the distance
-    errors: [V, 6] their standard errors
+    changes: [V, 7] of the plan, all views moved together as near to it as can be: shifts x, y [pixels], turns about x,
+        y, z of the lab [degrees], shares of the distance and of the magnification
+    errors: [V, 7] their standard errors
     flux: [V] of each frame, beside one
     before, after: [V] rms of what a volume leaves unexplained of each frame, as a share of its contrast, with the
         planned and with the found exposures
@@ -74,7 +74,8 @@ class AlignedViews:
         root = np.sqrt(np.square(self.changes).mean(0))
         said = [
             f"changes of the plan (rms): shifts {np.hypot(root[0], root[1]) / np.sqrt(2):.3f} pixels, turns across the "
-            f"beam {np.hypot(root[2], root[3]) / np.sqrt(2):.3f}°, roll {root[4]:.3f}°, distance {root[5]:.2%}",
+            f"beam {np.hypot(root[2], root[3]) / np.sqrt(2):.3f}°, roll {root[4]:.3f}°, distance {root[5]:.2%}"
+            + (f", magnification {root[6]:.2%}, each ± {_rms(self.errors[:, 6]):.2%}" if root[6] > 0 else ""),
             f"unexplained share of the contrast: {_rms(self.before):.3f} as planned, {_rms(self.after):.3f} now",
             *self.words,
             "view  shift x        shift y        turn x           turn y           roll             unexplained",
@@ -149,19 +150,20 @@ def align_views(
 
 
 def errors_of(covariances: Tensor) -> np.ndarray:
-    """[V, 6] standard errors [pixels, degrees, share] by covariances [V, 7, 7] of `NUMBERS`."""
+    """[V, 7] standard errors [pixels, degrees, shares] by covariances [V, 8, 8] of `NUMBERS`."""
     roots = covariances.diagonal(dim1=1, dim2=2).clamp_min(0).sqrt().numpy()[:, :FLUX]
-    return roots * np.array([1, 1, *[np.rad2deg(1)] * 3, 1])
+    return roots * np.array([1, 1, *[np.rad2deg(1)] * 3, 1, 1])
 
 
 def changes(found: Exposures, planned: Exposures) -> np.ndarray:
-    """[V, 6]: shifts x, y [pixels], turns about x, y, z of the lab [degrees], and share of the distance."""
+    """[V, 7]: shifts x, y [pixels], turns about x, y, z of the lab [degrees], shares of distance and magnification."""
     turns = np.einsum("vij,vkj->vik", found.views.rotations, planned.views.rotations)
     degrees = Rotation.from_matrix(turns).as_rotvec(degrees=True)
-    shifts = (found.views.shifts - planned.views.shifts) / planned.views.pixel_size
+    shifts = (found.views.shifts - planned.views.shifts) / planned.views.pixel_sizes[:, None]
     near = np.where(planned.distance > 0, planned.distance, 1.0)
     stretch = (found.distance - planned.distance) / near
-    return np.concatenate([shifts, degrees, stretch[:, None]], axis=1)
+    larger = planned.views.pixel_sizes / found.views.pixel_sizes - 1
+    return np.concatenate([shifts, degrees, stretch[:, None], larger[:, None]], axis=1)
 
 
 def forget_distance(search: PoseSearch) -> None:
@@ -220,7 +222,7 @@ class Judged:
         """On pixels `pixels` times larger; the same for all exposures that are compared."""
         scan = Scan(scan.frames, exposures, scan.is_test).binned(pixels)
         frames, train, options = torch.from_numpy(scan.frames), np.flatnonzero(~scan.is_test), search.options
-        lines = search.thickness(scan, scan.exposures) / scan.views.pixel_size
+        lines = search.thickness(scan, scan.exposures) / scan.views.pitch
         views = in_pixels(scan.views)
         grid = Grid.of_views(views)
         solver = PrimalDual(LatticeProjector(grid, views[train]), torch.zeros(grid.shape), options.weight, search.upper)

@@ -46,7 +46,8 @@ def filtered_backprojection(
     """
     require(
         views.shares_axis,
-        "filtered back-projection needs views that turn about the y axis only, at one height; take sirt, art or tv.",
+        "filtered back-projection needs views that turn about the y axis only, at one height, on pixels of one size; "
+        "take sirt, art or tv.",
     )
     pitch, top = views.pixel_size, checked_upper(upper)
     views, grid = in_pixels(lines, views, grid)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ..checks import at_least
-from ..geometry import Grid, Views
+from ..geometry import Grid
 from ..materials import DeltaBeta
 from ..memory import memory_kept
 from ..model import Instrument, SolvedLight
@@ -133,7 +133,7 @@ def _tomography(scan: Scan, material: DeltaBeta, options: HolographicTV, on_prog
     rays = rays_of(lines, scan.views, Grid.of_views(scan.views), options.backend)
     first = min(TotalVariation.first, options.iterations)
     known = {"still_light": options.still_light, "misfit": options.misfit}
-    inside = options.inside / scan.views.pixel_size
+    inside = options.inside / scan.views.finest
     steps = TotalVariation(first=first, iterations=options.iterations - first, inside=inside, **known)
     weights = photons_left(lines, scan.exposures, material)
     return tv_solver(rays, options.upper or None, steps, partial(on_progress, "tomography"), options.backend, weights)
@@ -156,7 +156,7 @@ def _settled(
     for _ in range(1 + options.relit):
         scan = replace(scan, frames=light.evened(measured).numpy())
         solver = _tomography(scan, material, options, on_progress)
-        lines = refined(solver.lines(), samples) * scan.views.pixel_size
+        lines = refined(solver.lines(), samples) * scan.views.finest
         predicted = frames_of(instrument, lines, material).detach()
         after = light.settled(measured, predicted)
         misfit = after.misfit(measured, predicted)
@@ -183,7 +183,8 @@ def _agree(
     round that agrees best is returned, for the iteration may diverge; the first ones, in which the solver finds its
     dual variables, do not count.
     """
-    frames, pitch, views = torch.from_numpy(scan.frames), scan.views.pixel_size, _in_pixels(scan.views)
+    frames, pitch = torch.from_numpy(scan.frames), scan.views.finest
+    views = scan.views.in_units_of(pitch)
     correction = Correction(scan, material)
     beside = None if light is None or light.background is None else SolvedLight(light.background, frames, light.air)
     finer = math.ceil(fringe_sampling(scan.exposures) / refine)
@@ -215,12 +216,12 @@ class Correction:
     """
 
     def __init__(self, scan: Scan, material: DeltaBeta) -> None:
-        self._exposures, frames = scan.exposures, torch.from_numpy(scan.frames)
-        self._radian = radian(scan.exposures, material.delta)
-        wide, _ = surrounded(frames, scan.exposures)
-        raster = Raster((wide.shape[-2], wide.shape[-1]), scan.views.pixel_size)
-        h = response(scan.exposures, material.beta / material.delta, raster)
-        known = spectra(frames, scan.exposures, h, raster, noise_found(frames, None), MODEL_ERROR, PRIOR)
+        exposures, frames = scan.exposures.optical, torch.from_numpy(scan.frames)
+        self._exposures, self._radian = exposures, radian(exposures, material.delta)
+        wide, _ = surrounded(frames, exposures)
+        raster = Raster((wide.shape[-2], wide.shape[-1]), exposures.views.pixel_size)
+        h = response(exposures, material.beta / material.delta, raster)
+        known = spectra(frames, exposures, h, raster, noise_found(frames, None), MODEL_ERROR, PRIOR)
         self._inverse = known.inverse
 
     def __call__(self, missing: Tensor) -> Tensor:
@@ -239,11 +240,6 @@ def _working_resolution(scan: Scan, options: HolographicTV) -> tuple[Scan, int, 
     while w * w * h / factor**3 > options.max_voxels and factor < min(h, w):
         factor += 1
     return scan.binned(factor), refine, factor
-
-
-def _in_pixels(views: Views) -> Views:
-    """The same views with the pixel as the unit of length."""
-    return Views(views.rotations, views.shifts / views.pixel_size, views.shape, 1.0)
 
 
 def _in_metres(grid: Grid, pitch: float) -> Grid:

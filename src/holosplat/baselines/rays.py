@@ -24,7 +24,7 @@ FEWEST = 1e-3
 
 @dataclass(frozen=True)
 class Rays:
-    """What tomography works on; lengths are in detector pixels.
+    """What tomography works on; lengths are in detector pixels, the smallest ones where they differ.
 
     measured: line integrals in the projector's order; views, grid: in pixels, the views on the raster of the grid's
     voxels; refine: voxels along a pixel's edge.
@@ -42,7 +42,7 @@ def rays_of(lines: Tensor, views: Views, grid: Grid, backend: str = "cpu") -> Ra
 
     Where the voxels are finer than pixels, lines are interpolated (bilinearly) to a raster of the voxels' pitch.
     """
-    pitch = views.pixel_size
+    pitch = views.finest
     views, grid = in_pixels(lines, views, grid)
     edge = grid.voxel_size[0]
     cubic = bool(np.allclose(grid.voxel_size, edge))
@@ -57,15 +57,14 @@ def rays_of(lines: Tensor, views: Views, grid: Grid, backend: str = "cpu") -> Ra
 
 
 def in_pixels(lines: Tensor, views: Views, grid: Grid) -> tuple[Views, Grid]:
-    """Views and grid with the detector's pixel as the unit of length; `InputError` unless the lines are theirs."""
+    """Views and grid with the (smallest) pixel as the unit of length; `InputError` unless the lines are theirs."""
     wanted, shape = (len(views), *views.shape), tuple(lines.shape)
     require(shape == wanted, f"line integrals must have the shape {wanted} of the views, but it is {shape}.")
     bad = lines.numel() - int(torch.isfinite(lines).sum())
     require(bad == 0, f"line integrals must be finite, but {bad} are not; mask or repair them first.")
-    pitch = views.pixel_size
+    pitch = views.finest
     (dx, dy, dz), (x, y, z) = ([length / pitch for length in lengths] for lengths in (grid.voxel_size, grid.origin))
-    in_views = Views(views.rotations, views.shifts / pitch, views.shape, 1.0)
-    return in_views, Grid(grid.shape, (dx, dy, dz), (x, y, z))
+    return views.in_units_of(pitch), Grid(grid.shape, (dx, dy, dz), (x, y, z))
 
 
 def photons_left(lines: Tensor, exposures: Exposures, material: DeltaBeta) -> Tensor | None:

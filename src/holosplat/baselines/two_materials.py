@@ -160,7 +160,8 @@ def absorption(
     linearised a few times): refraction moves light about, only absorption takes it away.
     """
     instrument, lines = _lines(scan, values, grid, backend)
-    fringe = np.sqrt((wavelength(scan.exposures.energy_kev) * scan.exposures.distance).max()) / scan.views.pixel_size
+    optics = scan.exposures.optical
+    fringe = np.sqrt((wavelength(optics.energy_kev) * optics.distance).max()) / optics.views.pixel_size
     sigma = options.blur * fringe
 
     def blurred(frames: Tensor) -> np.ndarray:

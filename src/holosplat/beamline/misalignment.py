@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from ..checks import require
 from ..scan import Exposures
 
-MOST_SHIFT_PX, MOST_ROTATION_DEG, MOST_DISTANCE = 1000.0, 45.0, 0.1
+MOST_SHIFT_PX, MOST_ROTATION_DEG, MOST_DISTANCE, MOST_MAGNIFICATION = 1000.0, 45.0, 0.1, 0.1
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,12 @@ class Misalignment:
     """Relative error of the propagation distance (default: none)."""
     seed: int = 0
     """Seed of the errors."""
+    magnification: float = 0.0
+    """Relative error of the magnification (default: none)."""
 
     def __post_init__(self) -> None:
         limits = {"shift_px": MOST_SHIFT_PX, "rotation_deg": MOST_ROTATION_DEG, "distance": MOST_DISTANCE}
+        limits["magnification"] = MOST_MAGNIFICATION
         for name, most in limits.items():
             value = getattr(self, name)
             inside = math.isfinite(value) and 0 <= value <= most
@@ -39,22 +42,24 @@ class Misalignment:
         require(self.seed >= 0, f"misalignment seed must be 0 or more, but it is {self.seed}.")
 
     def __bool__(self) -> bool:
-        return self.shift_px > 0 or self.rotation_deg > 0 or self.distance > 0
+        return max(self.shift_px, self.rotation_deg, self.distance, self.magnification) > 0
 
     def true_exposures(self, nominal: Exposures) -> Exposures:
         """The true exposures [V] of the planned ones, `nominal`: `R' = exp([ω]×) R`, `s' = s + p e`, `z' = z (1 + ε)`.
 
-        ω, e and ε come from generators of their own, so that one kind of error does not change with another's size.
+        The true pixel in the sample's plane is `p' = p / (1 + m)`. ω, e, ε and m come from generators of their own, so
+        that one kind of error does not change with another's size.
         """
         count, views = len(nominal), nominal.views
-        of_turn, of_shift, of_distance = (np.random.default_rng([self.seed, kind]) for kind in range(3))
+        of_turn, of_shift, of_distance, of_scale = (np.random.default_rng([self.seed, kind]) for kind in range(4))
         turns = np.deg2rad(self.rotation_deg) * of_turn.standard_normal((count, 3))
-        shifts = self.shift_px * views.pixel_size * of_shift.standard_normal((count, 2))
+        shifts = self.shift_px * views.pixel_sizes[:, None] * of_shift.standard_normal((count, 2))
         stretched = 1 + self.distance * of_distance.standard_normal(count)
+        scales = views.relative / (1 + self.magnification * of_scale.standard_normal(count))
         rotations = Rotation.from_rotvec(turns).as_matrix() @ views.rotations
         return replace(
             nominal,
-            views=replace(views, rotations=rotations, shifts=views.shifts + shifts),
+            views=replace(views, rotations=rotations, shifts=views.shifts + shifts, scales=scales),
             distance=nominal.distance * stretched,
         )
 

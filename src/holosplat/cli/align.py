@@ -37,6 +37,8 @@ class UncertainOptions:
     """Turns about the two axes across the beam [degrees]."""
     uncertain_roll: float = 1.0
     """Turns about the beam [degrees]."""
+    uncertain_magnification: float = 0.0
+    """Magnification, as a share of it; that of all training frames together is as planned."""
     uncertain_distance: float = 0.0
     """Distance, as a share of it: only where fringes are resolved."""
 
@@ -44,8 +46,8 @@ class UncertainOptions:
         """The options of the search."""
         from ..align import PoseOptions, Uncertain
 
-        shift, angle, roll, distance = vars(self).values()
-        return PoseOptions(Uncertain(shift, angle, roll, distance))
+        sizes = {name.removeprefix("uncertain_"): value for name, value in vars(self).items()}
+        return PoseOptions(Uncertain(**sizes))
 
 
 @dataclass(frozen=True)
@@ -53,14 +55,16 @@ class RefineOptions:
     """Beams that may be elsewhere than the scan says."""
 
     refine: str | None = None
-    """What is found of each frame beside the matter: shifts, angles, roll, distance, with commas between (default:
-    nothing, the beams are where the scan says)."""
+    """What is found of each frame beside the matter: shifts, angles, roll, distance, magnification, with commas between
+    (default: nothing, the beams are where the scan says)."""
     uncertain_shift: float = 2.0
     """Standard deviation of the detector's shifts along rows and columns [pixels]."""
     uncertain_angle: float = 1.0
     """Standard deviation of turns about the two axes across the beam [degrees]."""
     uncertain_roll: float = 1.0
     """Standard deviation of turns about the beam [degrees]."""
+    uncertain_magnification: float = 0.01
+    """Standard deviation of the magnification, as a share of it."""
     uncertain_distance: float = 0.02
     """Standard deviation of the distance, as a share of it."""
 
@@ -166,7 +170,15 @@ def _write_geometry(
 
 def _write_table(path: Path, found: AlignedViews) -> None:
     """A row for each view."""
-    names = ("shift_x_px", "shift_y_px", "turn_x_deg", "turn_y_deg", "roll_deg", "distance_share")
+    names = (
+        "shift_x_px",
+        "shift_y_px",
+        "turn_x_deg",
+        "turn_y_deg",
+        "roll_deg",
+        "distance_share",
+        "magnification_share",
+    )
     header = ["view", *names, *(f"error_{name}" for name in names), "flux", "before", "after"]
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")

@@ -148,11 +148,11 @@ def _retrieved(scan: Scan, prior: MaterialPrior) -> tuple[np.ndarray, float]:
 
     Where only δ/β is known, δ is such that the greatest thickness is half the field's longer side.
     """
-    exposures, views = scan.exposures, scan.views
+    exposures, views = scan.exposures.optical, scan.views
     delta, beta = (1.0, 1.0 / prior.ratio) if isinstance(prior, KnownRatio) else prior.materials[0]
     refraction = exposures.refraction(delta, beta)
     found = retrieve_thickness(
-        torch.from_numpy(scan.frames), views.pixel_size, exposures.distance, exposures.energy_kev, *refraction
+        torch.from_numpy(scan.frames), views.pitch, exposures.distance, exposures.energy_kev, *refraction
     ).numpy()
     if prior.fixes_level:
         return found, delta

@@ -13,6 +13,7 @@ from ..io.reading import Part, Reading
 from ..optics.camera import Camera
 from ..optics.illumination import Illumination
 from ..optics.resampling import Flip
+from ..units import span
 from ..workflows.correct import CorrectionOptions
 from ..workflows.correct import correct as correct_file
 from ..workflows.join import join as join_files
@@ -80,12 +81,12 @@ def join(
     flip: tuple[Flip, ...] = (),
     part: Part = Part(),
 ) -> None:
-    """Join scans of several beams, one file each, on one raster.
+    """Join scans of several beams, one file each; pixel sizes, energies and distances may differ.
 
     Args:
-        scans: Scans, one a beam; their photon energies may differ.
+        scans: Scans, one a beam, with as many pixels each; else give --crop or --pixel-size.
         out: Scan file to write.
-        pixel_size: Pixel of the result [m] (default: the coarsest of the files).
+        pixel_size: Bring all frames to pixels of this size [m] (default: each file keeps its own).
         flip: What each detector saw reversed, one word a file (default: what the files say themselves).
     """
     with ProgressBar() as bar:
@@ -93,7 +94,7 @@ def join(
             scans, out, pixel_size, flip, lambda fraction: bar.show("joining frames", fraction, {}), part
         )
     rows, columns = joined.views.shape
-    _say(f"wrote {out}: {len(joined)} frames of {rows} × {columns} pixels of {1e6 * joined.views.pixel_size:.4g} µm")
+    _say(f"wrote {out}: {len(joined)} frames of {rows} × {columns} pixels of {span(1e6 * joined.views.pixel_sizes)} µm")
 
 
 def _say(text: str) -> None:

@@ -189,6 +189,8 @@ class MisalignmentOptions:
     """Standard deviation of small turns about x, y and z [degrees]."""
     misalign_distance: float = 0.0
     """Standard deviation of the distance, as a share of it."""
+    misalign_magnification: float = 0.0
+    """Standard deviation of the magnification, as a share of it."""
     misalign_seed: int = 0
     """Seed of these errors."""
 
@@ -196,7 +198,8 @@ class MisalignmentOptions:
         """The errors that the options name."""
         from ..beamline.misalignment import Misalignment
 
-        return Misalignment(self.misalign_shift, self.misalign_rotation, self.misalign_distance, self.misalign_seed)
+        errors = (self.misalign_shift, self.misalign_rotation, self.misalign_distance)
+        return Misalignment(*errors, self.misalign_seed, self.misalign_magnification)
 
     def facts(self) -> dict[str, str]:
         """What the file of the true exposures says of them."""

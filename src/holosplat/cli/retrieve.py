@@ -108,7 +108,7 @@ def _preview(path: Path, measured: Scan, found: Retrieved) -> None:
         None if background is None else background.factor().numpy(),
         found.phase.numpy(),
         view_labels(measured.views),
-        measured.views.pixel_size,
+        measured.views.pixel_sizes,
     )
     figure.savefig(path)
 

@@ -160,5 +160,5 @@ def outside(cloud: GaussianCloud, views: Views) -> Tensor:
     rotations = torch.as_tensor(views.rotations, **held)
     shifts = torch.as_tensor(views.shifts / cloud.unit_length, **held)
     lab = torch.einsum("vij,nj->vni", rotations[:, :2], cloud.centres.detach()) - shifts[:, None]
-    half = torch.tensor([views.width, views.height], **held) / (2 * cloud.unit_length)
+    half = torch.as_tensor(views.fields[:, None], **held) / (2 * cloud.unit_length)
     return ~(lab.abs() <= half).all(dim=2).any(dim=0)

@@ -37,7 +37,7 @@ SAMPLED = 0.015
 """Share by which sampling shifts the mean distance where the first fringe is a pixel wide; it falls with the square of
 the width (docs/data/alignment.csv)."""
 
-PLACES = {"shifts": [0, 1], "turns": [2, 3, 4], "stretches": [5]}
+PLACES = {"shifts": [0, 1], "turns": [2, 3, 4], "stretches": [5], "magnified": [6]}
 """Places of the corrections of `Alignment` among the numbers of a view."""
 
 
@@ -46,8 +46,9 @@ class Freedom:
     """What is not known of V views, as standard deviations; 0: it stays as it is.
 
     shift [pixels], angle (turns about the axes across the beam) [rad], roll [rad], distance [share]
-    so_far: [V, 6] how far the views are from the plan already: shifts x, y [pixels], turns about x, y, z of the lab
-        [rad], share of the distance
+    so_far: [V, 7] how far the views are from the plan already: shifts x, y [pixels], turns about x, y, z of the lab
+        [rad], shares of the distance and of the magnification
+    magnification [share]
     edges: whether the matter is fitted with sharp edges of one known density; soft matter takes any mean distance
     """
 
@@ -56,28 +57,31 @@ class Freedom:
     roll: float
     distance: float
     so_far: np.ndarray
+    magnification: float = 0.0
     edges: bool = False
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "so_far", shaped("so_far", np.asarray(self.so_far), (len(self.so_far), 6)))
+        object.__setattr__(self, "so_far", shaped("so_far", np.asarray(self.so_far), (len(self.so_far), 7)))
 
     def __len__(self) -> int:
         return len(self.so_far)
 
     def __bool__(self) -> bool:
-        return max(self.shift, self.angle, self.roll, self.distance) > 0
+        return bool(self.deviations().any())
 
     def __getitem__(self, index: np.ndarray) -> Freedom:
         return replace(self, so_far=self.so_far[index])
 
     def deviations(self) -> np.ndarray:
-        """[6] of each of the numbers of a view."""
-        return np.array([self.shift, self.shift, self.angle, self.angle, self.roll, self.distance])
+        """[7] of each of the numbers of a view."""
+        across = [self.shift, self.shift, self.angle, self.angle]
+        return np.array([*across, self.roll, self.distance, self.magnification])
 
     def alignment(self, device: torch.device | str = "cpu") -> Alignment:
         """No correction yet, with room for what is free."""
         turns = self.angle > 0 or self.roll > 0
         names = {"turns": turns, "shifts": self.shift > 0, "stretches": self.distance > 0}
+        names["magnified"] = self.magnification > 0
         return Alignment.planned(len(self), *(name for name, free in names.items() if free), device=device)
 
     def after(self, alignment: Alignment) -> Freedom:
@@ -97,7 +101,8 @@ class Freedom:
 
 def mean_distance_error(exposures: Exposures) -> float:
     """By how much a fit finds all distances too short or too long together, as a share: its waves are sampled."""
-    width = float(np.mean(fringes(exposures))) / exposures.views.pixel_size
+    optics = exposures.optical
+    width = float(np.mean(fringes(optics))) / optics.views.pixel_size
     return SAMPLED / max(width, 1e-3) ** 2
 
 
@@ -110,11 +115,13 @@ def moved(exposures: Exposures, alignment: Alignment) -> Exposures:
     """`exposures` [V] where a fit has found them; those that it had set aside are where they were."""
     fitted = np.flatnonzero(_fitted(len(exposures), len(alignment)))
     found = alignment.exposures(exposures[fitted])
-    rotations, shifts, distance = exposures.views.rotations.copy(), exposures.views.shifts.copy(), exposures.distance
+    views, distance = exposures.views, exposures.distance.copy()
+    rotations, shifts, scales = views.rotations.copy(), views.shifts.copy(), views.pixel_sizes / views.pitch
     rotations[fitted], shifts[fitted] = found.views.rotations, found.views.shifts
-    distance = distance.copy()
-    distance[fitted] = found.distance
-    return replace(exposures, views=replace(exposures.views, rotations=rotations, shifts=shifts), distance=distance)
+    scales[fitted], distance[fitted] = found.views.pixel_sizes / views.pitch, found.distance
+    return replace(
+        exposures, views=replace(views, rotations=rotations, shifts=shifts, scales=scales), distance=distance
+    )
 
 
 def freed(plan: Plan, freedom: Freedom | None, train: Scan) -> Plan:
@@ -136,6 +143,7 @@ def freed(plan: Plan, freedom: Freedom | None, train: Scan) -> Plan:
         "alignment.shifts": RATE_PX,
         "alignment.turns": RATE_PX / (0.5 * max(h, w)),
         "alignment.stretches": RATE_SHARE * freedom.distance,
+        "alignment.magnified": RATE_PX / (0.5 * max(h, w)),
     }
     expected = Expected(freedom, level / (h * w * len(train)), model.instrument.device)
 
@@ -180,7 +188,8 @@ class Expected:
 
 
 class Gauge:
-    """What no frame tells stays: a motion and a turn of the whole object, and a mean distance that sampling would move.
+    """What no frame tells stays: a motion and a turn of the whole object, its size (the mean magnification), and a mean
+    distance that sampling would move.
 
     An event of a fit: gradients and numbers are projected onto what changes frames. What is not free has no gradient.
     """
@@ -192,7 +201,8 @@ class Gauge:
         self._projections = {
             "alignment.shifts": projection(views.rotations[:, :2].reshape(-1, 3), np.tile(free[:2], count)),
             "alignment.turns": projection(_turns(views), np.tile(free[2:5], count)),
-            "alignment.stretches": projection(ones, np.tile(free[5:], count)),
+            "alignment.stretches": projection(ones, np.tile(free[5:6], count)),
+            "alignment.magnified": projection(np.ones((count, 1)), np.tile(free[6:], count)),
         }
 
     def _each(self, leaves: Leaves, of: Callable[[Tensor], Tensor | None]) -> None:

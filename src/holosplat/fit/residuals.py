@@ -35,8 +35,8 @@ class Rings:
 
     band: [h, w//2 + 1] number of the band of each coefficient of `rfft2`
     weight: [h, w//2 + 1] how many coefficients of the full transform it stands for
-    edges: [B + 1] frequencies [1/m] between the bands; the first band holds the mean of the frame and what has one
-        period along its longer side, the last one the corners
+    edges: [B + 1] frequencies [1/m] between the bands, on the smallest pixels where they differ; the first band holds
+        the mean of the frame and what has one period along its longer side, the last one the corners
     """
 
     band: Tensor
@@ -186,7 +186,7 @@ def residuals(said: Prediction, measured: Tensor, noise: Tensor, allowance: Allo
         tuple(measured.shape) == wanted,
         f"measured frames must have the shape {wanted} of the exposures, but they have {tuple(measured.shape)}.",
     )
-    rings = Rings.of(views.shape, views.pixel_size)
+    rings = Rings.of(views.shape, views.finest)
     probed = np.unique(np.linspace(0, count - 1, min(count, MOST_PROBED)).round().astype(int))
     spectra, sampling, changes = list[Tensor](), list[Tensor](), list[Tensor]()
     for i in range(count):
@@ -201,7 +201,7 @@ def residuals(said: Prediction, measured: Tensor, noise: Tensor, allowance: Allo
     spectrum, nearest = torch.cat(spectra), np.abs(np.arange(count)[:, None] - probed).argmin(axis=1)
     contrast, known = rings.mean(_power(measured.double().cpu() - 1)), rings.mean(noise.double().cpu())
     sampled = rings.mean(torch.cat(sampling))[nearest]
-    allowed = known + sampled + allowance.power(contrast, rings, views.pixel_size)
+    allowed = known + sampled + allowance.power(contrast, rings, views.finest)
     weight = rings.weight / rings.spread(allowed).clamp_min(SMALLEST)
     probes = tuple(_probe(change, spectrum[i], weight[i]) for i, change in zip(probed, changes))
     return Residuals(rings, rings.mean(_squared(spectrum)), contrast, known, sampled, allowed, probed, probes)
@@ -216,8 +216,8 @@ def _changes(one: Model) -> Tensor:
     exposures, time = one.instrument.exposures, float(one.instrument.times[0])
     planned = one.alignment or Alignment()
     lines, light = one.lines(time), 1.0 if one.light is None else one.light.factor()
-    distance = planned.distance(exposures)
-    distance = torch.from_numpy(exposures.distance) if distance is None else distance
+    distance = planned.optical_distance(exposures)
+    distance = torch.from_numpy(exposures.optical.distance) if distance is None else distance
     sigma = planned.psf_sigma_px(exposures)
     sigma = torch.from_numpy(exposures.psf_sigma_px) if sigma is None else sigma
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d, avg_pool3d, interpolate
 
 from ..checks import at_least, require
-from ..geometry import Grid, Views
+from ..geometry import Grid
 from ..projectors.voxels import projector_for
 from .whitened import WhitenedFrames
 
@@ -86,7 +86,7 @@ class VolumeProblem:
         require(level > 0, f"the level of the matter must be positive, but it is {level:g}.")
         self.frames, self.prior, self.level, self.support = frames, prior, level, support
         views = frames.train.views
-        pixels = Views(views.rotations, views.shifts / views.pixel_size, views.shape, 1.0)
+        pixels = views.in_units_of(views.finest)
         self.grid = Grid.of_views(pixels)
         self._projector = projector_for(self.grid, pixels, backend)
         self._symbol = self._data_symbol()

@@ -42,7 +42,7 @@ class WhitenedFrames:
     Amplitudes √I have the same noise everywhere (Godard et al. 2012, eq. 9), half that of the intensity near one; P is
     its power by `NoiseModel`, at each spatial frequency, with the part of the contrast that sampled matter cannot
     explain (`model_error`) beside it, or frames without noise would be trusted without end. F is the unitary `rfft2`.
-    The unknowns are line integrals [V, H, W] of one material's occupancy, in pixels of path length.
+    The unknowns are line integrals [V, H, W] of one material's occupancy, in (the smallest) pixels of path length.
 
     train: the frames; material: δ > 0 and β of an occupancy of one; noise: their noise; light: a factor of each frame,
     None for even light; oversample: wave samples a pixel (0: as the first fringe needs).
@@ -60,7 +60,7 @@ class WhitenedFrames:
         exposures = train.exposures
         self.train, self.material = train, material
         self.instrument = Instrument(exposures, oversample or fringe_sampling(exposures), backend=backend)
-        self.shape, self.pixel = (train.views.shape[0], train.views.shape[1]), train.views.pixel_size
+        self.shape, self.pixel = (train.views.shape[0], train.views.shape[1]), train.views.finest
         frames = torch.from_numpy(train.frames)
         self._amplitudes = frames.clamp_min(0).sqrt()
         self._light = None if light is None else light.factor().detach()
@@ -81,11 +81,12 @@ class WhitenedFrames:
         That of a thin object, `(k δ p H / 2)² / P`, and of a shift of the image by a slow change of the phase, a prism:
         `δI = (λz/2π) ∇δφ · ∇I` (from the transport of intensity, Teague 1983).
         """
-        exposures, p = self.train.exposures, self.pixel
+        exposures = self.train.exposures.optical
+        p = exposures.views.pixel_size
         raster = Raster(self.shape, p)
         h = response(exposures, self.material.beta / self.material.delta, raster)
         delta = exposures.refraction(self.material.delta, 0.0)[0]
-        unit = torch.from_numpy(wavenumber(exposures.energy_kev) * delta * p)[:, None, None]
+        unit = torch.from_numpy(wavenumber(exposures.energy_kev) * delta * self.pixel)[:, None, None]
         frames = torch.from_numpy(self.train.frames).double()
         slope2 = torch.zeros(len(frames), dtype=torch.float64)
         for axis in (1, 2):

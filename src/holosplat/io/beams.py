@@ -16,7 +16,7 @@ from ..tables import from_table, read_table
 from .atomic import atomic_path
 
 FORMAT = "holosplat geometry 1"
-ERRORS = ("shift_px", "turn_deg", "distance_share")
+ERRORS = ("shift_px", "turn_deg", "distance_share", "magnification_share")
 
 Pair = tuple[float, float]
 Triple = tuple[float, float, float]
@@ -32,6 +32,8 @@ class ViewErrors:
     """Turns about x and y, across the beam, and z, the roll [degrees]."""
     distance_share: float = 0.0
     """Distance, as a share of it."""
+    magnification_share: float = 0.0
+    """Magnification, as a share of it."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +55,7 @@ class BeamView:
     energy_kev: float | None = None
     """Photon energy [keV]."""
     pixel_size_m: float | None = None
-    """Effective pixel size [m], of all views or of none."""
+    """Effective pixel size [m]."""
     error: ViewErrors | None = None
     """Standard errors, which are kept and not used."""
 
@@ -89,8 +91,6 @@ class Beams:
     def __post_init__(self) -> None:
         require(self.format == FORMAT, f"format must be {FORMAT!r}, but it is {self.format!r}; correct it.")
         require(len(self.view) > 0, "there must be a table [[view]] for each beam, but there is none.")
-        sizes = {each.pixel_size_m for each in self.view}
-        require(len(sizes) == 1, "pixel_size_m must be the same for all views, or for none; make it one.")
         Views.from_rotations(np.array([each.matrix() for each in self.view]), (1, 1), 1.0)
 
     def __len__(self) -> int:
@@ -100,20 +100,21 @@ class Beams:
     def of(
         cls, exposures: Exposures, errors: np.ndarray | None = None, made_by: Mapping[str, str] | None = None
     ) -> Beams:
-        """Those of `exposures` [V]; errors: [V, 6] standard errors of shifts x, y [pixels], turns about x, y, z
-        [degrees], and the distance as a share of it."""
-        known = None if errors is None else shaped("errors", np.asarray(errors), (len(exposures), 6)).tolist()
+        """Those of `exposures` [V]; errors: [V, 7] standard errors of shifts x, y [pixels], turns about x, y, z
+        [degrees], and of distance and magnification as shares of them."""
+        known = None if errors is None else shaped("errors", np.asarray(errors), (len(exposures), 7)).tolist()
         views = []
         for v in range(len(exposures)):
             rows = exposures.views.rotations[v].tolist()
             shift, told = exposures.views.shifts[v].tolist(), None
             if known is not None:
-                told = ViewErrors((known[v][0], known[v][1]), (known[v][2], known[v][3], known[v][4]), known[v][5])
+                x, y, *turns, distance, larger = known[v]
+                told = ViewErrors((x, y), _triple(turns), distance, larger)
             rotation = (_triple(rows[0]), _triple(rows[1]), _triple(rows[2]))
             distance, energy = float(exposures.distance[v]), float(exposures.energy_kev[v])
-            views.append(
-                BeamView(rotation, shift_m=(shift[0], shift[1]), distance_m=distance, energy_kev=energy, error=told)
-            )
+            pixel = None if exposures.views.has_one_pixel else float(exposures.views.pixel_sizes[v])
+            rest = {"distance_m": distance, "energy_kev": energy, "pixel_size_m": pixel}
+            views.append(BeamView(rotation, shift_m=(shift[0], shift[1]), **rest, error=told))
         return cls(tuple(views), made_by=dict(made_by or {}))
 
     def with_pixel_size(self, pixel_size: float) -> Beams:
@@ -143,11 +144,13 @@ class Beams:
         """
         index, planned = self._index(scan), scan.exposures
         pixels, metres, in_pixels = (self.said(name) for name in ("pixel_size_m", "shift_m", "shift_px"))
-        pixel = planned.views.pixel_size if pixels is None else float(pixels[0])
+        sizes = planned.views.pixel_sizes if pixels is None else pixels[index]
         rotations = np.array([each.matrix() for each in self.view])[index]
-        moved = metres if in_pixels is None else pixel * in_pixels
-        shifts = planned.views.shifts if moved is None else moved[index]
-        views = replace(planned.views, rotations=rotations, shifts=shifts, pixel_size=pixel)
+        shifts = planned.views.shifts if metres is None else metres[index]
+        shifts = shifts if in_pixels is None else sizes[:, None] * in_pixels[index]
+        views = replace(planned.views, rotations=rotations, shifts=shifts)
+        if pixels is not None:
+            views = Views.of_pixels(rotations, shifts, views.shape, sizes)
         distance, energy = self.said("distance_m"), self.said("energy_kev")
         exposures = replace(
             planned,
@@ -201,7 +204,7 @@ def read_beams(path: str | Path) -> Beams:
     try:
         found = from_table(_File, table)
         beams = Beams(found.view, found.format, origin)
-        for name in ("shift_m", "shift_px", "distance_m", "energy_kev"):
+        for name in ("shift_m", "shift_px", "distance_m", "energy_kev", "pixel_size_m"):
             beams.said(name)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None

@@ -14,20 +14,24 @@ from .table import Table
 
 
 def beam_table(scan: Scan) -> dict[str, Any]:
-    """The values that all frames share: `pixel_size_m`, the texts of `provenance`, and `energy_kev` if it is the
+    """The values that all frames share: the texts of `provenance`, and `pixel_size_m` and `energy_kev` if they are the
     same."""
     views, exposures = scan.views, scan.exposures
     energy = {"energy_kev": float(exposures.energy_kev[0])} if exposures.has_one_energy else {}
-    return {"pixel_size_m": views.pixel_size, **energy, "provenance": dict(scan.provenance)}
+    pixel = {"pixel_size_m": views.pixel_size} if views.has_one_pixel else {}
+    return {**pixel, **energy, "provenance": dict(scan.provenance)}
 
 
 def exposure_table(exposures: Exposures, n: int) -> dict[str, Any]:
     """Frame `n`: `rotation` [3, 3], `shift_m` [2], `distance_m`, `psf_sigma_px`, `time_s`; floats are kept exactly.
 
-    `energy_kev` too, where frames have several energies.
+    `energy_kev` and `pixel_size_m` too, where frames have several.
     """
+    views = exposures.views
     energy = {} if exposures.has_one_energy else {"energy_kev": float(exposures.energy_kev[n])}
+    pixel = {} if views.has_one_pixel else {"pixel_size_m": float(views.pixel_sizes[n])}
     return {
+        **pixel,
         **energy,
         "rotation": exposures.views.rotations[n].tolist(),
         "shift_m": exposures.views.shifts[n].tolist(),
@@ -40,15 +44,15 @@ def exposure_table(exposures: Exposures, n: int) -> dict[str, Any]:
 def read_exposures(beam: Table, frames: Sequence[Table], shape: tuple[int, int]) -> Exposures:
     """Exposures of frames of `shape` (H, W) from what `beam_table` and `exposure_table` wrote.
 
-    Written by hand, a frame may have `angle_deg` instead of `rotation`; `energy_kev`, `distance_m` and `psf_sigma_px`
-    may stand in the beam's table, for all frames; shift, blur and time are 0 where they are left out.
+    Written by hand, a frame may have `angle_deg` instead of `rotation`; `energy_kev`, `distance_m`, `pixel_size_m` and
+    `psf_sigma_px` may stand in the beam's table, for all frames; shift, blur and time are 0 where they are left out.
     """
     values = [[_per_frame(beam, f, name, default) for f in frames] for name, default in _NUMBERS]
     shifts = [f.numbers("shift_m", (2,)) if "shift_m" in f else np.zeros(2) for f in frames]
     rotations = [_rotation(f) for f in frames]
-    pixel_size = beam.number("pixel_size_m")
+    pixel_sizes = np.array([_per_frame(beam, f, "pixel_size_m", None) for f in frames])
     try:
-        views = Views(np.array(rotations), np.array(shifts), shape, pixel_size)
+        views = Views.of_pixels(np.array(rotations), np.array(shifts), shape, pixel_sizes)
         energy, distance, psf_sigma, time = (np.array(v) for v in values)
         return Exposures(views, energy, distance, psf_sigma, time)
     except InputError as error:

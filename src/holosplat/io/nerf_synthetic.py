@@ -106,8 +106,10 @@ def write_nerf_synthetic(
 
     Held-out frames have the same grey scale as training frames; intensities beyond it are cut off. thickness: [N, H, W]
     retrieved for a known material; then the points fill its visual hull, else the field of view. transforms_val.json is
-    a copy of the test's: most readers ask for one.
+    a copy of the test's: most readers ask for one. Errors: `InputError` for views of several pixel sizes, since one
+    angle of view serves all cameras.
     """
+    _ = scan.views.pixel_size
     views, train = scan.views, np.flatnonzero(~scan.is_test)
     low, high = grey_range(scan)
     head = {

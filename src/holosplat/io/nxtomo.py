@@ -136,8 +136,9 @@ def _write_instrument(instrument: h5py.Group, exposures: Exposures, raw: RawLayo
         detector[MASK.rsplit("/", 1)[1]] = np.asarray(raw.mask, dtype=np.uint32)
         for name, flipped in zip(FLIPS, raw.flips):
             detector[name.rsplit("/", 1)[1]] = flipped
+    views = exposures.views
     for axis in "xy":
-        _put(detector, f"{axis}_pixel_size", exposures.views.pixel_size, "m")
+        _put(detector, f"{axis}_pixel_size", views.pixel_size if views.has_one_pixel else views.pixel_sizes, "m")
     same = bool((exposures.distance == exposures.distance[0]).all())  # a scalar is what most programs expect
     _put(detector, "distance", exposures.distance[0] if same else exposures.distance, "m")
     _put(detector, "shift", exposures.views.shifts, "m")

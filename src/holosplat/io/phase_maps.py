@@ -64,7 +64,7 @@ def write_phase_maps(path: Path, found: PhaseMaps) -> None:
         "format": FORMAT,
         "maps": {name: {"file": f"{name}.tif", "unit": UNITS[name]} for name in found.maps},
         "facts": dict(found.facts),
-        "pixel_size_m": exposures.views.pixel_size,
+        "pixel_size_m": np.asarray(_pixels(exposures)).tolist(),
         "energy_kev": exposures.energy_kev.tolist(),
         "frames": [exposure_table(exposures, n) for n in range(len(exposures))],
     }
@@ -76,6 +76,12 @@ def write_phase_maps(path: Path, found: PhaseMaps) -> None:
         write_json(folder / "maps.json", table)
 
 
+def _pixels(exposures: Exposures) -> float | np.ndarray:
+    """The pixel size [m] of all maps, or [V] where they have several."""
+    views = exposures.views
+    return views.pixel_size if views.has_one_pixel else views.pixel_sizes
+
+
 def _write_hdf5(path: Path, found: PhaseMaps) -> None:
     exposures = found.exposures
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
@@ -84,7 +90,7 @@ def _write_hdf5(path: Path, found: PhaseMaps) -> None:
         for name, images in found.maps.items():
             file.create_dataset(name, data=images.astype(np.float32)).attrs["units"] = UNITS[name]
         numbers = {
-            "pixel_size": (exposures.views.pixel_size, "m"),
+            "pixel_size": (_pixels(exposures), "m"),
             "distance": (exposures.distance, "m"),
             "energy": (exposures.energy_kev, "keV"),
         }

@@ -184,12 +184,12 @@ def _optional(
 def _views(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> Views:
     shape = fields.dataset(fields.need(*DATA_NAMES)).shape[1:]
     shifts = _optional(fields, kinds, SHIFT, LENGTH_UNITS, "m", (2,))
-    pixel_size = said(given, "pixel_size") or _pixel_size(fields)
+    pixel_size = said(given, "pixel_size") or _pixel_sizes(fields, kinds)
     if given.get("angles_deg") is not None or not fields.find(ROTATION):
-        return Views(_rotations_of_angles(fields, kinds, given), shifts, shape, pixel_size)
+        return Views.of_pixels(_rotations_of_angles(fields, kinds, given), shifts, shape, pixel_size)
     rotations = _per_frame(fields, kinds, ROTATION, (3, 3))
     try:
-        return Views(rotations, shifts, shape, pixel_size)
+        return Views.of_pixels(rotations, shifts, shape, pixel_size)
     except InputError as error:
         raise InputError(f"{fields.label(ROTATION)}: {error}") from None
 
@@ -207,28 +207,29 @@ def _rotations_of_angles(fields: Fields, kinds: np.ndarray, given: Mapping[str, 
     return rotation_y(np.rad2deg(angles * fields.unit(name, ANGLE_UNITS, "rad")))
 
 
-def _pixel_size(fields: Fields) -> float:
-    """The pixel size [m], which x and y must share; the one along y alone is not enough."""
+def _pixel_sizes(fields: Fields, kinds: np.ndarray) -> float | np.ndarray:
+    """The pixel size [m], or those [n] of the projections; x and y must share them, and y alone is not enough."""
     for names in ((name.format("x"), name.format("y")) for name in PIXEL_SIZES):
         found = [name for name in names if fields.find(name)]
         if not found:
             continue
-        sizes = [
-            in_range(fields.label(name), number * fields.unit(name, LENGTH_UNITS, "m"), *PIXEL_RANGE_M, unit="metres")
-            for name in found
-            for number in shaped(fields.label(name), fields.numbers(name).reshape(-1), (1,))
-        ]
+        sizes = [_per_frame(fields, kinds, name) * fields.unit(name, LENGTH_UNITS, "m") for name in found]
+        for name, each in zip(found, sizes):
+            for size in (each.min(), each.max()):
+                in_range(fields.label(name), float(size), *PIXEL_RANGE_M, unit="metres")
+        across, down = sizes[0], sizes[-1]
         require(
             found[0] == names[0],
-            f"{fields.label(names[0])} must be there beside y_pixel_size ({sizes[0]:g} m), but it is missing; say the "
+            f"{fields.label(names[0])} must be there beside y_pixel_size ({down[0]:g} m), but it is missing; say the "
             "size of square pixels by --pixel-size, or add it.",
         )
-        if not np.isclose(sizes[0], sizes[-1], rtol=1e-6, atol=0):
+        unequal = np.flatnonzero(~np.isclose(across, down, rtol=1e-6, atol=0))
+        if len(unequal):
             raise InputError(
                 f"{fields.label(names[0])} and {names[1].rsplit('/', 1)[1]} must be equal (square pixels), but they "
-                f"are {sizes[0]:g} m and {sizes[1]:g} m; resample the frames first."
+                f"are {across[unequal[0]]:g} m and {down[unequal[0]]:g} m; resample the frames first."
             )
-        return sizes[0]
+        return float(across[0]) if np.allclose(across, across[0], rtol=1e-6, atol=0) else across
     missing = fields.label(PIXEL_SIZES[-1].format("x"))
     raise InputError(f"{missing} must be there, but it is missing; say it by --pixel-size, or add it.")
 

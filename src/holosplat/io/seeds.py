@@ -47,6 +47,6 @@ def hull_points(thickness: np.ndarray, views: Views, count: int, seed: int = 0) 
 def _pixels(points: np.ndarray, views: Views, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Whether view `n` sees points [P, 3] [m], and the (row, column) of the pixels [P] that they fall on."""
     lab = points @ views.rotations[n, :2].T - views.shifts[n]
-    column, row = np.floor(lab / views.pixel_size + 0.5 * np.array(views.shape[::-1])).astype(int).T
+    column, row = np.floor(lab / views.pixel_sizes[n] + 0.5 * np.array(views.shape[::-1])).astype(int).T
     h, w = views.shape
     return (row >= 0) & (row < h) & (column >= 0) & (column < w), row, column

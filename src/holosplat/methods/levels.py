@@ -82,7 +82,7 @@ def decide_matter(task: Task, options: LevelTest = LevelTest()) -> Decision:
     matter, judge = Matter.one(*material), MissingMatter(aside, material)
     backend = options.volume.backend
     free = _Misfit.of(judge, VoxelGrid(values[None], grid, matter).on(backend))
-    pixel = max(1, round(seen.views.pixel_size / grid.voxel_size[0]))
+    pixel = max(1, round(seen.views.finest / grid.voxel_size[0]))
     flat = [_Misfit.of(judge, VoxelGrid(one[None], grid, matter).on(backend)) for one in flattened(values, pixel)]
     return _decided(task, free, flat, noise_share(judge.measured) > options.noisy, options)
 

@@ -23,7 +23,7 @@ from ..fit.terms import Objective
 from ..fit.terms.field import FieldVariation, RetrievedThickness
 from ..fit.terms.spectral import SpectralMisfit
 from ..fit.trainable import Trainable
-from ..geometry import Grid, Views
+from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..model import Model
 from ..optics.background import Light
@@ -258,10 +258,11 @@ def visual_hull(thickness: Tensor, views: Views, grid: Grid, share: float) -> Te
     """
     level = share * float(np.quantile(thickness.cpu().numpy(), PEAK))
     shown = max_pool2d((thickness > level)[:, None].float(), 3, stride=1, padding=1)[:, 0] > 0
-    x, y, z = (torch.from_numpy(axis / views.pixel_size) for axis in grid.axes())
+    x, y, z = (torch.from_numpy(axis / views.pitch) for axis in grid.axes())
     hull = torch.ones(grid.shape, dtype=torch.bool)
     h, w = views.shape
-    for image, rotation, shift in zip(shown, views.rotations, views.shifts / views.pixel_size):
+    poses = Poses.of(views)
+    for image, rotation, shift in zip(shown, poses.matrices.numpy(), poses.offsets.numpy() / views.pitch):
         column, row = (
             (a[2] * z[:, None, None] + a[1] * y[:, None] + a[0] * x - s + 0.5 * n).floor().long()
             for a, s, n in zip(rotation, shift, (w, h))

@@ -51,7 +51,7 @@ def _from_phase_retrieval(task: Task, options: GaussianOptions) -> GaussianCloud
 
     volume, grid = retrieve(scan)
     shares = _shares(task, options, material, (volume, grid), retrieve)
-    pitch = scan.views.pixel_size
+    pitch = scan.views.finest
     spacing = _spacing_px(scan, options) * pitch
     if shares is None:
         whole = at_pitch(volume, grid, pitch)
@@ -71,7 +71,7 @@ def _shares(
 ) -> Shares | None:
     """Where two materials are, if two are known, or nothing is and the volume `found` of `material` shows two."""
     (volume, grid), scan, prior, backend = found, task.scan, task.prior, options.volume.backend
-    pixel, how = round(scan.views.pixel_size / grid.voxel_size[0]) or 1, options.two_materials
+    pixel, how = round(scan.views.finest / grid.voxel_size[0]) or 1, options.two_materials
     known = prior.materials if len(prior.materials) == 2 else ()
     levels = (known[0].delta, known[1].delta) if known else None
     if task.matter == "levels" and not prior.fixes_ratio and options.most_materials == 2 and not options.separate:
@@ -103,9 +103,9 @@ def _random(task: Task, options: GaussianOptions) -> GaussianCloud:
         material = prior.materials[0]
     elif isinstance(prior, KnownRatio):
         material = DeltaBeta(material.delta, material.delta / prior.ratio)
-    frames, pitch = torch.from_numpy(scan.frames), scan.views.pixel_size
-    refraction = scan.exposures.refraction(*material)
-    retrieved = retrieve_thickness(frames, pitch, scan.exposures.distance, scan.exposures.energy_kev, *refraction)
+    frames, pitch, optics = torch.from_numpy(scan.frames), scan.views.finest, scan.exposures.optical
+    refraction = optics.refraction(*material)
+    retrieved = retrieve_thickness(frames, optics.views.pixel_size, optics.distance, optics.energy_kev, *refraction)
     h, w = scan.views.shape
     disc = np.pi / 4 * min(h, w) ** 2 / (h * w)
     thickness = max(float(retrieved.mean()) / disc, 0.1 * pitch)

@@ -78,7 +78,10 @@ def svmbir_volume(
 
 def _check(views: Views, grid: Grid) -> None:
     """`InputError` unless svmbir's geometry, a parallel fan of slices about their middle, is that of the scan."""
-    require(views.shares_axis, "svmbir needs views that turn about the y axis only; take tv, which takes any poses.")
+    require(
+        views.shares_axis,
+        "svmbir needs views that turn about the y axis only, on pixels of one size; take tv, which takes any.",
+    )
     alike = bool(np.allclose(views.shifts, views.shifts[0], atol=1e-6))
     require(alike, "svmbir needs one detector shift for all views; align the frames first.")
     require(rows_match(grid, views), "svmbir needs a grid whose rows along y are the detector's rows.")

@@ -167,7 +167,7 @@ def voxel_fit(
     Minimised is `mean over views of the misfit + λ/(k² V) Σ |∇u|`, k voxels a pixel and V views, so that λ does not
     depend on either.
     """
-    refine = max(1, round(scan.views.pixel_size / start.grid.voxel_size[0]))
+    refine = max(1, round(scan.views.finest / start.grid.voxel_size[0]))
     schedule = replace(options.schedule, steps=options.steps)
     base = ground(scan, start, start.matter, options.objective, schedule, "cpu", finer=refine, light=light)
     spectral = base.frames.spectral

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,7 +13,7 @@ from ..checks import require
 from ..geometry import Poses
 from ..scan import Exposures
 
-WIDTHS: dict[str, tuple[int, ...]] = {"turns": (3,), "shifts": (2,), "stretches": (), "blurs": ()}
+WIDTHS: dict[str, tuple[int, ...]] = {"turns": (3,), "shifts": (2,), "stretches": (), "blurs": (), "magnified": ()}
 """The corrections by name, and how many numbers each view has of them."""
 
 
@@ -21,9 +22,10 @@ class Alignment:
     """Corrections of V planned exposures, float64; None costs nothing, and zeros leave the plan as it is.
 
     turns: [V, 3] rotation vectors ω [rad] about the lab axes: `R' = exp([ω]×) R`
-    shifts: [V, 2] shifts e of the detector along x and y [pixels of pitch p]: `s' = s + p e`
+    shifts: [V, 2] shifts e of the detector along x and y [pixels p of the view]: `s' = s + p e`
     stretches: [V] changes ε of the propagation distance, as a share of it: `z' = z (1 + ε)`
     blurs: [V] changes b of the width of the point-spread function [pixels]: `σ' = |σ + b|`
+    magnified: [V] changes m of the magnification, as a share of it: the pixel in the sample's plane is `p / (1 + m)`
 
     The signs are those of `beamline.misalignment`. Errors: `InputError` for shapes that do not fit together.
     """
@@ -32,6 +34,7 @@ class Alignment:
     shifts: Tensor | None = None
     stretches: Tensor | None = None
     blurs: Tensor | None = None
+    magnified: Tensor | None = None
 
     def __post_init__(self) -> None:
         shapes = {name: tuple(p.shape) for name, p in self.parameters().items()}
@@ -56,25 +59,46 @@ class Alignment:
         """The alignment with other corrections in the place of those named."""
         return replace(self, **dict(parameters))
 
+    @property
+    def moves_waves(self) -> bool:
+        """Whether waves travel otherwise than planned."""
+        return self.stretches is not None or self.magnified is not None
+
     def poses(self, planned: Poses, pixel: float, index: Tensor | None = None) -> Poses:
         """The `planned` poses of all views, corrected; only those of `index` [K] if it is given.
 
-        pixel: the detector's pitch [m], whatever raster the poses are on.
+        pixel: the detector's pitch [m], whatever raster the poses are on; scales of the views come on top.
         """
         chosen = planned if index is None else planned[index]
-        rotations, shifts = chosen.rotations, chosen.shifts
+        rotations, shifts, scales = chosen.rotations, chosen.shifts, chosen.scales
         if self.turns is not None:
             rotations = rotation_matrices(_picked(self.turns, index)) @ rotations
         if self.shifts is not None:
-            shifts = shifts + pixel * _picked(self.shifts, index)
-        return replace(chosen, rotations=rotations, shifts=shifts)
+            moved = pixel * _picked(self.shifts, index)
+            shifts = shifts + (moved if scales is None else moved * scales[:, None])
+        if self.magnified is not None:
+            larger = 1 + _picked(self.magnified, index)
+            scales = 1 / larger if scales is None else scales / larger
+        return replace(chosen, rotations=rotations, shifts=shifts, scales=scales)
 
     def distance(self, planned: Exposures, index: Tensor | None = None) -> Tensor | None:
         """Propagation distances [K] [m], float64; None where they are as planned."""
-        if self.stretches is None:
+        return None if self.stretches is None else self._stretched(planned.distance, index)
+
+    def optical_distance(self, planned: Exposures, index: Tensor | None = None) -> Tensor | None:
+        """Distances [K] [m] on pixels of the views' pitch (`Exposures.optical`), float64; None: as planned.
+
+        Of z and the pixel waves know only z/p²: magnified frames look like those of a distance (1 + m)² longer.
+        """
+        if not self.moves_waves:
             return None
-        stretches = _picked(self.stretches, index)
-        return _picked(torch.from_numpy(planned.distance).to(stretches), index) * (1 + stretches)
+        distance = self._stretched(planned.optical.distance, index)
+        return distance if self.magnified is None else distance * (1 + _picked(self.magnified, index)) ** 2
+
+    def _stretched(self, distance: np.ndarray, index: Tensor | None) -> Tensor:
+        like = next(iter(self.parameters().values()))
+        lengths = _picked(torch.from_numpy(distance).to(like), index)
+        return lengths if self.stretches is None else lengths * (1 + _picked(self.stretches, index))
 
     def psf_sigma_px(self, planned: Exposures, index: Tensor | None = None) -> Tensor | None:
         """Widths [K] of the point-spread functions [pixels], float64; None where they are as planned."""
@@ -86,7 +110,7 @@ class Alignment:
     def exposures(self, planned: Exposures) -> Exposures:
         """The `planned` exposures, corrected."""
         with torch.no_grad():
-            poses = self.poses(Poses.of(planned.views), planned.views.pixel_size)
+            poses = self.poses(Poses.of(planned.views), planned.views.pitch)
             distance, sigma = self.distance(planned), self.psf_sigma_px(planned)
         return replace(
             planned,

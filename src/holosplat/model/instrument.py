@@ -25,7 +25,7 @@ MOST_SAMPLES = 1_000_000_000
 class Instrument:
     """The wave optics of some exposures, made ready: line integrals in, frames out, differentiable.
 
-    The line integrals live on `views`: the detector's raster, padded by the fringes' reach so that nothing
+    The line integrals [m] live on `views`: the detectors' rasters, padded by the fringes' reach so that nothing
     wraps around, and `oversample` times finer than the detector. `backend`: `cpu`, `cuda`, `reference` or
     `auto` (see `backends`); float64 (`dtype`) is what only `reference` computes in, and stands for it.
     `dispersion`: factors [V, 2], or of each channel of matter [V, C, 2], of δ and β at the frames' energies over those
@@ -44,6 +44,7 @@ class Instrument:
         known = dtype in (torch.float32, torch.float64)
         require(known, f"the wave optics computes in float32 or float64, but {dtype} is asked for.")
         self.exposures, self.oversample, self.dtype = exposures, int(oversample), dtype
+        self._optical = exposures.optical
         self.backend = resolve("reference" if dtype == torch.float64 else backend)
         self.device = device(self.backend)
         self.margin = padding(exposures, self.oversample)
@@ -77,8 +78,8 @@ class Instrument:
     ) -> Tensor:
         """Frames [V, H, W] from line integrals on `self.views` (or its views `index`), in the instrument's type.
 
-        distance, psf_sigma_px: other distances [V] [m] and point-spread functions [V] [pixels] than those of the
-        exposures, float64, with gradients if they require them.
+        distance, psf_sigma_px: other distances [V] [m], on pixels of the views' pitch (`Exposures.optical`), and
+        point-spread functions [V] [pixels] than those of the exposures, float64, with gradients if they require them.
         """
         chosen = None if index is None else torch.as_tensor(index, device=self.device)
         if distance is None and psf_sigma_px is None:
@@ -102,12 +103,12 @@ class Instrument:
 
     def _path(self, index: Tensor | None, distance: Tensor | None, psf_sigma_px: Tensor | None) -> OpticalPath:
         """The path of the views `index` at other distances, or through other point-spread functions."""
-        taken = self.exposures if index is None else self.exposures[index.cpu().numpy()]
+        taken = self._optical if index is None else self._optical[index.cpu().numpy()]
         my, mx = (m * self.oversample for m in self.margin)
         sigma = taken.psf_sigma_px if psf_sigma_px is None else psf_sigma_px
         return optical_path(
             self.views.shape,
-            self.views.pixel_size,
+            self.views.pitch,
             taken.energy_kev,
             taken.distance if distance is None else distance,
             sigma * self.oversample,

@@ -51,7 +51,7 @@ class Model:
     def capturable(self) -> bool:
         """Whether frames are made on the device alone: those of one time, at the planned distances and blurs."""
         alignment = self.alignment
-        planned = alignment is None or (alignment.stretches is None and alignment.blurs is None)
+        planned = alignment is None or not (alignment.moves_waves or alignment.blurs is not None)
         return planned and len(self.instrument.times) == 1
 
     def parameters(self) -> dict[str, Tensor]:
@@ -95,7 +95,7 @@ class Model:
         lines, planned, alignment = self.lines(time, index), self.instrument.exposures, self.alignment
         if alignment is None:
             return self.instrument.frames(lines, index)
-        distance, sigma = alignment.distance(planned, index), alignment.psf_sigma_px(planned, index)
+        distance, sigma = alignment.optical_distance(planned, index), alignment.psf_sigma_px(planned, index)
         return self.instrument.frames(lines, index, distance, sigma)
 
     def _of_several_times(self, index: Tensor | None, delay: float) -> Tensor:
@@ -108,7 +108,7 @@ class Model:
         return torch.cat(parts)[torch.from_numpy(np.argsort(np.concatenate(places))).to(device)]
 
     def _poses(self, index: Tensor | None) -> Poses:
-        planned, pixel = self.instrument.poses, self.instrument.exposures.views.pixel_size
+        planned, pixel = self.instrument.poses, self.instrument.exposures.views.pitch
         if self.alignment is not None:
             return self.alignment.poses(planned, pixel, index)
         return planned if index is None else planned[index]

@@ -26,6 +26,7 @@ def padding(exposures: Exposures, oversample: int) -> tuple[int, int]:
     The margin on each side is at most the field of view; the propagator cuts light that would travel further (see
     `fresnel_transfer`).
     """
+    exposures = exposures.optical
     pitch = exposures.views.pixel_size
     optics = zip(exposures.distance, exposures.energy_kev)
     reach = max(fresnel_reach_px(pitch / oversample, z, float(energy)) for z, energy in optics)
@@ -40,6 +41,7 @@ def fringe_sampling(exposures: Exposures, extra: int = 0) -> int:
 
     Frames whose first fringe is narrower than `NARROWEST_FRINGE` pixels, or that have none, need one sample a pixel.
     """
+    exposures = exposures.optical
     seen = np.flatnonzero(fringes(exposures) >= NARROWEST_FRINGE * exposures.views.pixel_size)
     return extra + (resolving_oversample(exposures[seen], FRINGE_SAMPLES, at_least=1) if len(seen) else 1)
 
@@ -56,6 +58,7 @@ def resolving_oversample(exposures: Exposures, samples_per_fringe: float, at_lea
     cells of 64 µm on 3.2 µm pixels stay right to 1.5 % of their contrast however short the distance). In contact there
     is no fringe, and `at_least` is what is taken.
     """
+    exposures = exposures.optical
     widths = fringes(exposures)
     if not widths.any():
         return at_least

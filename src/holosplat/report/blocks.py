@@ -175,6 +175,8 @@ def _correlation(content: ReportContent) -> Block:
     text = ""
     if images is not None:
         text += "Fourier ring correlation of predicted with measured held-out views. "
+        if content.held_out is not None and content.held_out.pixels is not None and np.ptp(content.held_out.pixels):
+            text += "Their pixels differ: frequencies are those of the smallest, with as many periods a pixel. "
     if content.volume_scores is not None:
         crossings = _resolutions(content.volume_scores)
         text += f"Fourier shell correlation of the reconstructed with the true δ, {crossings}. "

@@ -23,13 +23,14 @@ class HeldOutViews:
     """Frames that the fit never saw, and what the reconstruction predicts for them.
 
     measured, predicted: [T, H, W] relative intensity; labels: T texts, from `view_labels`; scores: of these
-    frames.
+    frames; pixels: [T] their sizes [m], None where all are that of the report.
     """
 
     measured: np.ndarray
     predicted: np.ndarray
     labels: tuple[str, ...]
     scores: ImageScores
+    pixels: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         measured = shaped("measured frames", np.asarray(self.measured), (None, None, None))
@@ -46,7 +47,7 @@ class LitViews:
     """Training frames in uneven light: measured, their light beside the prediction, and what even light would give.
 
     measured, light, predicted: [T, H, W] relative intensity; labels: T texts, from `view_labels`; words: on the light
-    of all frames.
+    of all frames; pixels: as in `HeldOutViews`.
     """
 
     measured: np.ndarray
@@ -54,6 +55,7 @@ class LitViews:
     predicted: np.ndarray
     labels: tuple[str, ...]
     words: str
+    pixels: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         measured = shaped("measured frames", np.asarray(self.measured), (len(self.labels), None, None))
@@ -66,7 +68,7 @@ class ProjectedMaps:
     """Line integrals of the reconstruction, and of the truth where it is known, for a few views.
 
     projected_beta, projected_delta: B = ∫β dz and D = ∫δ dz, [V, H, W] [m]; true_projected_beta,
-    true_projected_delta: likewise, or None; labels: V texts, from `view_labels`.
+    true_projected_delta: likewise, or None; labels: V texts, from `view_labels`; pixels: as in `HeldOutViews`.
     """
 
     projected_beta: np.ndarray
@@ -74,6 +76,7 @@ class ProjectedMaps:
     labels: tuple[str, ...]
     true_projected_beta: np.ndarray | None = None
     true_projected_delta: np.ndarray | None = None
+    pixels: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         shape = shaped("projected δ", np.asarray(self.projected_delta), (None, None, None)).shape
@@ -94,7 +97,8 @@ class ReportContent:
 
     - title: what was reconstructed; summary: a sentence or two on the experiment, plain text
     - reconstruction, truth: volumes on one grid
-    - energy_kev: at which δ and β are said [keV]; pixel_size: of the frames [m]
+    - energy_kev: at which δ and β are said [keV]; pixel_size: of the frames [m],
+      the smallest where they differ
     - held_out: test views; projections: line integrals of a few views; volume_scores: against the truth
     - material_delta: the material's δ, for surfaces and masks; None: the robust maximum of the truth, or else
       of the reconstruction
@@ -148,8 +152,18 @@ class ReportContent:
         return robust_material_delta(volume) if np.any(volume.delta) else None
 
 
+def pixel_of(shown: HeldOutViews | LitViews | ProjectedMaps, row: int, pixel_size: float) -> float:
+    """The pixel size [m] of frame `row`."""
+    return pixel_size if shown.pixels is None else float(shown.pixels[row])
+
+
 def view_labels(views: Views) -> tuple[str, ...]:
-    """A label for each view: "θ = 15.0°" where all turn about the y axis, else "view k" (counted from 1)."""
+    """A label for each view: "θ = 15.0°" where all turn about the y axis, else "view k" (counted from 1).
+
+    With their pixels where these differ.
+    """
+    if not views.has_one_pixel:
+        return tuple(f"view {k + 1}, pixels of {1e6 * p:.4g} µm" for k, p in enumerate(views.pixel_sizes))
     if not views.shares_axis:
         return tuple(f"view {k + 1}" for k in range(len(views)))
     angles = np.degrees(np.arctan2(views.rotations[:, 0, 2], views.rotations[:, 0, 0])) % 360.0

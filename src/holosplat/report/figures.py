@@ -16,7 +16,7 @@ from ..geometry import Grid
 from ..metrics import robust_material_delta
 from ..units import wavenumber
 from ..volume import Volume
-from .content import HeldOutViews, ProjectedMaps
+from .content import HeldOutViews, ProjectedMaps, pixel_of
 from .style import (
     BETA_MAP,
     DELTA_MAP,
@@ -124,9 +124,9 @@ def held_out_figure(views: HeldOutViews, pixel_size: float, most: int = 4) -> Fi
     scale, power = decimal_scale(limit)
     height, width = views.measured.shape[1:]
     panels = PanelGrid(len(chosen), [width] * 3, [height] * 3, (1, 2))
-    pitch = (pixel_size, pixel_size)
     for row, k in enumerate(chosen):
-        axes = panels.axes[row]
+        axes, pixel = panels.axes[row], pixel_of(views, k, pixel_size)
+        pitch = (pixel, pixel)
         grey = image_panel(axes[0], views.measured[k], pitch, HOLOGRAM_MAP, (low, high))
         image_panel(axes[1], views.predicted[k], pitch, HOLOGRAM_MAP, (low, high))
         residual = (views.predicted[k] - views.measured[k]) / scale
@@ -134,7 +134,7 @@ def held_out_figure(views: HeldOutViews, pixel_size: float, most: int = 4) -> Fi
         scores = f"SSIM {views.scores.ssim[k]:.3f}, FRCM {views.scores.frcm[k]:.3f}"
         for i, title in enumerate((f"Measured, {views.labels[k]}", f"Predicted ({scores})", "Predicted − measured")):
             letter(axes[i], 3 * row + i, title)
-        scale_bar(axes[0], width * pixel_size)
+        scale_bar(axes[0], width * pixel)
     panels.bar(grey, 1, (0, len(chosen) - 1), "intensity relative to the flat field", "both")
     panels.bar(signed, 2, (0, len(chosen) - 1), f"difference of intensity{f' ({power})' if power else ''}", "both")
     return panels.figure
@@ -169,7 +169,7 @@ def projections_figure(maps: ProjectedMaps, energy_kev: float, pixel_size: float
         panels = PanelGrid(views, [width] * 2, [height] * 2, (0, 1), 0.8 * WIDTH)
         for index, (phase, i) in enumerate(pairs):
             found = -k * maps.projected_delta[i] if phase else 2 * k * maps.projected_beta[i]
-            _projected(panels, divmod(index, 2), [found], phase, maps.labels[i], pixel_size)
+            _projected(panels, divmod(index, 2), [found], phase, maps.labels[i], pixel_of(maps, i, pixel_size))
         return panels.figure
     panels = PanelGrid(2 * views, [width] * 3, [height] * 3, (1, 2))
     for row, (phase, i) in enumerate(pairs):
@@ -179,7 +179,7 @@ def projections_figure(maps: ProjectedMaps, energy_kev: float, pixel_size: float
             else (2 * k, maps.true_projected_beta, maps.projected_beta)
         )
         shown = [factor * np.asarray(true[i]), factor * np.asarray(found[i])]
-        _projected(panels, (row, 0), shown, phase, maps.labels[i], pixel_size)
+        _projected(panels, (row, 0), shown, phase, maps.labels[i], pixel_of(maps, i, pixel_size))
     return panels.figure
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 
-from .content import LitViews
+from .content import LitViews, pixel_of
 from .figures import evenly_chosen
 from .style import (
     HOLOGRAM_MAP,
@@ -35,12 +35,11 @@ def light_figure(views: LitViews, pixel_size: float) -> Figure:
     scale, power = decimal_scale(limit)
     panels = _panels(views.measured, bars=(0, 1, 2))
     for row in range(len(views.labels)):
-        grey = _frame(panels, row, views.measured, views.labels[row], pixel_size)
-        lit = _light(panels, row, views.light, pixel_size)
+        pixel = pixel_of(views, row, pixel_size)
+        grey = _frame(panels, row, views.measured, views.labels[row], pixel)
+        lit = _light(panels, row, views.light, pixel)
         axes = panels.axes[row][2]
-        left = image_panel(
-            axes, residual[row] / scale, (pixel_size, pixel_size), SIGNED_MAP, (-limit / scale, limit / scale)
-        )
+        left = image_panel(axes, residual[row] / scale, (pixel, pixel), SIGNED_MAP, (-limit / scale, limit / scale))
         letter(axes, 3 * row + 2, "Left by light and object")
     rows = (0, len(views.labels) - 1)
     panels.bar(grey, 0, rows, "relative intensity", "both")
@@ -55,10 +54,13 @@ def phase_figure(
     light: np.ndarray | None,
     phase: np.ndarray,
     labels: Sequence[str],
-    pixel_size: float,
+    pixel_sizes: np.ndarray,
     most: int = 3,
 ) -> Figure:
-    """Up to `most` frames [V, H, W], the light in them (None: even), and the phase [rad] of the exit wave."""
+    """Up to `most` frames [V, H, W], the light in them (None: even), and the phase [rad] of the exit wave.
+
+    pixel_sizes: [V] [m].
+    """
     chosen = evenly_chosen(len(measured), most)
     measured, phase = measured[chosen], phase[chosen]
     factor = np.ones_like(phase) if light is None else light[chosen]
@@ -66,6 +68,7 @@ def phase_figure(
     low, high = (float(v) for v in np.percentile(phase, (0.02, 99.98)))
     limits = (low, high) if high > low else (low - 0.5, low + 0.5)
     for row, number in enumerate(chosen):
+        pixel_size = float(pixel_sizes[number])
         grey = _frame(panels, row, measured, labels[number], pixel_size)
         lit = _light(panels, row, factor, pixel_size)
         axes = panels.axes[row][2]

@@ -12,6 +12,7 @@ import torch
 from ..geometry import Grid, Views
 from ..projectors.voxels import voxel_line_integrals
 from ..scan import Scan
+from ..units import span
 from ..volume import Volume
 from ..workflows.evaluate import Evaluation, render
 from ..workflows.reconstruct import Reconstruction
@@ -40,14 +41,16 @@ def report_run(
     held_out = None
     if evaluation.test is not None and evaluation.predicted is not None:
         test = scan.test()
-        held_out = HeldOutViews(test.frames, evaluation.predicted, view_labels(test.views), evaluation.test)
+        held_out = HeldOutViews(
+            test.frames, evaluation.predicted, view_labels(test.views), evaluation.test, test.views.pixel_sizes
+        )
     content = ReportContent(
         title=_title(config, reconstruction),
         summary=_summary(reconstruction, scan),
         reconstruction=found.voxelise(grid),
         truth=truth,
         energy_kev=scan.exposures.reference_energy,
-        pixel_size=scan.views.pixel_size,
+        pixel_size=scan.views.finest,
         held_out=held_out,
         projections=_projections(reconstruction, scan.views, truth),
         volume_scores=evaluation.volume,
@@ -86,14 +89,13 @@ def _title(config: Mapping[str, Any], reconstruction: Reconstruction) -> str:
 def _summary(reconstruction: Reconstruction, scan: Scan) -> str:
     exposures, views = scan.exposures, scan.views
     h, w = views.shape
-    low, high = 100 * exposures.distance.min(), 100 * exposures.distance.max()
-    distance = f"{low:.4g} cm" if low == high else f"{low:.4g} to {high:.4g} cm"
+    distance = f"{span(100 * exposures.distance)} cm"
     energies = exposures.energy_kev.min(), exposures.energy_kev.max()
     energy = f"{energies[0]:g}" if exposures.has_one_energy else f"{energies[0]:g} to {energies[1]:g}"
     state = "" if reconstruction.finished else " The fit was interrupted before its end."
     return (
         f"{len(scan.train())} training and {len(scan.test())} held-out frames of {h} × {w} pixels of "
-        f"{1e6 * views.pixel_size:.4g} µm, {energy} keV, {distance} behind the sample; "
+        f"{span(1e6 * views.pixel_sizes)} µm, {energy} keV, {distance} behind the sample; "
         f"{reconstruction.object.described}.{state}"
     )
 
@@ -113,7 +115,14 @@ def _lit(reconstruction: Reconstruction, scan: Scan, evaluation: Evaluation) -> 
     predicted = render(reconstruction, shown.exposures)
     background = light.background[torch.from_numpy(chosen)]
     beside = background.seen_beside(torch.from_numpy(shown.frames), torch.from_numpy(predicted))
-    return LitViews(shown.frames, beside.factor().numpy(), predicted, view_labels(shown.views), light.in_words)
+    return LitViews(
+        shown.frames,
+        beside.factor().numpy(),
+        predicted,
+        view_labels(shown.views),
+        light.in_words,
+        shown.views.pixel_sizes,
+    )
 
 
 def _projections(reconstruction: Reconstruction, views: Views, truth: Volume | None) -> ProjectedMaps:
@@ -123,9 +132,9 @@ def _projections(reconstruction: Reconstruction, views: Views, truth: Volume | N
     with torch.no_grad():
         beta, delta = (line.numpy() for line in reconstruction.object.project(chosen))
         if truth is None:
-            return ProjectedMaps(beta, delta, view_labels(chosen))
+            return ProjectedMaps(beta, delta, view_labels(chosen), pixels=chosen.pixel_sizes)
         true_beta, true_delta = (line.numpy() for line in _project_volume(truth, chosen).unbind(1))
-    return ProjectedMaps(beta, delta, view_labels(chosen), true_beta, true_delta)
+    return ProjectedMaps(beta, delta, view_labels(chosen), true_beta, true_delta, chosen.pixel_sizes)
 
 
 def _project_volume(truth: Volume, views: Views) -> torch.Tensor:

@@ -150,9 +150,9 @@ def _geometry_table(content: ReportContent) -> Table | None:
         numbers += [f"{change[k]:+.3f} ± {error[k]:.3f}" for k in (2, 3, 4)]
         name = f"{v} (held out)" if found.held_out[v] else str(v)
         left = f"{found.before[v]:.3f} → {found.after[v]:.3f}"
-        rows.append((name, *(n.replace("-", "−") for n in numbers), percent(change[5]), left))
-    head = ("frame", "shift x (px)", "shift y (px)", "turn x (°)", "turn y (°)", "roll (°)", "distance", "unexplained")
-    return Table("Geometry beside the plan", rows, head)
+        rows.append((name, *(n.replace("-", "−") for n in numbers), percent(change[5]), percent(change[6]), left))
+    names = ("shift x (px)", "shift y (px)", "turn x (°)", "turn y (°)", "roll (°)", "distance", "magnification")
+    return Table("Geometry beside the plan", rows, ("frame", *names, "unexplained"))
 
 
 def percent(value: float | None) -> str:

@@ -119,16 +119,17 @@ class GaussianCloud:
         """Line integrals [V, C, H, W] of the amplitudes, in units of `unit_length`.
 
         Views are checked, Poses (on the cloud's device) are taken as they are, without waiting for a GPU. Gradients
-        reach the cloud's parameters, and the rotations and shifts of Poses that require them.
+        reach the cloud's parameters, and the rotations, shifts and scales of Poses that require them.
         """
         poses = Poses.of(views, self.centres.device) if isinstance(views, Views) else views
-        scale = self.unit_length / poses.pixel_size
+        scale = self.unit_length / poses.pitch
         return splat(
             *self._scaled(scale),
             amplitudes=self.amplitudes if scale == 1 else self.amplitudes / scale,
             rotations=poses.rotations,
-            shifts=poses.shifts / poses.pixel_size,
+            shifts=poses.shifts / poses.pitch,
             shape=poses.shape,
+            pixels=poses.scales,
             backend=self.backend,
             trusted=not isinstance(views, Views),
         )

@@ -150,10 +150,10 @@ def random_cloud(count: int, views: Views, matter: Matter, thickness: float, see
     distance = radius * torch.rand(count, 1, generator=generator) ** (1 / 3)
     centres = distance * direction / direction.norm(dim=1, keepdim=True)
     sigma = 0.5 * radius * (4.19 / count) ** (1 / 3)
-    mass = np.pi * radius**2 * thickness / views.pixel_size / count
+    mass = np.pi * radius**2 * thickness / views.finest / count
     peak = torch.full((count, len(matter)), mass / ((2 * np.pi) ** 1.5 * sigma**3))
     log_scales = torch.full((count, 3), float(np.log(sigma)))
-    return GaussianCloud((centres, log_scales, _identity(count), raw_of(peak)), views.pixel_size, matter)
+    return GaussianCloud((centres, log_scales, _identity(count), raw_of(peak)), views.finest, matter)
 
 
 def freed(cloud: GaussianCloud) -> GaussianCloud:

@@ -193,10 +193,14 @@ class NeuralField:
         return self
 
     def raster(self, views: AnyViews) -> AnyViews:
-        """The same views on pixels of a voxel edge, a whole number of them where `views` hold one."""
-        ratio = views.pixel_size / self.pitch
+        """The same views on pixels of a voxel edge, a whole number of them where `views` hold one.
+
+        Where pixel sizes differ, those of the largest pixels are no wider than an edge, and the others narrower.
+        """
+        widest = 1.0 if views.scales is None or not len(views) else max(1.0, float(views.scales.max()))
+        ratio = views.pitch * widest / self.pitch
         h, w = (max(1, math.ceil(n * ratio - 1e-6)) for n in views.shape)
-        return replace(views, shape=(h, w), pixel_size=self.pitch)
+        return replace(views, shape=(h, w), pitch=self.pitch / widest)
 
     def project(self, views: Views | Poses) -> LineIntegrals:
         """Line integrals (B, D), differentiable in the parameters and in the rotations and shifts of `Poses`.
@@ -262,10 +266,14 @@ class NeuralField:
         (h, w), rotation = rays.shape, torch.as_tensor(rays.rotations[v]).cpu()
         shift_x, shift_y = torch.as_tensor(rays.shifts[v]).cpu() / self.pitch
         centre = torch.as_tensor(self.grid.centre / self.pitch)
+        edge = torch.as_tensor(rays.pitch / self.pitch, dtype=torch.float64)
+        if rays.scales is not None:
+            edge = edge * torch.as_tensor(rays.scales[v]).cpu()
         # x_obj = Rᵀ x_lab is affine in (column, row, depth)
-        first = torch.stack([0.5 - 0.5 * w + shift_x, 0.5 - 0.5 * h + shift_y, rotation[2] @ centre - self._reach()])
+        depth_at = rotation[2] @ centre - self._reach()
+        first = torch.stack([(0.5 - 0.5 * w) * edge + shift_x, (0.5 - 0.5 * h) * edge + shift_y, depth_at])
         origin = rotation.T @ first - self.corner.cpu().double()
-        axes = rotation.to(like)
+        axes = (torch.stack([edge, edge, torch.ones_like(edge)])[:, None] * rotation).to(like)
         lab = torch.stack((pixel % w, pixel // w, depth.to(like)), dim=1).to(like)
         return torch.addmm(origin.to(like), lab, axes)
 
@@ -327,9 +335,9 @@ def uniform(generator: torch.Generator, *shape: int) -> Tensor:
 
 def spread(images: Tensor, rays: Views | Poses, views: Views | Poses) -> Tensor:
     """Images [V, C, h, w] on `rays` brought to the pixels of `views`: linear on finer ones, means on larger ones."""
-    if (rays.shape, rays.pixel_size) == (views.shape, views.pixel_size):
+    if (rays.shape, rays.pitch) == (views.shape, views.pitch):
         return images
-    fine, coarse = views.pixel_size, rays.pixel_size
+    fine, coarse = views.pitch, rays.pitch
     rows, columns = (
         resampling((n, coarse, -0.5 * (n - 1) * coarse), (m, fine, -0.5 * (m - 1) * fine))
         for n, m in zip(rays.shape, views.shape)

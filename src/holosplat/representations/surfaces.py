@@ -89,9 +89,9 @@ class SurfaceMesh:
         return self
 
     def project(self, views: Views | Poses) -> LineIntegrals:
-        """Line integrals (B, D), float64, differentiable in the vertices and in the rotations and shifts of `Poses`."""
+        """Line integrals (B, D), float64, differentiable in the vertices and in the numbers of `Poses`."""
         poses = Poses.of(views) if isinstance(views, Views) else views
-        pitch = poses.pixel_size
+        pitch = poses.pitch
         thickness = surface_thickness(
             self.vertices * (self.unit_length / pitch),
             self.faces,
@@ -99,6 +99,7 @@ class SurfaceMesh:
             poses.shifts / pitch,
             poses.shape,
             self.lines,
+            pixels=poses.scales,
         )
         return LineIntegrals(thickness[:, None], self.matter.in_lengths(pitch))
 

@@ -14,6 +14,10 @@ from ..checks import require
 from ..geometry import Grid, Poses, Views
 from ..projectors.voxels import LatticeProjector, SliceProjector
 
+SAME = 0.9
+"""Share of the pitch that pixels may have with voxels as on pixels of the pitch: views that are found to be magnified
+by some per cent keep their voxels."""
+
 Axis = tuple[int, float, float]
 """A row of cells: their count, their size [m], and the centre of the first one [m]."""
 
@@ -79,7 +83,8 @@ class _AnyPose:
     """[Z, Y, X] → [V, H, W] for poses of any kind."""
 
     def __init__(self, grid: Grid, views: Views | Poses) -> None:
-        fx, fy, fz = (max(1, math.ceil(d / views.pixel_size - 1e-6)) for d in grid.voxel_size)
+        edge = views.pitch if views.finest > SAME * views.pitch else views.finest
+        fx, fy, fz = (max(1, math.ceil(d / edge - 1e-6)) for d in grid.voxel_size)
         fine = grid.divided((fx, fy, fz))
         self._matrices = None if fine is grid else axis_matrices(grid, fine)
         (nz, ny, nx), (x, y, z) = fine.shape, (o - 0.5 * d for o, d in zip(fine.origin, fine.voxel_size))

@@ -221,7 +221,7 @@ class ContinuousScene:
 
     def missing_field(self, views: Views) -> float:
         """How far [m] the scene reaches beyond the detector in the worst view (0 or less: it fits)."""
-        half = 0.5 * np.array([views.width, views.height])
+        half = 0.5 * views.fields
         worst = -math.inf
         for element in self.elements:
             centre = (views.rotations @ element.centre)[:, :2] - views.shifts

@@ -61,8 +61,7 @@ class MeshScene:
         """How far [m] the scene reaches beyond the detector in the worst view (0 or less: it fits)."""
         vertices = np.concatenate([m.vertices for m in self.meshes])
         lab = np.einsum("vij,pj->vpi", views.rotations, vertices)[..., :2] - views.shifts[:, None]
-        half = 0.5 * np.array([views.width, views.height])
-        return float((np.abs(lab) - half).max())
+        return float((np.abs(lab) - 0.5 * views.fields[:, None]).max())
 
     def _soup(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[tuple[float, float], ...]]:
         """All meshes as one: vertices [P, 3], faces [F, 3], and the matter of each face's body, [C, F] of C kinds.

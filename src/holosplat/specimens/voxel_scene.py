@@ -50,7 +50,7 @@ class VoxelScene:
     def missing_field(self, views: Views) -> float:
         """How far [m] the filled box reaches beyond the detector in the worst view (0 or less: it fits)."""
         lab = _corners(self.bounds, views)
-        return float((np.abs(lab) - 0.5 * np.array([views.width, views.height])).max())
+        return float((np.abs(lab) - 0.5 * views.fields[:, None]).max())
 
     def project(self, views: Views) -> LineIntegrals:
         """Line integrals of δ and β, [V, 2, H, W]: one channel where β is δ times a number.
@@ -58,17 +58,17 @@ class VoxelScene:
         Rays are cast where the filled box is, with a margin of a voxel, and no others.
         """
         values, kinds = self._channels()
-        p, counts = views.pixel_size, np.array(views.shape[::-1])
+        counts = np.array(views.shape[::-1])
         lines = torch.zeros((len(views), len(kinds), *views.shape))
         margin = max(self.volume.grid.voxel_size)
-        for v, lab in enumerate(_corners(self.bounds, views)):
+        for v, (lab, p) in enumerate(zip(_corners(self.bounds, views), views.pixel_sizes)):
             first = np.clip(np.floor((lab.min(0) - margin) / p + 0.5 * counts), 0, counts).astype(int)
             last = np.clip(np.ceil((lab.max(0) + margin) / p + 0.5 * counts), 0, counts).astype(int)
             if np.any(last <= first):
                 continue
             shift = views.shifts[v] + (0.5 * (first + last) - 0.5 * counts) * p
             (w, h), (column, row) = last - first, first
-            part = Views(views.rotations[[v]], shift[None], (h, w), p)
+            part = Views(views.rotations[[v]], shift[None], (h, w), float(p))
             cast = voxel_line_integrals(values, self.volume.grid, part, step=STEP)
             lines[v, :, row : row + h, column : column + w] = cast[0]
         return LineIntegrals(lines, kinds)

@@ -1,4 +1,4 @@
-"""Scans of several beams, each with a detector of its own, brought onto one raster."""
+"""Scans of several beams, each with a detector of its own, in one file: as they are, or brought onto one raster."""
 
 from __future__ import annotations
 
@@ -33,8 +33,9 @@ def join(
 ) -> Exposures:
     """One scan file `out` of all frames of the scans `sources`, one a beam, in their order.
 
-    Each frame is brought to pixels of `pixel_size` [m] (default: the coarsest of all), over the field that every
-    detector has, about its own centre; distances, poses, shifts and times stay its own, its point-spread function is
+    Frames of several pixel sizes stay as they are, if they have as many pixels. With `pixel_size` [m], and where the
+    files' own is the same, each frame is brought to such pixels, over the field that every detector has, about its own
+    centre. Distances, poses, shifts and times stay its own, its point-spread function is
     carried along. `flips`: for each file, what its detector saw reversed and the file does not say itself. Raw files
     are corrected plainly, and frames keep the photon energy of their beam. part: what is taken of each file.
     """
@@ -47,9 +48,7 @@ def join(
     )
     scans = [part.of(read(source)) for source in sources]
     parts = [scan.exposures for scan in scans]
-    pitch = _common_pixel(parts, pixel_size)
-    shape = _common_shape(parts, pitch)
-    joined, resamplings = _joined(parts, shape, pitch)
+    joined, resamplings = _on_one_raster(parts, pixel_size) if _share_pixel(parts, pixel_size) else _as_they_are(parts)
     described = {"joined": "; ".join(path.name for path in sources), **_shared([scan.provenance for scan in scans])}
     done = 0
     is_test = np.concatenate([scan.is_test for scan in scans])
@@ -57,16 +56,31 @@ def join(
         for n, (scan, resampling) in enumerate(zip(scans, resamplings)):
             rows, columns = FLIPS[flips[n]] if flips else (False, False)
             for frame in (frame for block in scan.blocks() for frame in block):
-                add(resampling(frame[:: -1 if rows else 1, :: -1 if columns else 1]))
+                turned = frame[:: -1 if rows else 1, :: -1 if columns else 1]
+                add(turned if resampling is None else resampling(turned))
                 done += 1
                 on_progress(done / len(joined))
     return joined
 
 
-def _common_pixel(parts: list[Exposures], pixel_size: float | None) -> float:
-    """The pixel size of the result [m]."""
-    coarsest = max(part.views.pixel_size for part in parts)
-    return coarsest if pixel_size is None else in_range("--pixel-size", pixel_size, *PIXEL_RANGE_M, unit="metres")
+def _share_pixel(parts: list[Exposures], pixel_size: float | None) -> bool:
+    """Whether the result has one pixel size: the one that is asked for, or that of all parts."""
+    sizes = np.concatenate([part.views.pixel_sizes for part in parts])
+    return pixel_size is not None or bool(np.allclose(sizes, sizes[0], rtol=1e-6, atol=0))
+
+
+def _as_they_are(parts: list[Exposures]) -> tuple[Exposures, list[Resampling | None]]:
+    """The exposures of all frames on their own rasters, which nothing needs to bring there."""
+    shapes = sorted({part.views.shape for part in parts})
+    said = " and ".join(f"{h} × {w}" for h, w in shapes)
+    require(
+        len(shapes) == 1,
+        f"frames of several pixel sizes must have as many pixels, but they have {said}; cut all to one shape "
+        "(--crop ROWS,COLUMNS), or bring them to one raster (--pixel-size).",
+    )
+    sizes = np.concatenate([part.views.pixel_sizes for part in parts])
+    blurs = np.concatenate([part.psf_sigma_px for part in parts])
+    return _exposures(parts, shapes[0], sizes, blurs), [None] * len(parts)
 
 
 def _common_shape(parts: list[Exposures], pitch: float) -> tuple[int, int]:
@@ -83,25 +97,34 @@ def _common_shape(parts: list[Exposures], pitch: float) -> tuple[int, int]:
     return rows, columns
 
 
-def _joined(parts: list[Exposures], shape: tuple[int, int], pitch: float) -> tuple[Exposures, list[Resampling]]:
+def _on_one_raster(parts: list[Exposures], pixel_size: float | None) -> tuple[Exposures, list[Resampling | None]]:
     """The exposures of all frames on the common raster, and what brings each part's frames there."""
-    resamplings, blurs = [], []
+    if pixel_size is not None:
+        in_range("--pixel-size", pixel_size, *PIXEL_RANGE_M, unit="metres")
+    pitch = max(part.views.pixel_size for part in parts) if pixel_size is None else pixel_size
+    shape = _common_shape(parts, pitch)
+    resamplings, blurs = list[Resampling | None](), []
     for part in parts:
         own = part.views.pixel_size
         resampling = Resampling(part.views.shape, own, shape, pitch)
         resamplings.append(resampling)
         blurs.append(joined_blur_px(part.psf_sigma_px * own / pitch, resampling.extra_blur, pitch))
-    views = Views(
+    return _exposures(parts, shape, pitch, np.concatenate(blurs)), resamplings
+
+
+def _exposures(
+    parts: list[Exposures], shape: tuple[int, int], pixel_size: float | np.ndarray, blurs: np.ndarray
+) -> Exposures:
+    views = Views.of_pixels(
         np.concatenate([part.views.rotations for part in parts]),
         np.concatenate([part.views.shifts for part in parts]),
         shape,
-        pitch,
+        pixel_size,
     )
     energy, distance, time = (
         np.concatenate([getattr(part, name) for part in parts]) for name in ("energy_kev", "distance", "time")
     )
-    joined = Exposures(views, energy, distance, np.concatenate(blurs), time)
-    return joined, resamplings
+    return Exposures(views, energy, distance, blurs, time)
 
 
 def _shared(texts: list[dict[str, str]]) -> dict[str, str]:

@@ -134,12 +134,14 @@ def where(exposures: Exposures) -> dict[str, Tensor]:
     """What a fit of the geometry changes of exposures, as a checkpoint holds it."""
     views = exposures.views
     arrays = {"rotations": views.rotations, "shifts": views.shifts, "distance": exposures.distance}
+    arrays["pixel_sizes"] = views.pixel_sizes
     return {name: torch.from_numpy(array) for name, array in arrays.items()}
 
 
 def placed_at(exposures: Exposures, saved: Mapping[str, Tensor]) -> Exposures:
     """`exposures` where a checkpoint says."""
-    views = replace(exposures.views, rotations=saved["rotations"].numpy(), shifts=saved["shifts"].numpy())
+    planned, scales = exposures.views, saved["pixel_sizes"].numpy() / exposures.views.pitch
+    views = replace(planned, rotations=saved["rotations"].numpy(), shifts=saved["shifts"].numpy(), scales=scales)
     return replace(exposures, views=views, distance=saved["distance"].numpy())
 
 

@@ -31,7 +31,9 @@ def scan_hash(scan: Scan) -> str:
     )
     for array in parts:
         digest.update(np.ascontiguousarray(array).tobytes())
-    digest.update(repr((scan.views.pixel_size, _energies(exposures))).encode())
+    views = scan.views
+    pixels = views.pixel_size if views.has_one_pixel else views.pixel_sizes.tolist()
+    digest.update(repr((pixels, _energies(exposures))).encode())
     return digest.hexdigest()[:16]
 
 

@@ -34,7 +34,7 @@ def summary_of(done: Reconstruction, fit: Running | None, train: Scan) -> dict[s
         "best_step": (fit.best_step or fit.step) if fit else 0,
         "oversample": done.oversample,
         "detector": {
-            **{"rows": h, "columns": w, "pixel_size_m": train.views.pixel_size},
+            **{"rows": h, "columns": w, "pixel_size_m": train.views.finest},
             "centre_m": Grid.of_views(train.views).centre.tolist(),
         },
         "energy_kev": done.energy_kev,

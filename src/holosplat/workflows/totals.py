@@ -133,7 +133,7 @@ def _imaged_as_voxels(said: Prediction, frames: Scan, factor: int) -> bool:
     plain = factor == 1 and said.alignment is None and said.light is None
     if not (plain and isinstance(found, VoxelGrid) and found.matter.single):
         return False
-    return bool(np.allclose(found.grid.voxel_size, frames.views.pixel_size, rtol=1e-6))
+    return bool(np.allclose(found.grid.voxel_size, frames.views.finest, rtol=1e-6))
 
 
 def _predicted(said: Prediction, few: Scan, chosen: np.ndarray) -> Scan:

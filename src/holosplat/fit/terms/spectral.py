@@ -37,7 +37,7 @@ class SpectralMisfit:
         on, exposures = instrument.device, train.exposures
         ratio = matter.beta / matter.delta
         strongest = sensitivity(exposures, ratio)
-        phase = wavenumber(exposures.energy_kev) * exposures.refraction(matter.delta, 0.0)[0] * train.views.pixel_size
+        phase = wavenumber(exposures.energy_kev) * exposures.refraction(matter.delta, 0.0)[0] * train.views.finest
         unit = phase * strongest
         self._unit = torch.from_numpy(unit).float()[:, None, None].to(on)
         self._amplitudes = torch.from_numpy(train.frames).clamp_min(0).sqrt().to(on)
@@ -62,6 +62,7 @@ class SpectralMisfit:
 def linear_response(exposures: Exposures, absorption: float) -> Tensor:
     """|H| [V, H, W//2 + 1] for `rfft2`, float64, of a thin object with β/δ = `absorption` at the reference energy;
     1 beyond its maximum."""
+    exposures = exposures.optical
     views = exposures.views
     fy, fx = np.fft.fftfreq(views.shape[0], views.pixel_size), np.fft.rfftfreq(views.shape[1], views.pixel_size)
     reach = (wavelength(exposures.energy_kev) * exposures.distance)[:, None, None]

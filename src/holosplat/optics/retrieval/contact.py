@@ -58,6 +58,7 @@ def or_in_contact(method: Method) -> Method:
 
     @wraps(method)
     def retrieve(frames: Tensor, exposures: Exposures, delta: float, beta: float, **options: Any) -> Tensor:
+        exposures = exposures.optical
         checked(frames, exposures, delta)
         alone = absorption_alone(exposures, beta / delta)
         if not alone.any():

@@ -136,7 +136,8 @@ def sensitivity(exposures: Exposures, ratio: float) -> np.ndarray:
 
 def finest_phase(exposures: Exposures) -> np.ndarray:
     """`χ = πλz f²` [V] at the highest frequency of the frames, in the corner of their spectra: `πλz / 2p²`."""
-    return 0.5 * np.pi * wavelength(exposures.energy_kev) * exposures.distance / exposures.views.pixel_size**2
+    optics = exposures.optical
+    return 0.5 * np.pi * wavelength(optics.energy_kev) * optics.distance / optics.views.pixel_size**2
 
 
 def contrast_level(frames: Tensor) -> Tensor:

@@ -31,7 +31,7 @@ def mesh_line_integrals(
     for v in range(len(views)):
         lab = vertices @ views.rotations[v].T
         lab[:, :2] -= views.shifts[v]
-        out[v] = mean_depths(lab, faces, face_values, views.shape, views.pixel_size, rays)
+        out[v] = mean_depths(lab, faces, face_values, views.shape, float(views.pixel_sizes[v]), rays)
     return torch.from_numpy(out)
 
 

@@ -33,6 +33,7 @@ def splat(
     shifts: Tensor | np.ndarray,
     shape: tuple[int, int],
     *,
+    pixels: Tensor | None = None,
     backend: str = "cpu",
     cutoff: float = 4.0,
     pixel_variance: float = 1 / 12,
@@ -44,6 +45,10 @@ def splat(
     shifts [V, 2]: detector shifts `(sx, sy)` [px]. Pixel `(i, j)` of `shape = (H, W)` has its centre at
     `x = (j + ½ - W/2) + sx`, `y = (i + ½ - H/2) + sy`. A gradient of the rotations treats their nine numbers as free
     (the third row has gradient zero: it moves matter along the beam), and costs nothing where none is required.
+
+    `pixels`: [V] float64, edges of the views' pixels in the unit of length, which is the pixel where there are none;
+    they may want gradients. A view of pixels s is one of pixels 1 by the matrix `R / s`, which shrinks areas, and not
+    the mass, by s².
 
     `pixel_variance` [px²] is added to the projected covariance, mass conserved: the pixel's own, 1/12, stands
     for integration over its area (within 0.3 % for σ ≥ 1 px). The sum over pixels is the mass within 0.3 %
@@ -61,7 +66,12 @@ def splat(
         _check_raster("detector shape", shape, "two positive counts (rows, columns)", 2)
         _check_spread(cutoff, "pixel_variance", pixel_variance)
         rotations, shifts = (array.to(centres.device) for array in _check_views(rotations, shifts))
-    return run(*cloud, rotations, shifts, _counts(shape), float(cutoff), float(pixel_variance))
+        _check_pixels(pixels, rotations)
+    spread = _counts(shape), float(cutoff), float(pixel_variance)
+    if pixels is None:
+        return run(*cloud, rotations, shifts, *spread)
+    lines = run(*cloud, rotations / pixels[:, None, None], shifts / pixels[:, None], *spread)
+    return lines * (pixels**-2)[:, None, None, None].to(lines)
 
 
 def voxelise(
@@ -146,6 +156,16 @@ def _check_views(rotations: Tensor | np.ndarray, shifts: Tensor | np.ndarray) ->
     proper = bool(proper and np.all(np.linalg.det(turns) > 0))
     require(proper, "rotations must hold proper rotation matrices (R Rᵀ = 1, det R = 1).")
     return rotations.double(), shifts.double()
+
+
+def _check_pixels(pixels: Tensor | None, rotations: Tensor) -> None:
+    """`InputError` unless there is one edge above zero for each view, or none at all."""
+    if pixels is None:
+        return
+    good = pixels.dtype == torch.float64 and tuple(pixels.shape) == (len(rotations),)
+    held = (pixels.dtype, tuple(pixels.shape))
+    require(good, f"pixels must be float64, one edge for each of the {len(rotations)} views, but they are {held}.")
+    require(bool((pixels > 0).all()), "pixels must be edges above zero, but one is not; correct it.")
 
 
 def _check_raster(field: str, shape: tuple[int, ...], wanted: str, dimensions: int) -> None:

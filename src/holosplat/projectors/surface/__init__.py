@@ -37,19 +37,28 @@ def surface_thickness(
     shape: tuple[int, int],
     lines: int = 2,
     backend: str = "cpu",
+    *,
+    pixels: Tensor | None = None,
 ) -> Tensor:
     """Line integrals [V, H, W] of one over the inside of closed surfaces, float64; lengths in PIXELS.
 
     vertices: [P, 3] float64 `(x, y, z)`, object frame; faces: [F, 3] int64, counter-clockwise seen from outside (a
     cavity's from within it); rotations [V, 3, 3], shifts [V, 2] `(sx, sy)`, float64: as for `projectors.splat`; lines:
-    rows integrated in a pixel. Overlapping bodies add up. Gradients: of the vertices, the rotations (all nine numbers,
-    as of any matrix) and the shifts; a gradient that is not required costs nothing. Errors: `InputError` for other
+    rows integrated in a pixel; pixels: [V] edges of the views' pixels in the unit of length, which is the pixel where
+    there are none. Overlapping bodies add up. Gradients: of the vertices, the rotations (all nine numbers, as of any
+    matrix), the shifts and the edges; a gradient that is not required costs nothing. Errors: `InputError` for other
     shapes and types, and vertices that are not finite.
     """
     _check(vertices, faces)
     require(lines >= 1, f"lines must be at least 1, but it is {lines}.")
-    poses = (rotations.to(vertices), shifts.to(vertices))
-    return _Thickness.apply(vertices, *poses, faces.contiguous(), shape, lines, backend)  # type: ignore[no-any-return]
+    poses, faces = (rotations.to(vertices), shifts.to(vertices)), faces.contiguous()
+    if pixels is None:
+        return _Thickness.apply(vertices, *poses, None, faces, shape, lines, backend)  # type: ignore[no-any-return]
+    edges = pixels.to(vertices)  # R / s shortens lines, too
+    scaled = (poses[0] / edges[:, None, None], poses[1] / edges[:, None])
+    found = _Thickness.apply(vertices, *scaled, edges.detach(), faces, shape, lines, backend)
+    assert isinstance(found, Tensor)
+    return found * edges[:, None, None]
 
 
 def surface_occupancy(vertices: Tensor, faces: Tensor, shape: tuple[int, int, int], lines: int = 4) -> Tensor:
@@ -87,31 +96,34 @@ class _Thickness(torch.autograd.Function):
         vertices: Tensor,
         rotations: Tensor,
         shifts: Tensor,
+        edges: Tensor | None,
         faces: Tensor,
         shape: tuple[int, int],
         lines: int,
         backend: str,
     ) -> Tensor:
         points = _on_raster(vertices, rotations, shifts, shape)
-        ctx.save_for_backward(vertices, faces, points)
+        ctx.save_for_backward(vertices, faces, points, edges)
         ctx.backend = backend
         return implementation(__name__, backend).thickness(points, faces, shape, lines)  # type: ignore[no-any-return]
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        vertices, faces, points = ctx.saved_tensors
+        vertices, faces, points, edges = ctx.saved_tensors
         gradient = gradient.to(vertices)
-        of_vertices = _of_vertices(vertices, faces, points, gradient) if ctx.needs_input_grad[0] else None
+        of_vertices = _of_vertices(vertices, faces, points, edges, gradient) if ctx.needs_input_grad[0] else None
         poses: tuple[Tensor | None, Tensor | None] = (None, None)
         if any(ctx.needs_input_grad[1:3]):
             poses = implementation(__name__, ctx.backend).pose_gradients(points, vertices, faces, gradient)
-        return of_vertices, *poses, None, None, None, None
+        return of_vertices, *poses, None, None, None, None, None
 
 
-def _of_vertices(vertices: Tensor, faces: Tensor, points: Tensor, gradient: Tensor) -> Tensor:
-    """The gradient [P, 3] of the vertices, of the image's [V, H, W]."""
+def _of_vertices(vertices: Tensor, faces: Tensor, points: Tensor, edges: Tensor | None, gradient: Tensor) -> Tensor:
+    """The gradient [P, 3] of the vertices, of the image's [V, H, W]; a view of pixels s sees volumes s³ smaller."""
     found = sampled(points, faces, gradient)
+    if edges is not None:
+        found = found * (edges**-3)[:, None, None]
     weights = torch.tensor(QUADRATURE, dtype=vertices.dtype)
     a, b, c = vertices[faces].unbind(1)
     normals = torch.linalg.cross(b - a, c - a) / 6  # vector area, shared by the three points

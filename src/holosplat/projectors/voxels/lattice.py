@@ -27,6 +27,9 @@ class LatticeProjector:
     where the lattice and the raster beat; their means do not. Arrays are volumes [Z, Y, X] and images [V, H, W]. Voxels
     at the very rim of the detector, with a pixel of their hat outside, are left out.
 
+    Where pixel sizes differ, a view of pixels `s p` is one of pixels p with the matrix `R / s`, and a voxel's mass is
+    spread over s² pixels p².
+
     The projector uses the poses as they are when it is made. Gradients of poses are exact, except for matter that
     enters or leaves at the detector's rim, and for voxels on a pixel's centre, where hats have a kink: there the
     gradient is the mean of both sides.
@@ -36,24 +39,33 @@ class LatticeProjector:
         self.grid, self.views, self.backend = grid, views, backend
         self.array_shape = grid.shape
         self._poses = Poses.of(views) if isinstance(views, Views) else _checked(views)
-        pixel = views.pixel_size
-        self._arrays = (self._poses.rotations.detach().clone(), self._poses.shifts.detach() / pixel)
+        pixel, poses = views.pitch, self._poses
+        self._arrays = (poses.matrices.detach().clone(), poses.offsets.detach() / pixel)
         self._native = native.Views(len(views), *views.shape, *(a.data_ptr() for a in self._arrays))
         origin, pitch = ((native.c_double * 3)(*(a / pixel for a in ends)) for ends in (grid.origin, grid.voxel_size))
         self._lattice = native.Lattice(*grid.shape, origin, pitch)
         self._mass = _mass(grid, pixel)
+        self._spread = None if poses.scales is None else poses.scales.detach()[:, None, None].float() ** -2
 
     def lines(self, array: Tensor) -> Tensor:
         """As `project`, differentiable: in `array`, and in the poses that ask for gradients."""
         if self.backend == "reference":
             return lattice_reference(array, self.grid, self._poses)
-        return _Lines.apply(array, self._poses.rotations, self._poses.shifts, self)  # type: ignore[no-any-return]
+        poses = self._poses
+        lines = _Lines.apply(array, poses.matrices, poses.offsets, self)
+        assert isinstance(lines, Tensor)
+        return lines if poses.scales is None else lines * poses.scales[:, None, None].float() ** -2
 
     def project(self, array: Tensor) -> Tensor:
         """Line integrals [V, H, W] in metres × value of `array` [Z, Y, X]."""
         _check_shape("volume", array, self.grid.shape)
         if self.backend == "reference":
             return lattice_reference(array, self.grid, self.views)
+        images = self.on_pixels(array)
+        return images if self._spread is None else images.mul_(self._spread)
+
+    def on_pixels(self, array: Tensor) -> Tensor:
+        """As `project`, before a voxel's mass is spread over larger pixels; by the compiled kernel."""
         images = torch.empty(len(self.views), *self.views.shape)
         self._call("holosplat_lattice_project", array, images)
         return images.mul_(self._mass)
@@ -64,21 +76,25 @@ class LatticeProjector:
         if self.backend == "reference":
             anything = torch.zeros(self.grid.shape, requires_grad=True)
             return torch.autograd.grad(lattice_reference(anything, self.grid, self.views), anything, lines)[0]
+        return self.from_pixels(lines if self._spread is None else lines * self._spread)
+
+    def from_pixels(self, lines: Tensor) -> Tensor:
+        """The adjoint of `on_pixels`."""
         volume = torch.empty(self.grid.shape)
         self._call("holosplat_lattice_backproject", lines, volume)
         return volume.mul_(self._mass)
 
     def pose_gradients(self, array: Tensor, upstream: Tensor) -> tuple[Tensor, Tensor]:
-        """Gradients of rotations [V, 3, 3] and shifts [V, 2] [1/m], of the lines' gradient `upstream` [V, H, W].
+        """Gradients of matrices [V, 3, 3] and offsets [V, 2] [1/m], of the gradient [V, H, W] of `on_pixels`.
 
-        float64; the rotations' last rows, which move voxels along the beam, are zero. By the compiled kernel.
+        float64; the matrices' last rows, which move voxels along the beam, are zero. By the compiled kernel.
         """
         rotations = torch.zeros(len(self.views), 2, 3, dtype=torch.float64)
         shifts = torch.zeros(len(self.views), 2, dtype=torch.float64)
         if min(self.views.shape) > 1:
             self._call("holosplat_lattice_poses", array, upstream, rotations, shifts)
         last = torch.zeros(len(self.views), 1, 3, dtype=torch.float64)
-        return torch.cat((rotations, last), 1).mul_(self._mass), shifts.mul_(self._mass / self.views.pixel_size)
+        return torch.cat((rotations, last), 1).mul_(self._mass), shifts.mul_(self._mass / self.views.pitch)
 
     def volume_in(self, volume: Tensor) -> Tensor:
         """The volume as it is: this projector's order is [Z, Y, X]."""
@@ -103,17 +119,17 @@ class _Lines(torch.autograd.Function):
 
     @staticmethod
     def forward(  # type: ignore[override]
-        ctx: Any, array: Tensor, rotations: Tensor, shifts: Tensor, projector: LatticeProjector
+        ctx: Any, array: Tensor, matrices: Tensor, offsets: Tensor, projector: LatticeProjector
     ) -> Tensor:
         ctx.projector = projector
         ctx.save_for_backward(array if any(ctx.needs_input_grad[1:3]) else None)
-        return projector.project(array)
+        return projector.on_pixels(array)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         (array,), upstream = ctx.saved_tensors, upstream.float().contiguous()
-        of_array = ctx.projector.backproject(upstream) if ctx.needs_input_grad[0] else None
+        of_array = ctx.projector.from_pixels(upstream) if ctx.needs_input_grad[0] else None
         poses = (None, None) if array is None else ctx.projector.pose_gradients(array, upstream)
         return of_array, *poses, None
 
@@ -143,14 +159,14 @@ def _mass(grid: Grid, pixel: float) -> float:
 def lattice_reference(volume: Tensor, grid: Grid, views: Views | Poses) -> Tensor:
     """The plain form of `LatticeProjector.lines`, any float type: [Z, Y, X] → [V, H, W]."""
     poses = Poses.of(views) if isinstance(views, Views) else views
-    pixel, (h, w) = poses.pixel_size, poses.shape
+    pixel, (h, w) = poses.pitch, poses.shape
     x, y, z = (torch.as_tensor(axis / pixel, dtype=volume.dtype) for axis in grid.axes())
     zz, yy, xx = torch.meshgrid(z, y, x, indexing="ij")
     points = torch.stack([xx, yy, zz]).reshape(3, -1)
     # On either side of a kink the values are the same, and the derivatives are not.
     sides = (KINK, -KINK) if poses.requires_grad else (0.0,)
     images = []
-    for rotation, shift in zip(poses.rotations, poses.shifts / pixel):
+    for rotation, shift in zip(poses.matrices, poses.offsets / pixel):
         lab = rotation.to(volume.dtype)[:2] @ points
         column, row = lab[0] - shift[0] + 0.5 * w - 0.5, lab[1] - shift[1] + 0.5 * h - 0.5
         slack = 1e-6
@@ -163,4 +179,5 @@ def lattice_reference(volume: Tensor, grid: Grid, views: Views | Poses) -> Tenso
             for offset, weight in ((0, (1 - a) * (1 - b)), (1, a * (1 - b)), (w, (1 - a) * b), (w + 1, a * b)):
                 image = image.index_add(0, at + offset, value * weight)
         images.append(image.reshape(h, w))
-    return torch.stack(images) * _mass(grid, pixel)
+    lines = torch.stack(images) * _mass(grid, pixel)
+    return lines if poses.scales is None else lines * poses.scales[:, None, None].to(lines) ** -2

@@ -32,8 +32,9 @@ def _cast(values: Tensor, grid: Grid, views: Views, v: int, step: float) -> Tens
     length = step * float(size.min())
     reach = float(np.linalg.norm(half))
     rotation, shift = views.rotations[v], views.shifts[v]
-    x = (np.arange(w) + 0.5 - w / 2) * views.pixel_size + shift[0]
-    y = (np.arange(h) + 0.5 - h / 2) * views.pixel_size + shift[1]
+    pixel = float(views.pixel_sizes[v])
+    x = (np.arange(w) + 0.5 - w / 2) * pixel + shift[0]
+    y = (np.arange(h) + 0.5 - h / 2) * pixel + shift[1]
     count = 2 * int(np.ceil(reach / length)) + 1
     z = (np.arange(count) - count // 2) * length + float((rotation @ centre)[2])
     # x_obj = Rᵀ x_lab is affine in (x, y, z): normalised to [-1, 1] for grid_sample, one row of pixels at a time.
