@@ -24,6 +24,7 @@ from holosplat.specimens.red_cells import icosphere
 
 PIXEL, SHAPE = 1e-6, (45, 48)
 MATERIAL = hs.DeltaBeta(5e-7, 5e-10)
+QUICK = CalibrationOptions(retrieval=0)
 KNOWN = hs.MaterialPrior.known(MATERIAL)
 BEADS = np.array([[9, -8, 3], [-10, 5, 7], [2, 10, -11], [-5, -11, -8]], dtype=float)
 
@@ -59,7 +60,7 @@ def with_mesh() -> tuple[Calibrated, hs.Exposures]:
     turn = Rotation.from_rotvec([0.7, -0.4, 1.9]).as_matrix()
     there = body.transformed(turn, PIXEL * np.array([2, -1, 1.5]) - turn @ centre_of_mass(body))
     scan = frames_of(hs.MeshScene.of_one_material([there], MATERIAL), true, planned())
-    return calibrate(scan, KNOWN, body), true
+    return calibrate(scan, KNOWN, body, QUICK), true
 
 
 def test_a_phantom_tells_the_geometry_to_the_bars(with_mesh):
@@ -90,7 +91,7 @@ def test_the_common_motion_goes_to_the_phantom(with_mesh):
 def test_beads_in_unknown_places_tell_it_too():
     """Ten times better than the bars; and where the beads are, but for a motion of all."""
     true = Misalignment(1.0, 0.6, 0.02, 3).true_exposures(planned())
-    found = calibrate(frames_of(beads(BEADS), true, planned()), KNOWN, 4.0 * PIXEL)
+    found = calibrate(frames_of(beads(BEADS), true, planned()), KNOWN, 4.0 * PIXEL, QUICK)
     assert len(found.phantom) == len(BEADS)
     errors = worst(found, true)
     assert errors[:2].max() < 0.005
@@ -104,7 +105,7 @@ def test_one_bead_tells_no_turns_and_a_pixel_may_be_told():
     """What is not told stays as planned, and is said. The pixel is said to be 3 % larger than it is."""
     said = planned(1.03 * PIXEL)
     scan = frames_of(beads(BEADS[:1], 6.0), planned(), said)
-    options = CalibrationOptions(Uncertain(5.0, 1.0, 1.0, 0.05), pixel=0.05)
+    options = CalibrationOptions(Uncertain(5.0, 1.0, 1.0, 0.05), pixel=0.05, retrieval=0)
     found = calibrate(scan, KNOWN, 6.0 * PIXEL, options)
     assert "one bead looks the same" in found.words[0]
     np.testing.assert_allclose(found.exposures.views.rotations, said.views.rotations, atol=1e-9)
@@ -178,4 +179,4 @@ def test_what_cannot_be_calibrated_is_refused(change, said):
     scan = frames_of(beads(BEADS[:2]), planned(), planned())
     given = {"prior": KNOWN, "body": 4.0 * PIXEL} | change
     with pytest.raises(hs.InputError, match=said):
-        calibrate(scan, given["prior"], given["body"])
+        calibrate(scan, given["prior"], given["body"], QUICK)

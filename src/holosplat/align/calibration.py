@@ -14,7 +14,7 @@ from ..matter import Known, MaterialPrior
 from ..mesh import TriangleMesh
 from ..model import Alignment, Instrument
 from ..optics.background import Light, LightOptions
-from ..optics.retrieval import paganin, tikhonov
+from ..optics.retrieval import Tikhonov, paganin, tikhonov
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..scan import Exposures, Scan
@@ -60,10 +60,13 @@ class CalibrationOptions:
     most_pixels: int = 400_000
     """Pixels of all frames, on the smallest pixels: larger frames are binned, and shifts found to a part of that."""
 
+    retrieval: int = 20
+    """Steps of the phase retrieval that a first place needs; 0: Paganin's filter, which will do without noise."""
+
     def __post_init__(self) -> None:
         at_least(self, 1, "rounds", "most_pixels")
         at_least(self, 8, "least_side")
-        at_least(self, 0, "pixel")
+        at_least(self, 0, "pixel", "retrieval")
         require(
             self.uncertain.magnification == 0, "calibrate finds one pixel size of all views; leave magnification 0."
         )
@@ -171,14 +174,14 @@ class _Search:
             on_progress("first pose", 0.0)
             pixels = options.bins(len(scan), scan.views.shape)[0]
             coarse = scan.binned(pixels)
-            phantom, shifts = placed(Phantom.of_mesh(body), _thickness(coarse, prior), coarse.views)
+            phantom, shifts = placed(Phantom.of_mesh(body), _thickness(coarse, prior, options), coarse.views)
             search = cls(scan, prior, phantom, options)
             search.numbers[:, SHIFT] = torch.from_numpy(shifts * pixels)
             return search
         on_progress("beads", 0.0)
         pixels = options.bins(len(scan), scan.views.shape)[-1]
         fine = scan.binned(pixels)
-        thickness = _thickness(fine, prior)
+        thickness = _thickness(fine, prior, options)
         shifts = shifts_by_mass(thickness, fine.views)
         views = replace(fine.views, shifts=fine.views.shifts + shifts * fine.views.pixel_size)
         centres = find_beads(torch.from_numpy(thickness).float(), views, body)
@@ -283,9 +286,12 @@ class _Search:
         )
 
 
-def _thickness(scan: Scan, prior: Known) -> np.ndarray:
+def _thickness(scan: Scan, prior: Known, options: CalibrationOptions) -> np.ndarray:
     """Retrieved thickness [V, H, W] [m], without what is faint."""
     frames = torch.from_numpy(scan.frames)
-    retrieve = paganin if prior.material.beta > 0 and scan.exposures.distance.all() else tikhonov
-    found = retrieve(frames, scan.exposures, *prior.material).double().numpy()
+    if options.retrieval:
+        how = Tikhonov(iterations=options.retrieval)
+        found = tikhonov(frames, scan.exposures, *prior.material, options=how).double().numpy()
+    else:
+        found = paganin(frames, scan.exposures, *prior.material).double().numpy()
     return np.where(found > FAINT * found.max(axis=(1, 2), keepdims=True), found, 0.0)

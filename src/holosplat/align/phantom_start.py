@@ -26,8 +26,8 @@ CHOSEN = 6
 """The best of them, which are improved."""
 SMALLEST = 0.7
 """Degrees by which the turn is improved in the end; least squares does the rest."""
-SEEN = 0.5
-"""Share of a bead's volume that must be found around its centre."""
+SEEN, LEAST = 0.5, 0.15
+"""Share of what the fullest bead holds that another must hold, for all are of one size, and of a ball's volume."""
 APART = 1.5
 """Least distance of two beads' centres [radii]; beads that touch have two."""
 
@@ -106,7 +106,7 @@ def _improved(misfit: Callable[[np.ndarray], float], turn: np.ndarray, value: fl
 def find_beads(thickness: Tensor, views: Views, radius: float) -> np.ndarray:
     """Centres [N, 3] [m] of balls of `radius` [m] in the volume of total-variation tomography of `thickness` [m].
 
-    A centre is where a ball holds more of the occupancy than anywhere within `APART` radii, and more than `SEEN`.
+    A centre is where a ball holds more of the occupancy than anywhere within `APART` radii, and enough (`SEEN`).
     Errors: `InputError` where there is none, and for balls of less than a pixel.
     """
     pixel = views.pixel_size
@@ -116,7 +116,7 @@ def find_beads(thickness: Tensor, views: Views, radius: float) -> np.ndarray:
     values = TOMOGRAPHIES["tv"](thickness, views, grid, 1.0, lambda fraction: None).numpy().astype(np.float64)
     ball = np.clip(reach + 0.5 - _distances(reach), 0, 1)
     held = fftconvolve(values, ball / ball.sum(), mode="same")
-    tops = np.argwhere((held == maximum_filter(held, 3)) & (held > SEEN))
+    tops = np.argwhere((held == maximum_filter(held, 3)) & (held > max(LEAST, SEEN * held.max())))
     peaks = np.zeros((0, 3))
     for top in tops[np.argsort(-held[tuple(tops.T)])]:  # the fullest first
         if np.all(np.linalg.norm(peaks - top, axis=1) > APART * reach):
