@@ -21,6 +21,7 @@ from ..projectors.voxels import LatticeProjector
 from ..scan import Exposures, Scan
 from .coarse import mirrored
 from .derivatives import in_pixels, predicted
+from .directions import hardly_told
 from .gauge import moved_onto
 from .poses import DISTANCE, FLUX, MAGNIFICATION, SHIFT, PoseOptions, PoseSearch
 from .shadows import EVEN_OR_NOT
@@ -125,6 +126,9 @@ def align_views(
     if options.uncertain.distance > 0 and not sharp:
         words.append(UNTOLD)
     errors = errors_of(search.covariances)
+    expected = options.uncertain.deviations()
+    expected[DISTANCE] = options.uncertain.distance if sharp else 0.0
+    words += hardly_told(search.covariances, expected)
     words += _kept(search, scan.exposures, levels[-1].pixels, sharp)
     found = search.exposures(scan.exposures)
     found = replace(found, views=moved_onto(found.views, scan.views))

@@ -10,7 +10,6 @@ import torch
 
 from ..baselines import HolographicTV, holographic_tv
 from ..checks import at_least, require
-from ..fit.freedom import Freedom, freed
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Leaves
 from ..fit.problem import Problem
@@ -149,7 +148,7 @@ class VoxelStage:
         assert isinstance(start, VoxelGrid)
         options = replace(self.options, upper=task.bound(self.options.upper) if start.matter.single else 0.0)
         steps = self.options.coarse_steps if self.coarse else self.options.steps
-        return voxel_fit(task.scan, start, replace(options, steps=steps), task.seed, task.uneven, task.freedom)
+        return voxel_fit(task.scan, start, replace(options, steps=steps), task.seed, task.uneven)
 
 
 def voxel_fit(
@@ -158,11 +157,8 @@ def voxel_fit(
     options: VoxelFit,
     seed: int = 0,
     light: Light | None = None,
-    freedom: Freedom | None = None,
 ) -> Fit:
     """The fit of `start`, on its own grid, to the training frames of `scan`, made ready.
-
-    freedom: of where these frames are, which is then fitted, too.
 
     Minimised is `mean over views of the misfit + λ/(k² V) Σ |∇u|`, k voxels a pixel and V views, so that λ does not
     depend on either.
@@ -181,7 +177,7 @@ def voxel_fit(
 
     terms = (base.frames, VoxelVariation(weight, options.smoothing), *base.extra(options.terms))
     plan = Plan(Problem(base.model, terms), schedule, optimiser, judge=base.judge)
-    return Fit(freed(plan, freedom, base.train), seed)
+    return Fit(plan, seed)
 
 
 def refinement(train: Scan, options: VoxelFit) -> int:
