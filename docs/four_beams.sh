@@ -30,5 +30,4 @@ beam 4 130 4
 for n in 1 2 3 4; do holosplat correct "raw$n.nxs" --out "corrected$n.nxs"; done
 holosplat join corrected1.nxs corrected2.nxs corrected3.nxs corrected4.nxs --out scan.nxs
 holosplat align scan.nxs --material haemoglobin --geometry-out geometry.toml --out aligned.nxs
-holosplat reconstruct scan.nxs --exposures geometry.toml --material haemoglobin --matter levels --out run
-holosplat reconstruct scan.nxs --material haemoglobin --matter levels --out as_planned
+holosplat reconstruct scan.nxs --exposures geometry.toml --material haemoglobin --preset fast --out run
