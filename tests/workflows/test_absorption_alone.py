@@ -15,7 +15,7 @@ from holosplat.checks import InputError
 from holosplat.geometry import Grid
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.matter import DeltaBeta, MaterialPrior
-from holosplat.methods import METHODS, Gaussians
+from holosplat.methods import METHODS, Auto, Gaussians
 from holosplat.methods.presets import preset
 from holosplat.optics.retrieval import RETRIEVALS, absorption_alone
 from holosplat.optics.retrieval.spectra import sensitivity
@@ -131,6 +131,17 @@ def test_a_fan_of_a_few_rows_reconstructs(shape):
     scores = evaluate(found, scan, None)
     assert scores.test is not None
     assert scores.test.mean["ssim"] > 0.9
+
+
+def test_a_wide_fan_of_few_rows_reconstructs_by_default():
+    """Frames are binned no further than their rows allow, where a default of a square frame's would be."""
+    ball = (4.0, 0.0, -9.0, 24.0, BETA)
+    scan = contact_scan([ball], (1, 137), photons=50_000)
+    found = reconstruct(scan, PRIORS["ratio"], Auto().with_effort(0.1))
+    volume = found.object.voxelise(Grid.of_views(scan.views))
+    assert mean_beta(volume, ball) == pytest.approx(1, abs=0.05)
+    assert found.verdict is not None
+    assert found.verdict.good
 
 
 def test_the_commands_run_in_contact_on_one_row(tmp_path):
