@@ -153,6 +153,8 @@ def _write_geometry(
     path: Path, source: Path, reading: Reading, measured: Scan, found: Exposures, errors: np.ndarray | None, said: str
 ) -> None:
     """That of whole frames: `found` is that of `measured`, which may be cut and have larger pixels."""
+    import numpy as np
+
     from ..io.beams import Beams, write_beams
     from ..io.formats import read_as
 
@@ -161,7 +163,7 @@ def _write_geometry(
     views = replace(whole.views, rotations=found.views.rotations, shifts=shifts)
     if errors is not None:
         larger = measured.views.pixel_size / whole.views.pixel_size
-        errors = errors * [larger, larger, 1, 1, 1, 1]
+        errors = np.concatenate([larger * errors[:, :2], errors[:, 2:]], axis=1)
     origin = {"scan": str(source), "aligned": said}
     beams = Beams.of(replace(whole, views=views, distance=found.distance), errors, origin)
     write_beams(path, beams)
