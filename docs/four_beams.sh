@@ -41,3 +41,24 @@ holosplat join corrected1.nxs corrected2.nxs corrected3.nxs corrected4.nxs --out
 holosplat join beads1.nxs beads2.nxs beads3.nxs beads4.nxs --out beads.nxs
 holosplat calibrate beads.nxs --beads 3.5e-6 --material polystyrene --out geometry.toml
 holosplat reconstruct scan.nxs --exposures geometry.toml --material haemoglobin --preset fast --out run
+
+# How near it came to the truth, which a beamline does not have.
+python - <<'PYTHON'
+from dataclasses import replace
+
+import numpy as np
+
+from holosplat.align.gauge import moved_onto
+from holosplat.align.views import changes
+from holosplat.io import read_beams, read_scan
+
+files = [read_scan(f"true{n}.nxs").exposures for n in (1, 2, 3, 4)]
+scan = read_scan("scan.nxs")
+rotations, shifts = (np.concatenate([getattr(each.views, name) for each in files]) for name in ("rotations", "shifts"))
+views = replace(scan.views, rotations=rotations, shifts=shifts)
+true = replace(scan.exposures, views=views, distance=np.concatenate([each.distance for each in files]))
+for name, exposures in (("planned", scan.exposures), ("found", read_beams("geometry.toml").applied(scan).exposures)):
+    away = changes(replace(exposures, views=moved_onto(exposures.views, views)), true)
+    shift, across, roll, distance = (np.sqrt(np.square(away[:, at]).mean()) for at in ([0, 1], [2, 3], [4], [5]))
+    print(f"{name}: shifts {shift:.4f} px, turns {across:.4f}°, roll {roll:.4f}°, distance {distance:.2%} (rms errors)")
+PYTHON
