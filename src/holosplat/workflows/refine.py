@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..align.find import align_views
 from ..align.geometry import Geometry
 from ..align.held_out import place_frames
 from ..align.poses import PoseOptions
-from ..align.views import KINDS, align_views
+from ..align.views import KINDS
 from ..checks import require
 from ..io.json import read_json, write_json
 from ..matter import MaterialPrior
