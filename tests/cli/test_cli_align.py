@@ -12,7 +12,9 @@ import pytest
 import holosplat as hs
 from helpers.cli import FORMULA, QUICK, holosplat, known, refused, worked
 from helpers.contact import PIXEL, contact_scan
+from helpers.moving_balls import beams, series
 from holosplat.align import PoseOptions, Uncertain
+from holosplat.beamline.misalignment import Misalignment
 from holosplat.cli.options import PriorOptions
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.workflows.run_folder import RunFolder
@@ -100,11 +102,13 @@ def test_refinements_that_make_no_sense_are_refused(shop, tmp_path, options, sai
 def test_single_views_are_moved_and_told(shop, tmp_path):
     """Of the shared scan, whose views are said to be moved by a pixel."""
     scan = read_scan(shop.scan)
-    path, out, table, beams = (tmp_path / name for name in ("moved.nxs", "aligned.nxs", "views.csv", "geometry.toml"))
+    path, out, table, geometry = (
+        tmp_path / name for name in ("moved.nxs", "aligned.nxs", "views.csv", "geometry.toml")
+    )
     planned = read_scan(moved(shop, path)).views.shifts
     matter = ("--material", FORMULA, "--density", "1.335")
     unsure = ("--uncertain-shift", 2, "--uncertain-angle", 0, "--uncertain-roll", 0)
-    written = ("--table", table, "--geometry-out", beams, "--out", out)
+    written = ("--table", table, "--geometry-out", geometry, "--out", out)
     done = worked(holosplat("align", path, *matter, *unsure, *written))
     assert "changes of the plan" in done.out
     found = read_scan(out)
@@ -117,7 +121,7 @@ def test_single_views_are_moved_and_told(shop, tmp_path):
     assert len(rows) == len(scan)
     assert float(rows[0]["after"]) < float(rows[0]["before"])
     assert found.provenance["aligned"].startswith("changes of the plan")
-    worked(holosplat("convert", path, tmp_path / "there.nxs", "--to", "nxtomo", "--exposures", beams))
+    worked(holosplat("convert", path, tmp_path / "there.nxs", "--to", "nxtomo", "--exposures", geometry))
     there = read_scan(tmp_path / "there.nxs")
     np.testing.assert_allclose(there.views.shifts, found.views.shifts, atol=1e-15)
     np.testing.assert_allclose(there.views.rotations, found.views.rotations, atol=1e-15)
@@ -125,13 +129,33 @@ def test_single_views_are_moved_and_told(shop, tmp_path):
 
 def test_the_geometry_of_a_part_is_that_of_whole_frames(turning, tmp_path):
     """It is found on larger pixels of fewer rows and columns, and serves the whole scan."""
-    (path, true), beams, out = turning, tmp_path / "geometry.toml", tmp_path / "whole.nxs"
+    (path, true), geometry, out = turning, tmp_path / "geometry.toml", tmp_path / "whole.nxs"
     part = ("--crop", "2:22,4:46", "--bin", 2)
-    worked(holosplat("align", path, "--axis-only", *part, "--geometry-out", beams, "--out", tmp_path / "part.nxs"))
-    worked(holosplat("convert", path, out, "--to", "nxtomo", "--exposures", beams))
+    worked(holosplat("align", path, "--axis-only", *part, "--geometry-out", geometry, "--out", tmp_path / "part.nxs"))
+    worked(holosplat("convert", path, out, "--to", "nxtomo", "--exposures", geometry))
     np.testing.assert_allclose(read_scan(out).views.shifts, true.views.shifts, atol=0.1 * PIXEL)
-    few = ("--views", "0:36:2", "--geometry-out", beams)
+    few = ("--views", "0:36:2", "--geometry-out", geometry)
     refused(holosplat("align", path, "--axis-only", *few, "--out", tmp_path / "few.nxs"), "--geometry-out", "--views")
+
+
+def test_a_series_has_one_geometry_and_its_reversed_beam_is_turned_back(tmp_path):
+    """The geometry serves every time of another series of these beams."""
+    scan, _ = series(beams((0.0, 30.0, 48.0)), Misalignment(1.0, 0.6, 0.0, seed=2), 3)
+    frames = scan.frames.copy()
+    frames[2::3] = frames[2::3, ::-1]
+    path, upside, out, geometry = (tmp_path / name for name in ("s.nxs", "u.nxs", "a.nxs", "geometry.toml"))
+    write_scan(path, scan)
+    write_scan(upside, replace(scan, frames=frames))
+    matter = ("--material", FORMULA, "--density", "1.335")
+    done = worked(holosplat("align", path, *matter, "--geometry-out", geometry, "--out", out))
+    assert "3 beams, from 3 times" in done.out
+    found = read_scan(out)
+    worked(holosplat("convert", path, tmp_path / "there.nxs", "--to", "nxtomo", "--exposures", geometry))
+    np.testing.assert_allclose(read_scan(tmp_path / "there.nxs").views.shifts, found.views.shifts, atol=1e-15)
+    refused(holosplat("align", upside, *matter, "--geometry-out", geometry, "--out", out), "reversed")
+    done = worked(holosplat("align", upside, *matter, "--out", out))
+    assert "beam 2 is reversed along y" in done.out
+    np.testing.assert_array_equal(read_scan(out).frames, scan.frames)
 
 
 def test_requests_that_cannot_be_met_are_refused(turning, tmp_path):

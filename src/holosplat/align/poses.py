@@ -54,6 +54,11 @@ class Uncertain:
             value = getattr(self, name)
             require(value <= most, f"uncertain {name} must be {most:g} at most, but it is {value:g}; correct it.")
 
+    def pose(self, pixels: float = 1.0) -> np.ndarray:
+        """Standard deviations [5] of shifts [pixels that are so many times larger] and turns about x, y, z [rad]."""
+        turns = np.deg2rad([self.angle, self.angle, self.roll])
+        return np.array([self.shift / pixels, self.shift / pixels, *turns])
+
     def deviations(self, turning: bool = True) -> Tensor:
         """Standard deviations [8] of `NUMBERS`, shifts in detector pixels; turning: whether turns and magnification,
         which act far from the middle, are free."""
@@ -66,6 +71,27 @@ class Uncertain:
         """The same for a fit of matter and geometry; so_far: [V, 7] changes of the plan [pixels, rad, shares]."""
         angle, roll = np.deg2rad([self.angle, self.roll])
         return Freedom(self.shift, float(angle), float(roll), self.distance, so_far, self.magnification)
+
+
+@dataclass(frozen=True)
+class Drift:
+    """Standard deviations of how far each beam of a series goes from the first time to the last; 0: it stays."""
+
+    shift: float = 0.0
+    """Detector's shifts along rows and columns [pixels]."""
+    angle: float = 0.0
+    """Turns about all three axes [degrees]."""
+
+    def __post_init__(self) -> None:
+        at_least(self, 0, "shift", "angle")
+        for name, most in (("shift", 100.0), ("angle", 20.0)):
+            value = getattr(self, name)
+            require(value <= most, f"drift {name} must be {most:g} at most, but it is {value:g}; correct it.")
+
+    def pose(self, pixels: float = 1.0) -> np.ndarray:
+        """Standard deviations [5] of half the way, by which the ends differ from the middle, as `Uncertain.pose`."""
+        half = 0.5 * np.array([self.shift / pixels, np.deg2rad(self.angle)])
+        return half[[0, 0, 1, 1, 1]]
 
 
 TURNING = 30
@@ -116,12 +142,16 @@ class PoseOptions:
     """Uncertain shifts [pixels] beyond which centres of mass give the first ones: they are good to a pixel or two."""
     retrieval: int = 40
     """Steps of the phase retrieval."""
+    times: int = 8
+    """Times of a series that are used at most: those that say most, evenly spread."""
+    drift: Drift = field(default_factory=Drift)
+    """How far the beams of a series may drift."""
     edges: int = 60
     """Steps of surfaces with the geometry free, after the voxels, where matter has one known density: poses of cells
     settle in fifty (0: none)."""
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "rounds", "max_voxels", "steps", "first", "retrieval", "few_views")
+        at_least(self, 1, "rounds", "max_voxels", "steps", "first", "retrieval", "few_views", "times")
         at_least(self, 4, "least_side")
         at_least(self, 0, "weight", "edges")
         in_range("blur", self.blur, 0.3, 10.0, unit="pixels")

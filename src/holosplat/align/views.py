@@ -1,4 +1,4 @@
-"""`align_views`: a scan in, exposures as the frames say they are out, with errors and what the frames cannot tell."""
+"""`align_still`: a scan in, exposures as the frames say they are out, with errors and what the frames cannot tell."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class AlignedViews:
         return said
 
 
-def align_views(
+def align_still(
     scan: Scan,
     prior: MaterialPrior,
     options: PoseOptions = DEFAULT,
@@ -102,10 +102,9 @@ def align_views(
     the whole object, which no frame can tell, is chosen so that the mean turn and the mean shift are those planned.
     What differs from the plan by less than the accuracy that was measured (`ACCURACY`) stays as planned.
 
-    prior: what is known of the matter; where its δ is not, the occupancy has no bound. Errors: `InputError` for frames
-    of several times, and for fewer than two training frames.
+    prior: what is known of the matter; where its δ is not, the occupancy has no bound. Errors: `InputError` for fewer
+    than two training frames.
     """
-    require(not scan.is_series, "align needs frames of one time; choose one with --time-frame.")
     count = int((~scan.is_test).sum())
     require(count >= FEWEST, f"align needs {FEWEST} training frames at least, but there are {count}.")
     frames = torch.from_numpy(scan.frames)

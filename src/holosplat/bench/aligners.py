@@ -12,8 +12,8 @@ from torch import Tensor
 
 from ..align.coarse import shifts_by_mass
 from ..align.derivatives import in_pixels, projections
+from ..align.find import align_views
 from ..align.newton import blurred
-from ..align.views import align_views
 from ..baselines import TOMOGRAPHIES
 from ..geometry import Grid, Views
 from ..matter import Known, MaterialPrior

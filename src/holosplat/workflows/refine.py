@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..align.find import align_views
 from ..align.geometry import Geometry
 from ..align.held_out import fitted_frames, place_frames
 from ..align.poses import PoseOptions
 from ..align.poses import Uncertain as Where
-from ..align.views import KINDS, align_views
+from ..align.views import KINDS
 from ..checks import require
 from ..fit.freedom import Freedom
 from ..io.json import read_json, write_json

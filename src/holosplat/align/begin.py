@@ -1,0 +1,163 @@
+"""What retrieved thickness tells before there is a volume: beams that are reversed, and their numbers by rows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from ..geometry import Views
+from ..matter import DeltaBeta
+from ..optics.retrieval import Tikhonov, tikhonov
+from ..scan import Scan
+from .coarse import SIDES
+from .derivatives import in_pixels
+from .row_sums import FACTOR, RowEstimate, RowPrior, by_rows, plane_angles
+from .untold import Told
+
+REVERSED = 0.5
+"""A beam is said to be reversed if rows then disagree by less than this part of what they do as the frames are."""
+SMALL = 0.03
+"""Disagreement of rows, as a share of their moments, below which nothing is looked for that is reversed."""
+EDGE, PASSING = 1 / 16, 0.25
+"""Share of the columns on either side of a frame that are its edge; matter passes it where thickness there is more than
+this part of the mean (0.03 to 0.1 with the retrieval's errors alone, 0.4 and more with cells that pass)."""
+FIRMLY = 25.0
+"""Information, in units of the prior's, from which the angles between two or three beams are free: errors are then a
+fifth of what they were. The noise of rows is not independent, so that less of it may be none."""
+ANGLE = 3
+"""Place of the turn about the axis that all beams are normal to."""
+
+
+@dataclass(frozen=True)
+class Begun:
+    """What rows say of V views, lengths in pixels of the images.
+
+    numbers, rates: [V, 5] shifts and turns [rad] at the middle of the times, and how much more at their end
+    errors, rate_errors: [V, 5] of them
+    before, after: [V] rms of what rows have against being of one object, as a share of their moments
+    sides: [V] which mirror image each frame is, or ""
+    believed: whether matter lies in the field of every view, else rows need not agree
+    words: what they cannot tell
+    """
+
+    numbers: np.ndarray
+    rates: np.ndarray
+    errors: np.ndarray
+    rate_errors: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    sides: tuple[str, ...]
+    believed: bool
+    words: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Images:
+    """Retrieved thickness [T, V, H, W] of T times, whose views are planned (pixels of the images), and when [T] they
+    were taken, from -1 to 1; is_test: [V], views that have no part in the numbers of others."""
+
+    values: np.ndarray
+    views: Views
+    is_test: np.ndarray
+    when: np.ndarray
+
+    @classmethod
+    def of(cls, scans: Sequence[Scan], when: Sequence[float], material: DeltaBeta, steps: int) -> Images:
+        """Retrieved in `steps`, of scans of the same views."""
+        how, first = Tikhonov(iterations=steps), scans[0]
+        found = [tikhonov(torch.from_numpy(scan.frames), scan.exposures, *material, options=how) for scan in scans]
+        values = torch.stack(found).double().numpy() / first.views.pixel_size
+        return cls(values, in_pixels(first.views), first.is_test, np.asarray(when))
+
+    def passing(self) -> bool:
+        """Whether matter passes the left or the right edge of some view."""
+        columns, width = self.values.mean(axis=(0, 2)), max(2, round(EDGE * self.values.shape[-1]))
+        edges = np.stack([columns[:, :width].mean(1), columns[:, -width:].mean(1)])
+        return bool((edges > PASSING * columns.mean(1)).any())
+
+    def reversed(self, view: int, side: str) -> Images:
+        """The same with the images of one view reversed."""
+        values = self.values.copy()
+        values[:, view] = np.flip(values[:, view], SIDES[side])
+        return replace(self, values=values)
+
+    def estimate(self, prior: RowPrior, index: np.ndarray) -> RowEstimate:
+        """By the rows of the views `index`, of which `prior` is."""
+        return by_rows(self.values[:, index], self.views[index], prior, self.when)
+
+
+def begun(images: Images, expected: np.ndarray, drifts: np.ndarray, few: bool) -> Begun | None:
+    """What rows say; None for beams that do not lie in one plane.
+
+    expected: [5] standard deviations of shifts [pixels of the images] and turns [rad]; drifts: [5], as in `RowPrior`;
+    few: the angles between beams stay as planned unless they are told.
+    """
+    if plane_angles(images.views) is None:
+        return None
+    train, everything = np.flatnonzero(~images.is_test), np.arange(len(images.views))
+    planned = images.estimate(RowPrior.of(np.zeros_like(expected), len(everything)), everything)
+    held = expected * (np.arange(len(expected)) != ANGLE) if few else expected
+    images, sides, first = _upright(images, train, RowPrior.of(held, len(train)))
+    told, free = Told.of(first.information, images.views[train], expected), held
+    if few and len(told.ratios) and told.ratios[0] >= FIRMLY:
+        free = expected
+    prior = replace(
+        RowPrior.of(free, len(train)), drifts=drifts * (free > 0), begin=np.stack([first.numbers, first.rates])
+    )
+    found = images.estimate(prior, train)
+    told = Told.of(found.information, images.views[train], expected)
+    whole = images.estimate(_of_others(found, free, images.is_test), everything)
+    errors, rate_errors = _errors(whole), np.zeros((len(images.views), len(free)))
+    errors[train] = told.errors
+    rate_errors[train] = Told.of(found.rate_information, images.views[train], prior.drifts).errors
+    errors[:, free == 0] = expected[free == 0]
+    return Begun(
+        whole.numbers[:, : len(free)],
+        whole.rates[:, : len(free)],
+        errors,
+        rate_errors,
+        planned.before,
+        whole.after,
+        tuple(sides),
+        not images.passing(),
+        tuple(told.words(FIRMLY if few else 0.0)) if few else (),
+    )
+
+
+def _of_others(found: RowEstimate, free: np.ndarray, is_test: np.ndarray) -> RowPrior:
+    """The prior of all views of which those for training are as `found`."""
+    begin = np.zeros((2, len(is_test), found.numbers.shape[1]))
+    begin[:, ~is_test] = found.numbers, found.rates
+    return RowPrior(np.where(is_test[:, None], free, 0.0), np.zeros(len(free)), begin)
+
+
+def _errors(found: RowEstimate) -> np.ndarray:
+    """[V, 5] of the numbers by the covariance."""
+    variances = np.diag(found.covariance).reshape(2, len(found.numbers), -1)[0, :, :FACTOR]
+    return np.sqrt(np.maximum(variances, 0))
+
+
+def _upright(images: Images, train: np.ndarray, prior: RowPrior) -> tuple[Images, list[str], RowEstimate]:
+    """The images with reversed views turned back, which these are, and the estimate by training views.
+
+    One view after another is reversed, that which makes rows agree best; the later one of two that are as good. Masses
+    of rows tell which are upside down. Columns that are reversed turn the signs of first moments; with two views, any
+    two agree. Nothing is looked for where matter passes the edges, and rows need not agree.
+    """
+    sides, found = [""] * len(images.views), images.estimate(prior, train)
+    kinds = tuple(SIDES) if len(train) > 2 else ("y",)
+    for _ in range(0 if images.passing() else len(train) // 2):
+        left = float(np.sqrt(np.mean(found.after**2)))
+        if left < SMALL:
+            break
+        tried = {(v, side): images.reversed(v, side) for v in train[::-1] if not sides[v] for side in kinds}
+        estimates = {key: each.estimate(prior, train) for key, each in tried.items()}
+        worst = {key: float(np.sqrt(np.mean(each.after**2))) for key, each in estimates.items()}
+        best = min(worst, key=lambda key: round(worst[key] / left, 3))
+        if worst[best] > REVERSED * left:
+            break
+        sides[best[0]], images, found = best[1], tried[best], estimates[best]
+    return images, sides, found
