@@ -155,7 +155,7 @@ def test_the_api_lists_every_public_module_once():
 
 def test_the_api_describes_the_top_level_names():
     index = site.api_pages()["api/index.md"]
-    assert "[`Views`][holosplat.geometry.Views]: V parallel-beam views on one detector raster." in index
+    assert "[`Views`][holosplat.geometry.Views]: V parallel-beam views on detectors of one shape." in index
     assert "[holosplat.optics](optics.md)" in index
 
 

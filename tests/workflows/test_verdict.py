@@ -178,3 +178,17 @@ def test_contact_frames_and_few_rows_have_a_verdict(shape, distance):
     assert found.good, found.words
     assert not wrong.good
     assert all(np.isfinite(value) for cause in wrong.tested.values() for value in cause.values())
+
+
+def test_matter_that_goes_on_beyond_the_frames_is_named():
+    """Rows of a scan that are cut in the middle of the bodies, and what a volume of these rows predicts."""
+    whole, truth = a_scan(soft(), 100_000), soft()
+    cut = whole.cropped(slice(8, 17), slice(0, 32))
+    grid = Grid.of_views(cut.views)
+    kept = VoxelGrid(truth.values[:, :, 8:17], grid, truth.matter)
+    found = judge(Prediction(kept, cut.exposures, 2), cut)
+    assert not found.good
+    assert "matter goes on above or below" in found.reasons[0]
+    wrong = on(whole, soft(0.6))  # as wrong, of whole bodies
+    assert not wrong.good
+    assert "goes on" not in wrong.reasons[0]

@@ -96,10 +96,33 @@ class Verdict:
             raise InputError(f"a verdict must be what reconstruct wrote, but it lacks or garbles {error}.") from error
 
 
+LEAVES = (
+    "Likely cause: matter goes on above or below the frames, for the outermost rows have as much of it as the others. "
+    "What lies beyond is taken for air, so that fringes and matter are wrong near these rows and, of soft matter, far "
+    "from them; take frames of more rows, to where the matter ends."
+)
+OUTER_ROWS, LEAVING, FEW_VIEWS = 2, 0.3, 4
+"""Rows at the top and at the bottom, the part of the mean thickness from which on matter goes on there, and the views
+that are looked at."""
+
+
 def judge(said: Prediction, frames: Scan, noise: NoiseModel | None = None) -> Verdict:
     """The verdict on what is said of `frames`, whose exposures the prediction has; noise: None to estimate it."""
     measured = torch.from_numpy(frames.frames)
-    return verdict(residuals(said, measured, (noise or _noise(measured)).power()))
+    found = verdict(residuals(said, measured, (noise or _noise(measured)).power()))
+    if found.good or not _leaves_the_field(said):
+        return found
+    return replace(found, reasons=(LEAVES, *found.reasons))
+
+
+def _leaves_the_field(said: Prediction) -> bool:
+    """Whether the object has about as much matter in the outermost rows of the frames as in the others."""
+    views = said.exposures.views
+    few = np.unique(np.linspace(0, len(views) - 1, min(len(views), FEW_VIEWS)).round().astype(int))
+    with torch.no_grad():
+        matter = said.object.project(views[few])[1].abs().cpu()
+    outer = torch.cat([matter[:, :OUTER_ROWS], matter[:, -OUTER_ROWS:]], dim=1)
+    return float(outer.mean()) > LEAVING * float(matter.mean())
 
 
 def _noise(frames: torch.Tensor) -> NoiseModel:
