@@ -1,11 +1,13 @@
 """How well `align` finds the poses of views that are not where they are said to be: docs/data/alignment.csv.
 
     python benchmarks/alignment.py [--cases NAME …]
-    python benchmarks/alignment.py --cases "volume 12" "volume 4" --moments planned aligned true
+    python benchmarks/alignment.py --cases "volume 12" "volume 4" --moments planned aligned refined true
 
 Scenes of the benchmark (sharp cells) are simulated with errors of each view that are known, and aligned; errors are
-those after the best motion of the whole object, magnifications beside their mean. Cases called "volume …" are also
-reconstructed, and their volumes compared with the truth: in the planned, the found, and the true exposures.
+those after the best motion of the whole object, magnifications beside their mean. `distance` is the rms relative error
+of the distances, `mean_distance` that of their mean. Cases with methods are also reconstructed, and their volumes
+compared with the truth: in the planned and found (`aligned`) and true exposures, and with the geometry free in the fit,
+too (`refined`, as --refine does).
 """
 
 from __future__ import annotations
@@ -30,6 +32,9 @@ from holosplat.methods import Auto, Gaussians, Method
 from holosplat.metrics import volume_scores
 
 USUAL = Uncertain()
+MOMENTS = ("planned", "aligned", "refined", "true")
+FINE = str(Path(__file__).with_name("alignment_fine.toml"))
+"""Red cells whose first fringe is 2.5 pixels wide."""
 TABLE = Path(__file__).resolve().parents[1] / "docs/data/alignment.csv"
 Row = dict[str, object]
 FIELDS: tuple[str, ...] = (
@@ -48,6 +53,9 @@ FIELDS: tuple[str, ...] = (
     "method",
     "error_delta",
     "dice",
+    "distance",
+    "mean_distance",
+    "cpu_seconds",
 )
 
 
@@ -66,6 +74,10 @@ class Experiment:
     held_out: int = 4
     methods: tuple[str, ...] = ()
 
+    def told(self) -> Uncertain:
+        """What `align` is told: distances are as uncertain as they are, and 2 % where all is as planned."""
+        return replace(self.uncertain, distance=self.errors.distance or 0.02)
+
     def scene_seed(self) -> int:
         """Seed of the scene: those of poses alone are of one scene."""
         return self.errors.seed if self.methods else 0
@@ -79,6 +91,11 @@ CASES = {
     "1 px, 0.6°, 4 views": Experiment("main4", Misalignment(1.0, 0.6, 0.02, 0)),
     "5 px, 1°, 2000 photons": Experiment("main12", Misalignment(5.0, 1.0, 0.05, 1), 2000.0, Uncertain(shift=5.0)),
     "perfect": Experiment("main12", Misalignment()),
+    "perfect, 12 views": Experiment("main12", Misalignment(seed=7), methods=("gaussians",)),
+    "perfect, 4 views": Experiment("main4", Misalignment(seed=7), held_out=2, methods=("gaussians",)),
+    "fine pixels": Experiment(FINE, Misalignment(1.0, 0.6, 0.02, 3)),
+    "fine pixels, 2000 photons": Experiment(FINE, Misalignment(1.0, 0.6, 0.02, 3), 2000.0),
+    "soft cells": Experiment("soft12", Misalignment(1.0, 0.6, 0.02, 4)),
     "1 px, 0.6°, 1 % magnification": Experiment(
         "main12", Misalignment(1.0, 0.6, 0.0, 0, magnification=0.01), uncertain=Uncertain(magnification=0.01)
     ),
@@ -104,6 +121,12 @@ def rms_errors(found: hs.Exposures, true: hs.Exposures) -> tuple[float, float, f
     return shift, across, roll, magnification
 
 
+def distance_errors(found: hs.Exposures, true: hs.Exposures) -> tuple[float, float]:
+    """Rms relative error of the distances, and that of their mean."""
+    away = found.distance / true.distance - 1
+    return float(np.sqrt(np.square(away).mean())), float(away.mean())
+
+
 def measured(experiment: Experiment) -> tuple[Case, hs.Scan, hs.Exposures]:
     """The case, its scan with the planned exposures, and the true ones."""
     case = load_case(experiment.scene, experiment.scene_seed())
@@ -119,13 +142,13 @@ def measured(experiment: Experiment) -> tuple[Case, hs.Scan, hs.Exposures]:
 def rows_of(name: str, experiment: Experiment, moments: list[str], commit: str) -> list[Row]:
     """Errors of training and of held-out views, before and after; scores of volumes at `moments`."""
     case, scan, true = measured(experiment)
-    began = time.perf_counter()
-    found = align_views(scan, case.prior, PoseOptions(experiment.uncertain))
-    seconds = time.perf_counter() - began
+    began, worked = time.perf_counter(), time.process_time()
+    found = align_views(scan, case.prior, PoseOptions(experiment.told()))
+    seconds, worked = time.perf_counter() - began, time.process_time() - worked
     print(*found.words, sep="\n", flush=True)
     placed = {"planned": scan.exposures, "aligned": found.exposures, "true": true}
     rows = list[Row]()
-    said: Row = {"case": name, "scene": experiment.scene, "seed": experiment.errors.seed}
+    said: Row = {"case": name, "scene": Path(experiment.scene).stem, "seed": experiment.errors.seed}
     said |= {"machine": f"{platform.machine()}, one core of two", "commit": commit}
     for moment in ("planned", "aligned"):
         for views, index in (("training", ~scan.is_test), ("all", np.ones(len(scan), dtype=bool))):
@@ -133,13 +156,19 @@ def rows_of(name: str, experiment: Experiment, moments: list[str], commit: str) 
             errors = rms_errors(placed[moment][chosen], true[chosen])
             names = ("shift_px", "across_deg", "roll_deg", "magnification")
             values = {key: f"{e:.5f}" if key == "magnification" else f"{e:.4f}" for key, e in zip(names, errors)}
-            rows.append(said | {"views": views, "moment": moment, "seconds": f"{seconds:.0f}"} | values)
+            away = distance_errors(placed[moment][chosen], true[chosen])
+            values |= {key: f"{e:.4f}" for key, e in zip(("distance", "mean_distance"), away, strict=True)}
+            values |= {"seconds": f"{seconds:.0f}", "cpu_seconds": f"{worked:.0f}"}
+            rows.append(said | {"views": views, "moment": moment} | values)
             print(rows[-1], flush=True)
     for method in experiment.methods:
         for moment in moments:
-            score = volume_row(case, scan, placed[moment], true, method)
-            rows.append(said | {"views": "volume", "moment": moment, "method": method} | score)
-            print(rows[-1], flush=True)
+            if moment == "refined":
+                new = refined_rows(case, scan, true, experiment, method)
+            else:
+                new = [{"views": "volume"} | volume_row(case, scan, placed[moment], true, method)]
+            rows += [said | {"moment": moment} | row for row in new]
+            print(*rows[-len(new) :], sep="\n", flush=True)
     return rows
 
 
@@ -155,11 +184,39 @@ def volume_row(case: Case, scan: hs.Scan, exposures: hs.Exposures, true: hs.Expo
     return {"method": f"{method} ({done.object.kind})", "seconds": f"{seconds:.0f}"} | numbers
 
 
+def refined_rows(case: Case, scan: hs.Scan, true: hs.Exposures, experiment: Experiment, method: str) -> list[Row]:
+    """The same with the geometry free in the fit, and the errors of where the frames then are."""
+    scan = hs.Scan(scan.frames, together(scan, true), scan.is_test)
+    began = time.perf_counter()
+    done = hs.reconstruct(scan, case.prior, METHODS[method], refine=PoseOptions(experiment.told()))
+    said: Row = {"method": f"{method} ({done.object.kind})", "seconds": f"{time.perf_counter() - began:.0f}"}
+    found, rows = done.placed(scan).exposures, list[Row]()
+    for views, index in (("training", ~scan.is_test), ("all", np.ones(len(scan), dtype=bool))):
+        chosen = np.flatnonzero(index)
+        errors = (*rms_errors(found[chosen], true[chosen]), *distance_errors(found[chosen], true[chosen]))
+        keys = ("shift_px", "across_deg", "roll_deg", "distance", "mean_distance")
+        rows.append(said | {"views": views} | {key: f"{e:.4f}" for key, e in zip(keys, errors, strict=True)})
+    truth = case.truth()
+    scores = volume_scores(done.object.voxelise(truth.grid), truth)
+    numbers: Row = {"error_delta": f"{scores.relative_error_delta:.4f}", "dice": f"{scores.dice:.4f}"}
+    return [*rows, said | {"views": "volume"} | numbers]
+
+
+def together(scan: hs.Scan, true: hs.Exposures) -> hs.Exposures:
+    """The planned exposures, moved as a whole so that the mean turn and shift of the training views are the true ones:
+    those of what is found are then the true ones, too."""
+    views, train = moved_onto(scan.views, true.views), np.flatnonzero(~scan.is_test)
+    rotations, shifts = views.rotations.copy(), views.shifts.copy()
+    trained = moved_onto(scan.views[train], true.views[train])
+    rotations[train], shifts[train] = trained.rotations, trained.shifts
+    return replace(scan.exposures, views=replace(views, rotations=rotations, shifts=shifts))
+
+
 def main() -> None:
     """Run cases; rows of others stay."""
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--cases", nargs="*", default=list(CASES))
-    parser.add_argument("--moments", nargs="*", default=["aligned"], choices=["planned", "aligned", "true"])
+    parser.add_argument("--moments", nargs="*", default=["aligned"], choices=MOMENTS)
     wanted = parser.parse_args()
     commit = source_commit()  # before the table is written, which is part of the tree
     for name in wanted.cases:

@@ -47,7 +47,7 @@ OURS = ("gaussians", "surfaces")
 STANDING = {"ssim": 1, "frcm": 1, "dice": 1, "relative_error_delta": -1}
 """The scores in which methods are compared, and whether more of it is better."""
 SCORES = ("ssim", "frcm", "psnr", "l1")
-VOLUME = ("dice", "relative_error_delta", "delta_deviation", "ratio", "resolution_half")
+VOLUME = ("dice", "relative_error_delta", "relative_error_beta", "delta_deviation", "ratio", "resolution_half")
 
 
 def main(bench: Path) -> None:

@@ -85,3 +85,4 @@ def test_data_that_are_absent_are_named(tmp_path, monkeypatch):
     done = holosplat("bench", "run", *told, "--data", tmp_path)
     assert done.code == 2
     assert "capsule-dome is skipped, for its data are not at hand" in done.err
+    assert "none of the cases has its data at hand" in done.err

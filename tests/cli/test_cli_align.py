@@ -73,6 +73,7 @@ def test_a_run_refines_its_geometry_and_keeps_it(shop, tmp_path):
         before, after = (np.ptp((shifts - true.views.shifts)[chosen, 0]) for shifts in (planned.views.shifts, found))
         assert after < 0.5 * max(before, true.views.pixel_size)
     np.testing.assert_allclose(geometry["rotations"], true.views.rotations, atol=1e-9)
+    assert "geometry" in (run / "metrics.csv").read_text().splitlines()[0].split(",")  # it was free in the fit, too
     assert "Geometry beside the plan" in (run / "report.html").read_text()
     assert "not the scan" not in worked(holosplat("evaluate", run, "--json")).err
     worked(holosplat("render", run, "--scan", path, "--split", "all", "--out", frames))

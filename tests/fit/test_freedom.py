@@ -39,7 +39,7 @@ def misaligned(distance: float = 0.1) -> tuple[Scan, Exposures]:
 
 
 def free(count: int = 5, **known: float) -> Freedom:
-    return replace(Freedom(1.0, 0.02, 0.02, 0.03, np.zeros((count, 7))), **known)
+    return replace(Freedom(1.0, 0.02, 0.02, 0.03, np.zeros((count, 7)), edges=True), **known)
 
 
 OPTIONS = SurfaceFit(schedule=Schedule(steps=30, oversample=3, decay=0.2))
@@ -107,7 +107,9 @@ def test_the_mean_distance_stays_where_fringes_are_narrower_than_pixels():
     assert stretches.abs().max() > 1e-4
     assert abs(float(stretches.mean())) < 1e-12
     assert not free().tells_mean(scan.exposures)
-    assert free().tells_mean(misaligned(0.1)[0].exposures)
+    wide = misaligned(0.1)[0].exposures
+    assert free().tells_mean(wide)
+    assert not replace(free(), edges=False).tells_mean(wide)
     assert mean_distance_error(scan.exposures) == pytest.approx(0.015 * 1e-12 / (6.199e-11 * 0.001), rel=1e-3)
 
 

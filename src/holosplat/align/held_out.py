@@ -15,21 +15,30 @@ from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..representations import Stored
 from ..scan import Scan
+from .beside import Beside, numbers_of
 from .coarse import centres_of_mass
-from .derivatives import in_pixels, predicted
+from .derivatives import NUMBERS, in_pixels
+from .newton import unexplained
 from .poses import DISTANCE, FLUX, SHIFT, PoseOptions, PoseSearch
-from .views import AlignedViews, changes
+from .views import AlignedViews, changes, errors_of
 
 STAGE = "poses of held-out frames"
 
 
 def place_frames(
-    found: Stored, scan: Scan, options: PoseOptions, on_progress: Progress = lambda stage, fraction: None
+    found: Stored,
+    scan: Scan,
+    options: PoseOptions,
+    on_progress: Progress = lambda stage, fraction: None,
+    oversample: int = 0,
 ) -> AlignedViews:
     """Where all frames of `scan` are beside the matter that was `found`, which stays as it is.
 
     The matter counts as one material. Steps are those of `align_views`, from large pixels to small ones, with no
-    common motion to be chosen: the matter has its place. Each frame is free by itself.
+    common motion to be chosen: the matter has its place. Each frame is free by itself. The last steps are taken beside
+    the matter as it is, and not beside voxels of it (`Beside`), where they explain a frame better.
+
+    oversample: wave samples a pixel (0: as the first fringe needs).
     """
     scan = scan.with_split(np.zeros(len(scan), dtype=bool))
     material = DeltaBeta(found.matter.delta, found.matter.beta)
@@ -48,20 +57,23 @@ def place_frames(
             search.move(occupied, grid, search.exposures(binned.exposures), frames, oversample)
             done += 1
             on_progress(STAGE, done / rounds)
-    told = options.uncertain.distance > 0
-    search.numbers[:, DISTANCE] *= told
-    before, after = (_left(search, occupied, grid, binned, moved) for moved in (False, True))
+    search.numbers[:, DISTANCE] = 0
+    beside = Beside(found, scan.exposures, oversample or fringe_sampling(scan.exposures))
+    measured, nothing = torch.from_numpy(scan.frames), torch.zeros_like(search.numbers)
+    moved = beside.placed(measured, search.numbers, _expected(options))
+    tried = [unexplained(measured, beside.frames(numbers)) for numbers in (nothing, search.numbers, moved.numbers)]
+    before, after = tried[0], np.minimum(tried[1], tried[2])
+    search.numbers = torch.where(torch.from_numpy(tried[2] <= tried[1])[:, None], moved.numbers, search.numbers)
     worse = after > before
     search.numbers[torch.from_numpy(worse)] = 0
     exposures = search.exposures(scan.exposures)
-    errors = search.covariances.diagonal(dim1=1, dim2=2).clamp_min(0).sqrt().numpy()[:, :FLUX]
     words = [
         f"held-out frame {k} of {len(scan)} is as planned: no pose explains it better" for k in np.flatnonzero(worse)
     ]
     return AlignedViews(
         exposures,
         changes(exposures, scan.exposures),
-        errors * np.array([1, 1, *[np.rad2deg(1)] * 3, float(told), 1]) * ~worse[:, None],
+        errors_of(moved.covariances) * ~worse[:, None],
         np.exp(search.numbers[:, FLUX].numpy()) - 1,
         before,
         np.minimum(before, after),
@@ -86,10 +98,23 @@ def _by_mass(found: Stored, scan: Scan, material: DeltaBeta, options: PoseOption
     return torch.from_numpy(expected - seen)
 
 
-def _left(search: PoseSearch, occupied: Tensor, grid: Grid, scan: Scan, moved: bool) -> np.ndarray:
-    """[V] rms of what is unexplained of each frame, as a share of its contrast, as planned or as found."""
-    exposures = search.exposures(scan.exposures) if moved else scan.exposures
-    frames = torch.from_numpy(scan.frames)
-    images = predicted(occupied, grid, exposures, search.material, fringe_sampling(scan.exposures)).frames
-    left = (frames - images).square().mean((1, 2)).sqrt() / frames.std(dim=(1, 2)).clamp_min(1e-12)
-    return left.double().numpy()
+def _expected(options: PoseOptions) -> Tensor:
+    """Standard deviations [7] of the numbers of a view; 0 for what stays."""
+    expected = options.uncertain.deviations()
+    expected[DISTANCE] = options.uncertain.distance
+    return expected
+
+
+def fitted_frames(found: Stored, planned: Scan, fitted: Scan, options: PoseOptions, oversample: int) -> AlignedViews:
+    """What is to be said of the frames of `planned` that a fit has put where those of `fitted` are, in the same light.
+
+    Errors are those beside the matter that was `found`, as it is.
+    """
+    numbers = torch.zeros(len(planned), len(NUMBERS), dtype=torch.float64)
+    numbers[:, :FLUX] = numbers_of(fitted.exposures, planned.exposures)
+    measured, nothing = torch.from_numpy(fitted.frames), torch.zeros_like(numbers)
+    beside = Beside(found, planned.exposures, oversample or fringe_sampling(planned.exposures))
+    errors = errors_of(beside.placed(measured, numbers, _expected(options), steps=0).covariances)
+    before, after = (unexplained(measured, beside.frames(each)) for each in (nothing, numbers))
+    moved = changes(fitted.exposures, planned.exposures)
+    return AlignedViews(fitted.exposures, moved, errors, np.zeros(len(planned)), before, after, ())

@@ -96,6 +96,11 @@ class Drift:
 
 TURNING = 30
 """Pixels along a frame's shorter side from which on turns are looked for: on larger pixels there are shifts alone."""
+NEAR, SETTLED = 0.05, 0.01
+"""Rms steps of shifts [pixels of a level] at which a level ends: surfaces find the rest of the former in a few steps;
+steps of the latter are a third of what voxels leave in the end."""
+SLOWER = 0.9
+"""Steps of shifts that are not shorter than this part of those before fall no longer."""
 BLUR_AS_DISTANCE = 0.02
 """Share of the distance that is free where the distance is known: it takes up what the edges of voxels are too soft
 for, which would else be taken for something else. What is found of it is forgotten."""
@@ -116,7 +121,7 @@ class PoseOptions:
     uncertain: Uncertain = field(default_factory=Uncertain)
     """What is not known, and by how much."""
     rounds: int = 8
-    """Rounds of volume and poses on each size of pixels."""
+    """Rounds of volume and poses on each size of pixels, at most."""
     least_side: int = 16
     """Pixels along a frame's shorter side on the largest pixels, which catch the largest errors."""
     max_voxels: int = 4_000_000
@@ -219,12 +224,24 @@ class PoseSearch:
         return unexplained(torch.from_numpy(scan.frames), self.numbers[:, FLUX].exp().float()[:, None, None] * images)
 
     def run(self, level: Level, on_progress: Advance) -> None:
-        """All rounds of a level."""
-        at, trained = self.prepared(level), torch.from_numpy(~self.scan.is_test)
+        """The rounds of a level, until shifts have settled, or their steps fall no longer."""
+        at, last = self.prepared(level), math.inf
+        trained = torch.from_numpy(~self.scan.is_test)
         for done in range(level.rounds):
+            before = self.numbers[:, SHIFT].clone()
             self.solve(self.looked(at), at.shape)
             self.numbers[:, MAGNIFICATION] -= self.numbers[trained, MAGNIFICATION].mean()
+            moved = float((self.numbers[:, SHIFT] - before).square().mean().sqrt()) / level.pixels
             on_progress((done + 1) / level.rounds)
+            if moved < (NEAR if self.edges_follow else SETTLED) or moved > SLOWER * last:
+                break
+            last = moved
+        on_progress(1.0)
+
+    @property
+    def edges_follow(self) -> bool:
+        """Whether surfaces of one known density go on from the voxels."""
+        return self.options.edges > 0 and self.upper == 1.0
 
     def prepared(self, level: Level) -> Prepared:
         """What the rounds of a level need."""

@@ -68,7 +68,7 @@ def sharpened(scan: Scan, numbers: Tensor, start: SurfaceMesh, search: PoseOptio
     frames, lit = torch.from_numpy(scan.frames), numbers[:, FLUX].exp().float()[:, None, None]
     begin = replace(scan, frames=(frames / lit).numpy(), exposures=aligned(numbers).exposures(scan.exposures))[train]
     uncertain = search.uncertain
-    freedom = uncertain.freedom(numbers[train, :FLUX].numpy())
+    freedom = replace(uncertain.freedom(numbers[train, :FLUX].numpy()), edges=True)
     fit = surface_fit(begin, start, options, freedom=freedom)
     fit.run(lambda record: on_progress(FITTED * fit.share))
     model = fit.result()

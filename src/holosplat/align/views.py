@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
 from ..baselines.primal_dual import PrimalDual
 from ..checks import require
@@ -20,6 +21,7 @@ from ..projectors.voxels import LatticeProjector
 from ..scan import Exposures, Scan
 from .coarse import mirrored
 from .derivatives import in_pixels, predicted
+from .directions import hardly_told
 from .gauge import moved_onto
 from .poses import DISTANCE, FLUX, MAGNIFICATION, SHIFT, PoseOptions, PoseSearch
 from .shadows import EVEN_OR_NOT
@@ -120,10 +122,12 @@ def align_still(
         search.run(level, lambda fraction, name=name: on_progress(name, fraction))
     forget_distance(search)
     sharp = by_edges(search, levels[-1].pixels, on_progress)
-    told = float(options.uncertain.distance > 0 and sharp)
     if options.uncertain.distance > 0 and not sharp:
         words.append(UNTOLD)
-    errors = search.covariances.diagonal(dim1=1, dim2=2).clamp_min(0).sqrt().numpy()
+    errors = errors_of(search.covariances)
+    expected = options.uncertain.deviations()
+    expected[DISTANCE] = options.uncertain.distance if sharp else 0.0
+    words += hardly_told(search.covariances, expected)
     words += _kept(search, scan.exposures, levels[-1].pixels, sharp)
     found = search.exposures(scan.exposures)
     found = replace(found, views=moved_onto(found.views, scan.views))
@@ -140,12 +144,18 @@ def align_still(
     return AlignedViews(
         found,
         changes(found, scan.exposures),
-        errors[:, :FLUX] * np.array([1, 1, *[np.rad2deg(1)] * 3, told, 1]),
+        errors,
         np.exp(search.numbers[:, FLUX].numpy()) - 1,
         before.left,
         after.left,
         tuple(words),
     )
+
+
+def errors_of(covariances: Tensor) -> np.ndarray:
+    """[V, 7] standard errors [pixels, degrees, shares] by covariances [V, 8, 8] of `NUMBERS`."""
+    roots = covariances.diagonal(dim1=1, dim2=2).clamp_min(0).sqrt().numpy()[:, :FLUX]
+    return roots * np.array([1, 1, *[np.rad2deg(1)] * 3, 1, 1])
 
 
 def changes(found: Exposures, planned: Exposures) -> np.ndarray:
@@ -169,8 +179,8 @@ def by_edges(search: PoseSearch, pixels: int, on_progress: Progress) -> bool:
     """Whether surfaces explain the frames better than voxels of `pixels`; if so, the numbers become theirs."""
     scan = search.scan.binned(pixels)
     options = search.options
-    wanted = options.edges > 0 and any(getattr(options.uncertain, kind) > 0 for kind in KINDS)
-    start = surfaces_of(search.volume, scan, search.material) if wanted and search.upper == 1.0 else None
+    wanted = search.edges_follow and any(getattr(options.uncertain, kind) > 0 for kind in KINDS)
+    start = surfaces_of(search.volume, scan, search.material) if wanted else None
     if start is None:
         return False
     scales = torch.ones(search.numbers.shape[1], dtype=torch.float64)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg, subcommand
 
+from ..checks import require
 from .progress import INTERRUPTED, ProgressBar
 from .thesis import thesis
 
@@ -70,6 +71,7 @@ def run(
     sources = {name: name for name in chosen("--cases", listed, known)} if listed or not files else {}
     sources = _at_hand(sources, folders.data)
     sources |= {load_case(file, min(seeds, default=0), folders.snapshots).name: file for file in files}
+    require(bool(sources), "none of the cases has its data at hand; give their folder by --data FOLDER.")
 
     def load(name: str, seed: int) -> Case | MeasuredCase:
         if name in MEASURED:

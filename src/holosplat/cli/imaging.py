@@ -66,7 +66,7 @@ def correct(raw: Positional[Path], out: Path, how: CorrectionOptions, reading: R
     flat = f"flat fields of {done.components} components" if done.method == "dynamic" else "the mean flat field"
     _say(f"wrote {out}: {done.frames} frames by {flat}, normalised: {done.normalised}")
     if how.method is None and done.method == "plain":
-        _say(f"method plain, for the file has {done.flats} flats, and the dynamic one needs three")
+        _say(f"method plain, for the dynamic one needs three flats, and the file has {done.flats}")
     if done.rings:
         _say(f"rings: a pattern of {done.rings:.2%} (rms) that all frames had in common was divided out")
     if done.airless:

@@ -18,7 +18,7 @@ from ..optics.sampling import fringes
 from ..scan import Exposures, Scan
 from .batch import Batch
 from .loop import Plan
-from .optimiser import Leaves
+from .optimiser import Adam, Apart, Leaves, Optimiser
 from .problem import Part
 from .running import Record
 from .trainable import Trainable
@@ -37,6 +37,9 @@ SAMPLED = 0.015
 """Share by which sampling shifts the mean distance where the first fringe is a pixel wide; it falls with the square of
 the width (docs/data/alignment.csv)."""
 
+PLACES = {"shifts": [0, 1], "turns": [2, 3, 4], "stretches": [5], "magnified": [6]}
+"""Places of the corrections of `Alignment` among the numbers of a view."""
+
 
 @dataclass(frozen=True)
 class Freedom:
@@ -46,6 +49,7 @@ class Freedom:
     so_far: [V, 7] how far the views are from the plan already: shifts x, y [pixels], turns about x, y, z of the lab
         [rad], shares of the distance and of the magnification
     magnification [share]
+    edges: whether the matter is fitted with sharp edges of one known density; soft matter takes any mean distance
     """
 
     shift: float
@@ -54,6 +58,7 @@ class Freedom:
     distance: float
     so_far: np.ndarray
     magnification: float = 0.0
+    edges: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "so_far", shaped("so_far", np.asarray(self.so_far), (len(self.so_far), 7)))
@@ -79,9 +84,19 @@ class Freedom:
         names["magnified"] = self.magnification > 0
         return Alignment.planned(len(self), *(name for name, free in names.items() if free), device=device)
 
+    def after(self, alignment: Alignment) -> Freedom:
+        """The same of views that a fit has moved on; those that it had set aside are where they were."""
+        so_far = self.so_far.copy()
+        fitted = np.flatnonzero(_fitted(len(self), len(alignment)))
+        for name, at in PLACES.items():
+            numbers = alignment.parameters().get(name)
+            if numbers is not None:
+                so_far[fitted[:, None], at] += numbers.detach().cpu().numpy().reshape(len(fitted), -1)
+        return replace(self, so_far=so_far)
+
     def tells_mean(self, exposures: Exposures) -> bool:
         """Whether frames tell the mean distance better than the plan does (see `SAMPLED`)."""
-        return mean_distance_error(exposures) < self.distance / np.sqrt(len(self))
+        return self.edges and mean_distance_error(exposures) < self.distance / np.sqrt(len(self))
 
 
 def mean_distance_error(exposures: Exposures) -> float:
@@ -89,6 +104,24 @@ def mean_distance_error(exposures: Exposures) -> float:
     optics = exposures.optical
     width = float(np.mean(fringes(optics))) / optics.views.pixel_size
     return SAMPLED / max(width, 1e-3) ** 2
+
+
+def _fitted(count: int, used: int) -> np.ndarray:
+    """Which of `count` views a fit of `used` of them looks at, [V] bool: the others are set aside for validation."""
+    return ~set_aside(count, count - used)
+
+
+def moved(exposures: Exposures, alignment: Alignment) -> Exposures:
+    """`exposures` [V] where a fit has found them; those that it had set aside are where they were."""
+    fitted = np.flatnonzero(_fitted(len(exposures), len(alignment)))
+    found = alignment.exposures(exposures[fitted])
+    views, distance = exposures.views, exposures.distance.copy()
+    rotations, shifts, scales = views.rotations.copy(), views.shifts.copy(), views.pixel_sizes / views.pitch
+    rotations[fitted], shifts[fitted] = found.views.rotations, found.views.shifts
+    scales[fitted], distance[fitted] = found.views.pixel_sizes / views.pitch, found.distance
+    return replace(
+        exposures, views=replace(views, rotations=rotations, shifts=shifts, scales=scales), distance=distance
+    )
 
 
 def freed(plan: Plan, freedom: Freedom | None, train: Scan) -> Plan:
@@ -101,7 +134,7 @@ def freed(plan: Plan, freedom: Freedom | None, train: Scan) -> Plan:
     if not freedom:
         return plan
     if len(freedom) > len(train):
-        freedom = freedom[~set_aside(len(freedom), len(freedom) - len(train))]
+        freedom = freedom[_fitted(len(freedom), len(train))]
     model, exposures = plan.problem.model, train.exposures
     alignment = freedom.alignment(model.instrument.device)
     (h, w), frames = exposures.views.shape, torch.from_numpy(train.frames)
@@ -118,7 +151,13 @@ def freed(plan: Plan, freedom: Freedom | None, train: Scan) -> Plan:
         return {**plan.rates(factor, step), **{name: rate * factor for name, rate in own.items()}}
 
     problem = replace(plan.problem, model=replace(model, alignment=alignment), terms=(*plan.problem.terms, expected))
-    return replace(plan, problem=problem, rates=rates, events=(*plan.events, Gauge(freedom, exposures)))
+
+    def optimiser(leaves: Leaves) -> Optimiser:
+        return Apart(leaves, "alignment.", lambda own: Adam(own, model.instrument.backend), plan.optimiser)
+
+    return replace(
+        plan, problem=problem, rates=rates, optimiser=optimiser, events=(*plan.events, Gauge(freedom, exposures))
+    )
 
 
 class Expected:
@@ -129,14 +168,13 @@ class Expected:
     def __init__(self, freedom: Freedom, weight: float, device: torch.device) -> None:
         """weight: of one number; that of a fit whose data term is a mean over pixels."""
         self._weight = weight
-        places = {"shifts": [0, 1], "turns": [2, 3, 4], "stretches": [5], "magnified": [6]}
         deviations = freedom.deviations()
         self._parts = {
             f"alignment.{name}": tuple(
                 torch.from_numpy(part).to(device)
                 for part in (freedom.so_far[:, at], np.where(deviations[at] > 0, deviations[at], np.inf))
             )
-            for name, at in places.items()
+            for name, at in PLACES.items()
         }
 
     def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:

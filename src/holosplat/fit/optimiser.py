@@ -65,6 +65,62 @@ class Group:
     together: bool = False
 
 
+class Apart:
+    """Two optimisers: one of the leaves whose names begin with `prefix`, and one of all others.
+
+    inner, outer: make those of the former and of the latter. The best parameters are those of `outer`, where it keeps
+    them, beside the last ones of `inner`.
+    """
+
+    def __init__(
+        self,
+        leaves: Leaves,
+        prefix: str,
+        inner: Callable[[Leaves], Optimiser],
+        outer: Callable[[Leaves], Optimiser],
+    ) -> None:
+        self._leaves = leaves
+        self._own = [{n: leaf for n, leaf in leaves.items() if n.startswith(prefix) == mine} for mine in (True, False)]
+        self._parts = [make(own) for make, own in zip((inner, outer), self._own)]
+
+    def _refresh(self) -> None:
+        """Whoever resizes or loads leaves replaces their entries."""
+        for own in self._own:
+            own.update({name: self._leaves[name] for name in own})
+
+    def prepare(self, rates: Mapping[str, float]) -> None:
+        """See `Optimiser`."""
+        for part in self._parts:
+            part.prepare(rates)
+
+    def apply(self, loss: Tensor) -> None:
+        """See `Optimiser`."""
+        for part in self._parts:
+            part.apply(loss)
+
+    def best(self) -> Leaves | None:
+        """See `Optimiser`."""
+        found = self._parts[1].best()
+        return None if found is None else {**found, **{n: leaf.detach().clone() for n, leaf in self._own[0].items()}}
+
+    def resize(self, names: list[str], keep: Tensor, added: Mapping[str, Tensor]) -> None:
+        """See `Optimiser`."""
+        self._refresh()
+        for own, part in zip(self._own, self._parts):
+            if mine := [name for name in names if name in own]:
+                part.resize(mine, keep, added)
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `Optimiser`."""
+        return {name: part.state_dict() for name, part in zip(("inner", "outer"), self._parts)}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """See `Optimiser`."""
+        self._refresh()
+        for name, part in zip(("inner", "outer"), self._parts):
+            part.load(state[name])
+
+
 class Adam:
     """Adam (Kingma & Ba 2015) over named parameters, each at its own rate.
 

@@ -10,6 +10,7 @@ import torch
 from ..backends import resolve
 from ..fit.batches import block_shape
 from ..fit.density import DensityEvent
+from ..fit.freedom import Freedom, freed
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Adam
 from ..fit.problem import Problem, Term
@@ -72,7 +73,8 @@ class GaussianStage:
     def fit(self, task: Task, start: Stored) -> Fit:
         """The fit of the cloud to the training frames."""
         assert isinstance(start, GaussianCloud)
-        return gaussian_fit(task.scan, start, resolved(self.options.fit, task, start.matter), task.seed, task.uneven)
+        options = resolved(self.options.fit, task, start.matter)
+        return gaussian_fit(task.scan, start, options, task.seed, task.uneven, task.freedom)
 
 
 def resolved(options: FitOptions, task: Task, matter: Matter) -> FitOptions:
@@ -83,9 +85,17 @@ def resolved(options: FitOptions, task: Task, matter: Matter) -> FitOptions:
 
 
 def gaussian_fit(
-    scan: Scan, cloud: GaussianCloud, options: FitOptions, seed: int = 0, light: Light | None = None
+    scan: Scan,
+    cloud: GaussianCloud,
+    options: FitOptions,
+    seed: int = 0,
+    light: Light | None = None,
+    freedom: Freedom | None = None,
 ) -> Fit:
-    """The fit of `cloud` to the training frames of `scan` in uneven `light`, made ready; errors: those of `ground`."""
+    """The fit of `cloud` to the training frames of `scan` in uneven `light`, made ready; errors: those of `ground`.
+
+    freedom: of where these frames are, which is then fitted, too.
+    """
     backend, schedule = resolve(options.backend), options.schedule
     base = ground(scan, cloud.on(backend), cloud.matter, options.objective, schedule, backend, light=light)
     grid = Grid.of_views(scan.views)
@@ -99,7 +109,7 @@ def gaussian_fit(
         judge=base.judge,
         grid=grid if options.objective.uses_volume else None,
     )
-    return Fit(plan, seed)
+    return Fit(freed(plan, freedom, base.train), seed)
 
 
 def _object_terms(base: Ground, options: FitOptions, grid: Grid, matter: Matter) -> list[Term]:

@@ -9,9 +9,10 @@ from typing import ClassVar, Protocol, runtime_checkable
 import torch
 
 from ..baselines.material import MaterialEstimate
-from ..fit.freedom import Freedom
+from ..fit.freedom import Freedom, moved
 from ..fit.running import Running
 from ..matter import MaterialPrior, MatterKind
+from ..model import Model
 from ..optics.background import Light, LightOptions
 from ..optics.noise_model import NoiseModel
 from ..optics.retrieval import absorption_alone
@@ -77,6 +78,13 @@ class Task:
         if found.background is not None:
             scan = replace(scan, frames=found.evened(frames).numpy())
         return replace(self, scan=scan, lit=found)
+
+    def moved(self, fitted: Model) -> Task:
+        """The same task with the frames where a fit has found them."""
+        if fitted.alignment is None or self.freedom is None:
+            return self
+        scan = replace(self.scan, exposures=moved(self.scan.exposures, fitted.alignment))
+        return replace(self, scan=scan, freedom=self.freedom.after(fitted.alignment))
 
     @property
     def noise(self) -> NoiseModel:
@@ -157,5 +165,6 @@ def solve_stages(method: Method, task: Task) -> Stored:
         fit = stage.fit(task, found)
         if fit is not None:
             found = run_quietly(fit, task.report(stage.name))
+            task = task.moved(fit.result())
     assert found is not None
     return found

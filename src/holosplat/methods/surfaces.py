@@ -137,7 +137,8 @@ class SurfaceStage:
     def fit(self, task: Task, start: Stored) -> Fit:
         """The fit of the surfaces to the training frames."""
         assert isinstance(start, SurfaceMesh)
-        return surface_fit(task.scan, start, self.options.fit, task.seed, task.uneven, task.freedom)
+        freedom = task.freedom and replace(task.freedom, edges=task.prior.kind == "known")
+        return surface_fit(task.scan, start, self.options.fit, task.seed, task.uneven, freedom)
 
 
 def extract_surfaces(cloud: GaussianCloud, scan: Scan, options: Extraction = Extraction()) -> SurfaceMesh:

@@ -151,7 +151,13 @@ class VoxelStage:
         return voxel_fit(task.scan, start, replace(options, steps=steps), task.seed, task.uneven)
 
 
-def voxel_fit(scan: Scan, start: VoxelGrid, options: VoxelFit, seed: int = 0, light: Light | None = None) -> Fit:
+def voxel_fit(
+    scan: Scan,
+    start: VoxelGrid,
+    options: VoxelFit,
+    seed: int = 0,
+    light: Light | None = None,
+) -> Fit:
     """The fit of `start`, on its own grid, to the training frames of `scan`, made ready.
 
     Minimised is `mean over views of the misfit + λ/(k² V) Σ |∇u|`, k voxels a pixel and V views, so that λ does not
@@ -170,7 +176,8 @@ def voxel_fit(scan: Scan, start: VoxelGrid, options: VoxelFit, seed: int = 0, li
         return ProjectedGradient(leaves, upper, scale)
 
     terms = (base.frames, VoxelVariation(weight, options.smoothing), *base.extra(options.terms))
-    return Fit(Plan(Problem(base.model, terms), schedule, optimiser, judge=base.judge), seed)
+    plan = Plan(Problem(base.model, terms), schedule, optimiser, judge=base.judge)
+    return Fit(plan, seed)
 
 
 def refinement(train: Scan, options: VoxelFit) -> int:

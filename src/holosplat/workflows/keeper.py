@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, cast
+
+import torch
+from torch import Tensor
 
 from ..matter import DeltaBeta, MatterKind
 from ..methods.cross_validation import MissingMatter
 from ..representations import KINDS, Stored
-from ..scan import Scan
+from ..scan import Exposures, Scan
 
 CLEARLY = 0.95
 """An earlier state is kept if it leaves less than this part of the matter that a later one leaves unexplained, and no
@@ -54,13 +57,15 @@ class Choice:
 @dataclass(frozen=True)
 class State:
     """name: of the stage that made it, or `start`; object: what it made; oversample: wave samples a pixel; share: of
-    all matter that it leaves unexplained in the training frames; contrast: the same of their contrast."""
+    all matter that it leaves unexplained in the training frames; contrast: the same of their contrast; exposures: where
+    these were."""
 
     name: str
     object: Stored
     oversample: int
     share: float
     contrast: float
+    exposures: Exposures
 
 
 @dataclass
@@ -78,6 +83,11 @@ class Keeper:
     """Share of all matter that each state leaves unexplained, by its name."""
     _judge: MissingMatter | None = None
 
+    def moved(self, train: Scan) -> None:
+        """The training frames are elsewhere from now on."""
+        if train.exposures is not self.train.exposures:
+            self.train, self._judge = train, None
+
     def look(self, name: str, found: Stored, oversample: int, fitted: bool = True) -> None:
         """Take in the latest state. What is not `fitted` is a step of the method, and takes the place of all others."""
         if self._judge is None:
@@ -87,7 +97,7 @@ class Keeper:
         best = self.best
         rivals = best is not None and fitted and (self.mixed or best.object.kind == found.kind)
         if best is None or not rivals or CLEARLY * share <= best.share or contrast < best.contrast:
-            self.best = State(name, found, oversample, share, contrast)
+            self.best = State(name, found, oversample, share, contrast, self.train.exposures)
 
     def state_dict(self) -> dict[str, Any] | None:
         """What `load` needs; None before the first state."""
@@ -101,6 +111,7 @@ class Keeper:
             "oversample": best.oversample,
             "share": best.share,
             "contrast": best.contrast,
+            "placed": where(best.exposures),
             "judged": dict(self.judged),
         }
 
@@ -109,9 +120,29 @@ class Keeper:
         if saved is not None:
             found = KINDS[saved["kind"]].from_state(saved["state"])
             self.best = State(
-                saved["name"], cast(Stored, found), saved["oversample"], saved["share"], saved["contrast"]
+                saved["name"],
+                cast(Stored, found),
+                saved["oversample"],
+                saved["share"],
+                saved["contrast"],
+                placed_at(self.train.exposures, saved.get("placed", where(self.train.exposures))),
             )
             self.judged = dict(saved["judged"])
+
+
+def where(exposures: Exposures) -> dict[str, Tensor]:
+    """What a fit of the geometry changes of exposures, as a checkpoint holds it."""
+    views = exposures.views
+    arrays = {"rotations": views.rotations, "shifts": views.shifts, "distance": exposures.distance}
+    arrays["pixel_sizes"] = views.pixel_sizes
+    return {name: torch.from_numpy(array) for name, array in arrays.items()}
+
+
+def placed_at(exposures: Exposures, saved: Mapping[str, Tensor]) -> Exposures:
+    """`exposures` where a checkpoint says."""
+    planned, scales = exposures.views, saved["pixel_sizes"].numpy() / exposures.views.pitch
+    views = replace(planned, rotations=saved["rotations"].numpy(), shifts=saved["shifts"].numpy(), scales=scales)
+    return replace(exposures, views=views, distance=saved["distance"].numpy())
 
 
 def _material(found: Stored) -> DeltaBeta:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
 import numpy as np
+import torch
 
 from ..align.geometry import Geometry
 from ..align.poses import PoseOptions
@@ -24,15 +25,17 @@ from ..progress import FitProgress
 from ..representations import KINDS, Stored
 from ..scan import Scan
 from ..tables import to_table
-from .keeper import Choice, Keeper
+from .keeper import Choice, Keeper, placed_at, where
 from .provenance import environment, scan_hash
 from .reconstruction import Reconstruction
 from .refine import (
+    freedom_of,
     keep_geometry,
     read_geometry,
     require_compatible,
     saved_geometry,
     trained_geometry,
+    with_fitted,
     with_held_out,
 )
 from .resume import require_same
@@ -93,14 +96,15 @@ def reconstruct(
         geometry = saved_geometry(folder, resume) or trained_geometry(scan, prior, refine, assumed, tell)
         scan = geometry.applied(scan)
     train = scan.train()
-    task = Task(train, prior, seed, tell, assumed).evened()
+    task = Task(train, prior, seed, tell, assumed, freedom=freedom_of(geometry, refine)).evened()
     run = _Run(task, method, folder, on_progress)
     run.begin(config, resume)
     run.settle(matter, ranges, scan, geometry)
     done = run.complete()
     if refine is None or geometry is None:
         return done
-    geometry = with_held_out(geometry, planned, done.object, refine, done.light, tell)
+    geometry = with_fitted(geometry, planned, run.task.scan, done, refine)
+    geometry = with_held_out(geometry, planned, done, refine, tell)
     if folder is not None:
         keep_geometry(folder, geometry, planned)
     return replace(done, geometry=geometry)
@@ -216,6 +220,8 @@ class _Run:
         last: Running | None = None
         for number in range(first, len(stages)):
             stage, saved = stages[number], self._saved if number == first else None
+            if saved:
+                self._go_back(saved)
             start = _restored(saved["start"]) if saved else self._started(stage, found)
             fit = stage.fit(self.task, start)
             oversample = fit.oversample if fit else 0
@@ -229,11 +235,32 @@ class _Run:
             complete = journal.run(saved["fit"] if saved else None)
             self.timing[stage.name] = fit.seconds
             found = cast(Stored, finished(fit))
+            self.task = self.task.moved(fit.result())
+            self._keeper.moved(self.task.scan)
             if not complete:
                 return self._result(found, fit, False)
             self._keeper.look(stage.name, found, oversample, fitted=not getattr(stage, "likelier", False))
         assert self._keeper.best is not None
+        self.task = replace(self.task, scan=replace(self.task.scan, exposures=self._keeper.best.exposures))
         return self._result(self._keeper.best.object, last, True)
+
+    def _go_back(self, saved: dict[str, Any]) -> None:
+        """To where the frames were when the stage of a checkpoint began."""
+        if self.task.freedom is not None:
+            scan = replace(self.task.scan, exposures=placed_at(self.task.scan.exposures, saved["placed"]))
+            self.task = replace(
+                self.task, scan=scan, freedom=replace(self.task.freedom, so_far=saved["so_far"].numpy())
+            )
+            self._keeper.moved(scan)
+
+    def placed(self) -> dict[str, Any]:
+        """Where the frames are at the beginning of a stage, as a checkpoint holds it."""
+        freedom = self.task.freedom
+        return (
+            {}
+            if freedom is None
+            else {"placed": where(self.task.scan.exposures), "so_far": torch.from_numpy(freedom.so_far)}
+        )
 
     def kept(self) -> dict[str, Any] | None:
         """The best of the states so far, as a checkpoint holds it."""
@@ -339,6 +366,7 @@ class _Journal:
             "fit": self._fit.state_dict(),
             "timing": self._run.timing,
             "kept": self._run.kept(),
+            **self._run.placed(),
         }
         folder.save_checkpoint(state)
         self._last = time.perf_counter()

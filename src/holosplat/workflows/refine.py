@@ -11,18 +11,21 @@ import torch
 
 from ..align.find import align_views
 from ..align.geometry import Geometry
-from ..align.held_out import place_frames
+from ..align.held_out import fitted_frames, place_frames
 from ..align.poses import PoseOptions
+from ..align.poses import Uncertain as Where
 from ..align.views import KINDS
 from ..checks import require
+from ..fit.freedom import Freedom
 from ..io.json import read_json, write_json
 from ..matter import MaterialPrior
 from ..methods.uncertain import Uncertain
 from ..optics.background import LightOptions
 from ..progress import Progress
-from ..representations import Stored
 from ..scan import Scan
+from .keeper import where
 from .provenance import scan_hash
+from .reconstruction import Reconstruction
 from .run_folder import RunFolder
 from .run_light import light_of
 
@@ -56,22 +59,47 @@ def saved_geometry(folder: RunFolder | None, resume: bool) -> Geometry | None:
     return None if table is None else Geometry.from_dict(table)
 
 
-def with_held_out(
-    geometry: Geometry, scan: Scan, found: Stored, options: PoseOptions, light: LightOptions, on_progress: Progress
-) -> Geometry:
-    """`geometry` with the held-out frames of the planned `scan` where the matter that was `found` puts them.
+def still_uncertain(geometry: Geometry, uncertain: Where) -> Where:
+    """`uncertain` without what stayed as planned for all training frames."""
+    changes = geometry.changes[~geometry.held_out]
+    return replace(uncertain, **{name: 0.0 for name in KINDS if not _moved(changes, KINDS[name])})
 
-    What stayed as planned for all training frames stays so here. light: what is assumed of that of other frames.
-    """
-    at = np.flatnonzero(scan.is_test)
-    moved = {name: _moved(geometry.changes[~scan.is_test], KINDS[name]) for name in KINDS}
-    if not len(at) or not any(moved.values()):
+
+def freedom_of(geometry: Geometry | None, options: PoseOptions | None) -> Freedom | None:
+    """What fits may still change of where the training frames are; None where nothing is refined."""
+    if geometry is None or options is None:
+        return None
+    changes = geometry.changes[~geometry.held_out]
+    so_far = np.concatenate([changes[:, :2], np.deg2rad(changes[:, 2:5]), changes[:, 5:]], axis=1)
+    return still_uncertain(geometry, options.uncertain).freedom(so_far)
+
+
+def with_fitted(
+    geometry: Geometry, planned: Scan, fitted: Scan, done: Reconstruction, options: PoseOptions
+) -> Geometry:
+    """`geometry` with the training frames of the `planned` scan where a fit has put them: as `fitted` are."""
+    at = np.flatnonzero(~planned.is_test)
+    if all(np.array_equal(part.numpy(), getattr(geometry, name)[at]) for name, part in where(fitted.exposures).items()):
         return geometry
-    lit = light_of(scan, light)
+    options = replace(options, uncertain=still_uncertain(geometry, options.uncertain))
+    return geometry.with_frames(at, fitted_frames(done.object, planned[at], fitted, options, done.oversample))
+
+
+def with_held_out(
+    geometry: Geometry, scan: Scan, done: Reconstruction, options: PoseOptions, on_progress: Progress
+) -> Geometry:
+    """`geometry` with the held-out frames of the planned `scan` where the matter that was found puts them.
+
+    What stayed as planned for all training frames stays so here.
+    """
+    at, uncertain = np.flatnonzero(scan.is_test), still_uncertain(geometry, options.uncertain)
+    if not len(at) or not any(getattr(uncertain, name) for name in KINDS):
+        return geometry
+    lit = light_of(scan, done.light)
     if lit is not None:
         scan = replace(scan, frames=lit.evened(torch.from_numpy(scan.frames)).numpy())
-    uncertain = replace(options.uncertain, **{name: 0.0 for name, free in moved.items() if not free})
-    return geometry.with_frames(at, place_frames(found, scan[at], replace(options, uncertain=uncertain), on_progress))
+    found = place_frames(done.object, scan[at], replace(options, uncertain=uncertain), on_progress, done.oversample)
+    return geometry.with_frames(at, found)
 
 
 def _moved(changes: np.ndarray, places: tuple[int, ...]) -> bool:

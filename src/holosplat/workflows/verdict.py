@@ -16,7 +16,7 @@ from ..fit.residuals import Prediction, Residuals, residuals
 from ..fit.running import Running
 from ..fit.validation import split_validation
 from ..methods import Task
-from ..model import Alignment, LightField, Model, SolvedLight
+from ..model import LightField, Model, SolvedLight
 from ..optics.noise import noise_levels
 from ..optics.noise_model import NoiseModel
 from ..representations import Stored
@@ -147,19 +147,18 @@ def said_of_run(found: Stored, fit: Running | None, task: Task, oversample: int)
     train = task.scan
     if fit is None:
         return Prediction(found, train.exposures, oversample, backend=found.backend), train
-    fitted, (alignment, light) = split_validation(train, fit.aside)[0], _in_memory(fit.result())
-    return Prediction(found, fitted.exposures, oversample, alignment, light, found.backend), fitted
+    # the frames of `task` are where the fit has found them
+    fitted, light = split_validation(train, fit.aside)[0], _in_memory(fit.result())
+    return Prediction(found, fitted.exposures, oversample, None, light, found.backend), fitted
 
 
-def _in_memory(model: Model) -> tuple[Alignment | None, LightField | None]:
-    """The alignment and the light of a model, on the CPU."""
-    alignment, light = model.alignment, model.light
-    if alignment is not None:
-        alignment = alignment.with_parameters({n: p.cpu() for n, p in alignment.parameters().items()})
+def _in_memory(model: Model) -> LightField | None:
+    """The light of a model, on the CPU."""
+    light = model.light
     if isinstance(light, SolvedLight):
         with torch.no_grad():
             light = light.settled(replace(model, light=None).frames())
-    return alignment, light and replace(light, coefficients=light.coefficients.cpu(), modes=light.modes.cpu())
+    return light and replace(light, coefficients=light.coefficients.cpu(), modes=light.modes.cpu())
 
 
 def verdict(found: Residuals) -> Verdict:
