@@ -73,6 +73,7 @@ def shop(recorder, monkeypatch) -> Recorder:
     """The command line with two small cases and two fast methods."""
     methods = {name: recorder.method(name) for name in ("one", "two")}
     monkeypatch.setattr("holosplat.bench.methods.METHODS", methods)
+    monkeypatch.setattr("holosplat.bench.methods.ALIGNED", {})
     monkeypatch.setattr("holosplat.bench.references.REFERENCES", {})
     monkeypatch.setattr("holosplat.bench.case.case_names", lambda: list(SHAPES))
 

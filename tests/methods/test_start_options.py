@@ -65,7 +65,7 @@ def test_as_many_ratios_are_tried_as_are_asked_for(monkeypatch):
         class views:
             shape = (8, 8)
 
-        def binned(self, factor):
+        def coarsened(self, factor):
             return self
 
     monkeypatch.setattr("holosplat.baselines.material._trial_volume", volume)

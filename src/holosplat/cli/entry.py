@@ -42,7 +42,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "calibrate",
         "Find where beams are by frames of a phantom of known shape, or of beads, for --exposures of other commands.",
     ),
-    "join": ("imaging", "Join scans of several beams, one file each, on one raster."),
+    "join": ("imaging", "Join scans of several beams, one file each; pixel sizes, energies and distances may differ."),
     "retrieve": ("retrieve", "Retrieve phase and thickness of single frames, into TIFF files or HDF5."),
     "reconstruct": (
         "commands",
