@@ -27,7 +27,7 @@ beam() {
     geometry="--angles-deg $2 --tilts-deg $3 --detector 64 64 --pixel-size 1e-6 --distance 0.05 --test-every 0
         --misalign-shift 1 --misalign-rotation 0.6 --misalign-distance 0.02 --misalign-seed $1"
     holosplat simulate cells/*.vtk $geometry --out "seen$1.nxs" --true-exposures "true$1.nxs"
-    holosplat record "seen$1.nxs" --photons-per-pixel 20000 --flats 20 --darks 10 --seed "$1" --out "raw$1.nxs"
+    holosplat record "seen$1.nxs" --photons-per-pixel 20000 --flats 200 --darks 20 --seed "$1" --out "raw$1.nxs"
     holosplat simulate beads/*.vtk --material polystyrene $geometry --origin 0 0 0 --out "beads$1.nxs"
 }
 beam 1 0 0
@@ -36,11 +36,11 @@ beam 3 85 -6
 beam 4 130 4
 
 # From here on, only what a beamline has: raw1.nxs … raw4.nxs, and frames of the beads.
-for n in 1 2 3 4; do holosplat correct "raw$n.nxs" --out "corrected$n.nxs"; done
+for n in 1 2 3 4; do holosplat correct "raw$n.nxs" --normalise mean --out "corrected$n.nxs"; done
 holosplat join corrected1.nxs corrected2.nxs corrected3.nxs corrected4.nxs --out scan.nxs
 holosplat join beads1.nxs beads2.nxs beads3.nxs beads4.nxs --out beads.nxs
 holosplat calibrate beads.nxs --beads 3.5e-6 --material polystyrene --out geometry.toml
-holosplat reconstruct scan.nxs --exposures geometry.toml --material haemoglobin --preset fast --out run
+holosplat reconstruct scan.nxs --exposures geometry.toml --material haemoglobin --out run
 
 # How near it came to the truth, which a beamline does not have.
 python - <<'PYTHON'
