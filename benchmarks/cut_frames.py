@@ -1,0 +1,88 @@
+"""What is lost where matter goes on above and below the frames: docs/data/cut_frames.csv.
+
+    python benchmarks/cut_frames.py --out docs/data/cut_frames.csv          # some minutes on one core
+
+Frames of a whole body are simulated, and only their middle rows are reconstructed, without options but the ratio δ/β.
+A row: relative error of δ in the field of view, in its middle half and in its two outermost rows on either side, the
+mass that was found over the true one there, and whether the verdict is good. Lines of the truth are closed forms.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import platform
+from pathlib import Path
+
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+
+import numpy as np
+import torch
+from machine import commit
+
+import holosplat as hs
+
+PIXEL, ENERGY, VIEWS, SEED = 1e-6, 20.0, 12, 3
+MATERIAL = hs.DeltaBeta(3e-7, 2e-10)
+COLUMNS: tuple[str, ...] = ("body", "seed", "rows", "of", "distance_m", "photons")
+COLUMNS += ("error_delta", "middle", "edge", "mass", "good", "machine", "commit")
+CASES = {
+    "round cell, whole": ("round cell", 120, 0.05, None),
+    "round cell": ("round cell", 40, 0.05, None),
+    "round cell, 5000 photons": ("round cell", 40, 0.05, 5000.0),
+    "round cell, contact": ("round cell", 40, 0.0, 20_000.0),
+    "tissue": ("tissue", 60, 0.05, None),
+}
+
+
+def body(name: str) -> tuple[hs.Object, tuple[int, int]]:
+    """The body, and the frames that hold all of it."""
+    if name == "tissue":
+        return hs.specimens.tissue((80e-6, 200e-6, 80e-6), MATERIAL, SEED), (220, 120)
+    return hs.specimens.round_cell(88e-6, MATERIAL, SEED), (120, 120)
+
+
+def row(name: str, rows: int, distance: float, photons: float | None) -> dict[str, str]:
+    """A row of the table."""
+    truth, (height, width) = body(name)
+    views = hs.Views.evenly_spaced(VIEWS, (height, width), PIXEL)
+    exposures = hs.Exposures.of(views, ENERGY, distance, 0.3)
+    whole = hs.simulate(truth, exposures, is_test=np.arange(VIEWS) % 4 == 3, photons_per_pixel=photons, seed=SEED)
+    top = (height - rows) // 2
+    scan = whole.cropped(slice(top, top + rows), slice(0, width))
+    done = hs.reconstruct(scan, hs.MaterialPrior.of_ratio(MATERIAL.ratio))
+    grid = hs.Grid.of_views(scan.views)
+    found, true = (np.asarray(each.voxelise(grid).delta, dtype=np.float64) for each in (done.object, truth))
+
+    def error(at: slice | list[int]) -> str:
+        size = np.linalg.norm(true[:, at])
+        return f"{np.linalg.norm(found[:, at] - true[:, at]) / size:.3f}" if size > 0 else ""
+
+    parts = (slice(None), slice(rows // 4, rows - rows // 4), [0, 1, -2, -1])
+    measured = dict(zip(("error_delta", "middle", "edge"), map(error, parts)))
+    said = {"body": name, "seed": str(SEED), "rows": str(rows), "of": str(height), "distance_m": f"{distance:g}"}
+    said |= {"photons": f"{photons or 0:g}", "mass": f"{found.sum() / true.sum():.3f}"}
+    good = str(done.verdict.good) if done.verdict else ""
+    return said | measured | {"good": good, "machine": platform.machine(), "commit": commit()}
+
+
+def main() -> None:
+    """Write the table, line by line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cases", nargs="+", default=list(CASES), choices=list(CASES))
+    parser.add_argument("--out", type=Path, required=True)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    with options.out.open("w", newline="") as file:
+        table = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        table.writeheader()
+        for name in options.cases:
+            found = row(*CASES[name])
+            table.writerow(found)
+            print(found, flush=True)
+            file.flush()
+
+
+if __name__ == "__main__":
+    main()
