@@ -21,8 +21,8 @@ from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from holosplat.align import calibrate
+from holosplat.align.changes import changes
 from holosplat.align.gauge import moved_onto
-from holosplat.align.views import changes
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.bench.record import source_commit
 from holosplat.geometry import Views, rotation_tilted

@@ -24,7 +24,8 @@ from machine import commit
 import holosplat as hs
 
 PIXEL, ENERGY, VIEWS, SEED = 1e-6, 20.0, 12, 3
-MATERIAL = hs.DeltaBeta(3e-7, 2e-10)
+SOFT, DARK = hs.DeltaBeta(3e-7, 2e-10), hs.DeltaBeta(1e-6, 1e-8)
+"""Matter that fringes show, and matter that shows in contact."""
 COLUMNS: tuple[str, ...] = ("body", "seed", "rows", "of", "distance_m", "photons")
 COLUMNS += ("error_delta", "middle", "edge", "mass", "good", "machine", "commit")
 CASES = {
@@ -36,22 +37,23 @@ CASES = {
 }
 
 
-def body(name: str) -> tuple[hs.Object, tuple[int, int]]:
+def body(name: str, material: hs.DeltaBeta) -> tuple[hs.Object, tuple[int, int]]:
     """The body, and the frames that hold all of it."""
     if name == "tissue":
-        return hs.specimens.tissue((80e-6, 200e-6, 80e-6), MATERIAL, SEED), (220, 120)
-    return hs.specimens.round_cell(88e-6, MATERIAL, SEED), (120, 120)
+        return hs.specimens.tissue((80e-6, 200e-6, 80e-6), material, SEED), (220, 120)
+    return hs.specimens.round_cell(88e-6, material, SEED), (120, 120)
 
 
 def row(name: str, rows: int, distance: float, photons: float | None) -> dict[str, str]:
     """A row of the table."""
-    truth, (height, width) = body(name)
+    material = SOFT if distance else DARK
+    truth, (height, width) = body(name, material)
     views = hs.Views.evenly_spaced(VIEWS, (height, width), PIXEL)
     exposures = hs.Exposures.of(views, ENERGY, distance, 0.3)
     whole = hs.simulate(truth, exposures, is_test=np.arange(VIEWS) % 4 == 3, photons_per_pixel=photons, seed=SEED)
     top = (height - rows) // 2
     scan = whole.cropped(slice(top, top + rows), slice(0, width))
-    done = hs.reconstruct(scan, hs.MaterialPrior.of_ratio(MATERIAL.ratio))
+    done = hs.reconstruct(scan, hs.MaterialPrior.of_ratio(material.ratio))
     grid = hs.Grid.of_views(scan.views)
     found, true = (np.asarray(each.voxelise(grid).delta, dtype=np.float64) for each in (done.object, truth))
 

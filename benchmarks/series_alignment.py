@@ -10,13 +10,12 @@ the found and the true exposures, each moved as a whole as near to the true ones
 from __future__ import annotations
 
 import argparse
-import csv
 import platform
 import time
 from dataclasses import dataclass, replace
 
 import numpy as np
-from alignment import FIELDS, TABLE, Row, rms_errors
+from alignment import Row, rms_errors, write_rows
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
@@ -159,12 +158,7 @@ def main() -> None:
     commit = source_commit()  # before the table is written, which is part of the tree
     for name in wanted.cases:
         new = rows_of(name, CASES[name], wanted.times, wanted.moments, commit)
-        with TABLE.open(newline="", encoding="utf-8") as file:
-            old = [row for row in csv.DictReader(file) if row["case"] != name]
-        with TABLE.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, FIELDS, restval="", lineterminator="\n")
-            writer.writeheader()
-            writer.writerows([*old, *new])
+        write_rows(name, new)
 
 
 if __name__ == "__main__":

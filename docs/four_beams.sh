@@ -49,7 +49,7 @@ from dataclasses import replace
 import numpy as np
 
 from holosplat.align.gauge import moved_onto
-from holosplat.align.views import changes
+from holosplat.align.changes import changes
 from holosplat.io import read_beams, read_scan
 
 files = [read_scan(f"true{n}.nxs").exposures for n in (1, 2, 3, 4)]

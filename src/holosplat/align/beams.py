@@ -16,6 +16,7 @@ from ..optics.background import Light, LightOptions
 from ..progress import Progress
 from ..scan import Exposures, Scan
 from .begin import Begun, Images, begun
+from .changes import changes, header, in_words, line
 from .coarse import SIDES
 from .derivatives import NUMBERS
 from .gauge import moved_onto
@@ -23,14 +24,12 @@ from .moments import Beams, Moment, chosen_moments, whens
 from .poses import DISTANCE, FLUX, SHIFT, TURN, PoseOptions, PoseSearch
 from .series_search import SeriesSearch
 from .shadows import EVEN_OR_NOT
-from .views import ACCURACY, DEFAULT, FEW, FEWEST, KINDS, AlignedViews, Judged, changes
+from .views import ACCURACY, DEFAULT, FEW, FEWEST, KINDS, AlignedViews, Judged
 
 SURE = 3.0
 """A drift is beyond doubt where some number of a beam has so many of its standard errors."""
 JUDGED = 3
 """Times whose volumes judge what volumes found."""
-
-
 ACROSS = "shifts across two beams are as planned: they are a motion of the whole object, which loses nothing"
 DISTANCES = "distances and magnifications are as planned: rows and voxels cannot tell them; align a single time"
 DEGREES = np.array([1, 1, *[np.pi / 180] * 3, 1, 1])
@@ -100,24 +99,18 @@ class AlignedBeams(AlignedViews):
     def lines(self) -> list[str]:
         """What was found, in words, and a table of the beams."""
         first = np.unique(self.of_frame, return_index=True)[1]
-        root = np.sqrt(np.square(self.beams).mean(0))
         before, after = (np.sqrt(np.mean(part[first] ** 2)) for part in (self.before, self.after))
         said = [
             f"{len(first)} beams, from frames of one time"
             if len(self.times) == 1
             else f"one geometry of {len(first)} beams, from {len(self.times)} times, {self.times[0]:g} to "
             f"{self.times[-1]:g} s",
-            f"changes of the plan (rms): shifts {np.hypot(root[0], root[1]) / np.sqrt(2):.3f} pixels, turns across the "
-            f"beam {np.hypot(root[2], root[3]) / np.sqrt(2):.3f}°, roll {root[4]:.3f}°, distance {root[5]:.2%}",
+            in_words(self.beams),
             f"{self.measure}: {before:.4f} as planned, {after:.4f} now",
             *self.words,
-            "beam  shift x        shift y        turn x           turn y           roll",
+            header("beam", 2),
+            *(line(b, self.beams[b], self.errors[frame], 2) for b, frame in enumerate(first)),
         ]
-        for b, frame in enumerate(first):
-            change, error = self.beams[b], self.errors[frame]
-            shifts = "  ".join(f"{change[k]:+6.2f} ± {error[k]:.2f}" for k in (0, 1))
-            turns = "  ".join(f"{change[k]:+6.3f}° ± {error[k]:.3f}" for k in (2, 3, 4))
-            said.append(f"{b:4d}  {shifts}  {turns}")
         for b in np.flatnonzero(self.drift.any(axis=1)):
             parts = [f"{self.drift[b, k]:+.3f} ± {self.drift_errors[b, k]:.3f}" for k in range(5)]
             said.append(

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ..model import Alignment, Instrument, Model
@@ -30,17 +28,6 @@ def aligned(numbers: Tensor) -> Alignment:
     """The corrections that `numbers` [V, 8] of `NUMBERS` are."""
     magnified = numbers[:, 6].exp() - 1 if bool((numbers[:, 6] != 0).any()) else None
     return Alignment(numbers[:, 2:5], numbers[:, :2], numbers[:, 5].exp() - 1, magnified=magnified)
-
-
-def numbers_of(found: Exposures, planned: Exposures) -> Tensor:
-    """[V, 7] shifts [pixels], turns [rad], and logarithms of distance and magnification, that make `planned` exposures
-    `found`."""
-    turns = np.einsum("vij,vkj->vik", found.views.rotations, planned.views.rotations)
-    shifts = (found.views.shifts - planned.views.shifts) / planned.views.pixel_sizes[:, None]
-    near = np.where(planned.distance > 0, found.distance / np.where(planned.distance > 0, planned.distance, 1), 1)
-    vectors = Rotation.from_matrix(turns).as_rotvec()
-    larger = np.log(planned.views.pixel_sizes / found.views.pixel_sizes)
-    return torch.from_numpy(np.concatenate([shifts, vectors, np.log(near)[:, None], larger[:, None]], axis=1))
 
 
 class Beside:

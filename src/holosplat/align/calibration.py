@@ -18,6 +18,7 @@ from ..optics.retrieval import Tikhonov, paganin, tikhonov
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..scan import Exposures, Scan
+from .changes import changes, header, line
 from .coarse import shifts_by_mass
 from .derivatives import NUMBERS
 from .gauge import moved_onto
@@ -26,7 +27,7 @@ from .phantom_fit import STEPS, Linear, linearised, solved
 from .phantom_start import find_beads, placed
 from .poses import DISTANCE, FLUX, SHIFT, TURN, Uncertain
 from .shadows import EVEN_OR_NOT
-from .views import KINDS, changes
+from .views import KINDS
 
 UNTOLD = 0.5
 """Standard error, as a share of what was expected, from which on frames do not tell a number."""
@@ -108,17 +109,16 @@ class Calibrated:
         """What was found, in words, and a table of the views."""
         size, doubt = self.pixel_size
         pixel = f"pixel {1e6 * size:.5g} µm ± {doubt:.2%}; " if doubt else ""
-        said = [
+        return [
             f"{pixel}{len(self.phantom)} {'beads' if self.phantom.free else 'body'}; unexplained share of the contrast "
             f"{float(np.sqrt(np.square(self.left).mean())):.4f}",
             *self.words,
-            "view  shift x          shift y          turn x             turn y             roll               distance",
+            header("view", 3, "distance"),
+            *(
+                line(v, change, error, 3, f"{change[5]:+.2%} ± {error[5]:.2%}")
+                for v, (change, error) in enumerate(zip(self.changes, self.errors))
+            ),
         ]
-        for v, (change, error) in enumerate(zip(self.changes, self.errors)):
-            shifts = "  ".join(f"{change[k]:+7.3f} ± {error[k]:.3f}" for k in (0, 1))
-            turns = "  ".join(f"{change[k]:+7.4f}° ± {error[k]:.4f}" for k in (2, 3, 4))
-            said.append(f"{v:4d}  {shifts}  {turns}  {change[5]:+.2%} ± {error[5]:.2%}")
-        return said
 
 
 def calibrate(

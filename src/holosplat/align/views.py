@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from ..baselines.primal_dual import PrimalDual
@@ -19,6 +18,7 @@ from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..projectors.voxels import LatticeProjector
 from ..scan import Exposures, Scan
+from .changes import changes, header, in_words, line
 from .coarse import mirrored
 from .derivatives import in_pixels, predicted
 from .directions import hardly_told
@@ -72,20 +72,18 @@ class AlignedViews:
 
     def lines(self) -> list[str]:
         """What was found, in words, and a table of the views."""
-        root = np.sqrt(np.square(self.changes).mean(0))
-        said = [
-            f"changes of the plan (rms): shifts {np.hypot(root[0], root[1]) / np.sqrt(2):.3f} pixels, turns across the "
-            f"beam {np.hypot(root[2], root[3]) / np.sqrt(2):.3f}°, roll {root[4]:.3f}°, distance {root[5]:.2%}"
-            + (f", magnification {root[6]:.2%}, each ± {_rms(self.errors[:, 6]):.2%}" if root[6] > 0 else ""),
+        larger = _rms(self.changes[:, 6])
+        return [
+            in_words(self.changes)
+            + (f", magnification {larger:.2%}, each ± {_rms(self.errors[:, 6]):.2%}" if larger > 0 else ""),
             f"unexplained share of the contrast: {_rms(self.before):.3f} as planned, {_rms(self.after):.3f} now",
             *self.words,
-            "view  shift x        shift y        turn x           turn y           roll             unexplained",
+            header("view", 2, "unexplained"),
+            *(
+                line(v, change, error, 2, f"{self.before[v]:.3f} → {self.after[v]:.3f}")
+                for v, (change, error) in enumerate(zip(self.changes, self.errors))
+            ),
         ]
-        for v, (change, error) in enumerate(zip(self.changes, self.errors)):
-            shifts = "  ".join(f"{change[k]:+6.2f} ± {error[k]:.2f}" for k in (0, 1))
-            turns = "  ".join(f"{change[k]:+6.3f}° ± {error[k]:.3f}" for k in (2, 3, 4))
-            said.append(f"{v:4d}  {shifts}  {turns}  {self.before[v]:.3f} → {self.after[v]:.3f}")
-        return said
 
 
 def align_still(
@@ -156,17 +154,6 @@ def errors_of(covariances: Tensor) -> np.ndarray:
     """[V, 7] standard errors [pixels, degrees, shares] by covariances [V, 8, 8] of `NUMBERS`."""
     roots = covariances.diagonal(dim1=1, dim2=2).clamp_min(0).sqrt().numpy()[:, :FLUX]
     return roots * np.array([1, 1, *[np.rad2deg(1)] * 3, 1, 1])
-
-
-def changes(found: Exposures, planned: Exposures) -> np.ndarray:
-    """[V, 7]: shifts x, y [pixels], turns about x, y, z of the lab [degrees], shares of distance and magnification."""
-    turns = np.einsum("vij,vkj->vik", found.views.rotations, planned.views.rotations)
-    degrees = Rotation.from_matrix(turns).as_rotvec(degrees=True)
-    shifts = (found.views.shifts - planned.views.shifts) / planned.views.pixel_sizes[:, None]
-    near = np.where(planned.distance > 0, planned.distance, 1.0)
-    stretch = (found.distance - planned.distance) / near
-    larger = planned.views.pixel_sizes / found.views.pixel_sizes - 1
-    return np.concatenate([shifts, degrees, stretch[:, None], larger[:, None]], axis=1)
 
 
 def forget_distance(search: PoseSearch) -> None:
