@@ -226,6 +226,10 @@ class Views:
         (h, w), (my, mx) = self.shape, margin
         return replace(self, shape=(h + 2 * my, w + 2 * mx))
 
+    def taller(self, rows: int) -> Views:
+        """The raster with `rows` more above and below; centres of old pixels stay."""
+        return self.padded((rows, 0))
+
 
 @dataclass(frozen=True)
 class Poses:

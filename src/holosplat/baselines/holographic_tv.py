@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ..checks import at_least
-from ..geometry import Grid
+from ..geometry import Grid, Views
 from ..materials import DeltaBeta
 from ..memory import memory_kept
 from ..model import Instrument, SolvedLight
@@ -29,6 +29,7 @@ from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..projectors.voxels import projector_for
 from ..scan import Scan
+from .beyond import carried_on, rows_beyond
 from .primal_dual import PrimalDual
 from .rays import photons_left, rays_of
 from .tomography import TotalVariation, tv_solver
@@ -120,7 +121,7 @@ def _holographic_tv(
         scan, light, solver = _settled(scan, material, options, on_progress, light)
     alone = absorption_alone(scan.exposures, material.beta / material.delta)  # then retrieval left nothing to correct
     if options.corrections == 0 or options.still_light or noise > options.noisy or alone.all():
-        return solver.volume, Grid.of_views(scan.views)
+        return solver.volume, Grid.of_views(_field(scan, solver))
     return _agree(scan, material, solver, options, refine, on_progress, light)
 
 
@@ -130,7 +131,9 @@ def _tomography(scan: Scan, material: DeltaBeta, options: HolographicTV, on_prog
     how = Tikhonov(iterations=options.retrieval, backend=options.backend)
     report = partial(on_progress, "phase retrieval")
     lines = tikhonov(frames, scan.exposures, *material, options=how, on_progress=report)
-    rays = rays_of(lines, scan.views, Grid.of_views(scan.views), options.backend)
+    beyond = 0 if options.still_light else rows_beyond(lines, scan.exposures, material.beta / material.delta)
+    lines, field = carried_on(lines, beyond), scan.views.taller(beyond)
+    rays = rays_of(lines, field, Grid.of_views(field), options.backend)
     first = min(TotalVariation.first, options.iterations)
     known = {"still_light": options.still_light, "misfit": options.misfit}
     inside = options.inside / scan.views.finest
@@ -184,7 +187,8 @@ def _agree(
     dual variables, do not count.
     """
     frames, pitch = torch.from_numpy(scan.frames), scan.views.finest
-    views = scan.views.in_units_of(pitch)
+    field = _field(scan, coarse)
+    beyond, views = (field.shape[0] - scan.views.shape[0]) // 2, field.in_units_of(pitch)
     correction = Correction(scan, material)
     beside = None if light is None or light.background is None else SolvedLight(light.background, frames, light.air)
     finer = math.ceil(fringe_sampling(scan.exposures) / refine)
@@ -204,8 +208,14 @@ def _agree(
         if misfit < least or done <= options.settling:
             best, least = solver.volume.clone(), misfit
         if done < options.corrections:
-            solver.run(lines + refined(correction(missing) / pitch, refine), inner)
+            more = carried_on(correction(missing), beyond)
+            solver.run(lines + refined(more / pitch, refine), inner)
     return best, _in_metres(grid, pitch)
+
+
+def _field(scan: Scan, solver: PrimalDual) -> Views:
+    """The views with the rows that the volume of `solver`, on voxels of a pixel, has beyond the frames."""
+    return scan.views.taller((solver.volume.shape[1] - scan.views.shape[0]) // 2)
 
 
 class Correction:

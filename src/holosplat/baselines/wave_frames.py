@@ -11,9 +11,13 @@ from ..volume import LineIntegrals
 
 
 def frames_of(instrument: Instrument, lines: Tensor, material: DeltaBeta) -> Tensor:
-    """Frames from thickness [V, H, W] in metres on the unpadded raster (matter outside it counts as none)."""
-    (my, mx), s = instrument.margin, instrument.oversample
-    padded = pad(lines, (mx * s, mx * s, my * s, my * s))
+    """Frames from thickness [V, H, W] in metres on the unpadded raster, or on a taller one about the same middle.
+
+    Matter outside it counts as none.
+    """
+    mx, s = instrument.margin[1], instrument.oversample
+    rows = (instrument.views.shape[0] - lines.shape[1]) // 2
+    padded = pad(lines, (mx * s, mx * s, rows, rows))
     return instrument.frames(LineIntegrals(padded[:, None], ((material.delta, material.beta),)))
 
 

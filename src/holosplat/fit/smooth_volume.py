@@ -9,7 +9,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool3d, avg_pool3d, interpolate
+from torch.nn.functional import adaptive_avg_pool3d, avg_pool3d, interpolate, pad
 
 from ..checks import at_least, require
 from ..geometry import Grid
@@ -71,6 +71,7 @@ class ContinuousPrior:
 class VolumeProblem:
     """½ χ² of the frames and the prior of a volume u [Z, Y, X] ≥ 0 of one material's occupancy, on voxels of a pixel.
 
+    The volume has the rows beyond the frames, too (`WhitenedFrames.field`).
     level: what u is about in matter, the unit of the prior's slopes and values; support [Z, Y, X] bool: where matter
     may be (None: anywhere), beyond which u must begin at zero, and stays there.
     """
@@ -85,7 +86,7 @@ class VolumeProblem:
     ) -> None:
         require(level > 0, f"the level of the matter must be positive, but it is {level:g}.")
         self.frames, self.prior, self.level, self.support = frames, prior, level, support
-        views = frames.train.views
+        views = frames.field
         pixels = views.in_units_of(views.finest)
         self.grid = Grid.of_views(pixels)
         self._projector = projector_for(self.grid, pixels, backend)
@@ -143,8 +144,10 @@ class VolumeProblem:
         """Spectrum of the response of the data's second derivative to one full voxel in the middle."""
         impulse, middle = torch.zeros(self.grid.shape), [n // 2 for n in self.grid.shape]
         impulse[tuple(middle)] = 1.0
-        lines, shape = self.lines(impulse), self.frames.shape
-        curved = torch.fft.irfft2(torch.fft.rfft2(lines) * self.frames.curvature(), s=shape)
+        lines, shape, beyond = self.lines(impulse), self.frames.shape, self.frames.beyond
+        seen = lines[:, beyond : beyond + shape[0]]
+        curved = torch.fft.irfft2(torch.fft.rfft2(seen) * self.frames.curvature(), s=shape)
+        curved = pad(curved, (0, 0, beyond, beyond))
         answer = torch.roll(self.backprojection(curved), [-m for m in middle], (0, 1, 2))
         return torch.fft.rfftn(answer).real.clamp_min(0)
 

@@ -42,10 +42,12 @@ class WhitenedFrames:
     Amplitudes √I have the same noise everywhere (Godard et al. 2012, eq. 9), half that of the intensity near one; P is
     its power by `NoiseModel`, at each spatial frequency, with the part of the contrast that sampled matter cannot
     explain (`model_error`) beside it, or frames without noise would be trusted without end. F is the unitary `rfft2`.
-    The unknowns are line integrals [V, H, W] of one material's occupancy, in (the smallest) pixels of path length.
+    The unknowns are line integrals [V, H, W] of one material's occupancy, in (the smallest) pixels of path length; with
+    matter `beyond` the frames, H is that of `field`.
 
     train: the frames; material: δ > 0 and β of an occupancy of one; noise: their noise; light: a factor of each frame,
-    None for even light; oversample: wave samples a pixel (0: as the first fringe needs).
+    None for even light; oversample: wave samples a pixel (0: as the first fringe needs); beyond: rows above and below the
+    frames in which there may be matter.
     """
 
     def __init__(
@@ -56,9 +58,12 @@ class WhitenedFrames:
         light: LightField | None = None,
         backend: str = "cpu",
         oversample: int = 0,
+        beyond: int = 0,
     ) -> None:
         exposures = train.exposures
-        self.train, self.material = train, material
+        self.train, self.material, self.beyond = train, material, beyond
+        self.field = train.views.taller(beyond)
+        """The views with the rows beyond."""
         self.instrument = Instrument(exposures, oversample or fringe_sampling(exposures), backend=backend)
         self.shape, self.pixel = (train.views.shape[0], train.views.shape[1]), train.views.finest
         frames = torch.from_numpy(train.frames)
@@ -76,7 +81,8 @@ class WhitenedFrames:
         return self._amplitudes.numel()
 
     def curvature(self) -> Tensor:
-        """About the second derivative [V, H, W//2 + 1] by the line integrals, at each spatial frequency of `rfft2`.
+        """About the second derivative [V, H, W//2 + 1] by the line integrals in the frames, at each spatial frequency of
+        `rfft2`.
 
         That of a thin object, `(k δ p H / 2)² / P`, and of a shift of the image by a slow change of the phase, a prism:
         `δI = (λz/2π) ∇δφ · ∇I` (from the transport of intensity, Teague 1983).
@@ -99,6 +105,7 @@ class WhitenedFrames:
     def amplitudes(self, lines: Tensor) -> Tensor:
         """√I [V, H, W] of line integrals [V, H, W] in pixels of path length; differentiable."""
         (my, mx), s = self.instrument.margin, self.instrument.oversample
+        my -= self.beyond
         padded = pad(lines, (mx, mx, my, my)) * self.pixel
         h, w = padded.shape[-2:]
         spectrum = torch.fft.rfft2(padded) * self._sharp

@@ -70,6 +70,11 @@ class SmoothPlan:
     loose: float
     backend: str
 
+    @property
+    def beyond(self) -> int:
+        """Rows above and below the frames in which the start has matter."""
+        return (self.begun.grid.shape[1] - self.scan.views.shape[0]) // 2
+
     def legs(self) -> tuple[Leg, ...]:
         """All descents: rounds on larger voxels, the choice of the likelier volume, and rounds on those of a pixel."""
         factors = [factor for factor in self.coarser if min(self.scan.views.shape) >= LEAST_EDGE * factor]
@@ -83,7 +88,8 @@ class SmoothPlan:
     def frames(self, factor: int) -> WhitenedFrames:
         """The frames on pixels `factor` times larger, in units of their noise."""
         noise, material = self.noise.binned(factor), self.begun.matter.channels[0]
-        return WhitenedFrames(self.scan.binned(factor), material, noise, backend=self.backend)
+        beyond = self.beyond // factor
+        return WhitenedFrames(self.scan.binned(factor), material, noise, backend=self.backend, beyond=beyond)
 
 
 class SmoothFit:
@@ -185,7 +191,7 @@ class SmoothFit:
                 return False
             self._descent = Descent(self._problem(frames, leg.factor), begun.values[0])
             return True
-        grid = begun.grid if leg.factor == 1 else Grid.of_views(frames.train.views)
+        grid = begun.grid if leg.factor == 1 else Grid.of_views(frames.field)
         if self._volume.grid != grid:
             self._volume = self._volume.resampled(grid)
         u = self._volume.values[0]

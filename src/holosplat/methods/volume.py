@@ -8,6 +8,7 @@ from typing import ClassVar
 import torch
 
 from ..baselines import HolographicTV, holographic_tv
+from ..baselines.beyond import rows_of
 from ..baselines.material import MaterialEstimate
 from ..checks import at_least, require
 from ..fit.smooth_volume import ContinuousPrior
@@ -86,7 +87,8 @@ class SmoothStage:
         backend = options.volume.backend
         material = assumed_material(scan, task.prior, task.on_progress, backend, options.estimate)
         first, grid = holographic_tv(scan, material, replace(options.volume, upper=0.0), task.on_progress, light)
-        return VoxelGrid(first[None], grid, Matter.one(*material)).resampled(Grid.of_views(scan.views))
+        field = scan.views.taller(rows_of(grid, scan.views))
+        return VoxelGrid(first[None], grid, Matter.one(*material)).resampled(Grid.of_views(field))
 
     def fit(self, task: Task, start: Stored) -> SmoothFit:
         """The fit to the training frames, from larger voxels on."""

@@ -9,6 +9,7 @@ from typing import ClassVar
 import torch
 
 from ..baselines import HolographicTV, holographic_tv
+from ..baselines.beyond import rows_of
 from ..checks import at_least, require
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Leaves
@@ -140,7 +141,9 @@ class VoxelStage:
         assert isinstance(before, VoxelGrid)
         free = before.matter.single and not task.prior.fixes_ratio
         refine = 1 if self.coarse else refinement(task.scan, self.options)
-        grid = (before.freed() if free else before).resampled(Grid.of_views(task.scan.views, refine))
+        grid = (before.freed() if free else before).resampled(
+            Grid.of_views(task.scan.views.taller(rows_of(before.grid, task.scan.views)), refine)
+        )
         return grid.with_parameters({"values": grid.values.detach().float()})
 
     def fit(self, task: Task, start: Stored) -> Fit:

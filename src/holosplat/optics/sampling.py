@@ -26,14 +26,18 @@ def padding(exposures: Exposures, oversample: int) -> tuple[int, int]:
     The margin on each side is at most the field of view; the propagator cuts light that would travel further (see
     `fresnel_transfer`).
     """
+    margin = fringe_reach(exposures, oversample) + GUARD_PX
+    h, w = exposures.views.shape
+    return smooth_margin(h, min(margin, h + GUARD_PX)), smooth_margin(w, min(margin, w + GUARD_PX))
+
+
+def fringe_reach(exposures: Exposures, oversample: int) -> int:
+    """How far [detector pixels] the finest fringes travel and the point-spread function reaches, in any frame."""
     exposures = exposures.optical
     pitch = exposures.views.pixel_size
     optics = zip(exposures.distance, exposures.energy_kev)
     reach = max(fresnel_reach_px(pitch / oversample, z, float(energy)) for z, energy in optics)
-    blur_px = math.ceil(4 * float(exposures.psf_sigma_px.max()))
-    margin = math.ceil(reach / oversample) + blur_px + GUARD_PX
-    h, w = exposures.views.shape
-    return smooth_margin(h, min(margin, h + GUARD_PX)), smooth_margin(w, min(margin, w + GUARD_PX))
+    return math.ceil(reach / oversample) + math.ceil(4 * float(exposures.psf_sigma_px.max()))
 
 
 def fringe_sampling(exposures: Exposures, extra: int = 0) -> int:
