@@ -8,31 +8,38 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
+import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
 from ..geometry import Grid, Views
+from ..optics.noise import noise_levels
 from ..optics.retrieval import absorption_alone
 from ..optics.sampling import fringe_reach, fringe_sampling
-from ..scan import Exposures
+from ..scan import Scan
 
-OUTER, LEAVING = 2, 0.1
-"""Rows at the top and at the bottom, and the part of the mean thickness from which on matter goes on there."""
+OUTER, LEAVING, FINE = 2, 0.15, 0.1
+"""Rows at the top and at the bottom, the part of the mean occupancy from which on matter goes on there, and the part of
+the mean square slope along a row of the frames: uneven light may pass for matter, but has no fine structure."""
 ROOM = 2
 """Rows beyond the reach of fringes and blur, for what a volume cannot have in its outermost ones."""
 MULTIPLE = 4
 """Rows beyond are a multiple of so many, so that larger pixels divide them, too."""
 
 
-def rows_beyond(lines: Tensor, exposures: Exposures, ratio: float) -> int:
-    """Rows above and below frames in which there is matter that acts on them, by their thickness `lines` [V, H, W].
+def rows_beyond(volume: Tensor, scan: Scan, ratio: float) -> int:
+    """Rows above and below the frames of `scan` in which there is matter that acts on them.
 
-    0 where the outermost rows have next to nothing, and where frames of a material of β/δ = `ratio` show absorption
-    alone, which is seen where it is. Else the fringes' reach with the blur, and `ROOM`.
+    volume: a first one [Z, Y, X], with a voxel for each row. 0 where its outermost slices have next to nothing, where
+    the outermost rows of the frames have no fine structure, and where frames of a material of β/δ = `ratio` show
+    absorption alone, which is seen where it is. Else the fringes' reach with the blur, and `ROOM`.
     """
-    outer = 0.5 * (lines[:, :OUTER].mean() + lines[:, -OUTER:].mean())
-    if float(outer) <= LEAVING * float(lines.mean()) or bool(np.all(absorption_alone(exposures, ratio))):
+    exposures, frames = scan.exposures, torch.from_numpy(scan.frames).double()
+    slopes = frames.diff(dim=2).square().mean(dim=(0, 2)) - 2 * noise_levels(frames).square().mean()
+    for rows, least in ((volume.mean(dim=(0, 2)), LEAVING), (slopes, FINE)):
+        if max(float(rows[:OUTER].mean()), float(rows[-OUTER:].mean())) <= least * float(rows.mean()):
+            return 0
+    if absorption_alone(exposures, ratio).all():
         return 0
     return MULTIPLE * math.ceil((fringe_reach(exposures, fringe_sampling(exposures)) + ROOM) / MULTIPLE)
 

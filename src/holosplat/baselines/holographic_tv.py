@@ -126,13 +126,21 @@ def _holographic_tv(
 
 
 def _tomography(scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress) -> PrimalDual:
-    """Phase retrieval of each view and total variation: the solver, on voxels of one pixel."""
-    frames = torch.from_numpy(scan.frames)
-    how = Tikhonov(iterations=options.retrieval, backend=options.backend)
+    """Phase retrieval of each view and total variation: the solver, on voxels of one pixel.
+
+    Where its volume has matter at the top or at the bottom, both are done anew with matter beyond the frames.
+    """
+    solver = _in_rows(scan, material, options, on_progress, 0)
+    beyond = 0 if options.still_light else rows_beyond(solver.volume, scan, material.beta / material.delta)
+    return _in_rows(scan, material, options, on_progress, beyond) if beyond else solver
+
+
+def _in_rows(scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress, beyond: int) -> PrimalDual:
+    """The same for a volume with so many rows beyond the frames."""
+    frames, field = torch.from_numpy(scan.frames), scan.views.taller(beyond)
+    how = Tikhonov(iterations=options.retrieval, backend=options.backend, leaves=beyond > 0)
     report = partial(on_progress, "phase retrieval")
-    lines = tikhonov(frames, scan.exposures, *material, options=how, on_progress=report)
-    beyond = 0 if options.still_light else rows_beyond(lines, scan.exposures, material.beta / material.delta)
-    lines, field = carried_on(lines, beyond), scan.views.taller(beyond)
+    lines = carried_on(tikhonov(frames, scan.exposures, *material, options=how, on_progress=report), beyond)
     rays = rays_of(lines, field, Grid.of_views(field), options.backend)
     first = min(TotalVariation.first, options.iterations)
     known = {"still_light": options.still_light, "misfit": options.misfit}
@@ -189,7 +197,7 @@ def _agree(
     frames, pitch = torch.from_numpy(scan.frames), scan.views.finest
     field = _field(scan, coarse)
     beyond, views = (field.shape[0] - scan.views.shape[0]) // 2, field.in_units_of(pitch)
-    correction = Correction(scan, material)
+    correction = Correction(scan, material, beyond)
     beside = None if light is None or light.background is None else SolvedLight(light.background, frames, light.air)
     finer = math.ceil(fringe_sampling(scan.exposures) / refine)
     instrument = Instrument(scan.exposures, refine * finer, backend=options.backend)
@@ -208,7 +216,7 @@ def _agree(
         if misfit < least or done <= options.settling:
             best, least = solver.volume.clone(), misfit
         if done < options.corrections:
-            more = carried_on(correction(missing), beyond)
+            more = correction(missing)
             solver.run(lines + refined(more / pitch, refine), inner)
     return best, _in_metres(grid, pitch)
 
@@ -225,19 +233,22 @@ class Correction:
     where noise hides a frequency, the views are not made to agree on it.
     """
 
-    def __init__(self, scan: Scan, material: DeltaBeta) -> None:
+    def __init__(self, scan: Scan, material: DeltaBeta, beyond: int = 0) -> None:
         exposures, frames = scan.exposures.optical, torch.from_numpy(scan.frames)
         self._exposures, self._radian = exposures, radian(exposures, material.delta)
         wide, _ = surrounded(frames, exposures)
         raster = Raster((wide.shape[-2], wide.shape[-1]), exposures.views.pixel_size)
         h = response(exposures, material.beta / material.delta, raster)
         known = spectra(frames, exposures, h, raster, noise_found(frames, None), MODEL_ERROR, PRIOR)
-        self._inverse = known.inverse
+        self._inverse, self._beyond = known.inverse, beyond
 
     def __call__(self, missing: Tensor) -> Tensor:
-        """The thickness, float32, for missing intensity [V, H, W]."""
-        wide, crop = surrounded(missing + 1, self._exposures)
-        return (-filtered(wide, self._inverse)[crop] * self._radian).float()
+        """The thickness, float32, for missing intensity [V, H, W]; and `beyond` rows more of it above and below."""
+        wide, (views, rows, columns) = surrounded(missing + 1, self._exposures)
+        room = min(self._beyond, rows.start)
+        taller = (views, slice(rows.start - room, rows.stop + room), columns)
+        found = (-filtered(wide, self._inverse)[taller] * self._radian).float()
+        return carried_on(found, self._beyond - room)
 
 
 def _working_resolution(scan: Scan, options: HolographicTV) -> tuple[Scan, int, int]:

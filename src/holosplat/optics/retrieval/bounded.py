@@ -18,6 +18,8 @@ from .spectra import Noise, Prior, Raster, filtered, response, spectra, surround
 
 STEPS = 25
 """Alternations between the frame and the bound. Where noise hides the lowest frequencies they go on to drift."""
+LEAVING_STEPS = 100
+"""The same of frames that matter leaves: from the sides alone, emptiness takes longer to tell."""
 SIGNIFICANT = 2.5
 """Standard deviations of its noise above which a pixel is matter."""
 MODEL_ERROR = 0.05
@@ -34,13 +36,18 @@ class Estimate:
     support: Tensor
 
 
-def bounded_estimate(frames: Tensor, exposures: Exposures, ratio: float, noise: Noise) -> Estimate:
+def bounded_estimate(
+    frames: Tensor, exposures: Exposures, ratio: float, noise: Noise, leaves: bool = False
+) -> Estimate:
     """From frames [V, H, W] of a material with β/δ = `ratio`; noise: theirs, None to estimate it.
 
     Wiener's inverse `W` of the contrast transfer function, in alternation with the bound (Papoulis 1975 and
     Gerchberg 1974, who extend spectra so): `φ ← φ₀ + (1 - W H) [φ]`, where `[φ]` is φ where it exceeds
     `SIGNIFICANT` deviations of its noise and zero elsewhere, for noise with its negative half cut off would pass for
     matter (a support found anew in every round: the "shrinkwrap" of Marchesini et al. 2003).
+
+    leaves: whether matter goes on above and below the frame. Air there would take a soft body away far into the frame,
+    for only the bends of its shadow are seen; it may then go on, and ends as smoothly as it can.
     """
     contrast, crop = surrounded(frames, exposures)
     raster = Raster((contrast.shape[-2], contrast.shape[-1]), exposures.views.pixel_size)
@@ -53,9 +60,9 @@ def bounded_estimate(frames: Tensor, exposures: Exposures, ratio: float, noise: 
     least = (SIGNIFICANT * doubtful)[:, None, None]
     linear = -filtered(contrast, known.inverse)
     inside = torch.zeros_like(linear[:1])
-    inside[crop] = 1
+    inside[:, slice(None) if leaves else crop[1], crop[2]] = 1
     phase = linear
-    for _ in range(STEPS):
+    for _ in range(LEAVING_STEPS if leaves else STEPS):
         matter = phase * (phase > least) * inside
         phase = linear + filtered(matter, trusted)
     matter = (phase * (phase > least))[crop]

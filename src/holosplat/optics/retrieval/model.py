@@ -57,6 +57,8 @@ class Regularised:
     """Standard deviation of the frames, or their noise model (default: estimated from them)."""
     backend: str = "cpu"
     """Implementation of the wave optics (see `backends`)."""
+    leaves: bool = False
+    """Whether matter goes on above and below the frames (`bounded_estimate`)."""
 
     def __post_init__(self) -> None:
         at_least(self, 1, "iterations")
@@ -74,8 +76,16 @@ class WaveModel:
     strongest frequency: 1 where fringes are seen, and far less where hardly any are.
     """
 
-    def __init__(self, frames: Tensor, exposures: Exposures, ratio: float, noise: Noise, backend: str = "cpu") -> None:
-        estimate = bounded_estimate(frames, exposures, ratio, noise)
+    def __init__(
+        self,
+        frames: Tensor,
+        exposures: Exposures,
+        ratio: float,
+        noise: Noise,
+        backend: str = "cpu",
+        leaves: bool = False,
+    ) -> None:
+        estimate = bounded_estimate(frames, exposures, ratio, noise, leaves)
         energy = exposures.one_energy("the wave model of a phase retrieval")
         self.exposures, self.ratio = exposures, float(absorption(exposures, ratio)[0])
         self.backend = resolve("reference" if frames.dtype == torch.float64 else backend)
