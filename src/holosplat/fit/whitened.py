@@ -46,8 +46,8 @@ class WhitenedFrames:
     matter `beyond` the frames, H is that of `field`.
 
     train: the frames; material: δ > 0 and β of an occupancy of one; noise: their noise; light: a factor of each frame,
-    None for even light; oversample: wave samples a pixel (0: as the first fringe needs); beyond: rows above and below the
-    frames in which there may be matter.
+    None for even light; oversample: wave samples a pixel (0: as the first fringe needs); beyond: rows above and
+    below the frames in which there may be matter.
     """
 
     def __init__(
@@ -81,8 +81,7 @@ class WhitenedFrames:
         return self._amplitudes.numel()
 
     def curvature(self) -> Tensor:
-        """About the second derivative [V, H, W//2 + 1] by the line integrals in the frames, at each spatial frequency of
-        `rfft2`.
+        """About the second derivative [V, H, W//2 + 1] by the lines in the frames, at each frequency of `rfft2`.
 
         That of a thin object, `(k δ p H / 2)² / P`, and of a shift of the image by a slow change of the phase, a prism:
         `δI = (λz/2π) ∇δφ · ∇I` (from the transport of intensity, Teague 1983).

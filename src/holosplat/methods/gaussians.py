@@ -8,6 +8,7 @@ from typing import ClassVar
 import torch
 
 from ..backends import resolve
+from ..baselines.beyond import rows_of
 from ..fit.batches import block_shape
 from ..fit.density import DensityEvent
 from ..fit.freedom import Freedom, freed
@@ -22,6 +23,7 @@ from ..optics.background import Light
 from ..optics.noise import noise_share
 from ..representations import GaussianCloud, Stored
 from ..scan import Scan
+from .field import field_of
 from .gaussian_options import Backend, FitOptions, GaussianOptions
 from .ground import Ground, ground
 from .method import Stage, Task
@@ -98,14 +100,14 @@ def gaussian_fit(
     """
     backend, schedule = resolve(options.backend), options.schedule
     base = ground(scan, cloud.on(backend), cloud.matter, options.objective, schedule, backend, light=light)
-    grid = Grid.of_views(scan.views)
+    grid = Grid.of_views(field_of(cloud, scan.views))
     terms = [base.frames, *_object_terms(base, options, grid, cloud.matter), *base.extra(options.terms)]
     plan = Plan(
         problem=Problem(base.model, tuple(terms)),
         schedule=schedule,
         optimiser=lambda leaves: Adam(leaves, backend),
         rates=lambda factor, step: options.rates.at(factor, step >= schedule.warmup_steps),
-        events=(DensityEvent(options.density, base.train.views),),
+        events=(DensityEvent(options.density, base.train.views.taller(rows_of(grid, scan.views))),),
         judge=base.judge,
         grid=grid if options.objective.uses_volume else None,
     )

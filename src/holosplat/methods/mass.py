@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ..baselines.beyond import rows_beyond
 from ..baselines.material import plateau
 from ..checks import require
 from ..fit.smooth_volume import ContinuousPrior, VolumeProblem, modulations
@@ -17,6 +18,7 @@ from ..matter import DeltaBeta
 from ..optics.noise_model import NoiseModel
 from ..representations import Stored
 from ..scan import Scan
+from ..volume import Object
 
 MODEL_SHARE = 0.03
 """Standard error of the total, as a share of it, beside that of the noise: of voxels, waves and shapes. Totals of runs
@@ -65,28 +67,37 @@ def total_delta(
     octaves, each from where the one before has led, and the total is that of the range with the least variance and
     squared bias, which is how much it differs from narrower ones beyond their errors (Goldenshluger & Lepski 2011).
 
+    The total is that of the field of view; matter that goes on above and below it is seen, and not counted.
+
     predicted: frames [V, H, W] of `found` by its own model; None where voxels of a pixel say the same. ratio_doubt:
     standard error of δ/β as a share, which joins that of the total; from `DOUBTFUL` on, low frequencies, which see the
     total by its absorption, are no better than the others, and all are taken at once. The error is that of the
     `noise`, of shapes (`SHAPES`) and of the model
     (`MODEL_SHARE`); it does not know of a wrong distance or energy. Errors: `InputError` for a volume without matter.
     """
-    grid = Grid.of_views(train.views)
-    volume = found.at(float(train.exposures.time[0])).voxelise(grid)
-    delta, beta = (torch.as_tensor(values).float() for values in (volume.delta, volume.beta))
+    there, grid = found.at(float(train.exposures.time[0])), Grid.of_views(train.views)
+    delta, beta = _indices(there, grid)
     whole = float(delta.double().clamp_min(0).sum())
     require(whole > 0, "the total δ of a volume without matter has no standard error; look at its frames first.")
     level = plateau(delta.clamp_min(0))
     unit = level * math.prod(grid.voxel_size)
     material = DeltaBeta(level, level * float(beta.double().sum()) / whole)
     backend = "reference" if found.backend == "reference" else "cpu"
-    frames = WhitenedFrames(train, material, noise, backend=backend)
+    beyond = rows_beyond(delta.clamp_min(0), train, material.beta / material.delta)
+    taller = _indices(there, Grid.of_views(train.views.taller(beyond)))[0] if beyond else delta
+    frames = WhitenedFrames(train, material, noise, backend=backend, beyond=beyond)
     ranges = _Ranges(frames, predicted, backend)
     limits = ranges.limits if ratio_doubt < DOUBTFUL else ranges.limits[-1:]
-    value, variance = _best(_by_range(ranges, limits, delta.clamp_min(0) / level))
+    value, variance = _best(_by_range(ranges, limits, taller.clamp_min(0) / level))
     doubts = MODEL_SHARE**2 + ratio_doubt**2
     error = math.sqrt(SHAPES**2 * variance + doubts * value**2)
     return Total(value * unit, error * unit, float(delta.double().sum()) * math.prod(grid.voxel_size))
+
+
+def _indices(found: Object, grid: Grid) -> tuple[Tensor, Tensor]:
+    """δ and β [Z, Y, X] on `grid`."""
+    volume = found.voxelise(grid)
+    return torch.as_tensor(volume.delta).float(), torch.as_tensor(volume.beta).float()
 
 
 class _Ranges:
@@ -120,10 +131,15 @@ class _Ranges:
         shares = covariance @ right
         count = float(((self.radius <= limit) * self._twice).sum()) * len(left)
         chi2 = (float((weight * left.abs().square()).double().sum()) - float(right @ shares)) / count
-        masses = torch.stack([change.double().sum() for change in changes])
+        masses = torch.stack([self._inside(change) for change in changes])
         moved = u + torch.einsum("k,kzyx->zyx", shares.float(), torch.stack(changes))
-        value, variance = float(u.double().sum() + masses @ shares), float(masses @ covariance @ masses)
+        value, variance = float(self._inside(u) + masses @ shares), float(masses @ covariance @ masses)
         return value, variance * max(1.0, chi2), moved.clamp_min(0)
+
+    def _inside(self, u: Tensor) -> Tensor:
+        """The sum of a volume in the field of view."""
+        beyond = self.frames.beyond
+        return u[:, beyond : u.shape[1] - beyond].double().sum()
 
     def _left(self, lines: Tensor) -> Tensor:
         """What is left of measured amplitudes."""

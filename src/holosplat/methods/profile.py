@@ -16,6 +16,7 @@ from scipy.ndimage import binary_dilation
 from torch import Tensor
 
 from ..baselines import HolographicTV, holographic_tv
+from ..baselines.beyond import rows_of
 from ..baselines.material import plateau
 from ..checks import at_least, require
 from ..fit.smooth_volume import ContinuousPrior, VolumeProblem, descend
@@ -91,9 +92,12 @@ class Profile:
         white = (noise.white.square() + options.doubt**2 * contrast).sqrt()
         self._noise = NoiseModel(white, noise.grain, noise.width)
         self._energy = self._scan.exposures.reference_energy
+        self._beyond = 0
         self._samples = max(fringe_sampling(self._exposed(c).exposures) for c in [nominal, *corners])
         with memory_kept():
-            first = self._start(self.frames(nominal))
+            whole = self._volume(self.frames(nominal))
+            self._beyond = rows_of(whole.grid, self._scan.views)
+            first = self._placed(whole)
         inside = (first > options.faint * plateau(first)).numpy()
         self.support = torch.from_numpy(np.asarray(binary_dilation(inside, iterations=max(1, options.dilated))))
         self._peak = plateau(first) / float((first * self.support).sum() / self.support.sum())
@@ -116,22 +120,26 @@ class Profile:
         scan = self._exposed(constants)
         ratio = constants.get("delta_beta", self._ratio * ratio_factor(scan, self._energy))
         material = DeltaBeta(UNIT_DELTA, UNIT_DELTA / ratio)
-        return WhitenedFrames(scan, material, self._noise, backend=self.options.start.backend, oversample=self._samples)
+        backend, samples = self.options.start.backend, self._samples
+        return WhitenedFrames(scan, material, self._noise, backend=backend, oversample=samples, beyond=self._beyond)
 
     def _exposed(self, constants: Constants) -> Scan:
         return exposed(self._scan, constants)
 
-    def _start(self, frames: WhitenedFrames) -> Tensor:
+    def _volume(self, frames: WhitenedFrames) -> VoxelGrid:
         values, grid = holographic_tv(frames.train, frames.material, self.options.start, quiet)
-        whole = VoxelGrid(values[None], grid, Matter.one(*frames.material))
-        return whole.resampled(Grid.of_views(frames.train.views)).values[0]
+        return VoxelGrid(values[None], grid, Matter.one(*frames.material))
+
+    def _placed(self, whole: VoxelGrid) -> Tensor:
+        """A volume with the rows beyond the frames that the first one has."""
+        return whole.resampled(Grid.of_views(self._scan.views.taller(self._beyond))).values[0]
 
     def __call__(self, constants: Constants) -> float:
         """½ χ² and prior of the likeliest volume in the support."""
         with memory_kept():
             frames, options = self.frames(constants), self.options
-            u = self._start(frames) * self.support
-            values = [frames(torch.zeros(frames.train.frames.shape)).value]
+            u = self._placed(self._volume(frames)) * self.support
+            values = [frames(torch.zeros(len(frames.field), *frames.field.shape)).value]
             for _ in range(2):
                 if bool((u > 0).any()):
                     level = self._peak * float(u.sum() / self.support.sum())

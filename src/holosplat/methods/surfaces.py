@@ -28,6 +28,7 @@ from ..progress import Progress
 from ..representations import GaussianCloud, Stored, SurfaceMesh, isosurface
 from ..representations.isosurface import adjacency, neighbour_mean
 from ..scan import Scan
+from .field import field_of
 from .gaussian_options import Backend
 from .gaussians import Gaussians
 from .ground import ExtraTerm, ground
@@ -142,7 +143,8 @@ class SurfaceStage:
 
 
 def extract_surfaces(cloud: GaussianCloud, scan: Scan, options: Extraction = Extraction()) -> SurfaceMesh:
-    """The surfaces where the occupancy of `cloud` crosses the level, in the field of view of `scan`.
+    """The surfaces where the occupancy of `cloud` crosses the level, in the field of view of `scan` and the
+    rows beyond that the cloud fills.
 
     Errors: `InputError` if the cloud is not of one material, or there is no such surface.
     """
@@ -152,7 +154,7 @@ def extract_surfaces(cloud: GaussianCloud, scan: Scan, options: Extraction = Ext
         f"surfaces need one material of known δ and β, but this run has {has}; "
         "reconstruct with --material or --delta-beta.",
     )
-    grid = Grid.of_views(scan.views, 1 / options.spacing)
+    grid = Grid.of_views(field_of(cloud, scan.views), 1 / options.spacing)
     with torch.no_grad():
         density = cloud.density(grid)[0].cpu().numpy()
     mesh = isosurface(density, grid, options.level, options.least_volume, options.smoothing)

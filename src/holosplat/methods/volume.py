@@ -14,12 +14,18 @@ from ..checks import at_least, require
 from ..fit.smooth_volume import ContinuousPrior
 from ..geometry import Grid
 from ..matter import Matter
+from ..optics.retrieval.spectra import contrast_level
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
 from .assumed import assumed_material
 from .cross_validation import predicted_frames
 from .method import Stage, Task
 from .smooth_fit import SmoothFit, SmoothPlan
+
+LEFT = 0.1
+"""Part of the contrast that counts as noise at least where matter leaves the frames: what is beyond explains too much.
+Frames that must be explained to less lead to matter half too much or too little before what is expected of it counts.
+Of blobs, a cell and tissue cut to a half of their rows and fewer, errors of 0.43 to 0.11 became 0.31 to 0.08."""
 
 
 def _start() -> HolographicTV:
@@ -95,8 +101,11 @@ class SmoothStage:
         assert isinstance(start, VoxelGrid)
         options, factor = self.options, binning(task.scan, self.options.max_voxels)
         noise, backend = task.noise.binned(factor), options.volume.backend
+        scan = _beside(task, start).binned(factor)
+        if rows_of(start.grid, scan.views):
+            noise = noise.at_least(LEFT * contrast_level(torch.from_numpy(scan.frames)))
         how = (options.prior, options.coarser, options.rounds, options.iterations, options.loose, backend)
-        return SmoothFit(SmoothPlan(_beside(task, start).binned(factor), start, noise, *how))
+        return SmoothFit(SmoothPlan(scan, start, noise, *how))
 
 
 def _beside(task: Task, start: VoxelGrid) -> Scan:

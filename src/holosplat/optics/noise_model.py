@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -65,6 +65,10 @@ class NoiseModel:
     def __getitem__(self, index: Tensor | np.ndarray | slice) -> NoiseModel:
         """The noise of some of the frames."""
         return NoiseModel(self.white[index], self.grain[index], self.width)
+
+    def at_least(self, level: Tensor) -> NoiseModel:
+        """The noise with white noise of at least the standard deviations `level` [V]."""
+        return replace(self, white=torch.maximum(self.white, level))
 
     def binned(self, factor: int) -> NoiseModel:
         """The noise of frames whose pixels are means of `factor` × `factor`, by that of the frames.

@@ -98,8 +98,8 @@ class Verdict:
 
 LEAVES = (
     "Likely cause: matter goes on above or below the frames, for the outermost rows have as much of it as the others. "
-    "What lies beyond is taken for air, so that fringes and matter are wrong near these rows and, of soft matter, far "
-    "from them; take frames of more rows, to where the matter ends."
+    "What lies beyond is not known, so that matter is wrong near these rows and, of soft matter, far from them; take "
+    "frames of more rows, to where the matter ends."
 )
 OUTER_ROWS, LEAVING, FEW_VIEWS = 2, 0.3, 4
 """Rows at the top and at the bottom, the part of the mean thickness from which on matter goes on there, and the views
