@@ -14,7 +14,7 @@ from tyro.conf import Positional, arg
 from ..checks import InputError, in_range, require
 from ..io.reading import Reading
 from .align import RefineOptions
-from .options import BeamlineOptions, LightFlags, MethodOptions, PriorOptions, TruthOptions
+from .options import BeamlineOptions, MethodOptions, PriorOptions, RunLightFlags, TruthOptions
 from .progress import INTERRUPTED, ProgressBar
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..workflows.reconstruct import Reconstruction
     from ..workflows.run_folder import RunFolder
 
-LIGHT = LightFlags()
+LIGHT = RunLightFlags()
 """Even, unless the air of frames says otherwise."""
 AS_PLANNED = RefineOptions()
 """Beams are where the scan says."""
@@ -41,7 +41,7 @@ def reconstruct(
     resume: bool = False,
     reading: Reading = Reading(),
     *,
-    illumination: LightFlags = LIGHT,
+    illumination: RunLightFlags = LIGHT,
     geometry: RefineOptions = AS_PLANNED,
     strict: bool = False,
 ) -> None:
@@ -90,7 +90,7 @@ def reconstruct(
     report = report_run(folder, result, measured, evaluation, None)
     _print_scores(evaluation)
     if folder.light.is_file():
-        _say(f"light {read_json(folder.summary)['light']}, by the air of the frames: divided out ({folder.light})")
+        _say(f"light {read_json(folder.summary)['light']}, by the frames' air: divided out ({folder.light})")
     _print_result(result, report)
     unexplained = result.verdict is not None and not result.verdict.good
     if unexplained:
