@@ -39,6 +39,8 @@ class MotionFlags:
     """How often bodies are looked for beside those that are known, at most."""
     least_volume: float = 30.0
     """Bodies of fewer voxels, of a pixel's edge, are not followed."""
+    volume_kept: float = 0.006
+    """Standard deviation of a body's volume over time, as a share (0: volumes are free)."""
     effort: float = 1.0
     """Factor of the numbers of steps."""
 
@@ -47,7 +49,8 @@ class MotionFlags:
         usual = TrackOptions().with_effort(positive("--effort", self.effort))
         paths = replace(usual.paths, degree=self.degree, pieces=self.pieces)
         found = replace(usual.sightings, least_volume=self.least_volume)
-        return replace(usual, paths=paths, sightings=found, rounds=self.rounds)
+        fits = {name: replace(getattr(usual, name), volume_kept=self.volume_kept) for name in ("stiff", "soft")}
+        return replace(usual, paths=paths, sightings=found, rounds=self.rounds, **fits)
 
 
 def track(

@@ -11,20 +11,20 @@ from scipy.sparse import csc_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
-from ..checks import at_least, positive
+from ..checks import at_least, positive, require
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Adam, Group
 from ..fit.problem import Problem, Term
 from ..fit.schedule import Schedule
 from ..fit.terms import Objective
-from ..methods.ground import ground
+from ..methods.ground import Ground, ground
 from ..methods.surfaces import BETAS, EPSILON, oversampling
 from ..optics.background import Light
 from ..optics.noise import noise_share
 from ..representations import MovingSurfaces
 from ..representations.isosurface import adjacency
 from ..scan import Scan
-from .terms import COEFFICIENTS, Acceleration, MovingBending
+from .terms import COEFFICIENTS, Acceleration, MovingBending, VolumeKept
 
 OPEN = 1e-3
 """Share of the times' mean square below which a coefficient is taken to be seen so well: what frames hardly see of a
@@ -45,13 +45,15 @@ class MotionFit:
     """How far a vertex draws its neighbours along, λ of Nicolet et al. (2021)."""
     acceleration: float = 1e-6
     """Weight of bent paths: the sum of squared coefficients of acceleration [pixels² per piece⁴]."""
+    volume_kept: float = 0.006
+    """Standard deviation of a body's volume over time, as a share (0: volumes are free). Of red cells it is that."""
     objective: Objective = field(default_factory=_objective)
     """How frames are compared, and what bending costs."""
     schedule: Schedule = field(default_factory=lambda: Schedule(steps=100, views_per_step=16))
     """The loop; memory is that of the frames of one step."""
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "stiffness", "acceleration")
+        at_least(self, 0, "stiffness", "acceleration", "volume_kept")
         positive("rate", self.rate, "pixels")
 
 
@@ -71,7 +73,7 @@ def motion_fit(
     times = base.train.exposures.time
     group = Group(BETAS, EPSILON, solve=_smooth_directions(start, options.stiffness, times), together=True)
     plan = Plan(
-        problem=Problem(base.model, (base.frames, *_terms(base.train, start, options))),
+        problem=Problem(base.model, (base.frames, *_terms(base, start, options))),
         schedule=schedule,
         optimiser=lambda leaves: Adam(leaves, "cpu", {COEFFICIENTS: group}),
         rates=lambda factor, step: {COEFFICIENTS: options.rate * factor},
@@ -80,15 +82,30 @@ def motion_fit(
     return Fit(plan, seed)
 
 
-def _terms(train: Scan, start: MovingSurfaces, options: MotionFit) -> list[Term]:
-    frames, wanted = torch.from_numpy(train.frames), options.objective
+def _terms(base: Ground, start: MovingSurfaces, options: MotionFit) -> list[Term]:
+    frames, wanted, times = torch.from_numpy(base.train.frames), options.objective, base.train.instants
     found: list[Term] = []
     if wanted.bending > 0:
         weight = wanted.bending * (1 + wanted.noise_gain * noise_share(frames)) / frames[0].numel()
-        found.append(MovingBending(weight, start, train.exposures.time))
+        found.append(MovingBending(weight, start, times))
     if options.acceleration > 0 and len(start.basis.curvature()):
         found.append(Acceleration(options.acceleration, start))
+    if options.volume_kept > 0 and start.basis.count > 1:
+        found.append(VolumeKept(_of_likelihood(base) * start.basis.count / 2 / options.volume_kept**2, start, times))
     return found
+
+
+def _of_likelihood(base: Ground) -> float:
+    """What a unit of minus the logarithm of a probability is in units of the loss of frames.
+
+    That is the mean over N pixels of √(r² + c²) - c, about r²/2c, while it should be the sum of r²/2σ²: σ²/(c N).
+    """
+    width, objective = base.frames.resolved.get("rounding", 0.0), base.frames.objective
+    require(
+        width > 0, "volume_kept needs frames that are compared by `rounded`; raise its weight, or leave volumes free."
+    )
+    noise = width / objective.rounding
+    return objective.rounded * noise**2 / width / base.train.frames.size
 
 
 def _smooth_directions(start: MovingSurfaces, stiffness: float, times: np.ndarray) -> Callable[[Tensor], Tensor]:

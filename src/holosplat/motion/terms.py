@@ -56,6 +56,31 @@ class Acceleration:
         return [Part("acceleration", self._weight, bent.square().sum() / paths.shape[1])]
 
 
+class VolumeKept:
+    """Σ over bodies of the mean over times of (V(t)/V - 1)², V a body's mean volume."""
+
+    names = ("volume_kept",)
+
+    def __init__(self, weight: float, start: MovingSurfaces, times: np.ndarray) -> None:
+        """times: [T] s, over which means are taken."""
+        self._weight, self._faces, self._body, self._count = weight, start.faces, start.of_body, start.count
+        self._weights = torch.from_numpy(start.basis.weights(times))
+        self.resolved = {"volume_kept": weight}
+
+    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+        """The one part."""
+        paths = model.parameters()[COEFFICIENTS]
+        volumes = torch.stack([self._volumes(torch.einsum("k,kpx->px", w, paths)) for w in self._weights])
+        change = volumes / volumes.mean(0) - 1
+        return [Part("volume_kept", self._weight, change.square().mean(0).sum())]
+
+    def _volumes(self, vertices: Tensor) -> Tensor:
+        """[B] of all bodies, about the middle of all vertices."""
+        a, b, c = (vertices - vertices.detach().mean(0))[self._faces].unbind(1)
+        parts = (a * torch.linalg.cross(b, c)).sum(1) / 6
+        return vertices.new_zeros(self._count).index_add(0, self._body, parts)
+
+
 def square_root(gram: np.ndarray) -> np.ndarray:
     """R [K, K] with Rᵀ R = `gram` [K, K], positive semi-definite."""
     values, axes = np.linalg.eigh(gram)
