@@ -97,3 +97,8 @@ def test_what_cannot_be_followed_is_refused(folder):
     refused(holosplat("track", scan_file, *known[:2], "--out", folder / "run"), "run")
     refused(holosplat("track", scan_file, *known, "--views", "0:4"), "two times or more", "reconstruct")
     assert not out.exists()
+
+
+def test_surfaces_of_bodies_in_motion_are_there_already(folder):
+    refused(holosplat("surface", folder / "run", "--out", folder / "again"), "closed surfaces already", "export")
+    assert not (folder / "again").exists()

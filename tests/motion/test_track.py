@@ -18,7 +18,7 @@ from holosplat.metrics import volume_scores
 from holosplat.motion import track
 from holosplat.motion.fit import MotionFit, motion_fit
 from holosplat.motion.pieces import PathOptions, chosen_paths, refined
-from holosplat.motion.remainder import apart, beside, joined, only, whole_ones
+from holosplat.motion.remainder import apart, beside, joined, only, sure_ones, whole_ones
 from holosplat.motion.sightings import centroid, sightings
 from holosplat.motion.terms import Acceleration, MovingBending, VolumeKept, square_root
 from holosplat.motion.track import TrackOptions, follow
@@ -132,6 +132,16 @@ def test_pieces_of_bodies_are_none():
         times = truth().times[2:3]
         assert whole_ones(joined(every, still), times) == wanted
         assert apart(still, every, times) == [0][: len(wanted) - 3]
+
+
+def test_small_bodies_wait_for_the_others_but_not_at_the_edge():
+    """Balls of half the others' volume: one in the middle of the field, one at the end of the rows."""
+    sphere, faces = icosphere(2)
+    still, views = TimeBasis(0.0, 0.0, 0), scan().views
+    balls = ((4.0, -8), (4.0, 8), (3.2, 0), (3.2, 17))
+    paths = [PIXEL * (radius * sphere + np.array([0, row, 0]))[None] for radius, row in balls]
+    bodies = MovingSurfaces.of_bodies(paths, [faces] * 4, still, PIXEL, Matter.one(*MATERIAL))
+    assert sure_ones(bodies, views, truth().times) == [0, 1, 3]
 
 
 def test_more_pieces_hold_the_same_paths():

@@ -11,6 +11,7 @@ from typing import Any
 
 from tyro.conf import Positional
 
+from ..checks import require
 from ..io.folder import atomic_folder, require_new
 from ..io.json import write_json
 from ..io.reading import Reading
@@ -21,6 +22,7 @@ from ..mesh import TriangleMesh
 from ..methods.surfaces import SurfaceOptions, oversampling, refine_surfaces
 from ..workflows.evaluate import evaluate as score
 from ..workflows.evaluate import score_object
+from ..workflows.moments import instants_of
 from ..workflows.provenance import scan_hash
 from ..workflows.reconstruct import load_reconstruction
 from ..workflows.run_folder import RunFolder
@@ -49,6 +51,10 @@ def surface(
     require_new(out)
     folder = RunFolder(run)
     result = load_reconstruction(folder)
+    require(
+        not instants_of(folder),
+        f"{run} holds bodies in motion, which are closed surfaces already; write them with export --bodies.",
+    )
     measured, volume = scan_for(folder, scan, reading), read_volume(truth) if truth else None
     if not folder.is_of(scan_hash(measured)):
         _say("this is not the scan that was reconstructed: its held-out frames may have been fitted")

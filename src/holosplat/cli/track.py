@@ -35,7 +35,7 @@ class MotionFlags:
     """Degree of the paths' polynomials."""
     pieces: int = 0
     """Pieces of the paths' splines over the whole time (0: as many as predict held-out frames best)."""
-    rounds: int = 3
+    rounds: int = 4
     """How often bodies are looked for beside those that are known, at most."""
     least_volume: float = 30.0
     """Bodies of fewer voxels, of a pixel's edge, are not followed."""

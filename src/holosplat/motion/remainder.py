@@ -10,12 +10,16 @@ import torch
 from scipy.spatial import KDTree
 
 from ..fit.residuals import Prediction
+from ..geometry import Views
 from ..mesh import TriangleMesh
 from ..representations import MovingSurfaces
 from ..scan import Scan
+from .sightings import is_cut
 
 CENTRES, PART, NEAR_PX = 0.6, 0.5, 2.0
 """When a body is one of its own: radii between centres, share of the median volume, and distance [pixels]."""
+SURE = 0.75
+"""Share of the median volume from which on a body is believed before all others are known."""
 DARKEST = 0.05
 """Relative intensity of a predicted pixel below which it divides no further."""
 
@@ -78,6 +82,18 @@ def apart(new: MovingSurfaces, known: MovingSurfaces, times: np.ndarray) -> list
     large = np.array([abs(mesh.volume) >= least for mesh in new.bodies(middle)])
     own = (distances.min(1) >= CENTRES) & (large | (gaps(new, known, times) > NEAR_PX))
     return [int(k) for k in np.flatnonzero(own)]
+
+
+def sure_ones(bodies: MovingSurfaces, views: Views, times: np.ndarray) -> list[int]:
+    """Numbers of the bodies of `SURE` of the median volume at least, and of those that the field cuts in the middle.
+
+    Of the others few views have smeared a part, or made them up where streaks of several cross; one is left at least.
+    """
+    meshes = bodies.bodies(float(times[len(times) // 2]))
+    cut = np.array([is_cut(mesh, views) for mesh in meshes])
+    volumes = np.array([abs(mesh.volume) for mesh in meshes])
+    middle = np.median(volumes if cut.all() else volumes[~cut])
+    return [int(k) for k in np.flatnonzero(cut | (volumes >= SURE * middle))]
 
 
 def gaps(of: MovingSurfaces, others: MovingSurfaces, times: np.ndarray) -> np.ndarray:

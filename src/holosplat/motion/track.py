@@ -19,7 +19,7 @@ from ..scan import Scan
 from .fit import MotionFit, motion_fit
 from .identities import LinkOptions
 from .pieces import PathOptions, chosen_paths
-from .remainder import apart, beside, joined, only, whole_ones
+from .remainder import apart, beside, joined, only, sure_ones, whole_ones
 from .sightings import Sighting, SightingOptions, sightings
 from .start import first_paths
 
@@ -44,7 +44,7 @@ class TrackOptions:
     """Which of them are one body."""
     paths: PathOptions = field(default_factory=PathOptions)
     """How the vertices move."""
-    rounds: int = 3
+    rounds: int = 4
     """How often bodies are looked for beside those that are known, at most."""
     fainter: float = 0.6
     """Factor of the level there: few views smear a body, and beside what is known there is little to take it for."""
@@ -143,10 +143,12 @@ class _Following:
         return found
 
     def first(self) -> MovingSurfaces:
-        """Bodies on first paths."""
+        """Bodies on first paths; the doubtful ones are left to be found beside the others."""
         times, options = self.train.instants, self.options
         basis = TimeBasis(float(times[0]), float(times[-1]), options.paths.degree)
-        return first_paths(self.seen, times, basis, self.train.views.finest, self.material, options.links)
+        found = first_paths(self.seen, times, basis, self.train.views.finest, self.material, options.links)
+        sure = sure_ones(found, self.train.views, times)
+        return found if options.rounds == 0 or len(sure) == found.count else only(found, sure)
 
     def more(self, bodies: MovingSurfaces) -> MovingSurfaces | None:
         """`bodies`, and those that frames show beside them; None where there are none."""
