@@ -24,10 +24,12 @@ from holosplat.representations import (
     KINDS,
     Encoding,
     GaussianCloud,
+    MovingSurfaces,
     Network,
     NeuralField,
     Stored,
     SurfaceMesh,
+    TimeBasis,
     VoxelGrid,
 )
 from holosplat.specimens.red_cells import icosphere
@@ -35,6 +37,7 @@ from holosplat.specimens.red_cells import icosphere
 PITCH = 2e-6
 GRID = Grid((7, 5, 9), (PITCH, PITCH, PITCH), (-8e-6, 1e-6, -5e-6))
 CELL = Matter.one(3e-7, 2e-10)
+KNOWN = "kinds gaussians, voxels, surfaces, moving-surfaces, neural-field"
 OLD = Path(__file__).resolve().parents[1] / "data/run_0_1_0/gaussians.h5"
 
 
@@ -50,6 +53,9 @@ def objects() -> dict[str, Stored]:
         "gaussians": GaussianCloud(cloud, PITCH, Matter.free(*CELL.channels[0])),
         "voxels": VoxelGrid(torch.rand(2, *GRID.shape), GRID, Matter.two((3e-7, 2e-10), (1e-7, 1e-11))),
         "surfaces": SurfaceMesh(3 * sphere, faces.long(), PITCH, CELL, 3),
+        "moving-surfaces": MovingSurfaces(
+            torch.stack([3 * sphere, 3 * sphere + 1]), faces.long(), 0 * faces[:, 0], TimeBasis(0, 1e-5, 1), PITCH, CELL
+        ),
         "neural-field": NeuralField(GRID, CELL, small, mask, seed=4, upper=0.7),
     }
 
@@ -150,8 +156,8 @@ def first(value: float) -> Callable[[np.ndarray], np.ndarray]:
 ANY: dict[str, tuple[Callable[[h5py.File], object], str]] = {
     "no format": (lambda f: f.attrs.__delitem__("format"), "its format is ''"),
     "a later format": (lambda f: f.attrs.update(format="holosplat object 2"), "its format is 'holosplat object 2'"),
-    "no kind": (lambda f: f.attrs.__delitem__("kind"), "kinds gaussians, voxels, surfaces, neural-field"),
-    "unknown kind": (lambda f: f.attrs.update(kind="sponge"), "kinds gaussians, voxels, surfaces, neural-field"),
+    "no kind": (lambda f: f.attrs.__delitem__("kind"), KNOWN),
+    "unknown kind": (lambda f: f.attrs.update(kind="sponge"), KNOWN),
     "no state": (lambda f: f.attrs.__delitem__("state"), "state"),
     "state that is no JSON": (lambda f: f.attrs.update(state="{"), "lacks or garbles"),
     "state that is no table": (lambda f: f.attrs.update(state="[1]"), "lacks or garbles"),

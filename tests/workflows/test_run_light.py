@@ -9,11 +9,13 @@ import pytest
 import torch
 
 from helpers.fit_balls import MATERIAL, PIXEL
+from holosplat.baselines import HolographicTV
 from holosplat.beamline.light import correlated_field
 from holosplat.beamline.simulate import simulate
 from holosplat.geometry import Grid, Views
 from holosplat.io.json import read_json
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
+from holosplat.methods import HolographicVoxels
 from holosplat.methods.per_view import PerView
 from holosplat.optics.background import LightOptions
 from holosplat.report.run import report_run
@@ -107,6 +109,8 @@ def test_what_a_folder_says_of_light():
 def test_a_run_finds_light_keeps_it_and_draws_it(tmp_path):
     scan, _ = lit(6)
     scan = scan.cropped(slice(0, 45), slice(10, 58))
+    pattern = 1 + 0.01 * np.random.default_rng(2).standard_normal(scan.views.shape)
+    scan = replace(scan, frames=(scan.frames * pattern).astype(np.float32))
     folder, quick = RunFolder(tmp_path / "run"), PerView("paganin", "sirt")
     run = reconstruct(scan, MaterialPrior.known(MATTER), quick, folder=folder)
     assert run.light == SMOOTH
@@ -114,4 +118,37 @@ def test_a_run_finds_light_keeps_it_and_draws_it(tmp_path):
     assert read_json(folder.summary)["light"].startswith("uneven")
     page = report_run(folder, run, scan, evaluate(run, scan, None), None).read_text()
     assert "light is uneven by" in page
+    assert " and the same " in page
     assert "Uneven light." in page
+
+
+def test_light_in_common_is_kept_with_the_run_and_evaluated_in(tmp_path):
+    scan, _ = lit(8, 0.0)
+    pattern = 1 + 0.01 * np.random.default_rng(2).standard_normal(SHAPE)
+    scan = replace(scan, frames=(scan.frames * pattern).astype(np.float32), is_test=np.arange(8) % 4 == 3)
+    folder = RunFolder(tmp_path / "run")
+    run = reconstruct(scan, MaterialPrior.known(MATTER), PerView("paganin", "sirt"), folder=folder)
+    assert run.still is not None
+    assert np.std(run.still / pattern) < 0.3 * np.std(pattern)
+    again = load_reconstruction(folder)
+    assert again.still is not None
+    np.testing.assert_array_equal(again.still, run.still)
+    assert again.light == EVEN
+    assert read_json(folder.summary)["light"] == "the same 0.99% in all frames"
+    known, unknown = (evaluate(each, scan, None) for each in (again, replace(again, still=None)))
+    assert known.test is not None
+    assert unknown.test is not None
+    assert known.test.mean["ssim"] > unknown.test.mean["ssim"] + 0.1
+    assert any("in all frames; predictions are compared in it" in line for line in known.lines())
+    other = evaluate(again, scan.cropped(slice(0, 45), slice(0, 50)), None)
+    assert other.light is None  # of another raster
+
+
+def test_light_that_a_method_solves_for_is_kept_with_the_run():
+    scan, _ = lit(6, 0.0)
+    rows = np.cos(np.pi * (np.arange(SHAPE[0]) + 0.5) / SHAPE[0])
+    scan = replace(scan, frames=(scan.frames * np.exp(0.03 * rows)[:, None]).astype(np.float32))
+    method = HolographicVoxels(volume=HolographicTV(still_light=1, retrieval=20, iterations=40, upper=0.0))
+    run = reconstruct(scan, MaterialPrior.known(MATTER), method, light=LightOptions("even"))
+    assert run.still is not None
+    assert run.still == pytest.approx(np.broadcast_to(np.exp(0.03 * rows)[:, None], SHAPE), abs=0.01)

@@ -160,7 +160,7 @@ def _settled(
     counts whose volume and light explain the frames best; where noise hides the shadows of bodies that is the first.
     """
     assert light.background is not None
-    measured = (torch.from_numpy(scan.frames) * light.background.factor()).float()
+    measured = (torch.from_numpy(scan.frames) * light.factor()).float()
     samples = fringe_sampling(scan.exposures)
     instrument = Instrument(scan.exposures, samples, backend=options.backend)
     best, least = None, float("inf")

@@ -346,3 +346,16 @@ class LightFlags:
         from ..optics.background import LightOptions
 
         return LightOptions(self.light, self.air)
+
+
+@dataclass(frozen=True)
+class RunLightFlags(LightFlags):
+    """The light beside the flat fields, of several frames."""
+
+    still_light: Literal["auto", "none"] = "auto"
+    """auto: what all frames have in common in the same pixels is divided out, where their air shows that the light does
+    it; none: it is not."""
+
+    def options(self) -> LightOptions:
+        """What is assumed of the light."""
+        return replace(super().options(), still=self.still_light)

@@ -7,17 +7,34 @@ from pathlib import Path
 import h5py
 import numpy as np
 
+from ..checks import InputError, finite
 from ..optics.background import ORDER, Background
 from .atomic import atomic_path
+from .hdf5 import open_hdf5
 
 FORMAT = "holosplat light 1"
 
 
-def write_light(path: Path, light: Background) -> None:
-    """Coefficients [V, (K + 1)²] of `exp(Σ c m)`, m the products of cosines of 0 to K half waves of `smooth_modes`."""
+def write_light(path: Path, light: Background | None, still: np.ndarray | None = None) -> None:
+    """Coefficients [V, (K + 1)²] of `exp(Σ c m)`, m the products of cosines of 0 to K half waves of `smooth_modes`, and
+    the light [H, W] that all frames have in common; None: there is none."""
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         file.attrs["format"] = FORMAT
-        file.attrs["half_waves"] = ORDER
-        file.attrs["shape"] = np.asarray(light.shape)
-        file["coefficients"] = light.coefficients.numpy()
-        file["variances"] = light.variances.numpy()
+        if light is not None:
+            file.attrs["half_waves"] = ORDER
+            file.attrs["shape"] = np.asarray(light.shape)
+            file["coefficients"] = light.coefficients.numpy()
+            file["variances"] = light.variances.numpy()
+        if still is not None:
+            file["still"] = still.astype(np.float32)
+
+
+def read_still_light(path: Path) -> np.ndarray | None:
+    """The light [H, W] that all frames have in common; None where the file has none. Errors: `InputError`."""
+    with open_hdf5(path) as file:
+        found = file.get("still")
+        if found is None:
+            return None
+        if not isinstance(found, h5py.Dataset) or found.ndim != 2:
+            raise InputError(f"{path}: /still must be an image [H, W], but it is not; reconstruct anew.")
+        return finite(f"{path}: /still", np.asarray(found[()], dtype=np.float32))

@@ -100,7 +100,7 @@ class Task:
     @property
     def light_in_words(self) -> str:
         """What the frames say of the light."""
-        return "even" if self.uneven is None else self.uneven.in_words
+        return "even" if self.lit is None else self.lit.in_words
 
     @property
     def bounded(self) -> bool:

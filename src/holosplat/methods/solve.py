@@ -17,6 +17,7 @@ from .auto import Auto
 from .gaussians import Gaussians
 from .levels import Decision, LevelTest, decide_matter
 from .method import Method, Task, solve_stages
+from .still import prepared
 from .uncertain import Determined, Uncertain, determine, likeliest_ratio, placed, told
 
 
@@ -90,5 +91,6 @@ def _levels(method: Method) -> LevelTest:
 
 def solve(method: Method, task: Task, matter: MatterKind | None = None) -> Stored:
     """What `method` makes of `task` in memory, without a folder; Ctrl-C is passed on. matter: as for `settled`."""
+    task = prepared(task, method)
     found = settled(method, task, matter)
     return solve_stages(found.method, found.task(task))

@@ -112,7 +112,7 @@ def _beside(task: Task, start: VoxelGrid) -> Scan:
     """The frames in the light that they have beside `start`, where that explains them better."""
     if task.uneven is None or task.uneven.background is None:
         return task.scan
-    light, measured = task.uneven, (torch.from_numpy(task.scan.frames) * task.uneven.background.factor()).float()
+    light, measured = task.uneven, (torch.from_numpy(task.scan.frames) * task.uneven.factor()).float()
     predicted = predicted_frames(task.scan.exposures, start)
     after = light.settled(measured, predicted)
     better = after.misfit(measured, predicted) < light.misfit(measured, predicted)

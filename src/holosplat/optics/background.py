@@ -34,6 +34,7 @@ DARKEST = 0.05
 
 
 Kind = Literal["auto", "even", "smooth"]
+Still = Literal["auto", "none"]
 
 
 @dataclass(frozen=True)
@@ -44,11 +45,15 @@ class LightOptions:
     """auto: smooth where the air is uneven beyond its noise, else even; even: none; smooth: in any case."""
     air: tuple[Box, ...] = ()
     """Boxes without matter or fringes in any frame: first row, end row, first column, end column (default: found)."""
+    still: Still = "auto"
+    """auto: what all frames have in common, pixel by pixel, is light where air shows such light; none: there is none.
+    Where `kind` is even, there is none either."""
 
     def __post_init__(self) -> None:
         require(
             self.kind in ("auto", "even", "smooth"), f"light must be auto, even or smooth, but it is {self.kind!r}."
         )
+        require(self.still in ("auto", "none"), f"still light must be auto or none, but it is {self.still!r}.")
 
     def air_of(self, frames: Tensor) -> Tensor:
         """The air [V, H, W] bool of frames [V, H, W]."""
@@ -59,11 +64,13 @@ class LightOptions:
 
 @dataclass(frozen=True)
 class Light:
-    """What is known of the light of some frames: air [V, H, W] bool; noise; background, None where light is even."""
+    """What is known of the light of some frames: air [V, H, W] bool; noise; background, None where light is even;
+    still [H, W], the factor that all frames have beside that, None where there is none."""
 
     air: Tensor
     noise: NoiseModel
     background: Background | None
+    still: Tensor | None = None
 
     @classmethod
     def of(cls, frames: Tensor, options: LightOptions = LightOptions()) -> Light:
@@ -83,14 +90,23 @@ class Light:
 
     @property
     def in_words(self) -> str:
-        """What the frames say of the light, with its root mean square deviation from one."""
-        if self.background is None:
-            return "even"
-        return f"uneven by {float((self.background.factor() - 1).square().mean().sqrt()):.2%}"
+        """What the frames say of the light, with root mean square deviations from one."""
+        said = []
+        if self.background is not None:
+            said.append(f"uneven by {_deviation(self.background.factor()):.2%}")
+        if self.still is not None:
+            said.append(f"the same {_deviation(self.still):.2%} in all frames")
+        return " and ".join(said) or "even"
+
+    def factor(self) -> Tensor:
+        """The light [V, H, W] of all frames, float64."""
+        one = torch.ones(self.air.shape, dtype=torch.float64) if self.background is None else self.background.factor()
+        return one if self.still is None else one * self.still
 
     def evened(self, frames: Tensor) -> Tensor:
         """Frames [V, H, W] as they would be in even light."""
-        return frames if self.background is None else (frames / self.background.factor()).to(frames.dtype)
+        known = self.background is not None or self.still is not None
+        return (frames / self.factor()).to(frames.dtype) if known else frames
 
     @property
     def doubt(self) -> NoiseModel:
@@ -105,6 +121,7 @@ class Light:
         known = self.background
         if known is None:
             return self
+        frames = frames if self.still is None else frames / self.still
         return replace(self, background=known.seen_beside(frames, torch.where(self.air, 1.0, predicted)))
 
     def part(self, index: Tensor, factor: int = 1) -> Light:
@@ -114,13 +131,15 @@ class Light:
         coarse = air[:, rows, columns].unflatten(2, (-1, factor)).unflatten(1, (-1, factor)).all(dim=4).all(dim=2)
         if known is not None:
             known = known[index] if factor == 1 else known[index].binned(rows, columns, factor)
-        return Light(coarse, self.noise[index].binned(factor), known)
+        still = self.still
+        if still is not None and factor > 1:
+            still = torch.nn.functional.avg_pool2d(still[None, rows, columns], factor)[0]
+        return Light(coarse, self.noise[index].binned(factor), known, still)
 
     def misfit(self, frames: Tensor, predicted: Tensor) -> float:
         """χ² of measured frames [V, H, W] beside those predicted in even light, and of the light for its prior."""
         known = self.background
-        factor = 1.0 if known is None else known.factor()
-        left = (frames - predicted * factor).double().square().sum(dim=(1, 2)) / _lowest_power(self.noise)
+        left = (frames - predicted * self.factor()).double().square().sum(dim=(1, 2)) / _lowest_power(self.noise)
         of_light = 0.0 if known is None else float((known.coefficients.square() / known.variances).sum())
         return float(left.sum()) + of_light
 
@@ -245,6 +264,10 @@ def _surely_uneven(frames: Tensor, air: Tensor, noise: NoiseModel, usable: Tenso
     size = float((((found @ modes).reshape(lit.shape) * seen).square().sum() - len(modes) * power.sum()) / seen.sum())
     contrast = float((lit - 1).square().mean())
     return squares > freedom + UNEVEN * (2 * freedom) ** 0.5 and size > SEEN**2 * contrast
+
+
+def _deviation(factor: Tensor) -> float:
+    return float((factor - 1).square().mean().sqrt())
 
 
 def _found(frames: Tensor, noise: NoiseModel, air: Tensor, kind: Kind) -> Background | None:

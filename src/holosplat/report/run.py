@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +74,7 @@ def report_run(
 NAMES = {
     "gaussians": "Gaussian reconstruction",
     "surfaces": "Reconstruction as closed surfaces",
+    "moving-surfaces": "Reconstruction as closed surfaces in motion",
     "voxels": "Voxel reconstruction",
     "neural-field": "Reconstruction as a neural field",
 }
@@ -107,17 +109,19 @@ def _drawn_grid(views: Views) -> Grid:
 def _lit(reconstruction: Reconstruction, scan: Scan, evaluation: Evaluation) -> LitViews | None:
     """A few training frames with the light that they have beside the prediction; None where light is even."""
     light = evaluation.light
-    if light is None or light.background is None or scan.is_test.all():
+    if light is None or scan.is_test.all():
         return None
     train = np.flatnonzero(~scan.is_test)
     chosen = train[evenly_chosen(len(train), MOST_LIT)]
     shown = scan[chosen]
     predicted = render(reconstruction, shown.exposures)
-    background = light.background[torch.from_numpy(chosen)]
-    beside = background.seen_beside(torch.from_numpy(shown.frames), torch.from_numpy(predicted))
+    measured, part = torch.from_numpy(shown.frames), light.part(torch.from_numpy(chosen))
+    if part.background is not None:
+        still = 1.0 if part.still is None else part.still
+        part = replace(part, background=part.background.seen_beside(measured / still, torch.from_numpy(predicted)))
     return LitViews(
         shown.frames,
-        beside.factor().numpy(),
+        part.factor().numpy(),
         predicted,
         view_labels(shown.views),
         light.in_words,

@@ -14,7 +14,9 @@ from .encodings import Encoding
 from .gaussians import GaussianCloud
 from .initialise import approximate, at_pitch, cloud_from_two, cloud_from_volume, freed, random_cloud
 from .isosurface import isosurface
+from .moving_surfaces import MovingSurfaces
 from .neural_field import Network, NeuralField
+from .paths import TimeBasis
 from .surfaces import SurfaceMesh
 from .voxel_lines import VoxelLines
 from .voxels import VoxelGrid
@@ -64,17 +66,21 @@ class Stored(TrainableObject, Protocol):
         ...
 
 
-KINDS: dict[str, type[Stored]] = {kind.kind: kind for kind in (GaussianCloud, VoxelGrid, SurfaceMesh, NeuralField)}
+KINDS: dict[str, type[Stored]] = {
+    kind.kind: kind for kind in (GaussianCloud, VoxelGrid, SurfaceMesh, MovingSurfaces, NeuralField)
+}
 """Every kind of Object that files hold, by name."""
 
 __all__ = [
     "KINDS",
     "Encoding",
     "GaussianCloud",
+    "MovingSurfaces",
     "Network",
     "NeuralField",
     "Stored",
     "SurfaceMesh",
+    "TimeBasis",
     "VoxelGrid",
     "VoxelLines",
     "approximate",

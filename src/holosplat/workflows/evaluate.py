@@ -112,7 +112,7 @@ class Evaluation(Scores):
         found = self.material
         said = self.verdict.lines("held-out frames") if self.verdict else []
         if self.light is not None:
-            said = [f"light: {self.light.in_words}, by the air of each frame; predictions are compared in it", *said]
+            said = [f"light: {self.light.in_words}; predictions are compared in it", *said]
         if not found.delta_told:
             beta = f"material: β {found.delta / found.ratio:.3e}; δ is not told: the frames show absorption alone"
             return [*super().lines(), *said, beta]
@@ -146,13 +146,14 @@ def evaluate(reconstruction: Reconstruction, scan: Scan | None, truth: Volume | 
     """Scores of `reconstruction`: on the frames of `scan`, and against `truth` on the truth's own grid.
 
     The data range is that of the scan's training frames. Where the light of the training frames is uneven, predictions
-    are compared in the light that each frame shows in its own air (`light_of`), held-out frames too.
+    are compared in the light that each frame shows in its own air (`light_of`), held-out frames too, and in that which
+    the training frames were found to have in common.
     """
     found = reconstruction.object
     lit = None
     if scan is not None:
         _require_energy(reconstruction, scan.exposures)
-        lit = light_of(scan, reconstruction.light)
+        lit = light_of(scan, reconstruction.light, reconstruction.still)
     scores = score_object(found, scan, truth, reconstruction.oversample, found.backend, _factor(lit))
     material = replace(material_found(found), delta_told=reconstruction.delta_told)
     said = held_out_verdict(reconstruction, scan, lit) if scan is not None else None
@@ -176,7 +177,7 @@ def held_out_verdict(reconstruction: Reconstruction, scan: Scan, lit: Light | No
 
 def _factor(lit: Light | None) -> np.ndarray | None:
     """The light [N, H, W] of all frames of a scan, float32."""
-    return None if lit is None or lit.background is None else lit.background.factor().numpy().astype(np.float32)
+    return None if lit is None else lit.factor().numpy().astype(np.float32)
 
 
 def score_object(

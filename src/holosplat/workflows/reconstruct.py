@@ -14,10 +14,11 @@ from ..align.poses import PoseOptions
 from ..checks import InputError, require
 from ..fit.running import Record, Running
 from ..io.json import read_json, write_json
-from ..io.light import write_light
+from ..io.light import read_still_light, write_light
 from ..io.objects import read_object, write_object
 from ..matter import MaterialPrior, MatterKind
 from ..methods import Auto, Gaussians, Method, Settled, Stage, Task, finished, settled
+from ..methods.still import prepared
 from ..methods.uncertain import Determined, Uncertain
 from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling
@@ -40,7 +41,7 @@ from .refine import (
 )
 from .resume import require_same
 from .run_folder import RunFolder
-from .run_light import found_in, read_light_options
+from .run_light import found_in, read_light_options, still_in
 from .run_record import config_of, summary_of
 from .totals import TotalMatter, total_of_run
 from .verdict import Verdict, judge_run, said_of_run
@@ -81,7 +82,7 @@ def reconstruct(
     for what the method cannot do.
     """
     require_one_time(scan)
-    _check_frames(scan.train())
+    check_frames(scan.train())
     assumed, ranges, planned = light or LightOptions(), uncertain or Uncertain(), scan
     said = {"light": to_table(assumed), "uncertain": to_table(ranges), "refine": refine and to_table(refine)}
     config = config_of(scan, prior, method, seed, matter) | said
@@ -96,7 +97,7 @@ def reconstruct(
         geometry = saved_geometry(folder, resume) or trained_geometry(scan, prior, refine, assumed, tell)
         scan = geometry.applied(scan)
     train = scan.train()
-    task = Task(train, prior, seed, tell, assumed, freedom=freedom_of(geometry, refine)).evened()
+    task = prepared(Task(train, prior, seed, tell, assumed, freedom=freedom_of(geometry, refine)), method)
     run = _Run(task, method, folder, on_progress)
     run.begin(config, resume)
     run.settle(matter, ranges, scan, geometry)
@@ -132,7 +133,8 @@ def require_one_time(scan: Scan) -> None:
     )
 
 
-def _check_frames(train: Scan) -> None:
+def check_frames(train: Scan) -> None:
+    """`InputError` for too few columns, and for frames that are not relative to the flat field."""
     h, w = train.views.shape
     require(
         w >= FEWEST_COLUMNS,
@@ -165,7 +167,8 @@ def load_reconstruction(folder: RunFolder) -> Reconstruction:
     total = TotalMatter.from_dict(summary["total"]) if "total" in summary else None
     constants = tuple(Determined.from_dict(each) for each in summary.get("constants", ()))
     light, choice = read_light_options(folder.read_config(), summary), Choice.read(summary)
-    told_of = (choice, told, said, total, constants, light, read_geometry(summary))
+    still = read_still_light(folder.light) if folder.light.is_file() else None
+    told_of = (choice, told, said, total, constants, light, read_geometry(summary), still)
     return Reconstruction(found, method, energy, oversample, timing, done, *told_of)
 
 
@@ -303,14 +306,16 @@ class _Run:
             total_of_run(*said_of_run(found, fit, self.task, oversample), self.task, self.constants),
             self.constants,
             found_in(self.task),
+            still=still_in(self.task, self.method, found, oversample),
         )
         if self.folder is not None:
             self.make_folder(found.backend)
             if fit is None:
                 self.folder.start_metrics([])
             write_object(self.folder.object, found)
-            if self.task.uneven is not None and self.task.uneven.background is not None:
-                write_light(self.folder.light, self.task.uneven.background)
+            background = self.task.uneven and self.task.uneven.background
+            if background is not None or done.still is not None:
+                write_light(self.folder.light, background, done.still)
             write_json(self.folder.summary, summary_of(done, fit, self.task.scan) | {"light": self.task.light_in_words})
         return done
 

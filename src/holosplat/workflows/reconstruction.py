@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from ..align.geometry import Geometry
 from ..methods.uncertain import Determined, placed
 from ..optics.background import LightOptions
@@ -32,6 +34,7 @@ class Reconstruction:
     constants: what was known to a range only, or of continuous matter not at all, by the frames
     light: what is assumed of the light of other frames of the scan: smooth if that of the training frames is uneven
     geometry: where the frames were found to be; None: they are taken to be where the scan says
+    still: [H, W] the light that all frames of the scan have in common, by those for training; None: there is none
     """
 
     object: Stored
@@ -47,6 +50,7 @@ class Reconstruction:
     constants: tuple[Determined, ...] = ()
     light: LightOptions = EVEN
     geometry: Geometry | None = None
+    still: np.ndarray | None = None
 
     def placed(self, scan: Scan) -> Scan:
         """`scan`, as it was given to the reconstruction, at the distance and energy, or in the poses, that were

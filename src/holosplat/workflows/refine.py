@@ -95,7 +95,7 @@ def with_held_out(
     at, uncertain = np.flatnonzero(scan.is_test), still_uncertain(geometry, options.uncertain)
     if not len(at) or not any(getattr(uncertain, name) for name in KINDS):
         return geometry
-    lit = light_of(scan, done.light)
+    lit = light_of(scan, done.light, done.still)
     if lit is not None:
         scan = replace(scan, frames=lit.evened(torch.from_numpy(scan.frames)).numpy())
     found = place_frames(done.object, scan[at], replace(options, uncertain=uncertain), on_progress, done.oversample)

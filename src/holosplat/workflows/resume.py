@@ -29,7 +29,8 @@ def require_same(folder: RunFolder, config: dict[str, Any]) -> None:
     """`InputError` unless the run in `folder` was started with this `config`; another machine may go on with it."""
     old, same = folder.read_config(), json.loads(json.dumps(config))
     for name, default in (("light", LightOptions()), ("uncertain", Uncertain())):
-        old.setdefault(name, json.loads(json.dumps(to_table(default))))
+        known = json.loads(json.dumps(to_table(default)))
+        old[name] = known | old.get(name, {})  # what older versions did not know
     old.setdefault("refine", None)
     version = old.get("schema_version", 1)
     require(

@@ -6,10 +6,15 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
 
-from ..methods import Task
+from ..methods import Method, Task
+from ..methods.cross_validation import predicted_frames
+from ..methods.still import still_order
 from ..optics.background import Light, LightOptions
+from ..optics.still_light import mean_light
+from ..representations import Stored
 from ..scan import Scan
 from ..tables import from_table
 
@@ -24,21 +29,38 @@ def found_in(task: Task) -> LightOptions:
 
 def read_light_options(config: Mapping[str, Any], summary: Mapping[str, Any]) -> LightOptions:
     """The same of a run folder; older ones say nothing of light, which is then even."""
-    if summary.get("light", "even") == "even":
+    if not str(summary.get("light", "even")).startswith("uneven"):
         return EVEN
     return replace(from_table(LightOptions, config.get("light", {}), "light"), kind="smooth")
 
 
-def light_of(scan: Scan, assumed: LightOptions) -> Light | None:
+def still_in(task: Task, method: Method, found: Stored, oversample: int) -> np.ndarray | None:
+    """The light [H, W] that the frames of a run have in common, float32; None where they have none.
+
+    It was divided out before (`prepared`), or is an unknown of `method`: then it is what is left beside what was found.
+    """
+    if task.lit is not None and task.lit.still is not None:
+        return task.lit.still.numpy().astype(np.float32)
+    order = still_order(method)
+    if not order:
+        return None
+    predicted = predicted_frames(task.scan.exposures, found, oversample)
+    return mean_light(torch.from_numpy(task.scan.frames), predicted, order).numpy().astype(np.float32)
+
+
+def light_of(scan: Scan, assumed: LightOptions, still: np.ndarray | None = None) -> Light | None:
     """The light of all frames of `scan`, held-out ones too, by their air; None where it is even.
 
     How strong light of each number of half waves is, all frames say together; the light itself is each frame's own. A
-    frame without air has the light that is expected before it is seen: even. None too where no frame has air.
+    frame without air has the light that is expected before it is seen: even; so have all where no frame has air.
+    still: [H, W], beside that: what the training frames of the run have in common, and frames of this raster with them.
     """
-    if assumed.kind == "even":
-        return None
     frames = torch.from_numpy(scan.frames)
-    if not bool(assumed.air_of(frames).any()):
+    common = None if still is None or still.shape != scan.views.shape else torch.from_numpy(still).double()
+    if common is not None:
+        frames = (frames / common).float()
+    smooth = assumed.kind != "even" and bool(assumed.air_of(frames).any())
+    if not smooth and common is None:
         return None
-    found = Light.of(frames, assumed)
-    return None if found.background is None else found
+    found = Light.of(frames, assumed if smooth else EVEN)
+    return None if found.background is None and common is None else replace(found, still=common)

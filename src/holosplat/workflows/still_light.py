@@ -5,23 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
-from ..baselines import HolographicTV, holographic_tv
+from ..baselines import HolographicTV
 from ..checks import require
 from ..frames import divided
-from ..matter import MaterialPrior, Matter
-from ..methods.assumed import assumed_material
-from ..model import measure
-from ..optics.modes import smooth_modes
-from ..optics.sampling import fringe_sampling
+from ..matter import MaterialPrior
+from ..methods.still import predicted_first
+from ..optics.still_light import mean_light
 from ..progress import Progress
-from ..representations import VoxelGrid
 from ..scan import Scan
 
 FEWEST = 2
 """Frames for training that still light takes: one frame's light cannot be told from its matter."""
-DARKEST = 0.01
-"""Relative intensity below which a pixel counts as so bright: its logarithm has no meaning."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +51,6 @@ def still_light(scan: Scan, prior: MaterialPrior, options: StillLight, on_progre
     """
     train = scan.train()
     require(len(train) >= FEWEST, f"still light needs at least {FEWEST} frames for training, but there is one.")
-    material = assumed_material(train, prior, on_progress)
     how = HolographicTV(
         iterations=options.iterations if options.order else HolographicTV.iterations,
         still_light=options.order,
@@ -63,15 +58,8 @@ def still_light(scan: Scan, prior: MaterialPrior, options: StillLight, on_progre
         inside=options.inside,
         upper=prior.bound(1.0),
     )
-    values, grid = holographic_tv(train, material, how, on_progress)
-    found = VoxelGrid(values[None], grid, Matter.one(*material))
-    predicted = measure(found, train.exposures, fringe_sampling(train.exposures)).detach().numpy()
-    logarithms = [np.log(np.maximum(frames, DARKEST)).astype(np.float64) for frames in (train.frames, predicted)]
-    mean = (logarithms[0] - logarithms[1]).mean(axis=0)
-    if options.order:
-        modes = smooth_modes(scan.views.shape, options.order)[1:].flatten(1).double().numpy()
-        mean = (np.linalg.lstsq(modes.T, mean.ravel(), rcond=None)[0] @ modes).reshape(mean.shape)
-    return np.exp(mean).astype(np.float32)
+    predicted = predicted_first(train, prior, how, on_progress)
+    return mean_light(torch.from_numpy(train.frames), predicted, options.order).float().numpy()
 
 
 def evened(

@@ -92,7 +92,14 @@ class Bending:
     def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
         """The one part."""
         vertices = model.parameters()["object.vertices"]
-        return [Part("bending", self._weight, _SquaredProduct.apply(vertices, *self._operators))]
+        return [Part("bending", self._weight, squared_product(vertices, *self._operators))]
+
+
+def squared_product(x: Tensor, matrix: csr_array, transposed: csr_array) -> Tensor:
+    """Σ (A x)² [] of x [P, …], differentiable; matrix, transposed: A and Aᵀ, sparse, on the CPU."""
+    found = _SquaredProduct.apply(x, matrix, transposed)
+    assert isinstance(found, Tensor)
+    return found
 
 
 class _SquaredProduct(torch.autograd.Function):
