@@ -129,8 +129,8 @@ def main() -> None:
     parser.add_argument("--work", type=Path, required=True)
     work = parser.parse_args().work.resolve()
     work.mkdir(parents=True, exist_ok=True)
-    edge(work)
     four_beams(work)
+    edge(work)
 
 
 if __name__ == "__main__":
