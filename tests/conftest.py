@@ -6,12 +6,16 @@ import importlib.util
 import os
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # threads that spin starve whoever shares the cores
 
 import pytest
 import torch
 from hypothesis import HealthCheck, settings
+
+if TYPE_CHECKING:
+    from helpers.once import Once
 
 pytest.register_assert_rewrite("helpers")  # failures there say as much as in the tests
 
@@ -86,6 +90,14 @@ def undrawn_reports() -> Iterator[None]:
 
     with undrawn():
         yield
+
+
+@pytest.fixture(scope="session")
+def memory() -> Once:
+    """What short runs of this session begin with, by their frames; see `helpers.once`."""
+    from helpers.once import Once
+
+    return Once()
 
 
 @pytest.fixture(scope="session")

@@ -9,7 +9,7 @@ import pytest
 import holosplat as hs
 from helpers.bench_shop import Recorder
 from helpers.contract import two_balls
-from helpers.decisions import decided_once
+from helpers.once import Once, once
 from holosplat.bench.methods import METHODS
 
 
@@ -26,7 +26,8 @@ def scan() -> hs.Scan:
 
 @pytest.fixture(scope="module")
 def decided() -> Iterator[None]:
-    """All methods ask the same of the same frames: whether their matter has levels."""
-    with decided_once() as made:
+    """All methods ask the same of the same frames: what their matter is, and what a first volume shows."""
+    memory = Once()
+    with once(memory):
         yield
-    assert len(made) < len(METHODS)
+    assert 0 < len(memory.made) < len(METHODS)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 
 import pytest
 
 from helpers.cli import COLUMNS, PIXEL, QUICK, ROWS, Workshop, holosplat, known, simulate, worked
+from helpers.once import Once, once
 from holosplat.io.vtk import write_mesh
 from holosplat.specimens.red_cells import random_cells
 from holosplat.tables import to_table
@@ -30,3 +32,10 @@ def shop(tmp_path_factory) -> Workshop:
 @pytest.fixture(autouse=True)
 def _undrawn(undrawn_reports: None) -> None:
     """Tests of the commands do not draw the figures of reports. The shop's run, which is made before, has them."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _begun_once(memory: Once) -> Iterator[None]:
+    """Commands in the tests' process begin with what an earlier run on the same frames has found."""
+    with once(memory):
+        yield

@@ -15,7 +15,7 @@ from holosplat.specimens.red_cells import icosphere
 MATERIAL = hs.DeltaBeta(2e-7, 2e-10)
 PITCH = 1e-6
 SHAPE = (24, 31)
-QUICK = methods(effort=0.05) | {"neural-field": methods(effort=0.25)["neural-field"]}
+QUICK = methods(effort=0.05) | {"neural-field": methods(effort=0.12)["neural-field"]}
 """The same methods with a small part of their steps: the contract is about form, not about quality."""
 QUICKER = methods(effort=0.05)
 """With a still smaller part, where finite numbers are all that is asked for."""

@@ -28,6 +28,7 @@ TIERS = (
     ("fit", "baselines"),
     ("methods",),
     ("align",),
+    ("motion",),
     ("workflows", "beamline", "planning"),
     ("report",),
     ("bench",),

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from helpers.once import Once, once
 from helpers.two_balls import NETWORK, ONE, scan
 from helpers.two_balls import truth as true_volume
 from holosplat.baselines import HolographicTV
@@ -17,6 +19,7 @@ from holosplat.geometry import Grid
 from holosplat.matter import MaterialPrior
 from holosplat.methods import (
     METHODS,
+    Auto,
     FitOptions,
     Gaussians,
     HolographicVoxels,
@@ -47,6 +50,7 @@ QUICK: dict[str, Method] = {
     "neural-field": NeuralFields(VOLUME, NEURAL),
     "holographic-tv": HolographicVoxels(VOLUME),
     "volume": SmoothVolume(VOLUME, rounds=1, iterations=5),
+    "auto": Auto().with_effort(0.1),
 }
 """Every method, with options that take seconds."""
 FITTED = ("gaussians", "surfaces", "voxels", "neural-field")
@@ -56,6 +60,13 @@ LEAST_BY_RATIO = {**LEAST, "gaussians": 0.5, "surfaces": 0.7}
 """δ is estimated at 0.6 of the balls' there, by which overfull Gaussians lose matter in their first steps."""
 KNOWN = MaterialPrior.known(ONE.channels[0])
 PRIORS = {"known": KNOWN, "ratio": MaterialPrior.of_ratio(ONE.channels[0].ratio), "unknown": MaterialPrior.unknown()}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _begun_once(memory: Once) -> Iterator[None]:
+    """Methods begin with the same volumes of the same frames."""
+    with once(memory):
+        yield
 
 
 @pytest.fixture(scope="module")

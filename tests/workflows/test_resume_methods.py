@@ -11,10 +11,13 @@ import pytest
 import torch
 
 import holosplat.workflows.reconstruct as module
-from helpers.runs import KNOWN, RANDOM
+from helpers.runs import KNOWN, PIXEL, RANDOM, scene
+from helpers.two_balls import NETWORK
 from holosplat.baselines import HolographicTV
+from holosplat.beamline.simulate import simulate
 from holosplat.fit.schedule import Schedule
 from holosplat.fit.terms import Objective
+from holosplat.geometry import Views
 from holosplat.io.objects import read_object
 from holosplat.matter import MaterialPrior
 from holosplat.methods import (
@@ -32,7 +35,7 @@ from holosplat.methods import (
     Voxels,
 )
 from holosplat.representations import NeuralField
-from holosplat.scan import Scan
+from holosplat.scan import Exposures, Scan
 from holosplat.volume import Object
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
@@ -48,7 +51,12 @@ SURFACES = SurfaceFit(schedule=Schedule(steps=6, decay=0.1, views_per_step=2))
 VOXELS = VoxelFit(coarse_steps=5, steps=7)
 SMOOTH = SmoothVolume(replace(VOLUME, upper=0.0, noisy=1.0), coarser=(2,), rounds=2, iterations=4)
 FIELD = NeuralFit(
-    warmup_steps=20, prune_every=2, schedule=Schedule(steps=7, views_per_step=1, validation_views=1, validate_every=2)
+    NETWORK,
+    warmup_steps=20,
+    warmup_rays=512,
+    probes=512,
+    prune_every=2,
+    schedule=Schedule(steps=7, views_per_step=1, validation_views=1, validate_every=2),
 )
 
 
@@ -81,11 +89,25 @@ def case(request) -> Case:
 
 
 @pytest.fixture(scope="module")
-def whole(scan, case, tmp_path_factory) -> RunFolder:
+def scan() -> Scan:
+    """The cells on coarser pixels, as few as have coarser voxels, too."""
+    views = Views.evenly_spaced(8, (25, 30), 1.6 * PIXEL)
+    return simulate(scene(), Exposures.of(views, 20.0, 0.1), oversample=2)
+
+
+@pytest.fixture(scope="module")
+def wholes() -> dict[Method, RunFolder]:
+    """Runs that nobody stopped; made once."""
+    return {}
+
+
+@pytest.fixture(scope="module")
+def whole(scan, case, wholes, tmp_path_factory) -> RunFolder:
     """A run that nobody stopped."""
-    folder = RunFolder(tmp_path_factory.mktemp("whole") / "run")
-    reconstruct(scan, KNOWN, case.method, seed=3, folder=folder)
-    return folder
+    if case.method not in wholes:
+        wholes[case.method] = RunFolder(tmp_path_factory.mktemp("whole") / "run")
+        reconstruct(scan, KNOWN, case.method, seed=3, folder=wholes[case.method])
+    return wholes[case.method]
 
 
 def stopping(case: Case, error: type[BaseException]):

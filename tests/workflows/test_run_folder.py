@@ -152,9 +152,10 @@ def test_a_folder_that_is_no_run_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("settings", [SMALL, RANDOM], ids=["phase", "random"])
-def test_the_same_seed_gives_the_same_run(request, scan, tmp_path, settings):
+def test_the_same_seed_gives_the_same_run(request, begun_once, scan, tmp_path, settings):
     reference = request.getfixturevalue("whole" if settings is SMALL else "random_whole")
     folder = RunFolder(tmp_path / "run")
+    begun_once.made.clear()
     reconstruct(scan, KNOWN, settings, seed=3, folder=folder)
     assert_same_result(folder, reference)
     assert len(metrics(folder)) == STEPS

@@ -1,0 +1,113 @@
+"""What most of a short run goes into, computed once for the same frames: kind and level of the matter, first volumes.
+
+The first answer is the program's own; whoever asks the same again gets it back, with the same progress.
+tests/methods/test_levels.py and tests/baselines hold what is computed, tests/house/test_once.py that nothing else is.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+from collections import OrderedDict
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+from torch import Tensor
+
+from holosplat.baselines import HolographicTV, holographic_tv
+from holosplat.baselines.material import estimate_delta, estimate_ratio
+from holosplat.geometry import Grid
+from holosplat.matter import DeltaBeta
+from holosplat.methods import Task
+from holosplat.methods.levels import Decision, LevelTest, decide_matter
+from holosplat.methods.sharp_level import material_of_levels
+from holosplat.optics.background import Light
+from holosplat.progress import Progress
+from holosplat.scan import Scan
+from holosplat.workflows.provenance import scan_hash
+
+Key = tuple[object, ...]
+KEPT = 32
+"""Answers that are kept, the latest ones: a first volume of the tests has up to a million voxels."""
+
+
+class Once:
+    """Answers by what was asked, with the progress that was told on the way."""
+
+    def __init__(self) -> None:
+        self.made: OrderedDict[Key, tuple[Any, list[tuple[str, float]]]] = OrderedDict()
+
+    def answer(self, key: Key, compute: Callable[[Progress], Any], on_progress: Progress) -> Any:
+        """That of `compute(progress)`, or of an earlier one for the same `key`; what fails is not kept."""
+        if key in self.made:
+            self.made.move_to_end(key)
+            for step in self.made[key][1]:
+                on_progress(*step)
+        else:
+            told: list[tuple[str, float]] = []
+
+            def progress(stage: str, fraction: float) -> None:
+                told.append((stage, fraction))
+                on_progress(stage, fraction)
+
+            self.made[key] = compute(progress), told
+            if len(self.made) > KEPT:
+                self.made.popitem(last=False)
+        return self.made[key][0]
+
+
+def of(scan: Scan) -> Key:
+    """What tells frames from others: what they show, and how they were taken."""
+    return scan_hash(scan), scan.frames.shape
+
+
+@contextlib.contextmanager
+def once(memory: Once) -> Iterator[None]:
+    """Within, runs take from `memory` what an earlier run on the same frames has found; uneven light is left alone."""
+
+    def decide(task: Task, options: LevelTest) -> Decision:
+        if task.uneven is not None:
+            return decide_matter(task, options)
+        key = ("kind", *of(task.scan), task.prior, options)
+        return memory.answer(
+            key, lambda told: decide_matter(replace(task, on_progress=told), options), task.on_progress
+        )
+
+    def ratio(scan: Scan, on_progress: Progress, *how: Any) -> float:
+        return memory.answer(("ratio", *of(scan), *how), lambda told: estimate_ratio(scan, told, *how), on_progress)
+
+    def delta(scan: Scan, known: float, on_progress: Progress, *how: Any) -> float:
+        key = ("delta", *of(scan), known, *how)
+        return memory.answer(key, lambda told: estimate_delta(scan, known, told, *how), on_progress)
+
+    def level(task: Task, *how: Any) -> DeltaBeta:
+        if task.uneven is not None:
+            return material_of_levels(task, *how)
+        key = ("level", *of(task.scan), task.prior, task.matter, *how)
+        return memory.answer(
+            key, lambda told: material_of_levels(replace(task, on_progress=told), *how), task.on_progress
+        )
+
+    def begin(
+        scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress, light: Light | None = None
+    ) -> tuple[Tensor, Grid]:
+        if light is not None:
+            return holographic_tv(scan, material, options, on_progress, light)
+        key = ("volume", *of(scan), material, options)
+        values, grid = memory.answer(key, lambda told: holographic_tv(scan, material, options, told), on_progress)
+        return values.clone(), grid
+
+    shared = {
+        "solve.decide_matter": decide,
+        "assumed.estimate_ratio": ratio,
+        "assumed.estimate_delta": delta,
+        "start.material_of_levels": level,
+        **{f"{module}.holographic_tv": begin for module in ("start", "volume", "voxels")},
+    }
+    with pytest.MonkeyPatch.context() as patch:
+        for name, act in shared.items():
+            module, function = name.split(".")
+            patch.setattr(importlib.import_module(f"holosplat.methods.{module}"), function, act)
+        yield
