@@ -78,22 +78,22 @@ def test_distances_are_as_planned_where_no_edges_are_known():
 def test_what_is_left_falls_and_is_told(misaligned):
     scan, _, found = misaligned
     assert found.after.mean() < 0.8 * found.before.mean()
-    assert [word.split(", in views")[0] for word in found.words] == ["hardly told: distance"]  # its mean is the plan's
+    assert "hardly told: distance" in [word.split(", in views")[0] for word in found.words]  # its mean is the plan's
     text = "\n".join(found.lines())
     assert "rms" in text
-    assert len(found.lines()) == 4 + len(scan)
+    assert len(found.lines()) == 3 + len(found.words) + len(scan)
     moved = moved_onto(found.exposures.views, scan.views)
     np.testing.assert_allclose(moved.shifts, found.exposures.views.shifts, atol=1e-3 * PIXEL)
     np.testing.assert_allclose(moved.rotations, found.exposures.views.rotations, atol=1e-6)
 
 
 def test_the_errors_are_those_that_are_said(misaligned):
-    """To within a factor of four, on matter so small."""
+    """To within a factor of ten, on matter so small; what remains without noise is smaller than they are."""
     _, true, found = misaligned
     shift, turn, roll = apart(found.exposures, true)
     said = np.sqrt(np.square(found.errors).mean(0))
     for error, stated in ((shift, said[:2].mean()), (turn, said[2:4].mean()), (roll, said[4])):
-        assert 0.25 < error / stated < 4
+        assert 0.1 < error / stated < 2
 
 
 def test_what_is_said_to_be_known_stays():

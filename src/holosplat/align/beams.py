@@ -19,12 +19,13 @@ from .begin import Begun, Images, begun
 from .changes import changes, header, in_words, line
 from .coarse import SIDES
 from .derivatives import NUMBERS
+from .few import KINDS
 from .gauge import moved_onto
 from .moments import Beams, Moment, chosen_moments, whens
 from .poses import DISTANCE, FLUX, SHIFT, TURN, PoseOptions, PoseSearch
 from .series_search import SeriesSearch
 from .shadows import EVEN_OR_NOT
-from .views import ACCURACY, DEFAULT, FEW, FEWEST, KINDS, AlignedViews, Judged
+from .views import ACCURACY, DEFAULT, FEW, FEWEST, AlignedViews, Judged
 
 SURE = 3.0
 """A drift is beyond doubt where some number of a beam has so many of its standard errors."""

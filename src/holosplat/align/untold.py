@@ -48,7 +48,7 @@ class Told:
         across = whole[np.ix_(ours, factors)]
         information = whole[np.ix_(ours, ours)] - across @ np.linalg.solve(whole[np.ix_(factors, factors)], across.T)
         scales, moved = np.tile(expected, count)[free], motions(views)
-        kept = _beside(moved[free] @ _null(moved[~free]) / scales[:, None])
+        kept = beside(moved[free] @ null(moved[~free]) / scales[:, None])
         ratios, vectors = np.linalg.eigh(kept.T @ (scales[:, None] * information * scales) @ kept)
         combinations, errors = np.zeros((len(ratios), free.size)), np.zeros(free.size)
         combinations[:, free] = (kept @ vectors).T
@@ -80,7 +80,7 @@ def motions(views: Views) -> np.ndarray:
     return columns.reshape(-1, 6)
 
 
-def _null(matrix: np.ndarray) -> np.ndarray:
+def null(matrix: np.ndarray) -> np.ndarray:
     """Orthonormal columns that `matrix` sends to zero."""
     if not len(matrix):
         return np.eye(matrix.shape[1])
@@ -88,7 +88,7 @@ def _null(matrix: np.ndarray) -> np.ndarray:
     return rows[np.count_nonzero(sizes > 1e-9) :].T
 
 
-def _beside(columns: np.ndarray) -> np.ndarray:
+def beside(columns: np.ndarray) -> np.ndarray:
     """Orthonormal columns of the space beside that of `columns` [N, K]."""
     basis, sizes, _ = np.linalg.svd(columns)
     return basis[:, np.count_nonzero(sizes > 1e-9 * max(sizes.max(initial=0.0), 1e-12)) :]

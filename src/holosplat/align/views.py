@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,13 +18,15 @@ from ..optics.background import Light, LightOptions
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..projectors.voxels import LatticeProjector
+from ..representations import SurfaceMesh
 from ..scan import Exposures, Scan
 from .changes import changes, header, in_words, line
 from .coarse import mirrored
 from .derivatives import in_pixels, predicted
 from .directions import hardly_told
+from .few import KINDS, beside_unknown
 from .gauge import moved_onto
-from .poses import DISTANCE, FLUX, MAGNIFICATION, SHIFT, PoseOptions, PoseSearch
+from .poses import DISTANCE, FLUX, SHIFT, PoseOptions, PoseSearch
 from .shadows import EVEN_OR_NOT
 from .sharp import believed, sharpened, surfaces_of
 
@@ -44,8 +47,7 @@ UNTOLD = (
     "distances are as planned: the matter shows no sharp edges of a known density, and a longer distance sharpens "
     "fringes as such edges would"
 )
-KINDS = {"shift": (0, 1), "angle": (2, 3), "roll": (4,), "distance": (DISTANCE,), "magnification": (MAGNIFICATION,)}
-"""Places of the numbers of each kind."""
+MAY_BE_NOISE = "{kind} is as planned: what few frames say against it may be noise, or matter that they do not know"
 
 
 @dataclass(frozen=True)
@@ -119,14 +121,17 @@ def align_still(
         name = f"alignment, pixels of {level.pixels}"
         search.run(level, lambda fraction, name=name: on_progress(name, fraction))
     forget_distance(search)
-    sharp = by_edges(search, levels[-1].pixels, on_progress)
+    surfaces = by_edges(search, levels[-1].pixels, on_progress)
+    sharp = surfaces is not None
     if options.uncertain.distance > 0 and not sharp:
         words.append(UNTOLD)
+    doubted = beside_unknown(search, levels[-1].pixels, surfaces) if count < options.few_views else ()
+    words += [MAY_BE_NOISE.format(kind=kind) for kind in doubted]
     errors = errors_of(search.covariances)
     expected = options.uncertain.deviations()
     expected[DISTANCE] = options.uncertain.distance if sharp else 0.0
     words += hardly_told(search.covariances, expected)
-    words += _kept(search, scan.exposures, levels[-1].pixels, sharp)
+    words += _kept(search, scan.exposures, levels[-1].pixels, sharp, doubted)
     found = search.exposures(scan.exposures)
     found = replace(found, views=moved_onto(found.views, scan.views))
     of = max(levels[-1].pixels, 2 if min(scan.views.shape) >= 2 * options.least_side else 1)
@@ -162,32 +167,34 @@ def forget_distance(search: PoseSearch) -> None:
     search.covariances[:, DISTANCE] = search.covariances[:, :, DISTANCE] = 0
 
 
-def by_edges(search: PoseSearch, pixels: int, on_progress: Progress) -> bool:
-    """Whether surfaces explain the frames better than voxels of `pixels`; if so, the numbers become theirs."""
+def by_edges(search: PoseSearch, pixels: int, on_progress: Progress) -> SurfaceMesh | None:
+    """Surfaces that explain the frames better than voxels of `pixels`, whose numbers those of the search become; or
+    None."""
     scan = search.scan.binned(pixels)
     options = search.options
     wanted = search.edges_follow and any(getattr(options.uncertain, kind) > 0 for kind in KINDS)
     start = surfaces_of(search.volume, scan, search.material) if wanted else None
     if start is None:
-        return False
+        return None
     scales = torch.ones(search.numbers.shape[1], dtype=torch.float64)
     scales[SHIFT] = pixels
     here = replace(options, uncertain=replace(options.uncertain, shift=options.uncertain.shift / pixels))
     found = sharpened(scan, search.numbers / scales, start, here, lambda part: on_progress(SHARP, part))
     if not believed(scan, found.left, search.unexplained(scan)):
-        return False
+        return None
     search.numbers, search.covariances = found.step.numbers * scales, found.step.covariances * scales[:, None] * scales
-    return True
+    return found.surfaces
 
 
-def _kept(search: PoseSearch, planned: Exposures, pixels: int, sharp: bool) -> list[str]:
-    """Puts kinds of numbers that differ from the plan by no more than they are known back to it; says which."""
+def _kept(search: PoseSearch, planned: Exposures, pixels: int, sharp: bool, others: Sequence[str]) -> list[str]:
+    """Puts kinds of numbers, beside `others`, that differ from the plan by no more than they are known back to it; says
+    which."""
     accuracy = SHARP_ACCURACY if sharp else ACCURACY
     found = search.exposures(planned)
     moved = changes(replace(found, views=moved_onto(found.views, planned.views)), planned)
     words, uncertain = [], search.options.uncertain
     for kind, places in KINDS.items():
-        if getattr(uncertain, kind) == 0 or kind not in accuracy:
+        if getattr(uncertain, kind) == 0 or kind not in accuracy or kind in others:
             continue
         limit = accuracy[kind] * (pixels if kind == "shift" else 1)
         if np.sqrt(np.square(moved[:, list(places)]).mean()) < limit:

@@ -1,0 +1,108 @@
+"""Poses of few views: what their frames tell of them beside matter that they do not know, and no more."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from ..geometry import Grid, Views
+from ..optics.sampling import fringe_sampling
+from ..representations import SurfaceMesh
+from .beside import BLUR
+from .derivatives import in_pixels, predicted
+from .evidence import weighed
+from .following import SHARP, SOFT, of_poses
+from .newton import blurred
+from .poses import DISTANCE, FLUX, MAGNIFICATION, PoseSearch
+from .untold import motions, null
+
+KINDS = {"shift": (0, 1), "angle": (2, 3), "roll": (4,), "distance": (DISTANCE,), "magnification": (MAGNIFICATION,)}
+"""Places of the numbers of each kind."""
+SLOPES = {**{place: place for place in range(5)}, MAGNIFICATION: 5}
+"""Places of these numbers among the derivatives of `projections`."""
+SIDE = 64
+"""Pixels along a frame's shorter side from which on larger ones say what is told: details of a pixel's size hardly
+change how well."""
+
+
+def beside_unknown(search: PoseSearch, pixels: int, surfaces: SurfaceMesh | None) -> tuple[str, ...]:
+    """Makes the covariances of the training views those beside matter that is not known.
+
+    Where no frames are held out, that could judge, numbers also go back to the plan as far as frames do not tell them
+    (`evidence.weighed`); returned are the kinds that do so altogether. Distances are left as they are.
+
+    pixels: of the last images; surfaces: in the poses that were found, or None for voxels.
+    """
+    uncertain, train = search.options.uncertain, np.flatnonzero(~search.scan.is_test)
+    free = {kind: places for kind, places in KINDS.items() if kind != "distance" and getattr(uncertain, kind) > 0}
+    places = sorted(place for kind in free.values() for place in kind)
+    if not places:
+        return ()
+    while min(search.scan.views.shape) // pixels > SIDE:
+        pixels *= 2
+    units = torch.tensor([pixels if place in range(2) else 1.0 for place in places]).double().repeat(len(train))
+    information = (_information(search, pixels, surfaces, train, places) / units[:, None] / units).numpy()
+    expected, kinds = (
+        uncertain.deviations()[places].numpy(),
+        [[places.index(at) for at in each] for each in free.values()],
+    )
+    found = search.numbers[train][:, places].numpy()
+    common = _motions(search.scan.views[train], places)
+    judged = weighed(found, information, expected, kinds, common)
+    at = torch.tensor(places)
+    covariances = search.covariances[train]
+    covariances[:, at] = covariances[:, :, at] = 0
+    blocks = torch.from_numpy(judged.covariance).reshape(len(train), len(places), len(train), len(places))
+    covariances[:, at[:, None], at] = torch.stack([blocks[v, :, v] for v in range(len(train))])
+    search.covariances[train] = covariances
+    if search.scan.is_test.any():
+        return ()
+    numbers = search.numbers[train]
+    numbers[:, at] = torch.from_numpy(judged.numbers)
+    search.numbers[train] = numbers
+    return tuple(kind for kind, scale in zip(free, judged.scales) if scale == 0)
+
+
+def _information(
+    search: PoseSearch, pixels: int, surfaces: SurfaceMesh | None, train: np.ndarray, places: list[int]
+) -> Tensor:
+    """That of `following.of_poses`, on pixels `pixels` times larger."""
+    scan = search.scan.binned(pixels)
+    exposures, grid = search.exposures(scan.exposures)[train], Grid.of_views(in_pixels(scan.views))
+    if surfaces is None:
+        volume = interpolate(search.volume[None, None], size=grid.shape, mode="trilinear", align_corners=False)[0, 0]
+    else:
+        with torch.no_grad():
+            delta = surfaces.voxelise(Grid.of_views(scan.views)).delta
+        volume = torch.from_numpy(delta / search.material.delta).float()
+    lit = search.numbers[train, FLUX].exp().float()[:, None, None]
+    blur = search.options.blur if surfaces is None else BLUR
+    images = predicted(volume, grid, exposures, search.material, fringe_sampling(exposures)).frames
+    return of_poses(
+        volume,
+        grid,
+        exposures,
+        search.material,
+        left=blurred(torch.from_numpy(scan.frames)[train] / lit - images, blur).square().mean((1, 2)),
+        leeway=SOFT if surfaces is None else SHARP,
+        blur=blur,
+        places=[SLOPES[place] for place in places],
+    )
+
+
+def _motions(views: Views, places: list[int]) -> np.ndarray:
+    """[V · K, M] what is common to all views and no frame tells: motions of the object that only move the numbers
+    `places`, and its size."""
+    free = np.tile(np.isin(np.arange(5), places), len(views))
+    moved = motions(in_pixels(views))
+    moved = moved[free] @ null(moved[~free])
+    size = np.zeros((len(views), len(places), 1))
+    found = np.zeros((len(views), len(places), moved.shape[1]))
+    pose = [k for k, place in enumerate(places) if place < 5]
+    found[:, pose] = moved.reshape(len(views), len(pose), -1)
+    if MAGNIFICATION in places:
+        size[:, places.index(MAGNIFICATION)] = 1
+        found = np.concatenate([found, size], axis=2)
+    return found.reshape(len(views) * len(places), -1)
