@@ -91,7 +91,7 @@ def reconstruct(
     report = report_run(folder, result, measured, evaluation, None)
     _print_scores(evaluation)
     if folder.light.is_file():
-        _say(f"light {read_json(folder.summary)['light']}, by the frames' air: divided out ({folder.light})")
+        _say(f"light: {read_json(folder.summary)['light']}, by the frames' air ({folder.light})")
     _print_result(result, report)
     unexplained = result.verdict is not None and not result.verdict.good
     if unexplained:
