@@ -22,7 +22,7 @@ from .derivatives import NUMBERS
 from .few import KINDS
 from .gauge import moved_onto
 from .moments import Beams, Moment, chosen_moments, whens
-from .poses import DISTANCE, FLUX, SHIFT, TURN, Level, PoseOptions, PoseSearch
+from .poses import DISTANCE, FLUX, SHIFT, TURN, Drift, Level, PoseOptions, PoseSearch
 from .series_search import SeriesSearch
 from .shadows import EVEN_OR_NOT
 from .views import ACCURACY, DEFAULT, FEW, FEWEST, AlignedViews, Judged
@@ -158,7 +158,7 @@ def align_beams(
         if count == FEWEST:
             found.words.append(ACROSS)
         elif isinstance(prior, Known):
-            search = SeriesSearch(moments, len(beams), material, options, 1.0)
+            search = SeriesSearch(moments, len(beams), material, replace(options, drift=Drift()), 1.0)
             found = _shifted_by_volumes(search, found, lambda fraction: on_progress(SHIFTS, fraction))
     else:
         search = SeriesSearch(moments, len(beams), material, options, 1.0 if isinstance(prior, Known) else None)
@@ -217,14 +217,14 @@ def _by_rows(start: Begun, pixels: int) -> Found:
 
 
 def _shifted_by_volumes(search: SeriesSearch, found: Found, on_progress: Advance) -> Found:
-    """The same with shifts by volumes of all times, which know that matter is not negative and has one density; turns
-    and rolls stay, for such volumes follow them."""
+    """The same with shifts by volumes of all times, which know that matter is not negative and has one density; turns,
+    rolls and a drift stay, for such volumes follow them."""
     search.numbers, search.rates = torch.from_numpy(found.numbers.copy()), torch.from_numpy(found.rates.copy())
     search.hold(*range(TURN.start, TURN.stop))
     search.run(Level(found.pixels, search.options.rounds), on_progress)
-    numbers, rates = found.numbers.copy(), found.rates.copy()
-    numbers[:, SHIFT], rates[:, SHIFT] = search.numbers[:, SHIFT].numpy(), search.rates[:, SHIFT].numpy()
-    return replace(found, numbers=numbers, rates=rates)
+    numbers = found.numbers.copy()
+    numbers[:, SHIFT] = search.numbers[:, SHIFT].numpy()
+    return replace(found, numbers=numbers)
 
 
 def _by_volumes(
