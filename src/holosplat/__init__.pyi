@@ -47,3 +47,4 @@ from .workflows.reconstruct import Reconstruction as Reconstruction
 from .workflows.reconstruct import load_reconstruction as load_reconstruction
 from .workflows.reconstruct import reconstruct as reconstruct
 from .workflows.run_folder import RunFolder as RunFolder
+from .workflows.track import track as track

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from ..workflows.evaluate import Evaluation
     from ..workflows.reconstruct import Reconstruction
     from ..workflows.run_folder import RunFolder
+    from .scans import Moment
 
 LIGHT = RunLightFlags()
 """Even, unless the air of frames says otherwise."""
@@ -95,7 +96,7 @@ def reconstruct(
     report = report_run(folder, result, measured, evaluation, None)
     _print_scores(evaluation)
     if folder.light.is_file():
-        _say(f"light {read_json(folder.summary)['light']}, by the frames' air: divided out ({folder.light})")
+        _say(f"light: {read_json(folder.summary)['light']}, by the frames' air ({folder.light})")
     _print_result(result, report)
     unexplained = result.verdict is not None and not result.verdict.good
     if unexplained:
@@ -141,12 +142,11 @@ def render(
     from ..io.nxtomo import write_scan
     from ..scan import Scan
     from ..workflows.evaluate import render as predict
-    from ..workflows.reconstruct import load_reconstruction
     from ..workflows.run_folder import RunFolder
-    from .scans import scan_for
+    from .scans import run_and_scan
 
     require_writable(out)
-    result, wanted = load_reconstruction(RunFolder(run)), scan_for(RunFolder(run), scan, reading)
+    result, wanted = run_and_scan(RunFolder(run), scan, reading)
     chosen = {"test": wanted.test, "train": wanted.train, "all": lambda: wanted}[split]()
     require(len(chosen) > 0, f"{scan} has no {split} frames to render; choose another --split.")
     frames = predict(result, chosen.exposures)
@@ -160,6 +160,7 @@ def export(
     shape: tuple[int, int, int] | None = None,
     voxel_size: float | None = None,
     bodies: Path | None = None,
+    time_frame: int | Literal["all"] | None = None,
 ) -> None:
     """Write δ and β of a run as a volume file, or the bodies of a run of surfaces as meshes.
 
@@ -168,32 +169,35 @@ def export(
         volume: Volume file to write (HDF5).
         shape: Voxels along z, y, x (default: the scan's field of view, Z = X = W, Y = H).
         voxel_size: Edge of a voxel [m] (default: the pixel size).
-        bodies: Folder to make, of a run of surfaces: one VTK file a body (µm), the largest first.
+        bodies: Folder to make, of a run of surfaces: one VTK file a body (µm), the largest first, or of a run of track
+            the same body under the same name at all times.
+        time_frame: Of a run of track: the time, counted from 0 (default: the first), or all, to files and folders whose
+            names end with _t0000 and so on.
     """
-    from ..workflows.reconstruct import load_reconstruction
     from ..workflows.run_folder import RunFolder
+    from .scans import moments_of
 
     require(volume is not None or bodies is not None, "export needs --volume or --bodies; name what to write.")
     folder = RunFolder(run)
-    result = load_reconstruction(folder)
-    if bodies is not None:
-        _export_bodies(result, bodies)
-    if volume is not None:
-        _export_volume(result, folder, volume, shape, voxel_size)
+    for one in moments_of(folder, time_frame):
+        if bodies is not None:
+            _export_bodies(one, bodies.with_name(bodies.name + one.ending))
+        if volume is not None:
+            _export_volume(one.result, folder, volume.with_stem(volume.stem + one.ending), shape, voxel_size)
 
 
-def _export_bodies(result: Reconstruction, out: Path) -> None:
+def _export_bodies(one: Moment, out: Path) -> None:
     from ..io.folder import require_new
-    from ..representations import SurfaceMesh
     from .surface import write_bodies
 
-    found = result.object
-    if not isinstance(found, SurfaceMesh):
+    found = one.result.object
+    if one.bodies is None:
         raise InputError(
             f"--bodies needs a run of surfaces, but this one holds {found.described}; use holosplat surface."
         )
     require_new(out)
-    _say(f"wrote {out}: {write_bodies(out, found, {})} bodies")
+    write_bodies(out, one.bodies, found.matter, {})
+    _say(f"wrote {out}: {len(one.bodies)} bodies")
 
 
 def _export_volume(
@@ -231,6 +235,8 @@ def evaluate(
 ) -> None:
     """Score a run on held-out frames and against the true volume, which then joins its report.
 
+    A run of track is scored on the frames of all its times, and on the volume of the first; with --time-frame at one.
+
     Args:
         run: Run folder.
         scan: Scan (default: the one that was reconstructed).
@@ -240,19 +246,20 @@ def evaluate(
     from ..io.volumes import read_volume
     from ..report.run import report_run
     from ..workflows.evaluate import evaluate as score
+    from ..workflows.moments import instants_of
     from ..workflows.provenance import scan_hash
-    from ..workflows.reconstruct import load_reconstruction
     from ..workflows.run_folder import RunFolder
-    from .scans import scan_for
+    from .scans import run_and_scan
 
     folder = RunFolder(run)
-    result = load_reconstruction(folder)
-    measured, true_volume = scan_for(folder, scan, reading), read_volume(truth) if truth else None
+    (result, measured), true_volume = run_and_scan(folder, scan, reading), read_volume(truth) if truth else None
     evaluation = score(result, measured, true_volume)
     if as_json:
         print(json.dumps(evaluation.as_dict(), indent=2, allow_nan=False))
     else:
         _print_scores(evaluation)
+    if instants_of(folder):
+        return  # its report is of the time in the middle
     if not folder.is_of(scan_hash(measured)):
         _say("this is not the scan that was reconstructed, its frames may have been fitted; report unchanged")
     elif true_volume is not None or not folder.report.exists():

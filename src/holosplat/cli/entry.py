@@ -48,6 +48,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "commands",
         "Reconstruct a scan by Gaussians, or by another method, into a run folder.",
     ),
+    "track": (
+        "track",
+        "Follow closed bodies through the times of a scan: their shapes on smooth paths, into a run folder.",
+    ),
     "render": ("commands", "Predict the frames of a scan from a run."),
     "export": ("commands", "Write δ and β of a run as a volume file, or the bodies of a run of surfaces as meshes."),
     "surface": (

@@ -1,14 +1,22 @@
-"""The frames of a scan that a run, which knows one time, can be compared with."""
+"""The frames of a scan that a run can be compared with, and the run as it is at their time."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
+from ..checks import require
 from ..io.formats import read_as
 from ..io.reading import Reading, at_time
 from ..io.run_scan import run_reading
+from ..mesh import TriangleMesh
+from ..representations import MovingSurfaces, SurfaceMesh
 from ..scan import Scan
-from ..workflows.reconstruct import require_one_time
+from ..workflows.moments import chosen_frames, instants_of, moment
+from ..workflows.reconstruct import load_reconstruction, require_one_time
+from ..workflows.reconstruction import Reconstruction
 from ..workflows.refine import where_found
 from ..workflows.run_folder import RunFolder
 
@@ -26,6 +34,50 @@ def scan_for(folder: RunFolder, scan: Path | None, reading: Reading) -> Scan:
         found = read_as(scan, reading)
         if found.is_series:
             found = at_time(found, own.part.time_frame)
-    if found.is_series:
+    if found.is_series and not instants_of(folder):
         require_one_time(found)
     return where_found(folder, found.in_memory())
+
+
+def run_and_scan(folder: RunFolder, scan: Path | None, reading: Reading) -> tuple[Reconstruction, Scan]:
+    """A run, and the scan to compare it with (see `scan_for`).
+
+    Of a run in motion --time-frame chooses the time of both; without it, frames of all times are compared with the
+    bodies at these. Errors: `InputError` for times that the run does not have.
+    """
+    result, times = load_reconstruction(folder), instants_of(folder)
+    if not times:
+        return result, scan_for(folder, scan, reading)
+    frame = reading.part.time_frame
+    if isinstance(frame, int):
+        result = moment(result, times, frame)
+    else:
+        reading = replace(reading, part=replace(reading.part, time_frame=None))
+    return result, scan_for(folder, scan, reading)
+
+
+@dataclass(frozen=True)
+class Moment:
+    """A run as it is at one time. ending: what names of its files add, such as _t0000, or nothing; bodies: closed
+    meshes [m], if it has them, of a run in motion in the order of their identities."""
+
+    ending: str
+    result: Reconstruction
+    bodies: list[TriangleMesh] | None
+
+
+def moments_of(folder: RunFolder, time_frame: int | Literal["all"] | None) -> Iterator[Moment]:
+    """A run at the times that are asked for.
+
+    time_frame: of a run in motion, the time, counted from 0 (default: the first), or "all". Errors: `InputError` for
+    times that the run does not have, and for any of a run that stands still.
+    """
+    result, times = load_reconstruction(folder), instants_of(folder)
+    found = result.object
+    if not isinstance(found, MovingSurfaces):
+        require(time_frame is None, f"{folder.path} is of one time; leave --time-frame.")
+        yield Moment("", result, found.bodies() if isinstance(found, SurfaceMesh) else None)
+        return
+    for k in chosen_frames(time_frame, times):
+        ending = f"_t{k:04d}" if time_frame == "all" else ""
+        yield Moment(ending, moment(result, times, k), found.bodies(times[k]))

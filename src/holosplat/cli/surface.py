@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from tyro.conf import Positional
 
+from ..checks import require
 from ..io.folder import atomic_folder, require_new
 from ..io.json import write_json
 from ..io.reading import Reading
 from ..io.volumes import read_volume
 from ..io.vtk import write_mesh
+from ..matter import Matter
+from ..mesh import TriangleMesh
 from ..methods.surfaces import SurfaceOptions, oversampling, refine_surfaces
-from ..representations import SurfaceMesh
 from ..workflows.evaluate import evaluate as score
 from ..workflows.evaluate import score_object
+from ..workflows.moments import instants_of
 from ..workflows.provenance import scan_hash
 from ..workflows.reconstruct import load_reconstruction
 from ..workflows.run_folder import RunFolder
@@ -48,6 +51,10 @@ def surface(
     require_new(out)
     folder = RunFolder(run)
     result = load_reconstruction(folder)
+    require(
+        not instants_of(folder),
+        f"{run} holds bodies in motion, which are closed surfaces already; write them with export --bodies.",
+    )
     measured, volume = scan_for(folder, scan, reading), read_volume(truth) if truth else None
     if not folder.is_of(scan_hash(measured)):
         _say("this is not the scan that was reconstructed: its held-out frames may have been fitted")
@@ -60,25 +67,24 @@ def surface(
     seconds = time.perf_counter() - began
     after = score_object(found, measured, volume, oversampling(measured.train(), how.fit))
     said = {"seconds": seconds, "settings": asdict(how), "gaussians": before.as_dict(), "surfaces": after.as_dict()}
-    count = write_bodies(out, found, said)
+    bodies = found.bodies()
+    write_bodies(out, bodies, found.matter, said)
     for name, scores in (("Gaussians", before), ("surfaces", after)):
         print(f"{name}:", *scores.lines(), sep="\n  ")
-    _say(f"wrote {out}: {count} bodies of {len(found.faces)} triangles, {seconds:.1f} s")
+    _say(f"wrote {out}: {len(bodies)} bodies of {len(found.faces)} triangles, {seconds:.1f} s")
 
 
-def write_bodies(out: Path, found: SurfaceMesh, said: Mapping[str, Any]) -> int:
-    """Write one VTK file a body (µm), and summary.json with what is `said` beside their sizes; returns their number."""
-    bodies = found.bodies()
+def write_bodies(out: Path, bodies: Sequence[TriangleMesh], matter: Matter, said: Mapping[str, Any]) -> None:
+    """Write one VTK file a body (µm), and summary.json with what is `said` beside their sizes and `matter`."""
     with atomic_folder(out) as temporary:
         for body in bodies:
             write_mesh(temporary / f"{body.name}.vtk", body, LENGTH_UNIT)
         about = {
             "bodies": {body.name: {"triangles": len(body.faces), "volume_m3": body.volume} for body in bodies},
             "length_unit": LENGTH_UNIT,
-            "material": {"delta": found.matter.delta, "beta": found.matter.beta},
+            "material": {"delta": matter.delta, "beta": matter.beta},
         }
         write_json(temporary / "summary.json", {**about, **said})
-    return len(bodies)
 
 
 def _say(text: str) -> None:

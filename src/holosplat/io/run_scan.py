@@ -56,7 +56,7 @@ def _where_found(summary: Path, scan: Scan) -> Scan:
     planned = scan.exposures
     views = replace(planned.views, rotations=rotations, shifts=shifts)
     exposures = replace(planned, views=views, distance=table.numbers("distance", (n,)))
-    return Scan.of(scan.source, exposures, scan.is_test, scan.provenance)
+    return scan.taken(exposures)
 
 
 def loader(read_as: ReadAs) -> Loader:

@@ -74,6 +74,7 @@ def report_run(
 NAMES = {
     "gaussians": "Gaussian reconstruction",
     "surfaces": "Reconstruction as closed surfaces",
+    "moving-surfaces": "Reconstruction as closed surfaces in motion",
     "voxels": "Voxel reconstruction",
     "neural-field": "Reconstruction as a neural field",
 }

@@ -144,3 +144,8 @@ class MovingSurfaces:
         vertices = self.unit_length * along(self.basis, self.coefficients.detach(), time)
         parts = (self.body(k) for k in range(self.count))
         return [TriangleMesh(vertices[u].numpy(), f.numpy(), f"body{k:03d}") for k, (u, f) in enumerate(parts)]
+
+    def velocities(self, time: float) -> list[np.ndarray]:
+        """Velocities [P, 3] [m/s] of the vertices of each of `bodies` at `time` [s]."""
+        speeds = self.unit_length * along(self.basis, self.coefficients.detach(), time, 1)
+        return [speeds[self.body(k)[0]].numpy() for k in range(self.count)]

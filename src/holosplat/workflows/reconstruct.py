@@ -82,7 +82,7 @@ def reconstruct(
     for what the method cannot do.
     """
     require_one_time(scan)
-    _check_frames(scan.train())
+    check_frames(scan.train())
     assumed, ranges, planned = light or LightOptions(), uncertain or Uncertain(), scan
     said = {"light": to_table(assumed), "uncertain": to_table(ranges), "refine": refine and to_table(refine)}
     config = config_of(scan, prior, method, seed, matter) | said
@@ -133,7 +133,8 @@ def require_one_time(scan: Scan) -> None:
     )
 
 
-def _check_frames(train: Scan) -> None:
+def check_frames(train: Scan) -> None:
+    """`InputError` for too few columns, and for frames that are not relative to the flat field."""
     h, w = train.views.shape
     require(
         w >= FEWEST_COLUMNS,

@@ -1,0 +1,105 @@
+"""`holosplat track`: closed bodies through the times of a scan."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from tyro.conf import Positional
+
+from ..checks import positive, require
+from ..io.formats import read_as
+from ..io.json import write_json
+from ..io.reading import Reading
+from ..io.run_scan import run_source
+from ..motion.track import TrackOptions
+from ..report.run import report_run
+from ..workflows.evaluate import evaluate as score
+from ..workflows.moments import moment
+from ..workflows.run_folder import RunFolder
+from ..workflows.track import BODIES, COLLECTION, TRACKS
+from ..workflows.track import track as follow
+from .options import LightFlags, PriorOptions
+from .progress import ProgressBar
+
+LIGHT = LightFlags()
+"""Even, unless the air of frames says otherwise."""
+
+
+@dataclass(frozen=True)
+class MotionFlags:
+    """How bodies are found and move."""
+
+    degree: int = 2
+    """Degree of the paths' polynomials."""
+    pieces: int = 0
+    """Pieces of the paths' splines over the whole time (0: as many as predict held-out frames best)."""
+    rounds: int = 4
+    """How often bodies are looked for beside those that are known, at most."""
+    least_volume: float = 30.0
+    """Bodies of fewer voxels, of a pixel's edge, are not followed."""
+    volume_kept: float = 0.006
+    """Standard deviation of a body's volume over time, as a share (0: volumes are free)."""
+    effort: float = 1.0
+    """Factor of the numbers of steps."""
+
+    def options(self) -> TrackOptions:
+        """The options of the method."""
+        usual = TrackOptions().with_effort(positive("--effort", self.effort))
+        paths = replace(usual.paths, degree=self.degree, pieces=self.pieces)
+        found = replace(usual.sightings, least_volume=self.least_volume)
+        fits = {name: replace(getattr(usual, name), volume_kept=self.volume_kept) for name in ("stiff", "soft")}
+        return replace(usual, paths=paths, sightings=found, rounds=self.rounds, **fits)
+
+
+def track(
+    scan: Positional[Path],
+    out: Path,
+    matter: PriorOptions = PriorOptions(),
+    how: MotionFlags = MotionFlags(),
+    seed: int = 0,
+    reading: Reading = Reading(),
+    *,
+    illumination: LightFlags = LIGHT,
+) -> None:
+    """Follow closed bodies through the times of a scan: their shapes on smooth paths, into a run folder.
+
+    Args:
+        scan: Scan of several times: a file (NXtomo), or a folder.
+        out: Run folder to make: bodies.pvd with one VTK file a body and time (µm), tracks.csv, and what reconstruct
+            writes.
+        seed: Seed of everything random.
+    """
+    require(seed >= 0, f"--seed must be 0 or more, but it is {seed}.")
+    require(
+        reading.part.time_frame is None,
+        f"bodies are followed through all times, but --time-frame is {reading.part.time_frame}; leave it.",
+    )
+    options, folder = how.options(), RunFolder(out)
+    folder.require_new()
+    measured = read_as(scan, reading).in_memory()
+    prior = matter.prior(measured.exposures.reference_energy)
+    with ProgressBar() as bar:
+        result = follow(
+            measured,
+            prior,
+            options,
+            seed,
+            light=illumination.options(),
+            folder=folder,
+            on_progress=bar.show,
+        )
+    write_json(folder.source, run_source(scan, reading))
+    evaluation = score(result, measured, None)
+    times = measured.instants.tolist()
+    middle = len(times) // 2
+    shown = measured.at_instant(middle)
+    report = report_run(folder, moment(result, times, middle), shown, evaluation, None)
+    for line in evaluation.lines():
+        print(line)
+    for line in result.verdict.lines("training frames") if result.verdict else ():
+        print(line)
+    seconds = sum(result.timing.values())
+    print(f"{seconds:.1f} s, {result.object.described}; report: {report}", file=sys.stderr)
+    print(f"wrote {out / COLLECTION} ({BODIES}/), {out / TRACKS}", file=sys.stderr)

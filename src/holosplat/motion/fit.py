@@ -1,0 +1,124 @@
+"""The fit of moving surfaces to the frames of all times, a few frames a step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from scipy.sparse import csc_array, diags_array, eye_array
+from scipy.sparse.linalg import splu
+from torch import Tensor
+
+from ..checks import at_least, positive, require
+from ..fit.loop import Fit, Plan
+from ..fit.optimiser import Adam, Group
+from ..fit.problem import Problem, Term
+from ..fit.schedule import Schedule
+from ..fit.terms import Objective
+from ..methods.ground import Ground, ground
+from ..methods.surfaces import BETAS, EPSILON, oversampling
+from ..optics.background import Light
+from ..optics.noise import noise_share
+from ..representations import MovingSurfaces
+from ..representations.isosurface import adjacency
+from ..scan import Scan
+from .terms import COEFFICIENTS, Acceleration, MovingBending, VolumeKept
+
+OPEN = 1e-3
+"""Share of the times' mean square below which a coefficient is taken to be seen so well: what frames hardly see of a
+path takes no steps that are longer than by its inverse."""
+
+
+def _objective() -> Objective:
+    return Objective(l1=0.0, rounded=1.0, rounding=3.0, bending=1.0, noise_gain=3.0)
+
+
+@dataclass(frozen=True)
+class MotionFit:
+    """Options of a fit of moving surfaces."""
+
+    rate: float = 0.2
+    """Length of the first steps [pixels], the same for all vertices."""
+    stiffness: float = 10.0
+    """How far a vertex draws its neighbours along, λ of Nicolet et al. (2021)."""
+    acceleration: float = 1e-6
+    """Weight of bent paths: the sum of squared coefficients of acceleration [pixels² per piece⁴]."""
+    volume_kept: float = 0.006
+    """Standard deviation of a body's volume over time, as a share (0: volumes are free). Of red cells it is that."""
+    objective: Objective = field(default_factory=_objective)
+    """How frames are compared, and what bending costs."""
+    schedule: Schedule = field(default_factory=lambda: Schedule(steps=100, views_per_step=16))
+    """The loop; memory is that of the frames of one step."""
+
+    def __post_init__(self) -> None:
+        at_least(self, 0, "stiffness", "acceleration", "volume_kept")
+        positive("rate", self.rate, "pixels")
+
+
+def motion_fit(
+    scan: Scan, start: MovingSurfaces, options: MotionFit = MotionFit(), seed: int = 0, light: Light | None = None
+) -> Fit:
+    """The fit of the paths of `start` to the training frames of `scan`, of any number of times, made ready.
+
+    Steps are Adam's, of one length for all vertices, in coordinates in which neighbours move together (Nicolet et al.
+    2021) and in which times count alike: the paths' Gram matrix over the times of the frames is one.
+    """
+    train, schedule = scan.train(), options.schedule
+    if 0 < len(train) <= schedule.views_per_step:
+        schedule = replace(schedule, views_per_step=0)
+    finer = oversampling(train) if not schedule.oversample else 0
+    base = ground(scan, start, start.matter, options.objective, schedule, "cpu", finer=finer, light=light)
+    times = base.train.exposures.time
+    group = Group(BETAS, EPSILON, solve=_smooth_directions(start, options.stiffness, times), together=True)
+    plan = Plan(
+        problem=Problem(base.model, (base.frames, *_terms(base, start, options))),
+        schedule=schedule,
+        optimiser=lambda leaves: Adam(leaves, "cpu", {COEFFICIENTS: group}),
+        rates=lambda factor, step: {COEFFICIENTS: options.rate * factor},
+        judge=base.judge,
+    )
+    return Fit(plan, seed)
+
+
+def _terms(base: Ground, start: MovingSurfaces, options: MotionFit) -> list[Term]:
+    frames, wanted, times = torch.from_numpy(base.train.frames), options.objective, base.train.instants
+    found: list[Term] = []
+    if wanted.bending > 0:
+        weight = wanted.bending * (1 + wanted.noise_gain * noise_share(frames)) / frames[0].numel()
+        found.append(MovingBending(weight, start, times))
+    if options.acceleration > 0 and len(start.basis.curvature()):
+        found.append(Acceleration(options.acceleration, start))
+    if options.volume_kept > 0 and start.basis.count > 1:
+        found.append(VolumeKept(_of_likelihood(base) * start.basis.count / 2 / options.volume_kept**2, start, times))
+    return found
+
+
+def _of_likelihood(base: Ground) -> float:
+    """What a unit of minus the logarithm of a probability is in units of the loss of frames.
+
+    That is the mean over N pixels of √(r² + c²) - c, about r²/2c, while it should be the sum of r²/2σ²: σ²/(c N).
+    """
+    width, objective = base.frames.resolved.get("rounding", 0.0), base.frames.objective
+    require(
+        width > 0, "volume_kept needs frames that are compared by `rounded`; raise its weight, or leave volumes free."
+    )
+    noise = width / objective.rounding
+    return objective.rounded * noise**2 / width / base.train.frames.size
+
+
+def _smooth_directions(start: MovingSurfaces, stiffness: float, times: np.ndarray) -> Callable[[Tensor], Tensor]:
+    """The inverse of Gram matrix × (1 + λΔ): gradients [K, P, 3] in, smooth directions out."""
+    faces, count = start.faces.numpy(), start.coefficients.shape[1]
+    edges = adjacency(faces, count)
+    solve = splu(csc_array(eye_array(count) + stiffness * (diags_array(edges.sum(1)) - edges))).solve
+    gram = start.basis.gram(times)
+    inverse = np.linalg.inv(gram + OPEN * np.trace(gram) / len(gram) * np.eye(len(gram)))
+
+    def directions(gradient: Tensor) -> Tensor:
+        even = np.einsum("kl,lpx->pkx", inverse, gradient.numpy())
+        found = solve(np.ascontiguousarray(even.reshape(count, -1))).reshape(even.shape)
+        return torch.from_numpy(np.ascontiguousarray(found.transpose(1, 0, 2)))
+
+    return directions

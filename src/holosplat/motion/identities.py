@@ -1,0 +1,201 @@
+"""Which sightings are one body: links from one time to the next, gaps closed, doubles left out.
+
+Numbers of sightings alone: centres, volumes, and whether the field cuts them. A body that is merged with another, or
+split, at some times breaks its track there: the pieces are joined where their straight paths meet.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from ..checks import at_least, in_range
+
+FAR = 1e9
+"""Cost of a pair that cannot be."""
+SAME, TOUCHING, OTHER = 0.7, 1.2, 0.75
+"""Radii within which centres are of one body; radii within which a body is part of a larger one (half the distance of
+two flat ones side by side); and the share of the volume above which it is no part."""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """A sighting in numbers. time: its index; centre: `(x, y, z)` [m]; volume [m³]; cut: by the edge of the field."""
+
+    time: int
+    centre: np.ndarray
+    volume: float
+    cut: bool
+
+    @property
+    def reach(self) -> float:
+        """Radius [m] of a ball of its volume."""
+        return float((3 * self.volume / (4 * np.pi)) ** (1 / 3))
+
+
+@dataclass(frozen=True)
+class LinkOptions:
+    """What two sightings of one body have in common."""
+
+    gate: float = 0.8
+    """A body is looked for within so many radii of where its velocity leads."""
+    change: float = 0.3
+    """By which part a body that is seen whole may change its volume: less than a merger with half a body does."""
+    gap: int = 6
+    """Times that a track may miss."""
+    least: int = 2
+    """Sightings that make a track, unless it is near the field's edge, where bodies enter and leave."""
+
+    def __post_init__(self) -> None:
+        at_least(self, 0, "gate", "gap")
+        at_least(self, 1, "least")
+        in_range("change", self.change, 0.01, 0.99)
+
+
+Track = tuple[int, ...]
+"""Numbers of the sightings of one body, in the order of time."""
+
+
+def identified(seen: Sequence[Seen], times: np.ndarray, options: LinkOptions = LinkOptions()) -> list[Track]:
+    """The tracks of all bodies among the sightings `seen` at `times` [T] s, the longest first."""
+    tracks = _stitched(_chains(seen, times, options), seen, times, options)
+    tracks = sorted(tracks, key=lambda track: (-len(track), track))
+    return [track for track in _alone(tracks, seen, times) if _believed(track, seen, options)]
+
+
+def velocity(track: Track, seen: Sequence[Seen], times: np.ndarray, flow: np.ndarray, late: bool) -> np.ndarray:
+    """[3] m/s at the end of a track (late) or its start, by the two sightings there; of a single one it is the `flow`.
+
+    What the field cuts says nothing of velocity.
+    """
+    whole = [k for k in track if not seen[k].cut]
+    if len(whole) < 2:
+        return flow
+    first, second = (whole[-2], whole[-1]) if late else (whole[0], whole[1])
+    return (seen[second].centre - seen[first].centre) / (times[seen[second].time] - times[seen[first].time])
+
+
+def drift(tracks: Sequence[Track], seen: Sequence[Seen], times: np.ndarray) -> np.ndarray:
+    """Median velocity [3] [m/s] of the tracks; zero without any of two sightings."""
+    still = np.full(3, np.nan)
+    found = np.array([velocity(track, seen, times, still, True) for track in tracks] or [still])
+    found = found[np.isfinite(found).all(1)]
+    return np.median(found, axis=0) if len(found) else np.zeros(3)
+
+
+def _alike(one: Seen, other: Seen, options: LinkOptions) -> bool:
+    """Whether volumes may be of one body: those that are cut can have any."""
+    if one.cut or other.cut:
+        return True
+    low, high = sorted((one.volume, other.volume))
+    return low >= (1 - options.change) * high
+
+
+def _chains(seen: Sequence[Seen], times: np.ndarray, options: LinkOptions) -> list[Track]:
+    """Links from each time to the next, twice: the first round finds the flow that single sightings go with."""
+    flow, found = np.zeros(3), list[Track]()
+    for _ in range(2):
+        found = []
+        open_ones: list[Track] = []
+        for t in range(len(times)):
+            new = [k for k, one in enumerate(seen) if one.time == t]
+            pairs = _matched(open_ones, new, seen, times, flow, options)
+            linked = {new[j]: open_ones[i] for i, j in pairs}
+            found += [track for i, track in enumerate(open_ones) if i not in {i for i, _ in pairs}]
+            open_ones = [(*linked.get(k, ()), k) for k in new]
+        found += open_ones
+        flow = drift(found, seen, times)
+    return found
+
+
+def _matched(
+    tracks: Sequence[Track],
+    new: Sequence[int],
+    seen: Sequence[Seen],
+    times: np.ndarray,
+    flow: np.ndarray,
+    options: LinkOptions,
+) -> list[tuple[int, int]]:
+    """Pairs (track, new sighting) whose distances from where velocities lead are least in sum, within the gate."""
+    cost = np.full((len(tracks), len(new)), FAR)
+    for i, track in enumerate(tracks):
+        last = seen[track[-1]]
+        speed = velocity(track, seen, times, flow, True)
+        for j, k in enumerate(new):
+            one = seen[k]
+            away = np.linalg.norm(last.centre + speed * (times[one.time] - times[last.time]) - one.centre)
+            if away <= options.gate * max(last.reach, one.reach) and _alike(last, one, options):
+                cost[i, j] = away
+    return _assigned(cost)
+
+
+def _assigned(cost: np.ndarray) -> list[tuple[int, int]]:
+    rows, columns = linear_sum_assignment(cost)
+    return [(int(i), int(j)) for i, j in zip(rows, columns) if cost[i, j] < FAR]
+
+
+def _stitched(tracks: list[Track], seen: Sequence[Seen], times: np.ndarray, options: LinkOptions) -> list[Track]:
+    """Tracks joined over gaps of at most `gap` times, where the one's velocity leads to the other and back."""
+    flow = drift(tracks, seen, times)
+    while True:
+        cost = np.full((len(tracks), len(tracks)), FAR)
+        for i, before in enumerate(tracks):
+            for j, after in enumerate(tracks):
+                cost[i, j] = _gap_cost(before, after, seen, times, flow, options)
+        pairs = _assigned(cost)
+        if not pairs:
+            return tracks
+        i, j = min(pairs, key=lambda pair: cost[pair])
+        joined = (*tracks[i], *tracks[j])
+        tracks = [track for k, track in enumerate(tracks) if k not in (i, j)] + [joined]
+
+
+def _gap_cost(
+    before: Track, after: Track, seen: Sequence[Seen], times: np.ndarray, flow: np.ndarray, options: LinkOptions
+) -> float:
+    last, first = seen[before[-1]], seen[after[0]]
+    missed = first.time - last.time - 1
+    if before is after or not 0 <= missed <= options.gap or not _alike(last, first, options):
+        return FAR
+    pause = times[first.time] - times[last.time]
+    forth = last.centre + pause * velocity(before, seen, times, flow, True) - first.centre
+    back = first.centre - pause * velocity(after, seen, times, flow, False) - last.centre
+    away = 0.5 * float(np.linalg.norm(forth - back))
+    return away if away <= options.gate * max(last.reach, first.reach) else FAR
+
+
+def _alone(tracks: Sequence[Track], seen: Sequence[Seen], times: np.ndarray) -> list[Track]:
+    """Tracks without those that are where longer ones already are: mergers and fragments of these."""
+    kept, flow = list[Track](), drift(tracks, seen, times)
+    for track in tracks:
+        inside = [any(_holds(other, k, seen, times, flow) for other in kept) for k in track]
+        if np.mean(inside) < 0.5:
+            kept.append(track)
+    return kept
+
+
+def _holds(track: Track, number: int, seen: Sequence[Seen], times: np.ndarray, flow: np.ndarray) -> bool:
+    """Whether a sighting is the body of `track`, a merger with it, or a piece of it."""
+    one, own = seen[number], max((seen[k] for k in track), key=lambda other: (not other.cut, other.volume))
+    low, high = sorted((one.volume, own.volume))
+    near = SAME if low > OTHER * high else TOUCHING
+    away = np.linalg.norm(place_at(track, one.time, seen, times, flow) - one.centre)
+    return bool(away < near * max(one.reach, own.reach))
+
+
+def place_at(track: Track, time: int, seen: Sequence[Seen], times: np.ndarray, flow: np.ndarray) -> np.ndarray:
+    """Where a track is [3] [m] at a time: between its sightings on straight lines, beyond by its last velocity."""
+    own = [seen[k] for k in track]
+    if time > own[-1].time:
+        return own[-1].centre + velocity(track, seen, times, flow, True) * (times[time] - times[own[-1].time])
+    if time < own[0].time:
+        return own[0].centre - velocity(track, seen, times, flow, False) * (times[own[0].time] - times[time])
+    when = times[[one.time for one in own]]
+    return np.array([np.interp(times[time], when, [one.centre[axis] for one in own]) for axis in range(3)])
+
+
+def _believed(track: Track, seen: Sequence[Seen], options: LinkOptions) -> bool:
+    return len(track) >= options.least or any(seen[k].cut for k in track)

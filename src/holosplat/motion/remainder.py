@@ -1,0 +1,126 @@
+"""What frames show beside bodies that are known, and bodies that are found there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from scipy.spatial import KDTree
+
+from ..fit.residuals import Prediction
+from ..geometry import Views
+from ..mesh import TriangleMesh
+from ..representations import MovingSurfaces
+from ..scan import Scan
+from .sightings import is_cut
+
+CENTRES, PART, NEAR_PX = 0.6, 0.5, 2.0
+"""When a body is one of its own: radii between centres, share of the median volume, and distance [pixels]."""
+SURE = 0.75
+"""Share of the median volume from which on a body is believed before all others are known."""
+DARKEST = 0.05
+"""Relative intensity of a predicted pixel below which it divides no further."""
+
+
+def beside(train: Scan, bodies: MovingSurfaces, oversample: int) -> Scan:
+    """The frames over those that `bodies` give: nearly what the matter that is left would give by itself.
+
+    Phases of bodies add up in the exit wave, whose product with the waves of others is what is measured; behind the
+    sample that is right to first order in the phases, which a first guess of what is left can do with.
+    """
+    said = Prediction(bodies, train.exposures, oversample)
+    with torch.no_grad():
+        predicted = np.stack([said.view(v).frames()[0].numpy() for v in range(len(train))])
+    return replace(train, frames=(train.frames / np.maximum(predicted, DARKEST)).astype(np.float32))
+
+
+def joined(one: MovingSurfaces, other: MovingSurfaces) -> MovingSurfaces:
+    """All bodies of two sets, those of `one` first; of the same basis, unit and material."""
+    return MovingSurfaces(
+        torch.cat([one.coefficients.detach(), other.coefficients.detach()], dim=1),
+        torch.cat([one.faces, other.faces + one.coefficients.shape[1]]),
+        torch.cat([one.of_body, other.of_body + one.count]),
+        one.basis,
+        one.unit_length,
+        one.matter,
+        one.lines,
+    )
+
+
+def only(bodies: MovingSurfaces, numbers: Sequence[int]) -> MovingSurfaces:
+    """The bodies `numbers`, in that order; at least one."""
+    parts = [bodies.body(k) for k in numbers]
+    starts = np.cumsum([0, *(len(used) for used, _ in parts[:-1])])
+    return MovingSurfaces(
+        torch.cat([bodies.coefficients.detach()[:, used] for used, _ in parts], dim=1),
+        torch.cat([faces + int(start) for (_, faces), start in zip(parts, starts)]),
+        torch.cat([torch.full((len(faces),), k) for k, (_, faces) in enumerate(parts)]),
+        bodies.basis,
+        bodies.unit_length,
+        bodies.matter,
+        bodies.lines,
+    )
+
+
+def apart(new: MovingSurfaces, known: MovingSurfaces, times: np.ndarray) -> list[int]:
+    """Numbers of `new` bodies that are bodies of their own beside `known` ones.
+
+    Their centres lie `CENTRES` of the larger radius away from all of these, in the mean over times; and they are either
+    `PART` of the median volume of these, at least, or touch none: small pieces at the surface of a body correct its
+    shape, which the next fit does better.
+    """
+    distances = np.zeros((new.count, known.count))
+    for time in times:
+        ours, theirs = ([_ball(mesh) for mesh in of.bodies(float(time))] for of in (new, known))
+        for i, (centre, radius) in enumerate(ours):
+            for j, (other, size) in enumerate(theirs):
+                distances[i, j] += np.linalg.norm(centre - other) / max(radius, size) / len(times)
+    middle = float(times[len(times) // 2])
+    least = PART * np.median([abs(mesh.volume) for mesh in known.bodies(middle)])
+    large = np.array([abs(mesh.volume) >= least for mesh in new.bodies(middle)])
+    own = (distances.min(1) >= CENTRES) & (large | (gaps(new, known, times) > NEAR_PX))
+    return [int(k) for k in np.flatnonzero(own)]
+
+
+def sure_ones(bodies: MovingSurfaces, views: Views, times: np.ndarray) -> list[int]:
+    """Numbers of the bodies of `SURE` of the median volume at least, and of those that the field cuts in the middle.
+
+    Of the others few views have smeared a part, or made them up where streaks of several cross; one is left at least.
+    """
+    meshes = bodies.bodies(float(times[len(times) // 2]))
+    cut = np.array([is_cut(mesh, views) for mesh in meshes])
+    volumes = np.array([abs(mesh.volume) for mesh in meshes])
+    middle = np.median(volumes if cut.all() else volumes[~cut])
+    return [int(k) for k in np.flatnonzero(cut | (volumes >= SURE * middle))]
+
+
+def gaps(of: MovingSurfaces, others: MovingSurfaces, times: np.ndarray) -> np.ndarray:
+    """[N] how near the vertices of each body `of` come to those of `others`, in the median over times [pixels]."""
+    found = np.zeros((len(times), of.count))
+    for t, time in enumerate(times):
+        tree = KDTree(np.concatenate([mesh.vertices for mesh in others.bodies(float(time))]))
+        found[t] = [tree.query(mesh.vertices)[0].min() / of.unit_length for mesh in of.bodies(float(time))]
+    return np.asarray(np.median(found, axis=0))
+
+
+def whole_ones(bodies: MovingSurfaces, times: np.ndarray) -> list[int]:
+    """Numbers of the bodies that are no pieces of others: of `PART` of the median volume at least, or touching none.
+
+    What is left out is looked for again, beside the others.
+    """
+    if bodies.count == 1:
+        return [0]
+    middle = float(times[len(times) // 2])
+    volumes = np.array([abs(mesh.volume) for mesh in bodies.bodies(middle)])
+    small = np.flatnonzero(volumes < PART * np.median(volumes))
+    large = np.setdiff1d(np.arange(bodies.count), small)
+    touching = [] if not len(small) else gaps(only(bodies, small.tolist()), only(bodies, large.tolist()), times)
+    pieces = {int(k) for k, gap in zip(small, touching) if gap <= NEAR_PX}
+    return [k for k in range(bodies.count) if k not in pieces]
+
+
+def _ball(mesh: TriangleMesh) -> tuple[np.ndarray, float]:
+    """Middle of the vertices [3] [m], and radius [m] of the ball of the same volume."""
+    return mesh.vertices.mean(0), float((3 * abs(mesh.volume) / (4 * np.pi)) ** (1 / 3))

@@ -1,0 +1,121 @@
+"""`track`: the scan of several times in, closed bodies in motion and their run folder out."""
+
+from __future__ import annotations
+
+import csv
+
+from ..checks import require
+from ..fit.residuals import Prediction
+from ..io.atomic import atomic_path
+from ..io.folder import atomic_folder
+from ..io.json import write_json
+from ..io.light import write_light
+from ..io.objects import write_object
+from ..io.pvd import TimeStep, write_pvd
+from ..io.vtk import write_mesh
+from ..matter import KnownTwo, MaterialPrior
+from ..methods import Task
+from ..methods.assumed import assumed_material
+from ..methods.presets import SCHEMA
+from ..motion.measures import columns, measured, row
+from ..motion.track import USUAL, Followed, TrackOptions, follow, require_times
+from ..optics.background import LightOptions
+from ..progress import FitProgress
+from ..representations import MovingSurfaces
+from ..scan import Scan
+from ..tables import to_table
+from .keeper import Choice
+from .provenance import environment, scan_hash
+from .reconstruct import check_frames
+from .reconstruction import Reconstruction
+from .run_folder import RunFolder
+from .run_light import found_in
+from .run_record import summary_of
+from .verdict import judge
+
+LENGTH_UNIT = "um"
+BODIES, COLLECTION, TRACKS = "bodies", "bodies.pvd", "tracks.csv"
+
+
+def track(
+    scan: Scan,
+    prior: MaterialPrior,
+    options: TrackOptions = USUAL,
+    seed: int = 0,
+    *,
+    light: LightOptions | None = None,
+    folder: RunFolder | None = None,
+    on_progress: FitProgress = lambda stage, fraction, record: None,
+) -> Reconstruction:
+    """Closed bodies of one material that move through the training frames of `scan`, of several times.
+
+    `object` of the result is a `MovingSurfaces`: `object.at(t)` is right at any time [s], between frames too. light:
+    what is assumed of it (default: even, unless air says otherwise). A material that is not known is estimated from the
+    first time. With a `folder`, everything is written there: what `reconstruct` writes, `bodies.pvd` with one VTK file
+    (.vtp, µm) a body and time, and `tracks.csv`. Errors: `InputError` for a scan of one time, frames that are not
+    relative to the flat field, two materials, no body that is seen, and folders that are there.
+    """
+    require(not isinstance(prior, KnownTwo), "bodies are of one material, but two are known; leave --second-material.")
+    require_times(scan.train())
+    check_frames(scan.train())
+    if folder is not None:
+        folder.require_new()
+    assumed = light or LightOptions()
+    task = Task(scan.train(), prior, seed, lambda stage, part: on_progress(stage, part, {}), assumed).evened()
+    train = task.scan
+    material = assumed_material(train.at_instant(0), task.prior, task.on_progress)
+    found = follow(train, material, options, seed, light=task.uneven, on_progress=on_progress)
+    said = Prediction(found.bodies, train.exposures, found.oversample)
+    done = Reconstruction(
+        found.bodies,
+        options.kind,
+        train.exposures.reference_energy,
+        found.oversample,
+        found.timing,
+        True,
+        Choice("levels", "closed bodies have a surface", {}, "soft fit"),
+        task.delta_told,
+        judge(said, train, task.noise if task.uneven else None),
+        light=found_in(task),
+    )
+    if folder is not None:
+        config = {"schema_version": SCHEMA, "method": {"kind": options.kind, **to_table(options)}, "seed": seed}
+        config |= {
+            "prior": prior.as_dict(),
+            "matter": "levels",
+            "scan_hash": scan_hash(scan),
+            "light": to_table(assumed),
+        }
+        folder.create()
+        write_json(folder.config, config | environment("cpu"))
+        _write(folder, done, found, task)
+        write_tracks(folder, found.bodies, scan)
+    return done
+
+
+def _write(folder: RunFolder, done: Reconstruction, found: Followed, task: Task) -> None:
+    """The object, the light, and what is said of the fits."""
+    folder.start_metrics(dict.fromkeys(name for record in found.records for name in record))
+    folder.append_metrics(found.records)
+    write_object(folder.object, found.bodies)
+    if task.uneven is not None and task.uneven.background is not None:
+        write_light(folder.light, task.uneven.background)
+    told = {"steps": len(found.records), "times_s": task.scan.instants.tolist(), "bodies": found.bodies.count}
+    told |= {"bodies_at_each_time": list(found.found), "light": task.light_in_words}
+    write_json(folder.summary, summary_of(done, None, task.scan) | told)
+
+
+def write_tracks(folder: RunFolder, bodies: MovingSurfaces, scan: Scan) -> None:
+    """tracks.csv, and bodies.pvd with one file a body and time."""
+    times, steps = scan.instants, list[TimeStep]()
+    with atomic_path(folder.path / TRACKS) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns())
+        writer.writerows(row(one) for one in measured(bodies, times, scan.views))
+    with atomic_folder(folder.path / BODIES) as temporary:
+        for t, time in enumerate(times):
+            named = [(f"{mesh.name}_{t:04d}.vtp", mesh) for mesh in bodies.bodies(float(time))]
+            for name, mesh in named:
+                write_mesh(temporary / name, mesh, LENGTH_UNIT)
+            steps.append(TimeStep(float(time), tuple(folder.path / BODIES / name for name, _ in named)))
+    write_pvd(folder.path / COLLECTION, steps)

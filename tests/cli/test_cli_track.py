@@ -1,0 +1,104 @@
+"""`track` on the command line, and every command that reads its runs."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from helpers.cli import Outcome, holosplat, refused, worked
+from helpers.moving_ellipsoids import PIXEL, STEP, TIMES, scan, truth
+from holosplat.geometry import Grid
+from holosplat.io.nxtomo import read_scan, write_scan
+from holosplat.io.objects import read_object
+from holosplat.io.pvd import read_pvd
+from holosplat.io.volumes import read_volume, write_voxels
+from holosplat.io.vtk import read_meshes
+from holosplat.representations import MovingSurfaces
+
+KNOWN = ("--material", "haemoglobin")
+
+
+def worked_by(*arguments: object) -> Outcome:
+    return worked(holosplat(*arguments))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """The scan, the truth at the last time, and a run of few steps."""
+    folder = tmp_path_factory.mktemp("track")
+    write_scan(folder / "scan.nxs", scan())
+    write_voxels(folder / "truth.h5", truth().at(STEP * (TIMES - 1)), Grid.of_views(scan().views))
+    how = (*KNOWN, "--effort", "0.2", "--pieces", "1", "--rounds", "0")
+    worked_by("track", folder / "scan.nxs", *how, "--out", folder / "run")
+    return folder
+
+
+def test_a_run_has_its_bodies_and_tracks(folder):
+    """The collection names a file a body and time; rows of the table are those of these files."""
+    run = folder / "run"
+    found = read_object(run / "object.h5")
+    assert isinstance(found, MovingSurfaces)
+    assert found.count == 3
+    steps = read_pvd(run / "bodies.pvd")
+    assert [step.time for step in steps] == pytest.approx(STEP * np.arange(TIMES))
+    with (run / "tracks.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["time_s"], row["body"]) for row in rows[:3]] == [("0", str(k)) for k in range(3)]
+    assert len(rows) == 3 * TIMES
+    for mesh, row in zip(read_meshes(steps[-1].files, "um"), rows[-3:]):
+        assert mesh.volume == pytest.approx(float(row["volume_m3"]), rel=1e-4)
+    summary = json.loads((run / "summary.json").read_text())
+    assert summary["times_s"] == pytest.approx(STEP * np.arange(TIMES))
+    assert summary["kind"] == "moving-surfaces"
+    assert (run / "report.html").is_file()
+
+
+def test_it_is_scored_at_one_time(folder):
+    whole = worked_by("evaluate", folder / "run", "--truth", folder / "truth.h5", "--json")
+    last = worked_by("evaluate", folder / "run", "--truth", folder / "truth.h5", "--time-frame", TIMES - 1, "--json")
+    first, right = (json.loads(said.out)["volume"]["dice"] for said in (whole, last))
+    assert right > 0.88 > first + 0.2  # without a time it is the first one's matter
+    refused(holosplat("evaluate", folder / "run", "--time-frame", TIMES), f"0 to {TIMES - 1}", str(TIMES))
+
+
+def test_frames_of_all_times_are_rendered(folder):
+    worked_by("render", folder / "run", "--scan", folder / "scan.nxs", "--split", "train", "--out", folder / "said.nxs")
+    said, wanted = read_scan(folder / "said.nxs").frames, scan().frames
+    assert np.abs(said - wanted).mean() < 0.6 * np.abs(wanted - 1).mean()
+
+
+def test_volumes_and_bodies_are_exported_at_times(folder):
+    """The same body has the same name at all times."""
+    worked_by("export", folder / "run", "--volume", folder / "v.h5", "--bodies", folder / "b", "--time-frame", "all")
+    found = read_object(folder / "run" / "object.h5")
+    assert isinstance(found, MovingSurfaces)
+    for k in range(TIMES):
+        volume = read_volume(folder / f"v_t{k:04d}.h5")
+        wanted = sum(mesh.volume for mesh in found.bodies(k * STEP))
+        inside = volume.delta.sum() * PIXEL**3 / found.matter.delta
+        assert inside == pytest.approx(wanted, rel=0.25)  # one body leaves the field
+        files = sorted((folder / f"b_t{k:04d}").glob("body*.vtk"))
+        for mesh, own in zip(read_meshes(files, "um"), found.bodies(k * STEP)):
+            assert mesh.vertices == pytest.approx(own.vertices, abs=1e-3 * PIXEL)
+    worked_by("export", folder / "run", "--volume", folder / "one.h5", "--time-frame", 3)
+    assert np.array_equal(read_volume(folder / "one.h5").delta, read_volume(folder / "v_t0003.h5").delta)
+
+
+def test_what_cannot_be_followed_is_refused(folder):
+    scan_file, out = folder / "scan.nxs", folder / "none"
+    known = (*KNOWN, "--out", out)
+    refused(holosplat("track", scan_file, *known, "--time-frame", "0"), "--time-frame", "leave it")
+    refused(holosplat("track", scan_file, *known, "--effort", "0"), "--effort")
+    refused(holosplat("track", scan_file, *known, "--degree", "0"), "degree")
+    refused(holosplat("track", scan_file, *known[:2], "--out", folder / "run"), "run")
+    refused(holosplat("track", scan_file, *known, "--views", "0:4"), "two times or more", "reconstruct")
+    assert not out.exists()
+
+
+def test_surfaces_of_bodies_in_motion_are_there_already(folder):
+    refused(holosplat("surface", folder / "run", "--out", folder / "again"), "closed surfaces already", "export")
+    assert not (folder / "again").exists()
