@@ -36,7 +36,7 @@ beam 3 85 -6
 beam 4 130 4
 
 # From here on, only what a beamline has: raw1.nxs … raw4.nxs, and frames of the beads.
-for n in 1 2 3 4; do holosplat correct "raw$n.nxs" --normalise mean --out "corrected$n.nxs"; done
+for n in 1 2 3 4; do holosplat correct "raw$n.nxs" --out "corrected$n.nxs"; done
 holosplat join corrected1.nxs corrected2.nxs corrected3.nxs corrected4.nxs --out scan.nxs
 holosplat join beads1.nxs beads2.nxs beads3.nxs beads4.nxs --out beads.nxs
 holosplat calibrate beads.nxs --beads 3.5e-6 --material polystyrene --out geometry.toml

@@ -100,6 +100,15 @@ def memory() -> Once:
     return Once()
 
 
+@pytest.fixture(scope="module")
+def begun_once(memory: Once) -> Iterator[Once]:
+    """Runs on the same frames begin with what the first of them has found. To begin anew: `begun_once.made.clear()`."""
+    from helpers.once import once
+
+    with once(memory):
+        yield memory
+
+
 @pytest.fixture(scope="session")
 def espresso_rbc() -> Path:
     """Folder of simulated red cells in a channel (VTK files of other programs); skips where it is absent."""

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .checks import finite, in_range, require, shaped
+from .divided_light import DividedLight
 from .frames import Binned, Cropped, Frames, binned, blocks, picked
 from .geometry import Views
 
@@ -160,6 +161,7 @@ class Scan:
     `scan.frames` is first used. `scan.source`, `scan[index]`, `blocks` and scans made from them do not read all frames.
     is_test: [N] bool, frames held out of the fit.
     provenance: origin of the scan, as flat text entries.
+    light: what is not known of smooth light that the frames were divided by; None: nothing is said of it.
     """
 
     if TYPE_CHECKING:
@@ -169,6 +171,7 @@ class Scan:
     exposures: Exposures
     is_test: np.ndarray
     provenance: dict[str, str] = field(default_factory=dict)
+    light: DividedLight | None = None
     source: np.ndarray | Frames = field(init=False)
 
     def __post_init__(self) -> None:
@@ -178,15 +181,27 @@ class Scan:
         else:
             frames = shaped("frames", np.ascontiguousarray(self.source, dtype=np.float32), wanted)
             object.__setattr__(self, "source", finite("frames", frames))
+        fits = self.light is None or len(self.light) == len(self.exposures)
+        require(fits, f"a scan of {wanted[0]} frames needs light of as many, but has {len(self.light or ())}.")
         is_test = shaped("split", np.asarray(self.is_test, dtype=bool), wanted[:1])
         object.__setattr__(self, "is_test", is_test)
 
     @classmethod
     def of(
-        cls, frames: np.ndarray | Frames, exposures: Exposures, is_test: np.ndarray, provenance: dict[str, str]
+        cls,
+        frames: np.ndarray | Frames,
+        exposures: Exposures,
+        is_test: np.ndarray,
+        provenance: dict[str, str],
+        light: DividedLight | None = None,
     ) -> Scan:
         """A scan of frames [N, H, W], an array or such as are read when they are asked for."""
-        return cls(frames, exposures, is_test, provenance)  # type: ignore[arg-type]  # `_FramesInMemory` takes both
+        # `_FramesInMemory` takes both
+        return cls(frames, exposures, is_test, provenance, light)  # type: ignore[arg-type]
+
+    def taken(self, exposures: Exposures) -> Scan:
+        """The same frames with other exposures."""
+        return Scan.of(self.source, exposures, self.is_test, self.provenance, self.light)
 
     def __len__(self) -> int:
         return len(self.source)
@@ -197,11 +212,12 @@ class Scan:
 
     def __getitem__(self, index: np.ndarray | list[int] | slice) -> Scan:
         frames = picked(self.source, index)
-        return Scan.of(frames, self.exposures[index], self.is_test[index], self.provenance)
+        light = None if self.light is None else self.light[index]
+        return Scan.of(frames, self.exposures[index], self.is_test[index], self.provenance, light)
 
     def in_memory(self) -> Scan:
         """This scan with all its frames read, where bad ones are named: for who uses each of them, more than once."""
-        return Scan.of(self.frames, self.exposures, self.is_test, self.provenance)
+        return Scan.of(self.frames, self.exposures, self.is_test, self.provenance, self.light)
 
     def blocks(self) -> Iterator[np.ndarray]:
         """All frames in turn, some at once, [K, H, W] float32: a few of a long series are in memory at a time."""
@@ -236,16 +252,15 @@ class Scan:
 
     def as_static(self) -> Scan:
         """All frames as if taken at the same time, 0."""
-        exposures = replace(self.exposures, time=np.zeros(len(self)))
-        return Scan.of(self.source, exposures, self.is_test, self.provenance)
+        return self.taken(replace(self.exposures, time=np.zeros(len(self))))
 
     def with_views(self, views: Views) -> Scan:
         """The same frames as if taken at other poses."""
-        return Scan.of(self.source, replace(self.exposures, views=views), self.is_test, self.provenance)
+        return self.taken(replace(self.exposures, views=views))
 
     def with_split(self, is_test: np.ndarray) -> Scan:
         """The scan with the frames `is_test` [N] bool held out, and no others."""
-        return Scan.of(self.source, self.exposures, is_test, self.provenance)
+        return Scan.of(self.source, self.exposures, is_test, self.provenance, self.light)
 
     def cropped(self, rows: slice, columns: slice) -> Scan:
         """The scan on the rows and columns from `start` to `stop` (pixels); the detector's shifts say where it lies.
@@ -258,7 +273,8 @@ class Scan:
         whole = self.source
         frames = Cropped(whole, rows, columns) if isinstance(whole, Frames) else whole[:, rows, columns]
         exposures = replace(self.exposures, views=self.views.cropped(rows, columns))
-        return Scan.of(frames, exposures, self.is_test, self.provenance)
+        light = self.light and self.light.cropped(rows.start, columns.start)
+        return Scan.of(frames, exposures, self.is_test, self.provenance, light)
 
     def coarsened(self, factor: int) -> Scan:
         """The scan on pixels `factor` times larger, or as large as its rows and columns allow."""
@@ -282,7 +298,8 @@ class Scan:
             shifts=self.views.shifts - 0.5 * odd * self.views.pixel_sizes[:, None],
         )
         exposures = replace(self.exposures, views=views, psf_sigma_px=self.exposures.psf_sigma_px / factor)
-        return Scan.of(frames, exposures, self.is_test, self.provenance)
+        light = self.light and self.light.cropped(top, left).binned(factor)
+        return Scan.of(frames, exposures, self.is_test, self.provenance, light)
 
     def train(self) -> Scan:
         """The training frames only; `InputError` when there are none."""

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from helpers.misaligned_balls import SHAPE
 from helpers.moving_balls import beams, thickness
+from helpers.row_images import gaussians, placed
 from holosplat.align.begin import Images, begun
 from holosplat.align.derivatives import in_pixels
 from holosplat.align.gauge import moved_onto
@@ -29,12 +30,6 @@ def images(angles: tuple[float, ...], errors: Misalignment, balls: int = 8) -> t
     true = errors.true_exposures(planned).views
     values = np.stack([thickness(true, when, balls).double().numpy() for when in WHEN])
     return values, in_pixels(planned.views), in_pixels(true)
-
-
-def placed(numbers: np.ndarray, planned: Views) -> Views:
-    """Planned views with numbers [V, 5]."""
-    rotations = Rotation.from_rotvec(numbers[:, 2:5]).as_matrix() @ planned.rotations
-    return replace(planned, rotations=rotations, shifts=planned.shifts + numbers[:, :2])
 
 
 def apart(found: Views, true: Views) -> tuple[float, float, float]:
@@ -59,20 +54,6 @@ def test_beams_are_found_without_a_volume(angles):
     assert after[2] < 0.1
     assert np.all(found.after < 0.1 * found.before)
     assert not found.numbers[:, 3].any()
-
-
-POINTS = ((4.0, -3.0, 5.0, 2.0), (-6.0, 2.0, 1.0, 1.0), (1.0, 6.0, -7.0, 1.5))
-WIDTH = 3.0
-
-
-def gaussians(views: Views) -> np.ndarray:
-    """Projections [V, H, W] of round Gaussians, lengths in pixels."""
-    (h, w), made = views.shape, []
-    x, y = np.arange(w) + 0.5 - w / 2, np.arange(h)[:, None] + 0.5 - h / 2
-    for rotation, shift in zip(views.rotations, views.shifts):
-        at = [(rotation[:2] @ np.array(point[:3]) - shift, point[3]) for point in POINTS]
-        made.append(sum(m * np.exp(-((x - a[0]) ** 2 + (y - a[1]) ** 2) / (2 * WIDTH**2)) for a, m in at))
-    return np.array(made)
 
 
 @pytest.mark.parametrize("number", range(COUNT - 1))

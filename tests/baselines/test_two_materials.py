@@ -44,6 +44,7 @@ SILICA = Compound("SiO2", 2.2).delta_beta(20.0)
 OIL = Compound("C16H34", 0.77).delta_beta(20.0)
 BOTH = (SILICA, OIL)
 PRIOR = MaterialPrior.known(OIL, SILICA)
+pytestmark = pytest.mark.usefixtures("begun_once")
 
 
 def capsules(seed: int = 1) -> MeshScene:
@@ -260,7 +261,7 @@ def truth(grid):
 
 def settings() -> Gaussians:
     quick = preset("default")
-    schedule = replace(quick.fit.schedule, steps=80)
+    schedule = replace(quick.fit.schedule, steps=40)
     return replace(quick, fit=replace(quick.fit, schedule=schedule))
 
 

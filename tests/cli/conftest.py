@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 
 import pytest
 
 from helpers.cli import COLUMNS, PIXEL, QUICK, ROWS, Workshop, holosplat, known, simulate, worked
-from helpers.once import Once, once
+from helpers.once import Once
 from holosplat.io.vtk import write_mesh
 from holosplat.specimens.red_cells import random_cells
 from holosplat.tables import to_table
@@ -35,7 +34,5 @@ def _undrawn(undrawn_reports: None) -> None:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _begun_once(memory: Once) -> Iterator[None]:
-    """Commands in the tests' process begin with what an earlier run on the same frames has found."""
-    with once(memory):
-        yield
+def _once(begun_once: Once) -> None:
+    """Commands in the tests' process share what runs begin with."""

@@ -146,13 +146,15 @@ def test_a_series_has_one_geometry_and_its_reversed_beam_is_turned_back(tmp_path
     path, upside, out, geometry = (tmp_path / name for name in ("s.nxs", "u.nxs", "a.nxs", "geometry.toml"))
     write_scan(path, scan)
     write_scan(upside, replace(scan, frames=frames))
-    matter = ("--material", FORMULA, "--density", "1.335")
+    matter = ("--delta-beta", 1000)
     done = worked(holosplat("align", path, *matter, "--geometry-out", geometry, "--out", out))
     assert "3 beams, from 3 times" in done.out
     found = read_scan(out)
     worked(holosplat("convert", path, tmp_path / "there.nxs", "--to", "nxtomo", "--exposures", geometry))
     np.testing.assert_allclose(read_scan(tmp_path / "there.nxs").views.shifts, found.views.shifts, atol=1e-15)
     refused(holosplat("align", upside, *matter, "--geometry-out", geometry, "--out", out), "reversed")
+    every = ("--time-frame", "all", "--refine", "shifts", "--out", tmp_path / "run")
+    refused(holosplat("reconstruct", path, *matter, *every), "--refine", "--time-frame all", "holosplat align")
     done = worked(holosplat("align", upside, *matter, "--out", out))
     assert "beam 2 is reversed along y" in done.out
     np.testing.assert_array_equal(read_scan(out).frames, scan.frames)

@@ -14,7 +14,7 @@ from holosplat.align.gauge import moved_onto
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.checks import InputError
 from holosplat.fit.batch import Batch
-from holosplat.fit.freedom import Expected, Freedom, mean_distance_error, projection
+from holosplat.fit.freedom import Expected, Freedom, mean_distance_error, moved, projection
 from holosplat.fit.schedule import Schedule
 from holosplat.geometry import Views, rotation_y
 from holosplat.methods.surfaces import SurfaceFit, surface_fit
@@ -140,3 +140,26 @@ def test_what_is_expected_counts_from_the_plan():
     assert part.weight == 0.5
     with pytest.raises(InputError, match="so_far"):
         Freedom(1.0, 0.0, 0.0, 0.0, np.zeros((3, 5)))
+
+
+def test_what_a_fit_found_is_added_and_places_the_frames():
+    """Of two fits one after the other; pixels and distances, too, and a view that is set aside stays."""
+    exposures = misaligned()[0].exposures
+    r = torch.Generator().manual_seed(0)
+    sizes = ((4, 3), (4, 2), (4,), (4,))
+    some = [0.01 * torch.randn(*size, generator=r, dtype=torch.float64) for size in sizes]
+    found = Alignment(some[0], some[1], some[2], magnified=some[3])
+    start = replace(free(), so_far=np.full((5, 7), 0.5))
+    after = start.after(found)
+    numbers = torch.cat([some[1], some[0], some[2][:, None], some[3][:, None]], dim=1).numpy()
+    placed = moved(exposures, found)
+    aside = np.flatnonzero((after.so_far == 0.5).all(axis=1))
+    assert len(aside) == 1
+    fitted = np.delete(np.arange(5), aside)
+    np.testing.assert_allclose(after.so_far[fitted], 0.5 + numbers, rtol=1e-6)
+    wanted = found.exposures(exposures[fitted])
+    for name in ("pixel_sizes", "shifts", "rotations"):
+        np.testing.assert_allclose(getattr(placed.views, name)[fitted], getattr(wanted.views, name), rtol=1e-12)
+        np.testing.assert_array_equal(getattr(placed.views, name)[aside], getattr(exposures.views, name)[aside])
+    np.testing.assert_allclose(placed.distance[fitted], wanted.distance)
+    assert np.ptp(placed.views.pixel_sizes) > 1e-3 * exposures.views.pitch

@@ -49,6 +49,7 @@ class Fake:
     act: Callable[[Task], hs.Object]
     kind: ClassVar[str] = "fake"
     name: ClassVar[str] = "fake"
+    wants_levels: ClassVar[bool] = False
 
     def stages(self) -> tuple[Fake]:
         return (self,)

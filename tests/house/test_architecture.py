@@ -21,7 +21,7 @@ Files = dict[str, str]
 
 TIERS = (
     ("units", "version", "checks", "lazy", "tables", "native", "backends", "memory", "progress")
-    + ("geometry", "frames", "scan", "volume", "mesh", "matter"),
+    + ("geometry", "frames", "divided_light", "scan", "volume", "mesh", "matter"),
     ("materials", "optics", "metrics", "projectors", "preprocess"),
     ("specimens", "representations", "model"),
     ("io",),

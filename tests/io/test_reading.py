@@ -163,6 +163,24 @@ def test_a_run_reads_its_scan_again_as_it_read_it(tmp_path, file):
     assert said == Reading(replace(reading.told, distance=0.3), reading.part)
 
 
+@pytest.mark.parametrize("old", [False, True], ids=["", "without pixels"])
+def test_a_run_gives_its_scan_where_it_found_the_frames(tmp_path, file, old):
+    """Pixels, too, where a magnification was found; runs of old have none."""
+    run, planned = tmp_path / "run", read(file)
+    run.mkdir()
+    shifts, turned = planned.views.shifts + 0.3 * PIXEL, planned.views.rotations[::-1]
+    sizes, distance = planned.views.pixel_sizes * np.linspace(0.99, 1.02, N), planned.exposures.distance * 1.1
+    found = {"rotations": turned, "shifts": shifts, "distance": distance} | ({} if old else {"pixel_sizes": sizes})
+    write_json(run / "config.json", {})
+    write_json(run / "source.json", run_source(file, Reading()))
+    write_json(run / "summary.json", {"geometry": {name: value.tolist() for name, value in found.items()}})
+    views = read(run).views
+    np.testing.assert_array_equal(views.rotations, turned)
+    np.testing.assert_array_equal(views.shifts, shifts)
+    np.testing.assert_allclose(views.pixel_sizes, planned.views.pixel_sizes if old else sizes, rtol=1e-12)
+    np.testing.assert_array_equal(read(run).exposures.distance, distance)
+
+
 def test_a_damaged_reading_of_a_run_is_named(tmp_path, file):
     run = tmp_path / "run"
     run.mkdir()

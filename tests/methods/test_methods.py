@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from helpers.once import Once, once
 from helpers.two_balls import NETWORK, ONE, scan
 from helpers.two_balls import truth as true_volume
 from holosplat.baselines import HolographicTV
@@ -62,11 +60,7 @@ KNOWN = MaterialPrior.known(ONE.channels[0])
 PRIORS = {"known": KNOWN, "ratio": MaterialPrior.of_ratio(ONE.channels[0].ratio), "unknown": MaterialPrior.unknown()}
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _begun_once(memory: Once) -> Iterator[None]:
-    """Methods begin with the same volumes of the same frames."""
-    with once(memory):
-        yield
+pytestmark = pytest.mark.usefixtures("begun_once")
 
 
 @pytest.fixture(scope="module")

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 
-from helpers.once import Once, once
+from helpers.once import Once
 from helpers.runs import PIXEL, SHAPE, scene
 from holosplat.beamline.simulate import simulate
 from holosplat.geometry import Views
@@ -22,7 +20,5 @@ def scan() -> Scan:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def begun_once(memory: Once) -> Iterator[Once]:
-    """Runs on the same frames begin with what the first of them has found. To begin anew: `begun_once.made.clear()`."""
-    with once(memory):
-        yield memory
+def _once(begun_once: Once) -> None:
+    """All runs share what they begin with."""

@@ -13,7 +13,7 @@ from ..matter import DeltaBeta, Known, MaterialPrior
 from ..methods.assumed import assumed_material
 from ..model import Alignment
 from ..optics.background import Light, LightOptions
-from ..progress import Progress
+from ..progress import Advance, Progress
 from ..scan import Exposures, Scan
 from .begin import Begun, Images, begun
 from .changes import changes, header, in_words, line
@@ -22,7 +22,7 @@ from .derivatives import NUMBERS
 from .few import KINDS
 from .gauge import moved_onto
 from .moments import Beams, Moment, chosen_moments, whens
-from .poses import DISTANCE, FLUX, SHIFT, TURN, PoseOptions, PoseSearch
+from .poses import DISTANCE, FLUX, SHIFT, TURN, Drift, Level, PoseOptions, PoseSearch
 from .series_search import SeriesSearch
 from .shadows import EVEN_OR_NOT
 from .views import ACCURACY, DEFAULT, FEW, FEWEST, AlignedViews, Judged
@@ -33,6 +33,7 @@ JUDGED = 3
 """Times whose volumes judge what volumes found."""
 ACROSS = "shifts across two beams are as planned: they are a motion of the whole object, which loses nothing"
 DISTANCES = "distances and magnifications are as planned: rows and voxels cannot tell them; align a single time"
+SHIFTS = "alignment, shifts by volumes"
 DEGREES = np.array([1, 1, *[np.pi / 180] * 3, 1, 1])
 """Units of `changes` in those of `NUMBERS`."""
 
@@ -156,6 +157,9 @@ def align_beams(
         found = _by_rows(start, pixels)
         if count == FEWEST:
             found.words.append(ACROSS)
+        elif isinstance(prior, Known):
+            search = SeriesSearch(moments, len(beams), material, replace(options, drift=Drift()), 1.0)
+            found = _shifted_by_volumes(search, found, lambda fraction: on_progress(SHIFTS, fraction))
     else:
         search = SeriesSearch(moments, len(beams), material, options, 1.0 if isinstance(prior, Known) else None)
         found = _by_volumes(
@@ -210,6 +214,17 @@ def _by_rows(start: Begun, pixels: int) -> Found:
     errors, rate_errors = scales * start.errors, scales * start.rate_errors
     measure = "rows disagree by this share of their moments"
     return Found(numbers, rates, errors, rate_errors, start.before, start.after, measure, pixels, list(start.words))
+
+
+def _shifted_by_volumes(search: SeriesSearch, found: Found, on_progress: Advance) -> Found:
+    """The same with shifts by volumes of all times, which know that matter is not negative and has one density; turns,
+    rolls and a drift stay, for such volumes follow them."""
+    search.numbers, search.rates = torch.from_numpy(found.numbers.copy()), torch.from_numpy(found.rates.copy())
+    search.hold(*range(TURN.start, TURN.stop))
+    search.run(Level(found.pixels, search.options.rounds), on_progress)
+    numbers = found.numbers.copy()
+    numbers[:, SHIFT] = search.numbers[:, SHIFT].numpy()
+    return replace(found, numbers=numbers)
 
 
 def _by_volumes(

@@ -101,9 +101,7 @@ class Geometry:
         planned = scan.exposures
         scales = self.pixel_sizes / planned.views.pitch
         views = replace(planned.views, rotations=self.rotations, shifts=self.shifts, scales=scales)
-        return Scan.of(
-            scan.source, replace(planned, views=views, distance=self.distance), scan.is_test, scan.provenance
-        )
+        return scan.taken(replace(planned, views=views, distance=self.distance))
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, which `from_dict` takes."""

@@ -65,13 +65,7 @@ class MeasuredCase:
 
     def truth(self) -> Volume:
         """β by filtered back-projection of all frames, and the δ that the ratio gives it."""
-        scan = self.scan()
-        lines = -np.log(np.maximum(scan.frames, DARKEST)) / (
-            2 * wavenumber(scan.exposures.one_energy("a measured case"))
-        )
-        grid = Grid.of_views(scan.views)
-        beta = filtered_backprojection(torch.from_numpy(lines), scan.views, grid, None, lambda done: None).numpy()
-        return Volume(self.prior.ratio * beta, beta, grid)
+        return back_projected(self.scan(), self.prior)
 
     def fingerprint(self) -> str:
         """A short hash (SHA-256) of the data and of what is done with them."""
@@ -101,12 +95,21 @@ class MeasuredCase:
         }
 
 
-def agreement(found: Volume, reference: Volume) -> dict[str, float]:
-    """Correlation of β with that of all views, and its slope (least squares through 0), within `WITHIN` of the axis."""
+def back_projected(scan: Scan, prior: KnownRatio) -> Volume:
+    """β by filtered back-projection of all frames of `scan`, and the δ that the ratio gives it."""
+    line = 2 * wavenumber(scan.exposures.one_energy("a measured case"))
+    lines, grid = -np.log(np.maximum(scan.frames, DARKEST)) / line, Grid.of_views(scan.views)
+    beta = filtered_backprojection(torch.from_numpy(lines), scan.views, grid, None, lambda done: None).numpy()
+    return Volume(prior.ratio * beta, beta, grid)
+
+
+def agreement(found: Volume, reference: Volume, rows: slice = slice(None)) -> dict[str, float]:
+    """Correlation of β with that of all views, and its slope (least squares through 0), within `WITHIN` of the axis and
+    in these rows."""
     x, _, z = reference.grid.axes()
     near = np.hypot(z[:, None], x[None]) < WITHIN * len(x) * reference.grid.voxel_size[0]
     inside = np.broadcast_to(near[:, None], reference.beta.shape)
-    a, b = (volume.beta[inside].astype(np.float64) for volume in (found, reference))
+    a, b = (volume.beta[:, rows][inside[:, rows]].astype(np.float64) for volume in (found, reference))
     return {"correlation": float(np.corrcoef(a, b)[0, 1]), "slope": float(a @ b / (b @ b))}
 
 

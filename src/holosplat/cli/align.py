@@ -139,7 +139,8 @@ def align(
         told = errors if errors is None else errors[lasting]
         _write_geometry(geometry_out, scan, reading, (measured.exposures[lasting], exposures[lasting]), told, lines[0])
     facts = measured.provenance | {"aligned": lines[0]}
-    write_scan(out, Scan.of(frames, exposures, measured.is_test, facts))
+    light = measured.light if frames is measured.source else None  # that of frames which were turned back is not known
+    write_scan(out, Scan.of(frames, exposures, measured.is_test, facts, light))
     print(f"wrote {out}: the same {len(measured)} frames, with other exposures", file=sys.stderr)
 
 

@@ -67,6 +67,11 @@ def reconstruct(
     method = how.chosen()
     require(seed >= 0, f"--seed must be 0 or more, but it is {seed}.")
     uncertain, refine = Uncertain(**reading.told.ranges(), **matter.ranges()), geometry.options()
+    require(
+        refine is None or reading.part.time_frame != "all",
+        "--refine finds each frame by itself, but --time-frame all has the same beams many times; find their one "
+        "geometry with holosplat align, and reconstruct the file that it writes without --refine.",
+    )
     measured = read_as(scan, replace(reading, told=reading.told.at_middle())).in_memory()
     prior = matter.without_ranges().prior(measured.exposures.reference_energy)
     folder = RunFolder(out)
@@ -91,7 +96,7 @@ def reconstruct(
     report = report_run(folder, result, measured, evaluation, None)
     _print_scores(evaluation)
     if folder.light.is_file():
-        _say(f"light {read_json(folder.summary)['light']}, by the frames' air: divided out ({folder.light})")
+        _say(f"light: {read_json(folder.summary)['light']}, by the frames' air ({folder.light})")
     _print_result(result, report)
     unexplained = result.verdict is not None and not result.verdict.good
     if unexplained:

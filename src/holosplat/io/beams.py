@@ -158,7 +158,7 @@ class Beams:
             distance=planned.distance if distance is None else distance[index],
             energy_kev=planned.energy_kev if energy is None else energy[index],
         )
-        return Scan.of(scan.source, exposures, scan.is_test, scan.provenance)
+        return scan.taken(exposures)
 
     def _index(self, scan: Scan) -> np.ndarray:
         """[N] which view each frame of `scan` is."""

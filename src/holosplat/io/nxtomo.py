@@ -12,10 +12,12 @@ import h5py
 import numpy as np
 
 from ..checks import finite, require, shaped
+from ..divided_light import DividedLight
 from ..scan import Exposures, Scan
 from ..version import __version__
 from . import arrays, exchange
 from .atomic import atomic_path
+from .divided_light import LIGHT, write_divided_light
 from .loader import Loader
 from .raw_file import NOTHING, PROJECTION, TAKES, reader
 from .scan_file import ANGLES, DATA, FLIPS, IMAGE_KEY, MASK, SPLIT, open_scan
@@ -47,7 +49,7 @@ def read_scan(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Scan:
 
 def write_scan(path: str | Path, scan: Scan) -> None:
     """Write `scan` as NXtomo (docs/conventions.md), replacing `path` only once all is written."""
-    with scan_writer(path, scan.exposures, scan.is_test, scan.provenance) as add:
+    with scan_writer(path, scan.exposures, scan.is_test, scan.provenance, light=scan.light) as add:
         for block in scan.blocks():
             for frame in block:
                 add(frame)
@@ -60,10 +62,12 @@ def scan_writer(
     is_test: np.ndarray,
     provenance: dict[str, str],
     raw: RawLayout | None = None,
+    light: DividedLight | None = None,
 ) -> Iterator[Callable[[np.ndarray], None]]:
     """A scan file that grows frame by frame: yields a function that takes the next frame, [H, W] relative intensity.
 
-    With `raw` the file holds counts (uint16), and exposures and is_test describe all its frames.
+    With `raw` the file holds counts (uint16), and exposures and is_test describe all its frames. light: what is not
+    known of light that the frames were divided by, if they were.
 
     The file appears at `path` when the block ends and all frames are there, and not at all when the block raises
     (Ctrl-C too): no frame is kept in memory. is_test: [N] bool. `view_rotation` holds the poses exactly;
@@ -78,6 +82,8 @@ def scan_writer(
     count = 0
     with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
         data = _write_entry(file, exposures, is_test, provenance, raw)
+        if light is not None:
+            write_divided_light(_group(file, LIGHT, "NXcollection"), light)
 
         def add(frame: np.ndarray) -> None:
             nonlocal count

@@ -12,6 +12,7 @@ import h5py
 import numpy as np
 
 from ..checks import InputError, finite, in_range, require
+from ..divided_light import DividedLight
 from ..frames import Frames
 from ..geometry import Views, rotation_y
 from ..preprocess.flat_field import mean_frame, relative_intensity, unlit
@@ -73,6 +74,7 @@ class ScanFile:
     marked: [H, W], not 0 for pixels that the file marks as defective, as stored; None if it marks none.
     texts: the provenance.
     has_given_fields: whether flats and darks that are said beside it are among its frames already.
+    divided: what is not known of light that its projections were divided by, if it says so.
     """
 
     path: Path
@@ -86,6 +88,7 @@ class ScanFile:
     texts: Mapping[str, str] = field(default_factory=dict)
     kinds_label: str = "the file"
     has_given_fields: bool = False
+    divided: DividedLight | None = None
 
     def numbers(self, kind: int) -> np.ndarray:
         """Which of the N frames are of `kind`."""
@@ -176,7 +179,7 @@ def reader(opens: Opens) -> Callable[[Path, Mapping[str, Any]], Scan]:
     def read(path: Path, given: Mapping[str, Any]) -> Scan:
         with opens(path, given) as opened:
             file = with_fields(opened, given)
-            return Scan.of(StoredFrames.of(file), file.exposures, file.is_test, file.provenance())
+            return Scan.of(StoredFrames.of(file), file.exposures, file.is_test, file.provenance(), file.divided)
 
     return read
 

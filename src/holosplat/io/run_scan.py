@@ -54,9 +54,11 @@ def _where_found(summary: Path, scan: Scan) -> Scan:
     table, n = Table(summary, found, "geometry."), len(scan)
     rotations, shifts = table.numbers("rotations", (n, 3, 3)), table.numbers("shifts", (n, 2))
     planned = scan.exposures
-    views = replace(planned.views, rotations=rotations, shifts=shifts)
+    old = "pixel_sizes" not in found
+    sizes = planned.views.pixel_sizes if old else table.numbers("pixel_sizes", (n,))
+    views = replace(planned.views, rotations=rotations, shifts=shifts, scales=sizes / planned.views.pitch)
     exposures = replace(planned, views=views, distance=table.numbers("distance", (n,)))
-    return Scan.of(scan.source, exposures, scan.is_test, scan.provenance)
+    return scan.taken(exposures)
 
 
 def loader(read_as: ReadAs) -> Loader:

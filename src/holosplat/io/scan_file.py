@@ -18,6 +18,7 @@ from ..checks import InputError, finite, in_range, require, shaped
 from ..geometry import Views, rotation_y
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, checked_distance
 from ..units import ANGLE_UNITS, ENERGY_UNITS, LENGTH_UNITS, TIME_UNITS
+from .divided_light import read_divided_light
 from .hdf5 import Fields, attribute_text, open_hdf5
 from .raw_file import DARK, FLAT, INVALID, NOTHING, PROJECTION, ScanFile, angles_of_projections, require_said, said
 
@@ -71,6 +72,7 @@ def open_scan(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterator[
             *(Path(path), fields.label(data), (fields.dataset(data),), kinds, exposures, is_test),
             *((flips[0], flips[1]), _marked(fields, views.shape), _read_provenance(fields)),
             fields.label(fields.find(*IMAGE_KEYS) or IMAGE_KEY),
+            divided=read_divided_light(fields, kinds == PROJECTION),
         )
 
 

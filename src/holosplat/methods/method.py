@@ -68,11 +68,14 @@ class Task:
     def evened(self) -> Task:
         """The same task with frames as they would be in even light, as far as their air says what the light is.
 
-        Frames whose air is even within its noise stay as they are. Errors: those of `Light.of`.
+        Frames whose air is even within its noise stay as they are, and those that were divided by light before: what
+        that left open (`Scan.light`) is then what is not known of it. Errors: those of `Light.of`.
         """
         if self.lit is not None:
             return self
-        frames = torch.from_numpy(self.scan.frames)
+        frames, handed = torch.from_numpy(self.scan.frames), self.scan.light
+        if handed is not None and self.light.kind != "even":
+            return replace(self, lit=Light.handed(frames, self.light, handed))
         found = Light.of(frames, self.light)
         scan = self.scan
         if found.background is not None:

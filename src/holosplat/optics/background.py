@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from ..checks import InputError, require
+from ..divided_light import DividedLight
 from .air import Box, air_in_boxes, find_air, has_air
-from .modes import half_waves, smooth_modes
+from .modes import cosines, half_waves, smooth_modes
 from .noise_model import NoiseModel
 
 ORDER = 8
@@ -88,11 +89,20 @@ class Light:
                 break
         return cls(air, noise, background)
 
+    @classmethod
+    def handed(cls, frames: Tensor, options: LightOptions, known: DividedLight) -> Light:
+        """Of frames [V, H, W] that were divided by smooth light, of which this is known."""
+        air = options.air_of(frames)
+        background = Background.handed(known, (frames.shape[-2], frames.shape[-1]))
+        return cls(air, NoiseModel.of_frames(frames, air), background)
+
     @property
     def in_words(self) -> str:
         """What the frames say of the light, with root mean square deviations from one."""
         said = []
-        if self.background is not None:
+        if self.background is not None and self.background.is_handed:
+            said.append(f"divided out before, {self.background.size_of_doubt:.2%} of it in doubt")
+        elif self.background is not None:
             said.append(f"uneven by {_deviation(self.background.factor()):.2%}")
         if self.still is not None:
             said.append(f"the same {_deviation(self.still):.2%} in all frames")
@@ -185,6 +195,31 @@ class Background:
             variances = (torch.zeros_like(count).index_add(0, bands, squares) / count)[bands].clamp_min(1e-12)
         mean, covariance = _posterior(normal, right, variances, powers)
         return cls(mean, covariance, variances, powers, shape)
+
+    @classmethod
+    def handed(cls, known: DividedLight, shape: tuple[int, int]) -> Background:
+        """What may be left of light that frames of `shape` (H, W) were divided by: no more, as far as is known."""
+        size, corner = known.binning, known.corner
+        parts = [
+            cosines(n, known.half_waves, "cpu")[:, at : at + size * count].unflatten(1, (count, size)).mean(dim=2)
+            for n, at, count in zip(known.whole, corner, shape)
+        ]
+        old = (parts[0][:, None, :, None] * parts[1][None, :, None, :]).flatten(2).flatten(0, 1)
+        change = _modes(shape) @ old.T / old.shape[1]
+        variances = change.square() @ torch.from_numpy(known.variances).mean(dim=0)
+        covariances = change @ torch.from_numpy(known.covariances) @ change.T
+        none = torch.zeros(len(known), len(change), dtype=torch.float64)
+        return cls(none, covariances, variances, torch.from_numpy(known.powers) / size**2, shape)
+
+    @property
+    def is_handed(self) -> bool:
+        """Whether the frames were divided by all light that is known of, before it was looked for."""
+        return not bool(self.coefficients.any())
+
+    @property
+    def size_of_doubt(self) -> float:
+        """Root mean square of what is not known of the light, relative to it."""
+        return float(self.covariances.diagonal(dim1=1, dim2=2).sum(dim=1).mean().sqrt())
 
     def __len__(self) -> int:
         return len(self.coefficients)

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from ..checks import InputError
+from ..divided_light import DividedLight
 from ..optics.air import Box, has_air
 from ..optics.background import ORDER, Light, LightOptions
 from ..optics.modes import cosines
@@ -20,10 +21,12 @@ LONGEST = 128
 
 @dataclass(frozen=True)
 class AirLight:
-    """coefficients [V, (K + 1)²] of smooth light; airless: how many projections had no air, and take the mean light."""
+    """coefficients [V, (K + 1)²] of smooth light; airless: how many projections had no air, and take the mean light;
+    doubt: what is not known of it, of whole frames."""
 
     coefficients: np.ndarray
     airless: int
+    doubt: DividedLight
 
     @classmethod
     def of(
@@ -48,7 +51,12 @@ class AirLight:
         usable = has_air(found.air)
         coefficients = found.background.coefficients
         coefficients = torch.where(usable[:, None], coefficients, coefficients[usable].mean(dim=0))
-        return cls(coefficients.numpy(), int((~usable).sum()))
+        known, count = found.background, len(coefficients)
+        variances = known.variances.expand(count, -1)
+        left = torch.where(usable[:, None, None], known.covariances, torch.diag_embed(variances))
+        powers = known.powers.numpy() * factor**2
+        doubt = DividedLight(left.numpy(), variances.numpy(), powers, (first.shape[0], first.shape[1]))
+        return cls(coefficients.numpy(), int((~usable).sum()), doubt)
 
     def factor(self, number: int, shape: tuple[int, int]) -> np.ndarray:
         """The light [H, W] of projection `number`."""

@@ -183,9 +183,10 @@ def correct(
         }
         if options.rings is not None:
             described["rings"] = f"{options.rings} columns, {normal.pattern.std():.3%} (rms)"
-        whole = Scan.of(_Corrected(fielding, normal), file.exposures, file.is_test, file.provenance() | described)
+        frames, doubt = _Corrected(fielding, normal), normal.light and normal.light.doubt
+        whole = Scan.of(frames, file.exposures, file.is_test, file.provenance() | described, doubt)
         scan = reading.applied(whole)
-        with scan_writer(out, scan.exposures, scan.is_test, scan.provenance) as add:
+        with scan_writer(out, scan.exposures, scan.is_test, scan.provenance, light=scan.light) as add:
             for i in range(len(scan)):
                 add(scan[[i]].frames[0])
                 on_progress(0.5 + 0.5 * (i + 1) / len(scan))

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..checks import in_range, require
+from ..divided_light import DividedLight
 from ..geometry import Views
 from ..io.atomic import require_apart, require_writable
 from ..io.formats import read
@@ -17,7 +18,7 @@ from ..io.reading import Part
 from ..optics.coherence import joined_blur_px
 from ..optics.resampling import FLIPS, Flip, Resampling
 from ..progress import Advance
-from ..scan import PIXEL_RANGE_M, Exposures
+from ..scan import PIXEL_RANGE_M, Exposures, Scan
 
 LEAST_PIXELS = 8
 """A common field of fewer pixels a side is taken for a mistake."""
@@ -52,7 +53,7 @@ def join(
     described = {"joined": "; ".join(path.name for path in sources), **_shared([scan.provenance for scan in scans])}
     done = 0
     is_test = np.concatenate([scan.is_test for scan in scans])
-    with scan_writer(out, joined, is_test, described) as add:
+    with scan_writer(out, joined, is_test, described, light=_light(scans, flips, joined)) as add:
         for n, (scan, resampling) in enumerate(zip(scans, resamplings)):
             rows, columns = FLIPS[flips[n]] if flips else (False, False)
             for frame in (frame for block in scan.blocks() for frame in block):
@@ -61,6 +62,20 @@ def join(
                 done += 1
                 on_progress(done / len(joined))
     return joined
+
+
+def _light(scans: Sequence[Scan], flips: Sequence[Flip], joined: Exposures) -> DividedLight | None:
+    """What is not known of light that all frames were divided by; None where it is not said of all of them, or where
+    they are brought to another raster."""
+    views, parts = joined.views, list[DividedLight]()
+    for n, scan in enumerate(scans):
+        own = scan.views
+        same = own.shape == views.shape and (not views.has_one_pixel or np.isclose(own.pixel_size, views.pixel_size))
+        if scan.light is None or not same:
+            return None
+        rows, columns = FLIPS[flips[n]] if flips else (False, False)
+        parts.append(scan.light.reversed(rows, columns, (views.shape[0], views.shape[1])))
+    return DividedLight.joined(parts)
 
 
 def _share_pixel(parts: list[Exposures], pixel_size: float | None) -> bool:

@@ -29,7 +29,8 @@ def found_in(task: Task) -> LightOptions:
 
 def read_light_options(config: Mapping[str, Any], summary: Mapping[str, Any]) -> LightOptions:
     """The same of a run folder; older ones say nothing of light, which is then even."""
-    if not str(summary.get("light", "even")).startswith("uneven"):
+    said = str(summary.get("light", "even"))
+    if said == "even" or said.startswith("the same"):
         return EVEN
     return replace(from_table(LightOptions, config.get("light", {}), "light"), kind="smooth")
 
@@ -62,5 +63,7 @@ def light_of(scan: Scan, assumed: LightOptions, still: np.ndarray | None = None)
     smooth = assumed.kind != "even" and bool(assumed.air_of(frames).any())
     if not smooth and common is None:
         return None
+    if smooth and scan.light is not None:
+        return replace(Light.handed(frames, assumed, scan.light), still=common)
     found = Light.of(frames, assumed if smooth else EVEN)
     return None if found.background is None and common is None else replace(found, still=common)

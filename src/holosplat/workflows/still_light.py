@@ -71,4 +71,5 @@ def evened(
     """The scan with all its frames, held-out ones too, divided by the `still_light` of those for training."""
     light = still_light(scan, prior, options, on_progress)
     said = {"still_light": f"{np.log(light).std():.2%} (rms), order {options.order}, divided out"}
-    return Scan.of(divided(scan.source, light[None]), scan.exposures, scan.is_test, scan.provenance | said)
+    frames, provenance = divided(scan.source, light[None]), scan.provenance | said
+    return Scan.of(frames, scan.exposures, scan.is_test, provenance, scan.light)
