@@ -21,6 +21,8 @@ from ..scan import Scan
 OUTER, LEAVING, FINE = 2, 0.15, 0.1
 """Rows at the top and at the bottom, the part of the mean occupancy from which on matter goes on there, and the part of
 the mean square slope along a row of the frames: uneven light may pass for matter, but has no fine structure."""
+SURE = 4.0
+"""Standard deviations of chance by which noise may have this fine structure there."""
 ROOM = 2
 """Rows beyond the reach of fringes and blur, for what a volume cannot have in its outermost ones."""
 MULTIPLE = 4
@@ -35,9 +37,12 @@ def rows_beyond(volume: Tensor, scan: Scan, ratio: float) -> int:
     absorption alone, which is seen where it is. Else the fringes' reach with the blur, and `ROOM`.
     """
     exposures, frames = scan.exposures, torch.from_numpy(scan.frames).double()
-    slopes = frames.diff(dim=2).square().mean(dim=(0, 2)) - 2 * noise_levels(frames).square().mean()
-    for rows, least in ((volume.mean(dim=(0, 2)), LEAVING), (slopes, FINE)):
-        if max(float(rows[:OUTER].mean()), float(rows[-OUTER:].mean())) <= least * float(rows.mean()):
+    noise = 2 * float(noise_levels(frames).square().mean())
+    slopes = frames.diff(dim=2).square().mean(dim=(0, 2)) - noise
+    chance = noise * math.sqrt(3 / (OUTER * len(frames) * frames.shape[2]))  # 3: neighbouring slopes share a pixel
+    for rows, part, doubt in ((volume.mean(dim=(0, 2)), LEAVING, 0.0), (slopes, FINE, SURE * chance)):
+        outer = max(float(rows[:OUTER].mean()), float(rows[-OUTER:].mean()))
+        if outer <= part * float(rows.mean()) + doubt:
             return 0
     if absorption_alone(exposures, ratio).all():
         return 0
