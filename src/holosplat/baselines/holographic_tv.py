@@ -128,10 +128,12 @@ def _holographic_tv(
 def _tomography(scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress) -> PrimalDual:
     """Phase retrieval of each view and total variation: the solver, on voxels of one pixel.
 
-    Where its volume has matter at the top or at the bottom, both are done anew with matter beyond the frames.
+    Where its volume has matter at the top or at the bottom, both are done anew with matter beyond the frames; but not
+    where a bound says how much of it there is, for it is then right to a few rows without them.
     """
     solver = _in_rows(scan, material, options, on_progress, 0)
-    beyond = 0 if options.still_light else rows_beyond(solver.volume, scan, material.beta / material.delta)
+    free = options.upper == 0 and options.still_light == 0
+    beyond = rows_beyond(solver.volume, scan, material.beta / material.delta) if free else 0
     return _in_rows(scan, material, options, on_progress, beyond) if beyond else solver
 
 
