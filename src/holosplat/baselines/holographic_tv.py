@@ -74,6 +74,8 @@ class HolographicTV:
     where that is more than half a pixel: about 2 where frames have systematic errors (0: always half a pixel)."""
     inside: float = 0.0
     """Distance from the axis within which matter lies [m], such as the inner radius of a tube (0: anywhere)."""
+    beyond: bool = True
+    """Whether a volume without a bound has rows above and below the frames where matter goes on there."""
     backend: Literal["cpu", "reference"] = "cpu"
     """What computes it: the compiled kernels, or plain torch, which is slow."""
 
@@ -132,7 +134,7 @@ def _tomography(scan: Scan, material: DeltaBeta, options: HolographicTV, on_prog
     where a bound says how much of it there is, for it is then right to a few rows without them.
     """
     solver = _in_rows(scan, material, options, on_progress, 0)
-    free = options.upper == 0 and options.still_light == 0
+    free = options.beyond and options.upper == 0 and options.still_light == 0
     beyond = rows_beyond(solver.volume, scan, material.beta / material.delta) if free else 0
     return _in_rows(scan, material, options, on_progress, beyond) if beyond else solver
 

@@ -44,8 +44,9 @@ class LevelTest:
     that does harm all the same says that matter is continuous."""
     validation: CrossValidation = field(default_factory=CrossValidation)
     """How views are set aside."""
-    volume: HolographicTV = field(default_factory=lambda: HolographicTV(upper=0.0, refine=1))
-    """The volume without bounds, on voxels of a pixel."""
+    volume: HolographicTV = field(default_factory=lambda: HolographicTV(upper=0.0, refine=1, beyond=False))
+    """The volume without bounds, on voxels of a pixel. What lies beyond the frames explains too much, and a flat inside
+    would seem worse for it."""
 
     def __post_init__(self) -> None:
         at_least(self, 1, "worse", "same")
