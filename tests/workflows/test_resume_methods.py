@@ -49,7 +49,7 @@ CLOUD = Gaussians(
 )
 SURFACES = SurfaceFit(schedule=Schedule(steps=6, decay=0.1, views_per_step=2))
 VOXELS = VoxelFit(coarse_steps=5, steps=7)
-SMOOTH = SmoothVolume(replace(VOLUME, upper=0.0, noisy=1.0), coarser=(2,), rounds=2, iterations=4)
+SMOOTH = SmoothVolume(replace(VOLUME, upper=0.0, noisy=1.0, beyond=False), coarser=(2,), rounds=2, iterations=4)
 FIELD = NeuralFit(
     NETWORK,
     warmup_steps=20,
