@@ -14,6 +14,7 @@ from ..checks import require
 from ..io.reading import Part, Reading
 from .options import LightFlags, PriorOptions
 from .progress import ProgressBar
+from .quantities import Degrees, Pixels, Share
 
 if TYPE_CHECKING:
     import numpy as np
@@ -31,19 +32,19 @@ LIGHT = LightFlags()
 class UncertainOptions:
     """How far off the plan each view may be: standard deviations. 0 keeps it as planned."""
 
-    uncertain_shift: float = 2.0
+    uncertain_shift: Pixels = 2.0
     """Detector's shifts along rows and columns [pixels]."""
-    uncertain_angle: float = 1.0
+    uncertain_angle: Degrees = 1.0
     """Turns about the two axes across the beam [degrees]."""
-    uncertain_roll: float = 1.0
+    uncertain_roll: Degrees = 1.0
     """Turns about the beam [degrees]."""
-    uncertain_magnification: float = 0.0
+    uncertain_magnification: Share = 0.0
     """Magnification, as a share of it; that of all training frames together is as planned."""
-    uncertain_distance: float = 0.0
+    uncertain_distance: Share = 0.0
     """Distance, as a share of it: only where fringes are resolved."""
-    drift_shift: float = 0.0
+    drift_shift: Pixels = 0.0
     """Of a series: how far each beam's shifts drift from the first time to the last [pixels]."""
-    drift_angle: float = 0.0
+    drift_angle: Degrees = 0.0
     """Of a series: how far each beam turns from the first time to the last [degrees]."""
 
     def options(self) -> PoseOptions:
@@ -61,15 +62,15 @@ class RefineOptions:
     refine: str | None = None
     """What is found of each frame beside the matter: shifts, angles, roll, distance, magnification, with commas between
     (default: nothing, the beams are where the scan says)."""
-    uncertain_shift: float = 2.0
+    uncertain_shift: Pixels = 2.0
     """Standard deviation of the detector's shifts along rows and columns [pixels]."""
-    uncertain_angle: float = 1.0
+    uncertain_angle: Degrees = 1.0
     """Standard deviation of turns about the two axes across the beam [degrees]."""
-    uncertain_roll: float = 1.0
+    uncertain_roll: Degrees = 1.0
     """Standard deviation of turns about the beam [degrees]."""
-    uncertain_magnification: float = 0.01
+    uncertain_magnification: Share = 0.01
     """Standard deviation of the magnification, as a share of it."""
-    uncertain_distance: float = 0.02
+    uncertain_distance: Share = 0.02
     """Standard deviation of the distance, as a share of it."""
 
     def options(self) -> PoseOptions | None:

@@ -13,6 +13,7 @@ from ..checks import require
 from ..io.reading import Part, Reading
 from .options import LightFlags, MaterialOptions
 from .progress import ProgressBar
+from .quantities import Degrees, Pixels, Share
 
 if TYPE_CHECKING:
     from ..align import Calibrated, CalibrationOptions
@@ -51,15 +52,15 @@ class BodyOptions:
 class DoubtOptions:
     """How far off the plan each view may be: standard deviations. 0 keeps it as planned."""
 
-    uncertain_shift: float = 5.0
+    uncertain_shift: Pixels = 5.0
     """Detector's shifts along rows and columns [pixels]."""
-    uncertain_angle: float = 2.0
+    uncertain_angle: Degrees = 2.0
     """Turns about the two axes across the beam [degrees]."""
-    uncertain_roll: float = 2.0
+    uncertain_roll: Degrees = 2.0
     """Turns about the beam [degrees]."""
-    uncertain_distance: float = 0.05
+    uncertain_distance: Share = 0.05
     """Distance, as a share of it."""
-    uncertain_pixel: float = 0.0
+    uncertain_pixel: Share = 0.0
     """Pixel size, as a share of it."""
 
     def options(self) -> CalibrationOptions:
