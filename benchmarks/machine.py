@@ -6,11 +6,19 @@ import subprocess
 from pathlib import Path
 
 
-def commit() -> str:
-    """The commit that is measured, with a mark if the tree was changed."""
+def _described() -> str:
     command = ["git", "describe", "--always", "--dirty", "--abbrev=7", "--exclude=*"]
     shown = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parent)
     return shown.stdout.strip() or "unknown"
+
+
+AT_THE_START = _described()
+"""Before a table is written, which is part of the tree."""
+
+
+def commit() -> str:
+    """The commit that is measured, with a mark if the tree was changed."""
+    return AT_THE_START
 
 
 def memory_megabytes(key: str) -> float:
