@@ -11,11 +11,11 @@ their contrast, and the mass that was found over the true one. Lines of the trut
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import platform
 import time
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -23,6 +23,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 import numpy as np
 import torch
 from machine import commit
+from rows import written
 
 import holosplat as hs
 from holosplat.model import measure
@@ -117,16 +118,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    with options.out.open("w", newline="") as file:
-        table = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        table.writeheader()
-        for name in options.cases:
-            for seed in options.seeds:
-                for told in options.told:
-                    found = row(name, seed, told)
-                    table.writerow(found)
-                    print(found, flush=True)
-                    file.flush()
+    wanted = product(options.cases, options.seeds, options.told)
+    written(options.out, COLUMNS, (row(*each) for each in wanted))
 
 
 if __name__ == "__main__":

@@ -24,8 +24,8 @@ from .smooth_fit import SmoothFit, SmoothPlan
 
 LEFT = 0.1
 """Part of the contrast that counts as noise at least where matter leaves the frames: what is beyond explains too much.
-Frames that must be explained to less lead to matter half too much or too little before what is expected of it counts.
-Of blobs, a cell and tissue cut to a half of their rows and fewer, errors of 0.43 to 0.11 became 0.31 to 0.08."""
+Frames that must be explained to less lead to matter half too much or too little before what is expected of it counts
+(benchmarks/cut_frames.py)."""
 
 
 def _start() -> HolographicTV:

@@ -189,7 +189,7 @@ class _Following:
 
 
 def require_times(scan: Scan) -> None:
-    """`InputError` unless the training frames are of several times, more than one at most of them."""
+    """`InputError` unless the training frames are of two times or more."""
     count = len(scan.instants)
     require(
         count >= 2,
