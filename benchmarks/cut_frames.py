@@ -2,8 +2,8 @@
 
     python benchmarks/cut_frames.py --out docs/data/cut_frames.csv          # some minutes on one core
 
-Frames of a whole body are simulated, and only their middle rows are reconstructed, by `auto` without options but the ratio δ/β, or by
-another method for continuous matter: "in the field" is a smooth volume that ends with the frames.
+Frames of a whole body are simulated, and only their middle rows are reconstructed: by `auto`, without options but the
+ratio δ/β, or by another method for continuous matter ("in the field": a smooth volume that ends with the frames).
 A row: relative error of δ in the field of view, in its middle half and in its two outermost rows on either side, the
 mass that was found over the true one there, and whether the verdict is good. Lines of the truth are closed forms.
 """
