@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from helpers.blobs import blob_scan
+from helpers.blobs import MATERIAL as BLOBS
+from helpers.blobs import SHAPE, blob_scan
 from helpers.soft import MATERIAL, two_cells
 from holosplat.baselines import HolographicTV
+from holosplat.baselines.beyond import rows_beyond
 from holosplat.checks import InputError
 from holosplat.matter import MaterialPrior
 from holosplat.methods import Task
-from holosplat.methods.profile import ProfileOptions
+from holosplat.methods.profile import Profile, ProfileOptions
 from holosplat.methods.uncertain import Determined, Search, Uncertain, at_energy, determine, likeliest_ratio, told
 
 RATIO = MaterialPrior.of_ratio(MATERIAL.ratio)
@@ -34,6 +37,18 @@ def test_a_distance_is_found_within_its_range(scan):
     assert found.low < 0.05 < found.high
     assert found.value == pytest.approx(0.05, rel=0.15)
     assert "by the frames" in found.line()
+
+
+def test_frames_that_cut_bodies_are_compared_to_volumes_with_rows_beyond_them():
+    """Without these rows a body that goes on has its likeliest distance where halos of the cut are the least."""
+    part = blob_scan(count=3).cropped(slice(7, 18), slice(0, SHAPE[1]))
+    at = {"distance": float(part.exposures.distance[0]), "delta_beta": BLOBS.ratio}
+    profile = Profile(Task(part, RATIO), BLOBS.ratio, at, [at], replace(QUICK, iterations=4))
+    rows = len(part.frames[0]) + 2 * rows_beyond(profile.support.float(), part, BLOBS.beta / BLOBS.delta)
+    assert rows > len(part.frames[0])
+    assert profile.support.shape[1] == profile.frames(at).field.shape[0] == rows
+    far = at | {"distance": 1.3 * at["distance"]}
+    assert profile(at) < profile(far)
 
 
 def test_a_ratio_is_found_where_nothing_is_known(scan):
