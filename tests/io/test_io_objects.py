@@ -249,7 +249,11 @@ def test_a_file_that_cannot_be_finished_leaves_the_old_one(tmp_path, monkeypatch
     path = tmp_path / "object.h5"
     write_object(path, objects()["voxels"])
     before = path.read_bytes()
-    monkeypatch.setattr(h5py.File, "__setitem__", lambda *_: (_ for _ in ()).throw(OSError("the disk is full")))
+
+    def full(*arguments: object, **more: object) -> None:
+        raise OSError("the disk is full")
+
+    monkeypatch.setattr(h5py.Group, "create_dataset", full)
     with pytest.raises(InputError, match="the disk is full"):
         write_object(path, objects()["surfaces"])
     assert path.read_bytes() == before

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from ..checks import at_least, in_range, require
-from ..io.atomic import atomic_path, require_apart, require_writable
+from ..io.atomic import require_apart, require_writable
 from ..io.formats import loader_of, read
+from ..io.hdf5_writing import new_hdf5, put
 from ..io.nxtomo import RawLayout, scan_writer
 from ..io.raw_file import DARK, FLAT, PROJECTION
 from ..io.reading import Part
@@ -198,11 +198,12 @@ def _provenance(options: RecordingOptions, camera: Camera, light: Illumination) 
 
 def _write_truth(path: Path, bench: _Bench, options: RecordingOptions) -> None:
     """The random draws, upright: light, pulses and sensor."""
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    with new_hdf5(path) as file:
         file.attrs["photons_per_pixel"] = options.photons_per_pixel
         for name in ("mean", "components", "deviations"):
-            file[f"light/{name}"] = getattr(bench.model, name)
+            put(file, f"light/{name}", getattr(bench.model, name))
         for name, pulses in (("flats", bench.flats), ("projections", bench.projections)):
-            file[f"{name}/energy"], file[f"{name}/weights"] = pulses.energy, pulses.weights
+            put(file, f"{name}/energy", pulses.energy)
+            put(file, f"{name}/weights", pulses.weights)
         for name in ("gain", "offset", "dead", "hot"):
-            file[f"sensor/{name}"] = getattr(bench.sensor, name)
+            put(file, f"sensor/{name}", getattr(bench.sensor, name))

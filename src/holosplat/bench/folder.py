@@ -13,6 +13,7 @@ from ..checks import InputError, require
 from ..io.atomic import atomic_path
 from ..io.folder import is_taken, require_parent
 from ..io.json import read_json, write_json
+from ..io.leftovers import is_hidden
 from .rows import Row, read_row, write_row
 
 FORMAT = "holosplat bench 1"
@@ -70,7 +71,7 @@ class BenchFolder:
 
     def read_rows(self) -> list[Row]:
         """All rows: by case and seed, in the methods' order."""
-        rows = [read_row(path) for path in sorted(self.rows.glob("*.json"))]
+        rows = [read_row(path) for path in sorted(self.rows.glob("*.json")) if not is_hidden(path)]
         return sorted(rows, key=lambda row: (row.case, row.seed, not row.is_reference, row.place, row.method))
 
     def write_picture(self, case: str, seed: int, name: str, arrays: Mapping[str, np.ndarray]) -> None:

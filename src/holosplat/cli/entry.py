@@ -7,9 +7,11 @@ each function imports its work where it starts, so that `holosplat COMMAND --hel
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable
 from importlib import import_module
+from typing import NoReturn
 
 import tyro
 from tyro.conf import OmitArgPrefixes
@@ -17,6 +19,12 @@ from tyro.conf import OmitArgPrefixes
 from ..checks import InputError
 from ..version import __version__
 from .progress import INTERRUPTED
+from .signals import end_as_on_interrupt
+
+OUT_OF_MEMORY = re.compile("can't allocate memory|not enough memory|out of memory|std::bad_alloc", re.IGNORECASE)
+"""What torch says of memory, in errors of no kind of their own."""
+LONGEST = 200
+"""Characters of another program's message, at most."""
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "plan": (
@@ -75,7 +83,11 @@ COMMANDS: dict[str, tuple[str, str]] = {
 
 
 def main() -> None:
-    """Run a command; bad input prints one sentence and exits with 2, Ctrl-C exits with 130."""
+    """Run a command; bad input, and a machine that cannot do it, print one sentence and exit with 2.
+
+    Ctrl-C, SIGTERM and SIGHUP exit with 130, after what can be saved is.
+    """
+    end_as_on_interrupt()
     if sys.argv[1:] == ["--version"]:
         print(f"holosplat {__version__}")
         return
@@ -87,14 +99,37 @@ def main() -> None:
             config=(OmitArgPrefixes,),
         )
     except InputError as error:
-        print(f"holosplat: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
+        _give_up(str(error))
+    except MemoryError as error:
+        _give_up(f"the memory of this machine is not enough{_said(error)}; take larger pixels (--bin) or fewer rows.")
+    except RecursionError:
+        _give_up("the input is nested too deeply; make it flat.")
+    except UnicodeError as error:
+        _give_up(f"a name or text is none in UTF-8: {error}; correct it.")
     except KeyboardInterrupt:
         print("holosplat: interrupted", file=sys.stderr)
         raise SystemExit(INTERRUPTED) from None
     except BrokenPipeError:  # the reader, such as `head`, has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
+    except OSError as error:
+        _give_up(f"a file cannot be read or written{_said(error)}; check its path, its permissions and the disk.")
+    except RuntimeError as error:
+        if not OUT_OF_MEMORY.search(str(error)):
+            raise
+        _give_up(f"the memory of this machine is not enough{_said(error)}; take larger pixels (--bin) or fewer rows.")
+
+
+def _give_up(sentence: str) -> NoReturn:
+    text = f"holosplat: {sentence}\n"
+    sys.stderr.write(text.encode("utf-8", "backslashreplace").decode("utf-8"))
+    raise SystemExit(2) from None
+
+
+def _said(error: BaseException) -> str:
+    """What an error says, in its first line; empty where it says nothing."""
+    text = str(error).split("\n", 1)[0].strip()
+    return f" ({text[:LONGEST]})" if text else ""
 
 
 def command(name: str) -> Callable[..., None]:

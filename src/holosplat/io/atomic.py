@@ -1,15 +1,16 @@
-"""Writing a file whole or not at all."""
+"""Writing a file whole or not at all, so that it is there after a crash, too."""
 
 from __future__ import annotations
 
 import os
-import secrets
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ..checks import InputError, require
+from .durable import flushed
 from .folder import require_parent
+from .leftovers import clear_leftovers, temporary_name
 
 
 def require_writable(path: str | Path) -> None:
@@ -28,16 +29,21 @@ def require_apart(out: Path, *others: Path) -> None:
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """A temporary path beside `path` (same suffix) to write to; it replaces `path` when the block ends well.
 
-    If the block raises, the temporary file goes and `path` stays as it was; a failure of the file system
-    itself (no such folder, no permission, disk full) becomes an `InputError`.
+    Its bytes are on the disk before it does (fsync), and so is its name afterwards. If the block raises, the temporary
+    file goes and `path` stays as it was; a failure of the file system itself (no such folder, no permission, disk full)
+    becomes an `InputError`. What a killed process left of the same file goes, too.
     """
     target = Path(os.path.realpath(path))  # of a link, what it points to is replaced
     require_writable(path)
-    temporary = target.with_name(f".{target.stem[:64]}-{secrets.token_hex(4)}{target.suffix}")
+    clear_leftovers(target)
+    temporary = temporary_name(target)
     try:
         yield temporary
+        flushed(temporary)
         os.replace(temporary, target)
+        flushed(target.parent)
     except OSError as error:
         raise InputError(f"{path} must be writable, but writing it failed: {error}.") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # what went wrong before is said, not this
+            temporary.unlink(missing_ok=True)

@@ -8,6 +8,7 @@ import numpy as np
 from ..checks import InputError, require
 from ..divided_light import DividedLight
 from .hdf5 import Fields
+from .hdf5_writing import put
 
 GROUP = "process/light"
 LIGHT = f"entry/{GROUP}"
@@ -18,8 +19,9 @@ PLACE = ("whole", "corner", "binning")
 
 def write_divided_light(group: h5py.Group, light: DividedLight) -> None:
     """Its arrays, and as attributes where its frames lie in whole ones."""
-    group["covariances"] = light.covariances.astype(np.float32)
-    group["variances"], group["powers"] = light.variances, light.powers
+    put(group, "covariances", light.covariances.astype(np.float32))
+    put(group, "variances", light.variances)
+    put(group, "powers", light.powers)
     group.attrs.update(whole=light.whole, corner=light.corner, binning=light.binning)
 
 

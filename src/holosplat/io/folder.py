@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import os
-import secrets
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from ..checks import InputError, require
+from .durable import flushed, flushed_tree
+from .leftovers import clear_leftovers, is_left, temporary_name
 
 
 def is_taken(path: str | Path) -> bool:
-    """Whether something is at `path`: a file, a broken link, or a folder that is not empty."""
+    """Whether something is at `path`: a file, a broken link, or a folder that holds more than what a process that was
+    killed at its start leaves."""
     target = Path(path)
-    return os.path.lexists(target) and (not target.is_dir() or any(target.iterdir()))
+    return os.path.lexists(target) and (not target.is_dir() or not all(is_left(found) for found in target.iterdir()))
 
 
 def require_new(path: str | Path, way_out: str = "choose another name, or remove it first") -> None:
@@ -38,13 +40,16 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     """
     require_new(path)
     target = Path(path).resolve()
-    temporary = target.with_name(f".{target.name[:64]}-{secrets.token_hex(4)}")
+    clear_leftovers(target)
+    temporary = temporary_name(target)
     try:
         temporary.mkdir()
         yield temporary
-        if target.is_dir():  # an empty one, which not every system replaces
-            target.rmdir()
+        flushed_tree(temporary)
+        if target.is_dir():  # one that `is_taken` calls free, which not every system replaces
+            shutil.rmtree(target)
         os.rename(temporary, target)
+        flushed(target.parent)
     except OSError as error:
         raise InputError(f"{path} must be writable, but writing it failed: {error}.") from error
     finally:

@@ -9,8 +9,8 @@ import numpy as np
 
 from ..checks import InputError, finite
 from ..optics.background import ORDER, Background
-from .atomic import atomic_path
 from .hdf5 import open_hdf5
+from .hdf5_writing import new_hdf5, put
 
 FORMAT = "holosplat light 1"
 
@@ -18,15 +18,15 @@ FORMAT = "holosplat light 1"
 def write_light(path: Path, light: Background | None, still: np.ndarray | None = None) -> None:
     """Coefficients [V, (K + 1)²] of `exp(Σ c m)`, m the products of cosines of 0 to K half waves of `smooth_modes`, and
     the light [H, W] that all frames have in common; None: there is none."""
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    with new_hdf5(path) as file:
         file.attrs["format"] = FORMAT
         if light is not None:
             file.attrs["half_waves"] = ORDER
             file.attrs["shape"] = np.asarray(light.shape)
-            file["coefficients"] = light.coefficients.numpy()
-            file["variances"] = light.variances.numpy()
+            put(file, "coefficients", light.coefficients.numpy())
+            put(file, "variances", light.variances.numpy())
         if still is not None:
-            file["still"] = still.astype(np.float32)
+            put(file, "still", still.astype(np.float32))
 
 
 def read_still_light(path: Path) -> np.ndarray | None:

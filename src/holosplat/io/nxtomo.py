@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,8 +17,8 @@ from ..divided_light import DividedLight
 from ..scan import Exposures, Scan
 from ..version import __version__
 from . import arrays, exchange
-from .atomic import atomic_path
 from .divided_light import LIGHT, write_divided_light
+from .hdf5_writing import new_hdf5, put, room_for
 from .loader import Loader
 from .raw_file import NOTHING, PROJECTION, TAKES, reader
 from .scan_file import ANGLES, DATA, FLIPS, IMAGE_KEY, MASK, SPLIT, open_scan
@@ -80,7 +81,8 @@ def scan_writer(
         require(bool(good), f"provenance must map names to texts, but {key!r} maps to {value!r}; correct it.")
     is_test = shaped("split", np.asarray(is_test, dtype=bool), (len(exposures),))
     count = 0
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    size = len(exposures) * math.prod(exposures.views.shape) * (2 if raw else 4)
+    with new_hdf5(path, size) as file:
         data = _write_entry(file, exposures, is_test, provenance, raw)
         if light is not None:
             write_divided_light(_group(file, LIGHT, "NXcollection"), light)
@@ -106,7 +108,7 @@ def _write_entry(
     file.attrs.update(NX_class="NXroot", default="entry", creator=f"holosplat {__version__}")
     entry = _group(file, "entry", "NXentry", default="data")
     entry["definition"] = "NXtomo"
-    entry[SPLIT] = is_test.astype(np.uint8)
+    put(entry, SPLIT, is_test.astype(np.uint8))
     data = _write_instrument(_group(entry, "instrument", "NXinstrument"), exposures, raw)
     _write_sample(_group(entry, "sample", "NXsample"), exposures)
     _write_process(_group(entry, "process", "NXprocess"), provenance)
@@ -125,8 +127,7 @@ def _group(parent: h5py.Group, name: str, nx_class: str, **attributes: str | lis
 
 
 def _put(group: h5py.Group, name: str, value: np.ndarray | float, units: str) -> None:
-    group[name] = value
-    group[name].attrs["units"] = units
+    put(group, name, value).attrs["units"] = units
 
 
 def _write_instrument(instrument: h5py.Group, exposures: Exposures, raw: RawLayout | None) -> h5py.Dataset:
@@ -136,10 +137,14 @@ def _write_instrument(instrument: h5py.Group, exposures: Exposures, raw: RawLayo
     _put(_group(instrument, "beam", "NXbeam"), "incident_energy", energy, "keV")
     detector = _group(instrument, "detector", "NXdetector")
     shape = (len(exposures), *exposures.views.shape)
-    data = detector.create_dataset("data", shape, np.uint16 if raw else np.float32)
-    detector["image_key"] = np.asarray(raw.kinds if raw else np.full(len(exposures), PROJECTION), dtype=np.int32)
+    data = room_for(detector, "data", shape, np.uint16 if raw else np.float32, chunk=(1, *shape[1:]))
+    put(
+        detector,
+        "image_key",
+        np.asarray(raw.kinds if raw else np.full(len(exposures), PROJECTION), dtype=np.int32),
+    )
     if raw is not None:
-        detector[MASK.rsplit("/", 1)[1]] = np.asarray(raw.mask, dtype=np.uint32)
+        put(detector, MASK.rsplit("/", 1)[1], np.asarray(raw.mask, dtype=np.uint32))
         for name, flipped in zip(FLIPS, raw.flips):
             detector[name.rsplit("/", 1)[1]] = flipped
     views = exposures.views
@@ -155,7 +160,7 @@ def _write_instrument(instrument: h5py.Group, exposures: Exposures, raw: RawLayo
 def _write_sample(sample: h5py.Group, exposures: Exposures) -> None:
     sample["name"] = "sample"
     rotations = exposures.views.rotations
-    sample["view_rotation"] = rotations
+    put(sample, "view_rotation", rotations)
     # R(θ) is nearest to R where tr(R(θ)ᵀ R) = cos θ (R00 + R22) + sin θ (R02 - R20) is largest.
     theta = np.arctan2(rotations[:, 0, 2] - rotations[:, 2, 0], rotations[:, 0, 0] + rotations[:, 2, 2])
     _put(sample, "rotation_angle", np.rad2deg(theta), "deg")

@@ -14,10 +14,10 @@ from torch import Tensor
 
 from ..checks import InputError, finite
 from ..representations import KINDS, Stored
-from .atomic import atomic_path
 from .gaussians import FORMAT as GAUSSIANS
 from .gaussians import read_gaussians
 from .hdf5 import Fields, open_hdf5
+from .hdf5_writing import new_hdf5, put
 
 FORMAT = "holosplat object 1"
 MOST_TEXT = 60_000
@@ -29,10 +29,10 @@ def write_object(path: Path, obj: Stored) -> None:
     tensors, plain = _parted(obj.state())
     text = json.dumps(plain)
     assert len(text) < MOST_TEXT
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    with new_hdf5(path) as file:
         file.attrs.update(format=FORMAT, kind=obj.kind, state=text)
         for name, tensor in tensors.items():
-            file[name] = tensor.detach().cpu().numpy()
+            put(file, name, tensor.detach().cpu().numpy())
 
 
 def read_object(path: Path) -> Stored:

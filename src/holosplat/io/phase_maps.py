@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from ..checks import require, shaped
 from ..scan import Exposures
-from .atomic import atomic_path, require_writable
+from .atomic import require_writable
 from .exposure_tables import exposure_table
 from .folder import atomic_folder, require_new
+from .hdf5_writing import new_hdf5, put
 from .json import write_json
 
 FORMAT = "holosplat phase maps 1"
@@ -84,16 +84,16 @@ def _pixels(exposures: Exposures) -> float | np.ndarray:
 
 def _write_hdf5(path: Path, found: PhaseMaps) -> None:
     exposures = found.exposures
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    with new_hdf5(path, sum(4 * images.size for images in found.maps.values())) as file:
         file.attrs["format"] = FORMAT
         file.attrs.update(found.facts)
         for name, images in found.maps.items():
-            file.create_dataset(name, data=images.astype(np.float32)).attrs["units"] = UNITS[name]
+            put(file, name, images.astype(np.float32)).attrs["units"] = UNITS[name]
         numbers = {
             "pixel_size": (_pixels(exposures), "m"),
             "distance": (exposures.distance, "m"),
             "energy": (exposures.energy_kev, "keV"),
         }
         for name, (values, unit) in numbers.items():
-            file.create_dataset(name, data=values).attrs["units"] = unit
-        file["rotations"] = exposures.views.rotations
+            put(file, name, values).attrs["units"] = unit
+        put(file, "rotations", exposures.views.rotations)

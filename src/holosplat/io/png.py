@@ -31,7 +31,7 @@ def read_png(path: Path) -> tuple[np.ndarray, int]:
     Colours must be equal and alpha opaque; `InputError` otherwise, or if the file is damaged.
     """
     try:
-        with Image.open(path) as image:
+        with Image.open(path, formats=("PNG",)) as image:
             mode, values = image.mode, np.asarray(image)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{path} must be a complete PNG image, but it is damaged or none: {error}.") from None

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..checks import InputError, require
+from .leftovers import is_hidden
 
 IMAGES = (".tif", ".tiff", ".png")
 
@@ -58,8 +59,12 @@ def stack_of(path: Path, pattern: str | None = None) -> ImageStack | np.ndarray:
 
 def images_in(folder: Path, pattern: str | None = None) -> list[Path]:
     """The image files in a folder whose names match `pattern`, in the order of the numbers in their names."""
-    found = [file for file in folder.glob(pattern or "*") if file.suffix.lower() in IMAGES and file.is_file()]
+    found = [file for file in folder.glob(pattern or "*") if _is_image(file)]
     return sorted(found, key=lambda file: [(word.isdigit(), word.zfill(20)) for word in re.split(r"(\d+)", file.name)])
+
+
+def _is_image(file: Path) -> bool:
+    return file.suffix.lower() in IMAGES and file.is_file() and not is_hidden(file)
 
 
 def _like(pattern: str | None) -> str:
@@ -105,7 +110,7 @@ def _image(file: Path, page: int) -> np.ndarray:
 def _png(file: Path) -> np.ndarray:
     from PIL import Image
 
-    with Image.open(file) as opened:
+    with Image.open(file, formats=("PNG",)) as opened:
         return np.asarray(opened.convert("RGB") if opened.mode == "P" else opened)
 
 

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-import h5py
 import numpy as np
 
 from ..checks import InputError, finite, in_range
 from ..geometry import Grid
 from ..progress import Advance
 from ..volume import Object, Volume
-from .atomic import atomic_path
 from .hdf5 import Fields, attribute_numbers, open_hdf5
+from .hdf5_writing import new_hdf5, room_for
 
 NAMES = ("delta", "beta")
 VOXEL_RANGE_M = (1e-10, 1e-2)
@@ -53,9 +53,10 @@ def write_slabs(path: str | Path, grid: Grid, slabs: Iterable[tuple[int, Volume]
     The parts must cover the grid; `path` is replaced only once all are written.
     """
     attributes = {"voxel_size": np.array(grid.voxel_size), "origin": np.array(grid.origin)}
-    with atomic_path(path) as temporary, h5py.File(temporary, "w") as file:
+    with new_hdf5(path, 4 * len(NAMES) * math.prod(grid.shape)) as file:
         file.attrs.update(attributes)
-        arrays = {name: file.create_dataset(name, grid.shape, np.float32) for name in NAMES}
+        chunk = (grid.shape[0], 1, grid.shape[2])  # slabs are whole in z and x
+        arrays = {name: room_for(file, name, grid.shape, np.float32, chunk=chunk) for name in NAMES}
         for array in arrays.values():
             array.attrs.update(attributes)
         for start, part in slabs:

@@ -21,6 +21,7 @@ from ..checks import InputError, require
 from ..mesh import TriangleMesh
 from ..units import LENGTH_UNITS, unit_factor
 from .atomic import atomic_path
+from .leftovers import is_hidden
 from .vtk_guard import cells_fault, legacy_fault
 
 SUFFIXES = (".vtk", ".vtu", ".vtp")
@@ -92,7 +93,7 @@ def write_mesh(path: str | Path, mesh: TriangleMesh, length_unit: str = "um") ->
 
 def _files(path: Path) -> list[Path]:
     if path.is_dir():
-        found = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES]
+        found = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and not is_hidden(file)]
         require(len(found) > 0, f"{path} must hold mesh files ({', '.join(SUFFIXES)}), but it holds none.")
         return sorted(found, key=_natural_order)
     require(path.exists(), f"{path} must be a mesh file, but there is no such file; check the path.")

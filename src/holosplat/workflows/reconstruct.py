@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
@@ -13,7 +14,7 @@ from ..align.geometry import Geometry
 from ..align.poses import PoseOptions
 from ..checks import InputError, require
 from ..fit.running import Record, Running
-from ..io.json import read_json, write_json
+from ..io.json import write_json
 from ..io.light import read_still_light, write_light
 from ..io.objects import read_object, write_object
 from ..matter import MaterialPrior, MatterKind
@@ -90,25 +91,26 @@ def reconstruct(
     def tell(stage: str, part: float) -> None:
         on_progress(stage, part, {})
 
-    geometry = None
-    if refine is not None:
-        require_compatible(ranges)
-        _look_at(folder, config, resume)
-        geometry = saved_geometry(folder, resume) or trained_geometry(scan, prior, refine, assumed, tell)
-        scan = geometry.applied(scan)
-    train = scan.train()
-    task = prepared(Task(train, prior, seed, tell, assumed, freedom=freedom_of(geometry, refine)), method)
-    run = _Run(task, method, folder, on_progress)
-    run.begin(config, resume)
-    run.settle(matter, ranges, scan, geometry)
-    done = run.complete()
-    if refine is None or geometry is None:
-        return done
-    geometry = with_fitted(geometry, planned, run.task.scan, done, refine)
-    geometry = with_held_out(geometry, planned, done, refine, tell)
-    if folder is not None:
-        keep_geometry(folder, geometry, planned)
-    return replace(done, geometry=geometry)
+    with folder.claimed() if folder else nullcontext():
+        geometry = None
+        if refine is not None:
+            require_compatible(ranges)
+            _look_at(folder, config, resume)
+            geometry = saved_geometry(folder, resume) or trained_geometry(scan, prior, refine, assumed, tell)
+            scan = geometry.applied(scan)
+        train = scan.train()
+        task = prepared(Task(train, prior, seed, tell, assumed, freedom=freedom_of(geometry, refine)), method)
+        run = _Run(task, method, folder, on_progress)
+        run.begin(config, resume)
+        run.settle(matter, ranges, scan, geometry)
+        done = run.complete()
+        if refine is None or geometry is None:
+            return done
+        geometry = with_fitted(geometry, planned, run.task.scan, done, refine)
+        geometry = with_held_out(geometry, planned, done, refine, tell)
+        if folder is not None:
+            keep_geometry(folder, geometry, planned)
+        return replace(done, geometry=geometry)
 
 
 def _look_at(folder: RunFolder | None, config: dict[str, Any], resume: bool) -> bool:
@@ -151,7 +153,7 @@ def check_frames(train: Scan) -> None:
 def load_reconstruction(folder: RunFolder) -> Reconstruction:
     """What a run folder holds; `InputError` if it holds no reconstruction."""
     folder.require_run()
-    summary = read_json(folder.summary)
+    summary = folder.read_summary()
     try:
         timing = {name: float(value) for name, value in summary["timing_s"].items()}
         energy, oversample = float(summary["energy_kev"]), int(summary["oversample"])
@@ -278,8 +280,7 @@ class _Run:
     def make_folder(self, backend: str) -> None:
         """Make the folder, once there is something to put in it."""
         if self.folder is not None and not self.folder.config.is_file():
-            self.folder.create()
-            write_json(self.folder.config, self._config | environment(backend))
+            self.folder.begin(self._config | environment(backend))
 
     def note_resolved(self, stage: str, fit: Running) -> None:
         """Add to config.json what the options have become in a stage: wave samples a pixel, weights and widths."""
@@ -316,7 +317,7 @@ class _Run:
             background = self.task.uneven and self.task.uneven.background
             if background is not None or done.still is not None:
                 write_light(self.folder.light, background, done.still)
-            write_json(self.folder.summary, summary_of(done, fit, self.task.scan) | {"light": self.task.light_in_words})
+            self.folder.write_summary(summary_of(done, fit, self.task.scan) | {"light": self.task.light_in_words})
         return done
 
 

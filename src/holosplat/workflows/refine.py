@@ -114,7 +114,7 @@ def read_geometry(summary: Mapping[str, Any]) -> Geometry | None:
 
 def keep_geometry(folder: RunFolder, geometry: Geometry, scan: Scan) -> None:
     """Write `geometry` into the folder of a finished run, and what the planned `scan` is with it."""
-    write_json(folder.summary, read_json(folder.summary) | {"geometry": geometry.as_dict()})
+    folder.write_summary(folder.read_summary() | {"geometry": geometry.as_dict()})
     config = folder.read_config()
     decided = config["decided"] | {"scan_hash": scan_hash(geometry.applied(scan))}
     write_json(folder.config, config | {"decided": decided})

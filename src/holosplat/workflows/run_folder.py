@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable
+import io
+import os
+import secrets
+import zipfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from ..checks import InputError, require
+from ..checks import require
 from ..io.atomic import atomic_path
-from ..io.folder import require_new
-from ..io.json import read_json
+from ..io.folder import require_new, require_parent
+from ..io.json import read_json, write_json
+from ..io.lock import sole_writer
+from .manifest import write_manifest
 
 
 class RunFolder:
@@ -24,6 +31,7 @@ class RunFolder:
         self.config = self.path / "config.json"
         self.metrics = self.path / "metrics.csv"
         self.checkpoint = self.path / "checkpoint.pt"
+        self.earlier_checkpoint = self.path / "checkpoint_before.pt"
         self.object = self.path / "object.h5"
         self.light = self.path / "light.h5"
         self.summary = self.path / "summary.json"
@@ -39,7 +47,7 @@ class RunFolder:
         """`InputError` unless the folder holds a reconstruction."""
         require(self.path.is_dir(), f"the run folder {self.path} does not exist; check the path.")
         found = self.config.is_file() and self.result().is_file()
-        hint = "; it was cut off, finish it with reconstruct --resume" if self.checkpoint.is_file() else ""
+        hint = "; it was cut off, finish it with reconstruct --resume" if self.config.is_file() else ""
         require(found, f"{self.path} must hold a reconstruction (config.json, object.h5), but it does not{hint}.")
 
     def result(self) -> Path:
@@ -47,9 +55,37 @@ class RunFolder:
         older = self.path / "gaussians.h5"
         return older if older.is_file() and not self.object.is_file() else self.object
 
-    def create(self) -> None:
-        """Make the folder."""
+    @contextmanager
+    def claimed(self) -> Iterator[None]:
+        """Make the folder, if need be, and keep other processes from writing to it (`sole_writer`); in the end its
+        manifest is of what was written."""
+        require_parent(self.path)
+        with sole_writer(self.path):
+            yield
+            if self.config.is_file():
+                write_manifest(self.path, self.name())
+
+    def begin(self, config: dict[str, Any]) -> None:
+        """Make the folder with its config.json, and with it a new run, whose name checkpoint and summary repeat."""
         self.path.mkdir(exist_ok=True)
+        write_json(self.config, {"run": secrets.token_hex(8), **config})
+
+    def write_summary(self, values: dict[str, Any]) -> None:
+        """Replace summary.json, with the name of the run."""
+        write_json(self.summary, values | {"run": self.name()})
+
+    def read_summary(self) -> dict[str, Any]:
+        """What summary.json holds; `InputError` if it is of another run than config.json."""
+        summary = read_json(self.summary)
+        require(
+            summary.get("run", "") == self.name() or "run" not in summary,
+            f"{self.summary} must be of the run in {self.config}, but it is of another one; bring back its own.",
+        )
+        return summary
+
+    def name(self) -> str:
+        """The name of the run, empty before it has begun and of older versions."""
+        return str(self.read_config().get("run", "")) if self.config.is_file() else ""
 
     def read_config(self) -> dict[str, Any]:
         """What config.json holds."""
@@ -89,9 +125,10 @@ class RunFolder:
             writer.writerows({k: f"{v:.7g}" for k, v in record.items()} for record in records)
 
     def read_rows(self) -> list[dict[str, str]]:
-        """The rows of metrics.csv as text."""
-        with self.metrics.open(newline="") as file:
-            return list(csv.DictReader(file))
+        """The rows of metrics.csv as text, without those that a killed process left half-written."""
+        with self.metrics.open(newline="", encoding="utf-8", errors="replace") as file:
+            reader = csv.DictReader(line for line in file if line.endswith("\n") and "\0" not in line)
+            return [row for row in reader if _is_whole(row)]
 
     def history(self) -> dict[str, np.ndarray]:
         """The columns of metrics.csv as float64 (NaN where a row has no entry); empty if there is no file."""
@@ -100,17 +137,54 @@ class RunFolder:
         return {name: np.array([float(row[name] or "nan") for row in rows]) for name in names}
 
     def save_checkpoint(self, state: dict[str, Any]) -> None:
-        """Replace checkpoint.pt."""
+        """Replace checkpoint.pt; the one before is kept beside it."""
+        content = io.BytesIO()
+        torch.save({"run": self.name(), "state": state}, content)
         with atomic_path(self.checkpoint) as temporary:
-            torch.save(state, temporary)
+            temporary.write_bytes(content.getbuffer())
+            if self.checkpoint.is_file():
+                os.replace(self.checkpoint, self.earlier_checkpoint)
 
     def load_checkpoint(self) -> dict[str, Any] | None:
-        """The last checkpoint, or None; `InputError` if it cannot be read."""
-        if not self.checkpoint.is_file():
-            return None
-        try:
-            return torch.load(self.checkpoint, map_location="cpu", weights_only=True)
-        except Exception as error:  # torch raises many kinds for damaged files
-            raise InputError(
-                f"{self.checkpoint} must be a checkpoint, but it is damaged; start anew without it."
-            ) from error
+        """The last checkpoint, or the one before if that is damaged or not there; None if there is none.
+
+        Errors: `InputError` if none of them can be read, or one is of another run.
+        """
+        damaged = False
+        for path in (self.checkpoint, self.earlier_checkpoint):
+            if not path.is_file():
+                continue
+            found = _loaded(path)
+            if found is None:
+                damaged = True
+                continue
+            require(
+                found.get("run", self.name()) == self.name(),
+                f"{path} must be of the run in {self.config}, but it is of another one; bring back its own, or start "
+                "anew.",
+            )
+            return found.get("state", found)
+        require(not damaged, f"{self.checkpoint} must be a checkpoint, but it is damaged; start anew without it.")
+        return None
+
+
+def _loaded(path: Path) -> dict[str, Any] | None:
+    """What a checkpoint holds; None if it is damaged, by the checksums of its parts or else."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            if archive.testzip() is not None:
+                return None
+        found = torch.load(path, map_location="cpu", weights_only=True)
+    except MemoryError:
+        raise
+    except Exception:  # zipfile and torch raise many kinds for damaged files
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def _is_whole(row: dict[str, Any]) -> bool:
+    """Whether a row has a number, or nothing, in each column."""
+    try:
+        return all(text is not None and float(text or "nan") is not None for text in row.values())
+    except (TypeError, ValueError):
+        return False

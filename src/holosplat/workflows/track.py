@@ -8,7 +8,6 @@ from ..checks import require
 from ..fit.residuals import Prediction
 from ..io.atomic import atomic_path
 from ..io.folder import atomic_folder
-from ..io.json import write_json
 from ..io.light import write_light
 from ..io.objects import write_object
 from ..io.pvd import TimeStep, write_pvd
@@ -86,8 +85,7 @@ def track(
             "scan_hash": scan_hash(scan),
             "light": to_table(assumed),
         }
-        folder.create()
-        write_json(folder.config, config | environment("cpu"))
+        folder.begin(config | environment("cpu"))
         _write(folder, done, found, task)
         write_tracks(folder, found.bodies, scan)
     return done
@@ -102,7 +100,7 @@ def _write(folder: RunFolder, done: Reconstruction, found: Followed, task: Task)
         write_light(folder.light, task.uneven.background)
     told = {"steps": len(found.records), "times_s": task.scan.instants.tolist(), "bodies": found.bodies.count}
     told |= {"bodies_at_each_time": list(found.found), "light": task.light_in_words}
-    write_json(folder.summary, summary_of(done, None, task.scan) | told)
+    folder.write_summary(summary_of(done, None, task.scan) | told)
 
 
 def write_tracks(folder: RunFolder, bodies: MovingSurfaces, scan: Scan) -> None:

@@ -1,0 +1,83 @@
+"""What a killed process leaves of files it was writing: named so that nobody reads it, and the next one removes it."""
+
+from __future__ import annotations
+
+import os
+import re
+import secrets
+import shutil
+import socket
+import zlib
+from contextlib import suppress
+from pathlib import Path
+
+LOCK = ".lock"
+"""The file that says who writes to a folder."""
+LONGEST = 180
+"""Bytes of a file's name that its temporary name keeps: with what is added it stays below the 255 of file systems."""
+PATTERN = re.compile(r"^\..*~(?P<host>[0-9a-f]{8})-(?P<process>[0-9a-f]+)-[0-9a-f]{8}(\.[^.]*)?$", re.DOTALL)
+
+
+def host() -> str:
+    """Eight digits that stand for this machine."""
+    return f"{zlib.crc32(socket.gethostname().encode()):08x}"
+
+
+def temporary_name(target: Path) -> Path:
+    """A new hidden name beside `target` with its suffix, which says which process of which machine writes it."""
+    owner = f"{host()}-{os.getpid():x}-{secrets.token_hex(4)}"
+    return target.with_name(f".{_kept(target)}~{owner}{target.suffix}")
+
+
+def is_hidden(path: Path) -> bool:
+    """Whether a file or folder has a name that readers of folders pass over: it begins with a dot."""
+    return path.name.startswith(".")
+
+
+def is_left(path: Path) -> bool:
+    """Whether a name is that of a half-written file, or of a lock."""
+    return PATTERN.match(path.name) is not None or path.name == LOCK
+
+
+def clear_leftovers(target: Path) -> None:
+    """Remove what processes of this machine that are no more left of `target`; where that fails, nothing is said."""
+    with suppress(OSError):
+        for found in target.parent.glob(f".{_escaped(_kept(target))}~*"):
+            _clear(found)
+
+
+def clear_all_leftovers(folder: Path) -> None:
+    """The same of everything in `folder`."""
+    with suppress(OSError):
+        for found in folder.iterdir():
+            _clear(found)
+
+
+def is_alive(process: int) -> bool:
+    """Whether this machine runs a process of that number."""
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (PermissionError, OverflowError):  # of somebody else; of no process at all
+        return True
+    return True
+
+
+def _clear(found: Path) -> None:
+    match = PATTERN.match(found.name)
+    if match is None or match["host"] != host() or is_alive(int(match["process"], 16)):
+        return
+    if found.is_dir() and not found.is_symlink():
+        shutil.rmtree(found, ignore_errors=True)
+    else:
+        found.unlink(missing_ok=True)
+
+
+def _kept(target: Path) -> str:
+    """The beginning of a file's name without its suffix, of whole characters."""
+    return os.fsdecode(os.fsencode(target.stem)[:LONGEST]).encode("utf-8", "ignore").decode("utf-8", "ignore")
+
+
+def _escaped(name: str) -> str:
+    return re.sub(r"([*?[])", r"[\1]", name)

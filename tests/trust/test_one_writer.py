@@ -1,0 +1,164 @@
+"""One writer of a folder, and files that belong together."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from holosplat.checks import InputError
+from holosplat.io.atomic import atomic_path
+from holosplat.io.folder import atomic_folder, is_taken
+from holosplat.io.leftovers import LOCK, host, temporary_name
+from holosplat.io.lock import sole_writer
+from holosplat.workflows.manifest import MANIFEST, faults
+from holosplat.workflows.run_folder import RunFolder
+
+
+def lock_of(process: int, machine: str = "", began: str = "1") -> str:
+    return json.dumps({"host": machine or socket.gethostname(), "process": process, "began": began, "since": "today"})
+
+
+@pytest.fixture
+def gone():
+    """The number of a process that is no more."""
+    with subprocess.Popen([sys.executable, "-c", ""]) as process:
+        process.wait()
+    return process.pid
+
+
+def test_another_process_may_not_write_to_it(tmp_path):
+    """A live one of this machine, by its number and beginning; nothing is touched."""
+    with sole_writer(tmp_path / "run"):
+        text = (tmp_path / "run" / LOCK).read_text()
+        code = (
+            "from pathlib import Path; from holosplat.io.lock import sole_writer; import sys\n"
+            "with sole_writer(Path(sys.argv[1])): pass"
+        )
+        done = subprocess.run(
+            [sys.executable, "-c", code, tmp_path / "run"], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 1
+        assert f"must have one writer, but process {os.getpid()} on {socket.gethostname()} writes to it" in done.stderr
+        assert (tmp_path / "run" / LOCK).read_text() == text
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_process_writes_to_its_own_folder_within_itself(tmp_path):
+    with sole_writer(tmp_path / "run"):
+        with sole_writer(tmp_path / "run"):
+            (tmp_path / "run" / "a").write_text("a")
+        assert (tmp_path / "run" / LOCK).exists()
+    assert os.listdir(tmp_path / "run") == ["a"]
+
+
+def test_a_lock_of_a_process_that_is_no_more_is_taken_over(tmp_path, gone):
+    """So is that of an older process of the same number, this one's too; what it left half-written goes."""
+    for text in (lock_of(gone), lock_of(os.getpid()), lock_of(os.getppid())):
+        (tmp_path / LOCK).write_text(text)
+        left = tmp_path / f".rows~{host()}-{gone:x}-0123abcd.csv"
+        left.write_text("half")
+        with sole_writer(tmp_path):
+            assert json.loads((tmp_path / LOCK).read_text())["process"] == os.getpid()
+            assert not left.exists()
+        tmp_path.mkdir(exist_ok=True)
+
+
+@pytest.mark.parametrize("text", [lock_of(1, "elsewhere"), "", "[]", '{"process": "x"}'])
+def test_a_lock_that_cannot_be_judged_is_left(tmp_path, text):
+    (tmp_path / LOCK).write_text(text)
+    with pytest.raises(InputError, match=r"remove .*\.lock if there is no such process"), sole_writer(tmp_path):
+        raise AssertionError("it must not begin")
+    assert (tmp_path / LOCK).read_text() == text
+
+
+def test_a_folder_of_locks_and_leftovers_is_free(tmp_path, gone):
+    """A run that was killed at its start can be begun anew, without --resume."""
+    run = tmp_path / "run"
+    run.mkdir()
+    (run / LOCK).write_text(lock_of(gone))
+    (run / f".config~{host()}-{gone:x}-0123abcd.json").write_text("{")
+    assert not is_taken(run)
+    RunFolder(run).require_new()
+    with atomic_folder(run) as folder:
+        (folder / "a").write_text("a")
+    assert os.listdir(run) == ["a"]
+    assert is_taken(run)
+
+
+def test_what_a_killed_process_left_of_a_file_goes_with_the_next_one(tmp_path, gone):
+    """Not what a living one is writing, nor one of another machine, nor a file of the user's."""
+    dead = tmp_path / f".scan~{host()}-{gone:x}-0123abcd.nxs"
+    kept = [temporary_name(tmp_path / "scan.nxs"), tmp_path / ".scan~deadbeef-1-0123abcd.nxs", tmp_path / ".scan~.nxs"]
+    for path in (dead, *kept):
+        path.write_text("half")
+    with atomic_path(tmp_path / "scan.nxs") as temporary:
+        temporary.write_text("whole")
+    assert not dead.exists()
+    assert all(path.exists() for path in kept)
+
+
+def begun(path) -> RunFolder:
+    folder = RunFolder(path)
+    with folder.claimed():
+        folder.begin({"seed": 1})
+        folder.start_metrics(["step", "loss"])
+        folder.append_metrics([{"step": 1.0, "loss": 0.5}, {"step": 2.0, "loss": 0.25}])
+        folder.write_summary({"finished": True})
+        folder.save_checkpoint({"step": 2})
+    return folder
+
+
+def test_checkpoints_and_summaries_of_another_run_are_refused(tmp_path):
+    one, other = begun(tmp_path / "one"), begun(tmp_path / "other")
+    assert one.load_checkpoint() == {"step": 2}
+    one.checkpoint.write_bytes(other.checkpoint.read_bytes())
+    with pytest.raises(InputError, match="but it is of another one"):
+        one.load_checkpoint()
+    one.summary.write_bytes(other.summary.read_bytes())
+    with pytest.raises(InputError, match="but it is of another one"):
+        one.read_summary()
+
+
+def test_the_checkpoint_before_serves_where_the_last_one_is_damaged(tmp_path):
+    folder = begun(tmp_path / "run")
+    folder.save_checkpoint({"step": 3, "values": list(range(400))})
+    content = bytearray(folder.checkpoint.read_bytes())
+    content[len(content) // 2] ^= 1  # within the values: torch itself would not notice
+    folder.checkpoint.write_bytes(content)
+    assert folder.load_checkpoint() == {"step": 2}
+    folder.checkpoint.unlink()
+    assert folder.load_checkpoint() == {"step": 2}
+    folder.earlier_checkpoint.write_bytes(b"")
+    with pytest.raises(InputError, match="damaged; start anew"):
+        folder.load_checkpoint()
+
+
+@pytest.mark.parametrize("torn", ["3,0.1", "3\n", "3,0.\0\n", "3,x\n", "\0\0\0\n", "3,1,2\n"])
+def test_a_torn_row_of_metrics_is_left_out(tmp_path, torn):
+    folder = begun(tmp_path / "run")
+    with folder.metrics.open("a") as file:
+        file.write(torn)
+    assert folder.history()["step"].tolist() == [1, 2]
+    folder.start_metrics(["step", "loss"], keep_until=1)
+    assert folder.history()["loss"].tolist() == [0.5]
+
+
+def test_a_manifest_says_what_was_written(tmp_path):
+    folder = begun(tmp_path / "run")
+    name = folder.name()
+    assert faults(folder.path, name) == []
+    with folder.summary.open("a") as file:
+        file.write(" ")
+    (folder.path / "stray.txt").write_text("")
+    folder.checkpoint.unlink()
+    assert faults(folder.path, name) == [
+        f"{folder.checkpoint} is missing",
+        f"{folder.path / MANIFEST} does not know of {folder.path / 'stray.txt'}",
+        f"{folder.summary} is not what was written",
+    ]
+    assert faults(folder.path, "another")[0].endswith("is of another run than config.json")
