@@ -7,6 +7,9 @@ command line prints it without a traceback and exits with a non-zero code.
 from __future__ import annotations
 
 import math
+import os
+import stat
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -72,6 +75,18 @@ def shaped(field: str, array: np.ndarray, shape: tuple[int | None, ...]) -> np.n
         wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
         raise InputError(f"{field} must have the shape {wanted}, but it has the shape {tuple(array.shape)}.")
     return array
+
+
+def require_regular(path: str | Path, what: str) -> None:
+    """`InputError` unless `path`, which must be `what`, is a regular file: a named pipe or a device may never end."""
+    try:
+        mode = os.stat(path).st_mode
+    except FileNotFoundError:
+        raise InputError(f"{path} must be {what}, but there is no such file; check the path.") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path} must be {what}, but it cannot be opened: {error}.") from None
+    require(not stat.S_ISDIR(mode), f"{path} must be {what}, but it is a folder; name the file in it.")
+    require(stat.S_ISREG(mode), f"{path} must be {what}, but it is a pipe or a device; copy what it gives to a file.")
 
 
 def _of(unit: str) -> str:

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
-from .checks import InputError, require
+from .checks import InputError, require, require_regular
 
 # --- files --------------------------------------------------------------------------------------------------
 
@@ -29,12 +29,15 @@ def read_table(path: Path) -> dict[str, Any]:
     """
     toml = path.suffix.lower() == ".toml"
     language = "TOML" if toml else "JSON"
+    require_regular(path, f"a {language} file")
     try:
         text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+    except (OSError, ValueError) as error:
         raise InputError(f"{path} must be a readable {language} file, but reading it failed: {error}.") from None
     try:
         table = tomllib.loads(text) if toml else json.loads(text)
+    except RecursionError:
+        raise InputError(f"{path} must be valid {language}, but it is nested too deeply; make it flat.") from None
     except ValueError as error:  # both decoders' errors
         raise InputError(f"{path} must be valid {language}, but: {error}.") from None
     require(isinstance(table, dict), f"{path} must hold a table, but it holds {type(table).__name__}.")

@@ -10,6 +10,7 @@ from typing import Any, Literal
 from ..checks import InputError, require
 from ..scan import Scan
 from . import arrays, euxfel, exchange, images, nerf_synthetic, nxtomo, r2_gaussian, run_scan, tiff
+from .hdf5_guard import allow_external
 from .loader import Loader
 from .raw_file import ScanFile, with_fields
 from .reading import Reading
@@ -44,6 +45,8 @@ def read(path: str | Path, given: Mapping[str, Any] | None = None) -> Scan:
 
 def read_as(path: str | Path, reading: Reading) -> Scan:
     """The scan at `path`, as `read`, with what is said of it beside its files, and cut to the part that is taken."""
+    if reading.told.allow_external:
+        allow_external(Path(path))
     return reading.applied(read(path, reading.told.given(loader_of(path).takes)))
 
 

@@ -11,25 +11,33 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ..checks import InputError, require, shaped
+from ..checks import InputError, require_regular, shaped
 from ..units import unit_factor
+from .guard import require_memory
+from .hdf5_guard import require_own
 
 
 @contextmanager
 def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
     """`path` opened for reading; `InputError` when it is missing, no HDF5 file, truncated or damaged."""
     file = Path(path)
-    require(file.exists(), f"{path} must be an HDF5 file, but there is no such file; check the path.")
-    require(file.is_file(), f"{path} must be an HDF5 file, but it is a folder; name the file in it.")
+    require_regular(file, "an HDF5 file")
     try:
         if not h5py.is_hdf5(file):
             raise InputError(f"{path} must be an HDF5 file, but it does not start like one.")
         with h5py.File(file, "r") as opened:
+            require_own(opened, file)
             yield opened
     except (OSError, RuntimeError, KeyError) as error:
+        hint = ", or the file system cannot lock it (then set HDF5_USE_FILE_LOCKING=FALSE)" if _no_lock(error) else ""
         raise InputError(
-            f"{path} must be a complete HDF5 file, but it is truncated, damaged or not readable: {error}."
+            f"{path} must be a complete HDF5 file, but it is truncated, damaged or not readable{hint}: {error}."
         ) from error
+
+
+def _no_lock(error: Exception) -> bool:
+    """Whether HDF5 failed as it could not lock the file, which some network file systems refuse."""
+    return "unable to lock file" in str(error)
 
 
 @dataclass(frozen=True)
@@ -70,7 +78,9 @@ class Fields:
 
     def numbers(self, name: str) -> np.ndarray:
         """All of the dataset `name` as float64."""
-        return np.asarray(self.dataset(name)[()], dtype=np.float64)
+        found = self.dataset(name)
+        require_memory(self.label(name), 8 * int(np.prod(found.shape, dtype=object)))
+        return np.asarray(found[()], dtype=np.float64)
 
     def unit(self, name: str, table: dict[str, float], default: str) -> float:
         """The factor of the dataset's `@units` to the base unit of `table`; `default` when it has none."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -122,10 +122,23 @@ Opens = Callable[[Path, Mapping[str, Any]], AbstractContextManager[ScanFile]]
 
 
 @dataclass(frozen=True)
+class _Place:
+    """Where a dataset is: in the file that was opened, or in one to which it links, where that is allowed."""
+
+    file: Path
+    name: str
+
+    @classmethod
+    def of(cls, dataset: h5py.Dataset) -> _Place:
+        path = Path(dataset.file.filename).resolve()
+        return cls(path, str(dataset.name))
+
+
+@dataclass(frozen=True)
 class StoredFrames(Frames):
     """The projections of a file, flat-field corrected when they are read.
 
-    stacks: of the file; a dataset of HDF5 by its name.
+    stacks: of the file; a dataset of HDF5 by its place.
     numbers: [N] of the projections among the file's frames.
     dark, light: [H, W] mean dark field and mean flat field less that, light None where the file is corrected already.
     stamp: of the file when it was opened.
@@ -136,7 +149,7 @@ class StoredFrames(Frames):
 
     path: Path
     label: str
-    stacks: tuple[Stack | str, ...]
+    stacks: tuple[Stack | _Place, ...]
     flips: tuple[bool, bool]
     numbers: np.ndarray
     dark: np.ndarray
@@ -149,7 +162,7 @@ class StoredFrames(Frames):
         """Those of an open file, whose dark and flat frames are read for their means."""
         numbers, path = file.numbers(PROJECTION), file.path.resolve()
         dark, light = _fields_of_light(file)
-        stacks = tuple(str(stack.name) if isinstance(stack, h5py.Dataset) else stack for stack in file.stacks)
+        stacks = tuple(_Place.of(stack) if isinstance(stack, h5py.Dataset) else stack for stack in file.stacks)
         whole = (len(numbers), *file.exposures.views.shape)
         return cls(path, file.label, stacks, file.flips, numbers, dark, light, whole, _stamp(path))
 
@@ -160,9 +173,12 @@ class StoredFrames(Frames):
         changed = f"{self.path} must be the file that was opened, but it has changed since; open it again."
         require(_stamp(self.path) == self.stamp, changed)
         frames = np.empty((len(numbers), *self.shape[1:]), dtype=np.float32)
-        stored = any(isinstance(stack, str) for stack in self.stacks)
-        with open_hdf5(self.path) if stored else nullcontext({}) as file:
-            stacks: list[Any] = [file[stack] if isinstance(stack, str) else stack for stack in self.stacks]
+        files = {stack.file for stack in self.stacks if isinstance(stack, _Place)}
+        with ExitStack() as opened:
+            file = {path: opened.enter_context(open_hdf5(path)) for path in files}
+            stacks: list[Any] = [
+                file[stack.file][stack.name] if isinstance(stack, _Place) else stack for stack in self.stacks
+            ]
             for i, n in enumerate(self.numbers[numbers]):  # one by one: raw frames are wider, and there may be many
                 raw = rows_of(stacks, int(n), slice(0, self.shape[1]), self.flips)
                 frames[i] = raw if self.light is None else relative_intensity(raw, self.dark, self.light)

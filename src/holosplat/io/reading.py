@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from ..checks import InputError, finite, require
+from ..checks import InputError, finite, require, require_regular
 from ..tables import from_table, to_table
 from .tube import Tube
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 Sense = Literal["clockwise", "anticlockwise"]
 
-OWN_WAY = ("angles", "axis_column", "sense", "tube", "exposures")
+OWN_WAY = ("angles", "axis_column", "sense", "tube", "exposures", "allow_external")
 """Fields of `Told` that no loader takes by their own name."""
 
 
@@ -47,6 +47,8 @@ class Told:
     """Of a folder of images: the names of the projections, such as 'raw_*.tif' (default: all but flat* and dark*)."""
     entry: str | None = None
     """HDF5: the group to read, where a file holds several scans."""
+    allow_external: bool = False
+    """HDF5: follow links to other files and virtual datasets, as some beamlines write them; only of files you trust."""
     sources: str | None = None
     """European XFEL: the cameras that are the views, names or parts of them with commas between (default: HPVX2)."""
     trains: str | None = None
@@ -206,6 +208,7 @@ def at_time(scan: Scan, time_frame: int | str | None) -> Scan:
 
 def read_angles(path: Path) -> np.ndarray:
     """The angles [N] in degrees of a text file: numbers separated by lines, spaces or commas; # begins a comment."""
+    require_regular(path, "a text file of angles")
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

@@ -6,10 +6,11 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ..checks import InputError, require
+from ..checks import InputError, require, require_regular
 from .leftovers import is_hidden
 
 IMAGES = (".tif", ".tiff", ".png")
@@ -72,8 +73,9 @@ def _like(pattern: str | None) -> str:
 
 
 def _array(path: Path) -> np.ndarray:
+    require_regular(path, "a NumPy array")
     try:
-        found = np.load(path, allow_pickle=False)
+        found = np.load(path, mmap_mode="r", allow_pickle=False)  # which needs no memory for what is not there
     except (OSError, ValueError) as error:
         raise InputError(f"{path} must be a NumPy array, but reading it failed: {error}.") from None
     require(found.ndim in (2, 3) and found.dtype.kind in "iuf", f"{path} must hold frames [N, H, W] of numbers.")
@@ -87,9 +89,24 @@ def _page_count(file: Path) -> int:
 
     try:
         with tifffile.TiffFile(file) as opened:
-            return len(opened.pages)
+            return _pages_of(opened)
+    except InputError:
+        raise
     except Exception as error:  # tifffile raises many kinds for damaged files
         raise InputError(f"{file} must be a complete TIFF file, but it is damaged or none: {error}.") from None
+
+
+def _pages_of(opened: Any) -> int:
+    """The pages of an open TIFF file; `InputError` where they run in a circle."""
+    places = set[int]()
+    while True:
+        try:
+            place = opened.pages[len(places)].offset
+        except IndexError:
+            return len(places)
+        name = opened.filehandle.path
+        require(place not in places, f"{name} must hold its pages one after another, but they run in a circle.")
+        places.add(place)
 
 
 def _image(file: Path, page: int) -> np.ndarray:

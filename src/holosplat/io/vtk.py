@@ -17,10 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import InputError, require
+from ..checks import InputError, require, require_regular
 from ..mesh import TriangleMesh
 from ..units import LENGTH_UNITS, unit_factor
 from .atomic import atomic_path
+from .guard import xml_fault
 from .leftovers import is_hidden
 from .vtk_guard import cells_fault, legacy_fault
 
@@ -130,6 +131,7 @@ def _read_data(path: Path) -> Any:
     from vtkmodules.vtkIOLegacy import vtkGenericDataObjectReader
     from vtkmodules.vtkIOXML import vtkXMLPolyDataReader, vtkXMLUnstructuredGridReader
 
+    require_regular(path, "a mesh file")
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -148,7 +150,7 @@ def _read_data(path: Path) -> Any:
         raise InputError(f"{path} must be a VTK file of PolyData or UnstructuredGrid, but {what}.")
     if xml and b"</VTKFile>" not in content[-4096:]:  # VTK may fill in what is missing of appended data
         raise _damaged(path, "its closing tag </VTKFile> is missing")
-    if fault := "" if xml else legacy_fault(content):
+    if fault := xml_fault(content) if xml else legacy_fault(content):
         raise _damaged(path, fault)
     reader = readers[kind]()
     reader.SetFileName(str(path))

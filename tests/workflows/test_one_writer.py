@@ -8,13 +8,16 @@ import socket
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from holosplat.checks import InputError
 from holosplat.io.atomic import atomic_path
 from holosplat.io.folder import atomic_folder, is_taken
+from holosplat.io.hdf5_writing import new_hdf5, put
 from holosplat.io.leftovers import LOCK, host, temporary_name
 from holosplat.io.lock import sole_writer
+from holosplat.workflows.check import check
 from holosplat.workflows.manifest import MANIFEST, faults
 from holosplat.workflows.run_folder import RunFolder
 
@@ -162,3 +165,21 @@ def test_a_manifest_says_what_was_written(tmp_path):
         f"{folder.summary} is not what was written",
     ]
     assert faults(folder.path, "another")[0].endswith("is of another run than config.json")
+
+
+def test_check_says_what_is_not_as_it_was_written(tmp_path):
+    folder = begun(tmp_path / "run")
+    with folder.claimed(), new_hdf5(folder.object) as file:
+        put(file, "values", np.arange(1000.0).reshape(20, 50))
+    assert check(folder.path) == check(folder.object) == (1, [])
+    content = bytearray(folder.object.read_bytes())
+    content[content.index(np.arange(300.0, 310.0).tobytes())] ^= 1
+    folder.object.write_bytes(content)
+    count, wrong = check(folder.path)
+    assert count == 1
+    assert wrong[0] == f"{folder.object} is not what was written"
+    assert "filter returned failure" in wrong[1]
+    for path, said in ((tmp_path / "none", "there is nothing"), (tmp_path / "empty", "holds none")):
+        (tmp_path / "empty").mkdir(exist_ok=True)
+        with pytest.raises(InputError, match=said):
+            check(path)
