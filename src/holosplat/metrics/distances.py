@@ -40,7 +40,7 @@ def _mean_square(of: TriangleMesh, to: TriangleMesh) -> float:
 
 
 def _to_triangles(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Distances [N] of points [N, 3] from triangles [N, 3, 3], each from its own: to the plane inside, else to a side."""
+    """Distances [N] of points [N, 3] from triangles [N, 3, 3], each from its own: of the plane inside, or a side."""
     a, b, c = np.moveaxis(corners, 1, 0)
     normal = np.cross(b - a, c - a)
     length = np.linalg.norm(normal, axis=1)

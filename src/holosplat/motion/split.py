@@ -16,6 +16,11 @@ from numpy.polynomial import legendre
 from scipy.spatial.transform import Rotation
 
 PARTS = ("centre", "turn", "stretch", "rest")
+MOST_REST = 1
+"""Highest power of time of the rest: of the next one, fits of paths hold more noise than motion, and half-sets do not
+notice, for both begin at the same fit and keep its fine noise."""
+POOLED = 2.0
+"""What a coefficient's variance in the other bodies counts against a body's own, which one difference tells."""
 
 
 @dataclass(frozen=True)
@@ -82,37 +87,42 @@ class Split:
         turns = Rotation.from_rotvec(vectors).as_matrix()
         return centre[:, None] + np.einsum("tij,tpj->tpi", turns, own)
 
+    def stiffened(self, window: Window) -> Split:
+        """The same motion of a body that keeps the shape of the window's last time."""
+        last = [window.values(np.array([window.last]), part)[0] for part in (self.stretch, self.rest)]
+        still = [np.concatenate([one[None], np.zeros((window.degree, *one.shape))]) for one in last]
+        return Split(self.shape, self.centre, self.turn, *still)
+
 
 def shrunk(splits: Sequence[Split], halves: tuple[Sequence[Split], Sequence[Split]] | None) -> list[Split]:
     """Each coefficient moved towards what it is without data, as far as two half-sets of the data disagree on it.
 
-    Of a coefficient q of all bodies, σ² is the mean of (q₁ - q₂)²/4 over them, and the mean of q² - σ² is how large it
-    is in truth: it is multiplied by 1 - σ²/⟨q²⟩ (empirical Bayes; Efron & Morris 1973, J. Am. Stat. Assoc. 68, 117).
-    Without data centres go with their mean velocity, and all else stays. The rest has one factor a power of time. The
-    means over the window (power 0) are kept. Without `halves` all is kept but the rest's power 2 and higher.
+    A coefficient q has the variance σ² = (q₁ - q₂)²/4 in a body, of which the median over bodies counts `POOLED` times
+    as much as its own; how large it is in truth, τ², is the median of q² less that of σ². It is multiplied by
+    τ²/(τ² + σ²) (empirical Bayes; Efron & Morris 1973, J. Am. Stat. Assoc. 68, 117). Without data centres go with
+    their median velocity, and all else stays. The rest has one factor a power of time, and none above `MOST_REST`. The
+    means over the window (power 0) are kept. Without `halves` all of this is.
     """
-    parts = {name: np.array([getattr(one, name) for one in splits]) for name in ("centre", "turn", "stretch")}
-    usual = {name: np.zeros_like(values) for name, values in parts.items()}
-    usual["centre"][:, 1] = parts["centre"][:, 1].mean(0)
-    kept = {}
-    for name, values in parts.items():
-        factor = np.ones(values.shape[1:])
-        if halves is not None:
-            differ = _differences(halves, name) / 2
-            factor = believed((differ**2).mean(0), ((values - usual[name]) ** 2).mean(0))
-        factor[0] = 1.0
-        kept[name] = usual[name] + factor * (values - usual[name])
-    powers = _rest_factors(splits, halves)
-    rests = [powers[:, None, None] * one.rest for one in splits]
-    return [
-        Split(one.shape, kept["centre"][b], kept["turn"][b], kept["stretch"][b], rests[b])
-        for b, one in enumerate(splits)
-    ]
+    changed = []
+    for name in ("centre", "turn", "stretch"):
+        values = np.array([getattr(one, name) for one in splits])
+        usual = np.zeros_like(values)
+        if name == "centre":
+            usual[:, 1] = np.median(values[:, 1], axis=0)
+        noise = 0 * values if halves is None else _differences(halves, name) ** 2 / 4
+        factors = believed(noise, (values - usual) ** 2)
+        factors[:, 0] = 1.0
+        changed.append(usual + factors * (values - usual))
+    rests = [factor[:, None, None] * one.rest for factor, one in zip(_rest_factors(splits, halves), splits)]
+    return [Split(one.shape, *parts) for one, *parts in zip(splits, *changed, rests)]
 
 
-def believed(noise: np.ndarray, total: np.ndarray) -> np.ndarray:
-    """1 - noise/total, between 0 and 1: of mean squares, the part that is no noise."""
-    return 1 - np.clip(noise / np.maximum(total, np.finfo(float).tiny), 0, 1)
+def believed(noise: np.ndarray, square: np.ndarray) -> np.ndarray:
+    """τ²/(τ² + σ²) [B, …], from the `noise` squared and the `square` of coefficients [B, …]; 1 without noise."""
+    usual = np.median(noise, axis=0)
+    own = (POOLED * usual + noise) / (POOLED + 1)
+    true = np.maximum(np.median(square, axis=0) - usual, 0)
+    return np.where(own > 0, true / np.maximum(true + own, np.finfo(float).tiny), 1.0)
 
 
 def _differences(halves: tuple[Sequence[Split], Sequence[Split]], name: str) -> np.ndarray:
@@ -120,14 +130,13 @@ def _differences(halves: tuple[Sequence[Split], Sequence[Split]], name: str) -> 
 
 
 def _rest_factors(splits: Sequence[Split], halves: tuple[Sequence[Split], Sequence[Split]] | None) -> np.ndarray:
-    """[D + 1] of the rest's powers of time."""
-    powers = len(splits[0].rest)
-    if halves is None:
-        return (np.arange(powers) < 2).astype(float)
-    noise = np.mean([((a.rest - b.rest) ** 2).mean((1, 2)) / 4 for a, b in zip(*halves)], axis=0)
-    total = np.mean([(one.rest**2).mean((1, 2)) for one in splits], axis=0)
-    factors = believed(noise, total)
-    factors[0] = 1.0
+    """[B, D + 1] of the rest's powers of time."""
+    square = np.array([(one.rest**2).mean((1, 2)) for one in splits])
+    noise = 0 * square
+    if halves is not None:
+        noise = np.array([((a.rest - b.rest) ** 2).mean((1, 2)) / 4 for a, b in zip(*halves)])
+    factors = believed(noise, square)
+    factors[:, 0], factors[:, MOST_REST + 1 :] = 1.0, 0.0
     return factors
 
 
