@@ -16,7 +16,6 @@ from ..io.run_scan import run_source
 from ..motion.track import TrackOptions
 from ..report.run import report_run
 from ..workflows.evaluate import evaluate as score
-from ..workflows.moments import moment
 from ..workflows.run_folder import RunFolder
 from ..workflows.track import BODIES, COLLECTION, TRACKS
 from ..workflows.track import track as follow
@@ -41,6 +40,14 @@ class MotionFlags:
     """Bodies of fewer voxels, of a pixel's edge, are not followed."""
     volume_kept: float = 0.006
     """Standard deviation of a body's volume over time, as a share (0: volumes are free)."""
+    area_kept: float = 0.03
+    """The same of its area (0: areas are free)."""
+    apart: float = 0.2
+    """How deep bodies may lie in each other, a standard deviation in pixels (0: as they like)."""
+    acceleration: float = 1e-6
+    """Weight of bent paths (0: as bent as splines can be)."""
+    bending: float = 1.0
+    """Weight of bent surfaces (0: free)."""
     effort: float = 1.0
     """Factor of the numbers of steps."""
 
@@ -49,7 +56,11 @@ class MotionFlags:
         usual = TrackOptions().with_effort(positive("--effort", self.effort))
         paths = replace(usual.paths, degree=self.degree, pieces=self.pieces)
         found = replace(usual.sightings, least_volume=self.least_volume)
-        fits = {name: replace(getattr(usual, name), volume_kept=self.volume_kept) for name in ("stiff", "soft")}
+        known = {name: getattr(self, name) for name in ("volume_kept", "area_kept", "apart", "acceleration")}
+        fits = {
+            name: replace(fit, objective=replace(fit.objective, bending=self.bending), **known)
+            for name, fit in (("stiff", usual.stiff), ("soft", usual.soft))
+        }
         return replace(usual, paths=paths, sightings=found, rounds=self.rounds, **fits)
 
 
@@ -92,10 +103,7 @@ def track(
         )
     write_json(folder.source, run_source(scan, reading))
     evaluation = score(result, measured, None)
-    times = measured.instants.tolist()
-    middle = len(times) // 2
-    shown = measured.at_instant(middle)
-    report = report_run(folder, moment(result, times, middle), shown, evaluation, None)
+    report = report_run(folder, result, measured, evaluation, None)
     for line in evaluation.lines():
         print(line)
     for line in result.verdict.lines("training frames") if result.verdict else ():
