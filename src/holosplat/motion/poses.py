@@ -1,9 +1,10 @@
-"""Pose search: affine bodies on straight paths that explain the shadows, one after the other."""
+"""Pose search: bodies of known rest shape on straight paths that explain the shadows of several times, one after the
+other (matching pursuit: Mallat & Zhang 1993, IEEE Trans. Signal Process. 41, 3397), and then all together."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -15,136 +16,192 @@ from .shadows import Shadows
 from .templates import Search, Templates
 
 ROUNDED = 3.0
+"""Standard deviations from which on a misfit counts by its size, no longer by its square: shadows of other bodies."""
+MODEL_ERROR = 0.15
+"""What the search expects affine bodies to miss of a shadow [radii of the ball of their volume], at least."""
 STRAIN = 0.02
+"""Cost of a squared strain of one, and of a turn by a radian, as a share of what the body casts."""
+LEAST, ALSO = 0.35, 0.8
+"""Share of what its shadow is worth by which a body must explain the frames; and share of the best one's from which on
+others are taken in the same round."""
+TRIED, FIRST_STEPS, STEPS, LAST_STEPS = 4, 8, 5, 15
+"""Places that are tried in a round, and steps of the search for better poses: of one, of all, of all in the end."""
+SAME_HEIGHT = 1.0
+"""Radii within which bodies that two beams might exchange are at one height."""
+MOST_ROUNDS = 60
+NUMBERS = 18
+"""Unknowns of a pose: affine matrix, centre, velocity, turning."""
+
+Parts = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
 @dataclass(frozen=True)
 class Pose:
-    """A body: vertices [P, 3] at the middle time, velocity [3], turning [3] (rotation vector), per unit of time."""
+    """A body x = M x₀ + c on a straight path. matrix: M [3, 3], of determinant one; centre: c [3] at time 0 [pixels];
+    velocity [3] [pixels] and turning [3] (rotation vector) per unit of time, of which the scan has from -1 to 1."""
 
-    nodes: np.ndarray
+    matrix: np.ndarray
+    centre: np.ndarray
     velocity: np.ndarray
     turning: np.ndarray
 
+    def nodes(self, rest: np.ndarray, time: float) -> np.ndarray:
+        """Where points `rest` [P, 3] about the centre are at a time, [P, 3]; turns are taken to be small."""
+        away = rest @ self.matrix.T
+        return away + time * np.cross(self.turning, away) + self.centre + time * self.velocity
+
+    def scaled(self, factor: float) -> Pose:
+        """The same in another unit of length."""
+        return replace(self, centre=factor * self.centre, velocity=factor * self.velocity)
+
 
 class Explained:
-    """What bodies of one mesh cost: the robust misfit of the shadows, and their strain."""
+    """What bodies of one rest shape leave of shadows, and what they cost."""
 
-    def __init__(self, mesh: TriangleMesh, seen: Shadows, noise: float) -> None:
-        self.mesh, self.seen, self.noise = mesh, seen, noise
-        self.target = torch.from_numpy(seen.thickness)
-        rest = torch.from_numpy(mesh.vertices - mesh.vertices.mean(0))
-        self.rest, self.inverse = rest, torch.linalg.pinv(rest)
-        self.radius = float(rest.norm(dim=1).mean())
+    def __init__(self, mesh: TriangleMesh, seen: Shadows) -> None:
+        radius = (3 * mesh.volume / (4 * np.pi)) ** (1 / 3)
+        self.mesh, self.seen = mesh, seen
+        self.noise = max(seen.noise, MODEL_ERROR * radius)
+        self.target, self.rest = torch.from_numpy(seen.thickness), torch.from_numpy(mesh.vertices)
+        self.radius = float(self.rest.norm(dim=1).mean())
         self.instants = np.unique(seen.times)
-        self.scale = float((mesh.volume ** (4 / 3)) * len(seen) / noise**2)
+        self.worth = STRAIN * mesh.volume ** (4 / 3) * len(seen) / self.noise**2
 
-    def faces(self, count: int) -> Tensor:
-        own = torch.from_numpy(self.mesh.faces)
-        return torch.cat([own + len(self.rest) * k for k in range(count)])
+    def beside(self, images: np.ndarray) -> Explained:
+        """The same beside matter that casts `images` [N, H, W]."""
+        return Explained(self.mesh, self.seen.without(images))
 
-    def cost(self, left: Tensor) -> Tensor:
+    def cost(self, left: Tensor | np.ndarray) -> Tensor:
+        """Of shadows [N, H, W] that are left, in likelihoods: squares, but of large misfits their size."""
         width = ROUNDED * self.noise
-        return ((left.square() + width**2).sqrt() - width).sum() * width / self.noise**2
-
-    def nodes(self, matrices: Tensor, centres: Tensor, velocity: Tensor, turning: Tensor, time: float) -> Tensor:
-        """[B P, 3] of bodies [B]: matrices [B, 3, 3] of determinant one on the rest shape."""
-        away = torch.einsum("bij,pj->bpi", matrices, self.rest)
-        away = away + time * torch.linalg.cross(turning[:, None].expand_as(away), away)
-        return (away + (centres + time * velocity)[:, None]).flatten(0, 1)
-
-    def project(self, parts: tuple[Tensor, Tensor, Tensor, Tensor]) -> Tensor:
-        faces, nodes = self.faces(len(parts[0])), {}
-        for time in self.instants:
-            nodes[time] = self.nodes(*parts, float(time))
-        return self.seen.project([nodes[time] for time in self.seen.times], faces)
-
-    def strain(self, matrices: Tensor) -> Tensor:
-        right = matrices.mT @ matrices
-        return (right - torch.eye(3, dtype=right.dtype)).square().sum((1, 2))
-
-    def parts(self, poses: Sequence[Pose]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        nodes = torch.from_numpy(np.array([pose.nodes for pose in poses]))
-        centres = nodes.mean(1)
-        matrices = unimodular(torch.einsum("pj,bpi->bij", self.inverse.mT, nodes - centres[:, None]))
-        motion = [torch.from_numpy(np.array([getattr(p, name) for p in poses])) for name in ("velocity", "turning")]
-        return matrices, centres, motion[0], motion[1]
-
-    def poses(self, parts: tuple[Tensor, Tensor, Tensor, Tensor]) -> list[Pose]:
-        matrices, centres, velocity, turning = parts
-        nodes = torch.einsum("bij,pj->bpi", matrices, self.rest) + centres[:, None]
-        return [Pose(n.numpy(), v.numpy(), w.numpy()) for n, v, w in zip(nodes, velocity, turning)]
-
-    def improved(self, poses: Sequence[Pose], steps: int) -> tuple[list[Pose], float, float]:
-        """Poses that explain more, their misfit and their strain's cost."""
-        first = self.parts(poses)
-        count, r = len(poses), self.radius
-
-        def moved(u: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-            matrices = unimodular(first[0] @ (torch.eye(3, dtype=u.dtype) + u[:, :9].reshape(-1, 3, 3) / r))
-            return matrices, first[1] + u[:, 9:12], first[2] + u[:, 12:15], first[3] + u[:, 15:18] / r
-
-        def value(u: Tensor) -> tuple[Tensor, Tensor]:
-            parts = moved(u)
-            extra = self.strain(parts[0]).sum() + parts[3].square().sum()
-            return self.cost(self.target - self.project(parts)), STRAIN * self.scale * extra
-
-        def both(flat: np.ndarray) -> tuple[float, np.ndarray]:
-            u = torch.from_numpy(flat.reshape(count, 18).copy()).requires_grad_()
-            total = sum(value(u))
-            total.backward()
-            return float(total.detach()), u.grad.numpy().ravel()
-
-        found = minimize(both, np.zeros(18 * count), jac=True, method="L-BFGS-B", options={"maxiter": steps})
-        u = torch.from_numpy(found.x.reshape(count, 18))
-        with torch.no_grad():
-            misfit, extra = value(u)
-            return self.poses(moved(u)), float(misfit), float(extra)
+        return ((torch.as_tensor(left).square() + width**2).sqrt() - width).sum() * width / self.noise**2
 
     def images(self, poses: Sequence[Pose]) -> np.ndarray:
+        """Thickness [N, H, W] of bodies in `poses`."""
+        if not poses:
+            return np.zeros_like(self.seen.thickness)
         with torch.no_grad():
-            return self.project(self.parts(poses)).numpy()
+            return self._project(_parts(poses)).numpy()
+
+    def share(self, pose: Pose) -> float:
+        """What the pose explains of the shadows, over what it would of its own: 1 for a body that is there alone."""
+        images = self.images([pose])
+        gain = self.cost(self.target) - self.cost(self.seen.thickness - images)
+        return float(gain / self.cost(images).clamp_min(1.0))
+
+    def improved(self, poses: Sequence[Pose], steps: int) -> list[Pose]:
+        """Poses that explain more, by so many steps of L-BFGS."""
+        if not poses:
+            return []
+        first = _parts(poses)
+
+        def moved(u: Tensor) -> Parts:
+            matrices = first[0] @ (torch.eye(3, dtype=u.dtype) + u[:, :9].reshape(-1, 3, 3) / self.radius)
+            return (
+                _unimodular(matrices),
+                first[1] + u[:, 9:12],
+                first[2] + u[:, 12:15],
+                first[3] + u[:, 15:] / self.radius,
+            )
+
+        def value(flat: np.ndarray) -> tuple[float, np.ndarray]:
+            u = torch.from_numpy(flat.reshape(-1, NUMBERS).copy()).requires_grad_()
+            parts = moved(u)
+            strain = parts[0].mT @ parts[0] - torch.eye(3, dtype=u.dtype)
+            total = self.worth * (strain.square().sum() + parts[3].square().sum())
+            total = total + self.cost(self.target - self._project(parts))
+            (gradient,) = torch.autograd.grad(total, u)
+            return float(total.detach()), gradient.numpy().ravel()
+
+        start = np.zeros(NUMBERS * len(poses))
+        found = minimize(value, start, jac=True, method="L-BFGS-B", options={"maxiter": steps})
+        return _poses(moved(torch.from_numpy(found.x.reshape(-1, NUMBERS))))
+
+    def _project(self, parts: Parts) -> Tensor:
+        matrices, centres, velocity, turning = parts
+        own = torch.from_numpy(self.mesh.faces)
+        faces = torch.cat([own + len(self.rest) * k for k in range(len(matrices))])
+        away = torch.einsum("bij,pj->bpi", matrices, self.rest)
+        turned = torch.linalg.cross(turning[:, None].expand_as(away), away)
+        nodes = {t: (away + t * turned + (centres + t * velocity)[:, None]).flatten(0, 1) for t in self.instants}
+        return self.seen.project([nodes[t] for t in self.seen.times], faces)
 
 
-def unimodular(matrices: Tensor) -> Tensor:
+def pursued(mesh: TriangleMesh, seen: Shadows, velocities: np.ndarray) -> list[Pose]:
+    """Poses of all bodies of the rest shape `mesh` [pixels] that shadows show, on paths near `velocities` [K, 3]."""
+    search = Search(Templates.of(mesh, seen), seen, velocities)
+    every, found = Explained(mesh, seen), list[Pose]()
+    left = every
+    for _ in range(MOST_ROUNDS):
+        tried = list[tuple[float, Pose]]()
+        for hit in search.tops(left.seen, TRIED):
+            start = Pose(hit.matrix, hit.centre, hit.velocity, np.zeros(3))
+            (pose,) = left.improved([start], FIRST_STEPS)
+            tried.append((left.share(pose), pose))
+        tried.sort(key=lambda pair: -pair[0])
+        if not tried or tried[0][0] < LEAST:
+            break
+        least = max(LEAST, ALSO * tried[0][0])
+        for _, pose in tried:
+            if left.share(pose) >= least:
+                found.append(pose)
+                left = left.beside(left.images([pose]))
+        found = every.improved(found, STEPS)
+        left = every.beside(every.images(found))
+    found = exchanged(every, search, every.improved(found, LAST_STEPS))
+    return [pose for k, pose in enumerate(found) if _needed(every, found, k)]
+
+
+def exchanged(every: Explained, search: Search, found: list[Pose]) -> list[Pose]:
+    """The same bodies, pairs of which have exchanged what two beams show of them where that explains more.
+
+    Two beams see two bodies at one height as they would see two others, each in the shadow of the one in the first
+    beam and of the other in the second. Their shapes and motion tell which they are.
+    """
+    seen, directions = every.seen, np.unique(search.templates.directions, return_index=True)[1]
+    if len(directions) != 2 or len(found) < 2:
+        return found
+    first, second = (seen.rotations[int(n)].numpy() for n in directions)
+    height = np.cross(first[2], second[2]) / np.linalg.norm(np.cross(first[2], second[2]))
+    found = list(found)
+    for i in range(len(found)):
+        for j in range(i):
+            if abs((found[i].centre - found[j].centre) @ height) > SAME_HEIGHT * every.radius:
+                continue
+            left = every.beside(every.images([pose for k, pose in enumerate(found) if k not in (i, j)]))
+            pair = [found[i], found[j]]
+            others = []
+            for one, other in (pair, pair[::-1]):
+                both = np.concatenate([first[:2], second[:2]])
+                moved = [
+                    np.linalg.lstsq(both, np.concatenate([first[:2] @ a, second[:2] @ b]), rcond=1e-9)[0]
+                    for a, b in ((one.centre, other.centre), (one.velocity, other.velocity))
+                ]
+                hit = search.here(left.seen, moved[0], moved[1])
+                others.append(Pose(hit.matrix, hit.centre, hit.velocity, np.zeros(3)))
+            others = left.improved(others, 2 * FIRST_STEPS)
+            costs = [float(left.cost(left.seen.thickness - left.images(poses))) for poses in (pair, others)]
+            if costs[1] < costs[0]:
+                found[i], found[j] = others
+    return every.improved(found, STEPS)
+
+
+def _needed(every: Explained, found: Sequence[Pose], number: int) -> bool:
+    """Whether the others do not explain what a body does."""
+    others = [pose for k, pose in enumerate(found) if k != number]
+    return every.beside(every.images(others)).share(found[number]) >= LEAST
+
+
+def _unimodular(matrices: Tensor) -> Tensor:
     return matrices / torch.linalg.det(matrices).abs().clamp_min(1e-9)[:, None, None] ** (1 / 3)
 
 
-def pursued(mesh, seen, velocities, noise, most=30, least=0.3, tries=4, say=lambda *a: None):
-    templates = Templates.of(mesh, seen)
-    search = Search(templates, seen, velocities)
-    every, found = Explained(mesh, seen, noise), []
-    left = seen
-    say("templates", len(templates.nodes), templates.bin, templates.images.shape)
-    while len(found) < most:
-        tops = search.tops(left)[:tries]
-        if not tops:
-            break
-        alone = Explained(mesh, left, noise)
-        before = float(alone.cost(alone.target))
-        tried = []
-        for hit in tops:
-            start = Pose(hit.nodes, hit.velocity, np.zeros(3))
-            (pose,), misfit, strain = alone.improved([start], 8)
-            own = float(alone.cost(torch.from_numpy(alone.images([pose]))))
-            tried.append(((before - misfit - strain) / max(own, 1.0), pose))
-        tried.sort(key=lambda pair: -pair[0])
-        say(len(found), [round(t[0], 2) for t in tried], np.round(tried[0][1].nodes.mean(0), 1))
-        if tried[0][0] < least:
-            break
-        taken = 0
-        for share, pose in tried:
-            images = alone.images([pose])
-            before = float(alone.cost(torch.from_numpy(left.thickness)))
-            gain = before - float(alone.cost(torch.from_numpy(left.thickness - images)))
-            now = gain / max(float(alone.cost(torch.from_numpy(images))), 1.0)
-            if share >= least and (taken == 0 or now > 0.8 * tried[0][0]):
-                found.append(pose)
-                left = left.without(images)
-                taken += 1
-        found, _, _ = every.improved(found, 5)
-        left = seen.without(every.images(found))
-        say("  taken", taken)
-    found, misfit, strain = every.improved(found, 20)
-    say("end", misfit, strain)
-    return found
+def _parts(poses: Sequence[Pose]) -> Parts:
+    names = ("matrix", "centre", "velocity", "turning")
+    first, second, third, fourth = (torch.from_numpy(np.array([getattr(p, name) for p in poses])) for name in names)
+    return first, second, third, fourth
+
+
+def _poses(parts: Parts) -> list[Pose]:
+    matrices, centres, velocity, turning = (part.detach().numpy() for part in parts)
+    return [Pose(*numbers) for numbers in zip(matrices, centres, velocity, turning)]

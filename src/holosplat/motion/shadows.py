@@ -10,20 +10,25 @@ import torch
 from torch import Tensor
 
 from ..matter import DeltaBeta
-from ..optics.noise import noise_level
+from ..optics.noise import noise_level, noise_levels
 from ..optics.retrieval import tikhonov
 from ..projectors.surface import surface_thickness
 from ..scan import Scan
 from ..units import wavelength, wavenumber
 
+QUIETEST = 1e-4
+"""Noise of frames that is assumed at least."""
+EVERYWHERE = 1e-3
+"""Information at all frequencies beside that of phase contrast: frames in contact have that alone."""
+
 
 @dataclass(frozen=True)
 class Shadows:
-    """Thickness of one material in N frames, lengths in pixels of edge `unit` [m].
+    """Thickness of one material in N frames, lengths in pixels.
 
     thickness: [N, H, W] float64; rotations [N, 3, 3], shifts [N, 2] float64: as of `surface_thickness`; times: [N],
-    from -1 to 1 over the whole scan; noise: standard deviation of the thickness; phases: [N, 2], λz/p² and the contrast
-    2kδp in units of the frames' noise.
+    from -1 to 1 over the whole scan; noise: standard deviation of the thickness; fringes: [N] λz/p², contrast: [N]
+    2kδp over the noise of a frame's pixel, p the pixel size.
     """
 
     thickness: np.ndarray
@@ -31,27 +36,24 @@ class Shadows:
     shifts: Tensor
     times: np.ndarray
     noise: float
-    unit: float
     fringes: np.ndarray
     contrast: np.ndarray
 
     @classmethod
     def of(cls, scan: Scan, material: DeltaBeta, first: float, last: float) -> Shadows:
-        """What the frames of `scan` show, at times between `first` and `last` [s]; all pixels are of one size."""
-        exposures, pitch = scan.exposures, scan.views.pixel_size
-        thickness = tikhonov(torch.from_numpy(scan.frames), exposures, *material).double() / pitch
-        views = scan.views
-        delta = exposures.refraction(*material)[0]
-        sigma = max(noise_level(torch.from_numpy(scan.frames)), 1e-6)
+        """What the frames of `scan`, of pixels of one size, show; first, last: times [s] of the whole scan."""
+        exposures, views, pitch = scan.exposures, scan.views, scan.views.pixel_size
+        frames = torch.from_numpy(scan.frames)
+        thickness = tikhonov(frames, exposures, *material).double() / pitch
+        per_pixel = 2 * wavenumber(exposures.energy_kev) * exposures.refraction(*material)[0] * pitch
         return cls(
             thickness.numpy(),
             torch.from_numpy(np.ascontiguousarray(views.rotations)),
             torch.from_numpy(views.shifts / pitch),
             2 * (exposures.time - first) / (last - first) - 1,
-            max(noise_level(thickness.float()), 1e-6),
-            pitch,
+            noise_level(thickness.float()),
             wavelength(exposures.energy_kev) * exposures.distance / pitch**2,
-            2 * wavenumber(exposures.energy_kev) * delta * pitch / sigma,
+            per_pixel / max(float(noise_levels(frames).mean()), QUIETEST),
         )
 
     def __len__(self) -> int:
@@ -74,7 +76,6 @@ class Shadows:
             thickness=parts.mean((2, 4)) / factor,
             shifts=self.shifts / factor + torch.from_numpy(moved),
             noise=self.noise / factor**2,
-            unit=self.unit * factor,
             fringes=self.fringes / factor**2,
             contrast=self.contrast * factor**2,
         )
@@ -88,6 +89,12 @@ class Shadows:
         index = np.asarray(numbers)
         parts = {name: getattr(self, name)[index] for name in ("thickness", "rotations", "shifts", "times")}
         return replace(self, **parts, fringes=self.fringes[index], contrast=self.contrast[index])
+
+    def information(self, n: int, size: tuple[int, int]) -> Tensor:
+        """What frame `n` knows of the thickness at each frequency of `rfft2` on a raster of `size`: |H|²/σ²."""
+        fy, fx = np.fft.fftfreq(size[0]), np.fft.rfftfreq(size[1])
+        chi = np.pi * self.fringes[n] * (fy[:, None] ** 2 + fx**2)
+        return torch.from_numpy((self.contrast[n] * np.sin(chi)) ** 2 + EVERYWHERE).float()
 
     def project(self, nodes: Sequence[Tensor] | Tensor, faces: Tensor, lines: int = 1) -> Tensor:
         """Thickness [N, H, W] of a mesh with vertices `nodes` [N, P, 3] in each frame; differentiable."""

@@ -16,10 +16,13 @@ from ..optics.background import Light
 from ..progress import FitProgress
 from ..representations import MovingSurfaces, TimeBasis
 from ..scan import Scan
+from .elastic import Rest
 from .fit import MotionFit, motion_fit
 from .identities import LinkOptions
+from .known import KnownBodies
 from .pieces import PathOptions, chosen_paths
 from .remainder import apart, beside, joined, only, sure_ones, whole_ones
+from .rest_shape import KnownBody
 from .sightings import Sighting, SightingOptions, sightings
 from .start import first_paths
 
@@ -38,6 +41,8 @@ class TrackOptions:
 
     kind: ClassVar[str] = "track"
 
+    body: KnownBody | None = None
+    """What is known of the bodies' shape at rest, which makes two beams enough; None: nothing."""
     sightings: SightingOptions = field(default_factory=SightingOptions)
     """How bodies are found at single times."""
     links: LinkOptions = field(default_factory=LinkOptions)
@@ -96,7 +101,6 @@ def follow(
     train = scan.train()
     require_times(train)
     run = _Following(train, material, options, seed, light, on_progress)
-    run.look(train)
     bodies = run.whole(run.fitted("stiff", run.first()))
     for _ in range(options.rounds):
         more = run.more(bodies)
@@ -104,7 +108,8 @@ def follow(
             break
         bodies = run.whole(run.fitted("stiff", more))
     bodies = run.fitted("soft", run.on_chosen_paths(bodies))
-    return Followed(bodies, run.records, run.oversample, run.timing, tuple(len(one) for one in run.seen))
+    found = tuple(len(one) for one in run.seen) or (bodies.count,) * len(train.instants)
+    return Followed(bodies, run.records, run.oversample, run.timing, found)
 
 
 @dataclass
@@ -121,6 +126,7 @@ class _Following:
     records: list[Record] = field(default_factory=list)
     timing: dict[str, float] = field(default_factory=dict)
     oversample: int = 1
+    known: KnownBodies | None = None
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:
@@ -146,13 +152,39 @@ class _Following:
         """Bodies on first paths; the doubtful ones are left to be found beside the others."""
         times, options = self.train.instants, self.options
         basis = TimeBasis(float(times[0]), float(times[-1]), options.paths.degree)
+        if options.body is not None:
+            return self._posed(options.body, basis)
+        self.look(self.train)
         found = first_paths(self.seen, times, basis, self.train.views.finest, self.material, options.links)
         sure = sure_ones(found, self.train.views, times)
         return found if options.rounds == 0 or len(sure) == found.count else only(found, sure)
 
+    @property
+    def rest(self) -> Rest | None:
+        """What is known of the bodies' shape."""
+        return None if self.known is None else self.known.rest
+
+    def _posed(self, body: KnownBody, basis: TimeBasis) -> MovingSurfaces:
+        """Bodies of known shape on first paths."""
+        self.on_progress("poses", 0.0, {})
+        with self._timed("poses"):
+            self.known = KnownBodies(self.train, self.material, body)
+            found = self.known.bodies(basis)
+        if found is None:
+            raise InputError(
+                f"no body of the shape {body.shape} was found in the frames; check its size, the material and the "
+                "pixel size, or leave --body."
+            )
+        return found
+
     def more(self, bodies: MovingSurfaces) -> MovingSurfaces | None:
         """`bodies`, and those that frames show beside them; None where there are none."""
         times = self.train.instants
+        if self.known is not None:
+            with self._timed("poses"):
+                new = self.known.bodies(bodies.basis, bodies)
+            own = [] if new is None else apart(new, bodies, times)
+            return joined(bodies, only(new, own)) if new is not None and own else None
         found = self.look(beside(self.train, bodies, self.oversample), self.options.fainter)
         try:
             new = first_paths(found, times, bodies.basis, bodies.unit_length, self.material, self.options.links)
@@ -170,11 +202,13 @@ class _Following:
         """`bodies` on paths of as many pieces as frames ask for."""
         self.on_progress("paths", 0.0, {})
         with self._timed("paths"):
-            return chosen_paths(self.train, bodies, self.options.paths, self.options.stiff, self.seed, self.light)
+            return chosen_paths(
+                self.train, bodies, self.options.paths, self.options.stiff, self.seed, self.light, self.rest
+            )
 
     def fitted(self, name: Literal["stiff", "soft"], start: MovingSurfaces) -> MovingSurfaces:
         """`start` after the fit of that name."""
-        fit = motion_fit(self.train, start, getattr(self.options, name), self.seed, self.light)
+        fit = motion_fit(self.train, start, getattr(self.options, name), self.seed, self.light, self.rest)
         before = len(self.records)
 
         def keep(record: Record) -> None:
