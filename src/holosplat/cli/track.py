@@ -41,6 +41,14 @@ class MotionFlags:
     """Bodies of fewer voxels, of a pixel's edge, are not followed."""
     volume_kept: float = 0.006
     """Standard deviation of a body's volume over time, as a share (0: volumes are free)."""
+    area_kept: float = 0.03
+    """The same of its area (0: areas are free)."""
+    apart: float = 0.2
+    """How deep bodies may lie in each other, a standard deviation in pixels (0: as they like)."""
+    acceleration: float = 1e-6
+    """Weight of bent paths (0: as bent as splines can be)."""
+    bending: float = 1.0
+    """Weight of bent surfaces (0: free)."""
     effort: float = 1.0
     """Factor of the numbers of steps."""
 
@@ -49,7 +57,11 @@ class MotionFlags:
         usual = TrackOptions().with_effort(positive("--effort", self.effort))
         paths = replace(usual.paths, degree=self.degree, pieces=self.pieces)
         found = replace(usual.sightings, least_volume=self.least_volume)
-        fits = {name: replace(getattr(usual, name), volume_kept=self.volume_kept) for name in ("stiff", "soft")}
+        known = {name: getattr(self, name) for name in ("volume_kept", "area_kept", "apart", "acceleration")}
+        fits = {
+            name: replace(fit, objective=replace(fit.objective, bending=self.bending), **known)
+            for name, fit in (("stiff", usual.stiff), ("soft", usual.soft))
+        }
         return replace(usual, paths=paths, sightings=found, rounds=self.rounds, **fits)
 
 

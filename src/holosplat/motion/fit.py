@@ -24,7 +24,8 @@ from ..optics.noise import noise_share
 from ..representations import MovingSurfaces
 from ..representations.isosurface import adjacency
 from ..scan import Scan
-from .terms import COEFFICIENTS, Acceleration, MovingBending, VolumeKept
+from .contact import Apart
+from .terms import COEFFICIENTS, Acceleration, MovingBending, area_kept, volume_kept
 
 OPEN = 1e-3
 """Share of the times' mean square below which a coefficient is taken to be seen so well: what frames hardly see of a
@@ -47,13 +48,17 @@ class MotionFit:
     """Weight of bent paths: the sum of squared coefficients of acceleration [pixels² per piece⁴]."""
     volume_kept: float = 0.006
     """Standard deviation of a body's volume over time, as a share (0: volumes are free). Of red cells it is that."""
+    area_kept: float = 0.03
+    """The same of its area: red cells in flow change theirs by 1 to 5 % (0: areas are free)."""
+    apart: float = 0.2
+    """How deep bodies may lie in each other, a standard deviation [pixels] (0: as they like)."""
     objective: Objective = field(default_factory=_objective)
     """How frames are compared, and what bending costs."""
     schedule: Schedule = field(default_factory=lambda: Schedule(steps=100, views_per_step=16))
     """The loop; memory is that of the frames of one step."""
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "stiffness", "acceleration", "volume_kept")
+        at_least(self, 0, "stiffness", "acceleration", "volume_kept", "area_kept", "apart")
         positive("rate", self.rate, "pixels")
 
 
@@ -90,8 +95,14 @@ def _terms(base: Ground, start: MovingSurfaces, options: MotionFit) -> list[Term
         found.append(MovingBending(weight, start, times))
     if options.acceleration > 0 and len(start.basis.curvature()):
         found.append(Acceleration(options.acceleration, start))
-    if options.volume_kept > 0 and start.basis.count > 1:
-        found.append(VolumeKept(_of_likelihood(base) * start.basis.count / 2 / options.volume_kept**2, start, times))
+    moves = start.basis.count > 1
+    for kept, deviation in ((volume_kept, options.volume_kept), (area_kept, options.area_kept)):
+        if deviation > 0 and moves:
+            found.append(kept(_of_likelihood(base) * start.basis.count / 2 / deviation**2, start, times))
+    if options.apart > 0 and start.count > 1:
+        found.append(
+            Apart(_of_likelihood(base) * start.basis.count / 2 / options.apart**2, start, base.train.exposures.time)
+        )
     return found
 
 
@@ -102,7 +113,9 @@ def _of_likelihood(base: Ground) -> float:
     """
     width, objective = base.frames.resolved.get("rounding", 0.0), base.frames.objective
     require(
-        width > 0, "volume_kept needs frames that are compared by `rounded`; raise its weight, or leave volumes free."
+        width > 0,
+        "volume_kept, area_kept and apart need frames that are compared by `rounded`; raise its weight, or set all "
+        "three to 0.",
     )
     noise = width / objective.rounding
     return objective.rounded * noise**2 / width / base.train.frames.size
