@@ -16,7 +16,6 @@ from ..io.run_scan import run_source
 from ..motion.track import TrackOptions
 from ..report.run import report_run
 from ..workflows.evaluate import evaluate as score
-from ..workflows.moments import moment
 from ..workflows.run_folder import RunFolder
 from ..workflows.track import BODIES, COLLECTION, TRACKS
 from ..workflows.track import track as follow
@@ -104,10 +103,7 @@ def track(
         )
     write_json(folder.source, run_source(scan, reading))
     evaluation = score(result, measured, None)
-    times = measured.instants.tolist()
-    middle = len(times) // 2
-    shown = measured.at_instant(middle)
-    report = report_run(folder, moment(result, times, middle), shown, evaluation, None)
+    report = report_run(folder, result, measured, evaluation, None)
     for line in evaluation.lines():
         print(line)
     for line in result.verdict.lines("training frames") if result.verdict else ():

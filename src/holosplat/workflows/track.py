@@ -111,7 +111,7 @@ def write_tracks(folder: RunFolder, bodies: MovingSurfaces, scan: Scan) -> None:
     with atomic_path(folder.path / TRACKS) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(columns())
-        writer.writerows(row(one) for one in measured(bodies, times, scan.views))
+        writer.writerows(row(one) for one in measured(bodies, scan.exposures))
     with atomic_folder(folder.path / BODIES) as temporary:
         for t, time in enumerate(times):
             named = [(f"{mesh.name}_{t:04d}.vtp", mesh) for mesh in bodies.bodies(float(time))]
