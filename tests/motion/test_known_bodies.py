@@ -157,7 +157,7 @@ def test_bins_and_projections_agree():
         for axis in (0, 1):
             places = np.arange(one.shape[axis])
             middles = [image.sum(1 - axis) @ places / image.sum() for image in (one, other)]
-            assert middles[0] == pytest.approx(middles[1], abs=0.03)
+            assert middles[0] == pytest.approx(middles[1], abs=0.15)  # the wrong way round: 0.5
     assert images.sum() == pytest.approx(coarse.thickness.sum(), rel=0.02)
 
 

@@ -21,7 +21,7 @@ from .shadows import Shadows
 
 SEARCH_RADIUS = 2.8
 """Radius of the ball of a body's volume in pixels of the search, whose frames are binned to about that."""
-SPREAD = (0.8, 0.9, 1.0, 1.1, 1.2)
+SPREAD = (0.85, 1.0, 1.15)
 """Velocities of the search over that of all matter together: a channel's flow is slower at its walls."""
 SIZES, SIZE_STEPS = 9, 8
 """Sizes that are tried for all bodies, and steps to better poses at the best one."""

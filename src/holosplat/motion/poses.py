@@ -26,6 +26,8 @@ LEAST, ALSO = 0.35, 0.8
 others are taken in the same round."""
 TRIED, FIRST_STEPS, STEPS, LAST_STEPS = 4, 8, 5, 15
 """Places that are tried in a round, and steps of the search for better poses: of one, of all, of all in the end."""
+SURE, LOOKS = 0.75, 4
+"""Share below which a body may stand for others, and how often that is looked into."""
 SAME_HEIGHT = 1.0
 """Radii within which bodies that two beams might exchange are at one height."""
 MOST_ROUNDS = 60
@@ -129,12 +131,18 @@ class Explained:
 
 def pursued(mesh: TriangleMesh, seen: Shadows, velocities: np.ndarray) -> list[Pose]:
     """Poses of all bodies of the rest shape `mesh` [pixels] that shadows show, on paths near `velocities` [K, 3]."""
-    search = Search(Templates.of(mesh, seen), seen, velocities)
-    every, found = Explained(mesh, seen), list[Pose]()
-    left = every
-    for _ in range(MOST_ROUNDS):
+    search, every = Search(Templates.of(mesh, seen), seen, velocities), Explained(mesh, seen)
+    found = _more(every, search, [])
+    found = _second_look(every, search, exchanged(every, search, every.improved(found, LAST_STEPS)))
+    return [pose for k, pose in enumerate(found) if _share(every, found, k) >= LEAST]
+
+
+def _more(every: Explained, search: Search, found: list[Pose], without: Sequence[np.ndarray] = ()) -> list[Pose]:
+    """`found`, and those that explain what these leave, one round after the other; the first one not near `without`."""
+    left = every.beside(every.images(found))
+    for turn in range(MOST_ROUNDS):
         tried = list[tuple[float, Pose]]()
-        for hit in search.tops(left.seen, TRIED):
+        for hit in search.tops(left.seen, TRIED, without if turn == 0 else ()):
             start = Pose(hit.matrix, hit.centre, hit.velocity, np.zeros(3))
             (pose,) = left.improved([start], FIRST_STEPS)
             tried.append((left.share(pose), pose))
@@ -144,12 +152,30 @@ def pursued(mesh: TriangleMesh, seen: Shadows, velocities: np.ndarray) -> list[P
         least = max(LEAST, ALSO * tried[0][0])
         for _, pose in tried:
             if left.share(pose) >= least:
-                found.append(pose)
+                found = [*found, pose]
                 left = left.beside(left.images([pose]))
         found = every.improved(found, STEPS)
         left = every.beside(every.images(found))
-    found = exchanged(every, search, every.improved(found, LAST_STEPS))
-    return [pose for k, pose in enumerate(found) if _needed(every, found, k)]
+    return found
+
+
+def _second_look(every: Explained, search: Search, found: list[Pose]) -> list[Pose]:
+    """The bodies without those that explain least, where others in their place explain more.
+
+    What was found first may have been taken for the shadows of several bodies, or for their crossing.
+    """
+    for _ in range(LOOKS):
+        shares = [_share(every, found, k) for k in range(len(found))]
+        if not shares or min(shares) >= SURE:
+            break
+        worst = int(np.argmin(shares))
+        others = [pose for k, pose in enumerate(found) if k != worst]
+        again = every.improved(_more(every, search, others, [found[worst].centre]), STEPS)
+        costs = [float(every.cost(every.seen.thickness - every.images(poses))) for poses in (found, again)]
+        if costs[1] >= costs[0]:
+            break
+        found = exchanged(every, search, again)
+    return found
 
 
 def exchanged(every: Explained, search: Search, found: list[Pose]) -> list[Pose]:
@@ -186,10 +212,10 @@ def exchanged(every: Explained, search: Search, found: list[Pose]) -> list[Pose]
     return every.improved(found, STEPS)
 
 
-def _needed(every: Explained, found: Sequence[Pose], number: int) -> bool:
-    """Whether the others do not explain what a body does."""
+def _share(every: Explained, found: Sequence[Pose], number: int) -> float:
+    """What a body explains of that which the others leave."""
     others = [pose for k, pose in enumerate(found) if k != number]
-    return every.beside(every.images(others)).share(found[number]) >= LEAST
+    return every.beside(every.images(others)).share(found[number])
 
 
 def _unimodular(matrices: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ that bodies that lie behind each other do not pass for one.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,7 +22,7 @@ from .shadows import Shadows
 
 STRETCHES = (1.35, 1.8)
 """Bodies are also looked for so much longer along a principal axis, at the same volume: red cells in flow are."""
-TURNS, ALIKE = 250, 0.92
+TURNS, ALIKE = 200, 0.92
 """Random turns of each shape, and the correlation of shadows in all directions above which one stands for both."""
 SPACING = 1.5
 """Between places that are tried [pixels]; the best ones are improved."""
@@ -119,8 +120,8 @@ class Search:
         self.grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
         self.corners = [[self._corners(seen, n, v, self.grid) for n in range(len(seen))] for v in velocities]
 
-    def tops(self, seen: Shadows, most: int) -> list[Hit]:
-        """The `most` best places, the best first."""
+    def tops(self, seen: Shadows, most: int, without: Sequence[np.ndarray] = ()) -> list[Hit]:
+        """The `most` best places, the best first, none near the places `without` [3]."""
         gains, held = zip(*(self._frame(seen, n) for n in range(len(seen))))
         rows = list[tuple[float, int, int, int]]()
         for k, corners in enumerate(self.corners):
@@ -133,7 +134,7 @@ class Search:
             centre = self.grid[place]
             if gain <= 0 or len(found) == most:
                 break
-            if all(np.linalg.norm(centre - hit.centre) > APART for hit in found):
+            if all(np.linalg.norm(centre - other) > APART for other in (*without, *(hit.centre for hit in found))):
                 found.append(Hit(gain, self.templates.matrices[which], centre, self.velocities[k]))
         return found
 
