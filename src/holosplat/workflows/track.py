@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import itertools
+import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -162,6 +163,8 @@ def write_tracks(
         beside = np.stack([one.ravel() for one in errors.values()], axis=1) if errors else itertools.repeat(())
         rows = zip(measured(bodies, scan.exposures), beside)
         writer.writerows([*row(one), *(f"{error:.3g}" for error in more)] for one, more in rows)
+    if (folder.path / BODIES).is_dir():  # of a run that was cut off when it wrote
+        shutil.rmtree(folder.path / BODIES)
     with atomic_folder(folder.path / BODIES) as temporary:
         for t, time in enumerate(times):
             named = [(f"{mesh.name}_{t:04d}.vtp", mesh) for mesh in bodies.bodies(float(time))]
