@@ -10,10 +10,12 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+import holosplat as hs
 from holosplat.checks import InputError
 from holosplat.cli.track import BodyFlags
 from holosplat.geometry import rotation_y
 from holosplat.io.vtk import write_mesh
+from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
 from holosplat.motion.elastic import Elastic, RestShapeKept
@@ -21,8 +23,11 @@ from holosplat.motion.known import best_size, drift
 from holosplat.motion.poses import Explained, Pose, exchanged, pursued
 from holosplat.motion.rest_shape import KnownBody, surface, thinned
 from holosplat.motion.shadows import Shadows
+from holosplat.motion.sightings import centroid
 from holosplat.motion.templates import Search, Templates
+from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces, TimeBasis
+from holosplat.specimens.mesh_series import MeshSeries
 from holosplat.specimens.red_cells import evans_fung_cell, icosphere
 
 SHAPE, STEPS = (47, 33), (-1.0, 0.0, 1.0)
@@ -195,3 +200,24 @@ def test_an_open_mesh_is_no_body(tmp_path):
 def test_flags_name_a_body():
     assert BodyFlags().known() is None
     assert BodyFlags(body="red-cell", body_size=8e-6).known() == KnownBody(size=8e-6)
+
+
+def test_two_beams_follow_a_cell_of_known_shape():
+    """From frames to a path: the cell's centre at all times, to a third of a pixel after a few steps."""
+    size, speed, times = 3.91e-6 / RADIUS, np.array([0.0, 1.5, 0.0]), np.array([0.0, 1e-5, 2e-5])
+    material = HAEMOGLOBIN.delta_beta(20.0)
+    mesh = KnownBody().mesh(size, coarse=True)
+    centres = size * (np.array([2.0, -1.0, -3.0]) + np.arange(3)[:, None] * speed)
+    moved = [TriangleMesh(size * mesh.vertices @ TURN.T + centre, mesh.faces, "cell") for centre in centres]
+    truth = MeshSeries(tuple(hs.MeshScene.of_one_material([one], material) for one in moved), times)
+    views = hs.Views.from_angles([0.0, 70.0], (37, 31), size)
+    exposures = hs.Exposures.of(views, 20.0, 0.3).repeated(times)
+    scan = hs.simulate(truth, exposures, photons_per_pixel=3000, seed=1, is_test=np.zeros(6, dtype=bool))
+    options = replace(TrackOptions(body=KnownBody(instants=3), rounds=0, intervals=False).with_effort(0.05))
+    found = follow(scan, material, options).bodies
+    assert found.count == 1
+    for time, centre in zip(times, centres):
+        assert np.linalg.norm(centroid(found.bodies(float(time))[0]) - centre) < 0.33 * size
+    empty = replace(scan, frames=1 + 0.01 * np.random.default_rng(0).normal(size=scan.frames.shape))
+    with pytest.raises(InputError, match="no body of the shape"):
+        follow(empty, material, options)

@@ -22,7 +22,7 @@ from ..workflows.run_folder import RunFolder
 from ..workflows.track import BODIES, COLLECTION, TRACKS
 from ..workflows.track import track as follow
 from .options import LightFlags, PriorOptions
-from .progress import ProgressBar
+from .progress import INTERRUPTED, ProgressBar
 
 
 @dataclass(frozen=True)
@@ -75,6 +75,8 @@ class MotionFlags:
     """Weight of bent paths (0: as bent as splines can be)."""
     bending: float = 1.0
     """Weight of bent surfaces (0: free)."""
+    intervals: bool = True
+    """Standard errors from fits to halves of the frames, which take about as long as the last fit."""
     effort: float = 1.0
     """Factor of the numbers of steps."""
 
@@ -86,9 +88,9 @@ class MotionFlags:
         known = {name: getattr(self, name) for name in ("volume_kept", "area_kept", "apart", "acceleration")}
         fits = {
             name: replace(fit, objective=replace(fit.objective, bending=self.bending), **known)
-            for name, fit in (("stiff", usual.stiff), ("soft", usual.soft))
+            for name, fit in (("stiff", usual.stiff), ("soft", usual.soft), ("half", usual.half))
         }
-        return replace(usual, paths=paths, sightings=found, rounds=self.rounds, **fits)
+        return replace(usual, paths=paths, sightings=found, rounds=self.rounds, intervals=self.intervals, **fits)
 
 
 def track(
@@ -97,6 +99,7 @@ def track(
     matter: PriorOptions = PriorOptions(),
     how: MotionFlags = MotionFlags(),
     seed: int = 0,
+    resume: bool = False,
     reading: Reading = Reading(),
     *,
     illumination: LightFlags = LIGHT,
@@ -109,6 +112,7 @@ def track(
         out: Run folder to make: bodies.pvd with one VTK file a body and time (µm), tracks.csv, and what reconstruct
             writes.
         seed: Seed of everything random.
+        resume: Go on with an interrupted run.
     """
     require(seed >= 0, f"--seed must be 0 or more, but it is {seed}.")
     require(
@@ -116,7 +120,8 @@ def track(
         f"bodies are followed through all times, but --time-frame is {reading.part.time_frame}; leave it.",
     )
     options, folder = replace(how.options(), body=known.known()), RunFolder(out)
-    folder.require_new()
+    if not resume:
+        folder.require_new(advise_resume=True)
     measured = read_as(scan, reading).in_memory()
     if options.body is None and len(beam_directions(measured.train().views)) == 2:
         print(
@@ -125,16 +130,22 @@ def track(
             file=sys.stderr,
         )
     prior = matter.prior(measured.exposures.reference_energy)
-    with ProgressBar() as bar:
-        result = follow(
-            measured,
-            prior,
-            options,
-            seed,
-            light=illumination.options(),
-            folder=folder,
-            on_progress=bar.show,
-        )
+    try:
+        with ProgressBar() as bar:
+            result = follow(
+                measured,
+                prior,
+                options,
+                seed,
+                light=illumination.options(),
+                folder=folder,
+                resume=resume,
+                on_progress=bar.show,
+            )
+    except KeyboardInterrupt:
+        begun = folder.checkpoint.is_file()
+        print(f"interrupted{f'; go on with --out {out} --resume' if begun else ''}", file=sys.stderr)
+        raise SystemExit(INTERRUPTED) from None
     write_json(folder.source, run_source(scan, reading))
     evaluation = score(result, measured, None)
     report = report_run(folder, result, measured, evaluation, None)

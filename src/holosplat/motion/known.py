@@ -30,9 +30,10 @@ SIZES, SIZE_STEPS = 9, 8
 class KnownBodies:
     """The search for bodies of `body`'s rest shape in the training frames of a scan, of views of one pixel size."""
 
-    def __init__(self, train: Scan, material: DeltaBeta, body: KnownBody) -> None:
+    def __init__(self, train: Scan, material: DeltaBeta, body: KnownBody, size: float = 1.0) -> None:
+        """size: of all bodies, beside what is said of it."""
         times, self.pixel = train.instants, train.views.pixel_size
-        self.material, self.body, self.size = material, body, 1.0
+        self.material, self.body, self.size = material, body, size
         self.first, self.last = float(times[0]), float(times[-1])
         chosen = times[np.unique(np.rint(np.linspace(0, len(times) - 1, body.instants)).astype(int))]
         self.coarse, self.fine = body.mesh(self.pixel, coarse=True), body.mesh(self.pixel)
@@ -41,11 +42,6 @@ class KnownBodies:
         frames = train[np.flatnonzero(np.isin(train.exposures.time, chosen))]
         self.seen = Shadows.of(frames, material, self.first, self.last).binned(self.bin)
         self.velocities = drift(self.seen) * np.array(SPREAD)[:, None]
-
-    @property
-    def rest(self) -> Rest:
-        """What is known of their shape, of the size that was found."""
-        return Rest(Elastic(_sized(self.fine, self.size)), self.body.stiffness)
 
     def bodies(self, basis: TimeBasis, known: MovingSurfaces | None = None) -> MovingSurfaces | None:
         """Bodies on paths of `basis` that explain what `known` ones leave of the frames; None where there are none.
@@ -77,6 +73,11 @@ class KnownBodies:
         paths = [self.pixel * basis.fitted(middle + half * when, one) for one in nodes]
         matter = Matter.one(*self.material)
         return MovingSurfaces.of_bodies(paths, [rest.faces] * len(paths), basis, self.pixel, matter)
+
+
+def at_rest(body: KnownBody, pixel: float, size: float) -> Rest:
+    """What is known of the shape of all bodies that are `size` times as large as `body`, on paths in `pixel` [m]."""
+    return Rest(Elastic(_sized(body.mesh(pixel), size)), body.stiffness)
 
 
 def best_size(mesh: TriangleMesh, seen: Shadows, poses: Sequence[Pose], uncertain: float) -> float:

@@ -28,7 +28,7 @@ SPACING = 1.5
 """Between places that are tried [pixels]; the best ones are improved."""
 VISIBLE, TIMES = 0.35, 0.4
 """Part of a ball about the centre that a frame must see to count, and part of the frames that must count."""
-HELD = 0.4
+HELD = 0.25
 """Part of the body's volume that each counted frame must show about its centre."""
 APART = 4.0
 """Least distance of the places of one search [pixels]."""
