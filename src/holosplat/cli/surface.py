@@ -52,6 +52,7 @@ def surface(
     """
     require_new(out)
     folder = RunFolder(run)
+    folder.require_run()
     times, name = instants_of(folder), "run" if instants_of(folder) else "Gaussians"
     require(
         not times or isinstance(reading.part.time_frame, int),
