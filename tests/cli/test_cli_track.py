@@ -131,6 +131,19 @@ def test_what_cannot_be_followed_is_refused(folder):
     assert not out.exists()
 
 
-def test_surfaces_of_bodies_in_motion_are_there_already(folder):
-    refused(holosplat("surface", folder / "run", "--out", folder / "again"), "closed surfaces already", "export")
+def test_surfaces_of_bodies_in_motion_are_fitted_at_one_time(folder):
+    """From those of the run, whose names they keep, to the frames of that time, which they explain better."""
+    again = ("surface", folder / "run", "--out", folder / "again")
+    refused(holosplat(*again), "at one time", f"0 … {TIMES - 1}", "export")
+    refused(holosplat(*again, "--time-frame", TIMES), f"0 to {TIMES - 1}")
     assert not (folder / "again").exists()
+    steps = ("--steps", "20")
+    worked_by(*again, "--time-frame", TIMES - 1, *steps)
+    found = read_object(folder / "run" / "object.h5")
+    assert isinstance(found, MovingSurfaces)
+    for k, own in enumerate(found.bodies((TIMES - 1) * STEP)):
+        (mesh,) = read_meshes([folder / "again" / f"body{k:03d}.vtk"], "um")
+        assert np.array_equal(mesh.faces, own.faces)
+        assert 0 < np.abs(mesh.vertices - own.vertices).mean() < PIXEL
+    said = json.loads((folder / "again" / "summary.json").read_text())
+    assert said["surfaces"]["train"]["mean"]["l1"] < said["run"]["train"]["mean"]["l1"]

@@ -127,7 +127,8 @@ class Search:
         for k, corners in enumerate(self.corners):
             chosen = torch.nonzero(self._plausible(held, corners))[:, 0]
             if len(chosen):
-                best, which = sum(gain[:, i[chosen]] for gain, i in zip(gains, corners)).max(0)
+                total = torch.stack([gain[:, i[chosen]] for gain, i in zip(gains, corners)]).sum(0)
+                best, which = total.max(0)
                 rows += list(zip(best.tolist(), which.tolist(), chosen.tolist(), [k] * len(chosen)))
         found = list[Hit]()
         for gain, which, place, k in sorted(rows, reverse=True):
