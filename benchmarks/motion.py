@@ -1,11 +1,13 @@
 """How well `track` follows cells that flow: rows of docs/data/motion.csv.
 
-    python benchmarks/motion.py DATA [--cases flow4 …] [--times 16] [--first 0] [--write]
+    python benchmarks/motion.py DATA [--cases flow4 …] [--times 16] [--first 0] [--every 1] [--ablation …] [--write]
 
 DATA holds the snapshots of an ESPResSo run, as for espresso_flow.py: 16 cells of 8 µm, 17.7 µs apart, imaged with the
 flow along the rotation axis on 128 × 96 pixels of 0.5 µm (20 keV, 10 cm, 1000 photons a pixel, haemoglobin, which is
 known). Cells enter and leave through the ends of the field. The simulation's projector is not that of the fit. A table
-is printed; with --write its rows stand in the file in place of earlier ones of the same case and times.
+is printed; with --write its rows stand in the file in place of earlier ones of the same case and times. --every 2 takes
+every second snapshot. --ablation leaves priors out, one at a time (all of them, or those that are named), whose rows go
+to docs/data/motion_ablation.csv.
 """
 
 from __future__ import annotations
@@ -14,7 +16,8 @@ import argparse
 import csv
 import platform
 import time
-from dataclasses import astuple, dataclass, fields
+from dataclasses import astuple, dataclass, fields, replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -27,31 +30,53 @@ from holosplat.geometry import Grid
 from holosplat.io.atomic import atomic_path
 from holosplat.mesh import TriangleMesh
 from holosplat.metrics import volume_scores
+from holosplat.motion.fit import MotionFit
+from holosplat.motion.halves import standard_errors
+from holosplat.motion.measures import area
+from holosplat.motion.rest_shape import KnownBody
 from holosplat.motion.sightings import centroid
-from holosplat.motion.track import TrackOptions, follow
+from holosplat.motion.track import Followed, TrackOptions, follow
 from holosplat.representations import MovingSurfaces
 from holosplat.specimens.mesh_series import MeshSeries
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "motion.csv"
-ANGLES = {"flow4": (0.0, 45.0, 90.0, 135.0), "flow3": (0.0, 30.0, 48.0), "flow2": (0.0, 90.0)}
+ABLATION = PAGE.with_name("motion_ablation.csv")
+ANGLES = {
+    "flow4": (0.0, 45.0, 90.0, 135.0),
+    "flow3": (0.0, 30.0, 48.0),
+    "flow2": (0.0, 90.0),
+    "flow3-body": (0.0, 30.0, 48.0),
+    "flow2-body": (0.0, 90.0),
+    "flow2n-body": (0.0, 23.8),
+}
+BODY = "-body"
+"""End of the names of cases in which the cells are known to be red cells."""
 SHAPE, PIXEL, PHOTONS = (128, 96), 0.5e-6, 1000.0
 MATERIAL = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
 TURN = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
 """Takes the flow, along x in the files, to the rotation axis y."""
+PRIORS = ("none", "acceleration", "volume_kept", "area_kept", "bending", "apart", "stiffness")
+"""What an ablation leaves out, one at a time; none: nothing."""
 FOLLOWED = 1e-6
 """A cell counts as followed if some body's centre stays within this distance [m], in the median over times."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """Of one run. dice, error: of occupancy, means over times; least_dice: of the worst time; cells: whole in the field
-    at half of the times or more; followed: of these; bodies: found in all; centre_um: median distance of the centres
-    of followed cells; volume_error, volume_spread: of their volumes over time, medians over cells [shares]."""
+    """Of one run. every: snapshots from one time to the next; without: the prior that is left out; dice, error: of
+    occupancy, means over times; least_dice: of the worst time; cells: whole in the field at half of the times or more;
+    followed: of these; bodies: found in all; centre_um: median distance of the centres of followed cells; volume_error,
+    volume_spread, area_spread: of their volumes and areas beside the true ones over time, medians over cells [shares];
+    overlap: share of the matter that lies in two bodies, mean over times; centre_over_error, volume_over_error: root
+    mean squares of what centres (each coordinate) and volumes of followed cells are off by, over their standard errors,
+    while the cells are whole in the field: one where errors are right."""
 
     case: str
     times: int
     first: int
+    every: int
     seed: int
+    without: str
     dice: float
     error: float
     least_dice: float
@@ -61,6 +86,10 @@ class Row:
     centre_um: float
     volume_error: float
     volume_spread: float
+    area_spread: float
+    overlap: float
+    centre_over_error: float
+    volume_over_error: float
     seconds: float
     cpu_seconds: float
     memory_mb: float
@@ -68,11 +97,11 @@ class Row:
     commit: str
 
 
-def cells_in_flow(data: Path, first: int, times: int) -> MeshSeries:
-    """The cells at `times` snapshots from `first` on, in the object frame."""
-    run = Run.read(data, first + times)
+def cells_in_flow(data: Path, first: int, times: int, every: int = 1) -> MeshSeries:
+    """The cells at `times` snapshots from `first` on, `every` so many, in the object frame."""
+    run = Run.read(data, first + every * (times - 1) + 1)
     middle = 0.5e-6 * np.array(run.parameters["box_um"])
-    nodes, when = (run.nodes[first:] - middle) @ TURN.T, run.times[first:] - run.times[first]
+    nodes, when = (run.nodes[first::every] - middle) @ TURN.T, run.times[first::every] - run.times[first]
     snapshots = [[TriangleMesh(cell, run.rest.faces, f"cell{k:02d}") for k, cell in enumerate(at)] for at in nodes]
     return MeshSeries(tuple(hs.MeshScene.of_one_material(at, MATERIAL) for at in snapshots), when)
 
@@ -87,57 +116,113 @@ def imaged(cells: MeshSeries, angles: tuple[float, ...], seed: int) -> hs.Scan:
 
 
 def volumes(found: MovingSurfaces, cells: MeshSeries, scan: hs.Scan) -> np.ndarray:
-    """[T, 2]: Dice and relative error of δ at every time."""
-    grid = Grid.of_views(scan.views)
-    scores = [volume_scores(found.at(t).voxelise(grid), cells.at(t).voxelise(grid)) for t in cells.times]
-    return np.array([(one.dice, one.relative_error_delta) for one in scores])
+    """[T, 3] at every time: Dice, relative error of δ, and share of the matter that lies in two bodies."""
+    grid, rows = Grid.of_views(scan.views), []
+    for t in cells.times:
+        ours = found.at(t).voxelise(grid)
+        scores, twice = volume_scores(ours, cells.at(t).voxelise(grid)), np.maximum(ours.delta - found.matter.delta, 0)
+        rows.append((scores.dice, scores.relative_error_delta, twice.sum() / ours.delta.sum()))
+    return np.array(rows)
+
+
+def over_errors(found: Followed, cells: MeshSeries, scan: hs.Scan) -> tuple[float, float]:
+    """Root mean squares of errors over standard errors, of centres and volumes of followed cells in the field."""
+    errors, centres, sizes = standard_errors(found.bodies, found.halves, scan), [], []
+    meshes = [found.bodies.bodies(float(t)) for t in cells.times]
+    for k, body in followed(found.bodies, cells):
+        for t, scene in enumerate(cells.snapshots):
+            true, ours = scene.meshes[k], meshes[t][body]
+            if not is_whole(true):
+                continue
+            away = (centroid(ours) - centroid(true)) / [errors[f"{axis}_m"][t, body] for axis in "xyz"]
+            centres.append(np.mean(away**2))
+            sizes.append(((ours.volume - true.volume) / errors["volume_m3"][t, body]) ** 2)
+    return float(np.mean(centres) ** 0.5), float(np.mean(sizes) ** 0.5)
+
+
+def followed(found: MovingSurfaces, cells: MeshSeries) -> list[tuple[int, int]]:
+    """Cells that are whole in the field at half of the times, with the body that follows each."""
+    pairs, kept = [], identities(found, cells)
+    whole = [np.mean([is_whole(scene.meshes[k]) for scene in cells.snapshots]) for k in range(_count(cells))]
+    for k, row in zip((k for k in range(_count(cells)) if whole[k] >= 0.5), kept):
+        if row[1] < FOLLOWED:
+            pairs.append((k, int(row[0])))
+    return pairs
+
+
+def is_whole(mesh: TriangleMesh) -> bool:
+    """Whether a cell is whole in the field, whose rows end along the flow."""
+    return bool(np.abs(mesh.vertices[:, 1]).max() < 0.5 * SHAPE[0] * PIXEL)
+
+
+def _count(cells: MeshSeries) -> int:
+    return len(cells.snapshots[0].meshes)
 
 
 def identities(found: MovingSurfaces, cells: MeshSeries) -> np.ndarray:
-    """[C, 4] of each cell that is whole in the field at half of the times: number of the body that stays nearest; and
-    over these times the median distance of centres [m], mean error and standard deviation of the volume [shares]."""
+    """[C, 5] of each cell that is whole in the field at half of the times: number of the body that stays nearest; and
+    over these times the median distance of centres [m], mean error and standard deviation of the volume, and standard
+    deviation of the area [shares]."""
     meshes = [found.bodies(float(t)) for t in cells.times]
     ours = np.array([[centroid(mesh) for mesh in at] for at in meshes])
     sizes = np.array([[mesh.volume for mesh in at] for at in meshes])
     rows = []
-    for k in range(len(cells.snapshots[0].meshes)):
+    for k in range(_count(cells)):
         own = [scene.meshes[k] for scene in cells.snapshots]
-        whole = np.array([np.abs(mesh.vertices[:, 1]).max() < 0.5 * SHAPE[0] * PIXEL for mesh in own])
+        whole = np.array([is_whole(mesh) for mesh in own])
         if whole.mean() < 0.5:
             continue
         way = np.array([centroid(mesh) for mesh in own])
         away = np.median(np.linalg.norm(ours - way[:, None], axis=-1)[whole], axis=0)
         best = int(away.argmin())
         shares = sizes[whole, best] / np.array([mesh.volume for mesh in own])[whole]
-        rows.append((best, away[best], shares.mean() - 1, shares.std()))
+        areas = np.array([area(meshes[t][best]) / area(own[t]) for t in np.flatnonzero(whole)])
+        rows.append((best, away[best], shares.mean() - 1, shares.std(), areas.std()))
     return np.array(rows)
 
 
-def row_of(case: str, data: Path, first: int, times: int, seed: int) -> Row:
+def options_without(prior: str) -> TrackOptions:
+    """What `follow` does unless it is told, but for one of `PRIORS`."""
+    usual = TrackOptions(intervals=prior == "none")
+
+    def freed(fit: MotionFit) -> MotionFit:
+        if prior == "none":
+            return fit
+        if prior == "bending":
+            return replace(fit, objective=replace(fit.objective, bending=0.0))
+        return replace(fit, **{prior: 0.0})
+
+    return replace(usual, stiff=freed(usual.stiff), soft=freed(usual.soft))
+
+
+def row_of(case: str, data: Path, first: int, times: int, every: int, seed: int, without: str) -> Row:
     """One run of `case`."""
-    cells = cells_in_flow(data, first, times)
+    cells = cells_in_flow(data, first, times, every)
     scan = imaged(cells, ANGLES[case], seed)
     began = time.perf_counter(), time.process_time()
-    found = follow(scan, MATERIAL, TrackOptions(), seed).bodies
+    options = replace(options_without(without), body=KnownBody() if case.endswith(BODY) else None)
+    result = follow(scan, MATERIAL, options, seed)
+    found = result.bodies
     seconds = time.perf_counter() - began[0], time.process_time() - began[1]
     memory = memory_megabytes("VmHWM")
     scores, kept = volumes(found, cells, scan), identities(found, cells)
     good = kept[kept[:, 1] < FOLLOWED]
-    followed = len(set(good[:, 0]))  # a body that is nearest to two cells follows one of them
+    count = len(set(good[:, 0]))  # a body that is nearest to two cells follows one of them
+    ratios = over_errors(result, cells, scan) if result.halves else (float("nan"), float("nan"))
     machine = f"{platform.machine()}, {torch.get_num_threads()} of 2 cores, shared"
-    dice, error = (float(one) for one in scores.mean(0))
-    away, wrong, spread = (float(np.median(np.abs(one))) for one in good[:, 1:].T)
-    said = (dice, error, float(scores[:, 0].min()), len(kept), followed, found.count, 1e6 * away, wrong, spread)
-    return Row(case, times, first, seed, *said, *seconds, memory, machine, commit())  # pyright: ignore[reportCallIssue]
+    dice, error, overlap = (float(one) for one in scores.mean(0))
+    away, *sizes = (float(np.median(np.abs(one))) for one in good[:, 1:].T)
+    said = (dice, error, float(scores[:, 0].min()), len(kept), count, found.count, 1e6 * away, *sizes, overlap, *ratios)
+    return Row(case, times, first, every, seed, without, *said, *seconds, memory, machine, commit())  # pyright: ignore[reportCallIssue]
 
 
-def write(rows: list[Row]) -> None:
-    """Put `rows` in place of those of the same case, times and seed."""
+def write(rows: list[Row], page: Path) -> None:
+    """Put `rows` in place of those of the same case, times, seed and priors."""
     names = [field.name for field in fields(Row)]
-    old = list(csv.reader(PAGE.read_text(encoding="utf-8").splitlines()))[1:] if PAGE.is_file() else []
+    old = list(csv.reader(page.read_text(encoding="utf-8").splitlines()))[1:] if page.is_file() else []
     new = [[f"{v:.5g}" if isinstance(v, float) else str(v) for v in astuple(row)] for row in rows]
-    kept = [row for row in old if row[:4] not in [one[:4] for one in new]]
-    with atomic_path(PAGE) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+    kept = [row for row in old if row[:6] not in [one[:6] for one in new]]
+    with atomic_path(page) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerows([names, *sorted([*kept, *new])])
 
@@ -149,14 +234,17 @@ def main() -> None:
     parser.add_argument("--cases", nargs="+", choices=ANGLES, default=["flow4"])
     parser.add_argument("--times", type=int, default=16)
     parser.add_argument("--first", type=int, default=0, help="snapshot of the first time")
+    parser.add_argument("--every", type=int, default=1, help="snapshots from one time to the next")
+    parser.add_argument("--ablation", nargs="*", choices=PRIORS, help="priors to leave out, one at a time")
     parser.add_argument("--seed", type=int, default=1, help="of the photons and of the fit")
     parser.add_argument("--write", action="store_true")
     asked = parser.parse_args()
-    for case in asked.cases:
-        row = row_of(case, asked.data, asked.first, asked.times, asked.seed)
+    chosen = ["none"] if asked.ablation is None else asked.ablation or PRIORS
+    for case, without in product(asked.cases, chosen):
+        row = row_of(case, asked.data, asked.first, asked.times, asked.every, asked.seed, without)
         print(*(f"{field.name} {getattr(row, field.name)}" for field in fields(Row)), sep="; ", flush=True)
         if asked.write:
-            write([row])
+            write([row], PAGE if asked.ablation is None else ABLATION)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
+from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
+from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.mesh_series import MeshSeries
 from holosplat.specimens.red_cells import icosphere
 
@@ -45,6 +47,17 @@ def truth() -> MeshSeries:
         for t in range(TIMES)
     ]
     return MeshSeries(tuple(scenes), STEP * np.arange(TIMES))
+
+
+@cache
+def true_paths(degree: int = 2) -> MovingSurfaces:
+    """The bodies, of coarse triangles, on their true paths, as near as polynomials come."""
+    basis, middle = TimeBasis(0.0, STEP * (TIMES - 1), degree), 0.5 * (TIMES - 1)
+    meshes = [[ellipsoid(k, t - middle, 2) for k in range(len(BODIES))] for t in range(TIMES)]
+    nodes = np.array([[mesh.vertices for mesh in at] for at in meshes])
+    paths = [basis.fitted(truth().times, nodes[:, k]) for k in range(len(BODIES))]
+    faces = [mesh.faces for mesh in meshes[0]]
+    return MovingSurfaces.of_bodies(paths, faces, basis, PIXEL, Matter.one(*MATERIAL))
 
 
 @cache

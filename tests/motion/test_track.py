@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.moving_ellipsoids import BODIES, MATERIAL, PIXEL, STEP, TIMES, ellipsoid, scan, truth
+from helpers.moving_ellipsoids import BODIES, MATERIAL, PIXEL, STEP, TIMES, scan, true_paths, truth
 from holosplat.checks import InputError
 from holosplat.fit.schedule import Schedule
 from holosplat.geometry import Grid
@@ -20,24 +20,11 @@ from holosplat.motion.fit import MotionFit, motion_fit
 from holosplat.motion.pieces import PathOptions, chosen_paths, refined
 from holosplat.motion.remainder import apart, beside, joined, only, sure_ones, whole_ones
 from holosplat.motion.sightings import centroid, sightings
-from holosplat.motion.terms import Acceleration, MovingBending, VolumeKept, square_root
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces, TimeBasis
-from holosplat.representations.isosurface import neighbour_mean
 from holosplat.specimens.red_cells import icosphere
 
 QUICK = TrackOptions().with_effort(0.3)
-
-
-@cache
-def true_paths(degree: int = 2) -> MovingSurfaces:
-    """The bodies, of coarse triangles, on their true paths, as near as polynomials come."""
-    basis, middle = TimeBasis(0.0, STEP * (TIMES - 1), degree), 0.5 * (TIMES - 1)
-    meshes = [[ellipsoid(k, t - middle, 2) for k in range(len(BODIES))] for t in range(TIMES)]
-    nodes = np.array([[mesh.vertices for mesh in at] for at in meshes])
-    paths = [basis.fitted(truth().times, nodes[:, k]) for k in range(len(BODIES))]
-    faces = [mesh.faces for mesh in meshes[0]]
-    return MovingSurfaces.of_bodies(paths, faces, basis, PIXEL, Matter.one(*MATERIAL))
 
 
 @cache
@@ -162,54 +149,6 @@ def test_pieces_are_chosen_by_frames_that_are_held_out():
         noise = 0.02 * np.random.default_rng(0).normal(size=scan().frames.shape)
         frames = replace(scan(), frames=scan().frames[chosen] + noise)
         assert (chosen_paths(frames, start, how, short).basis.pieces > 1) == bent
-
-
-class Fake:
-    """Stands for a model of these paths."""
-
-    def __init__(self, paths):
-        self.paths = paths
-
-    def parameters(self):
-        return {"object.coefficients": self.paths}
-
-
-def test_bending_in_time_is_the_mean_over_times():
-    """The term against the sum over times of the surfaces there, and its gradient against finite differences."""
-    body, times = true_paths(), truth().times
-    away = np.eye(body.coefficients.shape[1]) - neighbour_mean(body.faces.numpy(), body.coefficients.shape[1]).toarray()
-    wanted = np.mean([((away @ away @ body.at(t).vertices.numpy()) ** 2).sum() for t in times])
-
-    term, paths = MovingBending(1.0, body, times), body.coefficients.clone().requires_grad_()
-    (part,) = term(Fake(paths), None)  # type: ignore[arg-type]
-    assert float(part.value.detach()) == pytest.approx(wanted)
-    for made in (term, Acceleration(1.0, body), VolumeKept(1.0, body, times)):
-        paths.grad = None
-        made(Fake(paths), None)[0].value.backward()  # type: ignore[arg-type]
-        way = torch.randn(paths.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-        ends = [float(made(Fake(paths.detach() + s * way), None)[0].value) for s in (1e-4, -1e-4)]  # type: ignore[arg-type]
-        assert paths.grad is not None
-        assert float((paths.grad * way).sum()) == pytest.approx((ends[0] - ends[1]) / 2e-4, rel=3e-3)
-
-
-def test_volumes_are_kept_by_what_they_change():
-    """Bodies blown up evenly by 1, 2 and 3 % a time: Σ of the variances of their volumes over their squared means."""
-    basis, times = TimeBasis(0.0, 1.0, 3), np.linspace(0, 1, 5)
-    sphere, faces = icosphere(1)
-    paths, wanted = [], 0.0
-    for k, rate in enumerate((0.01, 0.02, 0.03)):
-        sizes = 1 + rate * 4 * times
-        paths.append(basis.fitted(times, PIXEL * (sizes[:, None, None] * sphere + 10.0 * k)))
-        wanted += np.var(sizes**3) / np.mean(sizes**3) ** 2
-    body = MovingSurfaces.of_bodies(paths, [faces] * 3, basis, PIXEL, Matter.one(*MATERIAL))
-    (part,) = VolumeKept(1.0, body, times)(Fake(body.coefficients), None)  # type: ignore[arg-type]
-    assert float(part.value) == pytest.approx(wanted)
-
-
-def test_a_square_root_squared_is_the_matrix():
-    matrix = TimeBasis(0.0, 1.0, 3, 2).gram(np.linspace(0, 1, 7))
-    root = square_root(matrix)
-    assert root.T @ root == pytest.approx(matrix)
 
 
 def test_one_time_is_no_motion():

@@ -19,7 +19,7 @@ from holosplat.io.leftovers import LOCK, host, temporary_name
 from holosplat.io.lock import sole_writer
 from holosplat.workflows.check import check
 from holosplat.workflows.manifest import MANIFEST, faults
-from holosplat.workflows.run_folder import RunFolder
+from holosplat.workflows.run_folder import RunFolder, claimed
 
 
 def lock_of(process: int, machine: str = "", began: str = "1") -> str:
@@ -107,7 +107,7 @@ def test_what_a_killed_process_left_of_a_file_goes_with_the_next_one(tmp_path, g
 
 def begun(path) -> RunFolder:
     folder = RunFolder(path)
-    with folder.claimed():
+    with claimed(folder):
         folder.begin({"seed": 1})
         folder.start_metrics(["step", "loss"])
         folder.append_metrics([{"step": 1.0, "loss": 0.5}, {"step": 2.0, "loss": 0.25}])
@@ -169,7 +169,7 @@ def test_a_manifest_says_what_was_written(tmp_path):
 
 def test_check_says_what_is_not_as_it_was_written(tmp_path):
     folder = begun(tmp_path / "run")
-    with folder.claimed(), new_hdf5(folder.object) as file:
+    with claimed(folder), new_hdf5(folder.object) as file:
         put(file, "values", np.arange(1000.0).reshape(20, 50))
     assert check(folder.path) == check(folder.object) == (1, [])
     content = bytearray(folder.object.read_bytes())

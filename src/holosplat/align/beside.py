@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,6 +22,8 @@ BLUR = 0.5
 """Frames are compared after a Gaussian of this standard deviation [pixels]: edges are sharp."""
 STEPS = 3
 """Newton's steps, from poses that are right to some tenths of a pixel."""
+SAMPLES = 4_000_000
+"""Wave samples of the frames that are made together: some hundred megabytes."""
 
 
 def aligned(numbers: Tensor) -> Alignment:
@@ -31,26 +33,48 @@ def aligned(numbers: Tensor) -> Alignment:
 
 
 class Beside:
-    """Frames of `matter`, and how they change with the numbers of `planned` exposures."""
+    """Frames of `matter`, and how they change with the numbers of `planned` exposures.
+
+    What costs the same for one frame as for many (voxels brought to the pixels' size) is done once for as many frames
+    as `SAMPLES` allows.
+    """
 
     def __init__(self, matter: Stored, planned: Exposures, oversample: int) -> None:
-        self._parts = [
-            Model(matter, Instrument(planned[[v]], oversample, backend=matter.backend)) for v in range(len(planned))
-        ]
+        self._matter, self._planned, self._oversample = matter, planned, oversample
+        h, w = planned.views.shape
+        self._most = max(1, SAMPLES // (h * w * oversample**2))
 
     def predicted(self, numbers: Tensor, magnified: bool = False) -> Predicted:
-        """Frames at `numbers` [V, 8], and their derivatives by one-sided differences; view by view to bound memory.
+        """Frames at `numbers` [V, 8], and their derivatives by one-sided differences.
 
         magnified: whether the derivative by the magnification is asked for, else it is zero.
         """
-        steps = SMALL if magnified else SMALL[:-1]
-        views = [_one(part, numbers[[v]], steps) for v, part in enumerate(self._parts)]
-        return Predicted(torch.stack([frame for frame, _ in views]), torch.stack([slopes for _, slopes in views]))
+        steps = torch.tensor(SMALL if magnified else SMALL[:-1], dtype=torch.float64)
+        moves = torch.cat([torch.zeros(1, len(NUMBERS)), torch.eye(len(NUMBERS))[: len(steps)]]).double()
+        moves[1:] *= steps[:, None]
+        count = len(moves)
+        tried = (numbers[:, None] + moves).flatten(0, 1)
+        frames = self._frames(np.repeat(np.arange(len(numbers)), count), tried)
+        frames = frames.reshape(len(numbers), count, *frames.shape[1:])
+        here = frames[:, 0]
+        slopes = torch.zeros(len(numbers), len(NUMBERS), *here.shape[1:])
+        slopes[:, : len(steps)] = (frames[:, 1:] - here[:, None]) / steps.float()[:, None, None]
+        slopes[:, -1] = here
+        return Predicted(here, slopes)
 
     def frames(self, numbers: Tensor) -> Tensor:
         """Frames [V, H, W] at `numbers`."""
-        with torch.no_grad():
-            return torch.stack([_frame(part, numbers[[v]]) for v, part in enumerate(self._parts)])
+        return self._frames(np.arange(len(numbers)), numbers)
+
+    @torch.no_grad()
+    def _frames(self, views: np.ndarray, numbers: Tensor) -> Tensor:
+        """Frames [N, H, W] of the planned exposures `views` [N] at `numbers` [N, 8]."""
+        parts = []
+        for first in range(0, len(views), self._most):
+            some = slice(first, first + self._most)
+            instrument = Instrument(self._planned[views[some]], self._oversample, backend=self._matter.backend)
+            parts.append(Model(self._matter, instrument, aligned(numbers[some])).frames().cpu())
+        return torch.cat(parts) * numbers[:, -1].exp().float()[:, None, None]
 
     def placed(
         self,
@@ -71,20 +95,3 @@ class Beside:
             found = moved if steps else replace(moved, numbers=numbers)
             tell((done + 1) / max(1, steps))
         return found
-
-
-@torch.no_grad()
-def _one(model: Model, numbers: Tensor, steps: Sequence[float]) -> tuple[Tensor, Tensor]:
-    """The frame [H, W] of one view, and its derivatives [8, H, W]."""
-    here, slopes = _frame(model, numbers), list[Tensor]()
-    for k, small in enumerate(steps):
-        moved = numbers.clone()
-        moved[:, k] += small
-        slopes.append((_frame(model, moved) - here) / small)
-    slopes += [torch.zeros_like(here)] * (len(SMALL) - len(steps))
-    return here, torch.stack([*slopes, here])
-
-
-def _frame(model: Model, numbers: Tensor) -> Tensor:
-    frames = replace(model, alignment=aligned(numbers)).frames()[0].cpu()
-    return frames * float(numbers[0, -1].exp())

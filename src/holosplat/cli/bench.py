@@ -59,6 +59,7 @@ def run(
     from ..bench.methods import ALIGNED, METHODS
     from ..bench.references import REFERENCES
     from ..bench.run import Suite, chosen, run_suite
+    from ..io.lock import sole_writer
 
     if list_only:
         _list([*case_names(), *MEASURED], METHODS | ALIGNED)
@@ -80,8 +81,9 @@ def run(
 
     suite = Suite(list(sources), sorted(set(seeds)), wanted, REFERENCES, load)
     folder = BenchFolder(out)
+    folder.require_usable()
     try:
-        with _Screen() as screen:
+        with sole_writer(out), _Screen() as screen:
             run_suite(suite, folder, retry=retry, on_progress=screen.show, on_row=screen.tell)
     except KeyboardInterrupt:
         _say(f"interrupted; what {out} holds is whole, and the same command goes on from there")

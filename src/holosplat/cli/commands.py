@@ -62,7 +62,7 @@ def reconstruct(
     from ..report.run import report_run
     from ..workflows.evaluate import evaluate as score
     from ..workflows.reconstruct import reconstruct as fit
-    from ..workflows.run_folder import RunFolder
+    from ..workflows.run_folder import RunFolder, claimed
 
     method = how.chosen()
     require(seed >= 0, f"--seed must be 0 or more, but it is {seed}.")
@@ -75,25 +75,26 @@ def reconstruct(
     measured = read_as(scan, replace(reading, told=reading.told.at_middle())).in_memory()
     prior = matter.without_ranges().prior(measured.exposures.reference_energy)
     folder = RunFolder(out)
-    with ProgressBar() as bar:
-        result = fit(
-            measured,
-            prior,
-            method,
-            seed,
-            matter=how.kind_of_matter(),
-            light=illumination.options(),
-            uncertain=uncertain,
-            refine=refine,
-            folder=folder,
-            resume=resume,
-            on_progress=bar.show,
-        )
-    found = {each.name: each.value for each in result.constants if each.name in reading.told.ranges()}
-    write_json(folder.source, run_source(scan, replace(reading, told=replace(reading.told, **found))))
-    measured = result.placed(measured)
-    evaluation = score(result, measured, None)
-    report = report_run(folder, result, measured, evaluation, None)
+    with claimed(folder):
+        with ProgressBar() as bar:
+            result = fit(
+                measured,
+                prior,
+                method,
+                seed,
+                matter=how.kind_of_matter(),
+                light=illumination.options(),
+                uncertain=uncertain,
+                refine=refine,
+                folder=folder,
+                resume=resume,
+                on_progress=bar.show,
+            )
+        found = {each.name: each.value for each in result.constants if each.name in reading.told.ranges()}
+        write_json(folder.source, run_source(scan, replace(reading, told=replace(reading.told, **found))))
+        measured = result.placed(measured)
+        evaluation = score(result, measured, None)
+        report = report_run(folder, result, measured, evaluation, None)
     _print_scores(evaluation)
     if folder.light.is_file():
         _say(f"light: {read_json(folder.summary)['light']}, by the frames' air ({folder.light})")
@@ -248,7 +249,7 @@ def evaluate(
     from ..workflows.evaluate import evaluate as score
     from ..workflows.moments import instants_of
     from ..workflows.provenance import scan_hash
-    from ..workflows.run_folder import RunFolder
+    from ..workflows.run_folder import RunFolder, claimed
     from .scans import run_and_scan
 
     folder = RunFolder(run)
@@ -263,7 +264,8 @@ def evaluate(
     if not folder.is_of(scan_hash(measured)):
         _say("this is not the scan that was reconstructed, its frames may have been fitted; report unchanged")
     elif true_volume is not None or not folder.report.exists():
-        _say(f"report: {report_run(folder, result, measured, evaluation, true_volume)}")
+        with claimed(folder):
+            _say(f"report: {report_run(folder, result, measured, evaluation, true_volume)}")
 
 
 def demo(out: Path = Path("demo")) -> None:

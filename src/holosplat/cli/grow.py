@@ -7,6 +7,7 @@ from pathlib import Path
 
 from ..beamline.grow import Growth, SeriesFolder
 from ..beamline.grow import grow as run
+from ..io.lock import sole_writer
 from .progress import INTERRUPTED, ProgressBar
 
 
@@ -18,7 +19,7 @@ def grow(out: Path, what: Growth, resume: bool = False) -> None:
         resume: Go on with an interrupted run, or to more snapshots.
     """
     try:
-        with ProgressBar() as bar:
+        with sole_writer(out), ProgressBar() as bar:
             grown = run(what, out, resume, lambda fraction: bar.show("cells in flow", fraction, {}))
     except KeyboardInterrupt:
         begun = SeriesFolder(out).state.is_file()

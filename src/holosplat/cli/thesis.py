@@ -33,12 +33,13 @@ def thesis(
         seed: Seed of the scene and of the random start.
     """
     from ..bench.case import load_case
+    from ..io.lock import sole_writer
     from ..thesis.study import PACES, Measured, StudyFolder, run_study
     from ..thesis.study import configurations as named
 
     chosen, folder, interrupted = named(configurations), StudyFolder(out), False
     try:
-        with ProgressBar() as bar:
+        with sole_writer(out), ProgressBar() as bar:
             bar.show("scene and scan", 0.0, {})
             measured = Measured.of(load_case(CASE, seed, snapshots))
             run_study(measured, chosen, PACES[schedule], seed, folder, bar.show)

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..checks import InputError
+from .folder import require_parent
 from .leftovers import LOCK, clear_all_leftovers, is_alive, temporary_name
 
 _held: set[Path] = set()
@@ -30,6 +31,7 @@ def sole_writer(folder: Path) -> Iterator[None]:
     if path in _held:  # a step of this process within another one
         yield
         return
+    require_parent(folder)
     try:
         path.mkdir(exist_ok=True)
         _take(path / LOCK, folder)

@@ -24,7 +24,9 @@ from ..optics.noise import noise_share
 from ..representations import MovingSurfaces
 from ..representations.isosurface import adjacency
 from ..scan import Scan
-from .terms import COEFFICIENTS, Acceleration, MovingBending, VolumeKept
+from .contact import Apart
+from .elastic import Rest, RestShapeKept
+from .terms import COEFFICIENTS, Acceleration, MovingBending, area_kept, volume_kept
 
 OPEN = 1e-3
 """Share of the times' mean square below which a coefficient is taken to be seen so well: what frames hardly see of a
@@ -47,20 +49,31 @@ class MotionFit:
     """Weight of bent paths: the sum of squared coefficients of acceleration [pixels² per piece⁴]."""
     volume_kept: float = 0.006
     """Standard deviation of a body's volume over time, as a share (0: volumes are free). Of red cells it is that."""
+    area_kept: float = 0.03
+    """The same of its area: red cells in flow change theirs by 1 to 5 % (0: areas are free)."""
+    apart: float = 0.2
+    """How deep bodies may lie in each other, a standard deviation [pixels] (0: as they like)."""
     objective: Objective = field(default_factory=_objective)
     """How frames are compared, and what bending costs."""
     schedule: Schedule = field(default_factory=lambda: Schedule(steps=100, views_per_step=16))
     """The loop; memory is that of the frames of one step."""
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "stiffness", "acceleration", "volume_kept")
+        at_least(self, 0, "stiffness", "acceleration", "volume_kept", "area_kept", "apart")
         positive("rate", self.rate, "pixels")
 
 
 def motion_fit(
-    scan: Scan, start: MovingSurfaces, options: MotionFit = MotionFit(), seed: int = 0, light: Light | None = None
+    scan: Scan,
+    start: MovingSurfaces,
+    options: MotionFit = MotionFit(),
+    seed: int = 0,
+    light: Light | None = None,
+    rest: Rest | None = None,
 ) -> Fit:
     """The fit of the paths of `start` to the training frames of `scan`, of any number of times, made ready.
+
+    rest: what is known of the bodies' shape at rest.
 
     Steps are Adam's, of one length for all vertices, in coordinates in which neighbours move together (Nicolet et al.
     2021) and in which times count alike: the paths' Gram matrix over the times of the frames is one.
@@ -73,7 +86,7 @@ def motion_fit(
     times = base.train.exposures.time
     group = Group(BETAS, EPSILON, solve=_smooth_directions(start, options.stiffness, times), together=True)
     plan = Plan(
-        problem=Problem(base.model, (base.frames, *_terms(base, start, options))),
+        problem=Problem(base.model, (base.frames, *_terms(base, start, options), *_at_rest(base, start, rest))),
         schedule=schedule,
         optimiser=lambda leaves: Adam(leaves, "cpu", {COEFFICIENTS: group}),
         rates=lambda factor, step: {COEFFICIENTS: options.rate * factor},
@@ -90,9 +103,21 @@ def _terms(base: Ground, start: MovingSurfaces, options: MotionFit) -> list[Term
         found.append(MovingBending(weight, start, times))
     if options.acceleration > 0 and len(start.basis.curvature()):
         found.append(Acceleration(options.acceleration, start))
-    if options.volume_kept > 0 and start.basis.count > 1:
-        found.append(VolumeKept(_of_likelihood(base) * start.basis.count / 2 / options.volume_kept**2, start, times))
+    moves = start.basis.count > 1
+    for kept, deviation in ((volume_kept, options.volume_kept), (area_kept, options.area_kept)):
+        if deviation > 0 and moves:
+            found.append(kept(_of_likelihood(base) * start.basis.count / 2 / deviation**2, start, times))
+    if options.apart > 0 and start.count > 1:
+        found.append(
+            Apart(_of_likelihood(base) * start.basis.count / 2 / options.apart**2, start, base.train.exposures.time)
+        )
     return found
+
+
+def _at_rest(base: Ground, start: MovingSurfaces, rest: Rest | None) -> list[Term]:
+    if rest is None or rest.stiffness == 0:
+        return []
+    return [RestShapeKept(rest.stiffness * _of_likelihood(base) * start.basis.count, rest.elastic, start)]
 
 
 def _of_likelihood(base: Ground) -> float:
@@ -102,7 +127,9 @@ def _of_likelihood(base: Ground) -> float:
     """
     width, objective = base.frames.resolved.get("rounding", 0.0), base.frames.objective
     require(
-        width > 0, "volume_kept needs frames that are compared by `rounded`; raise its weight, or leave volumes free."
+        width > 0,
+        "volume_kept, area_kept and apart need frames that are compared by `rounded`; raise its weight, or set all "
+        "three to 0.",
     )
     noise = width / objective.rounding
     return objective.rounded * noise**2 / width / base.train.frames.size

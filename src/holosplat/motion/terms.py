@@ -1,8 +1,8 @@
-"""What surfaces in motion cost beside what frames say: bending of surfaces and of paths."""
+"""What surfaces in motion cost beside what frames say: bending of surfaces and of paths, and changes of size."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -17,6 +17,9 @@ from ..representations import MovingSurfaces
 from ..representations.isosurface import neighbour_mean
 
 COEFFICIENTS = "object.coefficients"
+
+Size = Callable[[Tensor, Tensor, Tensor], Tensor]
+"""What triangles of the corners a, b, c [F, 3] add to a size of a body: [F]."""
 
 
 class MovingBending:
@@ -56,29 +59,48 @@ class Acceleration:
         return [Part("acceleration", self._weight, bent.square().sum() / paths.shape[1])]
 
 
-class VolumeKept:
-    """Σ over bodies of the mean over times of (V(t)/V - 1)², V a body's mean volume."""
+class SizeKept:
+    """Σ over bodies of the mean over times of (S(t)/S - 1)², S(t) a size of a body and S its mean over time."""
 
-    names = ("volume_kept",)
-
-    def __init__(self, weight: float, start: MovingSurfaces, times: np.ndarray) -> None:
-        """times: [T] s, over which means are taken."""
-        self._weight, self._faces, self._body, self._count = weight, start.faces, start.of_body, start.count
+    def __init__(self, name: str, size: Size, weight: float, start: MovingSurfaces, times: np.ndarray) -> None:
+        """name: of the part; size: one number of each triangle, whose sum is that of the body; times: [T] s, over which
+        means are taken."""
+        self.names, self._size, self._weight = (name,), size, weight
+        self._faces, self._body, self._count = start.faces, start.of_body, start.count
         self._weights = torch.from_numpy(start.basis.weights(times))
-        self.resolved = {"volume_kept": weight}
+        self.resolved = {name: weight}
 
     def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
         """The one part."""
         paths = model.parameters()[COEFFICIENTS]
-        volumes = torch.stack([self._volumes(torch.einsum("k,kpx->px", w, paths)) for w in self._weights])
-        change = volumes / volumes.mean(0) - 1
-        return [Part("volume_kept", self._weight, change.square().mean(0).sum())]
+        sizes = torch.stack([self._sizes(torch.einsum("k,kpx->px", w, paths)) for w in self._weights])
+        change = sizes / sizes.mean(0) - 1
+        return [Part(self.names[0], self._weight, change.square().mean(0).sum())]
 
-    def _volumes(self, vertices: Tensor) -> Tensor:
+    def _sizes(self, vertices: Tensor) -> Tensor:
         """[B] of all bodies, about the middle of all vertices."""
-        a, b, c = (vertices - vertices.detach().mean(0))[self._faces].unbind(1)
-        parts = (a * torch.linalg.cross(b, c)).sum(1) / 6
+        parts = self._size(*(vertices - vertices.detach().mean(0))[self._faces].unbind(1))
         return vertices.new_zeros(self._count).index_add(0, self._body, parts)
+
+
+def volume_kept(weight: float, start: MovingSurfaces, times: np.ndarray) -> SizeKept:
+    """That each body keeps its volume."""
+    return SizeKept("volume_kept", _tetrahedra, weight, start, times)
+
+
+def area_kept(weight: float, start: MovingSurfaces, times: np.ndarray) -> SizeKept:
+    """That each body keeps its area."""
+    return SizeKept("area_kept", _triangles, weight, start, times)
+
+
+def _tetrahedra(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """Signed volumes [F] between the origin and triangles of the corners a, b, c [F, 3]."""
+    return (a * torch.linalg.cross(b, c)).sum(1) / 6
+
+
+def _triangles(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """Areas [F] of triangles of the corners a, b, c [F, 3]."""
+    return 0.5 * torch.linalg.cross(b - a, c - a).norm(dim=1)
 
 
 def square_root(gram: np.ndarray) -> np.ndarray:

@@ -47,23 +47,13 @@ class RunFolder:
         """`InputError` unless the folder holds a reconstruction."""
         require(self.path.is_dir(), f"the run folder {self.path} does not exist; check the path.")
         found = self.config.is_file() and self.result().is_file()
-        hint = "; it was cut off, finish it with reconstruct --resume" if self.config.is_file() else ""
+        hint = "; it was cut off, finish it with --resume" if self.config.is_file() else ""
         require(found, f"{self.path} must hold a reconstruction (config.json, object.h5), but it does not{hint}.")
 
     def result(self) -> Path:
         """The file of the reconstructed object; a run of version 0.1 has it under another name."""
         older = self.path / "gaussians.h5"
         return older if older.is_file() and not self.object.is_file() else self.object
-
-    @contextmanager
-    def claimed(self) -> Iterator[None]:
-        """Make the folder, if need be, and keep other processes from writing to it (`sole_writer`); in the end its
-        manifest is of what was written."""
-        require_parent(self.path)
-        with sole_writer(self.path):
-            yield
-            if self.config.is_file():
-                write_manifest(self.path, self.name())
 
     def begin(self, config: dict[str, Any]) -> None:
         """Make the folder with its config.json, and with it a new run, whose name checkpoint and summary repeat."""
@@ -166,6 +156,20 @@ class RunFolder:
             return found.get("state", found)
         require(not damaged, f"{self.checkpoint} must be a checkpoint, but it is damaged; start anew without it.")
         return None
+
+
+@contextmanager
+def claimed(folder: RunFolder | None) -> Iterator[None]:
+    """Make the folder, if need be, and keep other processes from writing to it (`sole_writer`); in the end its manifest
+    is of what was written. Nothing without a folder."""
+    if folder is None:
+        yield
+        return
+    require_parent(folder.path)
+    with sole_writer(folder.path):
+        yield
+        if folder.config.is_file():
+            write_manifest(folder.path, folder.name())
 
 
 def _loaded(path: Path) -> dict[str, Any] | None:
