@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from tyro.conf import Positional
 
-from ..checks import InputError, positive, require
+from ..checks import positive, require
 from ..io.formats import read_as
 from ..io.json import write_json
 from ..io.reading import Reading, ends_of
@@ -42,8 +42,8 @@ class ForecastFlags:
     step: float | None = None
     """Between them [s] (default: the median step of the run)."""
     model: Literal["auto", "paths", "rigid", "dynamics"] = "auto"
-    """Paths go on, each part of the motion as far as frames tell it; rigid: shapes stay; dynamics: red cells in the flow
-    of --channel; auto: the mean of paths and dynamics by their errors, or paths without a channel."""
+    """Paths go on, each part of the motion as far as frames tell it; rigid: shapes stay; dynamics: red cells in the
+    flow of --channel; auto: the mean of paths and dynamics by their errors, or paths without a channel."""
     degree: int = 2
     """Powers of time that are believed, at most."""
     window: int = 0
@@ -94,11 +94,8 @@ def number_or_range(name: str, text: str) -> tuple[float, float]:
     """Both ends of what an option says: LOW:HIGH, or one number above 0 twice. Errors: `InputError` for other text."""
     if ":" in text:
         return ends_of(name, text)
-    try:
-        value = float(text)
-    except ValueError:
-        raise InputError(f"--{name.replace('_', '-')} must be a number or LOW:HIGH, but it is {text!r}.") from None
-    return positive(f"--{name.replace('_', '-')}", value), value
+    value = positive(f"--{name.replace('_', '-')}", text)
+    return value, value
 
 
 def forecast(run: Positional[Path], out: Path, how: ForecastFlags = ForecastFlags(), seed: int = 0) -> None:

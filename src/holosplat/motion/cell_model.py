@@ -10,13 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import positive
+from ..checks import InputError, positive
 from ..mesh import TriangleMesh
 from ..specimens.flow.channel import Channel
 from ..specimens.flow.suspension import Medium
 from ..specimens.membrane.model import Elasticity, Membrane
 from ..specimens.membrane.resting import resting_cell
-from .cell_flow import CellFlow, Unknowns, advanced
+from .cell_flow import CellFlow, Unknowns, Velocity, advanced
 from .dressing import Bound, dressed, scaled
 from .forecast import areas, normals
 
@@ -24,7 +24,7 @@ ENDLESS = 1e-3
 """Length of the channel [m]: no field holds cells that feel each other around it."""
 FREQUENCY = 4
 """Of the membranes' meshes: 162 nodes."""
-STABLE = 1.5
+STABLE = 1.0
 """Longest step in units of viscosity × radius over the modulus of area, the fastest time of a membrane."""
 REACH = 3.0
 """Cells whose centres are farther apart than so many radii do not feel each other's flow."""
@@ -36,6 +36,10 @@ INDEPENDENT = 20.0
 """Points of a surface whose errors are independent: its fit is smooth."""
 CHANGES = (0.02, 0.3)
 """Relative changes of peak and shear modulus in finite differences."""
+FINER = (1, 4, 16)
+"""By how much steps are shortened where the motion is not smooth."""
+LEAP = 3.0
+"""How far a node gets at most, in the way of the flow and a radius; beyond, the motion has become unstable."""
 AXES = "xyz"
 Range = tuple[float, float]
 
@@ -69,6 +73,11 @@ class ChannelFrame:
         """The other way."""
         return (points - self._middle()) @ self.rotation + np.asarray(self.centre)
 
+    def outside(self, points: Tensor) -> Tensor:
+        """As `outward`, of a tensor."""
+        turn, middle, centre = (torch.from_numpy(np.asarray(x)) for x in (self.rotation, self._middle(), self.centre))
+        return (points - middle) @ turn + centre
+
     @property
     def rotation(self) -> np.ndarray:
         """[3, 3] from the object frame to the channel's."""
@@ -84,9 +93,12 @@ class ChannelFrame:
 
 @dataclass(frozen=True)
 class Fitted:
-    """What a window says of the model. unknowns: peak and modulus; told: standard errors of their logarithms over those
-    before, by name (near 1: the window says nothing); wrong: velocity [C, 3] [m/s] and gradient [C, 3, 3] [1/s] of a flow
-    beside; left: [C] m, along the normals at the window's end, what the model misses."""
+    """What a window says of the model.
+
+    unknowns: peak and modulus; told: standard errors of their logarithms over those before, by name (near 1: the window
+    says nothing); wrong: velocity [C, 3] [m/s] and gradient [C, 3, 3] [1/s] of a flow beside; left: [C] m, along the
+    normals at the window's end, what the model misses.
+    """
 
     unknowns: Unknowns
     told: dict[str, float]
@@ -102,12 +114,20 @@ class Fitted:
 class CellModel:
     """Red cells in the channel of `frame`, all of one rest shape and one set of moduli.
 
-    volumes: of the cells [m³]; shear: modulus [N/m] at which membranes are laid on surfaces; viscosity: [Pa s].
+    meshes: whose median volume the rest shape takes; shear: modulus [N/m] at which membranes are laid on surfaces;
+    viscosity: [Pa s]; frequency: of the membranes' meshes, as of `resting_cell`.
     """
 
-    def __init__(self, frame: ChannelFrame, meshes: Sequence[TriangleMesh], shear: float, viscosity: float) -> None:
+    def __init__(
+        self,
+        frame: ChannelFrame,
+        meshes: Sequence[TriangleMesh],
+        shear: float,
+        viscosity: float,
+        frequency: int = FREQUENCY,
+    ) -> None:
         self.frame = frame
-        self.membrane = Membrane(scaled(resting_cell(FREQUENCY), meshes), Elasticity(skalak_shear=shear))
+        self.membrane = Membrane(scaled(resting_cell(frequency), meshes), Elasticity(skalak_shear=shear))
         self.radius = float(np.sqrt(self.membrane.rest.surface / (4 * np.pi)))
         self.step = STABLE * viscosity * self.radius / self.membrane.elasticity.global_area
         self._medium = Medium(viscosity, reach=min(REACH * self.radius, 0.5 * ENDLESS))
@@ -149,14 +169,24 @@ class CellModel:
             about = nodes - nodes.mean(1, keepdim=True)
             return found + wrong[0][:, None] + torch.einsum("cxy,cpy->cpx", wrong[1], about)
 
-        places = [[] for _ in bound]
+        states = [nodes]
         with torch.no_grad():
-            for k, time in enumerate(times):
-                if k:
-                    nodes = advanced(velocity, nodes, float(time - times[k - 1]), self.step)
-                for cell, one in enumerate(bound):
-                    places[cell].append(self.frame.outward(one.places(nodes[cell]).numpy()))
-        return [np.array(one) for one in places]
+            for wait in np.diff(times):
+                reach = LEAP * (float(unknowns.peak) * float(wait) + self.radius)
+                states.append(self._advanced(velocity, states[-1], float(wait), reach))
+        outward = self.frame.outward
+        return [np.array([outward(one.places(at[cell]).numpy()) for at in states]) for cell, one in enumerate(bound)]
+
+    def _advanced(self, velocity: Velocity, nodes: Tensor, wait: float, reach: float) -> Tensor:
+        """Nodes later, in finer steps where the usual ones are too long: where a node moves beyond `reach` [m]."""
+        for finer in FINER:
+            later = advanced(velocity, nodes, wait, self.step / finer)
+            if bool(later.isfinite().all()) and float((later - nodes).abs().max()) < reach:
+                return later
+        raise InputError(
+            "the motion of the cells must be smooth, but it is not in steps of "
+            f"{self.step / FINER[-1]:.2g} s; lower the shear modulus or the peak, or raise the viscosity."
+        )
 
     def peak_of(self, places: Sequence[np.ndarray], speeds: Sequence[np.ndarray]) -> float:
         """Peak [m/s] of the flow that carries surfaces at `places` [Q, 3] [m] with `speeds` [Q, 3] [m/s].
@@ -177,7 +207,8 @@ class CellModel:
     ) -> Fitted:
         """Peak and shear modulus within their ranges, and the flow beside, that tell best how the surfaces moved.
 
-        From `meshes`, to places `seen` of each [T, Q, 3] [m] at `times` [T] s, along their normals. One step of Gauss and Newton from the ranges' geometric means, whose ends are two standard deviations away.
+        From `meshes`, to places `seen` of each [T, Q, 3] [m] at `times` [T] s, along their normals. One step of Gauss
+        and Newton from the ranges' geometric means, whose ends are two standard deviations away.
         free: whether there is a flow beside.
         """
         start = self.dressed(meshes)

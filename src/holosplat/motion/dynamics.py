@@ -18,11 +18,15 @@ from ..checks import at_least, in_range, positive, require
 from ..mesh import TriangleMesh
 from ..representations import MovingSurfaces
 from ..specimens.flow.suspension import PLASMA_VISCOSITY
+from ..specimens.red_cells import RedCell
 from .cell_model import CellModel, ChannelFrame, Range
 from .forecast import Forecast, Halves, PathForecast, extrapolate, on_paths, places_of, smoothed
+from .measures import area
 
 ALIKE = 0.3
 """A body whose volume differs from the median by more is no whole cell."""
+STRETCHED = 1.15
+"""Area of a cell over that of a resting one of its volume, at most: membranes tear at less, and tracks are rough."""
 GOING_ON = PathForecast()
 """How paths go on unless it is said."""
 PEAK = 0.04
@@ -101,15 +105,20 @@ def carry(
 
 
 def whole_cells(meshes: list[TriangleMesh], frame: ChannelFrame) -> list[int]:
-    """Numbers of the bodies that lie within the channel and have nearly the median volume of those that do."""
-    channel = frame.channel
+    """Numbers of the bodies that are red cells within the channel.
+
+    They have nearly the median volume of those within, and no more area than a cell of that volume can have.
+    """
+    channel, rest = frame.channel, RedCell().mesh()
     depths = [channel.depth(torch.from_numpy(frame.inward(mesh.vertices))).min().item() for mesh in meshes]
     volumes = np.array([mesh.volume for mesh in meshes])
-    within = np.array(depths) > 0
+    within = (np.array(depths) > 0) & (volumes > 0)
     if not within.any():
         return []
     usual = np.median(volumes[within])
-    return [int(k) for k in np.flatnonzero(within & (np.abs(volumes / usual - 1) < ALIKE))]
+    alike = within & (np.abs(volumes / usual - 1) < ALIKE)
+    most = STRETCHED * area(rest) / rest.volume ** (2 / 3)
+    return [int(k) for k in np.flatnonzero(alike) if area(meshes[k]) < most * volumes[k] ** (2 / 3)]
 
 
 def _peak(
