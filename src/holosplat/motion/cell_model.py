@@ -111,6 +111,10 @@ class Fitted:
         return found | {f"{name}_told": value for name, value in self.told.items()}
 
 
+class _Unstable(Exception):
+    """Nodes have left the reach of any smooth motion."""
+
+
 class CellModel:
     """Red cells in the channel of `frame`, all of one rest shape and one set of moduli.
 
@@ -128,7 +132,7 @@ class CellModel:
     ) -> None:
         self.frame = frame
         self.membrane = Membrane(scaled(resting_cell(frequency), meshes), Elasticity(skalak_shear=shear))
-        self.radius = float(np.sqrt(self.membrane.rest.surface / (4 * np.pi)))
+        self.radius = float((self.membrane.rest.surface / (4 * np.pi)).sqrt())
         self.step = STABLE * viscosity * self.radius / self.membrane.elasticity.global_area
         self._medium = Medium(viscosity, reach=min(REACH * self.radius, 0.5 * ENDLESS))
 
@@ -179,10 +183,20 @@ class CellModel:
 
     def _advanced(self, velocity: Velocity, nodes: Tensor, wait: float, reach: float) -> Tensor:
         """Nodes later, in finer steps where the usual ones are too long: where a node moves beyond `reach` [m]."""
+
+        def within(places: Tensor) -> Tensor:
+            away = float((places - nodes).abs().max())
+            if not away < reach:
+                raise _Unstable
+            return velocity(places)
+
         for finer in FINER:
-            later = advanced(velocity, nodes, wait, self.step / finer)
-            if bool(later.isfinite().all()) and float((later - nodes).abs().max()) < reach:
-                return later
+            try:
+                later = advanced(within, nodes, wait, self.step / finer)
+                within(later)
+            except _Unstable:
+                continue
+            return later
         raise InputError(
             "the motion of the cells must be smooth, but it is not in steps of "
             f"{self.step / FINER[-1]:.2g} s; lower the shear modulus or the peak, or raise the viscosity."
