@@ -21,6 +21,7 @@ from ..volume import Volume
 from ..workflows.evaluate import Evaluation, render
 from ..workflows.reconstruct import Reconstruction
 from ..workflows.run_folder import RunFolder
+from ..workflows.track import read_errors
 from .content import HeldOutViews, LitViews, ProjectedMaps, ReportContent, view_labels
 from .figures import evenly_chosen
 from .moving import Moving
@@ -45,7 +46,7 @@ def report_run(
     config, moving = folder.read_config(), None
     found = reconstruction.object
     if isinstance(found, MovingSurfaces):
-        moving = moving_of(reconstruction, scan, evaluation.light)
+        moving = moving_of(reconstruction, scan, evaluation.light, read_errors(folder))
         found = found.at(_middle(moving))
     grid = truth.grid if truth is not None else _drawn_grid(scan.views)
     held_out = None
@@ -177,15 +178,14 @@ def moving_of(
 ) -> Moving:
     """What is shown of a run in motion and its `scan`; light: of all its frames, None where it is even."""
     assert isinstance(done.object, MovingSurfaces)
-    train = np.flatnonzero(~scan.is_test)
-    when = scan.exposures.time[train]
+    when, order = scan.exposures.time, np.argsort(scan.is_test, kind="stable")  # frames for training first
     times = np.unique(when)
     shown = np.array(evenly_chosen(len(times), MOST_FRAMES))
-    chosen = np.array([train[np.flatnonzero(when == times[t])[0]] for t in shown])
+    chosen = np.array([order[np.flatnonzero(when[order] == times[t])[0]] for t in shown])
     predicted = render(done, scan.exposures[chosen])
     if light is not None:
         predicted = predicted * light.factor().numpy()[chosen]
-    rows = list(measured(done.object, scan.train().exposures))
+    rows = list(measured(done.object, scan.exposures))
     tracks = {name: np.array([getattr(row, name) for row in rows]).reshape(len(times), -1) for name in columns()}
     grid = Grid.of_views(scan.views)
     middle, half = grid.centre, 0.5 * np.array(grid.shape[::-1]) * np.array(grid.voxel_size)
