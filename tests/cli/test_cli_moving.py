@@ -33,8 +33,8 @@ QUICK = CarriedOptions(
 def quick(monkeypatch, tmp_path):
     """A series of three times, fitted in few steps, without the report's drawing."""
 
-    def few(*what, **options):
-        return reconstruct_moving(*what, QUICK, ask=False, **options)
+    def few(scan, prior, **options):
+        return reconstruct_moving(scan, prior, QUICK, ask=False, **options)
 
     monkeypatch.setattr(motion, "reconstruct_moving", few)
     monkeypatch.setattr(motion, "report_run", lambda *what: tmp_path / "run/report.html")
