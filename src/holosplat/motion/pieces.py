@@ -10,6 +10,7 @@ import torch
 from ..checks import at_least, in_range
 from ..fit.residuals import Prediction
 from ..optics.background import Light
+from ..progress import Advance
 from ..representations import MovingSurfaces
 from ..scan import Scan
 from .fit import MotionFit, motion_fit
@@ -39,7 +40,13 @@ class PathOptions:
 
 
 def chosen_paths(
-    train: Scan, start: MovingSurfaces, options: PathOptions, how: MotionFit, seed: int = 0, light: Light | None = None
+    train: Scan,
+    start: MovingSurfaces,
+    options: PathOptions,
+    how: MotionFit,
+    seed: int = 0,
+    light: Light | None = None,
+    on_progress: Advance = lambda part: None,
 ) -> MovingSurfaces:
     """`start` on paths of the asked number of pieces, or of the number that predicts held-out frames best.
 
@@ -57,10 +64,13 @@ def chosen_paths(
     aside[np.random.default_rng(seed).permutation(len(train))[: len(train) // options.held_out]] = True
     short = replace(how, schedule=replace(how.schedule, steps=max(1, how.schedule.steps // 2)))
     kept, left = train.with_split(aside), train[np.flatnonzero(aside)]
+    done, most_fits = 0, 2 * len(candidates) - 1
 
     def fitted(bodies: MovingSurfaces) -> tuple[MovingSurfaces, np.ndarray]:
+        nonlocal done
         fit = motion_fit(kept, bodies, short, seed, _part(light, ~aside))
-        fit.run(lambda record: None)
+        fit.run(lambda record: on_progress((done + fit.share) / most_fits))
+        done += 1
         found = fit.result().object
         assert isinstance(found, MovingSurfaces)
         return found, _errors(left, found, fit.oversample)

@@ -250,9 +250,9 @@ class _Following:
 
     def on_chosen_paths(self, bodies: MovingSurfaces) -> MovingSurfaces:
         """`bodies` on paths of as many pieces as frames ask for."""
-        self.on_progress("paths", 0.0, {})
+        how = (self.options.paths, self.options.stiff, self.seed, self.light)
         with self._timed("paths"):
-            return chosen_paths(self.train, bodies, self.options.paths, self.options.stiff, self.seed, self.light)
+            return chosen_paths(self.train, bodies, *how, lambda part: self.on_progress("paths", part, {}))
 
     def fitted(
         self, name: str, frames: Scan, start: MovingSurfaces, how: MotionFit, light: Light | None
