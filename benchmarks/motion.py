@@ -33,6 +33,7 @@ from holosplat.metrics import volume_scores
 from holosplat.motion.fit import MotionFit
 from holosplat.motion.halves import standard_errors
 from holosplat.motion.measures import area
+from holosplat.motion.rest_shape import KnownBody
 from holosplat.motion.sightings import centroid
 from holosplat.motion.track import Followed, TrackOptions, follow
 from holosplat.representations import MovingSurfaces
@@ -40,7 +41,16 @@ from holosplat.specimens.mesh_series import MeshSeries
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "motion.csv"
 ABLATION = PAGE.with_name("motion_ablation.csv")
-ANGLES = {"flow4": (0.0, 45.0, 90.0, 135.0), "flow3": (0.0, 30.0, 48.0), "flow2": (0.0, 90.0)}
+ANGLES = {
+    "flow4": (0.0, 45.0, 90.0, 135.0),
+    "flow3": (0.0, 30.0, 48.0),
+    "flow2": (0.0, 90.0),
+    "flow3-body": (0.0, 30.0, 48.0),
+    "flow2-body": (0.0, 90.0),
+    "flow2n-body": (0.0, 23.8),
+}
+BODY = "-body"
+"""End of the names of cases in which the cells are known to be red cells."""
 SHAPE, PIXEL, PHOTONS = (128, 96), 0.5e-6, 1000.0
 MATERIAL = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
 TURN = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
@@ -190,7 +200,8 @@ def row_of(case: str, data: Path, first: int, times: int, every: int, seed: int,
     cells = cells_in_flow(data, first, times, every)
     scan = imaged(cells, ANGLES[case], seed)
     began = time.perf_counter(), time.process_time()
-    result = follow(scan, MATERIAL, options_without(without), seed)
+    options = replace(options_without(without), body=KnownBody() if case.endswith(BODY) else None)
+    result = follow(scan, MATERIAL, options, seed)
     found = result.bodies
     seconds = time.perf_counter() - began[0], time.process_time() - began[1]
     memory = memory_megabytes("VmHWM")

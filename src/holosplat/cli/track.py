@@ -13,6 +13,8 @@ from ..io.formats import read_as
 from ..io.json import write_json
 from ..io.reading import Reading
 from ..io.run_scan import run_source
+from ..motion.known import beam_directions
+from ..motion.rest_shape import KnownBody
 from ..motion.track import TrackOptions
 from ..report.run import report_run
 from ..workflows.evaluate import evaluate as score
@@ -22,8 +24,33 @@ from ..workflows.track import track as follow
 from .options import LightFlags, PriorOptions
 from .progress import INTERRUPTED, ProgressBar
 
+
+@dataclass(frozen=True)
+class BodyFlags:
+    """What is known of the bodies' shape."""
+
+    body: str = ""
+    """Shape at rest of all bodies: red-cell, or a file of one closed mesh (.stl, .ply, .obj, .vtk, .vtp, .vtu)."""
+    body_unit: str = "um"
+    """Unit of the mesh file's coordinates."""
+    body_size: float = 0.0
+    """Largest extent at rest [m] (0: a red cell's 7.82 µm, or the file's)."""
+    body_uncertain: float = 0.1
+    """By which part all bodies may be larger or smaller than that, at most."""
+    body_stiffness: float = 100.0
+    """Minus the logarithm of the probability of strains of about one."""
+
+    def known(self) -> KnownBody | None:
+        """None without a shape."""
+        if not self.body:
+            return None
+        return KnownBody(self.body, self.body_unit, self.body_size, self.body_uncertain, self.body_stiffness)
+
+
 LIGHT = LightFlags()
 """Even, unless the air of frames says otherwise."""
+UNKNOWN = BodyFlags()
+"""Nothing."""
 
 
 @dataclass(frozen=True)
@@ -76,6 +103,7 @@ def track(
     reading: Reading = Reading(),
     *,
     illumination: LightFlags = LIGHT,
+    known: BodyFlags = UNKNOWN,
 ) -> None:
     """Follow closed bodies through the times of a scan: their shapes on smooth paths, into a run folder.
 
@@ -91,10 +119,16 @@ def track(
         reading.part.time_frame is None,
         f"bodies are followed through all times, but --time-frame is {reading.part.time_frame}; leave it.",
     )
-    options, folder = how.options(), RunFolder(out)
+    options, folder = replace(how.options(), body=known.known()), RunFolder(out)
     if not resume:
         folder.require_new(advise_resume=True)
     measured = read_as(scan, reading).in_memory()
+    if options.body is None and len(beam_directions(measured.train().views)) == 2:
+        print(
+            "note: two beams leave the shapes of bodies open; where their shape at rest is known, --body red-cell or "
+            "--body FILE helps.",
+            file=sys.stderr,
+        )
     prior = matter.prior(measured.exposures.reference_energy)
     try:
         with ProgressBar() as bar:

@@ -13,6 +13,7 @@ from ..optics.background import Light
 from ..progress import Advance
 from ..representations import MovingSurfaces
 from ..scan import Scan
+from .elastic import Rest
 from .fit import MotionFit, motion_fit
 
 SURE = 2.0
@@ -46,6 +47,7 @@ def chosen_paths(
     how: MotionFit,
     seed: int = 0,
     light: Light | None = None,
+    rest: Rest | None = None,
     on_progress: Advance = lambda part: None,
 ) -> MovingSurfaces:
     """`start` on paths of the asked number of pieces, or of the number that predicts held-out frames best.
@@ -68,7 +70,7 @@ def chosen_paths(
 
     def fitted(bodies: MovingSurfaces) -> tuple[MovingSurfaces, np.ndarray]:
         nonlocal done
-        fit = motion_fit(kept, bodies, short, seed, _part(light, ~aside))
+        fit = motion_fit(kept, bodies, short, seed, _part(light, ~aside), rest)
         fit.run(lambda record: on_progress((done + fit.share) / most_fits))
         done += 1
         found = fit.result().object

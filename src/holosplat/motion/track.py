@@ -18,12 +18,15 @@ from ..optics.background import Light
 from ..progress import FitProgress
 from ..representations import MovingSurfaces, TimeBasis
 from ..scan import Scan
+from .elastic import Rest
 from .fit import MotionFit, motion_fit
 from .halves import halves_of
 from .identities import LinkOptions
 from .journal import Journal, Nowhere, from_sightings, to_sightings
+from .known import KnownBodies, at_rest
 from .pieces import PathOptions, chosen_paths
 from .remainder import apart, beside, joined, only, sure_ones, whole_ones
+from .rest_shape import KnownBody
 from .sightings import Sighting, SightingOptions, sightings
 from .start import first_paths
 
@@ -51,6 +54,8 @@ class TrackOptions:
 
     kind: ClassVar[str] = "track"
 
+    body: KnownBody | None = None
+    """What is known of the bodies' shape at rest, which makes two beams enough; None: nothing."""
     sightings: SightingOptions = field(default_factory=SightingOptions)
     """How bodies are found at single times."""
     links: LinkOptions = field(default_factory=LinkOptions)
@@ -146,8 +151,11 @@ class _Following:
     timing: dict[str, float] = field(default_factory=dict)
     halves: list[MovingSurfaces] = field(default_factory=list)
     oversample: int = 1
+    size: float = 1.0
+    """Of all bodies of known rest shape, beside what was said."""
     _begun: Mapping[str, Any] | None = None
     """The state of the fit in which the run was cut off."""
+    _search: KnownBodies | None = None
 
     def take_up(self) -> None:
         """Go on where the journal ends."""
@@ -159,11 +167,12 @@ class _Following:
         self.seen, self.counts = to_sightings(saved["seen"]), list(saved["counts"])
         self.records, self.timing = list(saved["records"]), dict(saved["timing"])
         self.halves = [MovingSurfaces.from_state(one) for one in saved["halves"]]
-        self._begun = saved["fit"]
+        self._begun, self.size = saved["fit"], float(saved["size"])
 
     def _save(self, fit: Mapping[str, Any] | None = None) -> None:
         """Write the journal; fit: the state of the one that runs, which starts at `bodies`."""
         state = {"next": self.stage, "round": self.round, "oversample": self.oversample, "counts": self.counts}
+        state["size"] = self.size
         state |= {"bodies": None if self.bodies is None else self.bodies.state(), "fit": fit}
         state |= {"seen": from_sightings(self.seen), "records": self.records, "timing": self.timing}
         self.journal.save(state | {"halves": [one.state() for one in self.halves]})
@@ -171,10 +180,12 @@ class _Following:
     def advance(self) -> None:
         """Do the stage that is next."""
         if self.stage == "sightings":
-            self.seen = self.look(self.train)
+            self.seen = [] if self.options.body else self.look(self.train)
             self.counts, self.stage = [len(one) for one in self.seen], "first paths"
         elif self.stage == "first paths":
             self.bodies, self.seen, self.stage = self.first(), [], "stiff"
+            if self.options.body is not None:
+                self.counts = [self.bodies.count] * len(self.train.instants)
         elif self.bodies is not None:
             self._go_on(self.bodies)
         self._save()
@@ -228,13 +239,40 @@ class _Following:
         """Bodies on first paths; the doubtful ones are left to be found beside the others."""
         times, options = self.train.instants, self.options
         basis = TimeBasis(float(times[0]), float(times[-1]), options.paths.degree)
+        if options.body is not None:
+            posed = self._posed(options.body, basis)
+            if posed is None:
+                raise InputError(
+                    f"no body of the shape {options.body.shape} was found in the frames; check its size, the material "
+                    "and the pixel size, or leave --body."
+                )
+            return posed
         found = first_paths(self.seen, times, basis, self.train.views.finest, self.material, options.links)
         sure = sure_ones(found, self.train.views, times)
         return found if options.rounds == 0 or len(sure) == found.count else only(found, sure)
 
+    @property
+    def rest(self) -> Rest | None:
+        """What is known of the bodies' shape."""
+        body = self.options.body
+        return None if body is None else at_rest(body, self.train.views.finest, self.size)
+
+    def _posed(self, body: KnownBody, basis: TimeBasis, known: MovingSurfaces | None = None) -> MovingSurfaces | None:
+        """Bodies of known shape beside `known` ones, on first paths."""
+        self.on_progress("poses", 0.0, {})
+        with self._timed("poses"):
+            self._search = self._search or KnownBodies(self.train, self.material, body, self.size)
+            found = self._search.bodies(basis, known)
+            self.size = self._search.size
+        return found
+
     def more(self, bodies: MovingSurfaces) -> MovingSurfaces | None:
         """`bodies`, and those that frames show beside them; None where there are none."""
         times = self.train.instants
+        if self.options.body is not None:
+            new = self._posed(self.options.body, bodies.basis, bodies)
+            own = [] if new is None else apart(new, bodies, times)
+            return joined(bodies, only(new, own)) if new is not None and own else None
         found = self.look(beside(self.train, bodies, self.oversample), self.options.fainter)
         try:
             new = first_paths(found, times, bodies.basis, bodies.unit_length, self.material, self.options.links)
@@ -250,7 +288,7 @@ class _Following:
 
     def on_chosen_paths(self, bodies: MovingSurfaces) -> MovingSurfaces:
         """`bodies` on paths of as many pieces as frames ask for."""
-        how = (self.options.paths, self.options.stiff, self.seed, self.light)
+        how = (self.options.paths, self.options.stiff, self.seed, self.light, self.rest)
         with self._timed("paths"):
             return chosen_paths(self.train, bodies, *how, lambda part: self.on_progress("paths", part, {}))
 
@@ -258,7 +296,7 @@ class _Following:
         self, name: str, frames: Scan, start: MovingSurfaces, how: MotionFit, light: Light | None
     ) -> MovingSurfaces:
         """`start` after a fit to `frames`, from where an earlier run was cut off in it."""
-        fit = motion_fit(frames, start, how, self.seed, light)
+        fit = motion_fit(frames, start, how, self.seed, light, self.rest)
         if self._begun is not None:
             fit.load(dict(self._begun))
             self._begun = None
