@@ -10,7 +10,6 @@ import torch
 from ..checks import at_least, in_range
 from ..fit.residuals import Prediction
 from ..optics.background import Light
-from ..progress import Advance
 from ..representations import MovingSurfaces
 from ..scan import Scan
 from .elastic import Rest
@@ -48,7 +47,6 @@ def chosen_paths(
     seed: int = 0,
     light: Light | None = None,
     rest: Rest | None = None,
-    on_progress: Advance = lambda part: None,
 ) -> MovingSurfaces:
     """`start` on paths of the asked number of pieces, or of the number that predicts held-out frames best.
 
@@ -66,13 +64,10 @@ def chosen_paths(
     aside[np.random.default_rng(seed).permutation(len(train))[: len(train) // options.held_out]] = True
     short = replace(how, schedule=replace(how.schedule, steps=max(1, how.schedule.steps // 2)))
     kept, left = train.with_split(aside), train[np.flatnonzero(aside)]
-    done, most_fits = 0, 2 * len(candidates) - 1
 
     def fitted(bodies: MovingSurfaces) -> tuple[MovingSurfaces, np.ndarray]:
-        nonlocal done
         fit = motion_fit(kept, bodies, short, seed, _part(light, ~aside), rest)
-        fit.run(lambda record: on_progress((done + fit.share) / most_fits))
-        done += 1
+        fit.run(lambda record: None)
         found = fit.result().object
         assert isinstance(found, MovingSurfaces)
         return found, _errors(left, found, fit.oversample)
