@@ -31,15 +31,26 @@ from holosplat.io.atomic import atomic_path
 from holosplat.mesh import TriangleMesh
 from holosplat.metrics import volume_scores
 from holosplat.motion.fit import MotionFit
+from holosplat.motion.halves import standard_errors
 from holosplat.motion.measures import area
+from holosplat.motion.rest_shape import KnownBody
 from holosplat.motion.sightings import centroid
-from holosplat.motion.track import TrackOptions, follow
+from holosplat.motion.track import Followed, TrackOptions, follow
 from holosplat.representations import MovingSurfaces
 from holosplat.specimens.mesh_series import MeshSeries
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "motion.csv"
 ABLATION = PAGE.with_name("motion_ablation.csv")
-ANGLES = {"flow4": (0.0, 45.0, 90.0, 135.0), "flow3": (0.0, 30.0, 48.0), "flow2": (0.0, 90.0)}
+ANGLES = {
+    "flow4": (0.0, 45.0, 90.0, 135.0),
+    "flow3": (0.0, 30.0, 48.0),
+    "flow2": (0.0, 90.0),
+    "flow3-body": (0.0, 30.0, 48.0),
+    "flow2-body": (0.0, 90.0),
+    "flow2n-body": (0.0, 23.8),
+}
+BODY = "-body"
+"""End of the names of cases in which the cells are known to be red cells."""
 SHAPE, PIXEL, PHOTONS = (128, 96), 0.5e-6, 1000.0
 MATERIAL = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
 TURN = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
@@ -56,7 +67,9 @@ class Row:
     occupancy, means over times; least_dice: of the worst time; cells: whole in the field at half of the times or more;
     followed: of these; bodies: found in all; centre_um: median distance of the centres of followed cells; volume_error,
     volume_spread, area_spread: of their volumes and areas beside the true ones over time, medians over cells [shares];
-    overlap: share of the matter that lies in two bodies, mean over times."""
+    overlap: share of the matter that lies in two bodies, mean over times; centre_over_error, volume_over_error: root
+    mean squares of what centres (each coordinate) and volumes of followed cells are off by, over their standard errors,
+    while the cells are whole in the field: one where errors are right."""
 
     case: str
     times: int
@@ -75,6 +88,8 @@ class Row:
     volume_spread: float
     area_spread: float
     overlap: float
+    centre_over_error: float
+    volume_over_error: float
     seconds: float
     cpu_seconds: float
     memory_mb: float
@@ -110,6 +125,40 @@ def volumes(found: MovingSurfaces, cells: MeshSeries, scan: hs.Scan) -> np.ndarr
     return np.array(rows)
 
 
+def over_errors(found: Followed, cells: MeshSeries, scan: hs.Scan) -> tuple[float, float]:
+    """Root mean squares of errors over standard errors, of centres and volumes of followed cells in the field."""
+    errors, centres, sizes = standard_errors(found.bodies, found.halves, scan), [], []
+    meshes = [found.bodies.bodies(float(t)) for t in cells.times]
+    for k, body in followed(found.bodies, cells):
+        for t, scene in enumerate(cells.snapshots):
+            true, ours = scene.meshes[k], meshes[t][body]
+            if not is_whole(true):
+                continue
+            away = (centroid(ours) - centroid(true)) / [errors[f"{axis}_m"][t, body] for axis in "xyz"]
+            centres.append(np.mean(away**2))
+            sizes.append(((ours.volume - true.volume) / errors["volume_m3"][t, body]) ** 2)
+    return float(np.mean(centres) ** 0.5), float(np.mean(sizes) ** 0.5)
+
+
+def followed(found: MovingSurfaces, cells: MeshSeries) -> list[tuple[int, int]]:
+    """Cells that are whole in the field at half of the times, with the body that follows each."""
+    pairs, kept = [], identities(found, cells)
+    whole = [np.mean([is_whole(scene.meshes[k]) for scene in cells.snapshots]) for k in range(_count(cells))]
+    for k, row in zip((k for k in range(_count(cells)) if whole[k] >= 0.5), kept):
+        if row[1] < FOLLOWED:
+            pairs.append((k, int(row[0])))
+    return pairs
+
+
+def is_whole(mesh: TriangleMesh) -> bool:
+    """Whether a cell is whole in the field, whose rows end along the flow."""
+    return bool(np.abs(mesh.vertices[:, 1]).max() < 0.5 * SHAPE[0] * PIXEL)
+
+
+def _count(cells: MeshSeries) -> int:
+    return len(cells.snapshots[0].meshes)
+
+
 def identities(found: MovingSurfaces, cells: MeshSeries) -> np.ndarray:
     """[C, 5] of each cell that is whole in the field at half of the times: number of the body that stays nearest; and
     over these times the median distance of centres [m], mean error and standard deviation of the volume, and standard
@@ -118,9 +167,9 @@ def identities(found: MovingSurfaces, cells: MeshSeries) -> np.ndarray:
     ours = np.array([[centroid(mesh) for mesh in at] for at in meshes])
     sizes = np.array([[mesh.volume for mesh in at] for at in meshes])
     rows = []
-    for k in range(len(cells.snapshots[0].meshes)):
+    for k in range(_count(cells)):
         own = [scene.meshes[k] for scene in cells.snapshots]
-        whole = np.array([np.abs(mesh.vertices[:, 1]).max() < 0.5 * SHAPE[0] * PIXEL for mesh in own])
+        whole = np.array([is_whole(mesh) for mesh in own])
         if whole.mean() < 0.5:
             continue
         way = np.array([centroid(mesh) for mesh in own])
@@ -134,7 +183,7 @@ def identities(found: MovingSurfaces, cells: MeshSeries) -> np.ndarray:
 
 def options_without(prior: str) -> TrackOptions:
     """What `follow` does unless it is told, but for one of `PRIORS`."""
-    usual = TrackOptions()
+    usual = TrackOptions(intervals=prior == "none")
 
     def freed(fit: MotionFit) -> MotionFit:
         if prior == "none":
@@ -151,16 +200,19 @@ def row_of(case: str, data: Path, first: int, times: int, every: int, seed: int,
     cells = cells_in_flow(data, first, times, every)
     scan = imaged(cells, ANGLES[case], seed)
     began = time.perf_counter(), time.process_time()
-    found = follow(scan, MATERIAL, options_without(without), seed).bodies
+    options = replace(options_without(without), body=KnownBody() if case.endswith(BODY) else None)
+    result = follow(scan, MATERIAL, options, seed)
+    found = result.bodies
     seconds = time.perf_counter() - began[0], time.process_time() - began[1]
     memory = memory_megabytes("VmHWM")
     scores, kept = volumes(found, cells, scan), identities(found, cells)
     good = kept[kept[:, 1] < FOLLOWED]
-    followed = len(set(good[:, 0]))  # a body that is nearest to two cells follows one of them
+    count = len(set(good[:, 0]))  # a body that is nearest to two cells follows one of them
+    ratios = over_errors(result, cells, scan) if result.halves else (float("nan"), float("nan"))
     machine = f"{platform.machine()}, {torch.get_num_threads()} of 2 cores, shared"
     dice, error, overlap = (float(one) for one in scores.mean(0))
     away, *sizes = (float(np.median(np.abs(one))) for one in good[:, 1:].T)
-    said = (dice, error, float(scores[:, 0].min()), len(kept), followed, found.count, 1e6 * away, *sizes, overlap)
+    said = (dice, error, float(scores[:, 0].min()), len(kept), count, found.count, 1e6 * away, *sizes, overlap, *ratios)
     return Row(case, times, first, every, seed, without, *said, *seconds, memory, machine, commit())  # pyright: ignore[reportCallIssue]
 
 

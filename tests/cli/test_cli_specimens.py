@@ -97,6 +97,10 @@ def test_light_is_in_the_frames_and_in_the_file(tmp_path):
         (["--specimen", "tissue", "--core", "iron"], "--core is what is inside"),
         (["--specimen", "coated-droplets", "--core-density", 1], "--core-density needs --core"),
         (["--specimen", "tissue", "--frame-rate", 100], "--frame-rate is of moving meshes"),
+        (["--specimen", "stirred-blob"], "moves; give --frame-rate"),
+        (["--specimen", "stirred-blob", "--frame-rate", 100], "--frames of two or more"),
+        (["--specimen", "stirred-blob", "--frame-rate", 1, "--frames", 2, "--start", 1], "leave --start"),
+        (["--specimen", "tissue", "--specimen-motion", 3], "--specimen-motion is of stirred-blob"),
         (["--specimen", "tissue", "--bandwidth", 0.01], "a spectrum needs meshes"),
         (["--specimen", "tissue", "--specimen-seed", -1], "specimen-seed must be 0 or more"),
         (["--specimen", "tissue", "--light-drift-px", 3], "light_drift_px moves the pattern"),
@@ -113,6 +117,20 @@ def test_requests_that_cannot_be_are_refused(arguments, said, tmp_path):
     assert outcome.code == 2
     assert re.search(r"\W+".join(re.findall(r"\w+", said)), outcome.said)
     assert not (tmp_path / "s.nxs").exists()
+
+
+@pytest.mark.parametrize(("kind", "goes"), [("stirred-blob", 90), ("collapsing-foam", 0.3)])
+def test_specimens_that_move_give_series(kind, goes, tmp_path):
+    out, truth = tmp_path / "series.nxs", tmp_path / "truth.h5"
+    moving = ["--specimen", kind, "--specimen-motion", goes, "--specimen-count", 2, "--frame-rate", 1e5, "--frames", 3]
+    field = ["--detector", 20, 23, "--pixel-size", "2e-6", "--views", 2, "--material", "PMMA", "--test-every", 0]
+    ran("simulate", *moving, *field, "--out", out, "--truth", truth, "--truth-frames", 0, 2)
+    scan = read_scan(out)
+    assert scan.is_series
+    assert scan.instants == pytest.approx([0, 1e-5, 2e-5], abs=0)
+    first, last = (read_volume(truth.with_stem(f"truth_t000{k}")).delta for k in (0, 2))
+    assert last.sum() == pytest.approx(first.sum(), rel=0.03)
+    assert np.abs(last - first).max() > 0.05 * first.max()
 
 
 def test_materials_are_listed():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,37 @@ def test_a_run_has_its_bodies_and_tracks(folder):
     assert (run / "report.html").is_file()
 
 
+def test_rows_have_standard_errors(folder):
+    """Of half a pixel at most, for bodies in the field; the report has them, too."""
+    with (folder / "run" / "tracks.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert "se_nx" not in rows[0]
+    middle = rows[3 * (TIMES // 2)]
+    for axis in "xyz":
+        assert 1e-4 * PIXEL < float(middle[f"se_{axis}_m"]) < 0.5 * PIXEL
+    assert 0 < float(middle["se_volume_m3"]) < 0.2 * float(middle["volume_m3"])
+    page = (folder / "run" / "report.html").read_text(encoding="utf-8")
+    assert "Bands are standard errors" in page
+    assert " ± " in page
+
+
+def test_a_run_that_was_cut_off_goes_on(folder, tmp_path):
+    """Here after its fits, before anything was written: with what it was begun with, and nothing else."""
+    cut, how = tmp_path / "run", (*KNOWN, "--effort", "0.2", "--pieces", "1", "--rounds", "0")
+    shutil.copytree(folder / "run", cut)
+    for name in ("tracks.csv", "object.h5", "summary.json", "report.html"):
+        (cut / name).unlink()
+    refused(holosplat("evaluate", cut), "finish it with --resume")
+    again = ("track", folder / "scan.nxs", *how, "--out", cut)
+    refused(holosplat(*again), "--resume")
+    refused(holosplat(*again, "--resume", "--volume-kept", "0.1"), "method", "use the same, or another --out")
+    refused(holosplat(*again, "--resume", "--views", "0:16"), "scan file", "use the same, or another --out")
+    worked_by(*again, "--resume")
+    for name in ("tracks.csv", "bodies.pvd", "metrics.csv"):
+        assert (cut / name).read_bytes() == (folder / "run" / name).read_bytes()
+    assert (cut / "report.html").is_file()
+
+
 def test_it_is_scored_at_one_time(folder):
     whole = worked_by("evaluate", folder / "run", "--truth", folder / "truth.h5", "--json")
     last = worked_by("evaluate", folder / "run", "--truth", folder / "truth.h5", "--time-frame", TIMES - 1, "--json")
@@ -99,6 +131,19 @@ def test_what_cannot_be_followed_is_refused(folder):
     assert not out.exists()
 
 
-def test_surfaces_of_bodies_in_motion_are_there_already(folder):
-    refused(holosplat("surface", folder / "run", "--out", folder / "again"), "closed surfaces already", "export")
+def test_surfaces_of_bodies_in_motion_are_fitted_at_one_time(folder):
+    """From those of the run, whose names they keep, to the frames of that time, which they explain better."""
+    again = ("surface", folder / "run", "--out", folder / "again")
+    refused(holosplat(*again), "at one time", f"0 … {TIMES - 1}", "export")
+    refused(holosplat(*again, "--time-frame", TIMES), f"0 to {TIMES - 1}")
     assert not (folder / "again").exists()
+    steps = ("--steps", "20")
+    worked_by(*again, "--time-frame", TIMES - 1, *steps)
+    found = read_object(folder / "run" / "object.h5")
+    assert isinstance(found, MovingSurfaces)
+    for k, own in enumerate(found.bodies((TIMES - 1) * STEP)):
+        (mesh,) = read_meshes([folder / "again" / f"body{k:03d}.vtk"], "um")
+        assert np.array_equal(mesh.faces, own.faces)
+        assert 0 < np.abs(mesh.vertices - own.vertices).mean() < PIXEL
+    said = json.loads((folder / "again" / "summary.json").read_text())
+    assert said["surfaces"]["train"]["mean"]["l1"] < said["run"]["train"]["mean"]["l1"]

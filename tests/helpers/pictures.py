@@ -32,6 +32,7 @@ def undrawn() -> Iterator[None]:
     All else of a report is as ever. tests/report draws, and so do the runs that the tests of the commands share.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("holosplat.report.blocks.data_uri", _blank)
+        patch.setattr("holosplat.report.block.data_uri", _blank)
         patch.setattr("holosplat.report.figures.render_surface", _coarse)
+        patch.setattr("holosplat.report.motion_blocks.animation", lambda moving: b"still")
         yield

@@ -12,6 +12,7 @@ from holosplat.mesh import TriangleMesh
 from holosplat.motion.measures import angular_velocity, columns, measure, measured, moments, row, volume_velocity
 from holosplat.motion.sightings import Sighting, centroid, is_cut
 from holosplat.representations import MovingSurfaces, TimeBasis
+from holosplat.scan import Exposures
 from holosplat.specimens.red_cells import icosphere
 
 AXES = np.array([5e-6, 3e-6, 2e-6])
@@ -87,7 +88,7 @@ def test_a_moving_body_is_measured_at_every_time():
     basis, times = TimeBasis(0.0, 1e-4, 2), np.linspace(0, 1e-4, 3)
     places = np.array([3e-6 * sphere + np.array([0, 0.3 * t, 0]) for t in times])
     body = MovingSurfaces.of_bodies([basis.fitted(times, places)], [faces], basis, 1e-6, Matter.one(1e-7, 0.0))
-    found = list(measured(body, times, VIEWS))
+    found = list(measured(body, Exposures.of(VIEWS, 20.0, 0.1).repeated(times)))
     assert [one.vy_m_s for one in found] == pytest.approx([0.3] * 3, rel=1e-6)
     assert [one.in_field for one in found] == [1.0, 0.0, 0.0]
 

@@ -52,6 +52,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "track",
         "Follow closed bodies through the times of a scan: their shapes on smooth paths, into a run folder.",
     ),
+    "forecast": (
+        "forecast",
+        "Carry a run of track on: its bodies and their frames at later times, with a standard error.",
+    ),
     "render": ("commands", "Predict the frames of a scan from a run."),
     "export": ("commands", "Write δ and β of a run as a volume file, or the bodies of a run of surfaces as meshes."),
     "surface": (

@@ -34,12 +34,13 @@ if TYPE_CHECKING:
     from ..beamline.series import Timing
     from ..geometry import Views
     from ..scan import Exposures
+    from ..specimens.carried import CarriedScene
     from ..specimens.continuous import ContinuousScene
     from ..specimens.mesh_series import MeshSeries
     from ..specimens.scene import MeshScene
     from ..specimens.voxel_scene import VoxelScene
 
-    Still = MeshScene | ContinuousScene | VoxelScene
+    Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene
 
 
 MESHES = SpecimenOptions()
@@ -95,13 +96,15 @@ def simulate(
     views, filled = beamline.planned(), filling.filling()
     true_views = experiment.misalignment.errors().true_exposures(views)
     with ProgressBar() as bar:
-        still = imaged.continuous(files, beamline, filled)
-        if still is None:
+        times = imaged.generated.timing(motion) if imaged.generated.specimen else np.zeros(1)
+        generated = imaged.continuous(files, beamline, filled, float(times[-1]))
+        if generated is None:
             specimen = _specimen(files, beamline, imaged.meshes, filled, motion.timing(), bar)
         else:
             imaged.meshes.require_static()
-            require(motion.frame_rate is None, "--frame-rate is of moving meshes; leave it out.")
-            specimen = _Specimen(still, np.zeros(1), _facts_of_still(imaged, files))
+            moves = len(times) > 1
+            require(moves or motion.frame_rate is None, "--frame-rate is of moving meshes; leave it out.")
+            specimen = _Specimen(generated, times, _facts_of_still(imaged, files))
     times, how = specimen.times, experiment.noise.simulation(motion.shutter(), experiment.light)
     _warn_of_missing_field(specimen.matter, true_views.views, beamline.pixel_size)
     split = beamline.split(len(views) if motion.hold_out == "views" else len(times))

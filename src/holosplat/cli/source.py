@@ -17,12 +17,13 @@ if TYPE_CHECKING:
     from ..beamline.simulate import Simulation
     from ..optics.coherence import Spectrum
     from ..scan import Exposures
+    from ..specimens.carried import CarriedScene
     from ..specimens.continuous import ContinuousScene
     from ..specimens.mesh_series import MeshSeries
     from ..specimens.scene import MeshScene
     from ..specimens.voxel_scene import VoxelScene
 
-    Still = MeshScene | ContinuousScene | VoxelScene
+    Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene
 
 
 @dataclass(frozen=True)
@@ -80,13 +81,14 @@ class SourceOptions:
         """Frames [H, W] of `matter`, one after another."""
         from ..beamline.polychromatic import polychromatic_frames, refilled
         from ..beamline.simulate import simulated_frames
+        from ..specimens.carried import CarriedScene
         from ..specimens.continuous import ContinuousScene
         from ..specimens.voxel_scene import VoxelScene
 
         light = self.light(exposures.one_energy("a simulation"))
         if light is None:
             return simulated_frames(matter, exposures, how)
-        if isinstance(matter, ContinuousScene | VoxelScene):
+        if isinstance(matter, ContinuousScene | CarriedScene | VoxelScene):
             raise InputError(
                 "a spectrum needs meshes, whose materials are known at every energy; leave --bandwidth and --spectrum "
                 "out."

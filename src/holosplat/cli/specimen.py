@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from ..checks import InputError, require
-from .options import BeamlineOptions, MeshOptions
+from .options import BeamlineOptions, MeshOptions, MotionOptions
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from ..beamline.scenes import Filling
+    from ..specimens.carried import CarriedScene
     from ..specimens.continuous import ContinuousScene
     from ..specimens.voxel_scene import VoxelScene
 
-Kind = Literal["soft-cells", "round-cell", "tissue", "head-phantom", "coated-droplets", "body-with-absorber"]
+Moving = Literal["stirred-blob", "collapsing-foam"]
+Kind = Literal["soft-cells", "round-cell", "tissue", "head-phantom", "coated-droplets", "body-with-absorber"] | Moving
+MOVING: tuple[Moving, ...] = ("stirred-blob", "collapsing-foam")
 CORED = ("coated-droplets", "body-with-absorber")
 
 
@@ -60,20 +66,39 @@ class GeneratedOptions:
     specimen_size: float | None = None
     """Its extent [m] (default: 0.85 of the shorter side of the field of view)."""
     specimen_count: int = 9
-    """Number of cells or droplets."""
+    """Number of cells, droplets or bubbles."""
     specimen_edge: float | None = None
-    """Width of the edges of soft cells and of the head phantom [m] (default: 3 pixels, or 4 % of the
+    """Width of the edges of soft cells, of the head phantom and of a foam [m] (default: 3 pixels, or 4 % of the
     extent where that is less)."""
     specimen_seed: int = 0
     """Seed of the specimen."""
+    specimen_motion: float | None = None
+    """How far it goes from the first frame to the last: by how much the middle of the stirred blob turns [degrees]
+    (default: 60), or which share of its gas the collapsing foam loses (default: 0.5)."""
     core: str | None = None
     """Formula or name of what is in coated droplets, or of the absorber; --material is around it."""
     core_density: float | None = None
     """Its density [g/cm³]; a named one has its own."""
 
-    def scene(self, beamline: BeamlineOptions, filling: Filling) -> ContinuousScene:
-        """The specimen in the beamline's field of view."""
-        from ..specimens import soft_matter
+    def timing(self, motion: MotionOptions) -> np.ndarray:
+        """The times [T] of the frames [s], the first at 0; `InputError` where `motion` and the specimen do not fit."""
+        import numpy as np
+
+        timing = motion.timing()
+        if self.specimen not in MOVING:
+            require(timing is None, "--frame-rate is of moving meshes, or of a specimen that moves; leave it out.")
+            return np.zeros(1)
+        if timing is None or timing.frames is None or timing.frames < 2:
+            raise InputError(f"--specimen {self.specimen} moves; give --frame-rate, and --frames of two or more.")
+        start = timing.start
+        require(start is None, f"--specimen {self.specimen} begins to move at the first frame; leave --start.")
+        return np.arange(timing.frames) / timing.frame_rate
+
+    def scene(
+        self, beamline: BeamlineOptions, filling: Filling, duration: float = 0.0
+    ) -> ContinuousScene | CarriedScene:
+        """The specimen in the beamline's field of view; duration: from the first frame to the last [s]."""
+        from ..specimens import soft_matter, soft_motion
 
         assert self.specimen is not None
         pixel = beamline.pixel_size
@@ -82,7 +107,17 @@ class GeneratedOptions:
         edge = min(3 * pixel, 0.04 * size) if edge is None else edge
         require(seed >= 0, f"--specimen-seed must be 0 or more, but it is {seed}.")
         matter = filling.of(self.specimen, beamline.energy_kev)
-        cores = self._cores(filling, beamline.energy_kev)
+        cores, goes = self._cores(filling, beamline.energy_kev), self.specimen_motion
+        require(
+            goes is None or self.specimen in MOVING,
+            f"--specimen-motion is of {' and '.join(MOVING)}, not of {self.specimen}; leave it.",
+        )
+        if self.specimen == "stirred-blob":
+            turn = math.radians(60.0 if goes is None else goes)
+            return soft_motion.stirred_blob(size, matter, seed, turn, duration)
+        if self.specimen == "collapsing-foam":
+            lost = 0.5 if goes is None else goes
+            return soft_motion.collapsing_foam(size, matter, seed, lost, duration, self.specimen_count, edge)
         if self.specimen == "soft-cells":
             return soft_matter.soft_cells(self.specimen_count, (0.2 * size, 0.35 * size), box, matter, seed, edge)
         if self.specimen == "round-cell":
@@ -122,15 +157,15 @@ class SpecimenOptions:
     generated: GeneratedOptions = GeneratedOptions()
 
     def continuous(
-        self, paths: tuple[Path, ...], beamline: BeamlineOptions, filling: Filling
-    ) -> ContinuousScene | VoxelScene | None:
-        """The specimen, unless `paths` are meshes; `InputError` for a mixture."""
+        self, paths: tuple[Path, ...], beamline: BeamlineOptions, filling: Filling, duration: float = 0.0
+    ) -> ContinuousScene | CarriedScene | VoxelScene | None:
+        """The specimen, unless `paths` are meshes; `InputError` for a mixture. duration: of its motion [s]."""
         from ..io.volume_files import VOLUME_SUFFIXES
 
         of_volume = [path for path in paths if path.suffix.lower() in VOLUME_SUFFIXES]
         if self.generated.specimen is not None:
             require(not paths, "--specimen generates what is imaged; give it or files, not both.")
-            return self.generated.scene(beamline, filling)
+            return self.generated.scene(beamline, filling, duration)
         require(len(paths) > 0, "simulate needs mesh files, a volume, or --specimen.")
         if not of_volume:
             require(self.volume == VolumeOptions(), "--voxel-size and --value-delta are of TIFF images, not of meshes.")

@@ -20,6 +20,7 @@ from ..io.vtk import write_mesh
 from ..matter import Matter
 from ..mesh import TriangleMesh
 from ..methods.surfaces import SurfaceOptions, oversampling, refine_surfaces
+from ..representations import MovingSurfaces
 from ..workflows.evaluate import evaluate as score
 from ..workflows.evaluate import score_object
 from ..workflows.moments import instants_of
@@ -27,7 +28,7 @@ from ..workflows.provenance import scan_hash
 from ..workflows.reconstruct import load_reconstruction
 from ..workflows.run_folder import RunFolder
 from .progress import ProgressBar
-from .scans import scan_for
+from .scans import run_and_scan
 
 LENGTH_UNIT = "um"
 
@@ -43,20 +44,23 @@ def surface(
     """Cut the bodies of a run out as closed surfaces, fit these to the frames, and write them as VTK files (µm).
 
     Args:
-        run: Run folder, of a reconstruction as one material: any but those that fit δ and β apart.
+        run: Run folder, of a reconstruction as one material: any but those that fit δ and β apart. Of a run of track,
+            --time-frame says at which time; bodies keep their names.
         out: Folder to make: body000.vtk …, the largest first, each with its cavities, and summary.json.
         scan: Scan (default: the one that was reconstructed).
         truth: Volume file of the truth, to score both against.
     """
     require_new(out)
     folder = RunFolder(run)
-    result = load_reconstruction(folder)
+    folder.require_run()
+    times, name = instants_of(folder), "run" if instants_of(folder) else "Gaussians"
     require(
-        not instants_of(folder),
-        f"{run} holds bodies in motion, which are closed surfaces already; write them with export --bodies.",
+        not times or isinstance(reading.part.time_frame, int),
+        f"{run} holds bodies in motion, whose surfaces are fitted at one time; choose it with --time-frame 0 … "
+        f"{len(times) - 1}, or write the bodies as they are with export --bodies.",
     )
-    measured, volume = scan_for(folder, scan, reading), read_volume(truth) if truth else None
-    if not folder.is_of(scan_hash(measured)):
+    (result, measured), volume = run_and_scan(folder, scan, reading), read_volume(truth) if truth else None
+    if not times and not folder.is_of(scan_hash(measured)):
         _say("this is not the scan that was reconstructed: its held-out frames may have been fitted")
     if folder.read_config().get("prior", {}).get("kind") == "free":
         _say("nothing was known of the matter: δ and β of the surfaces are what the run estimated")
@@ -66,11 +70,12 @@ def surface(
         found = refine_surfaces(result.object, measured, how, lambda *now: bar.show(now[0], now[1], {}))
     seconds = time.perf_counter() - began
     after = score_object(found, measured, volume, oversampling(measured.train(), how.fit))
-    said = {"seconds": seconds, "settings": asdict(how), "gaussians": before.as_dict(), "surfaces": after.as_dict()}
-    bodies = found.bodies()
+    said = {"seconds": seconds, "settings": asdict(how), name.lower(): before.as_dict(), "surfaces": after.as_dict()}
+    whole = load_reconstruction(folder).object
+    bodies = whole.parted(found.vertices.detach()) if isinstance(whole, MovingSurfaces) else found.bodies()
     write_bodies(out, bodies, found.matter, said)
-    for name, scores in (("Gaussians", before), ("surfaces", after)):
-        print(f"{name}:", *scores.lines(), sep="\n  ")
+    for of, scores in ((name, before), ("surfaces", after)):
+        print(f"{of}:", *scores.lines(), sep="\n  ")
     _say(f"wrote {out}: {len(bodies)} bodies of {len(found.faces)} triangles, {seconds:.1f} s")
 
 

@@ -13,18 +13,44 @@ from ..io.formats import read_as
 from ..io.json import write_json
 from ..io.reading import Reading
 from ..io.run_scan import run_source
+from ..motion.known import beam_directions
+from ..motion.rest_shape import KnownBody
 from ..motion.track import TrackOptions
 from ..report.run import report_run
 from ..workflows.evaluate import evaluate as score
-from ..workflows.moments import moment
 from ..workflows.run_folder import RunFolder
 from ..workflows.track import BODIES, COLLECTION, TRACKS
 from ..workflows.track import track as follow
 from .options import LightFlags, PriorOptions
-from .progress import ProgressBar
+from .progress import INTERRUPTED, ProgressBar
+
+
+@dataclass(frozen=True)
+class BodyFlags:
+    """What is known of the bodies' shape."""
+
+    body: str = ""
+    """Shape at rest of all bodies: red-cell, or a file of one closed mesh (.stl, .ply, .obj, .vtk, .vtp, .vtu)."""
+    body_unit: str = "um"
+    """Unit of the mesh file's coordinates."""
+    body_size: float = 0.0
+    """Largest extent at rest [m] (0: a red cell's 7.82 µm, or the file's)."""
+    body_uncertain: float = 0.1
+    """By which part all bodies may be larger or smaller than that, at most."""
+    body_stiffness: float = 100.0
+    """Minus the logarithm of the probability of strains of about one."""
+
+    def known(self) -> KnownBody | None:
+        """None without a shape."""
+        if not self.body:
+            return None
+        return KnownBody(self.body, self.body_unit, self.body_size, self.body_uncertain, self.body_stiffness)
+
 
 LIGHT = LightFlags()
 """Even, unless the air of frames says otherwise."""
+UNKNOWN = BodyFlags()
+"""Nothing."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +75,8 @@ class MotionFlags:
     """Weight of bent paths (0: as bent as splines can be)."""
     bending: float = 1.0
     """Weight of bent surfaces (0: free)."""
+    intervals: bool = True
+    """Standard errors from fits to halves of the frames, which take about as long as the last fit."""
     effort: float = 1.0
     """Factor of the numbers of steps."""
 
@@ -60,9 +88,9 @@ class MotionFlags:
         known = {name: getattr(self, name) for name in ("volume_kept", "area_kept", "apart", "acceleration")}
         fits = {
             name: replace(fit, objective=replace(fit.objective, bending=self.bending), **known)
-            for name, fit in (("stiff", usual.stiff), ("soft", usual.soft))
+            for name, fit in (("stiff", usual.stiff), ("soft", usual.soft), ("half", usual.half))
         }
-        return replace(usual, paths=paths, sightings=found, rounds=self.rounds, **fits)
+        return replace(usual, paths=paths, sightings=found, rounds=self.rounds, intervals=self.intervals, **fits)
 
 
 def track(
@@ -71,9 +99,11 @@ def track(
     matter: PriorOptions = PriorOptions(),
     how: MotionFlags = MotionFlags(),
     seed: int = 0,
+    resume: bool = False,
     reading: Reading = Reading(),
     *,
     illumination: LightFlags = LIGHT,
+    known: BodyFlags = UNKNOWN,
 ) -> None:
     """Follow closed bodies through the times of a scan: their shapes on smooth paths, into a run folder.
 
@@ -82,32 +112,43 @@ def track(
         out: Run folder to make: bodies.pvd with one VTK file a body and time (µm), tracks.csv, and what reconstruct
             writes.
         seed: Seed of everything random.
+        resume: Go on with an interrupted run.
     """
     require(seed >= 0, f"--seed must be 0 or more, but it is {seed}.")
     require(
         reading.part.time_frame is None,
         f"bodies are followed through all times, but --time-frame is {reading.part.time_frame}; leave it.",
     )
-    options, folder = how.options(), RunFolder(out)
-    folder.require_new()
+    options, folder = replace(how.options(), body=known.known()), RunFolder(out)
+    if not resume:
+        folder.require_new(advise_resume=True)
     measured = read_as(scan, reading).in_memory()
-    prior = matter.prior(measured.exposures.reference_energy)
-    with ProgressBar() as bar:
-        result = follow(
-            measured,
-            prior,
-            options,
-            seed,
-            light=illumination.options(),
-            folder=folder,
-            on_progress=bar.show,
+    if options.body is None and len(beam_directions(measured.train().views)) == 2:
+        print(
+            "note: two beams leave the shapes of bodies open; where their shape at rest is known, --body red-cell or "
+            "--body FILE helps.",
+            file=sys.stderr,
         )
+    prior = matter.prior(measured.exposures.reference_energy)
+    try:
+        with ProgressBar() as bar:
+            result = follow(
+                measured,
+                prior,
+                options,
+                seed,
+                light=illumination.options(),
+                folder=folder,
+                resume=resume,
+                on_progress=bar.show,
+            )
+    except KeyboardInterrupt:
+        begun = folder.checkpoint.is_file()
+        print(f"interrupted{f'; go on with --out {out} --resume' if begun else ''}", file=sys.stderr)
+        raise SystemExit(INTERRUPTED) from None
     write_json(folder.source, run_source(scan, reading))
     evaluation = score(result, measured, None)
-    times = measured.instants.tolist()
-    middle = len(times) // 2
-    shown = measured.at_instant(middle)
-    report = report_run(folder, moment(result, times, middle), shown, evaluation, None)
+    report = report_run(folder, result, measured, evaluation, None)
     for line in evaluation.lines():
         print(line)
     for line in result.verdict.lines("training frames") if result.verdict else ():

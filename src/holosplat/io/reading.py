@@ -119,6 +119,8 @@ class Part:
 
     time_frame: int | Literal["all"] | None = None
     """Of a time-resolved scan: the time to take, counted from 0, or all if nothing moved."""
+    time_frames: str | None = None
+    """Times to take of a time-resolved scan, counted from 0, as --views, such as 0:24; --time-frame counts these."""
     views: str | None = None
     """Frames to take, counted from 0: numbers and ranges start:stop:step, as in 0:91:8 or 3,5,20:30."""
     test_views: str | None = None
@@ -134,10 +136,17 @@ class Part:
         Errors: `InputError` for frames, rows, columns or times that the scan does not have.
         """
         require(self.bin >= 1, f"--bin must be at least 1, but it is {self.bin}.")
-        scan = self._chosen(at_time(scan, self.time_frame))
+        scan = self._chosen(at_time(self._timed(scan), self.time_frame))
         if self.crop is not None:
             scan = scan.cropped(*_corner(self.crop, scan.views.shape))
         return scan.binned(self.bin)
+
+    def _timed(self, scan: Scan) -> Scan:
+        if self.time_frames is None:
+            return scan
+        instants = scan.instants
+        kept = instants[marked("--time-frames", self.time_frames, len(instants))]
+        return scan[np.flatnonzero(np.isin(scan.exposures.time, kept))]
 
     def _chosen(self, scan: Scan) -> Scan:
         taken = np.ones(len(scan), dtype=bool) if self.views is None else marked("--views", self.views, len(scan))

@@ -125,7 +125,9 @@ class SurfaceStage:
     name: str = STAGE
 
     def start(self, task: Task, before: Stored | None) -> SurfaceMesh:
-        """The surfaces cut out of Gaussians."""
+        """The surfaces cut out of Gaussians; closed surfaces are taken as they are."""
+        if isinstance(before, SurfaceMesh):
+            return before
         task.on_progress(f"{STAGE}: extraction", 0.0)
         require(
             isinstance(before, GaussianCloud),
@@ -168,7 +170,8 @@ def refine_surfaces(
     options: SurfaceOptions = SurfaceOptions(),
     on_progress: Progress = quiet,
 ) -> SurfaceMesh:
-    """Surfaces cut out of `cloud` and fitted to the training frames of `scan`; errors: of both parts."""
+    """Surfaces cut out of `cloud`, or `cloud` itself if it is one, fitted to the training frames of `scan`; errors: of
+    both parts."""
     stage, task = SurfaceStage(options), Task(scan.train(), MaterialPrior.unknown(), 0, on_progress)
     fit = stage.fit(task, stage.start(task, cloud))
     found = run_quietly(fit, task.report(STAGE))

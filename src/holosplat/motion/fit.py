@@ -25,6 +25,7 @@ from ..representations import MovingSurfaces
 from ..representations.isosurface import adjacency
 from ..scan import Scan
 from .contact import Apart
+from .elastic import Rest, RestShapeKept
 from .terms import COEFFICIENTS, Acceleration, MovingBending, area_kept, volume_kept
 
 OPEN = 1e-3
@@ -63,9 +64,16 @@ class MotionFit:
 
 
 def motion_fit(
-    scan: Scan, start: MovingSurfaces, options: MotionFit = MotionFit(), seed: int = 0, light: Light | None = None
+    scan: Scan,
+    start: MovingSurfaces,
+    options: MotionFit = MotionFit(),
+    seed: int = 0,
+    light: Light | None = None,
+    rest: Rest | None = None,
 ) -> Fit:
     """The fit of the paths of `start` to the training frames of `scan`, of any number of times, made ready.
+
+    rest: what is known of the bodies' shape at rest.
 
     Steps are Adam's, of one length for all vertices, in coordinates in which neighbours move together (Nicolet et al.
     2021) and in which times count alike: the paths' Gram matrix over the times of the frames is one.
@@ -78,7 +86,7 @@ def motion_fit(
     times = base.train.exposures.time
     group = Group(BETAS, EPSILON, solve=_smooth_directions(start, options.stiffness, times), together=True)
     plan = Plan(
-        problem=Problem(base.model, (base.frames, *_terms(base, start, options))),
+        problem=Problem(base.model, (base.frames, *_terms(base, start, options), *_at_rest(base, start, rest))),
         schedule=schedule,
         optimiser=lambda leaves: Adam(leaves, "cpu", {COEFFICIENTS: group}),
         rates=lambda factor, step: {COEFFICIENTS: options.rate * factor},
@@ -104,6 +112,12 @@ def _terms(base: Ground, start: MovingSurfaces, options: MotionFit) -> list[Term
             Apart(_of_likelihood(base) * start.basis.count / 2 / options.apart**2, start, base.train.exposures.time)
         )
     return found
+
+
+def _at_rest(base: Ground, start: MovingSurfaces, rest: Rest | None) -> list[Term]:
+    if rest is None or rest.stiffness == 0:
+        return []
+    return [RestShapeKept(rest.stiffness * _of_likelihood(base) * start.basis.count, rest.elastic, start)]
 
 
 def _of_likelihood(base: Ground) -> float:

@@ -10,6 +10,7 @@ import numpy as np
 from ..geometry import Views
 from ..mesh import TriangleMesh
 from ..representations import MovingSurfaces
+from ..scan import Exposures
 
 
 @dataclass(frozen=True)
@@ -51,16 +52,16 @@ def columns() -> list[str]:
     return [one.name for one in fields(Measures)]
 
 
-def measured(bodies: MovingSurfaces, times: np.ndarray, views: Views) -> Iterator[Measures]:
-    """Of every body at each of `times` [s]: one time after the other, and then by body. views: of the frames."""
-    for time in times:
-        speeds = bodies.velocities(float(time))
+def measured(bodies: MovingSurfaces, exposures: Exposures) -> Iterator[Measures]:
+    """Of every body at each time of the `exposures`: one time after the other, and then by body."""
+    for time in np.unique(exposures.time):
+        speeds, views = bodies.velocities(float(time)), exposures.views[exposures.time == time]
         for number, (mesh, speed) in enumerate(zip(bodies.bodies(float(time)), speeds)):
             yield measure(mesh, speed, float(time), number, views)
 
 
 def measure(mesh: TriangleMesh, speed: np.ndarray, time: float, number: int, views: Views) -> Measures:
-    """Of one body whose vertices have the velocities `speed` [P, 3] [m/s]."""
+    """Of one body whose vertices have the velocities `speed` [P, 3] [m/s]; views: those of its time."""
     volume, centre, second = moments(mesh)
     values, axes = np.linalg.eigh(second / volume)
     c, b, a = np.sqrt(5 * np.maximum(values, 0))

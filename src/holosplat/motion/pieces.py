@@ -12,6 +12,7 @@ from ..fit.residuals import Prediction
 from ..optics.background import Light
 from ..representations import MovingSurfaces
 from ..scan import Scan
+from .elastic import Rest
 from .fit import MotionFit, motion_fit
 
 SURE = 2.0
@@ -39,7 +40,13 @@ class PathOptions:
 
 
 def chosen_paths(
-    train: Scan, start: MovingSurfaces, options: PathOptions, how: MotionFit, seed: int = 0, light: Light | None = None
+    train: Scan,
+    start: MovingSurfaces,
+    options: PathOptions,
+    how: MotionFit,
+    seed: int = 0,
+    light: Light | None = None,
+    rest: Rest | None = None,
 ) -> MovingSurfaces:
     """`start` on paths of the asked number of pieces, or of the number that predicts held-out frames best.
 
@@ -59,7 +66,7 @@ def chosen_paths(
     kept, left = train.with_split(aside), train[np.flatnonzero(aside)]
 
     def fitted(bodies: MovingSurfaces) -> tuple[MovingSurfaces, np.ndarray]:
-        fit = motion_fit(kept, bodies, short, seed, _part(light, ~aside))
+        fit = motion_fit(kept, bodies, short, seed, _part(light, ~aside), rest)
         fit.run(lambda record: None)
         found = fit.result().object
         assert isinstance(found, MovingSurfaces)

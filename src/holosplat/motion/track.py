@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import ClassVar, Literal
+from typing import Any, ClassVar
+
+import torch
 
 from ..checks import InputError, require
 from ..fit.running import Record
@@ -16,16 +18,30 @@ from ..optics.background import Light
 from ..progress import FitProgress
 from ..representations import MovingSurfaces, TimeBasis
 from ..scan import Scan
+from .elastic import Rest
 from .fit import MotionFit, motion_fit
+from .halves import halves_of
 from .identities import LinkOptions
+from .journal import Journal, Nowhere, from_sightings, to_sightings
+from .known import KnownBodies, at_rest
 from .pieces import PathOptions, chosen_paths
 from .remainder import apart, beside, joined, only, sure_ones, whole_ones
+from .rest_shape import KnownBody
 from .sightings import Sighting, SightingOptions, sightings
 from .start import first_paths
+
+CHECKPOINT_SECONDS = 20.0
+"""A fit that runs is kept so often [s]."""
+NOWHERE = Nowhere()
+"""No journal."""
 
 
 def _stiff() -> MotionFit:
     return MotionFit(rate=0.4, stiffness=100.0, schedule=Schedule(steps=60, views_per_step=16))
+
+
+def _half() -> MotionFit:
+    return MotionFit(rate=0.1, schedule=Schedule(steps=40, views_per_step=16))
 
 
 def _soft() -> MotionFit:
@@ -38,6 +54,8 @@ class TrackOptions:
 
     kind: ClassVar[str] = "track"
 
+    body: KnownBody | None = None
+    """What is known of the bodies' shape at rest, which makes two beams enough; None: nothing."""
     sightings: SightingOptions = field(default_factory=SightingOptions)
     """How bodies are found at single times."""
     links: LinkOptions = field(default_factory=LinkOptions)
@@ -53,9 +71,14 @@ class TrackOptions:
     soft: MotionFit = field(default_factory=_soft)
     """The second one, in which they deform."""
 
+    intervals: bool = True
+    """Whether halves of the frames are fitted, too, for standard errors: up to four fits of a quarter of the steps."""
+    half: MotionFit = field(default_factory=_half)
+    """The fit to a half, from the result: errors are hundredths of a pixel."""
+
     def with_effort(self, effort: float) -> TrackOptions:
         """The same with `effort` times the steps, at least one."""
-        parts = {name: getattr(self, name) for name in ("stiff", "soft")}
+        parts = {name: getattr(self, name) for name in ("stiff", "soft", "half")}
         changed = {
             name: replace(part, schedule=replace(part.schedule, steps=max(1, round(effort * part.schedule.steps))))
             for name, part in parts.items()
@@ -69,14 +92,16 @@ USUAL = TrackOptions()
 
 @dataclass(frozen=True)
 class Followed:
-    """What `follow` found. bodies: on their paths; records: of the steps of both fits; oversample: wave samples a pixel
-    in these; timing: seconds of each stage; found: sightings at each time."""
+    """What `follow` found. bodies: on their paths; records: of the steps of all fits; oversample: wave samples a pixel
+    in these; timing: seconds of each stage; found: how many bodies each time shows by itself; halves: the bodies by
+    halves of the frames, two and two, empty without intervals."""
 
     bodies: MovingSurfaces
     records: list[Record]
     oversample: int
     timing: dict[str, float]
     found: tuple[int, ...]
+    halves: tuple[MovingSurfaces, ...] = ()
 
 
 def follow(
@@ -86,41 +111,113 @@ def follow(
     seed: int = 0,
     *,
     light: Light | None = None,
+    journal: Journal = NOWHERE,
     on_progress: FitProgress = lambda stage, fraction, record: None,
 ) -> Followed:
     """The bodies of `material` in the training frames of `scan`, of several times.
 
-    light: of the training frames, which were divided by it, where it is uneven. Errors: `InputError` for a scan of one
-    time, and where no body is seen.
+    light: of the training frames, which were divided by it, where it is uneven. journal: keeps every stage that is
+    done, and fits from time to time; what it holds already is not done again, and the result is the same bit for bit.
+    Errors: `InputError` for a scan of one time, and where no body is seen.
     """
     train = scan.train()
     require_times(train)
-    run = _Following(train, material, options, seed, light, on_progress)
-    run.look(train)
-    bodies = run.whole(run.fitted("stiff", run.first()))
-    for _ in range(options.rounds):
-        more = run.more(bodies)
-        if more is None:
-            break
-        bodies = run.whole(run.fitted("stiff", more))
-    bodies = run.fitted("soft", run.on_chosen_paths(bodies))
-    return Followed(bodies, run.records, run.oversample, run.timing, tuple(len(one) for one in run.seen))
+    run = _Following(train, material, options, seed, light, journal, on_progress)
+    run.take_up()
+    while run.stage != "done":
+        run.advance()
+    assert run.bodies is not None
+    return Followed(run.bodies, run.records, run.oversample, run.timing, tuple(run.counts), tuple(run.halves))
 
 
 @dataclass
 class _Following:
-    """What `follow` has done so far."""
+    """What `follow` has done so far, and what is next: sightings, then stiff fits and looks beside their bodies in
+    turn, then paths, the soft fit, and fits to halves of the frames."""
 
     train: Scan
     material: DeltaBeta
     options: TrackOptions
     seed: int
     light: Light | None
+    journal: Journal
     on_progress: FitProgress
+    stage: str = "sightings"
+    round: int = 0
+    bodies: MovingSurfaces | None = None
     seen: list[list[Sighting]] = field(default_factory=list)
+    counts: list[int] = field(default_factory=list)
     records: list[Record] = field(default_factory=list)
     timing: dict[str, float] = field(default_factory=dict)
+    halves: list[MovingSurfaces] = field(default_factory=list)
     oversample: int = 1
+    size: float = 1.0
+    """Of all bodies of known rest shape, beside what was said."""
+    _begun: Mapping[str, Any] | None = None
+    """The state of the fit in which the run was cut off."""
+    _search: KnownBodies | None = None
+
+    def take_up(self) -> None:
+        """Go on where the journal ends."""
+        saved = self.journal.load()
+        if saved is None:
+            return
+        self.stage, self.round, self.oversample = str(saved["next"]), int(saved["round"]), int(saved["oversample"])
+        self.bodies = None if saved["bodies"] is None else MovingSurfaces.from_state(saved["bodies"])
+        self.seen, self.counts = to_sightings(saved["seen"]), list(saved["counts"])
+        self.records, self.timing = list(saved["records"]), dict(saved["timing"])
+        self.halves = [MovingSurfaces.from_state(one) for one in saved["halves"]]
+        self._begun, self.size = saved["fit"], float(saved["size"])
+
+    def _save(self, fit: Mapping[str, Any] | None = None) -> None:
+        """Write the journal; fit: the state of the one that runs, which starts at `bodies`."""
+        state = {"next": self.stage, "round": self.round, "oversample": self.oversample, "counts": self.counts}
+        state["size"] = self.size
+        state |= {"bodies": None if self.bodies is None else self.bodies.state(), "fit": fit}
+        state |= {"seen": from_sightings(self.seen), "records": self.records, "timing": self.timing}
+        self.journal.save(state | {"halves": [one.state() for one in self.halves]})
+
+    def advance(self) -> None:
+        """Do the stage that is next."""
+        if self.stage == "sightings":
+            self.seen = [] if self.options.body else self.look(self.train)
+            self.counts, self.stage = [len(one) for one in self.seen], "first paths"
+        elif self.stage == "first paths":
+            self.bodies, self.seen, self.stage = self.first(), [], "stiff"
+            if self.options.body is not None:
+                self.counts = [self.bodies.count] * len(self.train.instants)
+        elif self.bodies is not None:
+            self._go_on(self.bodies)
+        self._save()
+
+    def _go_on(self, bodies: MovingSurfaces) -> None:
+        """The stages after the first paths."""
+        if self.stage == "stiff":
+            self.bodies = self.whole(self.fitted("stiff fit", self.train, bodies, self.options.stiff, self.light))
+            self.stage = "beside" if self.round < self.options.rounds else "paths"
+        elif self.stage == "beside":
+            more = self.more(bodies)
+            self.round += 1
+            self.bodies, self.stage = (bodies, "paths") if more is None else (more, "stiff")
+        elif self.stage == "paths":
+            self.bodies, self.stage = self.on_chosen_paths(bodies), "soft"
+        elif self.stage == "soft":
+            self.bodies = self.fitted("soft fit", self.train, bodies, self.options.soft, self.light)
+            self.stage = "halves"
+        else:
+            self._half(bodies)
+
+    def _half(self, bodies: MovingSurfaces) -> None:
+        """The next half of the frames, if there is one."""
+        parts = (
+            [half for pair in halves_of(self.train, bodies.basis) for half in pair] if self.options.intervals else []
+        )
+        if len(self.halves) < len(parts):
+            part = parts[len(self.halves)]
+            light = self.light and self.light.part(torch.from_numpy(part))
+            self.halves.append(self.fitted("intervals", self.train[part], bodies, self.options.half, light))
+        if len(self.halves) == len(parts):
+            self.stage = "done"
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:
@@ -129,30 +226,53 @@ class _Following:
         self.timing[name] = self.timing.get(name, 0.0) + time.perf_counter() - began
 
     def look(self, frames: Scan, level: float = 1.0) -> list[list[Sighting]]:
-        """The bodies that each time of `frames` shows by itself; the first look is kept.
-
-        level: factor of the occupancy at the surface.
-        """
+        """The bodies that each time of `frames` shows by itself; level: factor of the occupancy at the surface."""
         how = replace(self.options.sightings, level=level * self.options.sightings.level)
         times, found = frames.instants, list[list[Sighting]]()
         with self._timed("sightings"):
             for t in range(len(times)):
                 self.on_progress("bodies at each time", t / len(times), {})
                 found.append(sightings(frames.at_instant(t), self.material, how))
-        self.seen = self.seen or found
         return found
 
     def first(self) -> MovingSurfaces:
         """Bodies on first paths; the doubtful ones are left to be found beside the others."""
         times, options = self.train.instants, self.options
         basis = TimeBasis(float(times[0]), float(times[-1]), options.paths.degree)
+        if options.body is not None:
+            posed = self._posed(options.body, basis)
+            if posed is None:
+                raise InputError(
+                    f"no body of the shape {options.body.shape} was found in the frames; check its size, the material "
+                    "and the pixel size, or leave --body."
+                )
+            return posed
         found = first_paths(self.seen, times, basis, self.train.views.finest, self.material, options.links)
         sure = sure_ones(found, self.train.views, times)
         return found if options.rounds == 0 or len(sure) == found.count else only(found, sure)
 
+    @property
+    def rest(self) -> Rest | None:
+        """What is known of the bodies' shape."""
+        body = self.options.body
+        return None if body is None else at_rest(body, self.train.views.finest, self.size)
+
+    def _posed(self, body: KnownBody, basis: TimeBasis, known: MovingSurfaces | None = None) -> MovingSurfaces | None:
+        """Bodies of known shape beside `known` ones, on first paths."""
+        self.on_progress("poses", 0.0, {})
+        with self._timed("poses"):
+            self._search = self._search or KnownBodies(self.train, self.material, body, self.size)
+            found = self._search.bodies(basis, known)
+            self.size = self._search.size
+        return found
+
     def more(self, bodies: MovingSurfaces) -> MovingSurfaces | None:
         """`bodies`, and those that frames show beside them; None where there are none."""
         times = self.train.instants
+        if self.options.body is not None:
+            new = self._posed(self.options.body, bodies.basis, bodies)
+            own = [] if new is None else apart(new, bodies, times)
+            return joined(bodies, only(new, own)) if new is not None and own else None
         found = self.look(beside(self.train, bodies, self.oversample), self.options.fainter)
         try:
             new = first_paths(found, times, bodies.basis, bodies.unit_length, self.material, self.options.links)
@@ -170,19 +290,34 @@ class _Following:
         """`bodies` on paths of as many pieces as frames ask for."""
         self.on_progress("paths", 0.0, {})
         with self._timed("paths"):
-            return chosen_paths(self.train, bodies, self.options.paths, self.options.stiff, self.seed, self.light)
+            return chosen_paths(
+                self.train, bodies, self.options.paths, self.options.stiff, self.seed, self.light, self.rest
+            )
 
-    def fitted(self, name: Literal["stiff", "soft"], start: MovingSurfaces) -> MovingSurfaces:
-        """`start` after the fit of that name."""
-        fit = motion_fit(self.train, start, getattr(self.options, name), self.seed, self.light)
-        before = len(self.records)
+    def fitted(
+        self, name: str, frames: Scan, start: MovingSurfaces, how: MotionFit, light: Light | None
+    ) -> MovingSurfaces:
+        """`start` after a fit to `frames`, from where an earlier run was cut off in it."""
+        fit = motion_fit(frames, start, how, self.seed, light, self.rest)
+        if self._begun is not None:
+            fit.load(dict(self._begun))
+            self._begun = None
+        before, saved = len(self.records) - fit.step, time.perf_counter()
 
         def keep(record: Record) -> None:
+            nonlocal saved
             self.records.append(record | {"step": before + record["step"]})
-            self.on_progress(f"{name} fit", fit.share, record)
+            self.on_progress(name, fit.share, record)
+            if time.perf_counter() - saved > CHECKPOINT_SECONDS:
+                self._save(fit.state_dict())
+                saved = time.perf_counter()
 
-        with self._timed(f"{name} fit"):
+        try:
             fit.run(keep)
+        except KeyboardInterrupt:
+            self._save(fit.state_dict())
+            raise
+        self.timing[name] = self.timing.get(name, 0.0) + fit.seconds
         found, self.oversample = fit.result().object, fit.oversample
         assert isinstance(found, MovingSurfaces)
         return found.with_parameters({"coefficients": found.coefficients.detach()})

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from ..metrics import VolumeScores
 from ..units import wavenumber
+from .block import Block, drawn_block
 from .content import ReportContent
 from .curves import correlation_figure, histogram_figure, history_figure
 from .explained import explained_figure
@@ -23,39 +23,21 @@ from .figures import (
     slices_figure,
 )
 from .light import light_figure
-from .style import WIDTH, data_uri, format_length, scientific
+from .motion_blocks import motion_blocks
+from .style import format_length, scientific
 
 MOST_VIEWS = 4
-
-
-@dataclass(frozen=True)
-class Block:
-    """One figure of the page: image is a `data:` URI, drawn `width` per cent of the page wide.
-
-    Without an image, `caption` says why there is none.
-    """
-
-    heading: str
-    caption: str
-    title: str = ""
-    image: str | None = None
-    width: int = 100
-    number: int | None = None
 
 
 def make_blocks(content: ReportContent) -> list[Block]:
     """All figures of the page, in order and numbered from 1."""
     makers = (_scene, _held_out, _explained, _light, _projections, _slices, _correlation, _history, _histograms)
     blocks, number = [], 0
-    for block in (make(content) for make in makers):
+    first = [] if content.moving is None else motion_blocks(content.moving)
+    for block in (*first, *(make(content) for make in makers)):
         number += block.image is not None
         blocks.append(replace(block, number=number) if block.image is not None else block)
     return blocks
-
-
-def _drawn(heading: str, caption: str, title: str, figure: Figure, kind: str) -> Block:
-    width = round(100 * float(figure.get_figwidth()) / WIDTH)
-    return Block(heading, caption.strip(), title, data_uri(figure, kind), width)
 
 
 def _scene(content: ReportContent) -> Block:
@@ -77,7 +59,7 @@ def _scene(content: ReportContent) -> Block:
             "a, truth; b, reconstruction; c, the reconstruction coloured by distance from the true surface "
             f"along its own normals: red outside, blue inside of it; colours end at one voxel, {voxel}."
         )
-    return _drawn(heading, text, "The scene and its reconstruction.", figure, "png")
+    return drawn_block(heading, text, "The scene and its reconstruction.", figure, "png")
 
 
 def _held_out(content: ReportContent) -> Block:
@@ -98,7 +80,7 @@ def _held_out(content: ReportContent) -> Block:
         f"Scores use the range of the training frames, {views.scores.data_range[0]:.3f} to "
         f"{views.scores.data_range[1]:.3f}."
     )
-    return _drawn(heading, text, "Prediction of held-out views.", figure, "png")
+    return drawn_block(heading, text, "Prediction of held-out views.", figure, "png")
 
 
 def _explained(content: ReportContent) -> Block:
@@ -112,7 +94,7 @@ def _explained(content: ReportContent) -> Block:
         "coefficients, beside the noise, the contrast, and what a residual may have. b, the residual over what it may "
         "have, in each view: colours end at 3."
     )
-    return _drawn(heading, text, "What is left of the training frames.", figure, "svg")
+    return drawn_block(heading, text, "What is left of the training frames.", figure, "svg")
 
 
 def _light(content: ReportContent) -> Block:
@@ -126,7 +108,7 @@ def _light(content: ReportContent) -> Block:
         f"light that they have beside what the reconstruction predicts (root mean square deviation from one: "
         f"{', '.join(size)}), and what light and reconstruction together leave."
     )
-    return _drawn(heading, text, "Uneven light.", figure, "png")
+    return drawn_block(heading, text, "Uneven light.", figure, "png")
 
 
 def _projections(content: ReportContent) -> Block:
@@ -144,7 +126,7 @@ def _projections(content: ReportContent) -> Block:
         text += "The truth is not known."
     else:
         text += "Truth and reconstruction share one colour scale; differences are reconstruction − truth."
-    return _drawn(heading, text, "Line integrals through the object.", figure, "png")
+    return drawn_block(heading, text, "Line integrals through the object.", figure, "png")
 
 
 def _slices(content: ReportContent) -> Block:
@@ -164,7 +146,7 @@ def _slices(content: ReportContent) -> Block:
             f", the truth's from {low} to {high}. "
             "Truth and reconstruction share one colour scale; differences are reconstruction − truth."
         )
-    return _drawn("Slices", text, "Slices of δ.", figure, "png")
+    return drawn_block("Slices", text, "Slices of δ.", figure, "png")
 
 
 def _correlation(content: ReportContent) -> Block:
@@ -184,7 +166,7 @@ def _correlation(content: ReportContent) -> Block:
         "The upper scale is the full period. Both thresholds were made for two halves of one data set "
         "(van Heel & Schatz 2005; Rosenthal & Henderson 2003); against a noise-free truth they are lenient."
     )
-    return _drawn(heading, text, "Correlation in Fourier space.", figure, "svg")
+    return drawn_block(heading, text, "Correlation in Fourier space.", figure, "svg")
 
 
 def _resolutions(scores: VolumeScores) -> str:
@@ -201,7 +183,7 @@ def _history(content: ReportContent) -> Block:
     if figure is None:
         return Block(heading, "No course of the fit was recorded.")
     text = "Recorded while fitting, over optimisation steps; the loss and its terms on a logarithmic scale."
-    return _drawn(heading, text, "Course of the fit.", figure, "svg")
+    return drawn_block(heading, text, "Course of the fit.", figure, "svg")
 
 
 def _histograms(content: ReportContent) -> Block:
@@ -216,4 +198,4 @@ def _histograms(content: ReportContent) -> Block:
         text += f"{100 * outside:.1f} % of the mass lies outside of the range drawn for δ\u2060/\u2060β. "
         if content.truth is not None:
             text += "The truth's δ\u2060/\u2060β is the ratio of its mean δ to its mean β. "
-    return _drawn(heading, text, "Distribution of δ\u2060/\u2060β and of δ.", figure, "svg")
+    return drawn_block(heading, text, "Distribution of δ\u2060/\u2060β and of δ.", figure, "svg")

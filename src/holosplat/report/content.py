@@ -16,6 +16,7 @@ from ..metrics import ImageScores, VolumeScores, require_same_grid, robust_mater
 from ..volume import Volume
 from ..workflows.totals import TotalMatter
 from ..workflows.verdict import Verdict
+from .moving import Moving
 
 
 @dataclass(frozen=True)
@@ -105,6 +106,7 @@ class ReportContent:
     - lit: training frames in uneven light; None: the light is even
     - explained: the verdict on the training frames; None: not judged
     - total: the total δ by these frames; None: not told
+    - moving: bodies in motion, whose volumes are those of one time; None: matter stands still
     - geometry: where the frames were found to be; None: as the scan says
     - history: columns of metrics.csv, each [S]: step, seconds, loss, the loss' terms, count, val_ssim …
     - seconds: time of the reconstruction [s]
@@ -126,6 +128,7 @@ class ReportContent:
     total: TotalMatter | None = None
     geometry: Geometry | None = None
     lit: LitViews | None = None
+    moving: Moving | None = None
     history: Mapping[str, np.ndarray] = field(default_factory=dict)
     seconds: float | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)

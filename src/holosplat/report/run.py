@@ -11,17 +11,24 @@ import numpy as np
 import torch
 
 from ..geometry import Grid, Views
+from ..motion.measures import columns, measured
+from ..optics.background import Light
 from ..projectors.voxels import voxel_line_integrals
+from ..representations import MovingSurfaces, Stored
 from ..scan import Scan
 from ..units import span
 from ..volume import Volume
 from ..workflows.evaluate import Evaluation, render
 from ..workflows.reconstruct import Reconstruction
 from ..workflows.run_folder import RunFolder
+from ..workflows.track import read_errors
 from .content import HeldOutViews, LitViews, ProjectedMaps, ReportContent, view_labels
 from .figures import evenly_chosen
+from .moving import Moving
 from .page import write_report
 
+MOST_FRAMES = 24
+"""Times that the animation of a report shows, at most."""
 MOST_LIT = 3
 """Training frames whose light a report draws."""
 LARGEST_VOLUME = 160
@@ -35,31 +42,35 @@ def report_run(
     evaluation: Evaluation,
     truth: Volume | None,
 ) -> Path:
-    """Write `report.html` of a run; returns its path."""
-    config = folder.read_config()
+    """Write `report.html` of a run, of one in motion with the volume at the time in the middle; returns its path."""
+    config, moving = folder.read_config(), None
     found = reconstruction.object
+    if isinstance(found, MovingSurfaces):
+        moving = moving_of(reconstruction, scan, evaluation.light, read_errors(folder))
+        found = found.at(_middle(moving))
     grid = truth.grid if truth is not None else _drawn_grid(scan.views)
     held_out = None
     if evaluation.test is not None and evaluation.predicted is not None:
         test = scan.test()
         held_out = HeldOutViews(
-            test.frames, evaluation.predicted, view_labels(test.views), evaluation.test, test.views.pixel_sizes
+            test.frames, evaluation.predicted, _labels(test), evaluation.test, test.views.pixel_sizes
         )
     content = ReportContent(
         title=_title(config, reconstruction),
-        summary=_summary(reconstruction, scan),
+        summary=_summary(reconstruction, scan, moving),
         reconstruction=found.voxelise(grid),
         truth=truth,
         energy_kev=scan.exposures.reference_energy,
         pixel_size=scan.views.finest,
         held_out=held_out,
-        projections=_projections(reconstruction, scan.views, truth),
+        projections=_projections(found, scan.views, truth),
         volume_scores=evaluation.volume,
         material_delta=found.matter.delta if found.matter.single else None,
         explained=reconstruction.verdict,
         total=reconstruction.total,
         geometry=reconstruction.geometry,
         lit=_lit(reconstruction, scan, evaluation),
+        moving=moving,
         history=folder.history(),
         seconds=sum(reconstruction.timing.values()),
         settings={"seed": config["seed"], "prior": config["prior"], **config.get("method", config.get("settings", {}))},
@@ -88,18 +99,32 @@ def _title(config: Mapping[str, Any], reconstruction: Reconstruction) -> str:
     return f"{NAMES[reconstruction.object.kind]}, {count}{said[config['prior']['kind']]}"
 
 
-def _summary(reconstruction: Reconstruction, scan: Scan) -> str:
+def _summary(reconstruction: Reconstruction, scan: Scan, moving: Moving | None) -> str:
     exposures, views = scan.exposures, scan.views
     h, w = views.shape
     distance = f"{span(100 * exposures.distance)} cm"
     energies = exposures.energy_kev.min(), exposures.energy_kev.max()
     energy = f"{energies[0]:g}" if exposures.has_one_energy else f"{energies[0]:g} to {energies[1]:g}"
     state = "" if reconstruction.finished else " The fit was interrupted before its end."
+    if moving is not None:
+        state += f" Volumes, slices and projections are those at {1e6 * _middle(moving):.4g} µs."
     return (
         f"{len(scan.train())} training and {len(scan.test())} held-out frames of {h} × {w} pixels of "
         f"{span(1e6 * views.pixel_sizes)} µm, {energy} keV, {distance} behind the sample; "
         f"{reconstruction.object.described}.{state}"
     )
+
+
+def _middle(moving: Moving) -> float:
+    return float(moving.times[len(moving.times) // 2])
+
+
+def _labels(test: Scan) -> tuple[str, ...]:
+    """Those of views, with the time where there are several."""
+    labels, times = view_labels(test.views), test.exposures.time
+    if len(np.unique(times)) < 2:
+        return labels
+    return tuple(f"{label}, {1e6 * time:.4g} µs" for label, time in zip(labels, times))
 
 
 def _drawn_grid(views: Views) -> Grid:
@@ -129,12 +154,12 @@ def _lit(reconstruction: Reconstruction, scan: Scan, evaluation: Evaluation) -> 
     )
 
 
-def _projections(reconstruction: Reconstruction, views: Views, truth: Volume | None) -> ProjectedMaps:
+def _projections(found: Stored, views: Views, truth: Volume | None) -> ProjectedMaps:
     """B and D of the first view and the one most at right angles to it, through the truth's voxels where known."""
     first, other = 0, int(abs(views.rotations[:, 2] @ views.rotations[0, 2]).argmin())
     chosen = views[[first, other] if other != first else [first]]
     with torch.no_grad():
-        beta, delta = (line.numpy() for line in reconstruction.object.project(chosen))
+        beta, delta = (line.numpy() for line in found.project(chosen))
         if truth is None:
             return ProjectedMaps(beta, delta, view_labels(chosen), pixels=chosen.pixel_sizes)
         true_beta, true_delta = (line.numpy() for line in _project_volume(truth, chosen).unbind(1))
@@ -145,3 +170,24 @@ def _project_volume(truth: Volume, views: Views) -> torch.Tensor:
     """Line integrals [V, 2, H, W] of β and δ [m]."""
     values = torch.from_numpy(truth.beta), torch.from_numpy(truth.delta)
     return voxel_line_integrals(torch.stack(values), truth.grid, views, step=0.5)
+
+
+def moving_of(
+    done: Reconstruction, scan: Scan, light: Light | None, errors: Mapping[str, np.ndarray] | None = None
+) -> Moving:
+    """What is shown of a run in motion and its `scan`; light: of all its frames, None where it is even."""
+    assert isinstance(done.object, MovingSurfaces)
+    when, order = scan.exposures.time, np.argsort(scan.is_test, kind="stable")  # frames for training first
+    times = np.unique(when)
+    shown = np.array(evenly_chosen(len(times), MOST_FRAMES))
+    chosen = np.array([order[np.flatnonzero(when[order] == times[t])[0]] for t in shown])
+    predicted = render(done, scan.exposures[chosen])
+    if light is not None:
+        predicted = predicted * light.factor().numpy()[chosen]
+    rows = list(measured(done.object, scan.exposures))
+    tracks = {name: np.array([getattr(row, name) for row in rows]).reshape(len(times), -1) for name in columns()}
+    grid = Grid.of_views(scan.views)
+    middle, half = grid.centre, 0.5 * np.array(grid.shape[::-1]) * np.array(grid.voxel_size)
+    box = (middle - half, middle + half)
+    shots = (shown, scan.views[chosen], scan.frames[chosen], predicted)
+    return Moving(done.object, times, tracks, *box, *shots, errors=errors or {})

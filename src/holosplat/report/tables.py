@@ -4,7 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from .content import ReportContent, flatten
+from .moving import Moving
 from .style import format_length, scientific
 
 
@@ -31,14 +34,31 @@ def verdict(content: ReportContent) -> str:
         parts.append(
             f"overlaps the truth with a Dice coefficient of {scores.dice:.3f}, its mean δ {size} {side} the true one"
         )
+    if content.moving is not None:
+        parts.insert(0, _followed(content.moving))
     if not parts:
         return "No view was held out and no truth is known: this page shows the reconstruction without a score."
     return f"The reconstruction {' and '.join(parts)}."
 
 
+def _followed(moving: Moving) -> str:
+    count, times = moving.bodies.count, moving.times
+    what = f"follows {count} bod{'y' if count == 1 else 'ies'} through {len(times)} times"
+    if not moving.whole.any():
+        return f"{what}, none of them ever whole in the field of view"
+    spread = 100 * float(np.nanmedian(moving.spread("volume_m3") / moving.mean("volume_m3")))
+    return f"{what}, whose volumes keep to ±{spread:.2g} % over time in the median"
+
+
 def key_figures(content: ReportContent) -> list[tuple[str, str, str]]:
     """Name, value and explanation of the numbers at the head of the page."""
     figures = []
+    if (moving := content.moving) is not None:
+        whole, span = int(moving.whole.any(0).sum()), 1e6 * float(np.ptp(moving.times))
+        figures += [
+            ("Bodies", str(moving.bodies.count), f"{whole} of them whole at times"),
+            ("Times", str(len(moving.times)), f"over {span:.4g} µs"),
+        ]
     if content.held_out is not None:
         mean = content.held_out.scores.mean
         figures += [
@@ -59,7 +79,13 @@ def key_figures(content: ReportContent) -> list[tuple[str, str, str]]:
 
 def score_tables(content: ReportContent) -> list[Table]:
     """The total δ, the scores of the volume and of each held-out view, and the geometry, as far as there are any."""
-    tables = (_total_table(content), _volume_table(content), _views_table(content), _geometry_table(content))
+    tables = (
+        _bodies_table(content),
+        _total_table(content),
+        _volume_table(content),
+        _views_table(content),
+        _geometry_table(content),
+    )
     return [table for table in tables if table is not None]
 
 
@@ -81,6 +107,34 @@ def record_tables(content: ReportContent) -> list[Table]:
     tables = [Table("Input", data)]
     tables += [Table(name, list(flatten(entries).items())) for name, entries in named.items() if entries]
     return tables
+
+
+def _bodies_table(content: ReportContent) -> Table | None:
+    """Each body in the mean over the times at which it is whole in the field, with standard errors where known."""
+    moving = content.moving
+    if moving is None:
+        return None
+    speed = np.linalg.norm([moving.mean(f"v{axis}_m_s") for axis in "xyz"], axis=0)
+    rows = []
+    for k in range(moving.bodies.count):
+        shown = [
+            _with_error(moving, name, k, factor, digits)
+            for name, factor, digits in (("volume_m3", 1e18, 2), ("area_m2", 1e12, 1), ("deformation", 1.0, 3))
+        ]
+        fast = f"{1e3 * speed[k]:.4g}" if np.isfinite(speed[k]) else "–"
+        rows.append((str(k), str(int(moving.whole[:, k].sum())), fast, *shown))
+    head = ("body", "times whole", "speed (mm/s)", "volume (µm³)", "area (µm²)", "deformation")
+    return Table("Bodies, means over the times at which they are whole in the field", rows, head)
+
+
+def _with_error(moving: Moving, name: str, body: int, factor: float, digits: int) -> str:
+    value, whole = float(moving.mean(name)[body]), moving.whole[:, body]
+    if not np.isfinite(value):
+        return "–"
+    text = f"{factor * value:.{digits}f}"
+    if name in moving.errors:
+        text += f" ± {factor * float(moving.errors[name][whole, body].mean()):.{digits}f}"
+    return text
 
 
 def _total_table(content: ReportContent) -> Table | None:

@@ -141,8 +141,11 @@ class MovingSurfaces:
 
     def bodies(self, time: float) -> list[TriangleMesh]:
         """One mesh [m] for each body at `time` [s], named body000, body001 …, the same body at every time."""
-        vertices = self.unit_length * along(self.basis, self.coefficients.detach(), time)
-        parts = (self.body(k) for k in range(self.count))
+        return self.parted(along(self.basis, self.coefficients.detach(), time))
+
+    def parted(self, vertices: Tensor) -> list[TriangleMesh]:
+        """One mesh [m] for each body, named as those of `bodies`, of all their vertices [P, 3] [units of length]."""
+        vertices, parts = self.unit_length * vertices, (self.body(k) for k in range(self.count))
         return [TriangleMesh(vertices[u].numpy(), f.numpy(), f"body{k:03d}") for k, (u, f) in enumerate(parts)]
 
     def velocities(self, time: float) -> list[np.ndarray]:

@@ -39,7 +39,7 @@ from .refine import (
     with_fitted,
     with_held_out,
 )
-from .resume import require_same
+from .resume import goes_on
 from .run_folder import RunFolder
 from .run_light import found_in, read_light_options, still_in
 from .run_record import config_of, summary_of
@@ -93,7 +93,7 @@ def reconstruct(
     geometry = None
     if refine is not None:
         require_compatible(ranges)
-        _look_at(folder, config, resume)
+        goes_on(folder, config, resume)
         geometry = saved_geometry(folder, resume) or trained_geometry(scan, prior, refine, assumed, tell)
         scan = geometry.applied(scan)
     train = scan.train()
@@ -109,17 +109,6 @@ def reconstruct(
     if folder is not None:
         keep_geometry(folder, geometry, planned)
     return replace(done, geometry=geometry)
-
-
-def _look_at(folder: RunFolder | None, config: dict[str, Any], resume: bool) -> bool:
-    """Whether a run in `folder` goes on. `InputError` for a folder that does not fit."""
-    if folder is None:
-        return False
-    if resume and folder.config.is_file():
-        require_same(folder, config)
-        return True
-    folder.require_new(advise_resume=not resume)
-    return False
 
 
 def require_one_time(scan: Scan) -> None:
@@ -192,7 +181,7 @@ class _Run:
         """Look at the folder, and at what of the run is there already; writes nothing."""
         self._config, self.asked = config, self.method.kind
         self._keeper = Keeper(self.task.scan, mixed=isinstance(self.method, Auto))
-        if self.folder is None or not _look_at(self.folder, config, resume):
+        if self.folder is None or not goes_on(self.folder, config, resume):
             return
         self._saved = self.folder.load_checkpoint()
         if self._saved:

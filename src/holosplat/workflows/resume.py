@@ -14,7 +14,7 @@ from .run_folder import RunFolder
 
 RESUMED_WITH = {
     "scan_hash": "scan file",
-    "method": "method and settings (--method, --preset, --config, --set)",
+    "method": "method and settings (--method, --preset, --config, --set, or the options of track)",
     "prior": "material (--material, --delta-beta)",
     "matter": "kind of matter (--matter)",
     "seed": "seed (--seed)",
@@ -23,6 +23,17 @@ RESUMED_WITH = {
     "refine": "refinement (--refine, --uncertain-…)",
 }
 """What must not change between the parts of a run, as messages call it."""
+
+
+def goes_on(folder: RunFolder | None, config: dict[str, Any], resume: bool) -> bool:
+    """Whether a run in `folder` goes on. `InputError` for a folder that does not fit."""
+    if folder is None:
+        return False
+    if resume and folder.config.is_file():
+        require_same(folder, config)
+        return True
+    folder.require_new(advise_resume=not resume)
+    return False
 
 
 def require_same(folder: RunFolder, config: dict[str, Any]) -> None:

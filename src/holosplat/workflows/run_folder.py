@@ -39,7 +39,7 @@ class RunFolder:
         """`InputError` unless the folder holds a reconstruction."""
         require(self.path.is_dir(), f"the run folder {self.path} does not exist; check the path.")
         found = self.config.is_file() and self.result().is_file()
-        hint = "; it was cut off, finish it with reconstruct --resume" if self.checkpoint.is_file() else ""
+        hint = "; it was cut off, finish it with --resume" if self.checkpoint.is_file() else ""
         require(found, f"{self.path} must hold a reconstruction (config.json, object.h5), but it does not{hint}.")
 
     def result(self) -> Path:

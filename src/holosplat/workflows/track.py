@@ -3,6 +3,13 @@
 from __future__ import annotations
 
 import csv
+import itertools
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
 
 from ..checks import require
 from ..fit.residuals import Prediction
@@ -17,8 +24,10 @@ from ..matter import KnownTwo, MaterialPrior
 from ..methods import Task
 from ..methods.assumed import assumed_material
 from ..methods.presets import SCHEMA
+from ..methods.uncertain import Uncertain
+from ..motion.halves import standard_errors
 from ..motion.measures import columns, measured, row
-from ..motion.track import USUAL, Followed, TrackOptions, follow, require_times
+from ..motion.track import NOWHERE, USUAL, Followed, TrackOptions, follow, require_times
 from ..optics.background import LightOptions
 from ..progress import FitProgress
 from ..representations import MovingSurfaces
@@ -28,6 +37,7 @@ from .keeper import Choice
 from .provenance import environment, scan_hash
 from .reconstruct import check_frames
 from .reconstruction import Reconstruction
+from .resume import goes_on
 from .run_folder import RunFolder
 from .run_light import found_in
 from .run_record import summary_of
@@ -35,6 +45,8 @@ from .verdict import judge
 
 LENGTH_UNIT = "um"
 BODIES, COLLECTION, TRACKS = "bodies", "bodies.pvd", "tracks.csv"
+ERROR = "se_"
+"""How the names of columns with standard errors begin."""
 
 
 def track(
@@ -45,6 +57,7 @@ def track(
     *,
     light: LightOptions | None = None,
     folder: RunFolder | None = None,
+    resume: bool = False,
     on_progress: FitProgress = lambda stage, fraction, record: None,
 ) -> Reconstruction:
     """Closed bodies of one material that move through the training frames of `scan`, of several times.
@@ -52,19 +65,24 @@ def track(
     `object` of the result is a `MovingSurfaces`: `object.at(t)` is right at any time [s], between frames too. light:
     what is assumed of it (default: even, unless air says otherwise). A material that is not known is estimated from the
     first time. With a `folder`, everything is written there: what `reconstruct` writes, `bodies.pvd` with one VTK file
-    (.vtp, µm) a body and time, and `tracks.csv`. Errors: `InputError` for a scan of one time, frames that are not
-    relative to the flat field, two materials, no body that is seen, and folders that are there.
+    (.vtp, µm) a body and time, and `tracks.csv`; and a later call with `resume=True` goes on from the last checkpoint,
+    with the same result as if nothing had happened. Ctrl-C (KeyboardInterrupt) is passed on. Errors: `InputError` for a
+    scan of one time, frames that are not relative to the flat field, two materials, no body that is seen, and folders
+    that do not fit.
     """
     require(not isinstance(prior, KnownTwo), "bodies are of one material, but two are known; leave --second-material.")
     require_times(scan.train())
     check_frames(scan.train())
-    if folder is not None:
-        folder.require_new()
     assumed = light or LightOptions()
+    config = _config(scan, prior, options, seed, assumed)
+    if folder is not None and not goes_on(folder, config, resume):
+        folder.create()
+        write_json(folder.config, config | environment("cpu"))
     task = Task(scan.train(), prior, seed, lambda stage, part: on_progress(stage, part, {}), assumed).evened()
     train = task.scan
     material = assumed_material(train.at_instant(0), task.prior, task.on_progress)
-    found = follow(train, material, options, seed, light=task.uneven, on_progress=on_progress)
+    journal = NOWHERE if folder is None else _Checkpoint(folder)
+    found = follow(train, material, options, seed, light=task.uneven, journal=journal, on_progress=on_progress)
     said = Prediction(found.bodies, train.exposures, found.oversample)
     done = Reconstruction(
         found.bodies,
@@ -79,18 +97,37 @@ def track(
         light=found_in(task),
     )
     if folder is not None:
-        config = {"schema_version": SCHEMA, "method": {"kind": options.kind, **to_table(options)}, "seed": seed}
-        config |= {
-            "prior": prior.as_dict(),
-            "matter": "levels",
-            "scan_hash": scan_hash(scan),
-            "light": to_table(assumed),
-        }
-        folder.create()
-        write_json(folder.config, config | environment("cpu"))
         _write(folder, done, found, task)
-        write_tracks(folder, found.bodies, scan)
+        write_tracks(folder, found.bodies, scan, standard_errors(found.bodies, found.halves, scan))
     return done
+
+
+@dataclass(frozen=True)
+class _Checkpoint:
+    """Keeps a run as checkpoint.pt of its folder."""
+
+    folder: RunFolder
+
+    def load(self) -> Mapping[str, Any] | None:
+        return self.folder.load_checkpoint()
+
+    def save(self, state: Mapping[str, Any]) -> None:
+        self.folder.save_checkpoint(dict(state))
+
+
+def _config(scan: Scan, prior: MaterialPrior, options: TrackOptions, seed: int, light: LightOptions) -> dict[str, Any]:
+    """What config.json says the run is of."""
+    return {
+        "schema_version": SCHEMA,
+        "method": {"kind": options.kind, **to_table(options)},
+        "prior": prior.as_dict(),
+        "matter": "levels",
+        "seed": seed,
+        "scan_hash": scan_hash(scan),
+        "light": to_table(light),
+        "uncertain": to_table(Uncertain()),
+        "refine": None,
+    }
 
 
 def _write(folder: RunFolder, done: Reconstruction, found: Followed, task: Task) -> None:
@@ -105,13 +142,29 @@ def _write(folder: RunFolder, done: Reconstruction, found: Followed, task: Task)
     write_json(folder.summary, summary_of(done, None, task.scan) | told)
 
 
-def write_tracks(folder: RunFolder, bodies: MovingSurfaces, scan: Scan) -> None:
-    """tracks.csv, and bodies.pvd with one file a body and time."""
+def read_errors(folder: RunFolder) -> dict[str, np.ndarray]:
+    """The standard errors [T, B] of tracks.csv, by their columns; empty where there are none."""
+    with (folder.path / TRACKS).open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    names = [name for name in rows[0] if name.startswith(ERROR)] if rows else []
+    times = len({row["time_s"] for row in rows})
+    return {n.removeprefix(ERROR): np.array([float(row[n]) for row in rows]).reshape(times, -1) for n in names}
+
+
+def write_tracks(
+    folder: RunFolder, bodies: MovingSurfaces, scan: Scan, errors: Mapping[str, np.ndarray] | None = None
+) -> None:
+    """tracks.csv, with standard `errors` [T, B] of columns where there are any, and bodies.pvd with one file a body and
+    time."""
     times, steps = scan.instants, list[TimeStep]()
     with atomic_path(folder.path / TRACKS) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns())
-        writer.writerows(row(one) for one in measured(bodies, times, scan.views))
+        writer.writerow([*columns(), *(f"{ERROR}{name}" for name in errors or ())])
+        beside = np.stack([one.ravel() for one in errors.values()], axis=1) if errors else itertools.repeat(())
+        rows = zip(measured(bodies, scan.exposures), beside)
+        writer.writerows([*row(one), *(f"{error:.3g}" for error in more)] for one, more in rows)
+    if (folder.path / BODIES).is_dir():  # of a run that was cut off when it wrote
+        shutil.rmtree(folder.path / BODIES)
     with atomic_folder(folder.path / BODIES) as temporary:
         for t, time in enumerate(times):
             named = [(f"{mesh.name}_{t:04d}.vtp", mesh) for mesh in bodies.bodies(float(time))]

@@ -1,0 +1,154 @@
+"""`holosplat forecast`: the bodies of a run of track, and their frames, at later times."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from tyro.conf import Positional
+
+from ..checks import positive, require
+from ..io.formats import read_as
+from ..io.json import write_json
+from ..io.reading import Reading, ends_of
+from ..io.run_scan import run_reading, run_source
+from ..motion.cell_model import ChannelFrame
+from ..motion.dynamics import DynamicsForecast
+from ..motion.fit import MotionFit
+from ..motion.forecast import PathForecast
+from ..report.run import report_run
+from ..scan import Scan
+from ..specimens.flow.suspension import PLASMA_VISCOSITY
+from ..workflows.evaluate import evaluate
+from ..workflows.forecast import FRAMES, TABLE, Forecasted, ForecastOptions, config_of, tracked_bodies, write_forecast
+from ..workflows.forecast import forecast as carry_on
+from ..workflows.moments import instants_of, moment
+from ..workflows.reconstruct import load_reconstruction
+from ..workflows.refine import where_found
+from ..workflows.run_folder import RunFolder
+from ..workflows.track import COLLECTION, TRACKS
+from .progress import ProgressBar
+
+
+@dataclass(frozen=True)
+class ForecastFlags:
+    """How bodies move on."""
+
+    times: int = 10
+    """Times ahead."""
+    step: float | None = None
+    """Between them [s] (default: the median step of the run)."""
+    model: Literal["auto", "paths", "rigid", "dynamics"] = "auto"
+    """Paths go on, each part of the motion as far as frames tell it; rigid: shapes stay; dynamics: red cells in the
+    flow of --channel; auto: the mean of paths and dynamics by their errors, or paths without a channel."""
+    degree: int = 2
+    """Powers of time that are believed, at most."""
+    window: int = 0
+    """Last times of the run that tell the motion (0: all)."""
+    half_sets: bool = True
+    """Whether paths are fitted again to two halves of the times, which say what is believed, and the error."""
+    keep_volume: bool = True
+    """Whether bodies keep their volume."""
+    effort: float = 1.0
+    """Factor of the numbers of steps of these fits."""
+
+    channel: tuple[float, float] | None = None
+    """Extents [m] of a rectangular channel across the flow, along the other two axes in the order x, y, z."""
+    flow_axis: Literal["x", "y", "z"] = "y"
+    """Along which axis of the object it leads; a flow along the rotation axis is one along y."""
+    channel_centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """A point on its axis (x, y, z) [m]."""
+    peak: str | None = None
+    """Velocity of the undisturbed flow on the axis [m/s], or a range LOW:HIGH (default: by the bodies' velocities)."""
+    shear_modulus: str = "2e-6:10e-6"
+    """Of the membranes [N/m], or a range LOW:HIGH, within which the run's times tell it."""
+    viscosity: float = PLASMA_VISCOSITY
+    """Of the fluid in and around cells [Pa s]."""
+
+    def options(self) -> ForecastOptions:
+        """The options of the forecast."""
+        step = 0.0 if self.step is None else positive("--step", self.step, "seconds")
+        model = PathForecast(self.degree, self.window, self.model == "rigid", self.keep_volume)
+        fit = MotionFit()
+        steps = max(1, round(positive("--effort", self.effort) * fit.schedule.steps))
+        fit = replace(fit, schedule=replace(fit.schedule, steps=steps))
+        return ForecastOptions(self.times, step, model, self._dynamics(), self.half_sets, fit)
+
+    def _dynamics(self) -> DynamicsForecast | None:
+        require(
+            self.model != "dynamics" or self.channel is not None,
+            "--model dynamics needs the channel that cells flow through; say --channel WIDTH HEIGHT [m].",
+        )
+        if self.channel is None or self.model in ("paths", "rigid"):
+            return None
+        frame = ChannelFrame(self.channel, self.flow_axis, self.channel_centre)
+        peak = (0.0, 0.0) if self.peak is None else number_or_range("peak", self.peak)
+        shear = number_or_range("shear_modulus", self.shear_modulus)
+        return DynamicsForecast(frame, peak, shear, self.viscosity, mixed=self.model == "auto")
+
+
+def number_or_range(name: str, text: str) -> tuple[float, float]:
+    """Both ends of what an option says: LOW:HIGH, or one number above 0 twice. Errors: `InputError` for other text."""
+    if ":" in text:
+        return ends_of(name, text)
+    value = positive(f"--{name.replace('_', '-')}", text)
+    return value, value
+
+
+def forecast(run: Positional[Path], out: Path, how: ForecastFlags = ForecastFlags(), seed: int = 0) -> None:
+    """Carry a run of track on: its bodies and their frames at later times, with a standard error.
+
+    Frames of the scan after the run's last time (track --time-frames) judge the forecast, and are used for nothing
+    else.
+
+    Args:
+        run: Run folder of track.
+        out: Run folder to make: what track writes, at the times ahead; forecast.nxs, the predicted frames;
+            forecast.csv, the standard error of each body's surface; forecast.json.
+        seed: Seed of the fits to half-sets.
+    """
+    require(seed >= 0, f"--seed must be 0 or more, but it is {seed}.")
+    options, folder, new = how.options(), RunFolder(run), RunFolder(out)
+    new.require_new()
+    tracked = load_reconstruction(folder)
+    tracked_bodies(tracked)
+    times = np.array(instants_of(folder))
+    scan = whole_scan(folder)
+    with ProgressBar() as bar:
+        found = carry_on(tracked, scan, times, options, seed, on_progress=bar.show)
+    done = write_forecast(new, tracked, found, config_of(options, scan, folder.read_config(), seed))
+    write_json(new.source, _source(folder, scan, found, out))
+    for line in found.lines():
+        print(line)
+    last = len(found.forecast.times) - 1
+    shown = _shown(scan, found)
+    final = moment(done, found.forecast.times.tolist(), last)
+    print(f"report: {report_run(new, final, shown, evaluate(final, shown, None), None)}", file=sys.stderr)
+    print(f"wrote {out / COLLECTION}, {out / TRACKS}, {out / FRAMES}, {out / TABLE}", file=sys.stderr)
+
+
+def whole_scan(folder: RunFolder) -> Scan:
+    """The scan of a run of track, of all its times, later ones too, where the run found the geometry to be."""
+    own = run_reading(folder.path)
+    reading = replace(own, part=replace(own.part, time_frame=None, time_frames=None))
+    return where_found(folder, read_as(folder.source_scan(), reading).in_memory())
+
+
+def _source(folder: RunFolder, scan: Scan, found: Forecasted, out: Path) -> dict[str, object]:
+    """What source.json says: the later times of the run's scan, or else the predicted frames."""
+    later = np.flatnonzero(scan.instants > found.forecast.bodies.basis.first)[: len(found.forecast.times)]
+    if not len(later):
+        return run_source(out / FRAMES, Reading())
+    own = run_reading(folder.path)
+    part = replace(own.part, time_frame=None, time_frames=f"{later[0]}:{later[-1] + 1}")
+    return run_source(folder.source_scan(), replace(own, part=part))
+
+
+def _shown(scan: Scan, found: Forecasted) -> Scan:
+    """What the report shows of the last time: frames that the run did not see, or else those that are predicted."""
+    last = found.forecast.times[-1]
+    held_out = scan[np.flatnonzero(np.isclose(scan.exposures.time, last, rtol=1e-6, atol=0))]
+    return held_out if len(held_out) else found.predicted[np.flatnonzero(found.predicted.exposures.time == last)]

@@ -1,0 +1,52 @@
+"""Fits to two halves of the times: where they disagree, frames do not tell."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from ..checks import require
+from ..fit.running import Record
+from ..optics.background import Light
+from ..representations import MovingSurfaces
+from ..scan import Scan
+from .fit import MotionFit, motion_fit
+from .forecast import Halves
+
+LEAST = 8
+"""Times from which on halves of them still tell the paths of the whole."""
+USUAL = MotionFit()
+"""How halves are fitted unless it is said."""
+
+
+def half_sets(
+    train: Scan,
+    bodies: MovingSurfaces,
+    how: MotionFit = USUAL,
+    seed: int = 0,
+    light: Light | None = None,
+    on_record: Callable[[Record], None] = lambda record: None,
+) -> Halves:
+    """`bodies`, fitted to the frames `train` of all times, fitted on to those of every other time, both halves of them.
+
+    A path is told by times before and after, so that each half tells it nearly as the whole does, with noise of its
+    own. light: of the frames, which were divided by it. Errors: `InputError` for fewer than 8 times.
+    """
+    times = train.instants
+    require(
+        len(times) >= LEAST,
+        f"half-sets need frames of {LEAST} times or more, but there are {len(times)}; leave them with --no-half-sets.",
+    )
+    number = np.searchsorted(times, train.exposures.time)
+    found = []
+    for half in (0, 1):
+        kept = np.flatnonzero(number % 2 == half)
+        part = None if light is None else light.part(torch.from_numpy(kept))
+        fit = motion_fit(train[kept], bodies, how, seed, part)
+        fit.run(on_record)
+        one = fit.result().object
+        assert isinstance(one, MovingSurfaces)
+        found.append(one.with_parameters({"coefficients": one.coefficients.detach()}))
+    return found[0], found[1]

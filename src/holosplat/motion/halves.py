@@ -1,0 +1,64 @@
+"""Standard errors from halves of the frames: what two fits that share no frame disagree by.
+
+Both start from the result of all frames. If halves err independently, each by √2 of what all frames do, half their
+difference is a draw of the error of the result. It tells what noise does, and not what all frames have in common.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ..representations import MovingSurfaces, TimeBasis
+from ..scan import Scan
+from .measures import Measures, columns, measured
+
+FEWEST_VIEWS = 4
+"""Views of a time from which on half of them still tell a shape."""
+NO_ERRORS = ("time_s", "body", "nx", "ny", "nz", "in_field")
+"""Columns that have no standard error."""
+
+Pair = tuple[np.ndarray, np.ndarray]
+
+
+def halves_of(train: Scan, basis: TimeBasis) -> list[Pair]:
+    """Frames of every second time and the others, where each half tells all coefficients of the paths; and every second
+    view of each time and the others, where there are `FEWEST_VIEWS` at every time."""
+    times, number = np.unique(train.exposures.time, return_inverse=True)
+    order = np.zeros(len(train), dtype=int)
+    for t in range(len(times)):
+        order[number == t] = np.arange((number == t).sum())
+    found = []
+    if len(times) // 2 >= basis.count:
+        found.append(number % 2)
+    if np.bincount(number).min() >= FEWEST_VIEWS:
+        found.append(order % 2)
+    return [(np.flatnonzero(part == 0), np.flatnonzero(part == 1)) for part in found]
+
+
+def standard_errors(bodies: MovingSurfaces, halves: Sequence[MovingSurfaces], scan: Scan) -> Mapping[str, np.ndarray]:
+    """By the name of a column, [T, B] standard errors of `bodies` at the times of `scan`; empty without `halves`.
+
+    halves: bodies by the one and the other half of a split, split after split. The square of an error is the mean over
+    splits of a quarter of the squared difference, in equal parts of the body at that time, and of all bodies at all
+    times, weighed by the part of them that is in the field: of one body alone, few splits tell little.
+    """
+    if not halves:
+        return {}
+    rows = [_table(one, scan) for one in (bodies, *halves)]
+    seen, found = rows[0]["in_field"], {}
+    for column in columns():
+        if column in NO_ERRORS:
+            continue
+        draws = [(one[column] - other[column]) ** 2 / 4 for one, other in zip(rows[1::2], rows[2::2])]
+        own = np.mean(draws, axis=0)
+        common = float((seen * own).sum() / seen.sum()) if seen.any() else float(own.mean())
+        found[column] = np.sqrt(0.5 * own + 0.5 * common)
+    return found
+
+
+def _table(bodies: MovingSurfaces, scan: Scan) -> dict[str, np.ndarray]:
+    rows: list[Measures] = list(measured(bodies, scan.exposures))
+    times = len(np.unique(scan.exposures.time))
+    return {name: np.array([getattr(row, name) for row in rows]).reshape(times, -1) for name in columns()}

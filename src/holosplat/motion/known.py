@@ -1,0 +1,137 @@
+"""Bodies of known rest shape on first paths, found in the frames of several times together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+import torch
+
+from ..checks import require
+from ..geometry import Views
+from ..matter import DeltaBeta, Matter
+from ..mesh import TriangleMesh
+from ..representations import MovingSurfaces, TimeBasis
+from ..scan import Scan
+from .elastic import Elastic, Rest
+from .poses import Explained, Pose, pursued
+from .rest_shape import KnownBody
+from .shadows import Shadows
+
+SEARCH_RADIUS = 2.8
+"""Radius of the ball of a body's volume in pixels of the search, whose frames are binned to about that."""
+SPREAD = (0.85, 1.0, 1.15)
+"""Velocities of the search over that of all matter together: a channel's flow is slower at its walls."""
+SIZES, SIZE_STEPS = 9, 8
+"""Sizes that are tried for all bodies, and steps to better poses at the best one."""
+
+
+class KnownBodies:
+    """The search for bodies of `body`'s rest shape in the training frames of a scan, of views of one pixel size."""
+
+    def __init__(self, train: Scan, material: DeltaBeta, body: KnownBody, size: float = 1.0) -> None:
+        """size: of all bodies, beside what is said of it."""
+        times, self.pixel = train.instants, train.views.pixel_size
+        self.material, self.body, self.size = material, body, size
+        self.first, self.last = float(times[0]), float(times[-1])
+        chosen = times[np.unique(np.rint(np.linspace(0, len(times) - 1, body.instants)).astype(int))]
+        self.coarse, self.fine = body.mesh(self.pixel, coarse=True), body.mesh(self.pixel)
+        radius = (3 * self.coarse.volume / (4 * np.pi)) ** (1 / 3)
+        self.bin = max(1, round(radius / SEARCH_RADIUS))
+        frames = train[np.flatnonzero(np.isin(train.exposures.time, chosen))]
+        self.seen = Shadows.of(frames, material, self.first, self.last).binned(self.bin)
+        self.velocities = drift(self.seen) * np.array(SPREAD)[:, None]
+
+    def bodies(self, basis: TimeBasis, known: MovingSurfaces | None = None) -> MovingSurfaces | None:
+        """Bodies on paths of `basis` that explain what `known` ones leave of the frames; None where there are none.
+
+        The first search finds the size of all bodies.
+        """
+        seen, mesh = self.seen, _sized(self.coarse, self.size / self.bin)
+        if known is not None:
+            seen = seen.without(self._shadows(known))
+        found = pursued(mesh, seen, self.velocities)
+        if not found:
+            return None
+        if known is None and self.body.uncertain > 0:
+            self.size = best_size(mesh, seen, found, self.body.uncertain)
+            found = Explained(_sized(mesh, self.size), seen).improved(found, SIZE_STEPS)
+        return self._paths([pose.scaled(self.bin) for pose in found], basis)
+
+    def _shadows(self, bodies: MovingSurfaces) -> np.ndarray:
+        """[N, H, W] thickness of bodies in the frames of the search."""
+        middle, half = 0.5 * (self.last + self.first), 0.5 * (self.last - self.first)
+        nodes = [bodies.at(middle + half * float(t)).vertices.detach() / self.bin for t in self.seen.times]
+        return self.seen.project(nodes, bodies.faces).numpy()
+
+    def _paths(self, poses: Sequence[Pose], basis: TimeBasis) -> MovingSurfaces:
+        rest = _sized(self.fine, self.size)
+        middle, half = 0.5 * (self.last + self.first), 0.5 * (self.last - self.first)
+        when = np.linspace(-1, 1, 4 * basis.count)
+        nodes = [np.array([pose.nodes(rest.vertices, t) for t in when]) for pose in poses]
+        paths = [self.pixel * basis.fitted(middle + half * when, one) for one in nodes]
+        matter = Matter.one(*self.material)
+        return MovingSurfaces.of_bodies(paths, [rest.faces] * len(paths), basis, self.pixel, matter)
+
+
+def at_rest(body: KnownBody, pixel: float, size: float) -> Rest:
+    """What is known of the shape of all bodies that are `size` times as large as `body`, on paths in `pixel` [m]."""
+    return Rest(Elastic(_sized(body.mesh(pixel), size)), body.stiffness)
+
+
+def best_size(mesh: TriangleMesh, seen: Shadows, poses: Sequence[Pose], uncertain: float) -> float:
+    """The factor within 1 ± `uncertain` by which all bodies of rest shape `mesh` in `poses` explain `seen` best."""
+    factors = np.linspace(1 - uncertain, 1 + uncertain, SIZES)
+    explained = [Explained(_sized(mesh, float(factor)), seen) for factor in factors]
+    width = explained[SIZES // 2]
+    costs = np.array([float(width.cost(width.target - torch.from_numpy(one.images(poses)))) for one in explained])
+    k = int(np.clip(costs.argmin(), 1, SIZES - 2))
+    before, here, after = costs[k - 1 : k + 2]
+    bent = before - 2 * here + after
+    step = 0.5 * (before - after) / bent if bent > 0 else 0.0
+    return float(np.clip(factors[k] + step * (factors[1] - factors[0]), factors[0], factors[-1]))
+
+
+def beam_directions(views: Views) -> np.ndarray:
+    """[U, 3] different directions of the beams, in the object frame."""
+    return np.unique(views.rotations[:, 2].round(6), axis=0)
+
+
+def drift(seen: Shadows) -> np.ndarray:
+    """Velocity [3] of all matter together [pixels per unit of time].
+
+    By it shadows of one time correlate best with those of the next one, in each direction that was seen at both.
+    """
+    rows, moves, instants = [], [], np.unique(seen.times)
+    require(len(instants) > 1, "bodies are followed through frames of two times or more.")
+    directions = seen.rotations.numpy().reshape(len(seen), -1).round(9)
+    for direction in np.unique(directions, axis=0):
+        own = np.flatnonzero((directions == direction).all(1))
+        own = own[np.argsort(seen.times[own])]
+        if len(own) < 2:
+            continue
+        pause = float(np.median(np.diff(seen.times[own])))
+        pairs = [(i, j) for i, j in pairwise(own) if abs(seen.times[j] - seen.times[i] - pause) < 0.2 * pause]
+        rows.append(seen.rotations[own[0], :2].numpy())
+        moves.append(_moved(seen, pairs) / pause)
+    if not rows:
+        return np.zeros(3)
+    return np.linalg.lstsq(np.concatenate(rows), np.concatenate(moves), rcond=1e-6)[0]
+
+
+def _moved(seen: Shadows, pairs: Sequence[tuple[int, int]]) -> np.ndarray:
+    """By how many pixels (x, y) what is seen moves from the first to the second frame of each pair."""
+    size = tuple(2 * n for n in seen.shape)
+    total = np.zeros(size)
+    for i, j in pairs:
+        first, second = (np.fft.rfft2(seen.thickness[k], s=size) for k in (i, j))
+        total += np.fft.irfft2(second * first.conj(), s=size)
+    row, column = np.unravel_index(int(total.argmax()), size)
+    return np.array(
+        [(column + seen.shape[1]) % size[1] - seen.shape[1], (row + seen.shape[0]) % size[0] - seen.shape[0]]
+    )
+
+
+def _sized(mesh: TriangleMesh, factor: float) -> TriangleMesh:
+    return TriangleMesh(mesh.vertices * factor, mesh.faces, mesh.name)

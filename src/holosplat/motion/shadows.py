@@ -1,0 +1,107 @@
+"""What frames of several times show of matter, as thickness, and what affine bodies on straight paths leave of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..matter import DeltaBeta
+from ..optics.noise import noise_level, noise_levels
+from ..optics.retrieval import tikhonov
+from ..projectors.surface import surface_thickness
+from ..scan import Scan
+from ..units import wavelength, wavenumber
+
+QUIETEST = 1e-4
+"""Noise of frames that is assumed at least."""
+EVERYWHERE = 1e-3
+"""Information at all frequencies beside that of phase contrast: frames in contact have that alone."""
+
+
+@dataclass(frozen=True)
+class Shadows:
+    """Thickness of one material in N frames, lengths in pixels.
+
+    thickness: [N, H, W] float64; rotations [N, 3, 3], shifts [N, 2] float64: as of `surface_thickness`; times: [N],
+    from -1 to 1 over the whole scan; noise: standard deviation of the thickness; fringes: [N] λz/p², contrast: [N]
+    2kδp over the noise of a frame's pixel, p the pixel size.
+    """
+
+    thickness: np.ndarray
+    rotations: Tensor
+    shifts: Tensor
+    times: np.ndarray
+    noise: float
+    fringes: np.ndarray
+    contrast: np.ndarray
+
+    @classmethod
+    def of(cls, scan: Scan, material: DeltaBeta, first: float, last: float) -> Shadows:
+        """What the frames of `scan`, of pixels of one size, show; first, last: times [s] of the whole scan."""
+        exposures, views, pitch = scan.exposures, scan.views, scan.views.pixel_size
+        frames = torch.from_numpy(scan.frames)
+        thickness = tikhonov(frames, exposures, *material).double() / pitch
+        per_pixel = 2 * wavenumber(exposures.energy_kev) * exposures.refraction(*material)[0] * pitch
+        return cls(
+            thickness.numpy(),
+            torch.from_numpy(np.ascontiguousarray(views.rotations)),
+            torch.from_numpy(views.shifts / pitch),
+            2 * (exposures.time - first) / (last - first) - 1,
+            noise_level(thickness.float()),
+            wavelength(exposures.energy_kev) * exposures.distance / pitch**2,
+            per_pixel / max(float(noise_levels(frames).mean()), QUIETEST),
+        )
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.thickness.shape[1], self.thickness.shape[2]
+
+    def binned(self, factor: int) -> Shadows:
+        """The same on pixels `factor` times as large; rows and columns that are left over at the end are left out."""
+        if factor == 1:
+            return self
+        n, (h, w) = len(self), (self.shape[0] // factor, self.shape[1] // factor)
+        parts = self.thickness[:, : h * factor, : w * factor].reshape(n, h, factor, w, factor)
+        moved = 0.5 * (np.array([w, h]) * factor - np.array(self.shape[::-1])) / factor
+        return replace(
+            self,
+            thickness=parts.mean((2, 4)) / factor,
+            shifts=self.shifts / factor + torch.from_numpy(moved),
+            noise=self.noise / factor**2,
+            fringes=self.fringes / factor**2,
+            contrast=self.contrast * factor**2,
+        )
+
+    def without(self, images: np.ndarray) -> Shadows:
+        """The same beside matter that has the thickness `images` [N, H, W]."""
+        return replace(self, thickness=self.thickness - images)
+
+    def at(self, numbers: Sequence[int] | np.ndarray) -> Shadows:
+        """The frames `numbers`."""
+        index = np.asarray(numbers)
+        parts = {name: getattr(self, name)[index] for name in ("thickness", "rotations", "shifts", "times")}
+        return replace(self, **parts, fringes=self.fringes[index], contrast=self.contrast[index])
+
+    def information(self, n: int, size: tuple[int, int]) -> Tensor:
+        """What frame `n` knows of the thickness at each frequency of `rfft2` on a raster of `size`: |H|²/σ²."""
+        fy, fx = np.fft.fftfreq(size[0]), np.fft.rfftfreq(size[1])
+        chi = np.pi * self.fringes[n] * (fy[:, None] ** 2 + fx**2)
+        return torch.from_numpy((self.contrast[n] * np.sin(chi)) ** 2 + EVERYWHERE).float()
+
+    def project(self, nodes: Sequence[Tensor] | Tensor, faces: Tensor, lines: int = 1) -> Tensor:
+        """Thickness [N, H, W] of a mesh with vertices `nodes` [N, P, 3] in each frame; differentiable."""
+        images = []
+        for time in np.unique(self.times):
+            own = np.flatnonzero(self.times == time)
+            found = surface_thickness(nodes[own[0]], faces, self.rotations[own], self.shifts[own], self.shape, lines)
+            images.append((own, found))
+        order = np.argsort(np.concatenate([own for own, _ in images]))
+        return torch.cat([found for _, found in images])[torch.from_numpy(order)]

@@ -1,0 +1,30 @@
+"""A figure of the page with its caption."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from matplotlib.figure import Figure
+
+from .style import WIDTH, data_uri
+
+
+@dataclass(frozen=True)
+class Block:
+    """One figure of the page: image is a `data:` URI, drawn `width` per cent of the page wide.
+
+    Without an image, `caption` says why there is none.
+    """
+
+    heading: str
+    caption: str
+    title: str = ""
+    image: str | None = None
+    width: int = 100
+    number: int | None = None
+
+
+def drawn_block(heading: str, caption: str, title: str, figure: Figure, kind: str) -> Block:
+    """`figure` as svg (curves) or png (images)."""
+    width = round(100 * float(figure.get_figwidth()) / WIDTH)
+    return Block(heading, caption.strip(), title, data_uri(figure, kind), width)

@@ -1,0 +1,253 @@
+"""Continuous matter that a motion carries along: truth objects of series, right at any time.
+
+A motion is a chain of maps in closed form, each with its inverse: matter at x at the time t is what was where the
+inverse takes x. Nothing is integrated over time, and no spline, lattice or voxel takes part, so that a
+reconstruction shares no numerics with it. Line integrals are sums of many points along each ray.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+import torch
+
+from ..checks import finite, in_range
+from ..geometry import Grid, Views
+from ..volume import LineIntegrals, Volume
+from .continuous import ContinuousScene, Element
+
+CHUNK = 1 << 15
+"""Points that are evaluated at once, which caches hold."""
+RAYS = 256
+"""Rays of a pixel row that are summed at once."""
+PER_VOXEL = 3
+"""Points a voxel's edge for the mean over a voxel."""
+
+
+class Motion(Protocol):
+    """A map of space that grows with time from the identity at time 0."""
+
+    def back(self, points: np.ndarray, time: float) -> np.ndarray:
+        """Where matter that is at `points` [3, P] [m] at `time` [s] was at time 0."""
+        ...
+
+    def forth(self, points: np.ndarray, time: float) -> np.ndarray:
+        """Where matter that was at `points` [3, P] [m] at time 0 is at `time` [s]."""
+        ...
+
+
+@dataclass(frozen=True)
+class Twist:
+    """Turns about an axis, by less the further from it: a vortex, whose velocity has no divergence.
+
+    centre, axis: `(x, y, z)`, a point [m] of the axis and its direction; rate: of the turning on the axis [rad/s];
+    width: distance w [m] from the axis ρ, of `exp(-ρ²/2w²)`, by which it falls.
+    """
+
+    centre: tuple[float, float, float]
+    axis: tuple[float, float, float]
+    rate: float
+    width: float
+
+    def back(self, points: np.ndarray, time: float) -> np.ndarray:
+        """See `Motion`."""
+        return self.forth(points, -time)
+
+    def forth(self, points: np.ndarray, time: float) -> np.ndarray:
+        """See `Motion`; by Rodrigues' formula, at a distance from the axis that does not change."""
+        along = np.asarray(self.axis, dtype=np.float64)[:, None]
+        along = along / np.linalg.norm(along)
+        centre = np.asarray(self.centre)[:, None]
+        x, y, z = away = points - centre
+        height = (along * away).sum(0)
+        angle = self.rate * time * np.exp((height**2 - (away * away).sum(0)) / (2 * self.width**2))
+        c, s = np.cos(angle), np.sin(angle)
+        (u, v, w), shift = along, height * (1 - c)
+        crossed = np.stack([v * z - w * y, w * x - u * z, u * y - v * x])
+        return away * c + crossed * s + along * shift + centre
+
+
+@dataclass(frozen=True)
+class Sink:
+    """Draws matter towards a point, where it vanishes in a ball about it; beyond the ball no volume changes.
+
+    centre: `(x, y, z)` [m]; core: radius [m] of the ball at time 0; loss: of its volume [m³/s], which goes on until
+    `least` of it is left. Beyond the core `r³` falls by `3/4π` of the lost volume; inside, lengths shrink alike.
+    """
+
+    centre: tuple[float, float, float]
+    core: float
+    loss: float
+    least: float = 0.02
+
+    def _lost(self, time: float) -> float:
+        """`r³` that is lost [m³]."""
+        most = (1 - self.least) * self.core**3
+        return float(np.clip(3 * self.loss * time / (4 * np.pi), 0.0, most))
+
+    def back(self, points: np.ndarray, time: float) -> np.ndarray:
+        """See `Motion`."""
+        lost = self._lost(time)
+        centre = np.asarray(self.centre)[:, None]
+        away = points - centre
+        cube = np.power((away * away).sum(0), 1.5)
+        shrunk = self.core**3 - lost
+        factor = np.where(cube >= shrunk, 1 + lost / np.maximum(cube, shrunk), self.core**3 / shrunk)
+        return centre + away * np.cbrt(factor)
+
+    def forth(self, points: np.ndarray, time: float) -> np.ndarray:
+        """See `Motion`."""
+        lost = self._lost(time)
+        centre = np.asarray(self.centre)[:, None]
+        away = points - centre
+        cube = np.power((away * away).sum(0), 1.5)
+        whole = self.core**3
+        factor = np.where(cube >= whole, 1 - lost / np.maximum(cube, whole), 1 - lost / whole)
+        return centre + away * np.cbrt(factor)
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Motions one after another: matter goes through the first one first."""
+
+    motions: tuple[Motion, ...]
+
+    def back(self, points: np.ndarray, time: float) -> np.ndarray:
+        """See `Motion`."""
+        for motion in reversed(self.motions):
+            points = motion.back(points, time)
+        return points
+
+    def forth(self, points: np.ndarray, time: float) -> np.ndarray:
+        """See `Motion`."""
+        for motion in self.motions:
+            points = motion.forth(points, time)
+        return points
+
+
+@dataclass(frozen=True)
+class Sinks:
+    """Sinks in turn, each about the point to which those before it have drawn its centre.
+
+    A ball about a later centre becomes slightly oval by the pull of earlier ones, and its sink does not.
+    """
+
+    sinks: tuple[Sink, ...]
+
+    def back(self, points: np.ndarray, time: float) -> np.ndarray:
+        """See `Motion`."""
+        for sink in reversed(self.placed(time)):
+            points = sink.back(points, time)
+        return points
+
+    def forth(self, points: np.ndarray, time: float) -> np.ndarray:
+        """See `Motion`."""
+        for sink in self.placed(time):
+            points = sink.forth(points, time)
+        return points
+
+    def placed(self, time: float) -> list[Sink]:
+        """The sinks about the points that they have at `time` [s]."""
+        found: list[Sink] = []
+        for sink in self.sinks:
+            centre = np.array([sink.centre]).T
+            for before in found:
+                centre = before.forth(centre, time)
+            x, y, z = centre[:, 0].tolist()
+            found.append(replace(sink, centre=(x, y, z)))
+        return found
+
+
+@dataclass(frozen=True)
+class CarriedScene:
+    """A continuous scene that a motion carries along; as it stands, that of time 0.
+
+    scene: at time 0; motion: how it goes on; reach: radius [m] of the ball about the origin that matter never leaves;
+    step: from point to point along a ray [m], a sixth of the narrowest edge; moment: [s] the time that is looked at.
+    Errors: `InputError` for lengths out of range.
+    """
+
+    scene: ContinuousScene
+    motion: Motion
+    reach: float
+    step: float
+    moment: float = 0.0
+
+    def __post_init__(self) -> None:
+        in_range("reach", self.reach, 1e-9, 1.0, unit="metres")
+        in_range("step", self.step, 1e-12, self.reach, unit="metres")
+        finite("moment", np.array([self.moment]))
+
+    def at(self, time: float) -> CarriedScene:
+        """The scene as it is at `time` [s]."""
+        return CarriedScene(self.scene, self.motion, self.reach, self.step, float(time))
+
+    def missing_field(self, views: Views) -> float:
+        """How far [m] the ball that holds the scene reaches beyond the detector in the worst view."""
+        return float((np.abs(views.shifts) + self.reach - 0.5 * views.fields).max())
+
+    def shares(self, points: np.ndarray) -> np.ndarray:
+        """δ and β [2, P] at `points` [3, P] `(x, y, z)` [m]."""
+        found = np.zeros((2, points.shape[1]))
+        for start in range(0, points.shape[1], CHUNK):
+            part = slice(start, start + CHUNK)
+            before = self.motion.back(points[:, part], self.moment)
+            for element in self.scene.elements:
+                _add(found[:, part], element, before)
+        return found
+
+    def project(self, views: Views) -> LineIntegrals:
+        """Line integrals of each of the scene's `kinds`, float64: sums of points `step` apart on the pixels' rays."""
+        kinds = self.scene.kinds
+        channels = np.zeros((len(views), len(kinds), *views.shape))
+        count = int(np.ceil(2 * self.reach / self.step))
+        depths = (np.arange(count) + 0.5) * (2 * self.reach / count) - self.reach
+        for v, of_view in enumerate(channels.reshape(len(views), len(kinds), -1)):
+            x, y = _centres(views, v)
+            flat = np.stack([one.ravel() for one in np.broadcast_arrays(x[None, :], y[:, None])])
+            inside = np.flatnonzero((flat * flat).sum(0) < self.reach**2)
+            for at in np.array_split(inside, max(1, len(inside) // RAYS)):
+                found = self._lines(flat[:, at], depths, views.rotations[v])
+                of_view[:, at] = found[:1] / kinds[0].delta if len(kinds) == 1 else found
+        return LineIntegrals(torch.from_numpy(channels), tuple((k.delta, k.beta) for k in kinds))
+
+    def _lines(self, rays: np.ndarray, depths: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+        """∫δ and ∫β [2, R] [m] on `rays` [2, R] of a view."""
+        half = np.sqrt(self.reach**2 - (rays * rays).sum(0))
+        ray, depth = np.nonzero(np.abs(depths) < half[:, None])
+        points = rotation.T @ np.stack([*rays[:, ray], depths[depth]])
+        values = self.shares(points) * (depths[1] - depths[0])
+        return np.stack([np.bincount(ray, one, rays.shape[1]) for one in values])
+
+    def voxelise(self, grid: Grid) -> Volume:
+        """δ and β averaged over voxels, from `PER_VOXEL`³ points of each that the ball touches."""
+        x, y, z = grid.axes()
+        middles = np.stack(np.meshgrid(z, y, x, indexing="ij")[::-1]).reshape(3, -1)
+        near = np.flatnonzero(np.linalg.norm(middles, axis=0) < self.reach + np.linalg.norm(grid.voxel_size))
+        values, size = np.zeros((2, middles.shape[1])), np.array(grid.voxel_size)
+        ticks = (np.arange(PER_VOXEL) + 0.5) / PER_VOXEL - 0.5
+        for offset in np.stack(np.meshgrid(ticks, ticks, ticks), -1).reshape(-1, 3):
+            values[:, near] += self.shares(middles[:, near] + (offset * size)[:, None]) / PER_VOXEL**3
+        delta, beta = values.reshape(2, *grid.shape)
+        return Volume(delta, beta, grid)
+
+
+def _add(found: np.ndarray, element: Element, points: np.ndarray) -> None:
+    """Add δ and β of an element at `points` [3, P] to `found` [2, P]."""
+    away = points - element.centre[:, None]
+    within = np.flatnonzero(
+        (away * away).sum(0) < (element.profile.reach * np.linalg.norm(element.axes, axis=1).max()) ** 2
+    )
+    if len(within):
+        near = away[:, within]
+        share = element.profile.density(np.square(element.inverse @ near).sum(0)) * (1 + element.gradient @ near)
+        found[0, within] += element.matter.delta * share
+        found[1, within] += element.matter.beta * share
+
+
+def _centres(views: Views, view: int) -> tuple[np.ndarray, np.ndarray]:
+    """Columns' x [W] and rows' y [H] [m] of the pixels of a view, in its own frame."""
+    (h, w), (sx, sy), p = views.shape, views.shifts[view], float(views.pixel_sizes[view])
+    return (np.arange(w) + 0.5 - w / 2) * p + sx, (np.arange(h) + 0.5 - h / 2) * p + sy

@@ -1,0 +1,243 @@
+"""`forecast`: a run of `track` in, its bodies and their holograms at later times out, with a band."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+
+from ..checks import InputError, at_least, positive, require
+from ..io.atomic import atomic_path
+from ..io.json import write_json
+from ..io.nxtomo import write_scan
+from ..io.objects import write_object
+from ..methods.presets import SCHEMA
+from ..metrics import image_scores, intensity_range
+from ..motion.dynamics import DynamicsForecast, carry
+from ..motion.fit import MotionFit
+from ..motion.forecast import Forecast, Halves, PathForecast, extrapolate
+from ..motion.half_sets import LEAST, half_sets
+from ..progress import FitProgress
+from ..representations import MovingSurfaces
+from ..scan import Scan
+from ..tables import to_table
+from .evaluate import render_object
+from .provenance import environment, scan_hash
+from .reconstruction import Reconstruction
+from .run_folder import RunFolder
+from .run_light import light_of
+from .run_record import summary_of
+from .track import write_tracks
+
+FRAMES, TABLE, NUMBERS = "forecast.nxs", "forecast.csv", "forecast.json"
+MOST_TIMES = 1000
+"""Of a forecast."""
+UNTOLD = 0.5
+"""Standard error after the fit over that before from which on a number is not told."""
+SAME_TIME = 1e-3
+"""Share of a step within which two times are one."""
+
+
+@dataclass(frozen=True)
+class ForecastOptions:
+    """How a run is carried on."""
+
+    kind: ClassVar[str] = "forecast"
+
+    times: int = 10
+    """Times ahead."""
+    step: float = 0.0
+    """Between them [s] (0: the median step of the run)."""
+    model: PathForecast = field(default_factory=PathForecast)
+    """How paths go on."""
+    dynamics: DynamicsForecast | None = None
+    """How cells go on by mechanics (default: all bodies go on their paths)."""
+    half_sets: bool = True
+    """Whether paths are fitted again to two halves of the times, which say what is believed of the motion."""
+    fit: MotionFit = field(default_factory=MotionFit)
+    """These fits."""
+
+    def __post_init__(self) -> None:
+        at_least(self, 0, "step")
+        require(
+            1 <= self.times <= MOST_TIMES,
+            f"a forecast must be of 1 to {MOST_TIMES} times, but {self.times} are asked for; change --times.",
+        )
+
+    def ahead(self, tracked: np.ndarray) -> np.ndarray:
+        """Times [N] s of the forecast after those of the run, `tracked` [T] s."""
+        step = self.step or float(np.median(np.diff(tracked)))
+        return tracked[-1] + positive("step", step, "seconds") * np.arange(1, self.times + 1)
+
+
+@dataclass(frozen=True)
+class Forecasted:
+    """What `forecast` found. forecast: bodies and band; predicted: the frames at its times; judged: scores against the
+    frames that the run did not see, a row a time, empty without such frames; flow: what mechanics found of it."""
+
+    forecast: Forecast
+    predicted: Scan
+    judged: list[dict[str, float]]
+    flow: dict[str, float] = field(default_factory=dict)
+
+    def lines(self) -> list[str]:
+        """The numbers as a few lines of text."""
+        step, last = self.forecast.times[0], self.forecast.times[-1]
+        band = 1e6 * self.forecast.usual_band()
+        said = [f"standard error of surfaces: {band[0]:.3f} µm at {step:.4g} s, {band[-1]:.3f} µm at {last:.4g} s"]
+        if self.flow:
+            said.append(flow_in_words(self.flow))
+        if self.judged:
+            ends = [self.judged[0], self.judged[-1]]
+            words = (f"SSIM {one['ssim']:.4f} (without change {one['ssim_still']:.4f})" for one in ends)
+            times = (f"{one['time_s']:.4g} s" for one in ends)
+            said.append("held-out frames: " + ", ".join(f"{w} at {t}" for w, t in zip(words, times)))
+        return said
+
+
+def tracked_bodies(run: Reconstruction) -> MovingSurfaces:
+    """The bodies of a run of `track`; `InputError` for any other run."""
+    if not isinstance(run.object, MovingSurfaces):
+        raise InputError(
+            f"a forecast needs a run of track, with bodies in motion, but this one holds {run.object.described}; run "
+            "holosplat track on a scan of several times."
+        )
+    return run.object
+
+
+def forecast(
+    run: Reconstruction,
+    scan: Scan,
+    times: np.ndarray,
+    options: ForecastOptions = ForecastOptions(),
+    seed: int = 0,
+    *,
+    on_progress: FitProgress = lambda stage, fraction, record: None,
+) -> Forecasted:
+    """What the bodies of `run`, tracked at `times` [T] s, and their holograms are expected to be afterwards.
+
+    scan: of the run, and of later times where it has them: these judge the forecast, and are used for nothing else.
+    Errors: `InputError` for runs that are not of `track`, and for a scan without the run's last time.
+    """
+    bodies, times = tracked_bodies(run), np.asarray(times, dtype=np.float64)
+    ahead = options.ahead(times)
+    slack = SAME_TIME * float(np.median(np.diff(times)))
+    known = scan[np.flatnonzero(scan.exposures.time <= times[-1] + slack)] if len(scan) else scan
+    last = np.flatnonzero(np.abs(scan.exposures.time - times[-1]) <= slack)
+    require(len(last) > 0, f"the scan must have frames of the run's last time, {times[-1]:.6g} s, but it has none.")
+    halves = _halves(run, known, bodies, options, seed, on_progress) if options.half_sets else None
+    on_progress("forecast", 0.0, {})
+    flow = dict[str, float]()
+    if options.dynamics is None:
+        found = extrapolate(bodies, times, ahead, options.model, halves)
+    else:
+        found, flow = carry(bodies, times, ahead, options.dynamics, options.model, halves)
+    exposures = scan.exposures[last].repeated(ahead)
+    frames = render_object(found.bodies, exposures, run.oversample, bodies.backend)
+    predicted = Scan(
+        frames, exposures, np.zeros(len(frames), dtype=bool), {"forecast": (options.dynamics or options.model).kind}
+    )
+    return Forecasted(found, predicted, _judged(found, run, scan, known, slack), flow)
+
+
+def flow_in_words(flow: dict[str, float]) -> str:
+    """What was found of the flow, and what the window does not tell."""
+    said = f"flow: peak {flow['peak_m_s']:.4g} m/s, shear modulus {1e6 * flow['shear_n_m']:.3g} µN/m"
+    for name, word in (("peak", "the peak"), ("shear", "the shear modulus")):
+        told = flow.get(f"{name}_told", np.nan)
+        if np.isnan(told):
+            said += f"; {word} was given"
+        elif told > UNTOLD:
+            said += f"; the window does not tell {word} (standard error {told:.2f} of the range's)"
+    return said + "; of the membrane's viscosity it says nothing"
+
+
+def write_forecast(folder: RunFolder, run: Reconstruction, found: Forecasted, config: dict[str, Any]) -> Reconstruction:
+    """The run folder of a forecast: bodies.pvd, tracks.csv and object.h5 as track writes them, at the times ahead;
+    forecast.nxs, the predicted frames; forecast.csv, the band of each body; forecast.json, all numbers.
+
+    config: entries of config.json, from `config_of`. Returns the bodies as a reconstruction.
+    """
+    folder.create()
+    said = found.forecast
+    done = replace(run, object=said.bodies, method=ForecastOptions.kind, timing={}, verdict=None, total=None)
+    write_json(folder.config, config | environment("cpu"))
+    write_object(folder.object, said.bodies)
+    told = {"steps": 0, "times_s": said.times.tolist(), "bodies": said.bodies.count}
+    write_json(folder.summary, summary_of(done, None, found.predicted) | told)
+    write_scan(folder.path / FRAMES, found.predicted)
+    with atomic_path(folder.path / TABLE) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["time_s", "body", "standard_error_m"])
+        rows = zip(said.times, said.band)
+        writer.writerows([f"{t:.7g}", k, f"{error:.4g}"] for t, band in rows for k, error in enumerate(band))
+    band = [None if np.isnan(one) else float(one) for one in said.usual_band()]
+    write_json(
+        folder.path / NUMBERS,
+        {"times_s": said.times.tolist(), "band_m": band, "held_out": found.judged, "flow": found.flow},
+    )
+    write_tracks(folder, said.bodies, found.predicted)
+    return done
+
+
+def config_of(options: ForecastOptions, scan: Scan, run: dict[str, Any], seed: int) -> dict[str, Any]:
+    """Entries of config.json. run: that of the run which is carried on."""
+    return {
+        "schema_version": SCHEMA,
+        "method": {"kind": options.kind, "forecast": (options.dynamics or options.model).kind, **to_table(options)},
+        "seed": seed,
+        "prior": run["prior"],
+        "light": run.get("light", {}),
+        "matter": "levels",
+        "scan_hash": scan_hash(scan),
+    }
+
+
+def _halves(
+    run: Reconstruction,
+    known: Scan,
+    bodies: MovingSurfaces,
+    options: ForecastOptions,
+    seed: int,
+    on_progress: FitProgress,
+) -> Halves | None:
+    """Fits to halves of the training frames; None for too few times."""
+    kept = np.flatnonzero(~known.is_test)
+    train = known[kept]
+    if len(train.instants) < LEAST:
+        return None
+    lit = light_of(known, run.light, run.still)
+    part = None
+    if lit is not None:
+        part = lit.part(torch.from_numpy(kept))
+        train = replace(train, frames=part.evened(torch.from_numpy(train.frames)).numpy())
+    total = 2 * options.fit.schedule.steps
+    done = [0]
+
+    def show(record: dict[str, float]) -> None:
+        done[0] += 1
+        on_progress("half-sets", done[0] / total, record)
+
+    return half_sets(train, bodies, options.fit, seed, part, show)
+
+
+def _judged(found: Forecast, run: Reconstruction, scan: Scan, known: Scan, slack: float) -> list[dict[str, float]]:
+    """Scores of the frames after the run's last time and within the forecast, a row a time; `_still`: of bodies that
+    stay where they are at the last time."""
+    last, rows = float(found.bodies.basis.first), list[dict[str, float]]()
+    data_range = intensity_range(known.frames)
+    lit = light_of(scan, run.light, run.still)
+    for time in scan.instants[(scan.instants > last + slack) & (scan.instants <= found.times[-1] + slack)]:
+        kept = np.flatnonzero(scan.exposures.time == time)
+        measured = scan[kept].frames
+        factor = 1.0 if lit is None else lit.part(torch.from_numpy(kept)).factor().numpy().astype(np.float32)
+        row = {"time_s": float(time)}
+        for ending, obj in (("", found.bodies.at(float(time))), ("_still", found.bodies.at(last))):
+            said = render_object(obj, scan.exposures[kept], run.oversample, found.bodies.backend) * factor
+            mean = image_scores(said, measured, data_range).mean
+            row |= {f"{name}{ending}": float(mean[name]) for name in ("ssim", "psnr", "l1")}
+        rows.append(row)
+    return rows

@@ -1,0 +1,112 @@
+"""`forecast` on the command line: from a run of the first times of a scan to the later ones, which judge it."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import holosplat as hs
+import holosplat.cli.track as command
+import holosplat.workflows.track as workflow
+from helpers.cli import Outcome, holosplat, refused, worked
+from helpers.moving_ellipsoids import MATERIAL, PIXEL, STEP, TIMES, ellipsoid, scan
+from holosplat.io.nxtomo import read_scan, write_scan
+from holosplat.io.objects import read_object
+from holosplat.io.pvd import read_pvd
+from holosplat.matter import Matter
+from holosplat.motion.track import Followed
+from holosplat.representations import MovingSurfaces, TimeBasis
+from holosplat.specimens.red_cells import icosphere
+
+AHEAD = 2
+
+
+def worked_by(*arguments: object) -> Outcome:
+    return worked(holosplat(*arguments))
+
+
+def on_true_paths(train: hs.Scan, *_: object, **__: object) -> Followed:
+    """What a perfect fit would give: the bodies on parabolas through their places at the times of the frames."""
+    times = train.instants
+    basis = TimeBasis(float(times[0]), float(times[-1]), 2)
+    places = [np.array([ellipsoid(k, time / STEP - 0.5 * (TIMES - 1), 2).vertices for time in times]) for k in range(3)]
+    paths, faces = [basis.fitted(times, one) for one in places], [icosphere(2)[1]] * 3
+    bodies = MovingSurfaces.of_bodies(paths, faces, basis, PIXEL, Matter.one(*MATERIAL))
+    return Followed(bodies, [], 2, {"soft fit": 0.0}, (3,) * len(times))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """The scan, a run of all times but the last, and its forecast of that and one more."""
+    folder = tmp_path_factory.mktemp("forecast")
+    write_scan(folder / "scan.nxs", scan())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(workflow, "follow", on_true_paths)
+        patch.setattr(command, "report_run", lambda folder, *_: folder.report)  # a second one says no more
+        how = ("--material", "haemoglobin", "--time-frames", f"0:{TIMES - 1}")
+        worked_by("track", folder / "scan.nxs", *how, "--out", folder / "run")
+    worked_by("forecast", folder / "run", "--times", AHEAD, "--out", folder / "later")
+    return folder
+
+
+def test_only_the_first_times_are_tracked(folder):
+    summary = json.loads((folder / "run" / "summary.json").read_text())
+    assert summary["times_s"] == pytest.approx(STEP * np.arange(TIMES - 1))
+
+
+def test_bodies_go_on_with_a_band(folder):
+    later = folder / "later"
+    wanted = STEP * (TIMES - 1 + np.arange(AHEAD))
+    assert [step.time for step in read_pvd(later / "bodies.pvd")] == pytest.approx(wanted)
+    with (later / "tracks.csv").open() as file:
+        assert [float(row["time_s"]) for row in csv.DictReader(file)] == pytest.approx(np.repeat(wanted, 3))
+    with (later / "forecast.csv").open() as file:
+        errors = np.array([float(row["standard_error_m"]) for row in csv.DictReader(file)]).reshape(AHEAD, 3)
+    assert (errors[1] > errors[0]).all()
+    before, after = (read_object(folder / name / "object.h5") for name in ("run", "later"))
+    assert isinstance(before, MovingSurfaces)
+    assert isinstance(after, MovingSurfaces)
+    for ours, theirs in zip(after.bodies(wanted[0] - STEP), before.bodies(wanted[0] - STEP)):
+        assert ours.vertices == pytest.approx(theirs.vertices, abs=0.3e-6)  # of 3 to 5 µm, that move 2 µm a step
+    assert (later / "report.html").is_file()
+
+
+def test_frames_that_were_held_out_judge_it(folder):
+    """Better than bodies that stay; the frames predicted are those of its bodies."""
+    (judged,) = json.loads((folder / "later" / "forecast.json").read_text())["held_out"]
+    assert judged["time_s"] == pytest.approx(STEP * (TIMES - 1))
+    assert judged["ssim"] > judged["ssim_still"] + 0.1
+    worked_by(
+        "render",
+        folder / "later",
+        "--scan",
+        folder / "later" / "forecast.nxs",
+        "--split",
+        "train",
+        "--out",
+        folder / "again.nxs",
+    )
+    assert read_scan(folder / "again.nxs").frames == pytest.approx(
+        read_scan(folder / "later" / "forecast.nxs").frames, abs=1e-5
+    )
+    said = json.loads(worked_by("evaluate", folder / "later", "--json").out)
+    assert said["train"]["mean"]["ssim"] == pytest.approx(judged["ssim"], abs=0.05)
+
+
+def test_what_cannot_be_carried_on_is_refused(folder):
+    run, out = folder / "run", folder / "none"
+    refused(holosplat("forecast", run, "--times", 0, "--out", out), "--times", "1 to 1000")
+    refused(holosplat("forecast", run, "--step", 0, "--out", out), "--step")
+    refused(holosplat("forecast", run, "--degree", 0, "--out", out), "degree")
+    refused(holosplat("forecast", run, "--out", folder / "later"), "later")
+    refused(holosplat("forecast", run, "--model", "dynamics", "--out", out), "--model dynamics", "--channel")
+    through = ("forecast", run, "--out", out, "--channel", "1e-5", "1e-5")
+    refused(holosplat(*through), "within the channel", "--flow-axis")
+    refused(holosplat(*through, "--peak", "0.2:0.1"), "--peak", "LOW:HIGH")
+    refused(holosplat(*through, "--shear-modulus", "soft"), "--shear-modulus")
+    refused(holosplat("forecast", folder, "--out", out), "must hold a reconstruction")
+    assert not out.exists()

@@ -1,0 +1,121 @@
+"""Forecasts of bodies whose motion is known, and the band about them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+import holosplat as hs
+from holosplat.checks import InputError
+from holosplat.fit.schedule import Schedule
+from holosplat.matter import Matter
+from holosplat.mesh import TriangleMesh
+from holosplat.metrics.distances import normal_distance
+from holosplat.motion.fit import MotionFit
+from holosplat.motion.forecast import PathForecast, across, extrapolate, normals
+from holosplat.motion.half_sets import half_sets
+from holosplat.representations import MovingSurfaces, TimeBasis
+from holosplat.specimens.red_cells import icosphere
+
+TIMES = 1e-5 * np.arange(12)
+AHEAD = TIMES[-1] + 1e-5 * np.array([1.0, 5.0, 10.0])
+SPHERE, FACES = icosphere(2)
+
+
+def truth(body: int, time: float) -> TriangleMesh:
+    """An ellipsoid that moves and turns evenly, by 0.06 rad in 1e-5 s."""
+    turn = Rotation.from_rotvec(time / 1e-5 * np.array([0.02, 0.05, 0.02 * body])).as_matrix()
+    middle = 1e-6 * np.array([9.0 * body, 2e5 * time, 0])
+    return TriangleMesh((SPHERE * [3e-6, 2.2e-6, 1.4e-6]) @ turn.T + middle, FACES)
+
+
+def fitted(noise: float = 0.0, seed: int = 0) -> MovingSurfaces:
+    """Paths of degree 3 through the true places, whose middle is off by `noise` [m] each time."""
+    random, basis = np.random.default_rng(seed), TimeBasis(TIMES[0], TIMES[-1], 3)
+    off = noise * random.normal(size=(2, len(TIMES), 1, 3))
+    places = [np.array([truth(b, t).vertices for t in TIMES]) + off[b] for b in range(2)]
+    paths = [basis.fitted(TIMES, one) for one in places]
+    return MovingSurfaces.of_bodies(paths, [FACES, FACES], basis, 0.5e-6, Matter.one(1e-7, 0.0))
+
+
+def missed(found: MovingSurfaces, body: int = 0) -> list[float]:
+    return [normal_distance(found.bodies(t)[body], truth(body, t)) for t in AHEAD]
+
+
+def test_what_turns_goes_on_turning():
+    """A turn is no polynomial of places: paths that are carried on straight swell, parts that turn do not."""
+    found = extrapolate(fitted(), TIMES, AHEAD)
+    straight = [normal_distance(fitted().bodies(t)[0], truth(0, t)) for t in AHEAD]
+    assert missed(found.bodies)[-1] < 0.1 * straight[-1]
+    assert missed(found.bodies)[-1] < 0.02e-6
+    volumes = [mesh.volume for t in AHEAD for mesh in found.bodies.bodies(t)]
+    assert volumes == pytest.approx(len(volumes) * [truth(0, 0.0).volume], rel=2e-3, abs=0)
+    assert found.bodies.bodies(TIMES[-1])[1].vertices == pytest.approx(truth(1, TIMES[-1]).vertices, abs=0.01e-6)
+
+
+def test_the_band_is_the_error_of_noise():
+    """Over noise of many seeds: what half-sets differ by is what forecasts are off by, at each time ahead."""
+    seeds, ratios = range(0, 18, 3), []
+    for seed in seeds:
+        halves = fitted(0.1e-6, seed + 1), fitted(0.1e-6, seed + 2)
+        mean = halves[0].with_parameters({"coefficients": 0.5 * (halves[0].coefficients + halves[1].coefficients)})
+        found = extrapolate(mean, TIMES, AHEAD, PathForecast(), halves)
+        assert (np.diff(found.band, axis=0) > 0).all()
+        ratios.append([np.square(missed(found.bodies)), np.square(found.band[:, 0])])
+    error, band = np.sqrt(np.mean(ratios, axis=0))
+    assert band / error == pytest.approx(1, abs=0.5)
+
+
+def test_a_window_and_a_stiff_body_are_told():
+    """Bodies that turned otherwise before the window; and ones whose shape was about to change."""
+    bodies = fitted()
+    late = extrapolate(bodies, TIMES, AHEAD, PathForecast(window=6))
+    assert missed(late.bodies)[-1] < 0.05e-6
+    grown = bodies.coefficients.clone()
+    grown[-1] = grown[-1] + 0.3 * (grown[-1] - grown[-1].mean(0))
+    swelling = bodies.with_parameters({"coefficients": grown})
+    free = extrapolate(swelling, TIMES, AHEAD, PathForecast(keep_volume=False)).bodies
+    stiff = extrapolate(swelling, TIMES, AHEAD, PathForecast(rigid=True, keep_volume=False)).bodies
+    first, last = (np.array([abs(of.bodies(t)[0].volume) for of in (free, stiff)]) for t in (AHEAD[0], AHEAD[-1]))
+    assert last[1] == pytest.approx(first[1], rel=0.01)
+    assert last[0] > 1.2 * first[0]
+
+
+def test_one_time_ahead_and_too_few_times_behind():
+    """A single step is enough; three times tell no error."""
+    found = extrapolate(fitted(), TIMES, AHEAD[:1])
+    assert missed(found.bodies)[0] < 0.02e-6
+    assert np.isnan(extrapolate(fitted(), TIMES[-3:], AHEAD).band).all()
+
+
+def test_distance_along_normals():
+    """Of a sphere that is moved, √(1/3) of the way; turned in itself, nothing."""
+    sphere = 2e-6 * SPHERE
+    moved = np.stack([sphere, sphere + [0, 1e-8, 0]])
+    assert across(np.stack([sphere, sphere]), moved, FACES) == pytest.approx([0, 1e-8 / 3**0.5], rel=0.01, abs=1e-12)
+    assert normals(TriangleMesh(sphere, FACES)) == pytest.approx(SPHERE, abs=0.03)
+
+
+def test_half_sets_are_fits_to_half_of_the_times():
+    """Each half moves the bodies towards its own frames: those of odd times are of bodies elsewhere."""
+    times = 1e-5 * np.arange(8)
+    views = hs.Views.from_angles(np.array([0.0, 90.0]), (15, 22), 1e-6)
+    exposures = hs.Exposures.of(views, 20.0, 0.05).repeated(times)
+    ball = 4.0 * SPHERE
+    basis = TimeBasis(0.0, times[-1], 1)
+    still = MovingSurfaces.of_bodies([np.stack([1e-6 * ball] * 2)], [FACES], basis, 1e-6, Matter.one(4e-7, 4e-10))
+    away = still.with_parameters({"coefficients": still.coefficients + torch.tensor([0.0, 1.0, 0.0])})
+    frames = np.concatenate(
+        [hs.simulate((away if t % 2 else still).at(0.0), exposures[[2 * t, 2 * t + 1]]).frames for t in range(8)]
+    )
+    scan = hs.Scan(frames, exposures, np.zeros(16, dtype=bool))
+    how = MotionFit(stiffness=100.0, schedule=Schedule(steps=25, views_per_step=0))
+    even, odd = (one.coefficients[..., 1].mean() for one in half_sets(scan, still, how))
+    assert even == pytest.approx(0, abs=0.1)
+    assert odd == pytest.approx(1, abs=0.2)
+    with pytest.raises(InputError, match="8 times"):
+        half_sets(scan[:8], still, replace(how))

@@ -1,0 +1,223 @@
+"""Bodies of known rest shape: what strains cost, and poses found by two beams, on a raster of odd sides."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+import holosplat as hs
+from holosplat.checks import InputError
+from holosplat.cli.track import BodyFlags
+from holosplat.geometry import rotation_y
+from holosplat.io.vtk import write_mesh
+from holosplat.materials import HAEMOGLOBIN
+from holosplat.matter import Matter
+from holosplat.mesh import TriangleMesh
+from holosplat.motion.elastic import Elastic, RestShapeKept
+from holosplat.motion.known import best_size, drift
+from holosplat.motion.poses import Explained, Pose, exchanged, pursued
+from holosplat.motion.rest_shape import KnownBody, surface, thinned
+from holosplat.motion.shadows import Shadows
+from holosplat.motion.sightings import centroid
+from holosplat.motion.templates import Search, Templates
+from holosplat.motion.track import TrackOptions, follow
+from holosplat.representations import MovingSurfaces, TimeBasis
+from holosplat.specimens.mesh_series import MeshSeries
+from holosplat.specimens.red_cells import evans_fung_cell, icosphere
+
+SHAPE, STEPS = (47, 33), (-1.0, 0.0, 1.0)
+RADIUS = 4.5
+FLOW = np.array([0.0, 4.0, 0.0])
+TURN = Rotation.from_rotvec([0.9, 0.3, 0.4]).as_matrix()
+OTHER = Rotation.from_rotvec([-0.2, 0.5, 1.3]).as_matrix()
+
+
+@cache
+def cell() -> TriangleMesh:
+    """A red cell about its centre [pixels]."""
+    return KnownBody().mesh(3.91e-6 / RADIUS, coarse=True)
+
+
+def shadows(poses: list[Pose], angles: tuple[float, ...] = (0.0, 90.0), mesh: TriangleMesh | None = None) -> Shadows:
+    """What beams at `angles` [degrees] see of bodies at three times, with a little noise."""
+    count = len(angles) * len(STEPS)
+    times = np.repeat(STEPS, len(angles))
+    rotations = torch.from_numpy(np.tile(rotation_y(np.array(angles)), (len(STEPS), 1, 1)))
+    empty = Shadows(
+        np.zeros((count, *SHAPE)), rotations, torch.zeros(count, 2, dtype=torch.float64), times, 0.0,
+        np.full(count, 25.0), np.full(count, 3.0),
+    )  # fmt: skip
+    images = Explained(mesh or cell(), empty).images(poses)
+    return replace(empty, thickness=images + 0.1 * np.random.default_rng(0).normal(size=images.shape))
+
+
+def pose(turn: np.ndarray, centre: tuple[float, float, float], speed: float = 1.0) -> Pose:
+    return Pose(turn, np.array(centre), speed * FLOW, np.zeros(3))
+
+
+def axis_error(found: Pose, turn: np.ndarray) -> float:
+    """Angle between the cells' axes [degrees], of either sign."""
+    axis = np.linalg.svd(found.matrix @ np.diag([1.0, 1.0, 0.3]))[0][:, 2]
+    return float(np.degrees(np.arccos(min(1.0, abs(axis @ turn[:, 2])))))
+
+
+def test_strain_costs_nothing_at_rest_in_any_pose_and_of_any_size():
+    rest = cell()
+    moved = torch.from_numpy(rest.vertices @ TURN.T + 7.0)
+    longer = torch.from_numpy(rest.vertices * np.array([1.3, 1.0, 1 / 1.3]))
+    assert float(Elastic(rest)(moved)) == pytest.approx(0, abs=1e-12)
+    costs = [Elastic(replace(rest, vertices=s * rest.vertices))(s * longer) for s in (1.0, 3.0)]
+    assert float(costs[0]) > 0.05
+    assert float(costs[1]) == pytest.approx(float(costs[0]), rel=1e-9)
+
+
+def test_a_strained_sheet_costs_what_skalak_says():
+    """A ball blown up by a factor s: I₁ = 2(s² - 1), I₂ = s⁴ - 1, and its area by s²; nothing bends."""
+    sphere, faces = icosphere(2)
+    s, nodes = 1.1, torch.from_numpy(1.1 * sphere)
+    first, second = 2 * (s**2 - 1), s**4 - 1
+    skalak = 0.25 * (first**2 + 2 * first - 2 * second + second**2)
+    whole = 0.5 * 345 * (s**2 - 1) ** 2
+    assert float(Elastic(TriangleMesh(sphere, faces))(nodes)) == pytest.approx(skalak + whole, rel=1e-6)
+
+
+def test_the_term_is_the_mean_over_times_and_its_gradient_is_right():
+    rest, basis = cell(), TimeBasis(0.0, 2.0, 1)
+    nodes = [rest.vertices * np.array([1.0 + 0.1 * k, 1.0, 1.0]) for k in range(2)]
+    paths = [np.stack([one, 1.1 * one]) for one in nodes]
+    bodies = MovingSurfaces.of_bodies(paths, [rest.faces] * 2, basis, 1.0, Matter.one(1e-7, 0.0))
+    elastic = Elastic(rest)
+    term = RestShapeKept(2.0, elastic, bodies)
+
+    class Fake:
+        def __init__(self, values):
+            self.values = values
+
+        def parameters(self):
+            return {"object.coefficients": self.values}
+
+    values = bodies.coefficients.clone().requires_grad_()
+    (part,) = term(Fake(values), None)  # type: ignore[arg-type]
+    wanted = sum(float(elastic(torch.from_numpy(f * one))) for one in nodes for f in (1.0, 1.05, 1.1)) / 3
+    assert float(part.value.detach()) == pytest.approx(wanted)
+    part.value.backward()
+    way = torch.randn(values.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    ends = [float(term(Fake(values.detach() + e * way), None)[0].value) for e in (1e-5, -1e-5)]  # type: ignore[arg-type]
+    assert values.grad is not None
+    assert float((values.grad * way).sum()) == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-4)
+    with pytest.raises(InputError, match="its triangles"):
+        RestShapeKept(1.0, Elastic(TriangleMesh(*icosphere(1))), bodies)
+
+
+def test_two_beams_find_a_body_and_its_pose():
+    """One cell that the frames cut at the end: centre, velocity and axis."""
+    truth = pose(TURN, (3.0, 11.0, -2.5), 1.1)
+    (found,) = pursued(cell(), shadows([truth]), FLOW * np.array([0.9, 1.1])[:, None])
+    assert np.linalg.norm(found.centre - truth.centre) < 0.2
+    assert np.linalg.norm(found.velocity - truth.velocity) < 0.2
+    assert axis_error(found, TURN) < 5
+    assert np.linalg.det(found.matrix) == pytest.approx(1)
+
+
+def test_ghosts_are_exchanged_for_bodies():
+    """Two cells at one height: each in the shadow of the one in the first beam, of the other in the second."""
+    truth = [pose(TURN, (6.0, 0.0, -5.0)), pose(OTHER, (-6.0, 1.0, 5.0), 1.2)]
+    seen = shadows(truth)
+    every = Explained(cell(), seen)
+    search = Search(Templates.of(cell(), seen), seen, FLOW[None])
+    ghosts = [pose(TURN, (6.0, 0.5, 5.0)), pose(OTHER, (-6.0, 0.5, -5.0))]
+    found = exchanged(every, search, every.improved(ghosts, 8))
+    for one in truth:
+        assert min(np.linalg.norm(other.centre - one.centre) for other in found) < 0.5
+    again = exchanged(every, search, truth)
+    assert all(np.linalg.norm(a.centre - b.centre) < 0.2 for a, b in zip(again, truth))
+
+
+def test_the_size_of_all_bodies_is_found():
+    larger = replace(cell(), vertices=1.04 * cell().vertices)
+    truth = [pose(TURN, (0.0, 2.0, 1.0))]
+    assert best_size(cell(), shadows(truth, mesh=larger), truth, 0.1) == pytest.approx(1.04, abs=0.006)
+
+
+def test_matter_drifts_where_shadows_go():
+    found = drift(shadows([pose(TURN, (3.0, 2.0, -2.5)), pose(OTHER, (-5.0, -3.0, 2.0))]))
+    assert found == pytest.approx(FLOW, abs=0.6)
+
+
+def test_bins_and_projections_agree():
+    """Thickness of the same bodies in larger pixels, of which an odd row is left over."""
+    truth = [pose(TURN, (3.0, 2.0, -2.5))]
+    seen = shadows(truth)
+    seen = replace(seen, thickness=Explained(cell(), seen).images(truth))
+    coarse = seen.binned(2)
+    assert coarse.shape == (23, 16)
+    small = replace(cell(), vertices=0.5 * cell().vertices)
+    images = Explained(small, coarse).images([one.scaled(0.5) for one in truth])
+    for one, other in zip(images, coarse.thickness):
+        for axis in (0, 1):
+            places = np.arange(one.shape[axis])
+            middles = [image.sum(1 - axis) @ places / image.sum() for image in (one, other)]
+            assert middles[0] == pytest.approx(middles[1], abs=0.15)  # the wrong way round: 0.5
+    assert images.sum() == pytest.approx(coarse.thickness.sum(), rel=0.02)
+
+
+def test_meshes_are_read_sized_and_thinned(tmp_path):
+    fine = evans_fung_cell(subdivisions=4)
+    write_mesh(tmp_path / "body.vtp", fine, "um")
+    body = KnownBody(str(tmp_path / "body.vtp"), size=8e-6)
+    mesh = body.mesh(0.5e-6)
+    assert len(mesh.faces) < 1000
+    assert np.ptp(mesh.vertices, axis=0).max() == pytest.approx(16, rel=0.01)
+    assert mesh.volume == pytest.approx(
+        fine.volume * (8e-6 / np.ptp(fine.vertices, axis=0).max() / 0.5e-6) ** 3, rel=1e-6
+    )
+    same = thinned(fine, len(fine.faces))
+    assert surface(same) == pytest.approx(surface(fine))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [({"shape": "blue-cell"}, "must be red-cell or a mesh file"), ({"size": 1e-7}, "3 to 300 pixels"),
+     ({"size": 1.0}, "3 to 300 pixels"), ({"uncertain": 0.5}, "uncertain"), ({"instants": 1}, "instants")],
+)  # fmt: skip
+def test_what_is_wrong_with_a_body_is_said(wrong, message):
+    with pytest.raises(InputError, match=message):
+        KnownBody(**wrong).mesh(0.5e-6)
+
+
+def test_an_open_mesh_is_no_body(tmp_path):
+    sphere, faces = icosphere(1)
+    write_mesh(tmp_path / "open.vtp", TriangleMesh(1e-6 * sphere, faces[1:]), "um")
+    with pytest.raises(InputError, match="must be a closed surface"):
+        KnownBody(str(tmp_path / "open.vtp")).mesh(1e-7)
+
+
+def test_flags_name_a_body():
+    assert BodyFlags().known() is None
+    assert BodyFlags(body="red-cell", body_size=8e-6).known() == KnownBody(size=8e-6)
+
+
+def test_two_beams_follow_a_cell_of_known_shape():
+    """From frames to a path: the cell's centre at all times, to a third of a pixel after a few steps."""
+    size, speed, times = 3.91e-6 / RADIUS, np.array([0.0, 1.5, 0.0]), np.array([0.0, 1e-5, 2e-5])
+    material = HAEMOGLOBIN.delta_beta(20.0)
+    mesh = KnownBody().mesh(size, coarse=True)
+    centres = size * (np.array([2.0, -1.0, -3.0]) + np.arange(3)[:, None] * speed)
+    moved = [TriangleMesh(size * mesh.vertices @ TURN.T + centre, mesh.faces, "cell") for centre in centres]
+    truth = MeshSeries(tuple(hs.MeshScene.of_one_material([one], material) for one in moved), times)
+    views = hs.Views.from_angles([0.0, 70.0], (37, 31), size)
+    exposures = hs.Exposures.of(views, 20.0, 0.3).repeated(times)
+    scan = hs.simulate(truth, exposures, photons_per_pixel=3000, seed=1, is_test=np.zeros(6, dtype=bool))
+    options = replace(TrackOptions(body=KnownBody(instants=3), rounds=0, intervals=False).with_effort(0.05))
+    found = follow(scan, material, options).bodies
+    assert found.count == 1
+    for time, centre in zip(times, centres):
+        assert np.linalg.norm(centroid(found.bodies(float(time))[0]) - centre) < 0.33 * size
+    empty = replace(scan, frames=1 + 0.01 * np.random.default_rng(0).normal(size=scan.frames.shape))
+    with pytest.raises(InputError, match="no body of the shape"):
+        follow(empty, material, options)

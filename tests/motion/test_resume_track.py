@@ -1,0 +1,137 @@
+"""Runs of `follow` that are cut off and go on, and halves of the frames."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.moving_ellipsoids import MATERIAL, PIXEL, TIMES, scan, true_paths
+from holosplat.fit.schedule import Schedule
+from holosplat.motion import track
+from holosplat.motion.halves import halves_of, standard_errors
+from holosplat.motion.pieces import PathOptions
+from holosplat.motion.track import TrackOptions, follow
+from holosplat.representations import TimeBasis
+
+SHORT = {name: replace(getattr(TrackOptions(), name), schedule=Schedule(steps=3)) for name in ("stiff", "soft", "half")}
+QUICK = replace(TrackOptions(), rounds=1, paths=PathOptions(degree=1, pieces=1), **SHORT)
+STAGES = ("first paths", "stiff", "beside", "paths", "soft", "halves", "done")
+
+
+class Kept:
+    """Keeps every state, as a file would; breaks off after `most` of them."""
+
+    def __init__(self, states=(), most: int = 10**6) -> None:
+        self.states, self.most = list(states), most
+
+    def load(self):
+        return copy.deepcopy(self.states[-1]) if self.states else None
+
+    def save(self, state) -> None:
+        self.states.append(copy.deepcopy(dict(state)))
+        if len(self.states) >= self.most:
+            raise KeyboardInterrupt
+
+
+@pytest.fixture(autouse=True)
+def frequent(monkeypatch):
+    """Fits are kept after every step, and each time sees the true bodies at once."""
+    monkeypatch.setattr(track, "CHECKPOINT_SECONDS", -1.0)
+    monkeypatch.setattr(track, "sightings", lambda frames, material, options: seen(float(frames.instants[0])))
+
+
+def seen(time: float):
+    return [track.Sighting(mesh, False) for mesh in true_paths().bodies(time)]
+
+
+@cache
+def whole() -> tuple[Kept, track.Followed]:
+    kept = Kept()
+    return kept, follow(scan(), MATERIAL, QUICK, journal=kept)
+
+
+def test_every_stage_is_kept():
+    named = [state["next"] for state in whole()[0].states]
+    assert [name for k, name in enumerate(named) if name not in named[:k]] == list(STAGES)
+    assert sum(state["fit"] is not None for state in whole()[0].states) == 3 * (1 + 1 + 4)
+
+
+@pytest.mark.parametrize("cut", ["first paths", "in stiff", "beside", "in soft", "in halves", "done"])
+def test_a_run_that_was_cut_off_goes_on_as_if_nothing_had_happened(cut):
+    """From every stage, and from the middle of fits: bodies, halves and records are the same bit for bit."""
+    states, result = whole()
+    name, within = cut.removeprefix("in "), cut.startswith("in ")
+    number = next(
+        k for k, one in enumerate(states.states) if one["next"] == name and (one["fit"] is not None) == within
+    )
+    again = follow(scan(), MATERIAL, QUICK, journal=Kept(states.states[: number + 1]))
+    assert torch.equal(again.bodies.coefficients, result.bodies.coefficients)
+    assert len(again.halves) == len(result.halves) == 4
+    for one, other in zip(again.halves, result.halves):
+        assert torch.equal(one.coefficients, other.coefficients)
+    without = lambda records: [{k: v for k, v in one.items() if k != "seconds"} for one in records]  # noqa: E731
+    assert without(again.records) == without(result.records)
+    assert again.found == result.found == (3,) * TIMES
+
+
+def test_ctrl_c_in_a_fit_loses_no_step(monkeypatch):
+    """It is passed on, after the state is kept."""
+    monkeypatch.setattr(track, "CHECKPOINT_SECONDS", 1e9)
+
+    def stop(stage, fraction, record):
+        if stage == "soft fit" and fraction > 0.5:
+            raise KeyboardInterrupt
+
+    kept = Kept()
+    with pytest.raises(KeyboardInterrupt):
+        follow(scan(), MATERIAL, QUICK, journal=kept, on_progress=stop)
+    assert kept.states[-1]["next"] == "soft"
+    assert kept.states[-1]["fit"]["step"] == 2
+    again = follow(scan(), MATERIAL, QUICK, journal=kept)
+    assert torch.equal(again.bodies.coefficients, whole()[1].bodies.coefficients)
+
+
+def test_halves_share_no_frame():
+    basis = TimeBasis(0.0, 1.0, 1)
+    (early, late), (some, others) = halves_of(scan(), basis)
+    times = scan().exposures.time
+    assert set(times[early]) & set(times[late]) == set()
+    assert sorted([*early, *late]) == sorted([*some, *others]) == list(range(len(scan())))
+    for part in (some, others):  # all times, two views of each, and the same views
+        assert np.array_equal(np.unique(times[part], return_counts=True)[1], np.full(TIMES, 2))
+        assert np.array_equal(scan().views.rotations[part][:2], scan().views.rotations[part][-2:])
+    assert len(halves_of(scan(), TimeBasis(0.0, 1.0, 2))) == 1  # two times do not tell parabolas
+    three = scan()[np.flatnonzero(np.arange(len(scan())) % 4 < 3)]
+    assert len(halves_of(three, basis)) == 1
+    assert halves_of(three, TimeBasis(0.0, 1.0, 2)) == []
+
+
+def test_standard_errors_are_half_of_what_halves_disagree_by():
+    """All bodies moved by the same, one way in one half and the other way in the other: that is the error; √2 less if
+    another pair of halves agrees."""
+    bodies, push = true_paths(), torch.tensor([0.2, -0.1, 0.0], dtype=torch.float64)
+    one, other = (bodies.with_parameters({"coefficients": bodies.coefficients + s * push}) for s in (1, -1))
+    found = standard_errors(bodies, [one, other], scan())
+    assert found["x_m"] == pytest.approx(np.full((TIMES, 3), 0.2 * PIXEL), rel=1e-6)
+    assert found["y_m"] == pytest.approx(np.full((TIMES, 3), 0.1 * PIXEL), rel=1e-6)
+    assert found["z_m"] == pytest.approx(np.zeros((TIMES, 3)), abs=1e-9 * PIXEL)
+    assert found["volume_m3"] == pytest.approx(np.zeros((TIMES, 3)), abs=1e-6 * PIXEL**3)
+    twice = standard_errors(bodies, [one, other, bodies, bodies], scan())
+    assert twice["x_m"] == pytest.approx(found["x_m"] / 2**0.5, rel=1e-6)
+    assert standard_errors(bodies, [], scan()) == {}
+
+
+def test_half_of_an_error_is_the_body_s_own():
+    """One of three bodies, which are all in the field, differs: the others have their part of the common error."""
+    bodies, moved = true_paths(), true_paths().coefficients.clone()
+    moved[:, bodies.body(0)[0], 0] += 0.4
+    found = standard_errors(bodies, [bodies.with_parameters({"coefficients": moved}), bodies], scan())["x_m"] / PIXEL
+    seen_parts = 2 + np.array([1.0])  # of three, where all are whole
+    common = 0.04 / seen_parts[0]
+    assert found[0, 0] ** 2 == pytest.approx(0.5 * 0.04 + 0.5 * common, rel=0.2)
+    assert found[0, 1] ** 2 == pytest.approx(0.5 * common, rel=0.3)
