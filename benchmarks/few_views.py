@@ -36,7 +36,7 @@ NUMBERS = ("shift_px", "across_deg", "roll_deg")
 @dataclass(frozen=True)
 class Experiment:
     """scene: of the benchmark, or "beams"; seed: of the scene and the errors; views; photons a pixel, None for no
-    noise; wrong: whether the plan is; smooth, grain: share of light that is not what the flat field says, smooth over 25
+    noise; wrong: whether the plan is; smooth, grain: share of light that the flat field does not say, smooth over 25
     pixels or grainy, another in each frame, where there are photons."""
 
     scene: str
