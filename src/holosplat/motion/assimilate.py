@@ -46,13 +46,15 @@ class Assimilation:
     """Skalak's modulus [N/m], likewise."""
     state: float = 0.1e-6
     """Standard deviation of the first state: how far a cell may be moved, or its surface by a linear map [m]."""
+    oversample: int = 2
+    """Wave samples a pixel: the gradient of a surface is right to second order in their distance."""
     steps: int = 20
     """Of L-BFGS, at most."""
     curvature: bool = True
     """Whether the curvature at the end says what the frames tell, where unknowns are few enough."""
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "steps")
+        at_least(self, 1, "steps", "oversample")
         positive("state", self.state, "metres")
         for name, (low, high) in (("peak", self.peak), ("shear", self.shear)):
             require(
@@ -125,7 +127,8 @@ class _Fit:
         ranges = {"peak": options.peak, "shear": options.shear}
         middle = {name: float(np.sqrt(low * high)) for name, (low, high) in ranges.items()}
         widths = {n: 0.25 * float(np.log(high / low)) for n, (low, high) in ranges.items() if high > low}
-        instruments = [Instrument(scan.exposures[np.flatnonzero(scan.exposures.time == t)]) for t in scan.instants]
+        at_each = [np.flatnonzero(scan.exposures.time == t) for t in scan.instants]
+        instruments = [Instrument(scan.exposures[kept], options.oversample) for kept in at_each]
         rest = (scan, model, flow, nodes, bound, faces, matter, middle, widths, options.state)
         rough = cls(*rest, 1.0, instruments)
         with torch.no_grad():
