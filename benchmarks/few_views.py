@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from holosplat.align import align_views
+from holosplat.beamline.light import UnevenLight
 from holosplat.beamline.misalignment import AS_PLANNED, Misalignment
 from holosplat.bench.case import load_case
 from holosplat.bench.record import source_commit
@@ -35,13 +36,16 @@ NUMBERS = ("shift_px", "across_deg", "roll_deg")
 @dataclass(frozen=True)
 class Experiment:
     """scene: of the benchmark, or "beams"; seed: of the scene and the errors; views; photons a pixel, None for no
-    noise; wrong: whether the plan is."""
+    noise; wrong: whether the plan is; smooth, grain: share of light that the flat field does not say, smooth over 25
+    pixels or grainy, another in each frame, where there are photons."""
 
     scene: str
     seed: int
     views: int = 4
     photons: float | None = None
     wrong: bool = True
+    smooth: float = 0.0
+    grain: float = 0.0
 
     def measured(self) -> tuple[hs.Scan, hs.Exposures, hs.MaterialPrior]:
         """The scan with the planned exposures, the true ones, and what is known of the matter."""
@@ -59,6 +63,12 @@ class Experiment:
             scene, prior, planned = case.scene, case.prior, case.exposures[some]
         errors = Misalignment(1.0, 0.6, 0.02, self.seed) if self.wrong else AS_PLANNED
         true, none = errors.true_exposures(planned), np.zeros(len(planned), dtype=bool)
+        if self.smooth or self.grain:
+            light = UnevenLight(
+                light_smooth=self.smooth, light_smooth_px=25.0, light_grain=self.grain, light_seed=self.seed
+            )
+            noisy = hs.simulate(scene, true, photons_per_pixel=self.photons, seed=self.seed, light=light, is_test=none)
+            return hs.Scan(noisy.frames, planned, none), true, prior
         frames = hs.simulate(scene, true, seed=0, is_test=none).frames
         if self.photons is not None:
             frames = np.random.default_rng(self.seed).poisson(frames * self.photons) / self.photons
@@ -66,6 +76,9 @@ class Experiment:
 
 
 CASES = {
+    **{f"light of 2 %, 20000 photons, seed {s}": Experiment("beams", s, 4, 20000, smooth=0.02) for s in (1, 2, 3)},
+    **{f"grain of 1 %, 20000 photons, seed {s}": Experiment("beams", s, 4, 20000, grain=0.01) for s in (1, 2)},
+    "6 beams, light of 2 %, 20000 photons, seed 2": Experiment("beams", 2, 6, 20000, smooth=0.02),
     **{f"beams, 20000 photons, seed {s}": Experiment("beams", s, photons=20000) for s in (1, 2, 3)},
     **{f"beams, 2000 photons, seed {s}": Experiment("beams", s, photons=2000) for s in (1, 2, 3)},
     **{f"beams, no noise, seed {s}": Experiment("beams", s) for s in (1, 2)},

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import holosplat as hs
 from helpers.polycube import polycube
 from holosplat.align import CalibrationOptions, Uncertain, calibrate
-from holosplat.align.calibration import Calibrated
+from holosplat.align.calibration import Calibrated, _Search
 from holosplat.align.changes import changes
 from holosplat.align.gauge import moved_onto
 from holosplat.align.phantom import Phantom, centre_of_mass
@@ -115,6 +115,32 @@ def test_one_bead_tells_no_turns_and_a_pixel_may_be_told():
     assert doubt < 5e-3
     assert found.exposures.views.pixel_size == size
     assert "pixel 1.00" in found.lines()[0] or "pixel 0.99" in found.lines()[0]
+
+
+def test_shifts_are_of_the_pixels_that_are_found():
+    """Planned ones and those beside them, in pixels of any size; and on pixels that are three times larger."""
+    views = replace(planned().views, shifts=PIXEL * np.array([[4.0, -2.0], [1.0, 3.0], [0.0, 0.5], [-1.0, 2.0]]))
+    scan = hs.Scan(np.ones((4, *SHAPE), np.float32), replace(planned(), views=views), np.zeros(4, dtype=bool))
+    search = _Search(scan, KNOWN, Phantom.of_beads(PIXEL * BEADS, 4 * PIXEL), QUICK)
+    search.numbers[:, :2] = torch.tensor([[0.3, -0.6], [0.9, 0.0], [-0.3, 0.6], [1.2, 0.3]])
+    search.size = float(np.log(1.04))
+    wanted = views.shifts / PIXEL + search.numbers[:, :2].numpy()
+    for pixels in (1, 3):
+        found = search.exposures(scan.binned(pixels).exposures).views
+        assert found.pixel_size == pytest.approx(1.04 * pixels * PIXEL, rel=1e-9, abs=0)
+        np.testing.assert_allclose(pixels * found.shifts / found.pixel_size, wanted, rtol=1e-9)
+
+
+def test_frames_in_contact_have_no_distance_to_be_found():
+    """Of some such frames among others, too: all distances stay, and are not said to be untold."""
+    true = replace(planned(), distance=np.array([0.0, 0.05, 0.05, 0.05]))
+    search = _Search(frames_of(beads(BEADS), true, true), KNOWN, Phantom.of_beads(PIXEL * BEADS, 4 * PIXEL), QUICK)
+    search.step(1)
+    found = search.found()
+    assert not found.errors[:, 5].any()
+    assert not found.changes[:, 5].any()
+    assert (found.errors[:, :2] > 0).all()
+    assert not [word for word in found.words if word.startswith("distance")]
 
 
 def test_derivatives_are_those_of_the_frames():

@@ -77,7 +77,7 @@ def test_numbers_go_back_to_the_plan_as_far_as_they_are_not_told():
         found = true + (kept @ own @ draws.normal(size=14)).reshape(4, 5) * expected
         judged = weighed(found, told, expected, kinds, common)
         away.append(((judged.numbers - true) / expected, (found - true) / expected, true / expected))
-        said.append(np.diag(judged.covariance).reshape(4, 5) / expected**2)
+        said.append(np.diag(judged.off).reshape(4, 5) / expected**2)
     ours, theirs, planned = np.sqrt(np.square(away).mean((0, 2, 3)))
     assert ours < 0.9 * min(theirs, planned)
     assert ours**2 == pytest.approx(np.mean(said), rel=0.5)
@@ -85,6 +85,13 @@ def test_numbers_go_back_to_the_plan_as_far_as_they_are_not_told():
     nothing = weighed(noise, told, expected, kinds, common)
     assert nothing.scales == (0.0, 0.0, 0.0)
     assert not nothing.numbers.any()
+    likeliest = np.linalg.lstsq(told + _prior(kept, expected), told @ noise.reshape(-1), rcond=None)[0]
+    assert np.diag(nothing.off) == pytest.approx(np.diag(nothing.covariance) + likeliest**2, rel=1e-6, abs=0)
+
+
+def _prior(kept: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    """The information of the prior about the directions `kept`."""
+    return kept @ kept.T / np.outer(np.tile(expected, 4), np.tile(expected, 4))
 
 
 def test_few_noisy_frames_leave_a_good_plan():

@@ -147,6 +147,18 @@ def test_a_reversed_beam_is_noticed(side, axis):
     assert apart(placed(found.numbers, planned), true)[0] < 0.05
 
 
+@pytest.mark.parametrize(("share", "free"), [(0.6, False), (1.6, True)])
+def test_angles_between_beams_are_free_where_they_are_told_firmly(share, free):
+    """What is told of them grows with the square of what is uncertain; 25 times that is a fifth of the error."""
+    values, planned, _ = images(THREE, Misalignment(1.0, 0.6, 0.0, seed=2))
+    held = by_rows(values, planned, RowPrior.of(EXPECTED * [1, 1, 1, 0, 1], 3), WHEN)
+    least = Told.of(held.information, planned, EXPECTED).ratios[0]
+    expected = EXPECTED * np.sqrt(share * 25.0 / least)
+    found = begun(Images(values, planned, np.zeros(3, dtype=bool), WHEN), expected, np.zeros(5), few=True)
+    assert found is not None
+    assert found.numbers[:, 3].any() == free
+
+
 def test_beams_beside_a_plane_have_no_rows_in_common():
     assert plane_angles(Views.from_rotations(rotation_tilted([0, 30], [0, 4]), SHAPE, 1.0)) is None
     angles = plane_angles(Views.from_angles([0, 30], SHAPE, 1.0))

@@ -69,6 +69,18 @@ def test_a_rigid_move_is_found_to_a_hundredth_of_a_voxel():
     np.testing.assert_allclose(back.translation / PITCH, move.translation / PITCH, atol=0.02)
 
 
+def test_steps_of_a_move_follow_each_other(monkeypatch):
+    """Each turns and moves what those before have moved."""
+    turn, by, steps = Rotation.from_rotvec([0.3, -0.2, 0.4]).as_matrix(), np.array([2.0, -1.0, 0.5]), iter(range(99))
+    still = (np.eye(3), np.zeros(3))
+    monkeypatch.setattr("holosplat.bench.moved._step", lambda *rest: (turn, by) if next(steps) < 2 else still)
+    grid = hs.Grid.centred((9, 10, 11), PITCH, (0.0, 0.0, 0.0))
+    truth = balls().voxelise(grid)
+    found, point = Move.best(truth, truth), np.array([3.0, 4.0, -2.0])
+    moved = turn @ (turn @ point + by) + by
+    np.testing.assert_allclose(found.rotation @ (PITCH * point) + found.translation, PITCH * moved, atol=1e-9 * PITCH)
+
+
 def test_a_result_is_judged_where_it_lies(case, scan):
     """The truth itself, turned and moved as no frame can tell: nothing is held against it."""
     rotation = Rotation.from_rotvec([0.0, 0.02, 0.01]).as_matrix()

@@ -11,11 +11,13 @@ import pytest
 
 from helpers.cli import BEAM, COLUMNS, MATTER, PIXEL, ROWS, holosplat, simulate, worked
 from holosplat.geometry import Grid, Views
+from holosplat.io.beams import Beams, write_beams
 from holosplat.io.nxtomo import read_scan
 from holosplat.io.volumes import read_volume
 from holosplat.io.vtk import read_meshes, write_mesh
 from holosplat.materials import HAEMOGLOBIN, PLASMA, RED_CELL, Compound
 from holosplat.mesh import TriangleMesh
+from holosplat.scan import Exposures
 from holosplat.specimens.red_cells import icosphere
 
 
@@ -49,6 +51,26 @@ def test_poses_may_be_matrices(shop, tmp_path):
     np.save(tmp_path / "poses.npy", matrices)
     worked(simulate(shop, "--rotations", tmp_path / "poses.npy", "--out", tmp_path / "scan.nxs"))
     np.testing.assert_allclose(read_scan(tmp_path / "scan.nxs").views.rotations, matrices, atol=1e-12)
+
+
+def test_poses_distances_and_pixels_may_be_those_of_a_geometry(shop, tmp_path):
+    """As `align` and `calibrate` write it; what it says may not be said again."""
+    views = Views.from_angles([10, 80, 30], (1, 1), 1.0)
+    sizes = [3.2e-6, 3.4e-6, 3.0e-6]
+    scaled = Views.of_pixels(views.rotations, np.full((3, 2), 1e-6), (ROWS, COLUMNS), np.array(sizes))
+    true = Exposures(scaled, np.full(3, 20.0), np.array([0.05, 0.06, 0.07]), np.zeros(3), np.zeros(3))
+    write_beams(tmp_path / "geometry.toml", Beams.of(true))
+    given = ["--exposures", tmp_path / "geometry.toml", "--detector", ROWS, COLUMNS, "--out", tmp_path / "scan.nxs"]
+    worked(holosplat("simulate", *shop.cells, *MATTER, *given))
+    found = read_scan(tmp_path / "scan.nxs")
+    np.testing.assert_allclose(found.views.rotations, views.rotations, atol=1e-12)
+    np.testing.assert_allclose(found.views.shifts, scaled.shifts, rtol=1e-9)
+    np.testing.assert_allclose(found.views.pixel_sizes, sizes, rtol=1e-9)
+    np.testing.assert_allclose(found.exposures.distance, true.distance, rtol=1e-9)
+    twice = holosplat("simulate", *shop.cells, *MATTER, *given, "--distance", 0.2)
+    assert (twice.code, "says it already; leave --distance" in twice.err) == (2, True)
+    more = holosplat("simulate", *shop.cells, *MATTER, *given, "--views", 3)
+    assert (more.code, "says where views are" in more.err) == (2, True)
 
 
 def test_photon_noise_follows_its_seed(shop, tmp_path):

@@ -24,6 +24,7 @@ from holosplat.motion.poses import Explained, Pose, exchanged, pursued
 from holosplat.motion.rest_shape import KnownBody, surface, thinned
 from holosplat.motion.shadows import Shadows
 from holosplat.motion.sightings import centroid
+from holosplat.motion.strain import strain_energy
 from holosplat.motion.templates import Search, Templates
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces, TimeBasis
@@ -214,8 +215,14 @@ def test_two_beams_follow_a_cell_of_known_shape():
     exposures = hs.Exposures.of(views, 20.0, 0.3).repeated(times)
     scan = hs.simulate(truth, exposures, photons_per_pixel=3000, seed=1, is_test=np.zeros(6, dtype=bool))
     options = replace(TrackOptions(body=KnownBody(instants=3), rounds=0, intervals=False).with_effort(0.05))
-    found = follow(scan, material, options).bodies
+    result = follow(scan, material, options)
+    found = result.bodies
     assert found.count == 1
+    assert result.rest is not None
+    assert np.ptp(result.rest.vertices, axis=0).max() == pytest.approx(7.82e-6, rel=0.1)
+    energies = strain_energy(found, times, result.rest)  # next to nothing beside shear modulus times area, 3.9e-16 J
+    assert (energies >= 0).all()
+    assert (energies < 1e-16).all()
     for time, centre in zip(times, centres):
         assert np.linalg.norm(centroid(found.bodies(float(time))[0]) - centre) < 0.33 * size
     empty = replace(scan, frames=1 + 0.01 * np.random.default_rng(0).normal(size=scan.frames.shape))

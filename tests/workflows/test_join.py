@@ -11,6 +11,7 @@ import pytest
 from helpers.imaging import PIXEL, SHAPE, cells, rms, taken
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
+from holosplat.geometry import Views
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.reading import Part
 from holosplat.optics.resampling import Resampling
@@ -120,3 +121,24 @@ def test_what_cannot_be_joined(tmp_path):
     with pytest.raises(InputError, match="--pixel-size must lie between"):
         join(paths, out, 3.2)
     assert not out.exists()
+
+
+def test_joined_frames_are_where_a_geometry_says(tmp_path):
+    """Whatever their files say; with pixels of its own it is refused, as is one of another number of views."""
+    exposures = taken((40, 48), psf=0.9)[[0, 1]]
+    for name in "ab":
+        write_scan(tmp_path / f"{name}.nxs", Scan(np.ones((2, 40, 48), np.float32), exposures, np.zeros(2, dtype=bool)))
+    files, angles = (tmp_path / "a.nxs", tmp_path / "b.nxs"), [0.0, 40.0, 85.0, 130.0]
+    geometry = tmp_path / "geometry.toml"
+    views = "".join(
+        f"[[view]]\nangle_deg = {a}\nshift_px = [{n}, 0.5]\ndistance_m = 0.3\n" for n, a in enumerate(angles)
+    )
+    geometry.write_text(f'format = "holosplat geometry 1"\n{views}')
+    join(files, tmp_path / "scan.nxs", geometry=geometry)
+    found, wanted = read_scan(tmp_path / "scan.nxs"), Views.from_angles(angles, (40, 48), exposures.views.pixel_size)
+    np.testing.assert_allclose(found.views.rotations, wanted.rotations, atol=1e-12)
+    np.testing.assert_allclose(found.views.shifts / wanted.pixel_size, [[n, 0.5] for n in range(4)], rtol=1e-9)
+    assert (found.exposures.distance == 0.3).all()
+    geometry.write_text(geometry.read_text().replace("distance_m = 0.3", "pixel_size_m = 9e-6"))
+    with pytest.raises(InputError, match="other pixel sizes"):
+        join(files, tmp_path / "other.nxs", geometry=geometry)

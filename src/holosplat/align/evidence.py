@@ -22,11 +22,14 @@ class Weighed:
 
     numbers: [V, K] as far as frames tell them
     covariance: [V · K, V · K] of what was found, with what is uncertain as the prior
+    off: [V · K, V · K] mean squares and products of what `numbers` are off by: the covariance, and how far they are
+        from the likeliest with this prior, for what stays as planned may be as wrong as what was found says
     scales: of each kind of numbers, the likeliest size of the plan's errors as a share of what is uncertain
     """
 
     numbers: np.ndarray
     covariance: np.ndarray
+    off: np.ndarray
     scales: tuple[float, ...]
 
 
@@ -66,8 +69,12 @@ def weighed(
         scales = max((scales[:k] + (tried,) + scales[k + 1 :] for tried in SCALES), key=gain)
     spread = spread_of(scales)
     shrunk = spread @ np.linalg.solve(told @ spread + np.eye(len(told)), told @ values)
-    covariance = kept @ np.linalg.inv(told + np.eye(len(told))) @ kept.T
-    return Weighed((units * (kept @ shrunk)).reshape(found.shape), units[:, None] * covariance * units, scales)
+    whole = np.linalg.inv(told + np.eye(len(told)))
+    away = whole @ told @ values - shrunk
+    covariance, off = (
+        units[:, None] * (kept @ part @ kept.T) * units for part in (whole, whole + np.outer(away, away))
+    )
+    return Weighed((units * (kept @ shrunk)).reshape(found.shape), covariance, off, scales)
 
 
 def _evidence(told: np.ndarray, values: np.ndarray, spread: np.ndarray) -> float:

@@ -27,13 +27,16 @@ SIDE = 64
 change how well."""
 
 
-def beside_unknown(search: PoseSearch, pixels: int, surfaces: SurfaceMesh | None) -> tuple[str, ...]:
-    """Makes the covariances of the training views those beside matter that is not known.
+def beside_unknown(
+    search: PoseSearch, pixels: int, surfaces: SurfaceMesh | None, rehearsed: np.ndarray
+) -> tuple[str, ...]:
+    """Makes the covariances of the training views those beside matter that is not known, and as large as errors are.
 
     Where no frames are held out, that could judge, numbers also go back to the plan as far as frames do not tell them
     (`evidence.weighed`); returned are the kinds that do so altogether. Distances are left as they are.
 
-    pixels: of the last images; surfaces: in the poses that were found, or None for voxels.
+    pixels: of the last images; surfaces: in the poses that were found, or None for voxels; rehearsed: [V, 7] errors of
+    the numbers in a rehearsal (`rehearsal.rehearsed`), of which each kind is made as uncertain as they are.
     """
     uncertain, train = search.options.uncertain, np.flatnonzero(~search.scan.is_test)
     free = {kind: places for kind, places in KINDS.items() if kind != "distance" and getattr(uncertain, kind) > 0}
@@ -51,18 +54,31 @@ def beside_unknown(search: PoseSearch, pixels: int, surfaces: SurfaceMesh | None
     found = search.numbers[train][:, places].numpy()
     common = _motions(search.scan.views[train], places)
     judged = weighed(found, information, expected, kinds, common)
+    wider = 1 / _larger(rehearsed[train][:, places], judged.covariance, kinds)
+    judged = weighed(found, wider[:, None] * information * wider, expected, kinds, common)
     at = torch.tensor(places)
     covariances = search.covariances[train]
     covariances[:, at] = covariances[:, :, at] = 0
-    blocks = torch.from_numpy(judged.covariance).reshape(len(train), len(places), len(train), len(places))
+    moves = not search.scan.is_test.any()
+    blocks = torch.from_numpy(judged.off if moves else judged.covariance).reshape(
+        len(train), len(places), len(train), len(places)
+    )
     covariances[:, at[:, None], at] = torch.stack([blocks[v, :, v] for v in range(len(train))])
     search.covariances[train] = covariances
-    if search.scan.is_test.any():
+    if not moves:
         return ()
     numbers = search.numbers[train]
     numbers[:, at] = torch.from_numpy(judged.numbers)
     search.numbers[train] = numbers
     return tuple(kind for kind, scale in zip(free, judged.scales) if scale == 0)
+
+
+def _larger(away: np.ndarray, covariance: np.ndarray, kinds: list[list[int]]) -> np.ndarray:
+    """[V · K] how many times larger than `covariance` says the errors `away` [V, K] of each kind are; 1 at least."""
+    said, found = np.diag(covariance).reshape(away.shape), np.ones(away.shape)
+    for each in kinds:
+        found[:, each] = max(1.0, float(np.sqrt(np.square(away[:, each]).mean() / said[:, each].mean())))
+    return found.reshape(-1)
 
 
 def _information(

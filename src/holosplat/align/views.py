@@ -12,7 +12,7 @@ from torch import Tensor
 from ..baselines.primal_dual import PrimalDual
 from ..checks import require
 from ..geometry import Grid
-from ..matter import Known, MaterialPrior
+from ..matter import DeltaBeta, Known, MaterialPrior
 from ..methods.assumed import assumed_material
 from ..optics.background import Light, LightOptions
 from ..optics.sampling import fringe_sampling
@@ -27,11 +27,13 @@ from .directions import hardly_told
 from .few import KINDS, beside_unknown
 from .gauge import moved_onto
 from .poses import DISTANCE, FLUX, SHIFT, PoseOptions, PoseSearch
+from .rehearsal import Searched, rehearsed
 from .shadows import EVEN_OR_NOT
 from .sharp import believed, sharpened, surfaces_of
 
 DEFAULT = PoseOptions()
 SHARP = "alignment, sharp edges"
+REHEARSAL = ", rehearsed"
 FEWEST = 2
 """Training views below which there is nothing to agree on."""
 STRAY = 1.35
@@ -111,30 +113,31 @@ def align_still(
     scan = replace(scan, frames=Light.of(frames, light).evened(frames).numpy())
     material = assumed_material(scan.train(), prior, on_progress)
     upper = 1.0 if isinstance(prior, Known) else None
-    words = list[str]()
+    words, held = list[str](), 0.0
     if count < FEW and options.uncertain.angle > 0:
+        held = options.uncertain.angle
         options = replace(options, uncertain=replace(options.uncertain, angle=0.0))
         words.append(f"turns across the beam are as planned: {count} views cannot tell them from the matter's depth")
-    search = PoseSearch(scan, material, options, upper)
-    levels = search.levels()
-    for level in levels:
-        name = f"alignment, pixels of {level.pixels}"
-        search.run(level, lambda fraction, name=name: on_progress(name, fraction))
-    forget_distance(search)
-    surfaces = by_edges(search, levels[-1].pixels, on_progress)
+    done = searched(scan, material, options, upper, on_progress)
+    search, pixels, surfaces = done.search, done.pixels, done.surfaces
     sharp = surfaces is not None
     if options.uncertain.distance > 0 and not sharp:
         words.append(UNTOLD)
-    doubted = beside_unknown(search, levels[-1].pixels, surfaces) if count < options.few_views else ()
+    doubted = tuple[str, ...]()
+    posed = any(getattr(options.uncertain, kind) > 0 for kind in KINDS if kind != "distance")
+    if posed and count < options.few_views:
+        again = lambda frames, how: searched(frames, material, how, upper, on_progress, REHEARSAL)  # noqa: E731
+        doubted = beside_unknown(search, pixels, surfaces, rehearsed(done, again))
     words += [MAY_BE_NOISE.format(kind=kind) for kind in doubted]
     errors = errors_of(search.covariances)
+    errors[:, 2:4] = np.maximum(errors[:, 2:4], held)
     expected = options.uncertain.deviations()
     expected[DISTANCE] = options.uncertain.distance if sharp else 0.0
     words += hardly_told(search.covariances, expected)
-    words += _kept(search, scan.exposures, levels[-1].pixels, sharp, doubted)
+    words += _kept(search, scan.exposures, pixels, sharp, doubted)
     found = search.exposures(scan.exposures)
     found = replace(found, views=moved_onto(found.views, scan.views))
-    of = max(levels[-1].pixels, 2 if min(scan.views.shape) >= 2 * options.least_side else 1)
+    of = max(pixels, 2 if min(scan.views.shape) >= 2 * options.least_side else 1)
     on_progress("alignment, before and after", 0.0)
     before, after = (Judged.of(scan, exposures, search, of) for exposures in (scan.exposures, found))
     on_progress("alignment, before and after", 1.0)
@@ -153,6 +156,20 @@ def align_still(
         after.left,
         tuple(words),
     )
+
+
+def searched(
+    scan: Scan, material: DeltaBeta, options: PoseOptions, upper: float | None, on_progress: Progress, what: str = ""
+) -> Searched:
+    """The search of poses: by voxels on ever smaller pixels, then by surfaces, where they explain the frames better."""
+    search = PoseSearch(scan, material, options, upper)
+    levels = search.levels()
+    for level in levels:
+        name = f"alignment{what}, pixels of {level.pixels}"
+        search.run(level, lambda fraction, name=name: on_progress(name, fraction))
+    forget_distance(search)
+    surfaces = by_edges(search, levels[-1].pixels, lambda stage, part: on_progress(stage + what, part))
+    return Searched(search, levels[-1].pixels, surfaces)
 
 
 def errors_of(covariances: Tensor) -> np.ndarray:

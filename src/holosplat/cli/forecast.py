@@ -13,12 +13,15 @@ from tyro.conf import Positional
 from ..checks import positive, require
 from ..io.formats import read_as
 from ..io.json import write_json
-from ..io.reading import Reading
+from ..io.reading import Reading, ends_of
 from ..io.run_scan import run_reading, run_source
+from ..motion.cell_model import ChannelFrame
+from ..motion.dynamics import DynamicsForecast
 from ..motion.fit import MotionFit
 from ..motion.forecast import PathForecast
 from ..report.run import report_run
 from ..scan import Scan
+from ..specimens.flow.suspension import PLASMA_VISCOSITY
 from ..workflows.evaluate import evaluate
 from ..workflows.forecast import FRAMES, TABLE, Forecasted, ForecastOptions, config_of, tracked_bodies, write_forecast
 from ..workflows.forecast import forecast as carry_on
@@ -38,8 +41,9 @@ class ForecastFlags:
     """Times ahead."""
     step: float | None = None
     """Between them [s] (default: the median step of the run)."""
-    model: Literal["paths", "rigid"] = "paths"
-    """Paths go on, each part of the motion as far as frames tell it; or bodies move and turn as they are."""
+    model: Literal["auto", "paths", "rigid", "dynamics"] = "auto"
+    """Paths go on, each part of the motion as far as frames tell it; rigid: shapes stay; dynamics: red cells in the
+    flow of --channel; auto: the mean of paths and dynamics by their errors, or paths without a channel."""
     degree: int = 2
     """Powers of time that are believed, at most."""
     window: int = 0
@@ -51,6 +55,19 @@ class ForecastFlags:
     effort: float = 1.0
     """Factor of the numbers of steps of these fits."""
 
+    channel: tuple[float, float] | None = None
+    """Extents [m] of a rectangular channel across the flow, along the other two axes in the order x, y, z."""
+    flow_axis: Literal["x", "y", "z"] = "y"
+    """Along which axis of the object it leads; a flow along the rotation axis is one along y."""
+    channel_centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """A point on its axis (x, y, z) [m]."""
+    peak: str | None = None
+    """Velocity of the undisturbed flow on the axis [m/s], or a range LOW:HIGH (default: by the bodies' velocities)."""
+    shear_modulus: str = "2e-6:10e-6"
+    """Of the membranes [N/m], or a range LOW:HIGH, within which the run's times tell it."""
+    viscosity: float = PLASMA_VISCOSITY
+    """Of the fluid in and around cells [Pa s]."""
+
     def options(self) -> ForecastOptions:
         """The options of the forecast."""
         step = 0.0 if self.step is None else positive("--step", self.step, "seconds")
@@ -58,7 +75,27 @@ class ForecastFlags:
         fit = MotionFit()
         steps = max(1, round(positive("--effort", self.effort) * fit.schedule.steps))
         fit = replace(fit, schedule=replace(fit.schedule, steps=steps))
-        return ForecastOptions(self.times, step, model, self.half_sets, fit)
+        return ForecastOptions(self.times, step, model, self._dynamics(), self.half_sets, fit)
+
+    def _dynamics(self) -> DynamicsForecast | None:
+        require(
+            self.model != "dynamics" or self.channel is not None,
+            "--model dynamics needs the channel that cells flow through; say --channel WIDTH HEIGHT [m].",
+        )
+        if self.channel is None or self.model in ("paths", "rigid"):
+            return None
+        frame = ChannelFrame(self.channel, self.flow_axis, self.channel_centre)
+        peak = (0.0, 0.0) if self.peak is None else number_or_range("peak", self.peak)
+        shear = number_or_range("shear_modulus", self.shear_modulus)
+        return DynamicsForecast(frame, peak, shear, self.viscosity, mixed=self.model == "auto")
+
+
+def number_or_range(name: str, text: str) -> tuple[float, float]:
+    """Both ends of what an option says: LOW:HIGH, or one number above 0 twice. Errors: `InputError` for other text."""
+    if ":" in text:
+        return ends_of(name, text)
+    value = positive(f"--{name.replace('_', '-')}", text)
+    return value, value
 
 
 def forecast(run: Positional[Path], out: Path, how: ForecastFlags = ForecastFlags(), seed: int = 0) -> None:

@@ -80,6 +80,7 @@ def join(
     pixel_size: float | None = None,
     flip: tuple[Flip, ...] = (),
     part: Part = Part(),
+    exposures: Path | None = None,
 ) -> None:
     """Join scans of several beams, one file each; pixel sizes, energies and distances may differ.
 
@@ -88,10 +89,11 @@ def join(
         out: Scan file to write.
         pixel_size: Bring all frames to pixels of this size [m] (default: each file keeps its own).
         flip: What each detector saw reversed, one word a file (default: what the files say themselves).
+        exposures: Where the frames are, in their order (geometry.toml of align or calibrate), whatever the files say.
     """
     with ProgressBar() as bar:
         joined = join_files(
-            scans, out, pixel_size, flip, lambda fraction: bar.show("joining frames", fraction, {}), part
+            scans, out, pixel_size, flip, lambda fraction: bar.show("joining frames", fraction, {}), part, exposures
         )
     rows, columns = joined.views.shape
     _say(f"wrote {out}: {len(joined)} frames of {rows} × {columns} pixels of {span(1e6 * joined.views.pixel_sizes)} µm")

@@ -109,13 +109,41 @@ class BeamlineOptions:
     """Or: a .npy file of rotation matrices [V, 3, 3], x_lab = R x_obj."""
     geometry: Geometry | None = None
     """Or: a known geometry: 16 even views, or two beams (0°, 23.8°) or three (0°, 30°, 48°) at once."""
+    exposures: Path | None = None
+    """Or: geometry.toml of align or calibrate, with the views, and the distances, energies and pixels that it says."""
     test_every: int = 4
     """One view in so many is held out of the fit (0: none)."""
 
-    def exposures(self) -> Exposures:
+    def told(self) -> BeamlineOptions:
+        """The same with what the file of --exposures says; `InputError` for options that say it, too."""
+        if self.exposures is None:
+            return self
+        from ..io.beams import read_beams
+
+        said = read_beams(self.exposures).scalars()
+        for name in said:
+            twice = getattr(self, name) != getattr(BeamlineOptions, name)
+            require(not twice, f"--exposures {self.exposures} says it already; leave --{name.replace('_', '-')}.")
+        return replace(self, **said)
+
+    def planned(self) -> Exposures:
         """How each frame is taken."""
         from ..scan import Exposures
 
+        if self.exposures is not None:
+            import numpy as np
+
+            from ..geometry import Views
+            from ..io.beams import read_beams
+
+            others = [self.views, self.angles_deg or None, self.tilts_deg or None, self.rotations, self.geometry]
+            require(
+                others == [None] * len(others), "--exposures says where views are; leave the other options of views."
+            )
+            beams = read_beams(self.exposures)
+            rotations = np.array([each.matrix() for each in beams.view])
+            views = Views.from_rotations(rotations, self.detector, self.pixel_size)
+            return beams.on(Exposures.of(views, self.energy_kev, self.distance, self.psf_sigma_px))
         directions = Directions(self.views, self.angles_deg, self.tilts_deg, self.rotations, self.geometry)
         views = directions.on(self.detector, self.pixel_size)
         return Exposures.of(views, self.energy_kev, self.distance, self.psf_sigma_px)

@@ -90,9 +90,10 @@ def simulate(
     from ..beamline.series import held_out
 
     truth.require_usable(out)
-    motion, source = experiment.motion, experiment.source
+    motion, source, beamline = experiment.motion, experiment.source, beamline.told()
+    require(beamline.exposures is None or not source.cone, "--cone goes with --distance; leave it, or --exposures.")
     of_source, beamline = source.facts(beamline), source.applied(beamline)
-    views, filled = beamline.exposures(), filling.filling()
+    views, filled = beamline.planned(), filling.filling()
     true_views = experiment.misalignment.errors().true_exposures(views)
     with ProgressBar() as bar:
         times = imaged.generated.timing(motion) if imaged.generated.specimen else np.zeros(1)

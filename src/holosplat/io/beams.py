@@ -138,11 +138,15 @@ class Beams:
         return {name: float(values[0]) for name, values in found.items() if values is not None}
 
     def applied(self, scan: Scan) -> Scan:
-        """The same frames in these exposures: one a frame, or one a frame of every time.
+        """The same frames in these exposures; errors: those of `on`."""
+        return scan.taken(self.on(scan.exposures))
+
+    def on(self, planned: Exposures) -> Exposures:
+        """These exposures in the place of those `planned`: one a frame, or one a frame of every time.
 
         Errors: `InputError` for another number of frames.
         """
-        index, planned = self._index(scan), scan.exposures
+        index = self._index(planned.time)
         pixels, metres, in_pixels = (self.said(name) for name in ("pixel_size_m", "shift_m", "shift_px"))
         sizes = planned.views.pixel_sizes if pixels is None else pixels[index]
         rotations = np.array([each.matrix() for each in self.view])[index]
@@ -152,25 +156,24 @@ class Beams:
         if pixels is not None:
             views = Views.of_pixels(rotations, shifts, views.shape, sizes)
         distance, energy = self.said("distance_m"), self.said("energy_kev")
-        exposures = replace(
+        return replace(
             planned,
             views=views,
             distance=planned.distance if distance is None else distance[index],
             energy_kev=planned.energy_kev if energy is None else energy[index],
         )
-        return scan.taken(exposures)
 
-    def _index(self, scan: Scan) -> np.ndarray:
-        """[N] which view each frame of `scan` is."""
-        count, times = len(self), scan.exposures.time
-        if len(scan) == count:
+    def _index(self, times: np.ndarray) -> np.ndarray:
+        """[N] which view each frame is, taken at `times` [N]."""
+        count = len(self)
+        if len(times) == count:
             return np.arange(count)
-        found = np.zeros(len(scan), dtype=int)
-        for time in scan.instants:
+        found = np.zeros(len(times), dtype=int)
+        for time in np.unique(times):
             at = np.flatnonzero(times == time)
             require(
                 len(at) == count,
-                f"the geometry must have a view for each of the {len(scan)} frames, or for each of the {len(at)} of "
+                f"the geometry must have a view for each of the {len(times)} frames, or for each of the {len(at)} of "
                 f"every time, but it has {count}; take that of this scan.",
             )
             found[at] = np.arange(count)

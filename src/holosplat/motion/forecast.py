@@ -77,7 +77,7 @@ def extrapolate(
     the forecast is. The band is half of what forecasts from the two differ by, and what a forecast of the window's last
     time from its first two thirds misses beyond that, growing with the square of the time ahead, counted in windows.
     """
-    places, spread = _forecast(bodies, options.times(times), np.r_[times[-1], ahead], options, halves)
+    places, spread = smoothed(bodies, options.times(times), np.r_[times[-1], ahead], options, halves)
     window = options.times(times)
     missed, horizon = _backtest(bodies, window, options, halves)
     growth = ((ahead - times[-1]) / (times[-1] - window[0]) / horizon) ** 2
@@ -128,10 +128,13 @@ def across(places: np.ndarray, others: np.ndarray, faces: np.ndarray) -> np.ndar
     return np.array(found)
 
 
-def _forecast(
+def smoothed(
     bodies: MovingSurfaces, times: np.ndarray, ahead: np.ndarray, options: PathForecast, halves: Halves | None
 ) -> tuple[Places, np.ndarray]:
-    """Places of each body at the times `ahead` [N], and half the distance [N, B] of what two halves say."""
+    """Places of each body at the times `ahead` [N], in the window `times` or later, by the parts of its motion.
+
+    And half the distance [N, B] [m] along normals of what two halves say, 0 without them.
+    """
     window = Window(float(times[0]), float(times[-1]), options.degree)
     splits = _splits(bodies, times, window, options)
     both = None
@@ -182,7 +185,7 @@ def _backtest(
     early = times[: (2 * len(times) + 2) // 3]
     if len(early) <= options.degree or len(early) == len(times):
         return np.full(bodies.count, np.nan), 1.0
-    said, spread = _forecast(bodies, early, times[-1:], replace(options, window=0), halves)
+    said, spread = smoothed(bodies, early, times[-1:], replace(options, window=0), halves)
     squares = np.zeros(bodies.count)
     for k, (one, other) in enumerate(zip(said, places_of(bodies, times[-1:]))):
         missed = across(one, other, bodies.body(k)[1].numpy())[0]

@@ -26,7 +26,7 @@ LEAST, ALSO = 0.35, 0.8
 others are taken in the same round."""
 TRIED, FIRST_STEPS, STEPS, LAST_STEPS = 4, 8, 5, 15
 """Places that are tried in a round, and steps of the search for better poses: of one, of all, of all in the end."""
-SURE, LOOKS = 0.75, 4
+SURE, LOOKS = 0.8, 3
 """Share below which a body may stand for others, and how often that is looked into."""
 SAME_HEIGHT = 1.0
 """Radii within which bodies that two beams might exchange are at one height."""
@@ -182,17 +182,18 @@ def exchanged(every: Explained, search: Search, found: list[Pose]) -> list[Pose]
     """The same bodies, pairs of which have exchanged what two beams show of them where that explains more.
 
     Two beams see two bodies at one height as they would see two others, each in the shadow of the one in the first
-    beam and of the other in the second. Their shapes and motion tell which they are.
+    beam and of the other in the second. Their shapes and motion tell which they are; pairs that explain enough (`SURE`)
+    are left as they are.
     """
     seen, directions = every.seen, np.unique(search.templates.directions, return_index=True)[1]
     if len(directions) != 2 or len(found) < 2:
         return found
     first, second = (seen.rotations[int(n)].numpy() for n in directions)
     height = np.cross(first[2], second[2]) / np.linalg.norm(np.cross(first[2], second[2]))
-    found = list(found)
+    found, sure = list(found), [_share(every, found, k) >= SURE for k in range(len(found))]
     for i in range(len(found)):
         for j in range(i):
-            if abs((found[i].centre - found[j].centre) @ height) > SAME_HEIGHT * every.radius:
+            if (sure[i] and sure[j]) or abs((found[i].centre - found[j].centre) @ height) > SAME_HEIGHT * every.radius:
                 continue
             left = every.beside(every.images([pose for k, pose in enumerate(found) if k not in (i, j)]))
             pair = [found[i], found[j]]

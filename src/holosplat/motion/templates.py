@@ -118,13 +118,13 @@ class Search:
         half = np.array([w, h, w]) / 2 + np.abs(velocities).max(0)
         axes = [np.arange(-a, a + 0.1, SPACING) for a in half]
         self.grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
-        self.corners = [[self._corners(seen, n, v, self.grid) for n in range(len(seen))] for v in velocities]
 
     def tops(self, seen: Shadows, most: int, without: Sequence[np.ndarray] = ()) -> list[Hit]:
         """The `most` best places, the best first, none near the places `without` [3]."""
         gains, held = zip(*(self._frame(seen, n) for n in range(len(seen))))
         rows = list[tuple[float, int, int, int]]()
-        for k, corners in enumerate(self.corners):
+        for k, velocity in enumerate(self.velocities):
+            corners = [self._corners(seen, n, velocity, self.grid) for n in range(len(seen))]
             chosen = torch.nonzero(self._plausible(held, corners))[:, 0]
             if len(chosen):
                 total = torch.stack([gain[:, i[chosen]] for gain, i in zip(gains, corners)]).sum(0)

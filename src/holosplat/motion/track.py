@@ -14,6 +14,7 @@ from ..checks import InputError, require
 from ..fit.running import Record
 from ..fit.schedule import Schedule
 from ..matter import DeltaBeta
+from ..mesh import TriangleMesh
 from ..optics.background import Light
 from ..progress import FitProgress
 from ..representations import MovingSurfaces, TimeBasis
@@ -94,7 +95,7 @@ USUAL = TrackOptions()
 class Followed:
     """What `follow` found. bodies: on their paths; records: of the steps of all fits; oversample: wave samples a pixel
     in these; timing: seconds of each stage; found: how many bodies each time shows by itself; halves: the bodies by
-    halves of the frames, two and two, empty without intervals."""
+    halves of the frames, two and two, empty without intervals; rest: their shape at rest [m], if that is known."""
 
     bodies: MovingSurfaces
     records: list[Record]
@@ -102,6 +103,7 @@ class Followed:
     timing: dict[str, float]
     found: tuple[int, ...]
     halves: tuple[MovingSurfaces, ...] = ()
+    rest: TriangleMesh | None = None
 
 
 def follow(
@@ -127,7 +129,8 @@ def follow(
     while run.stage != "done":
         run.advance()
     assert run.bodies is not None
-    return Followed(run.bodies, run.records, run.oversample, run.timing, tuple(run.counts), tuple(run.halves))
+    told = run.records, run.oversample, run.timing, tuple(run.counts), tuple(run.halves)
+    return Followed(run.bodies, *told, run.shape_at_rest())
 
 
 @dataclass
@@ -257,6 +260,13 @@ class _Following:
         body = self.options.body
         return None if body is None else at_rest(body, self.train.views.finest, self.size)
 
+    def shape_at_rest(self) -> TriangleMesh | None:
+        """In metres."""
+        if (rest := self.rest) is None:
+            return None
+        mesh = rest.elastic.membrane.mesh
+        return TriangleMesh(self.train.views.finest * mesh.vertices, mesh.faces, "rest")
+
     def _posed(self, body: KnownBody, basis: TimeBasis, known: MovingSurfaces | None = None) -> MovingSurfaces | None:
         """Bodies of known shape beside `known` ones, on first paths."""
         self.on_progress("poses", 0.0, {})
@@ -288,11 +298,10 @@ class _Following:
 
     def on_chosen_paths(self, bodies: MovingSurfaces) -> MovingSurfaces:
         """`bodies` on paths of as many pieces as frames ask for."""
+        how = (self.options.paths, self.options.stiff, self.seed, self.light, self.rest)
         self.on_progress("paths", 0.0, {})
         with self._timed("paths"):
-            return chosen_paths(
-                self.train, bodies, self.options.paths, self.options.stiff, self.seed, self.light, self.rest
-            )
+            return chosen_paths(self.train, bodies, *how)
 
     def fitted(
         self, name: str, frames: Scan, start: MovingSurfaces, how: MotionFit, light: Light | None

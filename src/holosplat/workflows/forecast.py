@@ -16,6 +16,7 @@ from ..io.nxtomo import write_scan
 from ..io.objects import write_object
 from ..methods.presets import SCHEMA
 from ..metrics import image_scores, intensity_range
+from ..motion.dynamics import DynamicsForecast, carry
 from ..motion.fit import MotionFit
 from ..motion.forecast import Forecast, Halves, PathForecast, extrapolate
 from ..motion.half_sets import LEAST, half_sets
@@ -34,6 +35,8 @@ from .track import write_tracks
 FRAMES, TABLE, NUMBERS = "forecast.nxs", "forecast.csv", "forecast.json"
 MOST_TIMES = 1000
 """Of a forecast."""
+UNTOLD = 0.5
+"""Standard error after the fit over that before from which on a number is not told."""
 SAME_TIME = 1e-3
 """Share of a step within which two times are one."""
 
@@ -49,7 +52,9 @@ class ForecastOptions:
     step: float = 0.0
     """Between them [s] (0: the median step of the run)."""
     model: PathForecast = field(default_factory=PathForecast)
-    """How bodies move on."""
+    """How paths go on."""
+    dynamics: DynamicsForecast | None = None
+    """How cells go on by mechanics (default: all bodies go on their paths)."""
     half_sets: bool = True
     """Whether paths are fitted again to two halves of the times, which say what is believed of the motion."""
     fit: MotionFit = field(default_factory=MotionFit)
@@ -71,17 +76,20 @@ class ForecastOptions:
 @dataclass(frozen=True)
 class Forecasted:
     """What `forecast` found. forecast: bodies and band; predicted: the frames at its times; judged: scores against the
-    frames that the run did not see, a row a time, empty without such frames."""
+    frames that the run did not see, a row a time, empty without such frames; flow: what mechanics found of it."""
 
     forecast: Forecast
     predicted: Scan
     judged: list[dict[str, float]]
+    flow: dict[str, float] = field(default_factory=dict)
 
     def lines(self) -> list[str]:
         """The numbers as a few lines of text."""
         step, last = self.forecast.times[0], self.forecast.times[-1]
         band = 1e6 * self.forecast.usual_band()
         said = [f"standard error of surfaces: {band[0]:.3f} µm at {step:.4g} s, {band[-1]:.3f} µm at {last:.4g} s"]
+        if self.flow:
+            said.append(flow_in_words(self.flow))
         if self.judged:
             ends = [self.judged[0], self.judged[-1]]
             words = (f"SSIM {one['ssim']:.4f} (without change {one['ssim_still']:.4f})" for one in ends)
@@ -122,11 +130,29 @@ def forecast(
     require(len(last) > 0, f"the scan must have frames of the run's last time, {times[-1]:.6g} s, but it has none.")
     halves = _halves(run, known, bodies, options, seed, on_progress) if options.half_sets else None
     on_progress("forecast", 0.0, {})
-    found = extrapolate(bodies, times, ahead, options.model, halves)
+    flow = dict[str, float]()
+    if options.dynamics is None:
+        found = extrapolate(bodies, times, ahead, options.model, halves)
+    else:
+        found, flow = carry(bodies, times, ahead, options.dynamics, options.model, halves)
     exposures = scan.exposures[last].repeated(ahead)
     frames = render_object(found.bodies, exposures, run.oversample, bodies.backend)
-    predicted = Scan(frames, exposures, np.zeros(len(frames), dtype=bool), {"forecast": options.model.kind})
-    return Forecasted(found, predicted, _judged(found, run, scan, known, slack))
+    predicted = Scan(
+        frames, exposures, np.zeros(len(frames), dtype=bool), {"forecast": (options.dynamics or options.model).kind}
+    )
+    return Forecasted(found, predicted, _judged(found, run, scan, known, slack), flow)
+
+
+def flow_in_words(flow: dict[str, float]) -> str:
+    """What was found of the flow, and what the window does not tell."""
+    said = f"flow: peak {flow['peak_m_s']:.4g} m/s, shear modulus {1e6 * flow['shear_n_m']:.3g} µN/m"
+    for name, word in (("peak", "the peak"), ("shear", "the shear modulus")):
+        told = flow.get(f"{name}_told", np.nan)
+        if np.isnan(told):
+            said += f"; {word} was given"
+        elif told > UNTOLD:
+            said += f"; the window does not tell {word} (standard error {told:.2f} of the range's)"
+    return said + "; of the membrane's viscosity it says nothing"
 
 
 def write_forecast(folder: RunFolder, run: Reconstruction, found: Forecasted, config: dict[str, Any]) -> Reconstruction:
@@ -148,7 +174,10 @@ def write_forecast(folder: RunFolder, run: Reconstruction, found: Forecasted, co
         rows = zip(said.times, said.band)
         writer.writerows([f"{t:.7g}", k, f"{error:.4g}"] for t, band in rows for k, error in enumerate(band))
     band = [None if np.isnan(one) else float(one) for one in said.usual_band()]
-    write_json(folder.path / NUMBERS, {"times_s": said.times.tolist(), "band_m": band, "held_out": found.judged})
+    write_json(
+        folder.path / NUMBERS,
+        {"times_s": said.times.tolist(), "band_m": band, "held_out": found.judged, "flow": found.flow},
+    )
     write_tracks(folder, said.bodies, found.predicted)
     return done
 
@@ -157,7 +186,7 @@ def config_of(options: ForecastOptions, scan: Scan, run: dict[str, Any], seed: i
     """Entries of config.json. run: that of the run which is carried on."""
     return {
         "schema_version": SCHEMA,
-        "method": {"kind": options.kind, "model_kind": options.model.kind, **to_table(options)},
+        "method": {"kind": options.kind, "forecast": (options.dynamics or options.model).kind, **to_table(options)},
         "seed": seed,
         "prior": run["prior"],
         "light": run.get("light", {}),

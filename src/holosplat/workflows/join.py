@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from ..checks import in_range, require
 from ..divided_light import DividedLight
 from ..geometry import Views
 from ..io.atomic import require_apart, require_writable
+from ..io.beams import read_beams
 from ..io.formats import read
 from ..io.nxtomo import scan_writer
 from ..io.reading import Part
@@ -31,6 +33,7 @@ def join(
     flips: Sequence[Flip] = (),
     on_progress: Advance = lambda fraction: None,
     part: Part = Part(),
+    geometry: Path | None = None,
 ) -> Exposures:
     """One scan file `out` of all frames of the scans `sources`, one a beam, in their order.
 
@@ -39,6 +42,7 @@ def join(
     centre. Distances, poses, shifts and times stay its own, its point-spread function is
     carried along. `flips`: for each file, what its detector saw reversed and the file does not say itself. Raw files
     are corrected plainly, and frames keep the photon energy of their beam. part: what is taken of each file.
+    geometry: file of `io.beams` that says where all frames are, in the place of what their files say; a view a frame.
     """
     require_writable(out)
     require_apart(out, *sources)
@@ -50,6 +54,7 @@ def join(
     scans = [part.of(read(source)) for source in sources]
     parts = [scan.exposures for scan in scans]
     joined, resamplings = _on_one_raster(parts, pixel_size) if _share_pixel(parts, pixel_size) else _as_they_are(parts)
+    joined = joined if geometry is None else _placed(joined, geometry)
     described = {"joined": "; ".join(path.name for path in sources), **_shared([scan.provenance for scan in scans])}
     done = 0
     is_test = np.concatenate([scan.is_test for scan in scans])
@@ -62,6 +67,14 @@ def join(
                 done += 1
                 on_progress(done / len(joined))
     return joined
+
+
+def _placed(joined: Exposures, geometry: Path) -> Exposures:
+    """The exposures of the file `geometry`, on the same pixels; errors: `InputError` where it says others."""
+    found = read_beams(geometry).on(joined)
+    same = np.allclose(found.views.pixel_sizes, joined.views.pixel_sizes, rtol=1e-6, atol=0)
+    require(same, f"{geometry} says other pixel sizes than the frames have; join first, and give it to what follows.")
+    return replace(found, views=replace(joined.views, rotations=found.views.rotations, shifts=found.views.shifts))
 
 
 def _light(scans: Sequence[Scan], flips: Sequence[Flip], joined: Exposures) -> DividedLight | None:

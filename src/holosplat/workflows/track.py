@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import itertools
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -26,6 +25,7 @@ from ..methods.presets import SCHEMA
 from ..methods.uncertain import Uncertain
 from ..motion.halves import standard_errors
 from ..motion.measures import columns, measured, row
+from ..motion.strain import strain_energy
 from ..motion.track import NOWHERE, USUAL, Followed, TrackOptions, follow, require_times
 from ..optics.background import LightOptions
 from ..progress import FitProgress
@@ -44,6 +44,8 @@ from .verdict import judge
 
 LENGTH_UNIT = "um"
 BODIES, COLLECTION, TRACKS = "bodies", "bodies.pvd", "tracks.csv"
+STRAIN = "strain_energy_J"
+"""The column of energies beside the shape at rest."""
 ERROR = "se_"
 """How the names of columns with standard errors begin."""
 
@@ -97,8 +99,16 @@ def track(
         )
         if folder is not None:
             _write(folder, done, found, task)
-            write_tracks(folder, found.bodies, scan, standard_errors(found.bodies, found.halves, scan))
+            write_tracks(folder, found.bodies, scan, _more(found, options, scan))
         return done
+
+
+def _more(found: Followed, options: TrackOptions, scan: Scan) -> dict[str, np.ndarray]:
+    """Columns of tracks.csv [T, B] beside those of every run: the strain energy of red cells, and standard errors."""
+    red_cells = options.body is not None and options.body.shape == "red-cell"  # whose moduli are known
+    more = {STRAIN: strain_energy(found.bodies, scan.instants, found.rest)} if red_cells and found.rest else {}
+    errors = standard_errors(found.bodies, found.halves, scan)
+    return more | {f"{ERROR}{name}": values for name, values in errors.items()}
 
 
 @dataclass(frozen=True)
@@ -151,17 +161,15 @@ def read_errors(folder: RunFolder) -> dict[str, np.ndarray]:
 
 
 def write_tracks(
-    folder: RunFolder, bodies: MovingSurfaces, scan: Scan, errors: Mapping[str, np.ndarray] | None = None
+    folder: RunFolder, bodies: MovingSurfaces, scan: Scan, more: Mapping[str, np.ndarray] | None = None
 ) -> None:
-    """tracks.csv, with standard `errors` [T, B] of columns where there are any, and bodies.pvd with one file a body and
-    time."""
-    times, steps = scan.instants, list[TimeStep]()
+    """tracks.csv, with `more` columns [T, B] by their names, and bodies.pvd with one file a body and time."""
+    times, steps, beside = scan.instants, list[TimeStep](), more or {}
     with atomic_path(folder.path / TRACKS) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*columns(), *(f"{ERROR}{name}" for name in errors or ())])
-        beside = np.stack([one.ravel() for one in errors.values()], axis=1) if errors else itertools.repeat(())
-        rows = zip(measured(bodies, scan.exposures), beside)
-        writer.writerows([*row(one), *(f"{error:.3g}" for error in more)] for one, more in rows)
+        writer.writerow([*columns(), *beside])
+        for k, one in enumerate(measured(bodies, scan.exposures)):
+            writer.writerow([*row(one), *(f"{column.ravel()[k]:.4g}" for column in beside.values())])
     if (folder.path / BODIES).is_dir():  # of a run that was cut off when it wrote
         shutil.rmtree(folder.path / BODIES)
     with atomic_folder(folder.path / BODIES) as temporary:

@@ -74,7 +74,10 @@ class Suspension:
 
     def velocity(self, nodes: Tensor) -> Tensor:
         """Velocity [C, P, 3] [m/s] of nodes [C, P, 3] [m]."""
-        forces = self.forces(nodes)
+        return self.channel.velocity(nodes) + self.disturbance(nodes, self.forces(nodes))
+
+    def disturbance(self, nodes: Tensor, forces: Tensor) -> Tensor:
+        """Velocity [C, P, 3] [m/s] of nodes [C, P, 3] [m] in the flow that `forces` [C, P, 3] [N] on them cause."""
         centres = nodes.mean(1)
         local = nodes - centres[:, None]  # small numbers, whose squares keep their digits
         disturbance = torch.stack(
@@ -86,7 +89,7 @@ class Suspension:
             on_i, on_j = mutual_velocity(local[i], local[j] + shift, of_both, self.blob)
             disturbance[i] += weight * scale * on_i
             disturbance[j] += weight * scale * on_j
-        return self.channel.velocity(nodes) + disturbance
+        return disturbance
 
     def _neighbours(self, centres: Tensor) -> list[tuple[int, int, Tensor, float]]:
         """Pairs of cells within reach: their numbers, the way [3] from the first to the second, and the weight."""

@@ -1,0 +1,195 @@
+"""How well `forecast` tells cells that flow: rows of docs/data/forecast.csv.
+
+    python benchmarks/forecast.py DATA [--case flow4] [--times 24] [--first 0] [--write] [--keep FOLDER]
+
+DATA, cells and frames are as for motion.py. The first `times` snapshots from `first` on are tracked; the forecasts of
+the next ones are compared with the cells themselves: distances along normals (rms over both surfaces), Dice, and SSIM
+of the predicted frames with frames without noise. Judged are the cells that are whole in the field at the last tracked
+time and are followed. `splines` are the fitted splines of single vertices as they go on; `wrong …` are dynamics with
+numbers that are wrong. With --keep the tracked bodies are kept in FOLDER, and taken from there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import platform
+from collections.abc import Iterator
+from dataclasses import astuple, dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from machine import commit
+
+import holosplat as hs
+from holosplat.geometry import Grid
+from holosplat.io.atomic import atomic_path
+from holosplat.io.objects import read_object, write_object
+from holosplat.metrics import image_scores, intensity_range, volume_scores
+from holosplat.metrics.distances import normal_distance
+from holosplat.motion.cell_model import ChannelFrame
+from holosplat.motion.dynamics import DynamicsForecast, carry
+from holosplat.motion.forecast import Forecast, Halves, PathForecast, extrapolate
+from holosplat.motion.half_sets import half_sets
+from holosplat.motion.sightings import centroid
+from holosplat.motion.track import TrackOptions, follow
+from holosplat.representations import MovingSurfaces
+from holosplat.specimens.mesh_series import MeshSeries
+from holosplat.workflows.evaluate import render_object
+from motion import ANGLES, MATERIAL, PIXEL, SHAPE, cells_in_flow, imaged
+
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "forecast.csv"
+AHEAD = (1, 5, 10, 15, 20, 25)
+FRAME = ChannelFrame((32e-6, 24e-6))
+"""The channel between the walls of 1 µm; cells_in_flow brings the flow to y and the middle to the origin."""
+GIVEN = DynamicsForecast(FRAME)
+MODELS = {
+    "dynamics": GIVEN,
+    "auto": replace(GIVEN, mixed=True),
+    "dynamics alone": replace(GIVEN, free=False),
+    "wrong shear": replace(GIVEN, shear=(50e-6, 50e-6), free=False),
+    "wrong viscosity": replace(GIVEN, viscosity=1.2e-2, shear=(2.9e-6, 2.9e-6), free=False),
+    "wrong walls": replace(GIVEN, frame=ChannelFrame((48e-6, 36e-6)), free=False),
+}
+DICE = ("paths", "auto")
+NEAR = 1.5e-6
+"""A cell is followed if a body's centre stays within this distance [m], in the mean over three times."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """Of one model and one time ahead. normal_um, worst_um: rms over cells, and of the worst; band_um: the standard
+    error that was said; ssim: of predicted frames; dice: of all matter (empty: not asked); cells: judged; found: of the
+    flow."""
+
+    case: str
+    first: int
+    times: int
+    seed: int
+    model: str
+    ahead: int
+    normal_um: float
+    worst_um: float
+    band_um: float
+    ssim: float
+    dice: float | str
+    cells: int
+    found: str
+    machine: str
+    commit: str
+
+
+@dataclass(frozen=True)
+class Judge:
+    """The cells of an experiment, the numbers of the cells that are judged and of their bodies, and the frames of the
+    times ahead without noise."""
+
+    cells: MeshSeries
+    pairs: list[tuple[int, int]]
+    frames: dict[int, hs.Scan]
+    contrast: tuple[float, float]
+    last: int
+
+    def scores(self, found: MovingSurfaces, ahead: int, dice: bool) -> tuple[float, float, float, float | str]:
+        """Distances [µm] over cells and of the worst, SSIM, Dice."""
+        time, scene = float(self.cells.times[self.last + ahead]), self.cells.snapshots[self.last + ahead]
+        bodies = found.bodies(time)
+        away = np.array([1e6 * normal_distance(bodies[k], scene.meshes[c]) for c, k in self.pairs])
+        scan = self.frames[ahead]
+        said = render_object(found.at(time), scan.exposures, 2)
+        ssim = float(image_scores(said, scan.frames, self.contrast).mean["ssim"])
+        grid = Grid.of_views(scan.views)
+        part = volume_scores(found.at(time).voxelise(grid), scene.voxelise(grid)).dice if dice else ""
+        return float(np.sqrt((away**2).mean())), float(away.max()), ssim, part
+
+
+def followed(found: MovingSurfaces, cells: MeshSeries, last: int) -> list[tuple[int, int]]:
+    """Cells that are whole in the field at the time `last`, and the body that follows each."""
+    asked, pairs = (0, last // 2, last), []
+    ours = np.array([[centroid(mesh) for mesh in found.bodies(float(cells.times[t]))] for t in asked])
+    for c, mesh in enumerate(cells.snapshots[last].meshes):
+        way = np.array([centroid(cells.snapshots[t].meshes[c]) for t in asked])
+        away = np.linalg.norm(ours - way[:, None], axis=-1).mean(0)
+        if np.abs(mesh.vertices[:, 1]).max() < 0.5 * SHAPE[0] * PIXEL and away.min() < NEAR:
+            pairs.append((c, int(away.argmin())))
+    return pairs
+
+
+def tracked(scan: hs.Scan, seed: int, keep: Path | None, name: str) -> tuple[MovingSurfaces, Halves]:
+    """The bodies by all frames and by two halves."""
+    files = [keep / f"{name}_{part}.h5" for part in ("whole", "even", "odd")] if keep else []
+    if files and all(file.is_file() for file in files):
+        whole, *halves = (read_object(file) for file in files)
+        return whole, tuple(halves)  # pyright: ignore[reportReturnType]
+    whole = follow(scan, MATERIAL, TrackOptions(), seed).bodies
+    halves = half_sets(scan, whole, seed=seed)
+    for file, bodies in zip(files, (whole, *halves)):
+        write_object(file, bodies)
+    return whole, halves
+
+
+def forecasts(
+    bodies: MovingSurfaces, halves: Halves, times: np.ndarray, ahead: np.ndarray
+) -> Iterator[tuple[str, Forecast, str]]:
+    """Every model's, by name, and what it found of the flow."""
+    found = extrapolate(bodies, times, ahead, PathForecast(), halves)
+    yield "splines", replace(found, bodies=bodies, band=np.full_like(found.band, np.nan)), ""
+    yield "paths", found, ""
+    yield "rigid", extrapolate(bodies, times, ahead, PathForecast(rigid=True), halves), ""
+    for name, options in MODELS.items():
+        found, flow = carry(bodies, times, ahead, options, PathForecast(), halves)
+        yield name, found, " ".join(f"{key}={value:.4g}" for key, value in flow.items())
+
+
+def rows_of(case: str, data: Path, first: int, times: int, seed: int, keep: Path | None) -> Iterator[Row]:
+    """All models at all times ahead."""
+    cells = cells_in_flow(data, first, times + max(AHEAD))
+    scan = imaged(cells, ANGLES[case], seed)
+    kept = scan[np.flatnonzero(scan.exposures.time <= cells.times[times - 1])]
+    bodies, halves = tracked(kept, seed, keep, f"{case}_{first}_{times}_{seed}")
+    pairs, last = followed(bodies, cells, times - 1), times - 1
+    exposures = hs.Exposures.of(hs.Views.from_angles(np.array(ANGLES[case]), SHAPE, PIXEL), 20.0, 0.1)
+    frames = {h: hs.simulate(cells, exposures.repeated(cells.times[[last + h]])) for h in AHEAD}
+    judge = Judge(cells, pairs, frames, intensity_range(kept.frames), last)
+    machine = f"{platform.machine()}, {torch.get_num_threads()} of 2 cores, shared"
+    for model, found, said in forecasts(bodies, halves, cells.times[:times], cells.times[[last + h for h in AHEAD]]):
+        for h, band in zip(AHEAD, found.band):
+            error = 1e6 * float(np.sqrt(np.mean([band[k] ** 2 for _, k in pairs])))
+            away, worst, ssim, dice = judge.scores(found.bodies, h, model in DICE)
+            row = (case, first, times, seed, model, h, away, worst, error, ssim, dice, len(pairs), said)
+            yield Row(*row, machine, commit())
+
+
+def write(rows: list[Row]) -> None:
+    """Put `rows` in place of those of the same case, window, seed, model and time."""
+    names = [field.name for field in fields(Row)]
+    old = list(csv.reader(PAGE.read_text(encoding="utf-8").splitlines()))[1:] if PAGE.is_file() else []
+    new = [[f"{v:.5g}" if isinstance(v, float) else str(v) for v in astuple(row)] for row in rows]
+    kept = [row for row in old if row[:6] not in [one[:6] for one in new]]
+    with atomic_path(PAGE) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerows([names, *sorted([*kept, *new], key=lambda row: (row[:5], int(row[5])))])
+
+
+def main() -> None:
+    """Run, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--case", choices=ANGLES, default="flow4")
+    parser.add_argument("--times", type=int, default=24, help="that are tracked")
+    parser.add_argument("--first", type=int, default=0, help="snapshot of the first time")
+    parser.add_argument("--seed", type=int, default=1, help="of the photons and of the fits")
+    parser.add_argument("--write", action="store_true")
+    parser.add_argument("--keep", type=Path, help="folder of tracked bodies")
+    asked = parser.parse_args()
+    rows = []
+    for row in rows_of(asked.case, asked.data, asked.first, asked.times, asked.seed, asked.keep):
+        print(*astuple(row)[:13], sep="; ", flush=True)
+        rows.append(row)
+    if asked.write:
+        write(rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,186 @@
+"""A flow of cells fitted to holograms of several times: its numbers, and the state that it begins with (4D-Var).
+
+The model is a strong constraint: between the first time and the last nothing but its mechanics moves the cells. Frames
+of all times then tell a few numbers: the peak of the flow, the shear modulus, and how each cell is off at the first
+time. The loss is minus the logarithm of the probability, of noise and of what is known before; its gradient goes back
+through the waves, the surface projector and all time steps (Le Dimet & Talagrand 1986, Tellus A 38, 97).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from torch import Tensor
+
+from ..checks import at_least, positive, require
+from ..matter import Matter
+from ..mesh import TriangleMesh
+from ..model import Instrument, Model
+from ..representations import SurfaceMesh
+from ..scan import Scan
+from .cell_flow import CellFlow, Unknowns, advanced
+from .cell_model import CellModel, Range
+from .dressing import Bound
+
+AFFINE = 12
+"""Numbers of a cell's first state: how far it is moved, and its linear map."""
+CHANGE = 0.05
+"""Of a whitened unknown, in differences of gradients: far above the rounding of frames."""
+MOST_UNKNOWNS = 64
+"""Up to which the curvature is computed, by a gradient for each."""
+MEDIAN = 1.4826
+"""Standard deviation over the median of absolute values, of a normal distribution."""
+
+
+@dataclass(frozen=True)
+class Assimilation:
+    """How a flow is fitted to frames."""
+
+    peak: Range
+    """Of the flow [m/s], two standard deviations below and above; equal: known."""
+    shear: Range = (2e-6, 10e-6)
+    """Skalak's modulus [N/m], likewise."""
+    state: float = 0.1e-6
+    """Standard deviation of the first state: how far a cell may be moved, or its surface by a linear map [m]."""
+    oversample: int = 2
+    """Wave samples a pixel: the gradient of a surface is right to second order in their distance."""
+    steps: int = 20
+    """Of L-BFGS, at most."""
+    curvature: bool = True
+    """Whether the curvature at the end says what the frames tell, where unknowns are few enough."""
+
+    def __post_init__(self) -> None:
+        at_least(self, 1, "steps", "oversample")
+        positive("state", self.state, "metres")
+        for name, (low, high) in (("peak", self.peak), ("shear", self.shear)):
+            require(
+                0 < low <= high, f"{name} must be a range LOW:HIGH above 0, but it is {low:g}:{high:g}; correct it."
+            )
+
+
+@dataclass(frozen=True)
+class Assimilated:
+    """What frames say of a flow.
+
+    unknowns: peak and modulus; told: standard errors after over those before, by name (1: nothing; absent: given, or
+    not computed); meshes: the cells [m] at the first time; places: of each cell [T, Q, 3] [m] at the scan's times;
+    losses: of the start and the end.
+    """
+
+    unknowns: Unknowns
+    told: dict[str, float]
+    meshes: list[TriangleMesh]
+    places: list[np.ndarray]
+    losses: tuple[float, float]
+
+
+def assimilate(
+    scan: Scan, model: CellModel, meshes: Sequence[TriangleMesh], matter: Matter, options: Assimilation
+) -> Assimilated:
+    """The flow that explains the frames of `scan`, of several times, from cells that are about `meshes` at the first.
+
+    matter: of the cells, alike in all. Errors: `InputError` for frames of one time.
+    """
+    require(len(scan.instants) > 1, "a flow is fitted to frames of two times or more, but there is one.")
+    fit = _Fit.of(scan, model, meshes, matter, options)
+    start = np.zeros(fit.size)
+    first = fit(start)[0]
+    found = minimize(fit, start, jac=True, method="L-BFGS-B", options={"maxiter": options.steps})
+    told = fit.told(found.x) if options.curvature and fit.size <= MOST_UNKNOWNS else {}
+    with torch.no_grad():
+        unknowns, nodes = fit.meant(torch.from_numpy(found.x))
+        ways = fit.ways(unknowns, nodes)
+    outward = model.frame.outward
+    places = [np.array([outward(one.places(at[c]).numpy()) for at in ways]) for c, one in enumerate(fit.bound)]
+    moved = [TriangleMesh(way[0], mesh.faces, mesh.name) for way, mesh in zip(places, meshes)]
+    return Assimilated(unknowns, told, moved, places, (first, float(found.fun)))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """The loss of whitened unknowns [N], and its gradient."""
+
+    scan: Scan
+    model: CellModel
+    flow: CellFlow
+    nodes: Tensor
+    bound: list[Bound]
+    faces: Tensor
+    matter: Matter
+    middle: dict[str, float]
+    widths: dict[str, float]
+    state: float
+    noise: float
+    instruments: list[Instrument]
+
+    @classmethod
+    def of(
+        cls, scan: Scan, model: CellModel, meshes: Sequence[TriangleMesh], matter: Matter, options: Assimilation
+    ) -> _Fit:
+        flow, nodes, bound = model.dressed(meshes)
+        starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+        faces = torch.from_numpy(np.concatenate([mesh.faces + start for mesh, start in zip(meshes, starts)]))
+        ranges = {"peak": options.peak, "shear": options.shear}
+        middle = {name: float(np.sqrt(low * high)) for name, (low, high) in ranges.items()}
+        widths = {n: 0.25 * float(np.log(high / low)) for n, (low, high) in ranges.items() if high > low}
+        at_each = [np.flatnonzero(scan.exposures.time == t) for t in scan.instants]
+        instruments = [Instrument(scan.exposures[kept], options.oversample) for kept in at_each]
+        rest = (scan, model, flow, nodes, bound, faces, matter, middle, widths, options.state)
+        rough = cls(*rest, 1.0, instruments)
+        with torch.no_grad():
+            misses = torch.cat([miss.ravel() for miss in rough.misses(*rough.meant(torch.zeros(rough.size)))])
+        return cls(*rest, MEDIAN * float(misses.abs().median()), instruments)
+
+    @property
+    def size(self) -> int:
+        """How many unknowns there are."""
+        return len(self.widths) + AFFINE * len(self.nodes)
+
+    def meant(self, white: Tensor) -> tuple[Unknowns, Tensor]:
+        """The numbers and the first nodes [C, P, 3] [m] of whitened unknowns [N]."""
+        common = {name: torch.tensor(value, dtype=torch.float64) for name, value in self.middle.items()}
+        for value, (name, width) in zip(white.double(), self.widths.items()):
+            common[name] = common[name] * torch.exp(width * value)
+        own = self.state * white.double()[len(self.widths) :].reshape(-1, AFFINE)
+        about = (self.nodes - self.nodes.mean(1, keepdim=True)) / self.model.radius
+        linear = torch.einsum("cxy,cpy->cpx", own[:, 3:].reshape(-1, 3, 3), about)
+        return Unknowns(**common), self.nodes + own[:, None, :3] + linear
+
+    def ways(self, unknowns: Unknowns, nodes: Tensor) -> list[Tensor]:
+        """The nodes at each of the scan's times."""
+        times, found = self.scan.instants, [nodes]
+        for wait in np.diff(times):
+            velocity = lambda places: self.flow.velocity(places, unknowns)  # noqa: E731
+            found.append(advanced(velocity, found[-1], float(wait), self.model.step))
+        return found
+
+    def misses(self, unknowns: Unknowns, nodes: Tensor) -> list[Tensor]:
+        """What is left of the frames of each time [V, H, W]."""
+        found, unit = [], self.scan.views.finest
+        for time, at, instrument in zip(self.scan.instants, self.ways(unknowns, nodes), self.instruments):
+            vertices = torch.cat([self.model.frame.outside(one.places(x)) for one, x in zip(self.bound, at)])
+            surfaces = SurfaceMesh(vertices / unit, self.faces, unit, self.matter)
+            measured = torch.from_numpy(self.scan.frames[self.scan.exposures.time == time])
+            found.append(Model(surfaces, instrument).frames() - measured)
+        return found
+
+    def __call__(self, white: np.ndarray) -> tuple[float, np.ndarray]:
+        """Loss and gradient [N]."""
+        unknown = torch.from_numpy(white.copy()).requires_grad_()
+        parts = [(miss.double() / self.noise).square().sum() for miss in self.misses(*self.meant(unknown))]
+        loss = 0.5 * (sum(parts) + unknown.square().sum())
+        (gradient,) = torch.autograd.grad(loss, unknown)
+        return float(loss.detach()), gradient.numpy().copy()
+
+    def told(self, white: np.ndarray) -> dict[str, float]:
+        """Standard errors of the common unknowns over those before: roots of the inverse of the loss's curvature."""
+        here = self(white)[1]
+        rows = [(self(white + step)[1] - here) / CHANGE for step in CHANGE * np.eye(self.size)]
+        curvature = 0.5 * (np.array(rows) + np.array(rows).T)
+        values, axes = np.linalg.eigh(curvature)
+        inverse = (axes / np.maximum(values, 1.0)) @ axes.T  # what is known before is never lost
+        return {name: float(np.sqrt(inverse[k, k])) for k, name in enumerate(self.widths)}

@@ -1,0 +1,137 @@
+"""Membranes on surfaces that were seen: a mesh of known rest shape is laid on each, with the least elastic energy.
+
+Motion along a surface is not seen, so where the nodes of a membrane are on it is not known; of all places those of
+least energy are taken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from scipy.spatial import KDTree
+
+from ..checks import require
+from ..mesh import TriangleMesh
+from ..specimens.membrane.model import Membrane
+from .forecast import areas, normals
+from .measures import area, moments
+
+STIFFNESS = (1e-6, 3e-6, 1e-5, 3e-5, 1e-4, 1e-4, 1e-4)
+"""Springs between the surfaces [N/m a node], one round after the other: at the last one, forces of the membrane, some
+0.3 pN a node, move it by 0.003 µm."""
+ITERATIONS = 25
+"""Steps of L-BFGS in a round; between them the nearest places are found again."""
+LENGTH, ENERGY = 1e-6, 1e-18
+"""Units of the search: µm and pN µm."""
+
+
+def dressed(meshes: Sequence[TriangleMesh], membrane: Membrane) -> np.ndarray:
+    """Nodes [C, P, 3] [m] of `membrane` on the surfaces `meshes`, within 0.02 µm or so, of least elastic energy."""
+    found = np.array([_on_surface(mesh, membrane) for mesh in meshes])
+    require(
+        bool(np.isfinite(found).all()),
+        "membranes must fit the tracked surfaces, but one does not; track more times or beams, or use --model paths.",
+    )
+    return found
+
+
+def scaled(rest: TriangleMesh, meshes: Sequence[TriangleMesh]) -> TriangleMesh:
+    """The rest shape with the median volume of `meshes`."""
+    wanted = float(np.median([mesh.volume for mesh in meshes]))
+    return TriangleMesh(rest.vertices * (wanted / rest.volume) ** (1 / 3), rest.faces, rest.name)
+
+
+@dataclass(frozen=True)
+class Bound:
+    """Points [Q, 3] of a surface that go with the triangles [F, 3] of a coarser one.
+
+    faces: [Q, 3] nodes of the triangle of each; parts: [Q, 3] barycentric; offset: [Q, 3] [m] in the triangle's frame.
+    """
+
+    faces: torch.Tensor
+    parts: torch.Tensor
+    offset: torch.Tensor
+
+    @classmethod
+    def of(cls, points: np.ndarray, nodes: np.ndarray, faces: np.ndarray) -> Bound:
+        """Each of `points` [Q, 3] [m] with the triangle whose middle is nearest."""
+        corners = nodes[faces]
+        nearest = KDTree(corners.mean(1)).query(points)[1]
+        a, b, c = np.moveaxis(corners[nearest], 1, 0)
+        plane = np.stack([b - a, c - a], axis=-1)
+        gram = np.einsum("qxi,qxj->qij", plane, plane)
+        along = np.einsum("qxi,qx->qi", plane, points - a)
+        second, third = (np.linalg.pinv(gram) @ along[..., None])[..., 0].T  # of a triangle without area, too
+        inside = np.maximum(np.stack([1 - second - third, second, third], axis=1), 0)
+        parts = torch.from_numpy(inside / inside.sum(1, keepdims=True))
+        chosen = torch.from_numpy(faces[nearest])
+        tensor = torch.from_numpy(nodes)
+        away = torch.from_numpy(points) - (parts[..., None] * tensor[chosen]).sum(1)
+        return cls(chosen, parts, torch.einsum("qxi,qx->qi", _frames(tensor[chosen]), away))
+
+    def places(self, nodes: torch.Tensor) -> torch.Tensor:
+        """The points [Q, 3] [m] when the nodes are at `nodes` [P, 3] [m]."""
+        corners = nodes[self.faces]
+        return (self.parts[..., None] * corners).sum(1) + torch.einsum("qxi,qi->qx", _frames(corners), self.offset)
+
+
+def _frames(corners: torch.Tensor) -> torch.Tensor:
+    """Orthonormal axes [Q, 3, 3] (columns) of triangles [Q, 3, 3]."""
+    a, b, c = corners.unbind(1)
+    first = torch.nn.functional.normalize(b - a, dim=-1)
+    normal = torch.nn.functional.normalize(torch.linalg.cross(b - a, c - a), dim=-1)
+    return torch.stack([first, torch.linalg.cross(normal, first), normal], dim=-1)
+
+
+def _on_surface(mesh: TriangleMesh, membrane: Membrane) -> np.ndarray:
+    """Nodes [P, 3] [m] on the surface `mesh`, whose area and volume the membrane takes on."""
+    own = Membrane(membrane.mesh, membrane.elasticity)
+    whole = {"surface": torch.tensor(area(mesh)), "volume": torch.tensor(mesh.volume)}
+    own.rest = replace(own.rest, **{name: value.double() for name, value in whole.items()})
+    tree, outward = KDTree(mesh.vertices), normals(mesh)
+    weights = areas(mesh) * len(membrane.mesh.vertices) / area(mesh)
+    nodes = _placed(mesh, membrane.mesh)
+    for stiffness in STIFFNESS:
+        near, back = tree.query(nodes)[1], KDTree(nodes).query(mesh.vertices)[1]
+        pairs = np.concatenate([np.arange(len(nodes)), back]), np.concatenate([near, np.arange(len(outward))])
+        springs = 0.5 * stiffness * np.concatenate([np.ones(len(nodes)), weights])
+        found = _Springs(own, pairs[0], mesh.vertices[pairs[1]], outward[pairs[1]], springs)
+        start = (nodes / LENGTH).ravel()
+        options = {"maxiter": ITERATIONS}
+        nodes = LENGTH * minimize(found, start, jac=True, method="L-BFGS-B", options=options).x.reshape(-1, 3)
+    return nodes
+
+
+@dataclass(frozen=True)
+class _Springs:
+    """A membrane whose nodes are held to planes: which [N], through points and with normals [N, 3], springs [N]."""
+
+    membrane: Membrane
+    which: np.ndarray
+    points: np.ndarray
+    normals: np.ndarray
+    springs: np.ndarray
+
+    def __call__(self, flat: np.ndarray) -> tuple[float, np.ndarray]:
+        """Energy and its gradient, in the units of the search."""
+        places = LENGTH * flat.reshape(-1, 3)
+        away = ((places[self.which] - self.points) * self.normals).sum(1)
+        nodes = torch.from_numpy(places)
+        energy = float(self.membrane.energy(nodes)) + 0.5 * float((self.springs * away**2).sum())
+        pull = self.membrane.forces(nodes).numpy()
+        np.subtract.at(pull, self.which, (self.springs * away)[:, None] * self.normals)
+        return energy / ENERGY, -(pull * (LENGTH / ENERGY)).ravel()
+
+
+def _placed(mesh: TriangleMesh, rest: TriangleMesh) -> np.ndarray:
+    """The nodes of `rest`, moved, turned and stretched such that its ellipsoid of second moments is that of `mesh`."""
+    (_, to, wanted), (_, origin, own) = (moments(one) for one in (mesh, rest))
+    (values, axes), (rests, frame) = np.linalg.eigh(wanted), np.linalg.eigh(own)
+    axes = axes * np.sign(np.linalg.det(axes) * np.linalg.det(frame)) ** np.array([1, 0, 0])
+    stretch = np.sqrt(np.maximum(values, 0) / rests)
+    stretch = stretch / stretch.prod() ** (1 / 3)
+    return ((rest.vertices - origin) @ frame * stretch) @ axes.T + to

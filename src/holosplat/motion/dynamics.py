@@ -1,0 +1,145 @@
+"""Forecasts by mechanics: membranes on the surfaces that were seen, carried by the flow of a channel.
+
+The model is not the truth: walls do not answer, moduli are those of healthy cells, and where a membrane's nodes are on
+a surface is not seen. So it is run over the last times of the window first, against the paths that were fitted there:
+what it misses is put down to the peak of the flow and the shear modulus, as far as a range is left to them, and to a
+small linear flow about each cell, which then goes on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+import torch
+
+from ..checks import at_least, in_range, positive, require
+from ..mesh import TriangleMesh
+from ..representations import MovingSurfaces
+from ..specimens.flow.suspension import PLASMA_VISCOSITY
+from ..specimens.red_cells import RedCell
+from .cell_model import CellModel, ChannelFrame, Range
+from .forecast import Forecast, Halves, PathForecast, extrapolate, on_paths, places_of, smoothed
+from .measures import area
+
+ALIKE = 0.3
+"""A body whose volume differs from the median by more is no whole cell."""
+STRETCHED = 1.15
+"""Area of a cell over that of a resting one of its volume, at most: membranes tear at less, and tracks are rough."""
+GOING_ON = PathForecast()
+"""How paths go on unless it is said."""
+PEAK = 0.04
+"""How far the peak may be from that which the bodies' velocities say, as a share."""
+
+
+@dataclass(frozen=True)
+class DynamicsForecast:
+    """How cells move on by mechanics."""
+
+    kind: ClassVar[str] = "dynamics"
+
+    frame: ChannelFrame
+    """The channel."""
+    peak: Range = (0.0, 0.0)
+    """Velocity of the undisturbed flow on the axis [m/s], a range; (0, 0): found from the bodies' velocities."""
+    shear: Range = (2e-6, 10e-6)
+    """Skalak's shear modulus [N/m], a range: what was measured of healthy cells. Motion tells it over the viscosity."""
+    viscosity: float = PLASMA_VISCOSITY
+    """Of the fluid, inside and outside [Pa s]."""
+    back: int = 8
+    """Last times over which the model is compared with the paths, at most a third of the run's."""
+    free: bool = True
+    """Whether what is wrong with the flow about each cell is put down to a linear flow of its own."""
+    mixed: bool = False
+    """Whether paths that go on count, too, by the inverse squares of both bands."""
+
+    def __post_init__(self) -> None:
+        in_range("viscosity", self.viscosity, 1e-6, 1e3, unit="pascal seconds")
+        at_least(self, 1, "back")
+        for name, (low, high) in (("peak", self.peak), ("shear", self.shear)):
+            require(0 <= low <= high, f"{name} must be a range LOW:HIGH, but it is {low:g}:{high:g}; correct it.")
+        positive("shear", self.shear[0], "newtons a metre")
+
+
+def carry(
+    bodies: MovingSurfaces,
+    times: np.ndarray,
+    ahead: np.ndarray,
+    options: DynamicsForecast,
+    paths: PathForecast = GOING_ON,
+    halves: Halves | None = None,
+) -> tuple[Forecast, dict[str, float]]:
+    """`bodies`, fitted at `times` [T] s, at the later times `ahead` [N] s, and what was found of the flow.
+
+    Whole cells within the channel go by mechanics, from the state that their paths have at the last time; all others
+    as `extrapolate` says. The band has the state's part, and what the model left of the window, growing with time.
+    Errors: `InputError` where no body is a whole cell within the channel.
+    """
+    window, every = paths.times(times), np.r_[times[-1], ahead]
+    past = window[-1 - min(options.back, max(1, len(window) // 3)) :]
+    seen, spread = smoothed(bodies, window, past, paths, halves)
+    base = extrapolate(bodies, times, ahead, paths, halves)
+    places, band = places_of(base.bodies, every), base.band.copy()
+    faces = [bodies.body(k)[1].numpy() for k in range(bodies.count)]
+    cells = whole_cells([TriangleMesh(one[-1], f) for one, f in zip(seen, faces)], options.frame)
+    require(
+        len(cells) > 0,
+        "dynamics need cells that are whole and within the channel at the last time, but there are none; check "
+        "--channel, --flow-axis and --channel-centre.",
+    )
+    first, last = ([TriangleMesh(seen[k][t], faces[k]) for k in cells] for t in (0, -1))
+    model = CellModel(options.frame, last, float(np.sqrt(np.prod(options.shear))), options.viscosity)
+    ranges = {"peak": _peak(model, bodies, cells, window, options), "shear": options.shear}
+    fitted = model.fitted(first, [seen[k] for k in cells], past, ranges, options.free)
+    later = model.run(last, every, fitted.unknowns, fitted.wrong)
+    growth = (every - times[-1]) / (past[-1] - past[0])
+    for k, own, left in zip(cells, later, fitted.left):
+        own += seen[k][-1] - own[0]  # what the coarse membrane does not follow
+        error = np.hypot(spread[-1, k], growth * left)
+        weight = _weights(error[1:], base.band[:, k], options.mixed)
+        places[k] = own + np.r_[0.0, 1 - weight][:, None, None] * (places[k] - own)
+        mixed = np.sqrt((weight * error[1:]) ** 2 + ((1 - weight) * base.band[:, k]) ** 2)
+        band[:, k] = mixed if options.mixed else error[1:]
+    return Forecast(on_paths(bodies, every, places), ahead, band), fitted.as_dict()
+
+
+def whole_cells(meshes: list[TriangleMesh], frame: ChannelFrame) -> list[int]:
+    """Numbers of the bodies that are red cells within the channel.
+
+    They have nearly the median volume of those within, and no more area than a cell of that volume can have.
+    """
+    channel, rest = frame.channel, RedCell().mesh()
+    depths = [channel.depth(torch.from_numpy(frame.inward(mesh.vertices))).min().item() for mesh in meshes]
+    volumes = np.array([mesh.volume for mesh in meshes])
+    within = (np.array(depths) > 0) & (volumes > 0)
+    if not within.any():
+        return []
+    usual = np.median(volumes[within])
+    alike = within & (np.abs(volumes / usual - 1) < ALIKE)
+    most = STRETCHED * area(rest) / rest.volume ** (2 / 3)
+    return [int(k) for k in np.flatnonzero(alike) if area(meshes[k]) < most * volumes[k] ** (2 / 3)]
+
+
+def _peak(
+    model: CellModel, bodies: MovingSurfaces, cells: list[int], window: np.ndarray, options: DynamicsForecast
+) -> Range:
+    """The range of the peak [m/s]: what is said, or about what the cells' velocities say."""
+    if options.peak[1] > 0:
+        return options.peak
+    places, speeds = list[np.ndarray](), list[np.ndarray]()
+    for time in window:
+        meshes, velocities = bodies.bodies(float(time)), bodies.velocities(float(time))
+        places += [meshes[k].vertices for k in cells]
+        speeds += [velocities[k] for k in cells]
+    found = model.peak_of(places, speeds)
+    require(found > 0, "cells must go with the flow, but they go against it; check --flow-axis.")
+    return (1 - PEAK) * found, (1 + PEAK) * found
+
+
+def _weights(error: np.ndarray, other: np.ndarray, mixed: bool) -> np.ndarray:
+    """[N] what mechanics count beside paths: the inverse squares of both errors."""
+    if not mixed:
+        return np.ones_like(error)
+    known = np.where(np.isnan(other), np.inf, other)
+    return np.where(np.isinf(known), 1.0, known**2 / np.maximum(error**2 + known**2, np.finfo(float).tiny))
