@@ -63,18 +63,25 @@ def reconstruct(
     from ..workflows.evaluate import evaluate as score
     from ..workflows.reconstruct import reconstruct as fit
     from ..workflows.run_folder import RunFolder
+    from .motion import asks_for_motion, reconstruct_in_motion
 
     method = how.chosen()
     require(seed >= 0, f"--seed must be 0 or more, but it is {seed}.")
     uncertain, refine = Uncertain(**reading.told.ranges(), **matter.ranges()), geometry.options()
     require(
-        refine is None or reading.part.time_frame != "all",
+        refine is None or reading.part.time_frame not in ("all", "still"),
         "--refine finds each frame by itself, but --time-frame all has the same beams many times; find their one "
         "geometry with holosplat align, and reconstruct the file that it writes without --refine.",
     )
     measured = read_as(scan, replace(reading, told=reading.told.at_middle())).in_memory()
     prior = matter.without_ranges().prior(measured.exposures.reference_energy)
     folder = RunFolder(out)
+    if asks_for_motion(
+        reading, method, how.kind_of_matter(), plain=not resume and refine is None and uncertain == Uncertain()
+    ):
+        if reconstruct_in_motion(scan, reading, prior, folder, seed, illumination.options()):
+            return
+        _say("nothing moves, as far as the frames tell: they are taken as of one time")
     with ProgressBar() as bar:
         result = fit(
             measured,

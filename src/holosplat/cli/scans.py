@@ -12,7 +12,7 @@ from ..io.formats import read_as
 from ..io.reading import Reading, at_time
 from ..io.run_scan import run_reading
 from ..mesh import TriangleMesh
-from ..representations import MovingSurfaces, SurfaceMesh
+from ..representations import MovingGaussians, MovingSurfaces, SurfaceMesh
 from ..scan import Scan
 from ..workflows.moments import chosen_frames, instants_of, moment
 from ..workflows.reconstruct import load_reconstruction, require_one_time
@@ -74,10 +74,11 @@ def moments_of(folder: RunFolder, time_frame: int | Literal["all"] | None) -> It
     """
     result, times = load_reconstruction(folder), instants_of(folder)
     found = result.object
-    if not isinstance(found, MovingSurfaces):
+    if not isinstance(found, MovingSurfaces | MovingGaussians):
         require(time_frame is None, f"{folder.path} is of one time; leave --time-frame.")
         yield Moment("", result, found.bodies() if isinstance(found, SurfaceMesh) else None)
         return
     for k in chosen_frames(time_frame, times):
         ending = f"_t{k:04d}" if time_frame == "all" else ""
-        yield Moment(ending, moment(result, times, k), found.bodies(times[k]))
+        bodies = found.bodies(times[k]) if isinstance(found, MovingSurfaces) else None
+        yield Moment(ending, moment(result, times, k), bodies)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -125,15 +125,18 @@ class VolumeProblem:
         gradient.add_(prior.values / (v + u))
         return value
 
-    def preconditioner(self, u: Tensor) -> Callable[[Tensor], Tensor]:
-        """About the inverse of the second derivative at u: by spatial frequency, of the data and of mean slopes."""
+    def preconditioner(self, u: Tensor, times: int = 1) -> Callable[[Tensor], Tensor]:
+        """About the inverse of the second derivative at u: by spatial frequency, of the data and of mean slopes.
+
+        times: how often the data are there.
+        """
         b, epsilon = self.prior.slope * self.level, self.prior.rounding * self.level
         size = _slopes(u, epsilon)
         pull = self.prior.slopes / ((b - epsilon + size) * size)
         matter = u > MATTER * u.max()
         mean = float(pull[matter].mean()) if bool(matter.any()) else float(pull.mean())
         least = 1e-4 * mean + 1e-6 * float(self._symbol.max())
-        inverse = 1 / (self._symbol + mean * self._laplacian + least)
+        inverse = 1 / (times * self._symbol + mean * self._laplacian + least)
 
         def applied(gradient: Tensor) -> Tensor:
             return torch.fft.irfftn(torch.fft.rfftn(gradient) * inverse, s=gradient.shape)
@@ -160,6 +163,18 @@ def _slopes(u: Tensor, epsilon: float) -> Tensor:
     return square.sqrt_()
 
 
+class Penalised(Protocol):
+    """What a `Descent` makes small."""
+
+    def __call__(self, u: Tensor) -> tuple[float, Tensor]:
+        """The objective and its gradient [Z, Y, X]."""
+        ...
+
+    def preconditioner(self, u: Tensor) -> Callable[[Tensor], Tensor]:
+        """About the inverse of the second derivative at u."""
+        ...
+
+
 class Descent:
     """Projected L-BFGS from `start` [Z, Y, X], an iteration at a time; the objective never rises.
 
@@ -170,7 +185,7 @@ class Descent:
     u: the volume; value: its objective; done: how many iterations; ended: whether none lowers the objective further.
     """
 
-    def __init__(self, problem: VolumeProblem, start: Tensor) -> None:
+    def __init__(self, problem: Penalised, start: Tensor) -> None:
         self.problem, self.u = problem, start.clamp_min(0)
         self.value, self._gradient = problem(self.u)
         self.done, self.ended = 0, False
@@ -216,7 +231,7 @@ class Descent:
         }
 
     @classmethod
-    def again(cls, problem: VolumeProblem, state: Mapping[str, Any]) -> Descent:
+    def again(cls, problem: Penalised, state: Mapping[str, Any]) -> Descent:
         """The descent as `state_dict` left it."""
         found = cls.__new__(cls)
         found.problem, found.u, found.value = problem, state["u"], float(state["value"])
@@ -226,7 +241,7 @@ class Descent:
         return found
 
 
-def descend(problem: VolumeProblem, start: Tensor, iterations: int) -> tuple[Tensor, list[float]]:
+def descend(problem: Penalised, start: Tensor, iterations: int) -> tuple[Tensor, list[float]]:
     """At most `iterations` of a `Descent`; the volume [Z, Y, X], and the objective before and after each."""
     descent = Descent(problem, start)
     values = [descent.value]
@@ -260,7 +275,7 @@ def _direction(
 
 
 def _searched(
-    problem: VolumeProblem, u: Tensor, value: float, gradient: Tensor, direction: Tensor
+    problem: Penalised, u: Tensor, value: float, gradient: Tensor, direction: Tensor
 ) -> tuple[Tensor, float, Tensor] | None:
     """The first point of a shrinking series along the projected `direction` that lowers the objective enough."""
     length = 1.0

@@ -117,8 +117,9 @@ class Told:
 class Part:
     """Which part of a scan is taken."""
 
-    time_frame: int | Literal["all"] | None = None
-    """Of a time-resolved scan: the time to take, counted from 0, or all if nothing moved."""
+    time_frame: int | Literal["all", "still"] | None = None
+    """Of a time-resolved scan: the time to take, counted from 0; still: all, as if nothing moved; all: likewise, but
+    `reconstruct` asks the frames whether something does, and then finds how."""
     time_frames: str | None = None
     """Times to take of a time-resolved scan, counted from 0, as --views, such as 0:24; --time-frame counts these."""
     views: str | None = None
@@ -207,7 +208,7 @@ def _said(kind: Told | Part) -> dict[str, Any]:
 
 
 def at_time(scan: Scan, time_frame: int | str | None) -> Scan:
-    """The frames of the instant `time_frame`, of "all" as if nothing moved, or (None) the scan as it is."""
+    """The frames of the instant `time_frame`, of "all" or "still" as if nothing moved, or (None) the scan as it is."""
     if time_frame is None:
         return scan
     return scan.at_instant(time_frame) if isinstance(time_frame, int) else scan.as_static()

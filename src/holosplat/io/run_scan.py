@@ -22,7 +22,7 @@ def run_reading(path: str | Path) -> Reading:
     """How the run folder `path` read its scan; `InputError` for a source.json that is damaged."""
     table = Table.read(Path(path) / SOURCE)
     time_frame = table.values.get("time_frame")
-    known = time_frame is None or time_frame == "all" or isinstance(time_frame, int)
+    known = time_frame is None or time_frame in ("all", "still") or isinstance(time_frame, int)
     require(known, f"{table.label('time_frame')} must be a number, 'all' or null, but it is {time_frame!r}.")
     said = Reading.from_table(table.values.get("reading", {}), f"{table.label('reading')}")
     return replace(said, part=replace(said.part, time_frame=time_frame))

@@ -215,6 +215,7 @@ class SmoothFit:
         (Morozov's discrepancy principle, 1966), as long as that helps.
         """
         problem, u = descent.problem, descent.u
+        assert isinstance(problem, VolumeProblem)
         self._descent = None
         unexplained = 2 * problem.frames(problem.lines(u)).value / problem.frames.count
         if leg.kind == "round" and bool((u > 0).any()):

@@ -86,6 +86,7 @@ NAMES = {
     "gaussians": "Gaussian reconstruction",
     "surfaces": "Reconstruction as closed surfaces",
     "moving-surfaces": "Reconstruction as closed surfaces in motion",
+    "moving-gaussians": "Reconstruction as Gaussians that a flow carries",
     "voxels": "Voxel reconstruction",
     "neural-field": "Reconstruction as a neural field",
 }

@@ -11,9 +11,11 @@ from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..volume import LineIntegrals, TrainableObject
 from .encodings import Encoding
+from .flow import Flow, Lattice
 from .gaussians import GaussianCloud
 from .initialise import approximate, at_pitch, cloud_from_two, cloud_from_volume, freed, random_cloud
 from .isosurface import isosurface
+from .moving_gaussians import MovingGaussians
 from .moving_surfaces import MovingSurfaces
 from .neural_field import Network, NeuralField
 from .paths import TimeBasis
@@ -67,14 +69,17 @@ class Stored(TrainableObject, Protocol):
 
 
 KINDS: dict[str, type[Stored]] = {
-    kind.kind: kind for kind in (GaussianCloud, VoxelGrid, SurfaceMesh, MovingSurfaces, NeuralField)
+    kind.kind: kind for kind in (GaussianCloud, VoxelGrid, SurfaceMesh, MovingSurfaces, MovingGaussians, NeuralField)
 }
 """Every kind of Object that files hold, by name."""
 
 __all__ = [
     "KINDS",
     "Encoding",
+    "Flow",
     "GaussianCloud",
+    "Lattice",
+    "MovingGaussians",
     "MovingSurfaces",
     "Network",
     "NeuralField",

@@ -7,7 +7,7 @@ from typing import Literal
 
 from ..checks import require
 from ..io.json import read_json
-from ..representations import MovingSurfaces
+from ..representations import MovingGaussians, MovingSurfaces
 from ..scan import Scan
 from .reconstruction import Reconstruction
 from .run_folder import RunFolder
@@ -34,7 +34,7 @@ def moment(done: Reconstruction, times: list[float], frame: int) -> Reconstructi
     Errors: `InputError` for an instant that there is not.
     """
     chosen_frames(frame, times)
-    assert isinstance(done.object, MovingSurfaces)
+    assert isinstance(done.object, MovingSurfaces | MovingGaussians)
     return replace(done, object=done.object.at(times[frame]))
 
 

@@ -1,0 +1,58 @@
+"""`holosplat reconstruct --time-frame all`: matter in motion, where the frames say that something moves."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from ..io.formats import read_as
+from ..io.json import write_json
+from ..io.reading import Reading
+from ..io.run_scan import run_source
+from ..matter import KnownTwo, MaterialPrior, MatterKind
+from ..methods import Auto, Method
+from ..optics.background import LightOptions
+from ..report.run import report_run
+from ..workflows.evaluate import evaluate as score
+from ..workflows.moments import moment
+from ..workflows.moving import reconstruct_moving
+from ..workflows.run_folder import RunFolder
+from .progress import ProgressBar
+
+FEWEST_TIMES = 3
+"""Times from which on matter in motion can be found."""
+
+
+def asks_for_motion(reading: Reading, method: Method, matter: MatterKind | None, plain: bool) -> bool:
+    """Whether --time-frame all is to find motion: where the method is left to the program, matter is not said to have
+    levels, and nothing else is asked for (`plain`)."""
+    return reading.part.time_frame == "all" and isinstance(method, Auto) and matter != "levels" and plain
+
+
+def reconstruct_in_motion(
+    scan: Path, reading: Reading, prior: MaterialPrior, folder: RunFolder, seed: int, light: LightOptions
+) -> bool:
+    """Find matter in motion, write its run, its report and its scores; False where nothing moves, or times are few."""
+    reading = replace(reading, part=replace(reading.part, time_frame=None))
+    measured = read_as(scan, replace(reading, told=reading.told.at_middle())).in_memory()
+    if isinstance(prior, KnownTwo) or len(measured.train().instants) < FEWEST_TIMES:
+        return False
+    with ProgressBar() as bar:
+        found = reconstruct_moving(measured, prior, seed=seed, light=light, folder=folder, on_progress=bar.show)
+    if found is None:
+        return False
+    result = found.reconstruction
+    write_json(folder.source, run_source(scan, reading))
+    evaluation, times = score(result, measured, None), measured.train().instants.tolist()
+    middle = len(times) // 2
+    shown = measured[(measured.exposures.time == times[middle]).nonzero()[0]].as_static()
+    now = moment(result, times, middle)
+    report = report_run(folder, now, shown, score(now, shown, None), None)
+    for line in (*evaluation.lines(), *(result.verdict.lines("training frames") if result.verdict else ())):
+        print(line)
+    seconds = sum(result.timing.values())
+    for line in found.history:
+        print(line, file=sys.stderr)
+    print(f"{seconds:.1f} s, {result.object.described}; report: {report}", file=sys.stderr)
+    return True

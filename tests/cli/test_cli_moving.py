@@ -1,0 +1,64 @@
+"""`holosplat reconstruct --time-frame all`: matter in motion, and what the other commands make of such a run."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from helpers.cli import holosplat, worked
+from holosplat.cli import motion
+from holosplat.io.nxtomo import read_scan
+from holosplat.io.volumes import read_volume
+from holosplat.methods import SmoothVolume
+from holosplat.motion.carried import CarriedOptions
+from holosplat.representations import MovingGaussians
+from holosplat.workflows.moving import reconstruct_moving
+from holosplat.workflows.reconstruct import load_reconstruction
+from holosplat.workflows.run_folder import RunFolder
+
+QUICK = CarriedOptions(
+    volume=SmoothVolume(coarser=(), rounds=1, iterations=4),
+    cells=2,
+    most_degree=0,
+    most_cells=2,
+    steps=2,
+    iterations=3,
+    final=3,
+)
+
+
+@pytest.fixture
+def quick(monkeypatch, tmp_path):
+    """A series of three times, fitted in few steps, without the report's drawing."""
+
+    def few(scan, prior, **options):
+        return reconstruct_moving(scan, prior, QUICK, ask=False, **options)
+
+    monkeypatch.setattr(motion, "reconstruct_moving", few)
+    monkeypatch.setattr(motion, "report_run", lambda *what: tmp_path / "run/report.html")
+    blob = ["--specimen", "stirred-blob", "--material", "PMMA", "--specimen-motion", 40, "--frame-rate", 1e3]
+    field = ["--frames", 3, "--detector", 15, 19, "--pixel-size", "1e-6", "--distance", 0.1, "--views", 3]
+    truth = ["--photons-per-pixel", 2000, "--test-every", 0, "--truth", tmp_path / "t.h5", "--truth-frames", 0, 2]
+    worked(holosplat("simulate", *blob, *field, *truth, "--out", tmp_path / "s.nxs"))
+    return tmp_path
+
+
+def test_a_series_in_motion_is_one_object_that_all_commands_read(quick):
+    known = ["--material", "PMMA", "--time-frame", "all"]
+    said = worked(holosplat("reconstruct", quick / "s.nxs", *known, "--out", quick / "run"))
+    assert "carried by a flow" in said.err
+    found = load_reconstruction(RunFolder(quick / "run"))
+    assert isinstance(found.object, MovingGaussians)
+    summary = json.loads((quick / "run/summary.json").read_text())
+    assert summary["times_s"] == pytest.approx([0, 1e-3, 2e-3], abs=0)
+    worked(holosplat("export", quick / "run", "--volume", quick / "v.h5", "--time-frame", "all"))
+    volumes = [read_volume(quick / f"v_t000{k}.h5").delta for k in range(3)]
+    assert np.abs(volumes[2] - volumes[0]).max() > 0.01 * volumes[0].max()
+    scored = worked(holosplat("evaluate", quick / "run", "--truth", quick / "t_t0002.h5", "--time-frame", 2, "--json"))
+    assert json.loads(scored.out)["relative_error_delta"] < 0.8
+    worked(holosplat("render", quick / "run", "--scan", quick / "s.nxs", "--split", "train", "--out", quick / "p.nxs"))
+    assert len(read_scan(quick / "p.nxs")) == 9
+    refused = holosplat("export", quick / "run", "--bodies", quick / "b")
+    assert refused.code == 2
