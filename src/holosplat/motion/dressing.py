@@ -14,6 +14,7 @@ import torch
 from scipy.optimize import minimize
 from scipy.spatial import KDTree
 
+from ..checks import require
 from ..mesh import TriangleMesh
 from ..specimens.membrane.model import Membrane
 from .forecast import areas, normals
@@ -30,7 +31,12 @@ LENGTH, ENERGY = 1e-6, 1e-18
 
 def dressed(meshes: Sequence[TriangleMesh], membrane: Membrane) -> np.ndarray:
     """Nodes [C, P, 3] [m] of `membrane` on the surfaces `meshes`, within 0.02 µm or so, of least elastic energy."""
-    return np.array([_on_surface(mesh, membrane) for mesh in meshes])
+    found = np.array([_on_surface(mesh, membrane) for mesh in meshes])
+    require(
+        bool(np.isfinite(found).all()),
+        "membranes must fit the tracked surfaces, but one does not; track more times or beams, or use --model paths.",
+    )
+    return found
 
 
 def scaled(rest: TriangleMesh, meshes: Sequence[TriangleMesh]) -> TriangleMesh:
@@ -59,7 +65,7 @@ class Bound:
         plane = np.stack([b - a, c - a], axis=-1)
         gram = np.einsum("qxi,qxj->qij", plane, plane)
         along = np.einsum("qxi,qx->qi", plane, points - a)
-        second, third = np.linalg.solve(gram, along[..., None])[..., 0].T
+        second, third = (np.linalg.pinv(gram) @ along[..., None])[..., 0].T  # of a triangle without area, too
         inside = np.maximum(np.stack([1 - second - third, second, third], axis=1), 0)
         parts = torch.from_numpy(inside / inside.sum(1, keepdims=True))
         chosen = torch.from_numpy(faces[nearest])
