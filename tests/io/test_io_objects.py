@@ -23,7 +23,10 @@ from holosplat.matter import Matter
 from holosplat.representations import (
     KINDS,
     Encoding,
+    Flow,
     GaussianCloud,
+    Lattice,
+    MovingGaussians,
     MovingSurfaces,
     Network,
     NeuralField,
@@ -37,7 +40,7 @@ from holosplat.specimens.red_cells import icosphere
 PITCH = 2e-6
 GRID = Grid((7, 5, 9), (PITCH, PITCH, PITCH), (-8e-6, 1e-6, -5e-6))
 CELL = Matter.one(3e-7, 2e-10)
-KNOWN = "kinds gaussians, voxels, surfaces, moving-surfaces, neural-field"
+KNOWN = "kinds gaussians, voxels, surfaces, moving-surfaces, moving-gaussians, neural-field"
 OLD = Path(__file__).resolve().parents[1] / "data/run_0_1_0/gaussians.h5"
 
 
@@ -48,9 +51,13 @@ def objects() -> dict[str, Stored]:
     cloud = (torch.randn(n, 3), torch.rand(n, 3), torch.randn(n, 4), torch.randn(n, 2))
     sphere, faces = (torch.from_numpy(array.copy()) for array in icosphere(1))
     mask = torch.rand(GRID.shape) > 0.3
+    free = GaussianCloud(cloud, PITCH, Matter.free(*CELL.channels[0]))
+    lattice = Lattice.around((9.0, 5.0, 7.0), 3)
+    flow = Flow(torch.randn(2, 3, *lattice.counts), lattice, TimeBasis(0, 1e-5, 1), 5e-6, 4)
     small = Network(Encoding(levels=2, features=2, log2_size=6), hidden=5, layers=1)
     return {
-        "gaussians": GaussianCloud(cloud, PITCH, Matter.free(*CELL.channels[0])),
+        "gaussians": free,
+        "moving-gaussians": MovingGaussians(free, flow, torch.randn(2, n)),
         "voxels": VoxelGrid(torch.rand(2, *GRID.shape), GRID, Matter.two((3e-7, 2e-10), (1e-7, 1e-11))),
         "surfaces": SurfaceMesh(3 * sphere, faces.long(), PITCH, CELL, 3),
         "moving-surfaces": MovingSurfaces(
