@@ -68,6 +68,8 @@ def test_the_whole_chain(shop, tmp_path):
         "config.json",
         "metrics.csv",
         "checkpoint.pt",
+        "checkpoint_before.pt",
+        "manifest.json",
         "object.h5",
         "summary.json",
         "source.json",

@@ -36,7 +36,7 @@ TITLES = {
     "voxels": "Voxel reconstruction",
     "neural-field": "Reconstruction as a neural field",
 }
-FILES = {"config.json", "metrics.csv", "object.h5", "summary.json", "source.json", "report.html"}
+FILES = {"manifest.json", "config.json", "metrics.csv", "object.h5", "summary.json", "source.json", "report.html"}
 
 
 @pytest.fixture(scope="module", params=QUICK)
@@ -60,7 +60,7 @@ def run(shop, method, tmp_path_factory) -> Path:
 def test_a_run_folder_says_what_made_it(method, run):
     kind = KINDS.get(method, method)
     stages = {"surfaces": {"metrics_0.csv"}, "voxels": {"metrics_1.csv"}}.get(method, set())
-    fitted = set() if method in KINDS else {"checkpoint.pt"}
+    fitted = set() if method in KINDS else {"checkpoint.pt", "checkpoint_before.pt"}
     assert {path.name for path in run.iterdir()} == FILES | stages | fitted
     config, summary = (json.loads((run / f"{name}.json").read_text()) for name in ("config", "summary"))
     assert config["method"]["kind"] == summary["method"]
@@ -108,9 +108,9 @@ def test_its_config_makes_it_again(shop, method, run, tmp_path):
         np.testing.assert_array_equal(state[name].numpy(), value.numpy(), err_msg=name)
 
 
-def test_surfaces_are_cut_out_of_gaussians_alone(method, run, tmp_path):
+def test_surfaces_are_cut_out_of_gaussians_or_there_already(method, run, tmp_path):
     outcome = holosplat("surface", run, "--out", tmp_path / "bodies", "--steps", 1)
-    if method == "gaussians":
+    if method in ("gaussians", "surfaces"):
         worked(outcome)
     else:
         refused(outcome, "surfaces are cut out of Gaussians", KINDS.get(method, method), "--method gaussians")

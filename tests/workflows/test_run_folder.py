@@ -74,7 +74,8 @@ def random_whole(scan, tmp_path_factory) -> RunFolder:
 
 
 def test_a_run_folder_holds_what_was_done(scan, whole):
-    names = {"config.json", "metrics.csv", "checkpoint.pt", "object.h5", "summary.json"}
+    names = {"config.json", "metrics.csv", "checkpoint.pt", "checkpoint_before.pt", "object.h5", "summary.json"}
+    names |= {"manifest.json"}
     assert set(contents(whole)) == names
     config = json.loads(whole.config.read_text())
     assert config["seed"] == 3
@@ -302,7 +303,8 @@ def test_resuming_with_something_else_is_refused(scan, whole, what, change):
 def test_a_damaged_checkpoint_is_refused(scan, tmp_path):
     folder = RunFolder(tmp_path / "run")
     reconstruct(scan, KNOWN, RANDOM, folder=folder, on_progress=Interruption(2))
-    folder.checkpoint.write_bytes(folder.checkpoint.read_bytes()[:1000])
+    for path in (folder.checkpoint, folder.earlier_checkpoint):
+        path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(InputError, match=r"checkpoint\.pt must be a checkpoint"):
         reconstruct(scan, KNOWN, RANDOM, folder=folder, resume=True)
 

@@ -75,7 +75,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "commands",
         "Score a run on held-out frames and against the true volume, which then joins its report.",
     ),
-    "check": ("check", "Say whether a run folder or an HDF5 file is as it was written."),
+    "check": (
+        "check",
+        "Say whether a run folder or an HDF5 file is as it was written: by its manifest, and by checksums of its values.",
+    ),
     "data": ("data", "Sample data of other people: list it, or fetch one into the cache (list, fetch NAME)."),
     "demo": ("commands", "Run the whole chain on generated red cells: simulate, reconstruct, evaluate, report."),
     "bench": (

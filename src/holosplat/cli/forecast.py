@@ -116,7 +116,7 @@ def forecast(run: Positional[Path], out: Path, how: ForecastFlags = ForecastFlag
     tracked = load_reconstruction(folder)
     tracked_bodies(tracked)
     times = np.array(instants_of(folder))
-    scan = whole_scan(folder)
+    scan = _whole_scan(folder)
     with ProgressBar() as bar:
         found = carry_on(tracked, scan, times, options, seed, on_progress=bar.show)
     with claimed(new):
@@ -131,7 +131,7 @@ def forecast(run: Positional[Path], out: Path, how: ForecastFlags = ForecastFlag
     print(f"wrote {out / COLLECTION}, {out / TRACKS}, {out / FRAMES}, {out / TABLE}", file=sys.stderr)
 
 
-def whole_scan(folder: RunFolder) -> Scan:
+def _whole_scan(folder: RunFolder) -> Scan:
     """The scan of a run of track, of all its times, later ones too, where the run found the geometry to be."""
     own = run_reading(folder.path)
     reading = replace(own, part=replace(own.part, time_frame=None, time_frames=None))

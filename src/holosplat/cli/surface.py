@@ -53,13 +53,14 @@ def surface(
     require_new(out)
     folder = RunFolder(run)
     folder.require_run()
-    times, name = instants_of(folder), "run" if instants_of(folder) else "Gaussians"
+    times = instants_of(folder)
     require(
         not times or isinstance(reading.part.time_frame, int),
         f"{run} holds bodies in motion, whose surfaces are fitted at one time; choose it with --time-frame 0 … "
         f"{len(times) - 1}, or write the bodies as they are with export --bodies.",
     )
     (result, measured), volume = run_and_scan(folder, scan, reading), read_volume(truth) if truth else None
+    name = "Gaussians" if result.object.kind == "gaussians" else "run"
     if not times and not folder.is_of(scan_hash(measured)):
         _say("this is not the scan that was reconstructed: its held-out frames may have been fitted")
     if folder.read_config().get("prior", {}).get("kind") == "free":

@@ -218,7 +218,7 @@ def at_time(scan: Scan, time_frame: int | str | None) -> Scan:
 
 def read_angles(path: Path) -> np.ndarray:
     """The angles [N] in degrees of a text file: numbers separated by lines, spaces or commas; # begins a comment."""
-    require_regular(path, "a text file of angles")
+    require_regular(path, "a text file of angles (--angles)")
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:

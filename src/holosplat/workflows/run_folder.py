@@ -166,6 +166,8 @@ def claimed(folder: RunFolder | None) -> Iterator[None]:
         yield
         return
     require_parent(folder.path)
+    if folder.path.exists() and not folder.path.is_dir():
+        folder.require_new()
     with sole_writer(folder.path):
         yield
         if folder.config.is_file():
