@@ -11,7 +11,7 @@ from ..workflows.check import check as look
 
 
 def check(path: Positional[Path]) -> None:
-    """Say whether a run folder or an HDF5 file is as it was written: by its manifest, and by checksums of its values.
+    """Say whether a run folder or an HDF5 file is as it was written, by manifest and checksums.
 
     Args:
         path: Run folder, another folder with HDF5 files, or one such file.

@@ -77,7 +77,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "check": (
         "check",
-        "Say whether a run folder or an HDF5 file is as it was written: by its manifest, and by checksums of its values.",
+        "Say whether a run folder or an HDF5 file is as it was written, by manifest and checksums.",
     ),
     "data": ("data", "Sample data of other people: list it, or fetch one into the cache (list, fetch NAME)."),
     "demo": ("commands", "Run the whole chain on generated red cells: simulate, reconstruct, evaluate, report."),

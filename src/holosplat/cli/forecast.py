@@ -85,12 +85,12 @@ class ForecastFlags:
         if self.channel is None or self.model in ("paths", "rigid"):
             return None
         frame = ChannelFrame(self.channel, self.flow_axis, self.channel_centre)
-        peak = (0.0, 0.0) if self.peak is None else number_or_range("peak", self.peak)
-        shear = number_or_range("shear_modulus", self.shear_modulus)
+        peak = (0.0, 0.0) if self.peak is None else _number_or_range("peak", self.peak)
+        shear = _number_or_range("shear_modulus", self.shear_modulus)
         return DynamicsForecast(frame, peak, shear, self.viscosity, mixed=self.model == "auto")
 
 
-def number_or_range(name: str, text: str) -> tuple[float, float]:
+def _number_or_range(name: str, text: str) -> tuple[float, float]:
     """Both ends of what an option says: LOW:HIGH, or one number above 0 twice. Errors: `InputError` for other text."""
     if ":" in text:
         return ends_of(name, text)
