@@ -71,6 +71,7 @@ def test_doubt_lies_where_frames_are_after_choosing_cropping_and_binning():
     assert coarse.light is not None
     assert Background.handed(coarse.light, coarse.views.shape).powers.numpy() == pytest.approx(1e-5 / 4)
     assert near(doubts(full.cropped(slice(4, 24), slice(8, 40)).binned(2)), means[:, 2:12, 4:20])
+    assert near(doubts(coarse.cropped(slice(2, 12), slice(4, 20))), means[:, 2:12, 4:20])
     assert full.in_memory().as_static().with_split(full.is_test).with_views(full.views).light is full.light
 
 

@@ -102,3 +102,12 @@ def test_what_the_edge_cuts_is_known():
     assert not is_cut(at(14.0, 0, 0), VIEWS)
     assert is_cut(at(14.0, 0, -30.0), VIEWS)
     assert Sighting(at(0, 0, 0), False).reach == pytest.approx(3e-6, rel=0.03)
+
+
+def test_what_one_beam_sees_is_in_the_field():
+    """Beside the columns of one view, within those of another; and half of a ball beyond the rows of both."""
+    sphere, faces = icosphere(3)
+    views = Views.from_angles([0.0, 90.0], (21, 31), 1e-6)
+    at = lambda *centre: TriangleMesh(3e-6 * sphere + 1e-6 * np.array(centre), faces)  # noqa: E731
+    parts = [measure(at(*c), np.zeros_like(sphere), 0.0, 0, views).in_field for c in ((20, 0, 0), (0, 10.5, 0))]
+    assert parts == pytest.approx([1.0, 0.5], abs=0.05)
