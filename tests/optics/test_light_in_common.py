@@ -84,3 +84,11 @@ def test_smooth_mean_light_is_that_of_its_modes():
     torch.testing.assert_close(mean_light(predicted * light, predicted, 2), light.contiguous(), atol=1e-6, rtol=0)
     torch.testing.assert_close(mean_light(2 * predicted, predicted, 2), torch.ones(SHAPE).double(), atol=1e-6, rtol=0)
     torch.testing.assert_close(mean_light(2 * predicted, predicted, 0), torch.full(SHAPE, 2.0).double())
+
+
+def test_a_few_pixels_of_air_have_something_in_common_by_chance():
+    """Three frames and four pixels: one draw in eight has more in common than noise leaves in the mean."""
+    draw, quiet = torch.Generator().manual_seed(1), NoiseModel.white_only(torch.full((3,), NOISE), (2, 2))
+    air = torch.ones(3, 2, 2, dtype=torch.bool)
+    for _ in range(60):
+        assert not shows_still_light(1 + NOISE * torch.randn(3, 2, 2, generator=draw).double(), air, quiet)
