@@ -243,5 +243,5 @@ def test_material_table_says_what_is_wrong(tmp_path, name, text, said):
 
 
 def test_material_table_that_is_not_there(tmp_path):
-    with pytest.raises(InputError, match="readable"):
+    with pytest.raises(InputError, match="there is no such file"):
         read_material_table(tmp_path / "none.json")

@@ -58,6 +58,13 @@ def at_least(options: object, low: float, *names: str) -> None:
         require(value >= low, f"{name} {wanted}, but it is {value}.")
 
 
+def whole_seed(field: str, seed: int) -> int:
+    """`seed`, if it is a number of 63 bits, which every generator takes; `InputError` naming `field` otherwise."""
+    require(seed >= 0, f"{field} must be 0 or more, but it is {seed}.")
+    require(seed < 1 << 63, f"{field} must be below 2⁶³, but it is {seed}.")
+    return seed
+
+
 def finite(field: str, array: np.ndarray) -> np.ndarray:
     """`array` unchanged, if every entry is finite; `InputError` naming `field` and the count otherwise."""
     bad = int(array.size - np.count_nonzero(np.isfinite(array)))

@@ -13,6 +13,9 @@ import torch
 
 from .checks import InputError, finite, positive, require, shaped
 
+FARTHEST_PX = 1e6
+"""Pixels beyond which no detector lies beside its place."""
+
 
 def rotation_y(angles_deg: np.ndarray | list[float]) -> np.ndarray:
     """Rotation matrices [V, 3, 3] of tomographic angles [V] in degrees about y (docs/conventions.md)."""
@@ -69,6 +72,10 @@ class Views:
         require(bool(proper), "view rotation must hold proper rotation matrices (R Rᵀ = 1, det R = 1).")
         shifts = finite("detector shift", np.asarray(self.shifts, dtype=np.float64))
         shaped("detector shift", shifts, (len(rotations), 2))
+        far = float(np.abs(shifts).max(initial=0.0)) / self.pitch
+        require(
+            far <= FARTHEST_PX, f"detector shift must be at most {FARTHEST_PX:g} pixels, but it is {far:g}; correct it."
+        )
         if len(self.shape) != 2 or min(self.shape) < 1:
             raise InputError(f"detector shape must be two positive counts (rows, columns), but it is {self.shape}.")
         object.__setattr__(self, "rotations", rotations)

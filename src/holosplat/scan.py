@@ -16,6 +16,8 @@ from .geometry import Views
 ENERGY_RANGE_KEV = (0.1, 1000.0)
 PIXEL_RANGE_M = (1e-10, 1e-2)
 DISTANCE_RANGE_M = (1e-9, 1e4)
+MOST_BLUR_PX = 1000.0
+"""Blur beyond which a frame is one grey."""
 """Limits of a distance [m] that is not zero; at 0, in contact, there is absorption alone."""
 
 
@@ -52,7 +54,11 @@ class Exposures:
             checked_distance(float(z))
         finite("psf_sigma_px", self.psf_sigma_px)
         finite("time", self.time)
+        worst = float(self.psf_sigma_px.max(initial=0.0))
         require(bool(np.all(self.psf_sigma_px >= 0)), "psf_sigma_px must not be negative; correct it.")
+        require(
+            worst <= MOST_BLUR_PX, f"psf_sigma_px must be at most {MOST_BLUR_PX:g}, but it is {worst:g}; correct it."
+        )
 
     @classmethod
     def of(cls, views: Views, energy_kev: float, distance: float, psf_sigma_px: float = 0.0) -> Exposures:

@@ -17,7 +17,7 @@ def test_more_columns_stand_beside_those_of_every_run(tmp_path):
     energies = 1e-17 * (1 + np.arange(3.0 * TIMES).reshape(TIMES, 3))
     errors = 1e-9 * (100 + np.arange(3.0 * TIMES).reshape(TIMES, 3))
     folder = RunFolder(tmp_path / "run")
-    folder.create()
+    folder.begin({})
     write_tracks(folder, true_paths(), scan(), {STRAIN: energies, "se_x_m": errors})
     with (folder.path / TRACKS).open() as file:
         rows = list(csv.DictReader(file))

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import InputError, in_range, require
+from ..checks import InputError, in_range, require, whole_seed
 from ..fit.interrupt import interrupts_held
 from ..io.atomic import atomic_path
 from ..io.folder import require_new
@@ -71,7 +71,7 @@ class Growth:
             require(1 <= number <= most, f"{name} must be from 1 to {most}, but it is {number}.")
         in_range("interval", self.period, 1e-12, 1e3, unit="seconds")
         require(0 <= self.warm_up <= 1e3, f"warm_up must be from 0 to 1000 s, but it is {self.warm_up}.")
-        require(self.seed >= 0, f"seed must be 0 or more, but it is {self.seed}.")
+        whole_seed("seed", self.seed)
         in_range("tolerance", self.tolerance, 1e-8, 0.1)
 
     @property

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from ..checks import at_least, require
+from ..checks import at_least, require, whole_seed
 
 MOST_RMS = 0.2
 """Largest relative deviation of light (rms): beyond, one in a million pixels would have to be dark."""
@@ -62,7 +62,7 @@ class UnevenLight:
             self.light_drift_px == 0 or self.light_pattern > 0,
             "light_drift_px moves the pattern, of which there is none; give light_pattern, too.",
         )
-        require(self.light_seed >= 0, f"light_seed must be 0 or more, but it is {self.light_seed}.")
+        whole_seed("light_seed", self.light_seed)
 
     @property
     def is_even(self) -> bool:

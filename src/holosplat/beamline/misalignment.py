@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..checks import require
+from ..checks import require, whole_seed
 from ..scan import Exposures
 
 MOST_SHIFT_PX, MOST_ROTATION_DEG, MOST_DISTANCE, MOST_MAGNIFICATION = 1000.0, 45.0, 0.1, 0.1
@@ -39,7 +39,7 @@ class Misalignment:
             value = getattr(self, name)
             inside = math.isfinite(value) and 0 <= value <= most
             require(inside, f"misalignment {name} must lie between 0 and {most:g}, but it is {value:g}.")
-        require(self.seed >= 0, f"misalignment seed must be 0 or more, but it is {self.seed}.")
+        whole_seed("misalignment seed", self.seed)
 
     def __bool__(self) -> bool:
         return max(self.shift_px, self.rotation_deg, self.distance, self.magnification) > 0

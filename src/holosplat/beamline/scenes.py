@@ -15,6 +15,9 @@ from ..specimens.repair import closed
 from ..specimens.scene import MeshScene
 from ..units import LENGTH_UNITS, unit_factor
 
+FARTHEST = 1.0
+"""Metres from the files' origin within which a field of view lies."""
+
 
 @dataclass(frozen=True)
 class Filling:
@@ -63,4 +66,9 @@ def field_centre(
     if origin is None:
         return 0.5 * (bounds[0] + bounds[1])
     require(bool(np.all(np.isfinite(origin))), f"origin must be three finite numbers, but it is {origin}.")
-    return unit_factor("length unit", length_unit, LENGTH_UNITS) * np.array(origin)
+    point = unit_factor("length unit", length_unit, LENGTH_UNITS) * np.array(origin)
+    require(
+        bool((np.abs(point) <= FARTHEST).all()),
+        f"origin must lie within {FARTHEST:g} m, but it is {origin} {length_unit}.",
+    )
+    return point

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from ..checks import in_range, require
+from ..checks import in_range, require, whole_seed
 from ..memory import memory_kept
 from ..model import Instrument, Model
 from ..optics.detector import poisson
@@ -79,7 +79,7 @@ class Simulation:
     def __post_init__(self) -> None:
         if self.photons_per_pixel is not None:
             in_range("photons_per_pixel", self.photons_per_pixel, *PHOTON_RANGE)
-        require(self.seed >= 0, f"seed must be 0 or more, but it is {self.seed}.")
+        whole_seed("seed", self.seed)
 
     def samples(self, exposures: Exposures) -> int:
         """Samples along a pixel's edge for `exposures`."""

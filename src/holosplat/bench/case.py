@@ -12,7 +12,7 @@ import numpy as np
 from ..beamline.light import EVEN_LIGHT, UnevenLight
 from ..beamline.misalignment import AS_PLANNED, Misalignment
 from ..beamline.simulate import simulate
-from ..checks import InputError, require, shaped
+from ..checks import InputError, require, shaped, whole_seed
 from ..geometry import Grid
 from ..matter import MaterialPrior
 from ..optics.detector import poisson
@@ -53,7 +53,7 @@ class Case:
     misalignment: Misalignment = AS_PLANNED
 
     def __post_init__(self) -> None:
-        require(self.seed >= 0, f"seed must be 0 or more, but it is {self.seed}.")
+        whole_seed("seed", self.seed)
         is_test = shaped("is_test", np.asarray(self.is_test, dtype=bool), (len(self.exposures),))
         object.__setattr__(self, "is_test", is_test)
         both = bool(is_test.any() and not is_test.all())
@@ -113,7 +113,7 @@ def load_case(name: str | Path, seed: int = 0, snapshots: Path | None = None) ->
     `[with_snapshots]` then show; the others are what they are without. `InputError` says what is wrong with a file, and
     where the scene is larger than the field of view.
     """
-    require(seed >= 0, f"seed must be 0 or more, but it is {seed}.")
+    whole_seed("seed", seed)
     path, called = _found(str(name))
     declared = read_declaration(path, called, snapshots is not None)
     try:

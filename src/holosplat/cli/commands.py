@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from ..checks import InputError, in_range, require
+from ..checks import InputError, in_range, require, whole_seed
 from ..io.reading import Reading
 from .align import RefineOptions
 from .options import BeamlineOptions, MethodOptions, PriorOptions, RunLightFlags, TruthOptions
@@ -66,7 +66,7 @@ def reconstruct(
     from .motion import asks_for_motion, reconstruct_in_motion
 
     method = how.chosen()
-    require(seed >= 0, f"--seed must be 0 or more, but it is {seed}.")
+    whole_seed("--seed", seed)
     uncertain, refine = Uncertain(**reading.told.ranges(), **matter.ranges()), geometry.options()
     require(
         refine is None or reading.part.time_frame not in ("all", "still"),

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from tyro.conf import Positional
 
-from ..checks import positive, require
+from ..checks import positive, require, whole_seed
 from ..io.formats import read_as
 from ..io.json import write_json
 from ..io.reading import Reading, ends_of
@@ -110,7 +110,7 @@ def forecast(run: Positional[Path], out: Path, how: ForecastFlags = ForecastFlag
             forecast.csv, the standard error of each body's surface; forecast.json.
         seed: Seed of the fits to half-sets.
     """
-    require(seed >= 0, f"--seed must be 0 or more, but it is {seed}.")
+    whole_seed("--seed", seed)
     options, folder, new = how.options(), RunFolder(run), RunFolder(out)
     new.require_new()
     tracked = load_reconstruction(folder)

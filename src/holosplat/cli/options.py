@@ -76,10 +76,10 @@ class MaterialOptions:
 
         require(self.medium is not None or self.medium_density is None, "--medium-density needs --medium.")
         table = read_material_table(self.materials) if self.materials else {}
-        named = self.material or (None if table else "haemoglobin")
+        named = self.material if self.material is not None or table else "haemoglobin"
         require(named is not None or self.density is None, "--density needs --material.")
         return Filling(
-            parse_material(named, self.density) if named else None,
+            parse_material(named, self.density) if named is not None else None,
             parse_material(self.medium, self.medium_density) if self.medium is not None else None,
             table,
         )

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from ..checks import InputError, require
+from ..checks import InputError, require, whole_seed
 from .options import BeamlineOptions, MeshOptions, MotionOptions
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ class GeneratedOptions:
         size = self.specimen_size or 0.85 * min(beamline.detector) * pixel
         edge, seed, box = self.specimen_edge, self.specimen_seed, (size, size, size)
         edge = min(3 * pixel, 0.04 * size) if edge is None else edge
-        require(seed >= 0, f"--specimen-seed must be 0 or more, but it is {seed}.")
+        whole_seed("--specimen-seed", seed)
         matter = filling.of(self.specimen, beamline.energy_kev)
         cores, goes = self._cores(filling, beamline.energy_kev), self.specimen_motion
         require(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from ..checks import positive, require
+from ..checks import positive, require, whole_seed
 from ..io.formats import read_as
 from ..io.json import write_json
 from ..io.reading import Reading
@@ -114,7 +114,7 @@ def track(
         seed: Seed of everything random.
         resume: Go on with an interrupted run.
     """
-    require(seed >= 0, f"--seed must be 0 or more, but it is {seed}.")
+    whole_seed("--seed", seed)
     require(
         reading.part.time_frame is None,
         f"bodies are followed through all times, but --time-frame is {reading.part.time_frame}; leave it.",

@@ -245,7 +245,13 @@ def _own_scan(meta: Table, entries: list[Table], lines: np.ndarray, is_test: np.
     exposures = read_exposures(ours, [frames[k] for k in order], (h, w))
     contact = replace(exposures, distance=np.array(0.0), psf_sigma_px=np.array(0.0))
     cut = lines[order, top : top + h, left : left + w]
-    return _absorber(cut, contact, is_test[order], ours.number("metres_per_unit"), ours.texts("provenance"))
+    return _absorber(
+        cut,
+        contact,
+        is_test[order],
+        positive("metres_per_unit", ours.number("metres_per_unit"), "metres"),
+        ours.texts("provenance"),
+    )
 
 
 def _absorber(

@@ -53,6 +53,10 @@ FLAT_LEVELS = (0.2, 5.0)
 """Between these lies the median of frames that are relative to the flat field."""
 
 
+MOST_NEGATIVE = 0.25
+"""Share of the pixels that may be below zero: noise makes half of those so that an absorber darkens wholly."""
+
+
 def reconstruct(
     scan: Scan,
     prior: MaterialPrior,
@@ -135,6 +139,11 @@ def check_frames(train: Scan) -> None:
         FLAT_LEVELS[0] < level < FLAT_LEVELS[1],
         f"frames must be relative to the flat field (about 1 beside the sample), but their median is {level:.4g}; "
         "add flats (image_key 1) to the scan, or divide by them.",
+    )
+    negative = float((train.frames < 0).mean())
+    require(
+        negative <= MOST_NEGATIVE,
+        f"frames must be intensities, but {negative:.0%} of their pixels are below zero; take off less of the dark.",
     )
 
 
