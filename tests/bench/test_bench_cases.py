@@ -379,7 +379,7 @@ def test_views_that_cannot_be(tmp_path):
 def test_names_and_seeds_are_checked(tmp_path):
     with pytest.raises(InputError, match=r"case must be one of main12, .*, or a TOML file, but it is 'main13'"):
         load_case("main13")
-    with pytest.raises(InputError, match="must be a readable TOML file"):
+    with pytest.raises(InputError, match="must be a TOML file, but there is no such file"):
         load_case(tmp_path / "none.toml")
     with pytest.raises(InputError, match="seed must be 0 or more, but it is -1"):
         load_case("main12", -1)

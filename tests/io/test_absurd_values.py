@@ -22,7 +22,7 @@ VIEWS = Views.evenly_spaced(2, (5, 13), 1e-6)
 @pytest.mark.parametrize("seed", [-1, 1 << 63, 1 << 70])
 def test_seeds_are_those_that_generators_take(seed):
     assert whole_seed("--seed", (1 << 63) - 1) == (1 << 63) - 1
-    with pytest.raises(InputError, match="--seed must be (0 or more|below 2⁶³), but"):
+    with pytest.raises(InputError, match=r"--seed must be (0 or more|below 2⁶³), but"):
         whole_seed("--seed", seed)
     with pytest.raises(InputError, match="light_seed must be"):
         UnevenLight(light_seed=seed)
