@@ -14,8 +14,9 @@ from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.io.objects import read_object, write_object
 from holosplat.matter import Matter
+from holosplat.projectors.splat.reference import rotation_matrices
 from holosplat.representations import Flow, GaussianCloud, Lattice, MovingGaussians, TimeBasis
-from holosplat.representations.principal import principal_axes, quaternions_of, rotations
+from holosplat.representations.principal import principal_axes, quaternions_of
 
 LATTICE = Lattice.around((40.0, 26.0, 32.0), 4)
 BASIS = TimeBasis(1.0, 3.0, 2)
@@ -54,7 +55,7 @@ def cloud(count: int = 6, dtype: torch.dtype = torch.float64) -> GaussianCloud:
 
 
 def covariance(of: GaussianCloud) -> Tensor:
-    axes = rotations(of.quaternions) * of.scales[:, None]
+    axes = rotation_matrices(of.quaternions) * of.scales[:, None]
     return axes @ axes.mT
 
 
@@ -111,10 +112,10 @@ def test_axes_and_quaternions_are_those_of_the_covariance():
     torch.manual_seed(1)
     shapes = torch.randn(50, 3, 3, dtype=torch.float64)
     logs, quaternions = principal_axes(shapes)
-    axes = rotations(quaternions) * logs.exp()[:, None]
+    axes = rotation_matrices(quaternions) * logs.exp()[:, None]
     assert torch.allclose(axes @ axes.mT, shapes @ shapes.mT, atol=1e-12)
-    turns = rotations(torch.randn(50, 4, dtype=torch.float64))
-    assert torch.allclose(rotations(quaternions_of(turns)), turns, atol=1e-12)
+    turns = rotation_matrices(torch.randn(50, 4, dtype=torch.float64))
+    assert torch.allclose(rotation_matrices(quaternions_of(turns)), turns, atol=1e-12)
 
 
 def test_gradients_are_those_of_finite_differences():

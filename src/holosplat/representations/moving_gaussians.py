@@ -11,10 +11,11 @@ from torch import Tensor
 from ..checks import positive, require
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
+from ..projectors.splat.reference import rotation_matrices
 from ..volume import LineIntegrals, Volume
 from .flow import Flow
 from .gaussians import PARAMETERS, GaussianCloud
-from .principal import principal_axes, rotations
+from .principal import principal_axes
 
 FLOW = "flow_"
 """What the names of the flow's tensors begin with among the parameters."""
@@ -68,7 +69,9 @@ class MovingGaussians:
         if time == flow.reference:
             return cloud
         centres, turned = flow.carried_with_jacobian(cloud.centres, flow.reference, float(time))
-        log_scales, quaternions = principal_axes(turned @ (rotations(cloud.quaternions) * cloud.scales[:, None]))
+        log_scales, quaternions = principal_axes(
+            turned @ (rotation_matrices(cloud.quaternions) * cloud.scales[:, None])
+        )
         raw = cloud.raw_amplitudes
         if self.fading is not None:
             later = (time - flow.reference) / (flow.basis.last - flow.basis.first)

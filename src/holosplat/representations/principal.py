@@ -13,17 +13,6 @@ ALIKE = 1e-3
 nothing there."""
 
 
-def rotations(quaternions: Tensor) -> Tensor:
-    """Rotation matrices [N, 3, 3] of quaternions [N, 4] `(w, x, y, z)` of any length but zero."""
-    w, x, y, z = (quaternions / quaternions.norm(dim=1, keepdim=True)).unbind(1)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
-
-
 def quaternions_of(turns: Tensor) -> Tensor:
     """Quaternions [N, 4] `(w, x, y, z)` of rotation matrices [N, 3, 3], of length one.
 
