@@ -1,4 +1,5 @@
-"""The pictures of motion.md, after the commands at its beginning: `python docs/make_motion.py RUN`."""
+"""The pictures of motion.md, of a run of track: `python docs/make_motion.py RUN`. Those that stand there are of four
+beams as benchmarks/motion.py simulates them (128 × 96 pixels)."""
 
 from __future__ import annotations
 

@@ -15,7 +15,7 @@ import tifffile
 from holosplat.checks import InputError
 from holosplat.geometry import Views
 from holosplat.io import hdf5_guard, read_scan, write_scan
-from holosplat.io.formats import read_as
+from holosplat.io.formats import read, read_as
 from holosplat.io.guard import require_memory, xml_fault
 from holosplat.io.reading import Reading, Told, read_angles
 from holosplat.io.stacks import stack_of
@@ -127,9 +127,9 @@ def test_only_regular_files_are_opened(tmp_path, kind):
         path.mkdir()
     elif kind == "loop":
         path.symlink_to(path)
-    for read in (read_table, read_angles, lambda p: read_meshes([p], "um"), stack_of):
+    for reader in (read_table, read_angles, lambda p: read_meshes([p], "um"), stack_of):
         with pytest.raises(InputError, match=r"must (be|hold)"):
-            read(path)
+            reader(path)
 
 
 @pytest.mark.parametrize(("name", "text"), [("a.json", '{"a": ' + "[" * 100_000), ("a.toml", "a = " + "[" * 100_000)])
@@ -181,6 +181,17 @@ def test_arrays_declare_what_they_hold(tmp_path):
         file.write(bytes(100))
     with pytest.raises(InputError, match=r"a\.npy must be a NumPy array, but reading it failed"):
         stack_of(path)
+
+
+def test_archives_declare_what_they_hold(tmp_path):
+    """A directory that says more than deflate can pack."""
+    path = tmp_path / "a.npz"
+    np.savez_compressed(path, counts=np.zeros(SHAPE, dtype=np.float32))
+    content = bytearray(path.read_bytes())
+    struct.pack_into("<I", content, content.index(b"PK\x01\x02") + 24, 0xFFFFFFF0)
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"a\.npz declares 4\.29e\+09 bytes of values, but holds"):
+        read(path)
 
 
 def test_hidden_files_are_nobodys_frames_or_bodies(tmp_path):

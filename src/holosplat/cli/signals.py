@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import threading
 from types import FrameType
 
 ASKING = (signal.SIGTERM, signal.SIGHUP)
@@ -11,7 +12,9 @@ ASKING = (signal.SIGTERM, signal.SIGHUP)
 
 def end_as_on_interrupt() -> None:
     """From now on these signals do what Ctrl-C does, also where that is switched off, as in jobs of a shell's
-    background; those that are ignored, as under nohup, stay ignored."""
+    background; those that are ignored, as under nohup, stay ignored. Only a main thread can say so."""
+    if threading.current_thread() is not threading.main_thread():
+        return
     for number in ASKING:
         if signal.getsignal(number) is signal.SIG_DFL:
             signal.signal(number, _interrupt)

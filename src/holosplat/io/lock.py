@@ -24,7 +24,7 @@ def sole_writer(folder: Path) -> Iterator[None]:
     """Keep other processes from writing to `folder`, which is made if need be, until the block ends.
 
     The lock of a process that is no more is taken over if it was of this machine, and its half-written files go. A
-    folder that is empty when the block raises goes, too. Errors: `InputError` where another process writes, where that
+    folder that is empty in the end goes, too. Errors: `InputError` where another process writes, where that
     of another machine may do so, and where the folder cannot be written.
     """
     path = Path(os.path.realpath(folder))
