@@ -13,7 +13,8 @@ import numpy as np
 from scipy.ndimage import median_filter
 from scipy.stats import spearmanr
 
-from .study import EXTRA, THESIS_TABLE, Study
+from .configurations import EXTRA, THESIS_TABLE
+from .folder import Study
 
 Verdict = Literal["reproduces", "reproduces in part", "does not reproduce", "cannot be judged"]
 

@@ -29,7 +29,7 @@ from ..report.style import (
 )
 from ..report.tables import Table, duration
 from .findings import Finding, findings
-from .study import Study
+from .folder import Study
 
 TITLE = "The thesis' study, rerun"
 HEAD = ("configuration", "SSIM", "FRCM", "PSNR (dB)", "L1", "Dice", "δ/β", "Gaussians", "ms a step", "time")
