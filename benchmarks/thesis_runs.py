@@ -8,8 +8,8 @@ DIR holds the snapshots of an ESPResSo run, as for espresso_flow.py. A run is on
 subprocess `holosplat bench thesis`; RUNS gets a folder of a study for each schedule, case, physics and seed. What is
 finished is skipped and what was cut off goes on from its checkpoint, so that the same command can be given again.
 `list` says what is left, with its command. `collect` writes runs.csv (a row a run: schedule, case, physics, seed, hash
-of the scan, commit, scores at the end and at the best held-out FRCM) and the curves of each run, and for the pictures
-the maps of those at 10 000 steps and seed 0.
+of the scan, commit, scores at the end and at the best held-out FRCM), the curves of each run, and for the pictures the
+maps of the studies of seed 0.
 """
 
 from __future__ import annotations
@@ -23,12 +23,14 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
+import numpy as np
+
 from holosplat.io.atomic import atomic_path
-from holosplat.thesis.configurations import BESIDE, DECLARED, EXTRA, THESIS_TABLE
+from holosplat.thesis.configurations import BESIDE, DECLARED, EVERY, EXTRA, THESIS_TABLE
 from holosplat.thesis.folder import CURVES, StudyFolder
 from holosplat.thesis.measured import PHYSICS
 
@@ -65,24 +67,15 @@ class Task:
 
 def tasks() -> list[Task]:
     """All of them, the most telling first."""
-    first = [Task("third", name) for name in (*SMALL, *OURS)]
-    other_physics = [Task("third", MAIN, physics=physics) for physics in PHYSICS if physics != "declared"]
-    long = [Task("full", name) for name in (*SMALL, *OURS)]
-    again = [Task("third", name, seed=seed) for seed, name in product(SEEDS[1:], (*SMALL, *OURS))]
-    again += [Task("third", MAIN, "thesis8", seed=seed) for seed in SEEDS[1:]]
-    again += [Task("third", MAIN, physics=p, seed=seed) for seed, p in product(SEEDS[1:], PHYSICS) if p != "declared"]
-    fewer = [Task("third", MAIN, "thesis8"), Task("full", MAIN, "thesis8")]
+    at_once = [Task("third", name) for name in (*SMALL, *OURS)]
+    long = [Task("full", name) for name in (MAIN, *(name for name in (*SMALL, *OURS) if name != MAIN))]
+    others = [Task("third", MAIN, "thesis8")]
+    others += [Task("third", MAIN, physics=physics) for physics in PHYSICS if physics != "declared"]
+    again = [replace(task, seed=seed) for seed in SEEDS[1:] for task in (*at_once[: len(SMALL)], *others)]
+    again += [replace(task, seed=seed) for seed in SEEDS[1:] for task in at_once[len(SMALL) :]]
     large = [Task(schedule, name) for schedule, name in product(("third", "full"), LARGE)]
-    return [
-        *first,
-        *fewer[:1],
-        *other_physics,
-        *long[: len(SMALL)],
-        *large[:3],
-        *again,
-        *long[len(SMALL) :],
-        *large[3:],
-    ]
+    shortest = [*at_once[: len(SMALL)], long[0], *others, *at_once[len(SMALL) :]]
+    return [*shortest, *large[:1], *again, *long[1:], *large[1:], Task("full", MAIN, "thesis8")]
 
 
 def finished(runs: Path, task: Task) -> bool:
@@ -146,7 +139,7 @@ def rows(runs: Path) -> Iterator[dict[str, object]]:
         about, row = json.loads(folder.about.read_text()), folder.row(task.name)
         looks = {f"{when}_{key}": value for when in ("last", "best") for key, value in row[when].items()}
         kept = {key: row[key] for key in ("status", "diverged_at", "steps", "seconds", "commit")}
-        about = {"scan_hash": about["scan_hash"][:12], "true_ratio": f"{about['true_delta'] / about['true_beta']:.6g}"}
+        about = {key: about[key] for key in ("scan_hash", "true_delta", "true_beta")}
         yield {key: getattr(task, key) for key in IDENTITY} | kept | about | looks
 
 
@@ -163,7 +156,22 @@ def collect(runs: Path) -> None:
             continue
         source = runs / task.study / f"{task.name}.curves.csv"
         (DATA / f"{task.study}_{task.name}.csv").write_bytes(source.read_bytes())
+    for study in ("third_thesis16_declared_0", "full_thesis16_declared_0"):
+        if (runs / study).is_dir():
+            collect_maps(runs / study, DATA / f"maps_{study}.npz")
     print(f"{len(found)} of {len(tasks())} runs, {len(CURVES)} columns of curves each, in {DATA}")
+
+
+def collect_maps(study: Path, out: Path) -> None:
+    """One file of what pictures show: the middle slice of each configuration, line integrals of one, the truth."""
+    found, folder = {}, StudyFolder(study)
+    for name in (c.name for c in EVERY if folder.finished(c.name)):
+        maps = folder.maps(name)
+        found[f"{name}/slice"] = maps["slice"]
+        if name == MAIN:
+            found |= {f"{name}/{key}": maps[key] for key in ("true_slice", "steps", "lines", "true_lines")}
+    with atomic_path(out) as path, path.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **found)
 
 
 def main() -> None:

@@ -115,8 +115,7 @@ def psnr_figure(study: Study) -> Figure:
 @styled
 def lines_figure(study: Study) -> Figure:
     """Phase and absorption of a held-out view through training: a row each, a column a look, the truth last."""
-    name = MAIN if MAIN in study.maps else next(iter(study.maps))
-    maps = study.maps[name]
+    maps = study.maps.get(MAIN) or next(iter(study.maps.values()))
     every = np.concatenate((maps["lines"], maps["true_lines"][None]))
     titles = [f"step {step}" for step in maps["steps"]] + ["truth"]
     figure = new_figure(WIDTH, 1.9)
@@ -135,7 +134,7 @@ def lines_figure(study: Study) -> Figure:
 def geometry_figure(study: Study) -> Figure:
     """The middle slice of δ of each configuration, and the truth."""
     names = list(study.maps)
-    true = study.maps[names[0]]["true_slice"]
+    true = next(maps["true_slice"] for maps in study.maps.values() if "true_slice" in maps)
     columns = 3
     figure = new_figure(WIDTH, 1.05 * (len(names) // columns + 1))
     panels = list(figure.subplots(len(names) // columns + 1, columns, squeeze=False).flat)
