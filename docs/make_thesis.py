@@ -15,10 +15,10 @@ import numpy as np
 from holosplat.io.atomic import atomic_path
 from holosplat.report.style import scientific
 from holosplat.thesis.configurations import EVERY, PACES, THESIS_TABLE
-from holosplat.thesis.figures import PICTURES, pictures, save
 from holosplat.thesis.findings import Finding, findings
 from holosplat.thesis.folder import CURVES, Study
-from holosplat.thesis.pages import markdown_table
+from holosplat.thesis.pages.figures import PICTURES, pictures, save
+from holosplat.thesis.pages.page import markdown_table
 
 DOCS = Path(__file__).resolve().parent
 DATA, IMAGES, PAGE = DOCS / "data" / "thesis_study", DOCS / "images", DOCS / "thesis_tables.md"
@@ -30,8 +30,8 @@ INTRODUCTION = """# Tables of the thesis' study
 
 Made by `python docs/make_thesis.py` from `docs/data/thesis_study/runs.csv`; what they mean stands in
 [thesis_study.md](thesis_study.md). Scores are of held-out frames at the last step; where there are several seeds (of
-the scene and of the start), means, and behind ± half of what lies between the least and the greatest. “best FRCM” is where
-an early stop would end, and the step. δ/β (true: 2808) is taken inside the true cells, and as mean and median of
+the scene and of the start), means, and behind ± half of what lies between the least and the greatest. “best FRCM” is
+where an early stop would end, and the step. δ/β (true: 2808) is taken inside the true cells, and as mean and median of
 the Gaussians' own ratios. Times are those of a machine that others used.
 """
 

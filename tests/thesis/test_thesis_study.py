@@ -14,14 +14,14 @@ from holosplat.checks import InputError
 from holosplat.cli import thesis as command
 from holosplat.fit.loop import DivergedError, Fit
 from holosplat.materials import HAEMOGLOBIN
-from holosplat.thesis import pages as report
 from holosplat.thesis import study as thesis_study
 from holosplat.thesis.configurations import EVERY, PACES, THESIS_TABLE, Pace
-from holosplat.thesis.figures import LINES, PICTURES, pictures
 from holosplat.thesis.findings import findings
 from holosplat.thesis.folder import CURVES, StudyFolder, load_study
 from holosplat.thesis.measured import Measured
-from holosplat.thesis.pages import study_markdown, write_study
+from holosplat.thesis.pages import page as report
+from holosplat.thesis.pages.figures import LINES, PICTURES, pictures
+from holosplat.thesis.pages.page import study_markdown, write_study
 from holosplat.thesis.study import random_start, run_study, thesis_fit
 
 SMALL = replace(THESIS_TABLE[1], count=60, threshold=1.0, amplitude_rate=0.1)

@@ -59,7 +59,7 @@ def thesis(
 
 def _report(folder: StudyFolder) -> None:
     from ..thesis.folder import load_study
-    from ..thesis.pages import write_study
+    from ..thesis.pages.page import write_study
 
     for path in write_study(load_study(folder), folder.path):
         _say(f"wrote {path}")

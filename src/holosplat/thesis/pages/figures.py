@@ -11,8 +11,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..report.style import CYCLE, DPI, FAINT, INK, WIDTH, colour_bar, decimal_scale, letter, new_figure, styled
-from .folder import Study
+from ...report.style import CYCLE, DPI, FAINT, INK, WIDTH, colour_bar, decimal_scale, letter, new_figure, styled
+from ..folder import Study
 
 SOLID, DASHED, DOTTED, DASH_DOTTED = "-", (0, (4, 1.5)), (0, (1, 1.2)), (0, (4, 1.2, 1, 1.2))
 LINES: dict[str, tuple[str, Any]] = {

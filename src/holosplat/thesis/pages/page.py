@@ -8,15 +8,15 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from ..io.atomic import atomic_path
-from ..report.blocks import Block
-from ..report.content import flatten
-from ..report.page import template
-from ..report.style import data_uri, scientific
-from ..report.tables import Table, duration
+from ...io.atomic import atomic_path
+from ...report.blocks import Block
+from ...report.content import flatten
+from ...report.page import template
+from ...report.style import data_uri, scientific
+from ...report.tables import Table, duration
+from ..findings import Finding, findings
+from ..folder import Study
 from .figures import Picture, pictures, save
-from .findings import Finding, findings
-from .folder import Study
 
 TITLE = "The thesis' study, rerun"
 HEAD = ("configuration", "SSIM", "FRCM", "best FRCM (step)", "PSNR (dB)", "L1")
