@@ -5,8 +5,8 @@
     python benchmarks/main_job.py --cases snapshot --meshes DIR/rbc*_049.vtk
     OMP_NUM_THREADS=1 python benchmarks/main_job.py --cases cells nine --surfaces --csv docs/data/main_job.csv
 
-Settings were chosen on other scenes (seeds below 100). Prints one JSON object, or a Markdown table; `--csv` adds each row
-to a file as it comes, and leaves out what the file has.
+Settings were chosen on other scenes (seeds below 100). Prints one JSON object, or a Markdown table; `--csv` adds each
+row to a file as it comes, and leaves out what the file has.
 """
 
 from __future__ import annotations
