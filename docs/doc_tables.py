@@ -159,7 +159,7 @@ def by_method(
 
 def _cell(numbers: dict[str, float], name: str) -> str:
     if name == "delta_deviation":
-        return f"{100 * numbers[name]:+.0f} %".replace("-", "−")
+        return f"{round(100 * numbers[name]):+d} %".replace("-", "−")
     return f"{numbers[name]:.3f}"
 
 

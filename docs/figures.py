@@ -13,17 +13,16 @@ from __future__ import annotations
 import argparse
 import importlib
 import re
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import doc_tables as benchmark
+import doc_tables_measured as measured
+import doc_tables_runs as runs
+
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
-sys.path[:0] = [str(DOCS)] if str(DOCS) not in sys.path else []
-
-import doc_tables as benchmark
-import doc_tables_runs as runs
 
 MARKED = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(\n<!-- end -->)", re.DOTALL)
 
@@ -104,6 +103,19 @@ TABLES |= {
         runs.snapshot, ("main_job.csv",), JOBS.format("snapshot --meshes DIR/rbc*_049.vtk"), "two minutes"
     ),
 }
+REAL = "python benchmarks/real_data.py --data FOLDER"
+TABLES |= {
+    name: Table(make, ("real_data.csv",), REAL, "half an hour")
+    for name, make in (
+        ("dome", measured.dome),
+        ("whole", measured.whole),
+        ("tooth", measured.tooth),
+        ("hair", measured.hair),
+    )
+}
+TABLES["bed"] = Table(
+    measured.bed, ("real_data.csv",), "python benchmarks/packed_bed.py --data FOLDER --work FOLDER", "an hour"
+)
 
 
 @dataclass(frozen=True)
