@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import csv
-import math
 from collections import defaultdict
 from collections.abc import Sequence
+from decimal import ROUND_HALF_UP, Decimal
 from pathlib import Path
 
 from holosplat.bench.case import case_names
@@ -214,8 +214,10 @@ def round_cell() -> str:
 
 
 def rounded(value: str, digits: int) -> str:
-    """A number of a file; a dash where there is none."""
-    return "–" if value in ("", "nan") or math.isnan(float(value)) else f"{float(value):.{digits}f}"
+    """A number of a file, halves of its last digit away from zero; a dash where there is none."""
+    if value in ("", "nan"):
+        return "–"
+    return str(Decimal(value).quantize(Decimal(1).scaleb(-digits), ROUND_HALF_UP))
 
 
 def shown(numbers: dict[str, float], name: str) -> str:

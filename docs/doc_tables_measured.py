@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from doc_tables import markdown, read
+from doc_tables import markdown, read, rounded
 
 Values = dict[tuple[str, str, str], str]
 """(case, method, measure) → value; the last row of a file counts."""
@@ -18,7 +18,7 @@ def values() -> Values:
 
 def three(found: Values, case: str, method: str, measure: str) -> str:
     """A number to three digits."""
-    return f"{float(found[case, method, measure]):.3f}"
+    return rounded(found[case, method, measure], 3)
 
 
 def dome() -> str:
