@@ -16,8 +16,11 @@ def in_few_colours(source: Path, target: Path, colours: int, width: int | None =
     image.quantize(colours, dither=Image.Dither.NONE).save(target, optimize=True)
 
 
-def commit() -> str:
-    """The commit that draws, with a mark if the tree was changed."""
+def _described() -> str:
     command = ["git", "describe", "--always", "--dirty", "--abbrev=7", "--exclude=*"]
     shown = subprocess.run(command, capture_output=True, text=True, check=False, cwd=Path(__file__).parent)
     return shown.stdout.strip() or "unknown"
+
+
+COMMIT = _described()
+"""The commit that draws, with a mark if the tree was changed before."""

@@ -24,7 +24,7 @@ import doc_tables_runs as runs
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
 
-MARKED = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(\n<!-- end -->)", re.DOTALL)
+MARKED = re.compile(r"(<!-- table: ([\w-]+) -->\n)(?:(?!<!--).)*(<!-- end -->)", re.DOTALL)
 
 
 @dataclass(frozen=True)
@@ -191,7 +191,7 @@ def pages() -> list[Path]:
 
 def filled(text: str) -> str:
     """A page with its tables made anew."""
-    return MARKED.sub(lambda found: f"{found[1]}{TABLES[found[2]].make()}{found[3]}", text)
+    return MARKED.sub(lambda found: f"{found[1]}{TABLES[found[2]].make()}\n{found[3]}", text)
 
 
 def changed() -> dict[Path, str]:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from drawing import commit
+from drawing import COMMIT
 
 import holosplat as hs
 from holosplat.beamline.misalignment import Misalignment
@@ -96,7 +96,7 @@ def imperfections() -> None:
     for n, (title, (label, scan)) in enumerate(cases().items()):
         result = hs.reconstruct(scan, hs.MaterialPrior.known(MATERIAL), hs.preset("fast"))
         scores = hs.evaluate(result, scan, truth).headline()
-        rows.append([label, *(f"{scores[score]:.6g}" for score in SCORES), commit()])
+        rows.append([label, *(f"{scores[score]:.6g}" for score in SCORES), COMMIT])
         above, below = grid.axes[0][n], grid.axes[1][n]
         frame = image_panel(above, scan.frames[2][INNER], (PIXEL, PIXEL), GREY, CONTRAST)
         letter(above, n, title)

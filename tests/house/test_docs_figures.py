@@ -32,6 +32,14 @@ def test_a_number_that_drifts_is_seen(figures):
     assert page.count("| 0.0757 |") == 1
 
 
+def test_an_empty_table_takes_nothing_with_it(figures):
+    page = "<!-- table: verdicts -->\n<!-- end -->\nText.\n<!-- table: round-cell -->\n|\n<!-- end -->\n"
+    parts = figures.filled(page).split("<!-- end -->\n")
+    assert parts[0].startswith("<!-- table: verdicts -->\n| run | error of δ")
+    assert parts[1].startswith("Text.\n<!-- table: round-cell -->\n| | δ/β told")
+    assert len(parts) == 3
+
+
 def test_every_table_stands_in_a_page_and_has_its_data(figures):
     found = [name for page in figures.pages() for _, name, _ in figures.MARKED.findall(page.read_text("utf-8"))]
     assert sorted(found) == sorted(figures.TABLES)

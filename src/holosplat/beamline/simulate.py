@@ -21,9 +21,9 @@ from ..volume import Object
 from .light import EVEN_LIGHT, UnevenLight
 
 SIMULATED_FRINGE_SAMPLES = 8
-"""Samples on the first fringe in simulations: frames of the benchmark are then right to 1 % of their contrast, and to
-0.2 % where pixels are fine (rms; docs/data/propagation.csv); faces exactly along the beam, where the phase jumps,
-converge more slowly (a few per cent)."""
+"""Samples on the first fringe in simulations: frames of the benchmark are then right to 1 % of their contrast (rms), most
+of them to half of that (docs/data/propagation.csv); faces exactly along the beam, where the phase jumps, converge more
+slowly (a few per cent)."""
 MOST_PULSES = 10_000
 
 
