@@ -94,15 +94,6 @@ TABLES = {
     "skalak": Table(runs.skalak, ("tweezers.csv",), "python benchmarks/tweezers.py", "minutes"),
     "springs": Table(runs.springs, ("tweezers.csv",), "python benchmarks/tweezers.py", "minutes"),
 }
-JOBS = "OMP_NUM_THREADS=1 python benchmarks/main_job.py --cases {} --surfaces --csv docs/data/main_job.csv"
-TABLES |= {
-    "main-job": Table(runs.main_job, ("main_job.csv",), JOBS.format("cells"), "ten minutes"),
-    "worst": Table(runs.worst, ("main_job.csv",), JOBS.format("cells"), "ten minutes"),
-    "harder": Table(runs.harder, ("main_job.csv",), JOBS.format("nine free ratio noise poses plasma"), "an hour"),
-    "snapshot": Table(
-        runs.snapshot, ("main_job.csv",), JOBS.format("snapshot --meshes DIR/rbc*_049.vtk"), "two minutes"
-    ),
-}
 REAL = "python benchmarks/real_data.py --data FOLDER"
 TABLES |= {
     name: Table(make, ("real_data.csv",), REAL, "half an hour")

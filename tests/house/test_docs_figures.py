@@ -52,13 +52,15 @@ def test_every_picture_is_made_by_something_and_there(figures):
     made = {name for figure in figures.FIGURES.values() for name in figure.pictures}
     made |= {name for names in figures.ELSEWHERE for name in names}
     images = DOCS / "images"
-    assert made == {path.relative_to(images).as_posix() for path in images.rglob("*.*")}
+    there = {path.relative_to(images).as_posix() for path in images.rglob("*.*")}
+    assert made == there, "docs/figures.py must name every picture, in FIGURES or ELSEWHERE"
     assert all("def main(" in (DOCS / f"{f.module}.py").read_text("utf-8") for f in figures.FIGURES.values())
 
 
 def test_every_data_file_is_named(figures):
-    """By a page, or by the table that it makes."""
-    text = "\n".join(page.read_text(encoding="utf-8") for page in figures.pages())
+    """By a page, a script or a test, or by the table that it makes."""
+    scripts = [path for room in ("src", "benchmarks", "tests") for path in (ROOT / room).rglob("*.py")]
+    text = "\n".join(path.read_text(encoding="utf-8") for path in [*figures.pages(), *scripts])
     named = {name.split("/")[0] for name in re.findall(r"\bdata/([\w./-]+\w)", text)}
     named |= {file for table in figures.TABLES.values() for file in table.data}
     assert sorted(p.name for p in (DOCS / "data").iterdir() if p.name not in named) == []
