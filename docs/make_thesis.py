@@ -11,9 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from holosplat.io.atomic import atomic_path
-from holosplat.report.style import scientific
+from holosplat.report.style import CYCLE, FAINT, WIDTH, letter, new_figure, scientific, styled
 from holosplat.thesis.configurations import EVERY, PACES, THESIS_TABLE
 from holosplat.thesis.findings import Finding, findings
 from holosplat.thesis.folder import CURVES, Study
@@ -22,6 +23,8 @@ from holosplat.thesis.pages.page import markdown_table
 
 DOCS = Path(__file__).resolve().parent
 DATA, IMAGES, PAGE = DOCS / "data" / "thesis_study", DOCS / "images", DOCS / "thesis_tables.md"
+CELL_PX = 7.8
+"""Width of a cell of the case [pixels]."""
 SCHEDULES = {"third": "10 000 steps", "full": "30 000 steps"}
 PLAIN = ("thesis16", "declared")
 HEAD = ("configuration", "seeds", "SSIM", "FRCM", "best FRCM (at)", "PSNR (dB)", "Dice")
@@ -31,7 +34,7 @@ INTRODUCTION = """# Tables of the thesis' study
 Made by `python docs/make_thesis.py` from `docs/data/thesis_study/runs.csv`; what they mean stands in
 [thesis_study.md](thesis_study.md). Scores are of held-out frames at the last step; where there are several seeds (of
 the scene and of the start), means, and behind ± half of what lies between the least and the greatest. “best FRCM” is
-where an early stop would end, and the step. δ/β (true: 2808) is taken inside the true cells, and as mean and median of
+where an early stop would end, and the step. δ/β (true: 2800) is taken inside the true cells, and as mean and median of
 the Gaussians' own ratios. Times are those of a machine that others used.
 """
 
@@ -172,8 +175,34 @@ def studies(rows: Sequence[Row]) -> dict[str, Study]:
     return found
 
 
+@styled
+def sampling_figure() -> Figure:
+    """Errors of frames over wave samples a pixel, and what views resolve over their number, from sampling.csv."""
+    with (DATA / "sampling.csv").open(newline="") as file:
+        found = list(csv.DictReader(file))
+    figure = new_figure(0.8 * WIDTH, 2.2)
+    left, right = figure.subplots(1, 2)
+    for index, (physics, said) in enumerate((("declared", "10 cm"), ("far", "50 cm"))):
+        chosen = [row for row in found if row["of"] == physics]
+        counts, values = ([float(row[key]) for row in chosen] for key in ("count", "value"))
+        left.plot(counts, values, "o-", ms=3, color=CYCLE[index], label=said)
+    left.set(xlabel="wave samples a pixel", ylabel="error / contrast", xscale="log", yscale="log")
+    left.set_xticks([1, 2, 4, 8], ["1", "2", "4", "8"], minor=False)
+    left.minorticks_off()
+    left.legend()
+    letter(left, 0, "Supersampling")
+    chosen = [row for row in found if row["what"] == "angle"]
+    counts, values = ([float(row[key]) for row in chosen] for key in ("count", "value"))
+    right.plot(counts, values, "o-", ms=3, color=CYCLE[0])
+    right.axhline(CELL_PX, color=FAINT, ls="--", lw=0.8)
+    right.set(xlabel="views over 180°", ylabel="resolved length (pixels)", ylim=(0, None))
+    letter(right, 1, "Angular sampling")
+    return figure
+
+
 def main() -> None:
     """Write the page and the pictures."""
+    save(sampling_figure(), IMAGES / "thesis_sampling.png")
     rows = read_rows()
     with atomic_path(PAGE) as temporary:
         temporary.write_text(page(rows), encoding="utf-8")

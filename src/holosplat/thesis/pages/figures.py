@@ -118,15 +118,15 @@ def lines_figure(study: Study) -> Figure:
     maps = study.maps.get(MAIN) or next(iter(study.maps.values()))
     every = np.concatenate((maps["lines"], maps["true_lines"][None]))
     titles = [f"step {step}" for step in maps["steps"]] + ["truth"]
-    figure = new_figure(WIDTH, 1.9)
-    grid = figure.subplots(2, len(every), squeeze=False)
+    figure = new_figure(WIDTH, 1.35)
+    grid = figure.subplots(2, len(every) + 1, squeeze=False, width_ratios=[*[1.0] * len(every), 0.06])
     for row, (label, axes_row) in enumerate(zip(("k∫δ (rad)", "k∫β"), grid)):
         top = float(np.percentile(maps["true_lines"][row], 99.5)) or 1.0
-        for axes, lines, title in zip(axes_row, every, titles):
+        for axes, lines, title in zip(axes_row[:-1], every, titles):
             drawn = axes.imshow(lines[row], vmin=0, vmax=top, cmap="magma")
             axes.set(xticks=[], yticks=[], title=title if row == 0 else "")
         axes_row[0].set_ylabel(label)
-        colour_bar(figure, drawn, axes_row[-1], label, extend="max")
+        colour_bar(figure, drawn, axes_row[-1], "rad" if row == 0 else "", extend="max")
     return figure
 
 
@@ -135,17 +135,19 @@ def geometry_figure(study: Study) -> Figure:
     """The middle slice of δ of each configuration, and the truth."""
     names = list(study.maps)
     true = next(maps["true_slice"] for maps in study.maps.values() if "true_slice" in maps)
-    columns = 3
-    figure = new_figure(WIDTH, 1.05 * (len(names) // columns + 1))
-    panels = list(figure.subplots(len(names) // columns + 1, columns, squeeze=False).flat)
-    top = float(true.max())
+    columns = 4
+    rows = len(names) // columns + 1
+    figure = new_figure(WIDTH, 0.95 * rows)
+    grid = figure.subplots(rows, columns + 1, squeeze=False, width_ratios=[*[1.0] * columns, 0.05])
+    panels, top = list(grid[:, :-1].flat), float(true.max())
+    scale, power = decimal_scale(top)
     for axes, title, picture in zip(panels, ("truth", *names), (true, *(study.maps[n]["slice"] for n in names))):
-        drawn = axes.imshow(picture, vmin=0, vmax=1.5 * top, cmap="magma")
+        drawn = axes.imshow(picture / scale, vmin=0, vmax=1.5 * top / scale, cmap="magma")
         axes.set(xticks=[], yticks=[])
         axes.set_title(title, loc="left")
-    for axes in panels[len(names) + 1 :]:
+    for axes in (*panels[len(names) + 1 :], *grid[1:, -1]):
         axes.axis("off")
-    colour_bar(figure, drawn, panels[0], "δ", extend="max")
+    colour_bar(figure, drawn, grid[0, -1], f"δ ({power})", extend="max")
     return figure
 
 
