@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from ..checks import InputError, in_range, require, whole_seed
+from ..checks import InputError, require, whole_seed
 from ..io.reading import Reading
 from .align import RefineOptions
 from .options import BeamlineOptions, MethodOptions, PriorOptions, RunLightFlags, TruthOptions
@@ -20,8 +19,6 @@ from .progress import INTERRUPTED, ProgressBar
 if TYPE_CHECKING:
     from ..workflows.evaluate import Evaluation
     from ..workflows.reconstruct import Reconstruction
-    from ..workflows.run_folder import RunFolder
-    from .scans import Moment
 
 LIGHT = RunLightFlags()
 """Even, unless the air of frames says otherwise."""
@@ -29,8 +26,6 @@ AS_PLANNED = RefineOptions()
 """Beams are where the scan says."""
 UNEXPLAINED = 3
 """Exit code of `reconstruct --strict` where frames are not explained."""
-MOST_VOXELS = 2**31
-"""The largest volume that `export` writes: 16 GB for δ and β."""
 
 
 def reconstruct(
@@ -161,78 +156,6 @@ def render(
     frames = predict(result, chosen.exposures)
     write_scan(out, Scan(frames, chosen.exposures, chosen.is_test, {"rendered_from": run.name}))
     _say(f"wrote {out}: {len(frames)} predicted frames")
-
-
-def export(
-    run: Positional[Path],
-    volume: Path | None = None,
-    shape: tuple[int, int, int] | None = None,
-    voxel_size: float | None = None,
-    bodies: Path | None = None,
-    time_frame: int | Literal["all"] | None = None,
-) -> None:
-    """Write δ and β of a run as a volume file, or the bodies of a run of surfaces as meshes.
-
-    Args:
-        run: Run folder.
-        volume: Volume file to write (HDF5).
-        shape: Voxels along z, y, x (default: the scan's field of view, Z = X = W, Y = H).
-        voxel_size: Edge of a voxel [m] (default: the pixel size).
-        bodies: Folder to make, of a run of surfaces: one VTK file a body (µm), the largest first, or of a run of track
-            the same body under the same name at all times.
-        time_frame: Of a run of track: the time, counted from 0 (default: the first), or all, to files and folders whose
-            names end with _t0000 and so on.
-    """
-    from ..workflows.run_folder import RunFolder
-    from .scans import moments_of
-
-    require(volume is not None or bodies is not None, "export needs --volume or --bodies; name what to write.")
-    folder = RunFolder(run)
-    for one in moments_of(folder, time_frame):
-        if bodies is not None:
-            _export_bodies(one, bodies.with_name(bodies.name + one.ending))
-        if volume is not None:
-            _export_volume(one.result, folder, volume.with_stem(volume.stem + one.ending), shape, voxel_size)
-
-
-def _export_bodies(one: Moment, out: Path) -> None:
-    from ..io.folder import require_new
-    from .surface import write_bodies
-
-    found = one.result.object
-    if one.bodies is None:
-        raise InputError(
-            f"--bodies needs a run of surfaces, but this one holds {found.described}; use holosplat surface."
-        )
-    require_new(out)
-    write_bodies(out, one.bodies, found.matter, {})
-    _say(f"wrote {out}: {len(one.bodies)} bodies")
-
-
-def _export_volume(
-    result: Reconstruction,
-    folder: RunFolder,
-    volume: Path,
-    shape: tuple[int, int, int] | None,
-    voxel_size: float | None,
-) -> None:
-    from ..geometry import Grid
-    from ..io.atomic import require_writable
-    from ..io.json import read_json
-    from ..io.volumes import write_voxels
-    from ..scan import PIXEL_RANGE_M
-
-    require_writable(volume)
-    detector = read_json(folder.summary)["detector"]
-    rows, columns = int(detector["rows"]), int(detector["columns"])
-    edge = float(detector["pixel_size_m"]) if voxel_size is None else voxel_size
-    x, y, z = (float(c) for c in detector.get("centre_m", (0.0, 0.0, 0.0)))
-    edge = in_range("voxel size", edge, *PIXEL_RANGE_M, unit="metres")
-    grid = Grid.centred(shape or (columns, rows, columns), edge, (x, y, z))
-    count = math.prod(grid.shape)
-    require(count <= MOST_VOXELS, f"shape must have at most {MOST_VOXELS:.0e} voxels, but it has {count:.0e}.")
-    write_voxels(volume, result.object, grid)
-    _say(f"wrote {volume}: {' × '.join(map(str, grid.shape))} voxels of {1e6 * grid.voxel_size[0]:.4g} µm")
 
 
 def evaluate(

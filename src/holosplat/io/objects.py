@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ..checks import InputError, finite
 from ..representations import KINDS, Stored
+from . import compact
 from .gaussians import FORMAT as GAUSSIANS
 from .gaussians import read_gaussians
 from .hdf5 import Fields, open_hdf5
@@ -35,20 +36,32 @@ def write_object(path: Path, obj: Stored) -> None:
             put(file, name, tensor.detach().cpu().numpy())
 
 
+def write_compact(path: Path, obj: Stored, steps: compact.Steps) -> None:
+    """Write an Object in few bytes, as near as `steps` say; `read_object` reads it."""
+    tensors, plain = _parted(compact.ordered(obj).state())
+    text = json.dumps(plain)
+    assert len(text) < MOST_TEXT
+    with new_hdf5(path) as file:
+        file.attrs.update(format=compact.FORMAT, kind=obj.kind, state=text)
+        compact.encode(file, tensors, steps)
+
+
 def read_object(path: Path) -> Stored:
-    """The Object that `write_object` wrote, or the Gaussians of a file of version 0.1; `InputError` for any other."""
+    """The Object that `write_object` or `write_compact` wrote, or the Gaussians of a file of version 0.1; `InputError`
+    for any other."""
     with open_hdf5(path) as file:
         form = str(file.attrs.get("format", ""))
         if form == GAUSSIANS:
             return read_gaussians(path)
         kind = KINDS.get(str(file.attrs.get("kind", "")))
-        if form != FORMAT or kind is None:
+        if form not in (FORMAT, compact.FORMAT) or kind is None:
             raise InputError(
                 f"{path} must be a {FORMAT!r} file of the kinds {', '.join(KINDS)}, but its format is {form!r}."
             )
         fields, names = Fields(path, file), list[str]()
         file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
-        arrays = {name: finite(fields.label(name), np.asarray(fields.dataset(name)[()])) for name in names}
+        decoded = compact.decode if form == compact.FORMAT else lambda dataset, label: np.asarray(dataset[()])
+        arrays = {n: finite(fields.label(n), decoded(fields.dataset(n), fields.label(n))) for n in names}
         try:
             plain = json.loads(str(file.attrs["state"]))
             return kind.from_state(_joined({name: torch.from_numpy(a) for name, a in arrays.items()}, plain))

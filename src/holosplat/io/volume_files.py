@@ -13,6 +13,8 @@ from ..checks import InputError, finite, in_range, require
 from ..geometry import Grid
 from ..matter import DeltaBeta
 from ..volume import Volume
+from .atomic import atomic_path
+from .hdf5_writing import require_room
 from .volumes import VOXEL_RANGE_M, read_volume
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
@@ -66,6 +68,22 @@ def read_specimen(paths: Sequence[Path], meaning: StackMeaning | None) -> Volume
     values = values.astype(np.float64)
     grid = Grid.centred((values.shape[0], values.shape[1], values.shape[2]), meaning.voxel_size)
     return Volume(meaning.of.delta * values, meaning.of.beta * values, grid)
+
+
+def write_ome_tiff(path: Path, volume: Volume) -> None:
+    """Write δ and β as the two channels of an OME-TIFF, float32, pages along z, with the voxels' size [µm] in it.
+
+    Its coordinates begin at the first voxel: the origin is not in such files.
+    """
+    import tifffile
+
+    values = np.stack([volume.delta, volume.beta]).astype(np.float32)
+    require_room(path, values.nbytes)
+    sizes = {f"PhysicalSize{axis}": 1e6 * size for axis, size in zip("XYZ", volume.grid.voxel_size)}
+    units = {f"PhysicalSize{axis}Unit": "µm" for axis in "XYZ"}
+    described = {"axes": "CZYX", "Channel": {"Name": ["delta", "beta"]}, **sizes, **units}
+    with atomic_path(path) as temporary:
+        tifffile.imwrite(temporary, values, ome=True, metadata=described, compression="zlib")
 
 
 def _pages(path: Path) -> np.ndarray:

@@ -1,0 +1,22 @@
+"""`holosplat export --compact` and OME-TIFF."""
+
+from __future__ import annotations
+
+import tifffile
+
+from helpers.cli import holosplat, refused, worked
+from holosplat.io.objects import read_object
+
+
+def test_a_run_is_exported_in_few_bytes_and_as_a_tiff(shop, tmp_path):
+    done = worked(holosplat("export", shop.run, "--compact", tmp_path / "c.h5", "--volume", tmp_path / "v.ome.tif"))
+    assert "times smaller than object.h5" in done.err
+    assert read_object(tmp_path / "c.h5").described == read_object(shop.run / "object.h5").described
+    with tifffile.TiffFile(tmp_path / "v.ome.tif") as file:
+        assert file.series[0].axes == "CZYX"
+
+
+def test_a_step_without_sense_leaves_nothing(shop, tmp_path):
+    refused(holosplat("export", shop.run, "--compact", tmp_path / "c.h5", "--step-px", "7"), "step must")
+    refused(holosplat("export", shop.run), "--volume, --bodies or --compact")
+    assert not list(tmp_path.iterdir())
