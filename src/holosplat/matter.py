@@ -10,6 +10,7 @@ import numpy as np
 
 from .checks import InputError, require
 from .geometry import Grid
+from .ranges import Signed, ranged
 from .volume import Volume
 
 MatterKind = Literal["levels", "continuous"]
@@ -213,10 +214,11 @@ class KnownTwo(MaterialPrior):
 
 
 @dataclass(frozen=True)
+@ranged
 class KnownRatio(MaterialPrior):
     """One material of which only δ/β is known."""
 
-    ratio: float
+    ratio: Signed
     kind = "ratio"
 
     def __post_init__(self) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import InputError, in_range, require, whole_seed
+from ..checks import InputError, in_range, require
 from ..fit.interrupt import interrupts_held
 from ..io.atomic import atomic_path
 from ..io.folder import require_new
@@ -19,6 +19,7 @@ from ..io.pvd import TimeStep, write_pvd
 from ..io.vtk import write_mesh
 from ..mesh import TriangleMesh
 from ..progress import Advance
+from ..ranges import Seconds, Seed, Small, ranged
 from ..specimens.flow.channel import Channel
 from ..specimens.flow.integrate import State, Stepper
 from ..specimens.flow.suspension import Medium, Suspension
@@ -37,26 +38,27 @@ MOST_CELLS, MOST_SNAPSHOTS = 1000, 100_000
 
 
 @dataclass(frozen=True)
+@ranged
 class Growth:
     """Which cells, in which flow, recorded when."""
 
     cells: int = 16
     """Number of cells."""
-    box: tuple[float, float, float] = (80e-6, 34e-6, 26e-6)
+    box: tuple[Small, Small, Small] = (80e-6, 34e-6, 26e-6)
     """The channel (x, y, z) [m]: flow along x, periodic; walls across y and z."""
     flow: float = 0.05
     """Velocity of the undisturbed flow on the channel's axis [m/s]."""
     snapshots: int = 50
     """Number of snapshots."""
-    interval: float | None = None
+    interval: Seconds | None = None
     """Time between snapshots [s] (default: in which the fastest fluid goes 1 µm)."""
-    warm_up: float = 0.0
+    warm_up: Seconds = 0.0
     """Time before the first snapshot, in which resting cells take up the flow [s]."""
-    diameter: float = DIAMETER
+    diameter: Small = DIAMETER
     """Of a resting cell [m]."""
     frequency: int = 6
     """Resolution f of the meshes: 10 f² + 2 nodes (6: 362)."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the cells' places and directions."""
     tolerance: float = 1e-3
     """Greatest estimated error of a step in time, in mean edges of the mesh."""
@@ -71,7 +73,6 @@ class Growth:
             require(1 <= number <= most, f"{name} must be from 1 to {most}, but it is {number}.")
         in_range("interval", self.period, 1e-12, 1e3, unit="seconds")
         require(0 <= self.warm_up <= 1e3, f"warm_up must be from 0 to 1000 s, but it is {self.warm_up}.")
-        whole_seed("seed", self.seed)
         in_range("tolerance", self.tolerance, 1e-8, 0.1)
 
     @property

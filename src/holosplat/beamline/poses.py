@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from ..checks import require
+from ..ranges import Signed, ranged
 
 if TYPE_CHECKING:
     from ..geometry import Views
@@ -24,14 +25,15 @@ GEOMETRIES: dict[Geometry, tuple[float, ...]] = {
 
 
 @dataclass(frozen=True)
+@ranged
 class Directions:
     """The views of an experiment: exactly one of `views`, `angles_deg`, `rotations` and `geometry`."""
 
     views: int | None = None
     """Number of views, evenly spaced over 180°."""
-    angles_deg: tuple[float, ...] = ()
+    angles_deg: tuple[Signed, ...] = ()
     """Angles about the rotation axis [degrees]."""
-    tilts_deg: tuple[float, ...] = ()
+    tilts_deg: tuple[Signed, ...] = ()
     """Tilts of the beam out of the plane normal to the axis [degrees], one an angle (default: none)."""
     rotations: Path | None = None
     """File (.npy) of rotation matrices [V, 3, 3]."""

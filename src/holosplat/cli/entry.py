@@ -17,6 +17,7 @@ import tyro
 from tyro.conf import OmitArgPrefixes
 
 from ..checks import InputError
+from ..ranges import with_checked_numbers
 from ..version import __version__
 from .progress import INTERRUPTED
 from .signals import end_as_on_interrupt
@@ -141,8 +142,8 @@ def _said(error: BaseException) -> str:
 
 
 def command(name: str) -> Callable[..., None]:
-    """The function of the command `name`, a key of `COMMANDS`; imports its module."""
-    return getattr(import_module(f".{COMMANDS[name][0]}", __package__), name)
+    """The function of the command `name`, a key of `COMMANDS`, whose numbers are checked; imports its module."""
+    return with_checked_numbers(getattr(import_module(f".{COMMANDS[name][0]}", __package__), name))
 
 
 def _functions(arguments: list[str]) -> dict[str, Callable[..., None]]:

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..geometry import Views
 from ..model import Model
+from ..ranges import Natural, Pixels, Share, Weight, ranged
 from ..representations.gaussians import PARAMETERS, GaussianCloud, raw_of, unit_quaternions
 from .optimiser import Leaves
 from .trainable import Trainable
@@ -19,26 +20,27 @@ CENTRES = "object.centres"
 
 
 @dataclass(frozen=True)
+@ranged
 class DensityControl:
     """Options of densification and pruning."""
 
     every: int = 0
     """Steps between events (0: never, as after a phase start, which has its Gaussians)."""
-    start: float = 0.1
+    start: Share = 0.1
     """First event, as a share of all steps."""
-    stop: float = 0.7
+    stop: Share = 0.7
     """Last event, as a share of all steps: what came last needs time to settle."""
-    grow_fraction: float = 0.05
+    grow_fraction: Share = 0.05
     """Share of Gaussians that is cloned or split, those with the largest mean position gradient."""
-    split_scale_px: float = 0.7
+    split_scale_px: Pixels = 0.7
     """Longest axis [pixels] up to which a Gaussian is cloned; longer ones are split in two."""
-    max_count: int = 200_000
+    max_count: Natural = 200_000
     """No growth beyond so many Gaussians."""
-    faint: float = 0.01
+    faint: Share = 0.01
     """Gaussians whose peak is below this share of the material are removed."""
-    huge_px: float = 20.0
+    huge_px: Pixels = 20.0
     """Gaussians with a longer axis [pixels] are removed."""
-    needle: float = 30.0
+    needle: Weight = 30.0
     """Gaussians with a larger ratio of longest to shortest axis are removed; so are those outside every view."""
 
     def due(self, step: int, steps: int) -> bool:

@@ -17,6 +17,7 @@ import numpy as np
 
 from ..checks import InputError, at_least, finite, in_range, positive, require, shaped
 from ..geometry import Grid, Views
+from ..ranges import ranged
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan
 from ..units import wavenumber
 from ..volume import Volume
@@ -37,6 +38,7 @@ SEED_DENSITY = 0.15
 
 
 @dataclass(frozen=True)
+@ranged
 class R2Options:
     """Options of the folder."""
 

@@ -12,6 +12,7 @@ import numpy as np
 from ..checks import InputError, finite, in_range, require
 from ..geometry import Grid
 from ..matter import DeltaBeta
+from ..ranges import Small, ranged
 from ..volume import Volume
 from .volumes import VOXEL_RANGE_M, read_volume
 
@@ -22,6 +23,7 @@ VOLUME_SUFFIXES = (*HDF5_SUFFIXES, *TIFF_SUFFIXES)
 
 
 @dataclass(frozen=True)
+@ranged
 class StackMeaning:
     """What a stack of TIFF images shows.
 
@@ -30,7 +32,7 @@ class StackMeaning:
     z), z for slices along it (rows of a page along y).
     """
 
-    voxel_size: float
+    voxel_size: Small
     of: DeltaBeta
     stacked: Literal["y", "z"] = "y"
 

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from ..checks import InputError, finite, in_range, require, shaped
 from ..mesh import TriangleMesh
+from ..ranges import Stretch, ranged
 
 RADIUS = 3.91e-6
 THICKNESS = (0.81e-6, 7.83e-6, -4.39e-6)
@@ -35,6 +36,7 @@ COARSE_POINTS, FINE_LEVEL = 162, 4
 
 
 @dataclass(frozen=True, eq=False)
+@ranged
 class RedCell:
     """One cell: size, pose and bending. Bending and stretch keep the volume exactly (unit Jacobian)."""
 
@@ -44,7 +46,7 @@ class RedCell:
     """[3, 3], with `x = rotation @ x_cell + centre` and the cell's axis along its own z."""
     centre: np.ndarray = field(default_factory=lambda: np.zeros(3))
     """[3] [m]."""
-    stretch: float = 0.0
+    stretch: Stretch = 0.0
     """Logarithm of the stretch along the cell's x and of the shrinkage along its y."""
     bend: np.ndarray = field(default_factory=lambda: np.zeros(5))
     """[5] amplitudes of the mid-plane's bending [radii]: Zernike's bowl, two saddles, two trefoils, unit rms each."""
