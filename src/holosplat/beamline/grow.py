@@ -10,10 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import InputError, in_range, require
+from ..checks import InputError, as_written, in_range, require
 from ..fit.interrupt import interrupts_held
 from ..io.atomic import atomic_path
 from ..io.folder import require_new
+from ..io.guard import require_archive
 from ..io.json import read_json, write_json
 from ..io.pvd import TimeStep, write_pvd
 from ..io.vtk import write_mesh
@@ -162,12 +163,16 @@ class SeriesFolder:
             return None
         try:
             with np.load(self.state, allow_pickle=False) as file:
+                require_archive(file, self.state)
                 nodes, numbers, counts = file["nodes"], file["numbers"].tolist(), file["counts"].tolist()
         except Exception as error:  # a damaged archive raises many kinds
             raise InputError(f"{self.state} must be a state that grow wrote, but it is damaged; start anew.") from error
         wanted = (growth.cells, len(suspension.membrane.mesh.vertices), 3)
         require(nodes.shape == wanted and bool(np.isfinite(nodes).all()), f"{self.state} is damaged; start anew.")
-        (time, step), (snapshot, taken, refused) = numbers, counts
+        with as_written(self.state, "a state that grow wrote"):
+            (time, step), (snapshot, taken, refused) = numbers, counts
+            good = step > 0 and 0 <= time < np.inf and min(snapshot, taken, refused) >= 0
+            require(good and step < np.inf, f"{self.state} is damaged; start anew.")
         return snapshot, State(torch.from_numpy(nodes), time, step, taken, refused)
 
 

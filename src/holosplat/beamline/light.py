@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from ..checks import at_least, require
-from ..ranges import Pixels, Seed, ranged
+from ..ranges import Pixels, Seed, Signed, ranged
 
 MOST_RMS = 0.2
 """Largest relative deviation of light (rms): beyond, one in a million pixels would have to be dark."""
@@ -44,7 +44,7 @@ class UnevenLight:
     """Relative deviation (rms) of the pattern that all frames and the flat share."""
     light_pattern_px: Pixels = 15.0
     """Correlation length of the pattern [pixels]."""
-    light_drift_px: Pixels = 0.0
+    light_drift_px: Signed = 0.0
     """How far the pattern moves sideways, along rows, from the flat and the first frame to the last [pixels]."""
     light_seed: Seed = 0
     """Seed of the light."""

@@ -13,7 +13,8 @@ from tyro.conf import Positional
 from ..checks import require
 from ..io.reading import Part, Reading
 from ..ranges import ranged
-from .options import LightFlags, PriorOptions
+from .light import LightFlags
+from .options import PriorOptions
 from .progress import ProgressBar
 from .quantities import Degrees, Pixels, Share
 

@@ -12,7 +12,8 @@ from tyro.conf import Positional
 from ..checks import require
 from ..io.reading import Part, Reading
 from ..ranges import Small, ranged
-from .options import LightFlags, MaterialOptions
+from .light import LightFlags
+from .options import MaterialOptions
 from .progress import ProgressBar
 from .quantities import Degrees, Pixels, Share
 

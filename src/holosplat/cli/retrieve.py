@@ -15,7 +15,8 @@ from ..io.phase_maps import PhaseMaps, is_file, require_place, write_phase_maps
 from ..io.reading import Reading
 from ..matter import DeltaBeta, KnownRatio
 from ..ranges import Grams, Signed, ranged
-from .options import LightFlags, PriorOptions
+from .light import LightFlags
+from .options import PriorOptions
 from .progress import ProgressBar
 
 if TYPE_CHECKING:

@@ -22,7 +22,8 @@ from ..workflows.evaluate import evaluate as score
 from ..workflows.run_folder import RunFolder, claimed
 from ..workflows.track import BODIES, COLLECTION, TRACKS
 from ..workflows.track import track as follow
-from .options import LightFlags, PriorOptions
+from .light import LightFlags
+from .options import PriorOptions
 from .progress import INTERRUPTED, ProgressBar
 
 

@@ -23,6 +23,7 @@ from ..units import wavenumber
 from ..volume import Volume
 from .exposure_tables import beam_table, exposure_table, in_order, read_exposures
 from .folder import atomic_folder
+from .guard import read_array
 from .json import write_json
 from .loader import Loader, folder_with
 from .seeds import hull_points
@@ -207,10 +208,7 @@ def _projections(entries: list[Table], shape: tuple[int, ...]) -> np.ndarray:
     images = []
     for entry in entries:
         file = entry.file("file_path")
-        try:
-            image = np.load(file, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise InputError(f"{file} must be an array of numbers (.npy), but it is damaged: {error}.") from None
+        image = read_array(file, "an array of numbers")
         require(image.dtype.kind in "iuf", f"{file} must hold numbers, but its type is {image.dtype}.")
         images.append(finite(str(file), shaped(str(file), image, shape)).astype(np.float32))
     return np.stack(images)

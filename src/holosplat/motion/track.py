@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 
 import torch
 
-from ..checks import InputError, require
+from ..checks import InputError, as_written, require
 from ..fit.running import Record
 from ..fit.schedule import Schedule
 from ..matter import DeltaBeta
@@ -165,8 +165,11 @@ class _Following:
     def take_up(self) -> None:
         """Go on where the journal ends."""
         saved = self.journal.load()
-        if saved is None:
-            return
+        if saved is not None:
+            with as_written("checkpoint.pt", "a checkpoint of this run"):
+                self._take_up(saved)
+
+    def _take_up(self, saved: Mapping[str, Any]) -> None:
         self.stage, self.round, self.oversample = str(saved["next"]), int(saved["round"]), int(saved["oversample"])
         self.bodies = None if saved["bodies"] is None else MovingSurfaces.from_state(saved["bodies"])
         self.seen, self.counts = to_sightings(saved["seen"]), list(saved["counts"])
