@@ -59,8 +59,8 @@ Share = Annotated[float, Within(0, 1)]
 SomeShare = Annotated[float, Within(0, 1, above=True)]
 Weight = Annotated[float, Within(0, 1e6)]
 """Weights of terms, and thresholds in units of a noise or a level."""
-Rate = Annotated[float, Within(0, 1e3)]
-"""Steps of an optimiser, in units of its parameters: more than a thousand of these are no steps."""
+Rate = Annotated[float, Within(0, 1e6)]
+"""Steps of an optimiser, in units of its parameters: more than a million of these are no steps."""
 Pixels = Annotated[float, Within(0, 1e4, unit="pixels")]
 """Lengths on a detector [pixels], which has no more."""
 Metres = Annotated[float, Within(0, 1e4, unit="metres")]

@@ -164,8 +164,7 @@ def test_parts_of_a_run_are_tables(tmp_path, value):
 
 
 def test_what_we_wrote_is_named_when_it_is_garbled(tmp_path):
-    with pytest.raises(InputError, match=r"a\.json must be as it was written, but it lacks or garbles 'x'"):
-        with as_written("a.json"):
-            {}["x"]
+    with pytest.raises(InputError, match=r"a\.json must be .*, but it lacks or garbles 'x'"), as_written("a.json"):
+        {}["x"]
     with pytest.raises(RuntimeError, match="not enough memory"), as_written("a.json"):
         raise RuntimeError("not enough memory: you tried to allocate")

@@ -63,6 +63,10 @@ def require_inflated(label: str, packed: bytes, most: int) -> None:
 def read_array(path: Path, what: str) -> np.ndarray:
     """The array of numbers in a .npy file, which must be `what`; `InputError` for any other, or one cut short."""
     try:
+        with path.open("rb") as file:
+            declared = _declared(file)
+        if declared > path.stat().st_size:
+            raise ValueError(f"it declares {declared:.3g} bytes, but has {path.stat().st_size}")
         return np.array(np.load(path, mmap_mode="r", allow_pickle=False))  # which maps no more than there is
     except (OSError, ValueError, EOFError, TypeError, OverflowError) as error:
         raise InputError(f"{path} must be {what} (.npy), but it is damaged or none: {error}.") from None
