@@ -94,6 +94,12 @@ TABLES = {
     "skalak": Table(runs.skalak, ("tweezers.csv",), "python benchmarks/tweezers.py", "minutes"),
     "springs": Table(runs.springs, ("tweezers.csv",), "python benchmarks/tweezers.py", "minutes"),
 }
+TABLES |= {
+    name: Table(
+        make, ("redesign/main_job_0.2.json",), "python benchmarks/main_job.py --surfaces --json > FILE", "three minutes"
+    )
+    for name, make in (("readme", runs.readme), ("main-job", runs.main_job), ("wanted", runs.wanted))
+}
 REAL = "python benchmarks/real_data.py --data FOLDER"
 TABLES |= {
     name: Table(make, ("real_data.csv",), REAL, "half an hour")

@@ -23,11 +23,7 @@ def main() -> None:
     figure: Figure = new_figure(WIDTH, 2.3)
     for index, (axes, (score, label)) in enumerate(zip(figure.subplots(1, 2), SCORES.items())):
         for colour, (kind, said) in zip(CYCLE, KINDS.items()):
-            for start, mark, what in (
-                ("object", "s", "as it is"),
-                ("compact", "o", "compact"),
-                ("voxels", "^", "voxels"),
-            ):
+            for start, (mark, line, what) in FILES.items():
                 chosen = [row for row in rows if row["kind"] == kind and row["file"].startswith(start)]
                 size = [float(row["bytes"]) / 1e6 for row in chosen]
                 lost = [1 - float(row[score]) if score == "frcm" else float(row[score]) for row in chosen]

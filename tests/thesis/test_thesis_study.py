@@ -121,7 +121,7 @@ def test_a_fit_that_diverges_is_a_result(measured, tmp_path, monkeypatch):
 
 def test_the_loop_raises_what_the_study_catches(measured):
     recipe = QUICK.recipe(SMALL, 22, 1.0)
-    wild = replace(recipe, fit=replace(recipe.fit, rates=replace(recipe.fit.rates, raw_amplitudes=1e38)))
+    wild = replace(recipe, fit=replace(recipe.fit, rates=replace(recipe.fit.rates, raw_amplitudes=1e6, centres=1e6)))
     fit = thesis_fit(measured.scan.train(), random_start(SMALL, measured.scan.views, 20.0, 0), wild, 0)
     with pytest.raises(DivergedError, match="diverged at step") as caught:
         fit.run(lambda record: None)

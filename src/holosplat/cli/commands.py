@@ -10,10 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from ..checks import InputError, require, whole_seed
+from ..checks import InputError, require
 from ..io.reading import Reading
+from ..ranges import Seed
 from .align import RefineOptions
-from .options import BeamlineOptions, MethodOptions, PriorOptions, RunLightFlags, TruthOptions
+from .light import RunLightFlags
+from .options import BeamlineOptions, MethodOptions, PriorOptions, TruthOptions
 from .progress import INTERRUPTED, ProgressBar
 
 if TYPE_CHECKING:
@@ -33,7 +35,7 @@ def reconstruct(
     out: Path,
     matter: PriorOptions = PriorOptions(),
     how: MethodOptions = MethodOptions(),
-    seed: int = 0,
+    seed: Seed = 0,
     resume: bool = False,
     reading: Reading = Reading(),
     *,
@@ -61,7 +63,6 @@ def reconstruct(
     from .motion import asks_for_motion, reconstruct_in_motion
 
     method = how.chosen()
-    whole_seed("--seed", seed)
     uncertain, refine = Uncertain(**reading.told.ranges(), **matter.ranges()), geometry.options()
     require(
         refine is None or reading.part.time_frame not in ("all", "still"),

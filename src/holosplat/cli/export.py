@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import math
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
-from ..checks import InputError, in_range, require
+from ..checks import InputError, as_written, in_range, require
+from ..ranges import Pixels, ranged
 
 if TYPE_CHECKING:
     from ..workflows.reconstruct import Reconstruction
@@ -20,15 +22,25 @@ MOST_VOXELS = 2**31
 """The largest volume that `export` writes: 16 GB for δ and β."""
 
 
+@dataclass(frozen=True)
+@ranged
+class CompactFile:
+    """The object of a run, its numbers rounded to steps and compressed."""
+
+    compact: Path | None = None
+    """File to write (HDF5); of a run of track it holds all times."""
+    step_px: Pixels = 1 / 32
+    """Step of places in it [pixels]; those of sizes, orientations and amplitudes go with it."""
+
+
 def export(
     run: Positional[Path],
     volume: Path | None = None,
     shape: tuple[int, int, int] | None = None,
     voxel_size: float | None = None,
     bodies: Path | None = None,
-    compact: Path | None = None,
-    step_px: float = 1 / 32,
     time_frame: int | Literal["all"] | None = None,
+    few_bytes: CompactFile = CompactFile(),
 ) -> None:
     """Write δ and β of a run as a volume, its bodies as meshes, or its object in few bytes.
 
@@ -40,20 +52,19 @@ def export(
         voxel_size: Edge of a voxel [m] (default: the pixel size).
         bodies: Folder to make, of a run of surfaces: one VTK file a body (µm), the largest first, or of a run of track
             the same body under the same name at all times.
-        compact: File to write of the object itself (HDF5), several times smaller than the run's: its numbers are
-            rounded to steps, and compressed. Of a run of track it holds all times.
-        step_px: Step of places in it [pixels]; those of sizes, orientations and amplitudes go with it.
         time_frame: Of a run of track: the time, counted from 0 (default: the first), or all, to files and folders whose
             names end with _t0000 and so on.
+        few_bytes: The object itself in a file several times smaller than the run's.
     """
     from ..workflows.run_folder import RunFolder
     from .scans import moments_of
 
-    wanted = (volume, bodies, compact)
-    require(any(wanted), "export needs --volume, --bodies or --compact; name what to write.")
+    require(
+        any((volume, bodies, few_bytes.compact)), "export needs --volume, --bodies or --compact; name what to write."
+    )
     folder = RunFolder(run)
-    if compact is not None:
-        _export_compact(folder, compact, step_px)
+    if few_bytes.compact is not None:
+        _export_compact(folder, few_bytes.compact, few_bytes.step_px)
     if volume is None and bodies is None:
         return
     for one in moments_of(folder, time_frame):
@@ -105,10 +116,11 @@ def _export_volume(
     from ..scan import PIXEL_RANGE_M
 
     require_writable(volume)
-    detector = read_json(folder.summary)["detector"]
-    rows, columns = int(detector["rows"]), int(detector["columns"])
-    edge = float(detector["pixel_size_m"]) if voxel_size is None else voxel_size
-    x, y, z = (float(c) for c in detector.get("centre_m", (0.0, 0.0, 0.0)))
+    with as_written(folder.summary, "what reconstruct wrote"):
+        detector = read_json(folder.summary)["detector"]
+        rows, columns = int(detector["rows"]), int(detector["columns"])
+        edge = float(detector["pixel_size_m"]) if voxel_size is None else voxel_size
+        x, y, z = (float(c) for c in detector.get("centre_m", (0.0, 0.0, 0.0)))
     edge = in_range("voxel size", edge, *PIXEL_RANGE_M, unit="metres")
     grid = Grid.centred(shape or (columns, rows, columns), edge, (x, y, z))
     count = math.prod(grid.shape)

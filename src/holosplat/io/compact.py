@@ -17,6 +17,7 @@ import torch
 from torch import Tensor
 
 from ..checks import InputError, in_range
+from ..ranges import ranged
 from ..representations import GaussianCloud, Stored
 
 FORMAT = "holosplat compact 1"
@@ -29,6 +30,7 @@ LEVELS = 2000
 
 
 @dataclass(frozen=True)
+@ranged
 class Steps:
     """The steps of what is stored.
 

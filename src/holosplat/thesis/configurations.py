@@ -18,6 +18,7 @@ from ..fit.terms import Objective
 from ..methods import FitOptions
 from ..methods.gaussian_options import GaussianRates
 from ..methods.presets import preset
+from ..ranges import ranged
 
 LOOK_EVERY = 400
 """Steps of the full schedule between two looks; every fifth falls on a densification, and shows its shock."""
@@ -27,6 +28,7 @@ stands for that of the frames: those of Zha et al. 2024 (R²-Gaussian)."""
 
 
 @dataclass(frozen=True)
+@ranged
 class Configuration:
     """A configuration in the thesis' units.
 

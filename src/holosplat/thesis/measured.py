@@ -8,11 +8,13 @@ import numpy as np
 
 from ..bench.case import Case
 from ..checks import InputError
+from ..ranges import ranged
 from ..scan import Scan
 from ..volume import Object, Volume
 
 
 @dataclass(frozen=True)
+@ranged
 class Physics:
     """What differs from the case as it is declared; None for nothing.
 
