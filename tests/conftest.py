@@ -92,6 +92,15 @@ def undrawn_reports() -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def unjudged_runs() -> Iterator[None]:
+    """Runs are not judged; see `helpers.unjudged`."""
+    from helpers.unjudged import unjudged
+
+    with unjudged():
+        yield
+
+
 @pytest.fixture(scope="session")
 def memory() -> Once:
     """What short runs of this session begin with, by their frames; see `helpers.once`."""

@@ -26,6 +26,8 @@ from holosplat.workflows.evaluate import evaluate, render
 from holosplat.workflows.reconstruct import load_reconstruction
 from holosplat.workflows.run_folder import RunFolder
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 
 def test_a_run_knows_its_material_seed_and_settings(shop):
     config = json.loads((shop.run / "config.json").read_text())

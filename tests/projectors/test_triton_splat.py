@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from helpers.kernels import few_programs
 from helpers.splats import DETECTOR, KINDS, NAMES, VOLUME, cloud, error, poses
 from helpers.watch import Watch
 from holosplat.projectors.splat import splat, voxelise
@@ -20,16 +21,8 @@ FORWARD_TOLERANCE, GRADIENT_TOLERANCE = 1e-5, 5e-5
 
 @pytest.fixture(autouse=True)
 def modules(gpu, monkeypatch):
-    """The modules that walk over boxes, with their usual sizes. The interpreter's time goes by programs: there, each
-    takes many Gaussians."""
-    from holosplat.projectors.splat import triton_boxes, triton_pixels
-
-    usual = {module: module.BLOCKS for module in (triton_pixels, triton_boxes)}
-    if gpu.type == "cpu":
-        for module, blocks in usual.items():
-            many = replace(blocks, gaussians=128, lanes=1024, rounds=1, large=10**6, large_programs=3)
-            monkeypatch.setattr(module, "BLOCKS", many)
-    return usual
+    """The modules that walk over boxes, with their usual sizes."""
+    return few_programs(monkeypatch, gpu)
 
 
 def draw_views(arrays, backend, **options) -> Tensor:
