@@ -3,13 +3,16 @@
     python benchmarks/main_job.py --json                                  # 24 generated cells, seeds 101, 102, 103
     python benchmarks/main_job.py --cases ratio free poses noise nine plasma --surfaces     # harder ones, and surfaces
     python benchmarks/main_job.py --cases snapshot --meshes DIR/rbc*_049.vtk
+    OMP_NUM_THREADS=1 python benchmarks/main_job.py --cases cells nine --surfaces --csv docs/data/main_job.csv
 
-Settings were chosen on other scenes (seeds below 100). Prints one JSON object, or a Markdown table.
+Settings were chosen on other scenes (seeds below 100). Prints one JSON object, or a Markdown table; `--csv` adds each
+row to a file as it comes, and leaves out what the file has.
 """
 
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import os
 import time
@@ -21,6 +24,7 @@ from typing import Any
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 import numpy as np
+import torch
 from machine import commit
 from scipy.spatial.transform import Rotation
 
@@ -109,9 +113,9 @@ def run(case: Case, preset: str, seed: int, surfaces: bool = False) -> list[dict
     """Simulate, reconstruct and score one case; with `surfaces`, a second row for those fitted from the Gaussians."""
     scan = case.scan(seed)
     truth = case.scene.voxelise(hs.Grid.of_views(case.exposures.views))
-    began = time.perf_counter()
+    began, cpu = time.perf_counter(), time.process_time()
     result = hs.reconstruct(scan, case.prior, hs.preset(preset), seed)
-    seconds = time.perf_counter() - began
+    seconds, cpu_seconds = time.perf_counter() - began, time.process_time() - cpu
     assert isinstance(result.object, hs.representations.GaussianCloud)
     scores = hs.evaluate(result, scan, truth)
     material = scores.as_dict()["material"]
@@ -119,17 +123,20 @@ def run(case: Case, preset: str, seed: int, surfaces: bool = False) -> list[dict
         {
             "method": "gaussians",
             "seconds": seconds,
+            "cpu_seconds": cpu_seconds,
             **{f"{stage}_seconds": value for stage, value in result.timing.items()},
             "gaussians": len(result.object),
             **numbers(scores, material),
         }
     ]
     if surfaces:
-        began = time.perf_counter()
+        began, cpu = time.perf_counter(), time.process_time()
         found = hs.methods.refine_surfaces(result.object, scan)
         seconds += time.perf_counter() - began
+        cpu_seconds += time.process_time() - cpu
         refined = score_object(found, scan, truth, oversampling(scan.train()))
-        rows.append({"method": "surfaces", "seconds": seconds, "gaussians": 0, **numbers(refined, material)})
+        times = {"seconds": seconds, "cpu_seconds": cpu_seconds}
+        rows.append({"method": "surfaces", **times, "gaussians": 0, **numbers(refined, material)})
     return [{"seed": seed, "preset": preset, **row} for row in rows]
 
 
@@ -149,16 +156,61 @@ def main() -> None:
     parser.add_argument("--preset", default="default")
     parser.add_argument("--surfaces", action="store_true", help="also fit surfaces; times are those of both together")
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--csv", type=Path, help="add rows to this file, but for those that it has")
     options = parser.parse_args()
     if "snapshot" in options.cases and not options.meshes:
         parser.error("the case snapshot needs --meshes")
-    rows = []
+    rows: list[dict[str, Any]] = []
+    kept = read(options.csv)
     for name in options.cases:
         for seed in [0] if name == "snapshot" else options.seeds:
+            if any((r["case"], r["seed"]) == (name, str(seed)) for r in kept):
+                continue
             case = snapshot(options.meshes) if name == "snapshot" else CASES[name](seed)
             rows += [{"case": name, **row} for row in run(case, options.preset, seed, options.surfaces)]
+            if options.csv:
+                write(kept + [flat(row) for row in rows], options.csv)
     report = {"commit": commit(), **environment("cpu"), "rows": rows}
     print(json.dumps(report, indent=2) if options.json else table(report))
+
+
+COLUMNS = (
+    "case",
+    "seed",
+    "preset",
+    "method",
+    "ssim",
+    "frcm",
+    "psnr",
+    "l1",
+    "dice",
+    "relative_error_delta",
+    "mean_delta",
+)
+COLUMNS += ("true_mean_delta", "delta", "ratio", "single_material", "gaussians", "seconds", "cpu_seconds", "threads")
+COLUMNS += ("commit",)
+
+
+def flat(row: dict[str, Any]) -> dict[str, Any]:
+    """A row as the file has it."""
+    said = row | row["material"] | {"threads": torch.get_num_threads(), "commit": commit()}
+    return {name: f"{said[name]:.6g}" if isinstance(said[name], float) else said[name] for name in COLUMNS}
+
+
+def read(path: Path | None) -> list[dict[str, Any]]:
+    """The rows of a file; none where there is no file."""
+    if path is None or not path.exists():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def write(rows: list[dict[str, Any]], path: Path) -> None:
+    """All rows."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def table(report: dict[str, Any]) -> str:

@@ -145,6 +145,9 @@ def test_events_take_place_when_due(scan):
     options = DensityControl(every=3, start=0.25, stop=0.75)
     assert [step + 1 for step in range(24) if options.due(step, 24)] == [6, 9, 12, 15, 18]
     assert not any(DensityControl(every=0).due(step, 24) for step in range(24))
+    longer = replace(options, prune_stop=1.0)
+    due = {step + 1: longer.grows(step, 24) for step in range(24) if longer.due(step, 24)}
+    assert due == {6: True, 9: True, 12: True, 15: True, 18: True, 21: False, 24: False}
     density = replace(GROW_ONLY, every=3, start=0.25, stop=0.75, grow_fraction=0.1)
     counts = [100] + [record["count"] for record in run(fit_of(scan, density=density, steps=12))]
     assert [step for step in range(1, 13) if counts[step] != counts[step - 1]] == [3, 6, 9]
@@ -166,6 +169,29 @@ def test_growth_follows_the_gradients_since_the_last_event(scan, monkeypatch):
     assert control.total is None
     run(fit, until=4)
     assert torch.equal(control.total, norms[3])
+
+
+def test_gaussians_of_a_steep_mean_gradient_grow(scan):
+    """Their number follows the gradients, whatever the share says, and the number of steps does not matter."""
+    total = torch.linspace(0.0, 9.9, 100)
+    for steps, most, grown in ((1, 1000, 19), (2, 1000, 0), (1, 107, 7)):
+        trainable, _ = trained(a_cloud(), scan)
+        before = of(trainable).detached()
+        made = event(replace(GROW_ONLY, grow_gradient=8.05, max_count=most), scan.views, total)
+        made.steps = steps
+        assert made.control(trainable, torch.Generator().manual_seed(0)) == (grown, 0)
+        assert torch.equal(of(trainable).centres.detach()[: 100 - grown], before.centres[: 100 - grown])
+        assert made.steps == 0
+
+
+def test_after_the_last_growth_gaussians_only_go(scan):
+    trainable, total = trained(a_cloud(), scan)
+    options = DensityControl(every=1, start=0, stop=0.5, prune_stop=1.0, grow_fraction=0.2, faint=0.02, huge_px=1e9)
+    faint = int(doomed(of(trainable), scan.views, options).count_nonzero())
+    made = event(options, scan.views, total)
+    assert made.after_step(trainable, 6, 10, torch.Generator())
+    assert len(of(trainable)) == 100 - faint
+    assert not made.after_step(trainable, 10, 10, torch.Generator()), "behind the last step"
 
 
 def spoilt_cloud(defect: str) -> GaussianCloud:

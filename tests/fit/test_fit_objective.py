@@ -8,7 +8,7 @@ import torch
 from skimage.metrics import structural_similarity as skimage_similarity
 
 from holosplat.checks import InputError
-from holosplat.fit.terms import THESIS, Objective
+from holosplat.fit.terms import Objective
 from holosplat.fit.terms import comparisons as terms
 from holosplat.fit.total_variation import total_variation
 from holosplat.metrics import image_scores
@@ -35,11 +35,10 @@ IMAGE_TERMS = {
 }
 
 
-def test_the_default_objective_is_l1_and_the_thesis_objective_is_as_published():
+def test_the_default_objective_is_l1():
     widths = {"frc_ramp", "anisotropy_limit", "rounding", "floor"}
     assert {name for name, w in vars(Objective()).items() if w > 0} == {"l1"} | widths
-    assert (THESIS.l1, THESIS.ssim, THESIS.tv_image, THESIS.frc) == (0.75, 0.20, 0.05, 0.05)
-    assert not THESIS.uses_volume
+    assert not Objective().uses_volume
     assert Objective(tv_volume=0.1).uses_volume
     assert Objective(overfull=0.1).uses_volume
     assert Objective(two_levels=0.1).uses_volume

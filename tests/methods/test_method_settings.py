@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from holosplat.checks import InputError
-from holosplat.methods import METHODS, Gaussians, Surfaces, Voxels
+from holosplat.methods import METHODS, Gaussians, Method, Surfaces, Voxels
 from holosplat.methods.presets import FOLDER, SCHEMA, method_called, method_of, preset, preset_names, read_method
 from holosplat.tables import overridden, paths, to_table
 
@@ -137,13 +137,24 @@ def test_settings_that_are_none_are_refused(tmp_path, text, message):
 # --- version 0.1.0 ------------------------------------------------------------------------------------------
 
 
+def of_version_0_1_0(name: str) -> Method:
+    """The preset as version 0.1.0 had it: that of today, but for what `thesis` has learnt of the thesis since."""
+    today = preset(name)
+    if name != "thesis":
+        return today
+    assert isinstance(today, Gaussians)
+    objective = replace(today.fit.objective, frc_ramp=0.5, anisotropy=0.0)
+    density = replace(today.fit.density, prune_stop=0.0, grow_gradient=0.0)
+    return replace(today, fit=replace(today.fit, objective=objective, density=density))
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_a_config_of_version_0_1_0_is_the_same_method_today(name, tmp_path):
     """The files are what version 0.1.0 wrote for its four presets."""
     old = DATA / f"config_0_1_0_{name}.json"
-    assert read_method(old) == preset(name)
+    assert read_method(old) == of_version_0_1_0(name)
     settings = json.loads(old.read_text())["settings"]
-    assert read_method(written(tmp_path, json.dumps(settings), "alone.json")) == preset(name)
+    assert read_method(written(tmp_path, json.dumps(settings), "alone.json")) == of_version_0_1_0(name)
 
 
 def test_rates_of_version_0_1_0_find_their_place():
@@ -156,3 +167,11 @@ def test_rates_of_version_0_1_0_find_their_place():
     assert json.dumps(table) == before, "the table that is read must stay as it is"
     with pytest.raises(InputError, match=r"options\.fit\.rates\.centres must be a number"):
         method_of({"fit": {"schedule": {"rate_position": "fast"}}})
+
+
+def test_the_preset_random_starts_at_random_and_judges_on_no_training_frame():
+    settings = preset("random")
+    assert settings.start == "random"
+    assert settings.fit.schedule.validation_views == 0
+    assert settings.fit.density.every > 0
+    assert settings.random_count <= 10_000

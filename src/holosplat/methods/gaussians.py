@@ -98,6 +98,14 @@ def gaussian_fit(
 
     freedom: of where these frames are, which is then fitted, too.
     """
+    plan, train = gaussian_plan(scan, cloud, options, light)
+    return Fit(freed(plan, freedom, train), seed)
+
+
+def gaussian_plan(
+    scan: Scan, cloud: GaussianCloud, options: FitOptions, light: Light | None = None
+) -> tuple[Plan, Scan]:
+    """What `gaussian_fit` does, and the frames that it fits."""
     backend, schedule = resolve(options.backend), options.schedule
     base = ground(scan, cloud.on(backend), cloud.matter, options.objective, schedule, backend, light=light)
     grid = Grid.of_views(field_of(cloud, scan.views))
@@ -111,7 +119,7 @@ def gaussian_fit(
         judge=base.judge,
         grid=grid if options.objective.uses_volume else None,
     )
-    return Fit(freed(plan, freedom, base.train), seed)
+    return plan, base.train
 
 
 def _object_terms(base: Ground, options: FitOptions, grid: Grid, matter: Matter) -> list[Term]:

@@ -40,7 +40,7 @@ class GaussianCloud:
         self.centres, self.log_scales, self.quaternions, self.raw_amplitudes = parameters
         self.unit_length, self.matter = float(unit_length), matter
         n, channels = len(self.centres), len(matter)
-        shapes = [tuple(p.shape) for p in self.parameters().values()]
+        shapes = [tuple(getattr(self, name).shape) for name in PARAMETERS]
         wanted = [(n, 3), (n, 3), (n, 4), (n, channels)]
         require(
             shapes == wanted,
@@ -69,6 +69,15 @@ class GaussianCloud:
     def amplitudes(self) -> Tensor:
         """Peak values [N, C] in units of the material's δ (and β)."""
         return softplus(self.raw_amplitudes)
+
+    @property
+    def strength(self) -> Tensor:
+        """What says whether a Gaussian is faint, [N]: its largest peak value."""
+        return self.amplitudes.amax(dim=1)
+
+    def values_times(self, factor: float, index: Tensor) -> dict[str, Tensor]:
+        """The parameters behind the amplitudes of the Gaussians `index` that make these `factor` times as large."""
+        return {"raw_amplitudes": raw_of(self.amplitudes.detach()[index] * factor)}
 
     @property
     def described(self) -> str:

@@ -144,7 +144,7 @@ class RunFolder:
         for path in (self.checkpoint, self.earlier_checkpoint):
             if not path.is_file():
                 continue
-            found = _loaded(path)
+            found = checkpoint_state(path)
             if found is None:
                 damaged = True
                 continue
@@ -174,7 +174,7 @@ def claimed(folder: RunFolder | None) -> Iterator[None]:
             write_manifest(folder.path, folder.name())
 
 
-def _loaded(path: Path) -> dict[str, Any] | None:
+def checkpoint_state(path: Path) -> dict[str, Any] | None:
     """What a checkpoint holds; None if it is damaged, by the checksums of its parts or else."""
     try:
         with zipfile.ZipFile(path) as archive:

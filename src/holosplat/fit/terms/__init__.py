@@ -10,7 +10,7 @@ from ..problem import Term
 from .frames import FrameTerm
 from .geometry import alignment_prior, light_prior
 from .object import Anisotropy, VolumeTerm
-from .objective import THESIS, Objective
+from .objective import Objective
 
 Build = Callable[[float, Model, Scan], Term]
 """(weight, the model at the start, the training frames) → the term."""
@@ -21,4 +21,4 @@ TERMS: dict[str, Build] = {
 }
 """Terms that any fit takes by name and weight (`terms` of its options), beside those of its objective."""
 
-__all__ = ["TERMS", "THESIS", "Anisotropy", "Build", "FrameTerm", "Objective", "VolumeTerm"]
+__all__ = ["TERMS", "Anisotropy", "Build", "FrameTerm", "Objective", "VolumeTerm"]

@@ -71,7 +71,3 @@ class Objective:
     def uses_volume(self) -> bool:
         """Whether a term needs the voxelised object."""
         return any(getattr(self, name) > 0 for name in VOLUME_TERMS)
-
-
-THESIS = Objective(l1=0.75, ssim=0.20, tv_image=0.05, frc=0.05, frc_ramp=0.5)
-"""The thesis' composite loss: 0.75 L1 + 0.20 (1 - SSIM) + TV + ramped FRC."""

@@ -1,0 +1,1 @@
+"""The pages of the study, and their pictures."""
