@@ -34,7 +34,7 @@ def fast(request, monkeypatch) -> tuple[str, torch.device]:
     return "cuda", device
 
 
-def of_kind(kind: str, channels: int = 1, count: int = 150) -> list[Tensor]:
+def of_kind(kind: str, channels: int = 1, count: int = 120) -> list[Tensor]:
     """Float32 clouds; beside those of `cloud`, far below a pixel, and needles 40 times as long as thick."""
     if kind not in ("tiny", "elongated"):
         return cloud(kind, channels, count)
@@ -69,7 +69,7 @@ class Drawn:
 @pytest.mark.parametrize("channels", [1, 2])
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_same_as_the_reference(kind, channels, fast):
-    arrays = of_kind(kind, channels, 40 if kind == "large" else 150)
+    arrays = of_kind(kind, channels, 12 if kind == "large" else 120)
     found, true = Drawn(arrays, poses(3), *fast), Drawn(arrays, poses(3), "reference")
     assert found.of_rotations.dtype == found.of_shifts.dtype == torch.float64
     assert found.error(true) < TOLERANCE

@@ -61,7 +61,7 @@ def assert_twins(draw, arrays: list[Tensor], gpu: torch.device) -> None:
 @pytest.mark.parametrize("channels", [1, 2])
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_same_as_the_reference(kind, channels, draw, gpu):
-    assert_twins(draw, cloud(kind, channels, 40 if kind == "large" else 120), gpu)
+    assert_twins(draw, cloud(kind, channels, 12 if kind == "large" else 120), gpu)
 
 
 @DRAWS
@@ -69,7 +69,7 @@ def test_the_same_as_the_reference(kind, channels, draw, gpu):
 def test_boxes_too_large_for_one_warp(kind, draw, gpu, modules, monkeypatch):
     for module in modules:
         monkeypatch.setattr(module, "BLOCKS", replace(module.BLOCKS, large=200, large_lanes=2048))
-    assert_twins(draw, cloud(kind, 2, 12), gpu)
+    assert_twins(draw, cloud(kind, 2, 6), gpu)
 
 
 @DRAWS
