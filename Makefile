@@ -12,7 +12,7 @@ TOOLS := build/tools
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help setup demo test check docs wheel wheels clean
+.PHONY: help setup demo test check docs figures wheel wheels clean
 
 help: ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
@@ -41,6 +41,10 @@ check: setup ## lint, formatting and types
 
 docs: $(GALLERY)/.built ## run the examples and build the documentation site, into build/site; warnings are errors
 	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/python -m mkdocs build --strict
+
+figures: setup ## make the tables of the docs from docs/data, and list what their figures need
+	$(VENV)/bin/python docs/figures.py
+	$(VENV)/bin/python docs/figures.py --list
 
 $(GALLERY)/.built: $(DOCS) docs/site/gallery.py $(wildcard examples/*.py) $(SOURCES)
 	rm -rf $(GALLERY)

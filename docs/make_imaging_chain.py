@@ -243,27 +243,24 @@ def save(grid: PanelGrid, name: str) -> None:
     grid.figure.savefig(folder / f"{name}.png", dpi=130, metadata={"Software": None})
 
 
-def main() -> None:
+def main(work: Path, preset: str = "default") -> None:
     """Pictures first, then one row after another."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("work", type=Path)
-    parser.add_argument("--preset", default="default")
-    parser.add_argument("--pictures", action="store_true", help="only those without a reconstruction")
-    given = parser.parse_args()
-    given.work.mkdir(parents=True, exist_ok=True)
+    work.mkdir(parents=True, exist_ok=True)
     light_picture()
-    flat_field_picture(given.work)
-    if given.pictures:
-        return
+    flat_field_picture(work)
     with (DOCS / "data" / "imaging_chain.csv").open("w", newline="", encoding="utf-8") as file:
         table = csv.writer(file, lineterminator="\n")
         table.writerow(("imperfection", "preset", *SCORES))
         for name in CASES:
-            scores = row(name, given.work, given.preset)
-            table.writerow((name, given.preset, *(f"{scores[score]:.4f}" for score in SCORES)))
+            scores = row(name, work, preset)
+            table.writerow((name, preset, *(f"{scores[score]:.4f}" for score in SCORES)))
             print(f"| {name} |", " | ".join(f"{scores[score]:.3f}" for score in SCORES), "|", flush=True)
-    slices_picture(given.work, given.preset)
+    slices_picture(work, preset)
 
 
 if __name__ == "__main__":
-    main()
+    parser = argparse.ArgumentParser()
+    parser.add_argument("work", type=Path)
+    parser.add_argument("--preset", default="default")
+    options = parser.parse_args()
+    main(options.work, options.preset)

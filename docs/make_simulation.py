@@ -1,31 +1,33 @@
-"""The pictures of docs/simulation.md: `python docs/make_simulation.py` takes minutes, and prints their numbers.
+"""The pictures of docs/simulation.md: `python docs/figures.py simulation` takes minutes, and writes their numbers.
 
 Generated red cells (seed 3) of 8 µm, 20 keV, 10 cm, 0.5 µm pixels, PSF 0.5 px, haemoglobin known, preset `fast`.
 """
 
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
 from pathlib import Path
 
-import matplotlib as mpl
-
-mpl.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.axes import Axes
+from drawing import COMMIT
 
 import holosplat as hs
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.beamline.poses import Directions
 from holosplat.beamline.simulate import Shutter
+from holosplat.report.style import PanelGrid, image_panel, letter, scale_bar, styled
 from holosplat.specimens.mesh_series import MeshSeries
 
 IMAGES = Path(__file__).parent / "images"
+TABLE = Path(__file__).parent / "data" / "simulation_imperfections.csv"
+SCORES = ("ssim", "dice", "relative_error_delta")
 SEED, PIXEL, SHAPE = 3, 0.5e-6, (72, 72)
 SPEED = 0.05
 MATERIAL = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
-CONTRAST = {"cmap": "gray", "vmin": 0.55, "vmax": 1.6}
+GREY, CONTRAST, DPI = "gray", (0.55, 1.6), 160
+STILL = 5, 18e-6
+"""Cells, and the edge of their cube [m]."""
 
 
 INNER = (slice(12, 60), slice(12, 60))
@@ -48,14 +50,7 @@ def exposures(directions: Directions, shape: tuple[int, int]) -> hs.Exposures:
     return hs.Exposures.of(directions.on(shape, PIXEL), 20.0, 0.1, 0.5)
 
 
-def draw(axes: Axes, image: np.ndarray, title: str, **style: object) -> None:
-    """One panel."""
-    axes.imshow(image, interpolation="nearest", **style)  # type: ignore[arg-type]
-    axes.set_title(title, fontsize=8)
-    axes.set_xticks([])
-    axes.set_yticks([])
-
-
+@styled
 def time_series() -> None:
     """Two beams × four times of cells in a channel."""
     shape, times = (48, 140), np.arange(4) * 100e-6
@@ -63,44 +58,66 @@ def time_series() -> None:
     cells = hs.MeshScene.of_one_material([mesh for group in groups for mesh in group.meshes], MATERIAL)
     obj = drifting(cells, 200e-6).delayed(150e-6)
     scan = hs.simulate(obj, exposures(Directions(geometry="xmpi_2beam"), shape).repeated(times))
-    figure, panels = plt.subplots(2, 4, figsize=(9, 2.3), layout="constrained")
+    grid = PanelGrid(2, [140.0] * 4, [48.0] * 4, (3,))
     for n, (frame, time) in enumerate(zip(scan.frames, scan.exposures.time)):
-        angle = (0.0, 23.8)[n % 2]
-        draw(panels[n % 2, n // 2], frame, f"{angle:g}°, {1e6 * time:.0f} µs", **CONTRAST)
-    figure.savefig(IMAGES / "simulation_series.png", dpi=110)
+        axes, angle = grid.axes[n % 2][n // 2], (0.0, 23.8)[n % 2]
+        drawn = image_panel(axes, frame, (PIXEL, PIXEL), GREY, CONTRAST)
+        letter(axes, 4 * (n % 2) + n // 2, f"{angle:g}°, {1e6 * time:.0f} µs")
+    scale_bar(grid.axes[0][0], shape[1] * PIXEL, beside=True)
+    grid.bar(drawn, 3, (0, 1), "intensity", "both")
+    grid.figure.savefig(IMAGES / "simulation_series.png", dpi=DPI, metadata={"Software": None})
 
 
-def imperfections() -> None:
-    """What motion and misalignment do to a hologram, and to a reconstruction that does not know of them."""
-    still = scene(5, 18e-6)
-    told = exposures(Directions(views=16), SHAPE)
-    grid = hs.Grid.of_views(told.views)
-    truth = still.voxelise(grid)
-    errors = Misalignment(shift_px=1.0, rotation_deg=1.0, distance=0.02, seed=SEED)
-    true = errors.true_exposures(told)
-    clean = hs.simulate(still, told)
+def cases() -> dict[str, tuple[str, hs.Scan]]:
+    """What is reconstructed: a title, what the table calls it, and the scan."""
+    still, told = scene(*STILL), exposures(Directions(views=16), SHAPE)
+    true = Misalignment(shift_px=1.0, rotation_deg=1.0, distance=0.02, seed=SEED).true_exposures(told)
     misaligned = replace(hs.simulate(still, true), exposures=told)
     exposure = 8 * PIXEL / SPEED
     blurred = hs.simulate(drifting(still, exposure), told, shutter=Shutter(exposure, 16))
-    cases = {
-        "as planned": clean,
-        f"motion of 8 pixels in {1e6 * exposure:.0f} µs": blurred,
-        "misaligned: 1 pixel, 1°, 2 %": misaligned,
-        "misaligned, true exposures known": replace(misaligned, exposures=true),
+    return {
+        "as planned": ("as planned", hs.simulate(still, told)),
+        f"moved by 8 px in {1e6 * exposure:.0f} µs": ("cells move by 8 pixels (4 µm) while a frame is taken", blurred),
+        "misaligned": ("views misaligned by 1 pixel, 1° and 2 % of the distance", misaligned),
+        "misaligned, known": (
+            "the same frames, reconstructed with the true exposures",
+            replace(misaligned, exposures=true),
+        ),
     }
-    figure, panels = plt.subplots(2, 4, figsize=(9, 5), layout="constrained")
+
+
+@styled
+def imperfections() -> None:
+    """What motion and misalignment do to a hologram, and to a reconstruction that does not know of them."""
+    voxels = hs.Grid.of_views(exposures(Directions(views=16), SHAPE).views)
+    truth, rows = scene(*STILL).voxelise(voxels), []
+    grid = PanelGrid(2, [1.0] * 4, [1.0] * 4, (3,))
     middle = int(np.argmax(truth.delta.sum((1, 2))))
-    for (name, scan), (above, below) in zip(cases.items(), panels.T):
+    for n, (title, (label, scan)) in enumerate(cases().items()):
         result = hs.reconstruct(scan, hs.MaterialPrior.known(MATERIAL), hs.preset("fast"))
         scores = hs.evaluate(result, scan, truth).headline()
-        print(f"| {name} | {scores['ssim']:.3f} | {scores['dice']:.3f} | {scores['relative_error_delta']:.3f} |")
-        draw(above, scan.frames[2][INNER], name, **CONTRAST)
-        delta, outline = (v.delta[middle][INNER] / MATERIAL.delta for v in (result.object.voxelise(grid), truth))
-        draw(below, delta, f"δ of a slice, Dice {scores['dice']:.2f}", cmap="magma", vmin=0, vmax=1)
-        below.contour(outline, [0.5], colors="w", linewidths=0.6)
-    figure.savefig(IMAGES / "simulation_imperfections.png", dpi=110)
+        rows.append([label, *(f"{scores[score]:.6g}" for score in SCORES), COMMIT])
+        above, below = grid.axes[0][n], grid.axes[1][n]
+        frame = image_panel(above, scan.frames[2][INNER], (PIXEL, PIXEL), GREY, CONTRAST)
+        letter(above, n, title)
+        delta, outline = (v.delta[middle][INNER] for v in (result.object.voxelise(voxels), truth))
+        slices = image_panel(below, 1e7 * delta, (PIXEL, PIXEL), "magma", (0, 1e7 * MATERIAL.delta))
+        height, width = (size * PIXEL for size in delta.shape)
+        below.contour(outline, [0.5 * MATERIAL.delta], colors="w", linewidths=0.6, extent=(0, width, 0, height))
+        letter(below, 4 + n, f"Dice {scores['dice']:.2f}")
+    scale_bar(grid.axes[0][0], delta.shape[1] * PIXEL)
+    grid.bar(frame, 3, (0, 0), "intensity", "both")
+    grid.bar(slices, 3, (1, 1), "δ (10⁻⁷)", "max")
+    grid.figure.savefig(IMAGES / "simulation_imperfections.png", dpi=DPI, metadata={"Software": None})
+    with TABLE.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file, lineterminator="\n").writerows([["case", *SCORES, "commit"], *rows])
+
+
+def main() -> None:
+    """Both pictures, and the table."""
+    time_series()
+    imperfections()
 
 
 if __name__ == "__main__":
-    time_series()
-    imperfections()
+    main()

@@ -13,9 +13,9 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from drawing import in_few_colours
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
-from PIL import Image
 
 import holosplat as hs
 from holosplat.report.style import SIGNED_MAP
@@ -47,7 +47,7 @@ def main(run: Path, truth: Path) -> None:
     bar.set_label("outside the true surface by / µm", fontsize=9)
     target = Path(__file__).parent / "images" / "surfaces.png"
     figure.savefig(target, dpi=110)
-    Image.open(target).convert("RGB").quantize(160).save(target, optimize=True)
+    in_few_colours(target, target, 160)
 
 
 if __name__ == "__main__":

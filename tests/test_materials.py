@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import pytest
+import xraydb
 
 from holosplat.checks import InputError
 from holosplat.materials import (
@@ -62,6 +63,14 @@ def test_haemoglobin_and_red_cells_at_20_kev():
     difference = RED_CELL.delta_beta(20).against(PLASMA.delta_beta(20))
     assert difference.delta == near(2.7e-8, rel=0.05)
     assert difference.beta == near(-1.5e-11, rel=0.1)
+
+
+def test_beta_is_photoabsorption_alone():
+    """With Elam's tables: scattering would lower δ/β of haemoglobin from 2683 (2800 by Chantler's) to 1694."""
+    delta = HAEMOGLOBIN.delta_beta(20).delta
+    for kind, ratio in (("photo", 2683), ("total", 1694)):
+        mu = 100 * xraydb.material_mu(HAEMOGLOBIN.formula, 20e3, HAEMOGLOBIN.density_g_cm3, kind)
+        assert delta / (mu * wavelength(20.0) / (4 * math.pi)) == near(ratio, rel=1e-3)
 
 
 def test_delta_beta_differences_and_ratios():

@@ -49,7 +49,7 @@ def ellipsoids() -> ContinuousScene:
 
 @pytest.mark.parametrize("scene", [meshes(), ellipsoids()], ids=["meshes", "ellipsoids"])
 def test_two_programs_make_the_same_frame(propagation, scene):
-    """To 0.5 % of the contrast, what `SIMULATED_FRINGE_SAMPLES` promises; and not by having no contrast."""
+    """To 0.5 % of the contrast on these pixels; and not by having no contrast."""
     taken = exposures()
     frame = next(simulated_frames(scene, taken)).astype(np.float64)
     slabs, one = propagation.other_frames(scene, taken)

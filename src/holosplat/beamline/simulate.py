@@ -21,8 +21,9 @@ from ..volume import Object
 from .light import EVEN_LIGHT, UnevenLight
 
 SIMULATED_FRINGE_SAMPLES = 8
-"""Samples on the first fringe in simulations: frames of rounded bodies are then right to 0.5 % of their contrast
-(rms); faces exactly along the beam, where the phase jumps, converge more slowly (a few per cent)."""
+"""Samples on the first fringe in simulations: frames of the benchmark are then right to 1 % of their contrast (rms),
+most of them to half of that (docs/data/propagation.csv); faces exactly along the beam, where the phase jumps, converge
+more slowly (a few per cent)."""
 MOST_PULSES = 10_000
 
 
@@ -116,9 +117,9 @@ class Simulation:
 def simulated_frames(obj: Object, exposures: Exposures, how: Simulation = Simulation()) -> Iterator[np.ndarray]:
     """Frames [H, W] float32 of `obj`, one after another; only one is in memory.
 
-    Plain torch (the `reference` of the optics, which no fit uses) on a fine raster in single precision, 1e-6 of the
-    contrast from double precision. A frame is the mean of the intensities at its pulses, with the light and the
-    noise that are asked for.
+    Plain torch (the `reference` of the optics, which fits use with that backend alone) on a fine raster in single
+    precision, less than 1e-5 of the contrast from double precision. A frame is the mean of the intensities at its
+    pulses, with the light and the noise that are asked for.
     """
     fine, detect = how.samples(exposures), how.detector(exposures)
     with memory_kept():

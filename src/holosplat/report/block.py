@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from .style import WIDTH, data_uri
@@ -11,9 +12,10 @@ from .style import WIDTH, data_uri
 
 @dataclass(frozen=True)
 class Block:
-    """One figure of the page: image is a `data:` URI, drawn `width` per cent of the page wide.
+    """One figure of the page: image is a `data:` URI, drawn `width` per cent of the page wide, or `live` is what stands
+    in its place, as HTML.
 
-    Without an image, `caption` says why there is none.
+    Without either, `caption` says why there is none.
     """
 
     heading: str
@@ -22,6 +24,12 @@ class Block:
     image: str | None = None
     width: int = 100
     number: int | None = None
+    live: Markup | None = None
+
+    @property
+    def drawn(self) -> bool:
+        """Whether there is a figure."""
+        return self.image is not None or self.live is not None
 
 
 def drawn_block(heading: str, caption: str, title: str, figure: Figure, kind: str) -> Block:

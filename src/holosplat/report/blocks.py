@@ -25,18 +25,30 @@ from .figures import (
 from .light import light_figure
 from .motion_blocks import motion_blocks
 from .style import format_length, scientific
+from .view3d.view import html
 
 MOST_VIEWS = 4
 
 
 def make_blocks(content: ReportContent) -> list[Block]:
     """All figures of the page, in order and numbered from 1."""
-    makers = (_scene, _held_out, _explained, _light, _projections, _slices, _correlation, _history, _histograms)
+    makers = (
+        _scene,
+        _turned,
+        _held_out,
+        _explained,
+        _light,
+        _projections,
+        _slices,
+        _correlation,
+        _history,
+        _histograms,
+    )
     blocks, number = [], 0
     first = [] if content.moving is None else motion_blocks(content.moving)
     for block in (*first, *(make(content) for make in makers)):
-        number += block.image is not None
-        blocks.append(replace(block, number=number) if block.image is not None else block)
+        number += block.drawn
+        blocks.append(replace(block, number=number) if block.drawn else block)
     return blocks
 
 
@@ -60,6 +72,23 @@ def _scene(content: ReportContent) -> Block:
             f"along its own normals: red outside, blue inside of it; colours end at one voxel, {voxel}."
         )
     return drawn_block(heading, text, "The scene and its reconstruction.", figure, "png")
+
+
+def _turned(content: ReportContent) -> Block:
+    heading, view = "From any side", content.view
+    if view is None:
+        return Block(heading, "What would be turned here was not given.")
+    first, *others = view.parts
+    kinds = {"volume": "a volume of coarser voxels", "gaussians": "its Gaussians"}
+    shown = kinds.get(view.parts[first].kind, "its surfaces")
+    text = (
+        f"Line integrals and the hologram that they would give, of the {first} by {shown}: drag the first picture, or "
+        "use the arrow keys on it, to turn the object. Values are quantitative: the phase shift is −k∫δ dz, and the "
+        "hologram that of an even beam over the distance of the first frame, one wave sample a raster pixel. "
+    )
+    if others:
+        text += f"The {' and the '.join(others)} can be chosen instead, from a volume of coarser voxels. "
+    return Block(heading, text.strip(), "The object, turned.", live=html(view))
 
 
 def _held_out(content: ReportContent) -> Block:

@@ -17,6 +17,7 @@ from ..volume import Volume
 from ..workflows.totals import TotalMatter
 from ..workflows.verdict import Verdict
 from .moving import Moving
+from .view3d.view import View3D
 
 
 @dataclass(frozen=True)
@@ -107,6 +108,7 @@ class ReportContent:
     - explained: the verdict on the training frames; None: not judged
     - total: the total δ by these frames; None: not told
     - moving: bodies in motion, whose volumes are those of one time; None: matter stands still
+    - view: what can be turned; None: nothing
     - geometry: where the frames were found to be; None: as the scan says
     - history: columns of metrics.csv, each [S]: step, seconds, loss, the loss' terms, count, val_ssim …
     - seconds: time of the reconstruction [s]
@@ -129,6 +131,7 @@ class ReportContent:
     geometry: Geometry | None = None
     lit: LitViews | None = None
     moving: Moving | None = None
+    view: View3D | None = None
     history: Mapping[str, np.ndarray] = field(default_factory=dict)
     seconds: float | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)

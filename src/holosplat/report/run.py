@@ -26,6 +26,7 @@ from .content import HeldOutViews, LitViews, ProjectedMaps, ReportContent, view_
 from .figures import evenly_chosen
 from .moving import Moving
 from .page import write_report
+from .view3d.of_run import view_of
 
 MOST_FRAMES = 24
 """Times that the animation of a report shows, at most."""
@@ -44,7 +45,7 @@ def report_run(
 ) -> Path:
     """Write `report.html` of a run, of one in motion with the volume at the time in the middle; returns its path."""
     config, moving = folder.read_config(), None
-    found = reconstruction.object
+    turned = found = reconstruction.object
     if isinstance(found, MovingSurfaces):
         moving = moving_of(reconstruction, scan, evaluation.light, read_errors(folder))
         found = found.at(_middle(moving))
@@ -55,10 +56,11 @@ def report_run(
         held_out = HeldOutViews(
             test.frames, evaluation.predicted, _labels(test), evaluation.test, test.views.pixel_sizes
         )
+    volume = found.voxelise(grid)
     content = ReportContent(
         title=_title(config, reconstruction),
         summary=_summary(reconstruction, scan, moving),
-        reconstruction=found.voxelise(grid),
+        reconstruction=volume,
         truth=truth,
         energy_kev=scan.exposures.reference_energy,
         pixel_size=scan.views.finest,
@@ -71,6 +73,7 @@ def report_run(
         geometry=reconstruction.geometry,
         lit=_lit(reconstruction, scan, evaluation),
         moving=moving,
+        view=view_of(turned, volume, truth, scan),
         history=folder.history(),
         seconds=sum(reconstruction.timing.values()),
         settings={"seed": config["seed"], "prior": config["prior"], **config.get("method", config.get("settings", {}))},

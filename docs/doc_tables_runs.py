@@ -1,0 +1,199 @@
+"""Tables of single studies in the docs, from docs/data alone; `docs/figures.py` puts them into the pages."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from doc_tables import DATA, Row, markdown, read, rounded
+
+BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+
+
+def script(name: str) -> ModuleType:
+    """benchmarks/NAME.py, whose own function makes the table."""
+    if str(BENCHMARKS) not in sys.path:
+        sys.path.append(str(BENCHMARKS))
+    return importlib.import_module(name)
+
+
+def propagation() -> str:
+    """The benchmark's frames beside other programs."""
+    return "\n".join(script("propagation").summary(read("propagation.csv")))
+
+
+def ablation() -> str:
+    """What each ingredient is worth."""
+    of = script("ablation")
+    return "\n".join(of.summary(of.read(DATA / "ablation.csv")))
+
+
+def trials() -> str:
+    """What was tried and left out: SSIM / FRCM, Dice / error of δ."""
+    rows = read("trials.csv")
+    cases = ("cells8", "noise12-2000", "thesis16", "foam12")
+    lines = []
+    for trial in dict.fromkeys(r["trial"] for r in rows):
+        own = {r["case"]: r for r in rows if r["trial"] == trial}
+        lines.append([trial, *(_four(own[case]) for case in cases)])
+    return markdown(("trial", *(f"`{case}`" for case in cases)), lines)
+
+
+def _four(row: Row) -> str:
+    ssim, frcm, dice, error = (rounded(row[n], 3) for n in ("ssim", "frcm", "dice", "relative_error_delta"))
+    return f"{ssim} / {frcm}, {dice} / {error}"
+
+
+def neural_options() -> str:
+    """Options of neural fields."""
+    return _fields("neural", "ed18f76")
+
+
+def voxel_options() -> str:
+    """Options of voxels."""
+    return _fields("voxels", "6e3bb1e")
+
+
+def _fields(method: str, commit: str) -> str:
+    numbers = ("relative_error_delta", "dice", "ssim", "frcm")
+    rows: list[dict[str, Any]] = [
+        r | {n: float(r[n]) for n in numbers} for r in read("tune_fields.csv") if r["commit"] == commit
+    ]
+    return "\n".join(script("tune_fields").table(rows, method))
+
+
+def verdicts() -> str:
+    """Right and wrong runs."""
+    lines = []
+    for row in read("verdicts.csv"):
+        numbers = [row[n] or "–" for n in ("error", "total", "over_contrast", "over_noise", "over_allowed")]
+        lines.append([row["case"], *numbers, "explained" if row["good"] == "True" else "not explained"])
+    head = ("run", "error of δ", "total δ over the true", "residual over contrast", "over noise")
+    return markdown((*head, "over what is allowed", "verdict"), lines)
+
+
+def imaging_chain() -> str:
+    """The cost of each imperfection."""
+    names = ("ssim", "frcm", "dice", "relative_error_delta")
+    lines = [[r["imperfection"], *(rounded(r[n], 3) for n in names)] for r in read("imaging_chain.csv")]
+    return markdown(("imperfection", "SSIM", "FRCM", "Dice", "relative error of δ"), lines)
+
+
+def imperfections() -> str:
+    """Motion and misalignment: what they do to a reconstruction."""
+    names = ("ssim", "dice", "relative_error_delta")
+    lines = [[r["case"], *(rounded(r[n], 3) for n in names)] for r in read("simulation_imperfections.csv")]
+    return markdown(("", "SSIM of held-out views", "Dice", "relative error of δ"), lines).replace("|  |", "| |", 1)
+
+
+def fibre() -> str:
+    """A fibre in uneven light, by method: one frame, or from the least to the greatest of several seeds."""
+    lights = {"even": "even light", "noise": "even light, 1900 photons"}
+    lights["uneven"] = "the same, uneven and grainy, {} seeds"
+    rows, lines = read("fibre.csv"), []
+    for light, called in lights.items():
+        for method in ("tikhonov", "admm", "ctf"):
+            own = [r for r in rows if (r["light"], r["method"]) == (light, method)]
+            cells = []
+            for name in ("error", "total", "least_phase", "air"):
+                values = sorted({float(r[name]) for r in own})
+                cells.append(" to ".join(f"{v:.3f}" for v in dict.fromkeys((values[0], values[-1]))))
+            lines.append([called.format(len(own)), f"`{method}`", *cells])
+    head = ("frame", "method", "error", "total phase over the true", "least phase (rad; true -1.149)", "air (rad)")
+    return markdown(head, lines)
+
+
+def skalak() -> str:
+    """Optical tweezers, Skalak's law."""
+    return _tweezers("Skalak")
+
+
+def springs() -> str:
+    """Optical tweezers, springs of which a part does not soften."""
+    return _tweezers("springs")
+
+
+def _tweezers(model: str) -> str:
+    of = script("tweezers")
+    found = []
+    for row in read("tweezers.csv"):
+        if (row["model"], row["nodes"]) == (model, "362"):
+            values = [float(row[n]) for n in ("force_n", "axial_m", "transverse_m", "area_change", "volume_change")]
+            found.append(of.Stretched(*values, 0.0, None))
+    return "\n".join(of.table(found))
+
+
+# --- the main job -------------------------------------------------------------------------------------------
+
+METHODS = ("gaussians", "surfaces")
+
+
+def jobs() -> list[dict[str, Any]]:
+    """The main job's rows, alone on the machine: three seeds, Gaussians and surfaces."""
+    return json.loads((DATA / "redesign" / "main_job_0.2.json").read_text(encoding="utf-8"))["rows"]
+
+
+def deviation(row: Mapping[str, Any]) -> float:
+    """Of the mean δ inside the true cells [%]."""
+    return 100 * (float(row["mean_delta"]) / float(row["true_mean_delta"]) - 1)
+
+
+def main_job() -> str:
+    """24 cells, each seed, Gaussians and surfaces."""
+    return _jobs([row | row["material"] for row in jobs()], "seconds", "time / s")
+
+
+def _jobs(rows: Sequence[Mapping[str, Any]], seconds: str, called: str) -> str:
+    lines = []
+    for row in rows:
+        name = "snapshot 049" if row["case"] == "snapshot" else f"{row['case']}, {row['seed']}"
+        name += ", surfaces" if row["method"] == "surfaces" else ""
+        digits = {"ssim": 3, "frcm": 3, "psnr": 1, "dice": 3}
+        scores = [rounded(str(row[score]), n) for score, n in digits.items()]
+        error, ratio = rounded(str(row["relative_error_delta"]), 3), rounded(str(row["ratio"]), 0)
+        ratio += "" if str(row["single_material"]) == "True" else " (found)"
+        count = "–" if int(row["gaussians"]) == 0 else str(row["gaussians"])
+        lines.append([name, *scores, f"{deviation(row):+.1f} %", error, ratio, count, rounded(str(row[seconds]), 0)])
+    head = ("case, seed", "SSIM", "FRCM", "PSNR / dB", "Dice", "mean δ", "error of δ", "δ/β", "Gaussians")
+    return markdown((*head, called), lines)
+
+
+def worst(method: str) -> dict[str, str]:
+    """The worst of the three scenes; times are those of the longest fit, of surfaces beyond the Gaussians'."""
+    rows = [r for r in jobs() if r["method"] == method]
+    found = {name: f"{min(r[name] for r in rows):.3f}" for name in ("ssim", "frcm", "dice")}
+    found["error"] = f"{max(r['relative_error_delta'] for r in rows):.3f}"
+    found["mean"] = f"{max((deviation(r) for r in rows), key=abs):+.1f} %"
+    before = {r["seed"]: r["seconds"] if method == "surfaces" else 0.0 for r in jobs() if r["method"] == METHODS[0]}
+    found["both"] = f"{max(r['seconds'] for r in rows):.0f} s"
+    return found | {"time": f"{max(r['seconds'] - before[r['seed']] for r in rows):.0f} s"}
+
+
+def readme() -> str:
+    """README's."""
+    called = {"ssim": "SSIM of held-out views", "frcm": "FRCM of held-out views", "dice": "Dice of the volume"}
+    called |= {"error": "relative error of δ", "mean": "mean δ inside the cells", "time": "time"}
+    ours, refined = (worst(method) for method in METHODS)
+    refined["time"] += " more"
+    lines = [[label, ours[name], refined[name]] for name, label in called.items()]
+    table = markdown(("", "Gaussians (`reconstruct`)", "surfaces fitted from them (`surface`)"), lines)
+    return table.replace("|  |", "| |", 1)
+
+
+def wanted() -> str:
+    """The same beside what was wanted."""
+    aims = {
+        "held-out SSIM / FRCM": ("> 0.975 / > 0.93", "{ssim} / {frcm}"),
+        "Dice; relative error of δ": ("> 0.985; < 0.09", "{dice}; {error}"),
+        "mean δ inside the cells": ("within 10 %", "{mean}"),
+        "time, both together for surfaces": ("< 90 s", "{both}"),
+    }
+    cells = [worst(method) for method in METHODS]
+    lines = [[label, aim, *(shown.format(**c) for c in cells)] for label, (aim, shown) in aims.items()]
+    table = markdown(("", "wanted", "Gaussians, worst of three scenes", "surfaces"), lines)
+    return table.replace("|  |", "| |", 1)

@@ -1,0 +1,246 @@
+"""Every table and figure of the documentation: what makes it, from what, and whether it is as its data are.
+
+    make figures                          # all tables, and all figures that need no runs
+    python docs/figures.py --list         # everything, and what needs hours of runs first, by which command
+    python docs/figures.py --check        # only say which tables differ from docs/data
+    python docs/figures.py hero demo      # the figure `hero`, from the run folder `demo`
+
+Tables stand in the pages between `<!-- table: NAME -->` and `<!-- end -->`; their numbers come from docs/data.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import doc_tables as benchmark
+import doc_tables_measured as measured
+import doc_tables_runs as runs
+
+DOCS = Path(__file__).resolve().parent
+ROOT = DOCS.parent
+
+MARKED = re.compile(r"(<!-- table: ([\w-]+) -->\n)(?:(?!<!--).)*(<!-- end -->)", re.DOTALL)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of a page: its text from data files, and the command that makes these, with its length."""
+
+    make: Callable[[], str]
+    data: tuple[str, ...]
+    command: str
+    takes: str
+
+
+BENCH = "holosplat bench run --out bench --snapshots DIR --seeds 101 102, then python docs/make_benchmark.py bench"
+TABLES = {
+    "standing": Table(benchmark.standing, ("benchmark.csv",), BENCH, "a day"),
+    "overview": Table(benchmark.overview, ("benchmark.csv",), BENCH, "a day"),
+    "before-noise": Table(
+        benchmark.before_noise,
+        ("before_noise.csv", "benchmark.csv"),
+        "git show c7e8d51:docs/data/benchmark.csv, its rows of Gaussians in noise",
+        "a second",
+    ),
+    "continuous": Table(
+        benchmark.continuous, ("benchmark_continuous.csv",), f"{BENCH} docs/data/benchmark_continuous.csv", "hours"
+    ),
+    "absorbers": Table(
+        benchmark.absorbers, ("benchmark_continuous.csv",), f"{BENCH} docs/data/benchmark_continuous.csv", "an hour"
+    ),
+    "measured": Table(
+        benchmark.measured,
+        ("benchmark_continuous.csv",),
+        f"{BENCH} docs/data/benchmark_continuous.csv (with --data FOLDER)",
+        "an hour",
+    ),
+    "sharp-light": Table(benchmark.sharp_light, ("sharp_light.csv",), f"{BENCH} docs/data/sharp_light.csv", "an hour"),
+    "misaligned": Table(
+        benchmark.misaligned, ("benchmark_misaligned.csv",), f"{BENCH} docs/data/benchmark_misaligned.csv", "hours"
+    ),
+    "round-cell": Table(benchmark.round_cell, ("round_cell.csv",), "python benchmarks/round_cell.py", "minutes"),
+    "propagation": Table(
+        runs.propagation,
+        ("propagation.csv",),
+        "python benchmarks/propagation.py --snapshots DIR --csv docs/data/propagation.csv",
+        "ten minutes",
+    ),
+    "ablation": Table(
+        runs.ablation,
+        ("ablation.csv",),
+        "python benchmarks/ablation.py --snapshots DIR --csv docs/data/ablation.csv",
+        "hours",
+    ),
+    "trials": Table(runs.trials, ("trials.csv",), "python benchmarks/trials.py --csv docs/data/trials.csv", "an hour"),
+    "neural-options": Table(
+        runs.neural_options, ("tune_fields.csv",), "python benchmarks/tune_fields.py --csv FILE", "hours"
+    ),
+    "voxel-options": Table(
+        runs.voxel_options, ("tune_fields.csv",), "python benchmarks/tune_fields.py --csv FILE", "an hour"
+    ),
+    "verdicts": Table(runs.verdicts, ("verdicts.csv",), "python benchmarks/verdicts.py", "ten minutes"),
+    "imaging-chain": Table(
+        runs.imaging_chain, ("imaging_chain.csv",), "python docs/make_imaging_chain.py WORK", "ten minutes"
+    ),
+    "imperfections": Table(
+        runs.imperfections, ("simulation_imperfections.csv",), "python docs/make_simulation.py", "minutes"
+    ),
+    "fibre": Table(runs.fibre, ("fibre.csv",), "python benchmarks/fibre.py", "ten minutes"),
+    "skalak": Table(runs.skalak, ("tweezers.csv",), "python benchmarks/tweezers.py", "minutes"),
+    "springs": Table(runs.springs, ("tweezers.csv",), "python benchmarks/tweezers.py", "minutes"),
+}
+TABLES |= {
+    name: Table(
+        make, ("redesign/main_job_0.2.json",), "python benchmarks/main_job.py --surfaces --json > FILE", "three minutes"
+    )
+    for name, make in (("readme", runs.readme), ("main-job", runs.main_job), ("wanted", runs.wanted))
+}
+REAL = "python benchmarks/real_data.py --data FOLDER"
+TABLES |= {
+    name: Table(make, ("real_data.csv",), REAL, "half an hour")
+    for name, make in (
+        ("dome", measured.dome),
+        ("whole", measured.whole),
+        ("tooth", measured.tooth),
+        ("hair", measured.hair),
+    )
+}
+TABLES["bed"] = Table(
+    measured.bed, ("real_data.csv",), "python benchmarks/packed_bed.py --data FOLDER --work FOLDER", "an hour"
+)
+
+
+@dataclass(frozen=True)
+class Figure:
+    """Pictures below docs/images: the module of docs/ that draws them, what it is given, and what makes that."""
+
+    pictures: tuple[str, ...]
+    module: str
+    given: tuple[str, ...] = ()
+    before: str = ""
+    takes: str = "seconds"
+
+
+FIGURES = {
+    "hero": Figure(("hero.png",), "make_pictures", ("DEMO",), "holosplat demo --out DEMO", "two minutes"),
+    "cells": Figure(
+        ("cells.png",),
+        "make_cells",
+        ("FOLDER",),
+        "holosplat grow --cells 16 --box 80e-6 34e-6 26e-6 --flow 0.058 --snapshots 50 --out FOLDER",
+        "three minutes",
+    ),
+    "surfaces": Figure(
+        ("surfaces.png",), "make_surfaces", ("RUN", "TRUTH"), "python benchmarks/surfaces.py --runs FOLDER", "an hour"
+    ),
+    "simulation": Figure(("simulation_imperfections.png", "simulation_series.png"), "make_simulation", takes="minutes"),
+    "imaging-chain": Figure(
+        ("imaging_chain/light.png", "imaging_chain/flat_fields.png", "imaging_chain/slices.png"),
+        "make_imaging_chain",
+        ("WORK",),
+        takes="ten minutes",
+    ),
+    "motion": Figure(
+        ("motion.webp", "motion_shapes.png"),
+        "make_motion",
+        ("RUN",),
+        "holosplat track SCAN --material haemoglobin --out RUN, of a scan as benchmarks/motion.py simulates it",
+        "an hour",
+    ),
+    "benchmark": Figure(
+        tuple(
+            f"benchmark/{name}.png"
+            for name in ("overview", "main12-slices", "main12-holograms", "main12-cost", "cells8-slices", "cells8-cost")
+        )
+        + tuple(f"benchmark/{n}.png" for n in ("noise12-2000-slices", "two_materials8-slices", "resolution-curves")),
+        "make_benchmark",
+        ("BENCH",),
+        "holosplat bench run --out BENCH --snapshots DIR --seeds 101 102, then holosplat bench report BENCH",
+        "a day",
+    ),
+}
+ELSEWHERE = {
+    ("plan.png", "plan.csv"): "the command of docs/planning.md: two minutes",
+    ("tweezers.png",): "python benchmarks/tweezers.py: minutes",
+    ("espresso_flow.png",): "python benchmarks/espresso_flow.py DATA: four minutes",
+    ("thesis_curves.png", "thesis_full.png", "thesis_full_v4.png", "thesis_psnr.png"): (
+        "holosplat bench thesis --out FOLDER --snapshots DIR: hours"
+    ),
+    tuple(f"real_data/{n}.png" for n in ("tooth", "dome", "dome_frames", "hair", "whole", "whole_soft")): (
+        "python benchmarks/real_data.py --data FOLDER: an hour"
+    ),
+    ("real_data/bed.png", "real_data/bed_light.png"): (
+        "python benchmarks/packed_bed.py --data FOLDER --work FOLDER: an hour"
+    ),
+}
+"""Pictures that other commands of the project write, and how long these take."""
+
+
+def pages() -> list[Path]:
+    """All pages that may hold tables."""
+    return [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+
+
+def filled(text: str) -> str:
+    """A page with its tables made anew."""
+    return MARKED.sub(lambda found: f"{found[1]}{TABLES[found[2]].make()}\n{found[3]}", text)
+
+
+def changed() -> dict[Path, str]:
+    """The pages whose tables differ from what the data say, and what they should be."""
+    found = {}
+    for path in pages():
+        before = path.read_text(encoding="utf-8")
+        if (after := filled(before)) != before:
+            found[path] = after
+    return found
+
+
+def listing() -> list[str]:
+    """A line for each table and figure."""
+    where = {name: page.relative_to(ROOT) for page in pages() for _, name, _ in MARKED.findall(page.read_text("utf-8"))}
+    lines = ["tables: `make figures` makes them from docs/data; the data by"]
+    for name, table in TABLES.items():
+        data = ", ".join(f"docs/data/{file}" for file in table.data)
+        lines.append(f"  {name} ({where.get(name, 'nowhere')}), {data}: {table.command} ({table.takes})")
+    lines.append("figures: python docs/figures.py NAME …")
+    for name, figure in FIGURES.items():
+        needs = f", after {figure.before}" if figure.before else ""
+        lines.append(f"  {name} {' '.join(figure.given)}: {', '.join(figure.pictures)}{needs} ({figure.takes})")
+    lines += [f"  {', '.join(pictures)}: {command}" for pictures, command in ELSEWHERE.items()]
+    return lines
+
+
+def main() -> None:
+    """Make, list or check."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("figure", nargs="?", choices=FIGURES, help="one figure (default: all tables)")
+    parser.add_argument("given", nargs="*", help="what the figure needs, see --list")
+    parser.add_argument("--list", action="store_true")
+    parser.add_argument("--check", action="store_true")
+    options = parser.parse_args()
+    if options.list:
+        print(*listing(), sep="\n")
+    elif options.figure:
+        figure = FIGURES[options.figure]
+        if len(options.given) != len(figure.given):
+            parser.error(f"{options.figure} needs {' '.join(figure.given) or 'nothing'}; make it by: {figure.before}")
+        importlib.import_module(figure.module).main(*map(Path, options.given))
+    else:
+        differing = changed()
+        for path, text in differing.items():
+            print(f"{path.relative_to(ROOT)}: {'differs from docs/data' if options.check else 'made anew'}")
+            if not options.check:
+                path.write_text(text, encoding="utf-8")
+        if not options.check:
+            print("figures need runs first; python docs/figures.py --list says which, and by which command")
+        raise SystemExit(1 if options.check and differing else 0)
+
+
+if __name__ == "__main__":
+    main()

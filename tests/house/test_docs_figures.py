@@ -1,0 +1,95 @@
+"""Tables and figures of the documentation: made from committed data, and as the data are."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+
+
+@pytest.fixture
+def figures(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """docs/figures.py."""
+    monkeypatch.syspath_prepend(str(DOCS))
+    return importlib.import_module("figures")
+
+
+def test_tables_are_as_their_data(figures):
+    """Or `make figures` was forgotten."""
+    assert [str(path.relative_to(ROOT)) for path in figures.changed()] == []
+
+
+def test_a_number_that_drifts_is_seen(figures):
+    page = (DOCS / "verdict.md").read_text(encoding="utf-8")
+    assert figures.filled(page) == page
+    assert figures.filled(page.replace("| 0.0757 |", "| 0.0751 |")) == page
+    assert page.count("| 0.0757 |") == 1
+
+
+def test_an_empty_table_takes_nothing_with_it(figures):
+    page = "<!-- table: verdicts -->\n<!-- end -->\nText.\n<!-- table: round-cell -->\n|\n<!-- end -->\n"
+    parts = figures.filled(page).split("<!-- end -->\n")
+    assert parts[0].startswith("<!-- table: verdicts -->\n| run | error of δ")
+    assert parts[1].startswith("Text.\n<!-- table: round-cell -->\n| | δ/β told")
+    assert len(parts) == 3
+
+
+def test_every_table_stands_in_a_page_and_has_its_data(figures):
+    found = [name for page in figures.pages() for _, name, _ in figures.MARKED.findall(page.read_text("utf-8"))]
+    assert sorted(found) == sorted(figures.TABLES)
+    missing = [file for table in figures.TABLES.values() for file in table.data if not (DOCS / "data" / file).exists()]
+    assert missing == []
+
+
+def test_every_picture_is_made_by_something_and_there(figures):
+    """And each script that draws has a `main`."""
+    made = {name for figure in figures.FIGURES.values() for name in figure.pictures}
+    made |= {name for names in figures.ELSEWHERE for name in names}
+    images = DOCS / "images"
+    there = {path.relative_to(images).as_posix() for path in images.rglob("*.*")}
+    assert made == there, "docs/figures.py must name every picture, in FIGURES or ELSEWHERE"
+    assert all("def main(" in (DOCS / f"{f.module}.py").read_text("utf-8") for f in figures.FIGURES.values())
+
+
+def test_every_data_file_is_named(figures):
+    """By a page, a script or a test, or by the table that it makes."""
+    scripts = [path for room in ("src", "benchmarks", "tests") for path in (ROOT / room).rglob("*.py")]
+    text = "\n".join(path.read_text(encoding="utf-8") for path in [*figures.pages(), *scripts])
+    named = {name.split("/")[0] for name in re.findall(r"\bdata/([\w./-]+\w)", text)}
+    named |= {file.split("/")[0] for table in figures.TABLES.values() for file in table.data}
+    assert sorted(p.name for p in (DOCS / "data").iterdir() if p.name not in named) == []
+
+
+def test_what_is_listed(figures):
+    text = "\n".join(figures.listing())
+    assert "nowhere" not in text
+    assert "standing (docs/benchmark.md), docs/data/benchmark.csv: holosplat bench run" in text
+    assert "cells FOLDER: cells.png, after holosplat grow" in text
+
+
+# --- the plan of the code -----------------------------------------------------------------------------------
+
+
+def shown_rooms() -> set[str]:
+    """What the tree in docs/design/architecture.md shows of src/holosplat."""
+    text = (DOCS / "design" / "architecture.md").read_text(encoding="utf-8")
+    tree = text.split("src/holosplat/\n")[1].split("tests/")[0]
+    lines = [line for line in tree.splitlines() if re.match(r"  \S", line)]
+    inside = [line for line in tree.splitlines() if re.match(r"    \S", line)]
+    names = re.compile(r"\b([a-z_]+(?:\.py|\.toml|/))(?=\s|$)")
+    top = {name for line in lines for name in names.findall(line)}
+    return top | {f"projectors/{name}" for line in inside for name in names.findall(line)[:1]}
+
+
+def test_the_plan_shows_the_rooms_that_are_there():
+    package = ROOT / "src" / "holosplat"
+    there = {f"{p.name}/" for p in package.iterdir() if p.is_dir() and p.name != "__pycache__"}
+    there |= {p.name for p in package.iterdir() if p.suffix in (".py", ".toml") and p.name != "__init__.py"}
+    there |= {f"projectors/{p.name}/" for p in (package / "projectors").iterdir() if (p / "__init__.py").exists()}
+    assert shown_rooms() == there
