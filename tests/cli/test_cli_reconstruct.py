@@ -133,7 +133,7 @@ def test_ctrl_c_leaves_a_usable_run_that_goes_on(shop, tmp_path):
         process = subprocess.Popen(
             [*PROGRAM, *map(str, arguments)], cwd=tmp_path, stdout=subprocess.PIPE, stderr=stderr, text=True
         )
-        deadline = time.monotonic() + 60
+        deadline = time.monotonic() + 300  # of a machine that does much else
         while "steps/s" not in log.read_text() and time.monotonic() < deadline:
             time.sleep(0.05)
         process.send_signal(signal.SIGINT)

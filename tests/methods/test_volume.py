@@ -27,6 +27,8 @@ from holosplat.scan import Exposures, Scan
 from holosplat.specimens.soft_matter import round_cell, tissue
 from holosplat.volume import Object
 
+pytestmark = pytest.mark.usefixtures("begun_once")
+
 RATIO = MaterialPrior.of_ratio(1500.0)
 QUICK = HolographicTV(retrieval=10, iterations=20, corrections=0, upper=0.0)
 
