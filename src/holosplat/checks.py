@@ -8,11 +8,19 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+OUT_OF_MEMORY = re.compile("can't allocate memory|not enough memory|out of memory|std::bad_alloc", re.IGNORECASE)
+"""What torch says of memory, in errors of no kind of their own."""
+LONGEST = 200
+"""Characters of another message within ours, at most."""
 
 
 class InputError(ValueError):
@@ -94,6 +102,26 @@ def require_regular(path: str | Path, what: str) -> None:
         raise InputError(f"{path} must be {what}, but it cannot be opened: {error}.") from None
     require(not stat.S_ISDIR(mode), f"{path} must be {what}, but it is a folder; name the file in it.")
     require(stat.S_ISREG(mode), f"{path} must be {what}, but it is a pipe or a device; copy what it gives to a file.")
+
+
+@contextmanager
+def as_written(path: str | Path, what: str = "") -> Iterator[None]:
+    """`InputError` in place of what goes wrong in the block because `path` is not as we wrote it: something in it is
+    missing, or of another kind; what: it must be, for the message."""
+    try:
+        yield
+    except InputError as error:
+        if str(path) in str(error):
+            raise
+        raise InputError(f"{path} must be {what or 'as it was written'}, but it is not: {error}") from error
+    except (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, AssertionError, RuntimeError) as error:
+        if OUT_OF_MEMORY.search(str(error)):
+            raise
+        said = " ".join(str(error).split())[:LONGEST] or type(error).__name__
+        raise InputError(
+            f"{path} must be {what or 'as it was written'}, but it lacks or garbles {said}; bring back the whole file, "
+            "or start anew."
+        ) from error
 
 
 def _of(unit: str) -> str:

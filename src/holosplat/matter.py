@@ -10,12 +10,15 @@ import numpy as np
 
 from .checks import InputError, require
 from .geometry import Grid
+from .ranges import Signed, ranged
 from .volume import Volume
 
 MatterKind = Literal["levels", "continuous"]
 """What matter is like: of one level of δ, or several, with sharp edges, or varying smoothly."""
 LEAST_CONTRAST = 1.6
 """Two materials whose δ differ by less than this factor pass for one."""
+MOST_DELTA = 1.0
+"""What no δ or β of X-rays comes near: those of gold at 1 keV are 0.002."""
 RATIO_RANGE = (1.0, 1e6)
 """Sizes of δ/β that may be given."""
 
@@ -53,6 +56,11 @@ class Matter:
     def __post_init__(self) -> None:
         channels = tuple(DeltaBeta(float(delta), float(beta)) for delta, beta in self.channels)
         require(len(channels) in (1, 2), f"matter must have one or two channels, but it has {len(channels)}.")
+        for name, value in ((name, value) for channel in channels for name, value in zip(("δ", "β"), channel)):
+            require(
+                abs(value) <= MOST_DELTA,
+                f"{name} of matter must lie within {MOST_DELTA:g} of 0, but it is {value:g} (n = 1 - δ + iβ).",
+            )
         object.__setattr__(self, "channels", channels)
 
     @classmethod
@@ -213,10 +221,11 @@ class KnownTwo(MaterialPrior):
 
 
 @dataclass(frozen=True)
+@ranged
 class KnownRatio(MaterialPrior):
     """One material of which only δ/β is known."""
 
-    ratio: float
+    ratio: Signed
     kind = "ratio"
 
     def __post_init__(self) -> None:

@@ -35,13 +35,18 @@ def read_table(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise InputError(f"{path} must be a readable {language} file, but reading it failed: {error}.") from None
     try:
-        table = tomllib.loads(text) if toml else json.loads(text)
+        table = tomllib.loads(text) if toml else json.loads(text, parse_constant=_no_number)
     except RecursionError:
         raise InputError(f"{path} must be valid {language}, but it is nested too deeply; make it flat.") from None
     except ValueError as error:  # both decoders' errors
         raise InputError(f"{path} must be valid {language}, but: {error}.") from None
     require(isinstance(table, dict), f"{path} must hold a table, but it holds {type(table).__name__}.")
     return table
+
+
+def _no_number(name: str) -> Any:
+    """What JSON does not have, and Python reads."""
+    raise ValueError(f"{name} is no number")
 
 
 # --- tables -------------------------------------------------------------------------------------------------

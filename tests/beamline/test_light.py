@@ -117,7 +117,7 @@ def test_simulations_take_light_last():
         ({"light_grain_px": 0.1}, "light_grain_px must be at least 0.3"),
         ({"light_drift_px": 3.0}, "light_drift_px moves the pattern, of which there is none"),
         ({"light_pattern": 0.1, "light_drift_px": 1e5}, "light_drift_px must be within 10 000"),
-        ({"light_seed": -1}, "light_seed must be 0 or more"),
+        ({"light_seed": -1}, "light_seed must not be negative"),
     ],
 )
 def test_light_out_of_range_is_refused(options, match):

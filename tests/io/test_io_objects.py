@@ -139,6 +139,11 @@ def with_state(change: Callable[[dict], object]) -> Callable[[h5py.File], None]:
     return act
 
 
+def with_channels(*channels: list[float]) -> Callable[[h5py.File], None]:
+    """A change of δ and β of the matter."""
+    return with_state(lambda state: state["matter"].update(channels=channels))
+
+
 def replaced(name: str, act: Callable[[np.ndarray], object]) -> Callable[[h5py.File], None]:
     """A change of a dataset."""
 
@@ -194,7 +199,11 @@ SOME: dict[tuple[str, str], tuple[Callable[[h5py.File], object], str]] = {
     ("surfaces", "negative faces"): (replaced("faces", first(-1)), "faces"),
     ("surfaces", "quads"): (replaced("faces", lambda a: a.reshape(-1, 4)), "face"),
     ("surfaces", "NaN"): (replaced("vertices", first(math.nan)), "finite"),
-    ("surfaces", "two materials"): (with_state(lambda s: s["matter"].update(channels=[[1, 2]] * 2)), "one material"),
+    ("surfaces", "two materials"): (with_channels([1e-7, 1e-9], [1e-7, 1e-9]), "one material"),
+    ("gaussians", "dense beyond belief"): (with_channels([1e30, 0]), "channels must be at most"),
+    ("gaussians", "δ of 2"): (with_channels([2, 0]), "δ of matter"),
+    ("gaussians", "an infinite number"): (with_channels([1e400, 0]), "finite"),
+    ("gaussians", "far away"): (replaced("centres", first(1e30)), "centres must hold numbers of at most"),
     ("surfaces", "lines of text"): (with_state(lambda s: s.update(lines="two")), "garbles"),
     ("neural-field", "a weight less"): (lambda f: f.__delitem__("weights/output.bias"), "output.bias"),
     ("neural-field", "another shape"): (replaced("weights/output.bias", lambda a: np.ones(7, "f4")), "output.bias"),

@@ -283,7 +283,7 @@ TRIANGLES = "POINTS 4 float\n0 0 0 4 0 0 0 4 0 0 0 4\nPOLYGONS 4 16\n3 0 2 1 3 0
         ("3 0 2 1", "3 0 x 1", "POLYGONS must hold 16 integers"),
         ("4 16", "4 15", "POLYGONS must be 4 cells of 15 integers"),
         ("4 16", "9 16", "POLYGONS must be 9 cells of 16 integers"),
-        ("4 16", "4 999999999999", "POLYGONS must hold 999999999999 integers"),
+        ("4 16", "4 999999999999", "it declares 999999999999 values"),
         ("3 1 2 3", "3 1 2 99999999", "point 99999999, but there are 4"),
         ("Version 3.0", "Version 5.1", "POLYGONS must be laid out"),
     ],

@@ -165,7 +165,8 @@ def test_the_gradient_converges_to_finite_differences(projector):
         (lambda v, f: (v[:, :2], f, 2), "vertices must be float64"),
         (lambda v, f: (v, f.int(), 2), "faces must be int64"),
         (lambda v, f: (v, f + 1, 2), "faces must name existing vertices"),
-        (lambda v, f: (v, f, 0), "lines must be at least 1"),
+        (lambda v, f: (v, f, 0), "lines must be from 1"),
+        (lambda v, f: (v, f, 2**40), "lines must be from 1 to 1024"),
         (lambda v, f: (v * torch.nan, f, 2), "vertices must be finite"),
     ],
 )

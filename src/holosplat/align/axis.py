@@ -12,6 +12,7 @@ from ..checks import at_least, in_range, require
 from ..geometry import Views
 from ..optics.background import LightOptions
 from ..progress import Advance
+from ..ranges import ranged
 from ..scan import Exposures, Scan
 from .axis_search import Search
 from .combine import Estimate
@@ -31,6 +32,7 @@ FEWEST_VIEWS = 6
 
 
 @dataclass(frozen=True)
+@ranged
 class AxisOptions:
     """How the axis of a turning object is looked for."""
 

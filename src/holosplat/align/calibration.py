@@ -17,6 +17,7 @@ from ..optics.background import Light, LightOptions
 from ..optics.retrieval import Tikhonov, paganin, tikhonov
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
+from ..ranges import Pixels, ranged
 from ..scan import Exposures, Scan
 from .changes import changes, header, line
 from .coarse import shifts_by_mass
@@ -45,6 +46,7 @@ NAMES = {"shift": "shifts", "angle": "turns across the beam", "roll": "roll", "d
 
 
 @dataclass(frozen=True)
+@ranged
 class CalibrationOptions:
     """How a calibration proceeds."""
 
@@ -54,7 +56,7 @@ class CalibrationOptions:
     """Standard deviation of the pixel size, as a share of it (0: it is known)."""
     rounds: int = 8
     """Gauss–Newton steps on each size of pixels, at most."""
-    blur: float = 1.0
+    blur: Pixels = 1.0
     """Frames are compared after a Gaussian of this standard deviation [pixels]."""
     least_side: int = 24
     """Pixels along a frame's shorter side on the largest pixels, on which a first pose is looked for."""
@@ -67,7 +69,6 @@ class CalibrationOptions:
     def __post_init__(self) -> None:
         at_least(self, 1, "rounds", "most_pixels")
         at_least(self, 8, "least_side")
-        at_least(self, 0, "pixel", "retrieval")
         require(
             self.uncertain.magnification == 0, "calibrate finds one pixel size of all views; leave magnification 0."
         )

@@ -20,6 +20,7 @@ from ..optics.retrieval import Tikhonov, tikhonov
 from ..optics.sampling import fringe_sampling
 from ..progress import Advance
 from ..projectors.voxels import LatticeProjector
+from ..ranges import Angle, Pixels, Weight, ranged
 from ..scan import Exposures, Scan
 from .coarse import shifts_by_mass
 from .derivatives import NUMBERS, in_pixels, predicted
@@ -30,14 +31,15 @@ SHIFT, TURN, DISTANCE, MAGNIFICATION, FLUX = slice(0, 2), slice(2, 5), 5, 6, 7
 
 
 @dataclass(frozen=True)
+@ranged
 class Uncertain:
     """Standard deviations of what is not known of each view; 0: it is as planned."""
 
-    shift: float = 2.0
+    shift: Pixels = 2.0
     """Detector's shifts along rows and columns [pixels]."""
-    angle: float = 1.0
+    angle: Angle = 1.0
     """Turns about the two axes across the beam [degrees]."""
-    roll: float = 1.0
+    roll: Angle = 1.0
     """Turns about the beam [degrees]."""
     distance: float = 0.0
     """Propagation distance, as a share of it. Only matter with sharp edges tells it: a longer distance sharpens edges
@@ -49,7 +51,6 @@ class Uncertain:
 
     def __post_init__(self) -> None:
         limits = {"shift": 100.0, "angle": 20.0, "roll": 20.0, "distance": 0.5, "flux": 0.5, "magnification": 0.1}
-        at_least(self, 0, *limits)
         for name, most in limits.items():
             value = getattr(self, name)
             require(value <= most, f"uncertain {name} must be {most:g} at most, but it is {value:g}; correct it.")
@@ -74,16 +75,16 @@ class Uncertain:
 
 
 @dataclass(frozen=True)
+@ranged
 class Drift:
     """Standard deviations of how far each beam of a series goes from the first time to the last; 0: it stays."""
 
-    shift: float = 0.0
+    shift: Pixels = 0.0
     """Detector's shifts along rows and columns [pixels]."""
-    angle: float = 0.0
+    angle: Angle = 0.0
     """Turns about all three axes [degrees]."""
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "shift", "angle")
         for name, most in (("shift", 100.0), ("angle", 20.0)):
             value = getattr(self, name)
             require(value <= most, f"drift {name} must be {most:g} at most, but it is {value:g}; correct it.")
@@ -115,6 +116,7 @@ class Level:
 
 
 @dataclass(frozen=True)
+@ranged
 class PoseOptions:
     """How poses are looked for."""
 
@@ -126,10 +128,10 @@ class PoseOptions:
     """Pixels along a frame's shorter side on the largest pixels, which catch the largest errors."""
     max_voxels: int = 4_000_000
     """Pixels are not smaller than allow so many voxels; shifts are found to some hundredths of such a pixel."""
-    blur: float = 1.0
+    blur: Pixels = 1.0
     """Frames are compared after a Gaussian of this standard deviation [pixels]: details of a pixel's size depend on
     the voxels' raster."""
-    weight: float = 0.5
+    weight: Weight = 0.5
     """Weight of total variation in the volume [pixels of path length]."""
     steps: int = 8
     """Primal–dual steps of the volume a round, for `few_views` or more."""
@@ -138,7 +140,7 @@ class PoseOptions:
     few_views: int = 10
     """With fewer training views than this there are more steps: total variation has more to fill in, and where it has
     not, a volume takes any pose."""
-    by_mass: float = 2.0
+    by_mass: Weight = 2.0
     """Uncertain shifts [pixels] beyond which centres of mass give the first ones: they are good to a pixel or two."""
     retrieval: int = 40
     """Steps of the phase retrieval."""
@@ -153,7 +155,6 @@ class PoseOptions:
     def __post_init__(self) -> None:
         at_least(self, 1, "rounds", "max_voxels", "steps", "first", "retrieval", "few_views", "times")
         at_least(self, 4, "least_side")
-        at_least(self, 0, "weight", "edges")
         in_range("blur", self.blur, 0.3, 10.0, unit="pixels")
 
     def levels(self, shape: tuple[int, int], views: int) -> tuple[Level, ...]:

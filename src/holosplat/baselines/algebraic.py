@@ -13,6 +13,7 @@ from ..geometry import Grid, Views
 from ..memory import memory_kept
 from ..progress import Advance
 from ..projectors.voxels import LatticeProjector, SliceProjector
+from ..ranges import ranged
 from .rays import Rays, bounded, checked_upper, rays_of
 
 SHORTEST = 1e-3
@@ -20,6 +21,7 @@ SHORTEST = 1e-3
 
 
 @dataclass(frozen=True)
+@ranged
 class Algebraic:
     """Options. sweeps: how often each ray is used (a few: errors of the lines are fitted later than the object);
     relaxation: length of a step, between 0 and 2; nonnegative: whether the occupancy is kept from going below zero.

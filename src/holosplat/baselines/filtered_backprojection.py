@@ -12,10 +12,12 @@ from torch import Tensor
 from ..checks import require
 from ..geometry import Grid, Views
 from ..progress import Advance
+from ..ranges import ranged
 from .rays import bounded, checked_upper, in_pixels
 
 
 @dataclass(frozen=True)
+@ranged
 class Ramp:
     """Options. window: of the ramp filter; cutoff: its end, as a fraction of the Nyquist frequency; nonnegative:
     whether values below zero are set to zero at the end, which is no longer linear.

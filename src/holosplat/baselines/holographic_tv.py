@@ -28,6 +28,7 @@ from ..optics.retrieval.spectra import Raster, filtered, noise_found, radian, re
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..projectors.voxels import projector_for
+from ..ranges import Metres, Weight, ranged
 from ..scan import Scan
 from .beyond import carried_on, rows_beyond
 from .primal_dual import PrimalDual
@@ -37,6 +38,7 @@ from .wave_frames import frames_of, refined
 
 
 @dataclass(frozen=True)
+@ranged
 class HolographicTV:
     """Options of the start: phase retrieval, total variation, and agreement with the holograms."""
 
@@ -44,7 +46,7 @@ class HolographicTV:
     """Steps of the phase retrieval."""
     iterations: int = 160
     """Primal–dual steps on the retrieved thickness."""
-    weight: float = 0.3
+    weight: Weight = 0.3
     """Weight of total variation while the volume is made to agree with the holograms, in pixels of path length."""
     relit: int = 3
     """Rounds at most in which uneven light is found anew beside the volume; the first does most."""
@@ -56,23 +58,23 @@ class HolographicTV:
     """With fewer views than this a round has more steps: total variation has more to fill in."""
     settling: int = 2
     """Rounds after which misfits are compared: in the first ones the solver finds its dual variables."""
-    noisy: float = 0.35
+    noisy: Weight = 0.35
     """Share of the frames' contrast that is noise from which on there are no rounds: the volume would agree with it."""
     refine: int = 0
     """Voxels along a pixel's edge in the rounds (0: as the first fringe needs)."""
     max_voxels: int = 70_000_000
     """Coarser voxels rather than more than this many."""
-    upper: float = 1.0
+    upper: Weight = 1.0
     """Bound of the occupancy (0: none)."""
     still_light: int = 0
     """Half waves across a frame up to which light that is the same in all frames, such as what a missing flat field has
     left, is unknown and found beside the matter (0: there is none). Its mean is taken to be right, for in few views it
     could pass for matter everywhere. A known material, whose bound tells matter from light, finds it best. There are
     then no rounds."""
-    misfit: float = 0.0
+    misfit: Weight = 0.0
     """Weight of total variation on the retrieved thickness as a multiple of what 60 steps leave unexplained (rms),
     where that is more than half a pixel: about 2 where frames have systematic errors (0: always half a pixel)."""
-    inside: float = 0.0
+    inside: Metres = 0.0
     """Distance from the axis within which matter lies [m], such as the inner radius of a tube (0: anywhere)."""
     beyond: bool = True
     """Whether a volume without a bound has rows above and below the frames where matter goes on there."""
@@ -80,22 +82,6 @@ class HolographicTV:
     """What computes it: the compiled kernels, or plain torch, which is slow."""
 
     def __post_init__(self) -> None:
-        at_least(
-            self,
-            0,
-            "weight",
-            "relit",
-            "corrections",
-            "inner",
-            "few_views",
-            "settling",
-            "noisy",
-            "refine",
-            "upper",
-            "still_light",
-            "misfit",
-            "inside",
-        )
         at_least(self, 1, "retrieval", "iterations", "max_voxels")
 
 

@@ -14,6 +14,7 @@ from ..geometry import Grid
 from ..memory import memory_kept
 from ..optics.retrieval import paganin
 from ..progress import Progress
+from ..ranges import Weight, ranged
 from ..scan import Scan
 from .rays import rays_of
 from .tomography import TotalVariation, tv_solver
@@ -23,6 +24,7 @@ TRIAL_DELTA = 1e-6
 
 
 @dataclass(frozen=True)
+@ranged
 class MaterialEstimate:
     """How a material that is not known is estimated from the frames."""
 
@@ -35,7 +37,7 @@ class MaterialEstimate:
     width: int = 64
     """Frames are binned to about so many pixels for δ/β, which acts on the lowest frequencies only; to twice as many
     for δ."""
-    weight: float = 0.1
+    weight: Weight = 0.1
     """Weight of total variation in the trial volumes, in pixels of path length."""
     iterations: int = 40
     """Primal–dual steps for a trial volume."""
@@ -45,7 +47,6 @@ class MaterialEstimate:
         require(rises, f"lowest must be below highest, {self.highest:g}, but it is {self.lowest:g}.")
         at_least(self, 3, "tried")
         at_least(self, 1, "width", "iterations")
-        at_least(self, 0, "weight")
 
 
 DEFAULT = MaterialEstimate()

@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import at_least
 from ..geometry import Grid, Views
 from ..memory import memory_kept
 from ..metrics.correlation import shortest_side
 from ..optics.modes import smooth_modes
 from ..progress import Advance
+from ..ranges import Metres, Share, Weight, ranged
 from .algebraic import Algebraic, art, sirt
 from .filtered_backprojection import filtered_backprojection
 from .primal_dual import PrimalDual
@@ -38,6 +38,7 @@ def sirt_nonnegative(lines: Tensor, views: Views, grid: Grid, upper: float | Non
 
 
 @dataclass(frozen=True)
+@ranged
 class TotalVariation:
     """Options. weight: of total variation, in pixels of path length; first: iterations with all frequencies of the
     lines trusted alike; iterations: those after, with each trusted by its misfit; discount: how much, as the power of
@@ -47,16 +48,13 @@ class TotalVariation:
     which matter lies, in pixels (0: anywhere).
     """
 
-    weight: float = 0.5
+    weight: Weight = 0.5
     first: int = 60
     iterations: int = 100
-    discount: float = 0.5
+    discount: Share = 0.5
     still_light: int = 0
-    misfit: float = 0.0
-    inside: float = 0.0
-
-    def __post_init__(self) -> None:
-        at_least(self, 0, "weight", "first", "iterations", "discount", "still_light", "misfit", "inside")
+    misfit: Weight = 0.0
+    inside: Metres = 0.0
 
 
 def total_variation(

@@ -25,6 +25,7 @@ from ..matter import LEAST_CONTRAST, DeltaBeta
 from ..model import Instrument
 from ..optics.sampling import fringe_sampling
 from ..projectors.voxels import voxel_line_integrals
+from ..ranges import Pixels, Share, Weight, ranged
 from ..representations.voxel_lines import VoxelLines
 from ..scan import Scan
 from ..units import wavelength
@@ -36,27 +37,27 @@ STEP, ITERATIONS = 1e-10, 5
 
 
 @dataclass(frozen=True)
+@ranged
 class TwoMaterials:
     """How two materials are told apart."""
 
     rounds: int = 2
     """Rounds in which the frames are turned into those of one ratio; with more, the materials drift."""
-    faint: float = 0.3
+    faint: Share = 0.3
     """Below this share of the level that most matter has, there are halos rather than matter."""
-    largest_spread: float = 0.4
+    largest_spread: Weight = 0.4
     """Share of the spread that two levels leave, at most, where there are two (`benchmarks/two_levels.py`)."""
-    least_share: float = 0.1
+    least_share: Share = 0.1
     """Share of all matter that the lighter material must have where it is more than a layer of partly filled voxels."""
-    largest_deviation: float = 0.3
+    largest_deviation: Weight = 0.3
     """Mean deviation of δ from its level where the lighter material is: below 0.2 for one, more on blurred rims."""
-    sliver: float = 0.05
+    sliver: Share = 0.05
     """Occupancies below this are noise."""
-    blur: float = 1.5
+    blur: Pixels = 1.5
     """Standard deviation of the blur of frames in which absorption is looked for, in widths √(λz) of a fringe."""
 
     def __post_init__(self) -> None:
         at_least(self, 1, "rounds")
-        at_least(self, 0, "faint", "largest_spread", "least_share", "largest_deviation", "sliver", "blur")
 
 
 DEFAULT = TwoMaterials()

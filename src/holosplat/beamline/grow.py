@@ -10,15 +10,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import InputError, in_range, require, whole_seed
+from ..checks import InputError, as_written, in_range, require
 from ..fit.interrupt import interrupts_held
 from ..io.atomic import atomic_path
 from ..io.folder import require_new
+from ..io.guard import require_archive
 from ..io.json import read_json, write_json
 from ..io.pvd import TimeStep, write_pvd
 from ..io.vtk import write_mesh
 from ..mesh import TriangleMesh
 from ..progress import Advance
+from ..ranges import Seconds, Seed, Small, ranged
 from ..specimens.flow.channel import Channel
 from ..specimens.flow.integrate import State, Stepper
 from ..specimens.flow.suspension import Medium, Suspension
@@ -37,26 +39,27 @@ MOST_CELLS, MOST_SNAPSHOTS = 1000, 100_000
 
 
 @dataclass(frozen=True)
+@ranged
 class Growth:
     """Which cells, in which flow, recorded when."""
 
     cells: int = 16
     """Number of cells."""
-    box: tuple[float, float, float] = (80e-6, 34e-6, 26e-6)
+    box: tuple[Small, Small, Small] = (80e-6, 34e-6, 26e-6)
     """The channel (x, y, z) [m]: flow along x, periodic; walls across y and z."""
     flow: float = 0.05
     """Velocity of the undisturbed flow on the channel's axis [m/s]."""
     snapshots: int = 50
     """Number of snapshots."""
-    interval: float | None = None
+    interval: Seconds | None = None
     """Time between snapshots [s] (default: in which the fastest fluid goes 1 µm)."""
-    warm_up: float = 0.0
+    warm_up: Seconds = 0.0
     """Time before the first snapshot, in which resting cells take up the flow [s]."""
-    diameter: float = DIAMETER
+    diameter: Small = DIAMETER
     """Of a resting cell [m]."""
     frequency: int = 6
     """Resolution f of the meshes: 10 f² + 2 nodes (6: 362)."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the cells' places and directions."""
     tolerance: float = 1e-3
     """Greatest estimated error of a step in time, in mean edges of the mesh."""
@@ -71,7 +74,6 @@ class Growth:
             require(1 <= number <= most, f"{name} must be from 1 to {most}, but it is {number}.")
         in_range("interval", self.period, 1e-12, 1e3, unit="seconds")
         require(0 <= self.warm_up <= 1e3, f"warm_up must be from 0 to 1000 s, but it is {self.warm_up}.")
-        whole_seed("seed", self.seed)
         in_range("tolerance", self.tolerance, 1e-8, 0.1)
 
     @property
@@ -161,12 +163,16 @@ class SeriesFolder:
             return None
         try:
             with np.load(self.state, allow_pickle=False) as file:
+                require_archive(file, self.state)
                 nodes, numbers, counts = file["nodes"], file["numbers"].tolist(), file["counts"].tolist()
         except Exception as error:  # a damaged archive raises many kinds
             raise InputError(f"{self.state} must be a state that grow wrote, but it is damaged; start anew.") from error
         wanted = (growth.cells, len(suspension.membrane.mesh.vertices), 3)
         require(nodes.shape == wanted and bool(np.isfinite(nodes).all()), f"{self.state} is damaged; start anew.")
-        (time, step), (snapshot, taken, refused) = numbers, counts
+        with as_written(self.state, "a state that grow wrote"):
+            (time, step), (snapshot, taken, refused) = numbers, counts
+            good = step > 0 and 0 <= time < np.inf and min(snapshot, taken, refused) >= 0
+            require(good and step < np.inf, f"{self.state} is damaged; start anew.")
         return snapshot, State(torch.from_numpy(nodes), time, step, taken, refused)
 
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from ..checks import at_least, require, whole_seed
+from ..checks import at_least, require
+from ..ranges import Pixels, Seed, Signed, ranged
 
 MOST_RMS = 0.2
 """Largest relative deviation of light (rms): beyond, one in a million pixels would have to be dark."""
@@ -21,6 +22,7 @@ FAINTEST = 0.01
 
 
 @dataclass(frozen=True)
+@ranged
 class UnevenLight:
     """How light differs from the flat field; by default not at all. Errors: `InputError` for values out of range."""
 
@@ -32,19 +34,19 @@ class UnevenLight:
     """Relative change (rms) of each frame's intensity from its middle to an edge, along rows and along columns."""
     light_smooth: float = 0.0
     """Relative deviation (rms) of a smooth random background, another in each frame."""
-    light_smooth_px: float = 30.0
+    light_smooth_px: Pixels = 30.0
     """Correlation length of the smooth background [pixels]: its correlation is exp(-r² / 2 length²)."""
     light_grain: float = 0.0
     """Relative deviation (rms) of correlated grain, another in each frame."""
-    light_grain_px: float = 1.5
+    light_grain_px: Pixels = 1.5
     """Correlation length of the grain [pixels]."""
     light_pattern: float = 0.0
     """Relative deviation (rms) of the pattern that all frames and the flat share."""
-    light_pattern_px: float = 15.0
+    light_pattern_px: Pixels = 15.0
     """Correlation length of the pattern [pixels]."""
-    light_drift_px: float = 0.0
+    light_drift_px: Signed = 0.0
     """How far the pattern moves sideways, along rows, from the flat and the first frame to the last [pixels]."""
-    light_seed: int = 0
+    light_seed: Seed = 0
     """Seed of the light."""
 
     def __post_init__(self) -> None:
@@ -62,7 +64,6 @@ class UnevenLight:
             self.light_drift_px == 0 or self.light_pattern > 0,
             "light_drift_px moves the pattern, of which there is none; give light_pattern, too.",
         )
-        whole_seed("light_seed", self.light_seed)
 
     @property
     def is_even(self) -> bool:

@@ -8,26 +8,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..checks import require, whole_seed
+from ..checks import require
+from ..ranges import Angle, Pixels, Seed, ranged
 from ..scan import Exposures
 
 MOST_SHIFT_PX, MOST_ROTATION_DEG, MOST_DISTANCE, MOST_MAGNIFICATION = 1000.0, 45.0, 0.1, 0.1
 
 
 @dataclass(frozen=True)
+@ranged
 class Misalignment:
     """Standard deviations of the errors of each view, all independent and normally distributed.
 
     Errors: `InputError` for values below 0 or too large to be errors of alignment.
     """
 
-    shift_px: float = 0.0
+    shift_px: Pixels = 0.0
     """Shifts of the detector along rows and along columns [pixels] (default: none)."""
-    rotation_deg: float = 0.0
+    rotation_deg: Angle = 0.0
     """Small turns about x, y and z of the lab frame [degrees] (default: none)."""
     distance: float = 0.0
     """Relative error of the propagation distance (default: none)."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the errors."""
     magnification: float = 0.0
     """Relative error of the magnification (default: none)."""
@@ -39,7 +41,6 @@ class Misalignment:
             value = getattr(self, name)
             inside = math.isfinite(value) and 0 <= value <= most
             require(inside, f"misalignment {name} must lie between 0 and {most:g}, but it is {value:g}.")
-        whole_seed("misalignment seed", self.seed)
 
     def __bool__(self) -> bool:
         return max(self.shift_px, self.rotation_deg, self.distance, self.magnification) > 0

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from ..checks import require
+from ..checks import require, require_regular
+from ..io.guard import read_array
+from ..ranges import Signed, ranged
 
 if TYPE_CHECKING:
     from ..geometry import Views
@@ -24,14 +26,15 @@ GEOMETRIES: dict[Geometry, tuple[float, ...]] = {
 
 
 @dataclass(frozen=True)
+@ranged
 class Directions:
     """The views of an experiment: exactly one of `views`, `angles_deg`, `rotations` and `geometry`."""
 
     views: int | None = None
     """Number of views, evenly spaced over 180°."""
-    angles_deg: tuple[float, ...] = ()
+    angles_deg: tuple[Signed, ...] = ()
     """Angles about the rotation axis [degrees]."""
-    tilts_deg: tuple[float, ...] = ()
+    tilts_deg: tuple[Signed, ...] = ()
     """Tilts of the beam out of the plane normal to the axis [degrees], one an angle (default: none)."""
     rotations: Path | None = None
     """File (.npy) of rotation matrices [V, 3, 3]."""
@@ -55,11 +58,8 @@ class Directions:
 
 
 def _matrices(path: Path) -> np.ndarray:
-    require(path.is_file(), f"--rotations must name a .npy file of matrices, but {path} does not exist.")
-    try:
-        matrices = np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError):
-        matrices = np.empty(0)
+    require_regular(path, "rotation matrices (V, 3, 3), of --rotations,")
+    matrices = read_array(path, "rotation matrices (V, 3, 3), of --rotations,")
     numeric = matrices.dtype.kind in "fiu" and matrices.ndim == 3
     require(numeric, f"--rotations must hold numbers of the shape (V, 3, 3) as .npy, but {path} does not.")
     return matrices

@@ -21,6 +21,7 @@ from ..optics.illumination import Illumination, PulseModel, Pulses
 from ..optics.noise import PHOTON_RANGE
 from ..optics.resampling import FLIPS, Flip
 from ..progress import Advance
+from ..ranges import Photons, Seed, ranged
 from ..scan import Exposures, Scan
 
 DEAD_BIT, HOT_BIT = 1 << 1, 1 << 3
@@ -28,10 +29,11 @@ DEAD_BIT, HOT_BIT = 1 << 1, 1 << 3
 
 
 @dataclass(frozen=True)
+@ranged
 class RecordingOptions:
     """Options of a recording."""
 
-    photons_per_pixel: float = 10_000.0
+    photons_per_pixel: Photons = 10_000.0
     """Mean photons detected in a pixel without the object."""
     flats: int = 100
     """Frames without the object, each of a pulse of its own; they come before the projections."""
@@ -39,13 +41,12 @@ class RecordingOptions:
     """Frames without light; they come first."""
     flip: Flip = "none"
     """The order that the detector reverses: of its rows, of its columns, or of both."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of everything random."""
 
     def __post_init__(self) -> None:
         in_range("photons_per_pixel", self.photons_per_pixel, *PHOTON_RANGE)
         at_least(self, 1, "flats", "darks")
-        at_least(self, 0, "seed")
         require(self.flip in FLIPS, f"flip must be one of {', '.join(FLIPS)}, but it is {self.flip!r}.")
 
 

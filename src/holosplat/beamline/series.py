@@ -12,6 +12,7 @@ import numpy as np
 from ..checks import in_range, require
 from ..io.snapshots import find_snapshots
 from ..progress import Advance
+from ..ranges import Frequency, Seconds, Signed, Weight, ranged
 from ..specimens.mesh_series import ROUNDING, MeshSeries
 from ..units import LENGTH_UNITS, unit_factor
 from .scenes import Filling, field_centre, filled_scene
@@ -22,17 +23,18 @@ MOST_TIMES = 1_000_000
 
 
 @dataclass(frozen=True)
+@ranged
 class Timing:
     """Times of the frames of a series.
 
     Errors: `InputError` for a rate or count out of range, or a start below 0.
     """
 
-    frame_rate: float
+    frame_rate: Frequency
     """Frames a second [Hz]."""
     frames: int | None = None
     """Number of times (default: as many as the snapshots cover)."""
-    start: float | None = None
+    start: Seconds | None = None
     """Time of the first frame after the first snapshot [s] (default: the earliest whose pulses all fit)."""
     shutter: Shutter = field(default_factory=Shutter)
     """Motion blur about each time (default: none)."""
@@ -66,18 +68,19 @@ class Timing:
 
 
 @dataclass(frozen=True)
+@ranged
 class SeriesFiles:
     """How files of snapshots are read."""
 
     length_unit: str = "um"
     """Unit of the files' coordinates."""
-    origin: tuple[float, float, float] | None = None
+    origin: tuple[Signed, Signed, Signed] | None = None
     """Point on the rotation axis at the field's centre, in `length_unit` (default: the middle of the swept box)."""
-    interval: float | None = None
+    interval: Seconds | None = None
     """Time from one snapshot to the next [s] (default: from the files)."""
     time_unit: str | None = None
     """Unit of a collection's time steps (default: seconds)."""
-    period: tuple[float, float, float] | None = None
+    period: tuple[Weight, Weight, Weight] | None = None
     """Edges of the periodic box that bodies are folded into, in `length_unit`, 0: open (default: no box)."""
 
 

@@ -9,13 +9,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from ..checks import in_range, require, whole_seed
+from ..checks import in_range, require
 from ..memory import memory_kept
 from ..model import Instrument, Model
 from ..optics.detector import poisson
 from ..optics.noise import PHOTON_RANGE
 from ..optics.sampling import resolving_oversample
 from ..progress import Advance
+from ..ranges import Photons, Seed, ranged
 from ..scan import Exposures, Scan, interleaved_split
 from ..volume import Object
 from .light import EVEN_LIGHT, UnevenLight
@@ -28,6 +29,7 @@ MOST_PULSES = 10_000
 
 
 @dataclass(frozen=True)
+@ranged
 class Shutter:
     """Length of an exposure and its flashes, each shorter than any motion.
 
@@ -60,15 +62,16 @@ class Shutter:
 
 
 @dataclass(frozen=True)
+@ranged
 class Simulation:
     """How frames are simulated.
 
     Errors: `InputError` for photons or a seed out of range.
     """
 
-    photons_per_pixel: float | None = None
+    photons_per_pixel: Photons | None = None
     """Mean counts of the Poisson noise (default: no noise)."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the noise."""
     oversample: int | None = None
     """Samples a pixel (default: as many as the fringes need)."""
@@ -80,7 +83,6 @@ class Simulation:
     def __post_init__(self) -> None:
         if self.photons_per_pixel is not None:
             in_range("photons_per_pixel", self.photons_per_pixel, *PHOTON_RANGE)
-        whole_seed("seed", self.seed)
 
     def samples(self, exposures: Exposures) -> int:
         """Samples along a pixel's edge for `exposures`."""

@@ -19,6 +19,7 @@ from ..geometry import Views, rotation_tilted, rotation_y
 from ..materials import DeltaBeta, parse_material
 from ..matter import MaterialPrior
 from ..optics.noise import PHOTON_RANGE
+from ..ranges import Grams, Metres, Natural, Photons, Pixels, Positive, Signed, Small, ranged
 from ..scan import Exposures, interleaved_split
 from ..specimens.continuous import ContinuousScene
 from ..specimens.phantoms import Ball
@@ -31,14 +32,15 @@ MOST_PIXELS = 4096
 
 
 @dataclass(frozen=True)
+@ranged
 class Substance:
     """A preset's name ("plasma"), "vacuum", a formula with its density [g/cm³], or `delta` and `beta` themselves."""
 
     shorthand: ClassVar[str] = "formula"
     formula: str | None = None
-    density: float | None = None
-    delta: float | None = None
-    beta: float | None = None
+    density: Grams | None = None
+    delta: Signed | None = None
+    beta: Signed | None = None
 
     def __post_init__(self) -> None:
         numbers = self.delta is not None and self.beta is not None
@@ -71,21 +73,23 @@ class Matter:
 
 
 @dataclass(frozen=True)
+@ranged
 class Beam:
     """energy_kev: photon energy [keV]; distance: effective propagation distance [m]."""
 
-    energy_kev: float
-    distance: float
+    energy_kev: Positive
+    distance: Metres
 
 
 @dataclass(frozen=True)
+@ranged
 class Detector:
     """rows, columns: pixels; pixel_size: effective pitch [m]; psf_sigma_px: of its point-spread function [pixels]."""
 
     rows: int
     columns: int
-    pixel_size: float
-    psf_sigma_px: float = 0.0
+    pixel_size: Small
+    psf_sigma_px: Pixels = 0.0
 
     def __post_init__(self) -> None:
         for name in ("rows", "columns"):
@@ -94,12 +98,13 @@ class Detector:
 
 
 @dataclass(frozen=True)
+@ranged
 class Interleaved:
     """`count` views evenly over 180° about the y axis, the last of every `hold_out_every` held out."""
 
     kind: ClassVar[str] = "interleaved"
-    count: int
-    hold_out_every: int = 4
+    count: Natural
+    hold_out_every: Natural = 4
 
     def __post_init__(self) -> None:
         enough = 2 <= self.hold_out_every <= self.count
@@ -112,11 +117,12 @@ class Interleaved:
 
 
 @dataclass(frozen=True)
+@ranged
 class Between:
     """`train` views evenly over 180° about the y axis, and `test` held-out ones, each in the middle of a gap."""
 
     kind: ClassVar[str] = "between"
-    train: int
+    train: Natural
     test: int
 
     def __post_init__(self) -> None:
@@ -132,12 +138,13 @@ class Between:
 
 
 @dataclass(frozen=True)
+@ranged
 class Listed:
     """Directions `[angle, tilt]` [degrees] (`geometry.rotation_tilted`) for training, and held out."""
 
     kind: ClassVar[str] = "listed"
-    train: tuple[tuple[float, float], ...]
-    test: tuple[tuple[float, float], ...]
+    train: tuple[tuple[Signed, Signed], ...]
+    test: tuple[tuple[Signed, Signed], ...]
 
     def __post_init__(self) -> None:
         for name in ("train", "test"):
@@ -151,6 +158,7 @@ class Listed:
 
 
 @dataclass(frozen=True)
+@ranged
 class Declaration:
     """A case without its seed. summary: one line about it; photons: mean counts a pixel of a frame for training, or
     none for frames without noise; prior: what methods are told of `matter.material` against the medium; light: how it
@@ -163,7 +171,7 @@ class Declaration:
     detector: Detector
     views: Interleaved | Between | Listed
     prior: Literal["known", "ratio", "free"]
-    photons: float | None = None
+    photons: Photons | None = None
     light: UnevenLight = EVEN_LIGHT
     misalignment: Misalignment = AS_PLANNED
 

@@ -12,6 +12,7 @@ import numpy as np
 from ..checks import InputError, require
 from ..io.atomic import atomic_path
 from ..io.folder import is_taken, require_parent
+from ..io.guard import require_archive
 from ..io.json import read_json, write_json
 from ..io.leftovers import is_hidden
 from .rows import Row, read_row, write_row
@@ -86,6 +87,7 @@ class BenchFolder:
             return None
         try:
             with np.load(path, allow_pickle=False) as arrays:
+                require_archive(arrays, path)
                 return dict(arrays)
         except Exception as error:  # numpy and zipfile raise many kinds for damaged files
             raise InputError(f"{path} must be a picture of the benchmark, but it is damaged; remove it.") from error

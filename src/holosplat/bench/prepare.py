@@ -45,7 +45,7 @@ def prepared(case: Case | MeasuredCase, folder: Path) -> tuple[Scan, Volume]:
     if not record.is_file():  # last, so that a folder with it is complete
         facts = case.described(scan) if isinstance(case, MeasuredCase) else described(case)
         write_json(record, {**facts, "fingerprint": mark, "scan_hash": scan_hash(scan)})
-    whole = read_json(record)["scan_hash"] == scan_hash(scan)
+    whole = read_json(record).get("scan_hash") == scan_hash(scan)
     require(whole, f"{scan_file} is not the scan that was simulated, its frames were changed; choose another --out.")
     return scan, truth
 

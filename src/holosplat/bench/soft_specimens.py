@@ -7,23 +7,25 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from ..matter import DeltaBeta
+from ..ranges import Metres, Natural, Small, ranged
 from ..specimens.continuous import ContinuousScene
 from ..specimens.soft_matter import body_with_absorber, coated_droplets, round_cell, shepp_logan, soft_cells, tissue
 
-Extents = tuple[float, float, float]
+Extents = tuple[Small, Small, Small]
 """`(x, y, z)` [m]."""
 
 
 @dataclass(frozen=True)
+@ranged
 class SoftCells:
     """`soft_cells`: `count` of them, the smallest and the largest of `diameters` [m], edges `edge` wide [m]."""
 
     kind: ClassVar[str] = "soft cells"
     has_core: ClassVar[bool] = False
-    count: int
-    diameters: tuple[float, float]
+    count: Natural
+    diameters: tuple[Small, Small]
     box: Extents
-    edge: float
+    edge: Small
 
     def continuous(self, seed: int, matter: Sequence[DeltaBeta]) -> tuple[ContinuousScene, str]:
         """The scene that `seed` gives of `matter` against its medium, and what it is in words."""
@@ -32,12 +34,13 @@ class SoftCells:
 
 
 @dataclass(frozen=True)
+@ranged
 class RoundCell:
     """`round_cell` of `diameter` [m]."""
 
     kind: ClassVar[str] = "round cell"
     has_core: ClassVar[bool] = False
-    diameter: float
+    diameter: Small
 
     def continuous(self, seed: int, matter: Sequence[DeltaBeta]) -> tuple[ContinuousScene, str]:
         """The scene that `seed` gives of `matter` against its medium, and what it is in words."""
@@ -45,6 +48,7 @@ class RoundCell:
 
 
 @dataclass(frozen=True)
+@ranged
 class Tissue:
     """`tissue`: a piece in the ellipsoid of extents `box` [m], with so many `cells` and `granules`."""
 
@@ -60,13 +64,14 @@ class Tissue:
 
 
 @dataclass(frozen=True)
+@ranged
 class SheppLogan:
     """`shepp_logan` of `height` [m], edges `edge` wide [m]; the seed changes nothing."""
 
     kind: ClassVar[str] = "head phantom"
     has_core: ClassVar[bool] = False
-    height: float
-    edge: float = 0.0
+    height: Small
+    edge: Metres = 0.0
 
     def continuous(self, seed: int, matter: Sequence[DeltaBeta]) -> tuple[ContinuousScene, str]:
         """The phantom of `matter` against its medium, and what it is in words."""
@@ -74,15 +79,16 @@ class SheppLogan:
 
 
 @dataclass(frozen=True)
+@ranged
 class CoatedDroplets:
     """`coated_droplets`: `count` of them, the smallest and largest of `diameters` [m], `coating` thick [m]; their
     coating is the case's material, and what is in them is its core."""
 
     kind: ClassVar[str] = "coated droplets"
     has_core: ClassVar[bool] = True
-    count: int
-    diameters: tuple[float, float]
-    coating: float
+    count: Natural
+    diameters: tuple[Small, Small]
+    coating: Small
     box: Extents
 
     def continuous(self, seed: int, matter: Sequence[DeltaBeta]) -> tuple[ContinuousScene, str]:
@@ -93,14 +99,15 @@ class CoatedDroplets:
 
 
 @dataclass(frozen=True)
+@ranged
 class BodyWithAbsorber:
     """`body_with_absorber`: a body of extents `size` [m], and in it `beads` of the case's core, of diameter `bead`."""
 
     kind: ClassVar[str] = "body with absorber"
     has_core: ClassVar[bool] = True
     size: Extents
-    bead: float
-    beads: int = 1
+    bead: Small
+    beads: Natural = 1
 
     def continuous(self, seed: int, matter: Sequence[DeltaBeta]) -> tuple[ContinuousScene, str]:
         """The scene that `seed` gives of `matter` against its medium, and what it is in words."""

@@ -13,6 +13,7 @@ import numpy as np
 from ..checks import InputError, in_range, require
 from ..io.vtk import SUFFIXES, read_meshes
 from ..mesh import TriangleMesh
+from ..ranges import Natural, Seed, Share, Small, SomeShare, ranged
 from ..specimens.capsules import place_capsules
 from ..specimens.foam import random_foam
 from ..specimens.phantoms import Ball, star_of_balls
@@ -20,7 +21,7 @@ from ..specimens.red_cells import crowded_cells, random_cells
 from ..specimens.repair import closed
 from .soft_specimens import Continuous
 
-Extents = tuple[float, float, float]
+Extents = tuple[Small, Small, Small]
 """`(x, y, z)` [m]."""
 
 
@@ -38,6 +39,7 @@ class Bodies:
 
 
 @dataclass(frozen=True)
+@ranged
 class RedCells:
     """`random_cells`: `count` cells of `diameter` [m] in the channel `box` [m], of the given `shape` and `deform`.
 
@@ -46,12 +48,12 @@ class RedCells:
 
     kind: ClassVar[str] = "red cells"
     has_core: ClassVar[bool] = False
-    count: int
-    diameter: float
+    count: Natural
+    diameter: Small
     box: Extents
     shape: Literal["cylinder", "box"] = "cylinder"
-    deform: float = 0.03
-    first_seed: int = 0
+    deform: Share = 0.03
+    first_seed: Seed = 0
 
     def bodies(self, seed: int, snapshots: Path | None) -> Bodies:
         """The cells that `seed` gives."""
@@ -61,15 +63,16 @@ class RedCells:
 
 
 @dataclass(frozen=True)
+@ranged
 class CrowdedCells:
     """`crowded_cells`: cells of `diameter` [m] that fill the fraction `haematocrit` of a cylinder in `box` [m]."""
 
     kind: ClassVar[str] = "crowded cells"
     has_core: ClassVar[bool] = False
-    haematocrit: float
-    diameter: float
+    haematocrit: SomeShare
+    diameter: Small
     box: Extents
-    deform: float = 0.03
+    deform: Share = 0.03
 
     def bodies(self, seed: int, snapshots: Path | None) -> Bodies:
         """The cells that `seed` gives."""
@@ -79,6 +82,7 @@ class CrowdedCells:
 
 
 @dataclass(frozen=True)
+@ranged
 class Snapshots:
     """One snapshot of simulated cells, `*_000.vtk`, `*_001.vtk` … in a folder (µm), enlarged by `scale`.
 
@@ -110,16 +114,17 @@ class Snapshots:
 
 
 @dataclass(frozen=True)
+@ranged
 class Capsules:
     """`place_capsules`: `count` of them, the smallest and largest of `diameters` [m], of the thickness `shell` [m]."""
 
     kind: ClassVar[str] = "capsules"
     has_core: ClassVar[bool] = True
-    count: int
-    diameters: tuple[float, float]
-    shell: float
+    count: Natural
+    diameters: tuple[Small, Small]
+    shell: Small
     box: Extents
-    flattening: float = 0.2
+    flattening: Share = 0.2
 
     def bodies(self, seed: int, snapshots: Path | None) -> Bodies:
         """The capsules that `seed` gives."""
@@ -130,14 +135,15 @@ class Capsules:
 
 
 @dataclass(frozen=True)
+@ranged
 class FoamDrop:
     """`random_foam`: a drop of diameter `drop` [m], `count` bubbles of log-normal diameters about `median` [m]."""
 
     kind: ClassVar[str] = "foam"
     has_core: ClassVar[bool] = True
-    drop: float
-    count: int
-    median: float
+    drop: Small
+    count: Natural
+    median: Small
     spread: float = 0.4
 
     def bodies(self, seed: int, snapshots: Path | None) -> Bodies:
@@ -148,13 +154,14 @@ class FoamDrop:
 
 
 @dataclass(frozen=True)
+@ranged
 class BallStar:
     """`star_of_balls`: `2 · spokes` balls of each of the `diameters` [m], on rings that shrink as the balls do."""
 
     kind: ClassVar[str] = "star of balls"
     has_core: ClassVar[bool] = False
-    diameters: tuple[float, ...]
-    spokes: int = 8
+    diameters: tuple[Small, ...]
+    spokes: Natural = 8
 
     def bodies(self, seed: int, snapshots: Path | None) -> Bodies:
         """The star that `seed` gives, with its balls."""

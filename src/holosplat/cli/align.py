@@ -12,7 +12,9 @@ from tyro.conf import Positional
 
 from ..checks import require
 from ..io.reading import Part, Reading
-from .options import LightFlags, PriorOptions
+from ..ranges import ranged
+from .light import LightFlags
+from .options import PriorOptions
 from .progress import ProgressBar
 from .quantities import Degrees, Pixels, Share
 
@@ -29,6 +31,7 @@ LIGHT = LightFlags()
 
 
 @dataclass(frozen=True)
+@ranged
 class UncertainOptions:
     """How far off the plan each view may be: standard deviations. 0 keeps it as planned."""
 
@@ -56,6 +59,7 @@ class UncertainOptions:
 
 
 @dataclass(frozen=True)
+@ranged
 class RefineOptions:
     """Beams that may be elsewhere than the scan says."""
 

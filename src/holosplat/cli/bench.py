@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg, subcommand
 
 from ..checks import require
+from ..ranges import Seed, with_checked_numbers
 from .progress import INTERRUPTED, ProgressBar
 from .thesis import thesis
 
@@ -36,7 +37,7 @@ class Folders:
 def run(
     cases: tuple[str, ...] = (),
     methods: tuple[str, ...] = (),
-    seeds: tuple[int, ...] = (FIRST_SEED,),
+    seeds: tuple[Seed, ...] = (FIRST_SEED,),
     out: Path = Path("bench"),
     folders: Folders = Folders(),
     retry: bool = False,
@@ -106,9 +107,9 @@ def report(folder: Positional[Path] = Path("bench")) -> None:
 
 def bench(
     act: Annotated[
-        Annotated[None, subcommand("run", constructor=run)]
+        Annotated[None, subcommand("run", constructor=with_checked_numbers(run))]
         | Annotated[None, subcommand("report", constructor=report)]
-        | Annotated[None, subcommand("thesis", constructor=thesis)],
+        | Annotated[None, subcommand("thesis", constructor=with_checked_numbers(thesis))],
         arg(name=""),
     ],
 ) -> None:

@@ -11,7 +11,9 @@ from tyro.conf import Positional
 
 from ..checks import require
 from ..io.reading import Part, Reading
-from .options import LightFlags, MaterialOptions
+from ..ranges import Small, ranged
+from .light import LightFlags
+from .options import MaterialOptions
 from .progress import ProgressBar
 from .quantities import Degrees, Pixels, Share
 
@@ -24,6 +26,7 @@ LIGHT = LightFlags()
 
 
 @dataclass(frozen=True)
+@ranged
 class BodyOptions:
     """The known shape: a mesh, or beads."""
 
@@ -31,7 +34,7 @@ class BodyOptions:
     """Closed mesh of the phantom (.stl, .ply, .obj, .vtk, .vtp, .vtu); its pose in the file does not matter."""
     length_unit: str = "um"
     """Unit of the mesh file's coordinates."""
-    beads: float | None = None
+    beads: Small | None = None
     """Or: radius of beads [m], of any number, anywhere in the field."""
 
     def body(self) -> TriangleMesh | float:
@@ -49,6 +52,7 @@ class BodyOptions:
 
 
 @dataclass(frozen=True)
+@ranged
 class DoubtOptions:
     """How far off the plan each view may be: standard deviations. 0 keeps it as planned."""
 

@@ -11,10 +11,12 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, arg
 
-from ..checks import InputError, in_range, require, whole_seed
+from ..checks import InputError, as_written, in_range, require
 from ..io.reading import Reading
+from ..ranges import Seed
 from .align import RefineOptions
-from .options import BeamlineOptions, MethodOptions, PriorOptions, RunLightFlags, TruthOptions
+from .light import RunLightFlags
+from .options import BeamlineOptions, MethodOptions, PriorOptions, TruthOptions
 from .progress import INTERRUPTED, ProgressBar
 
 if TYPE_CHECKING:
@@ -38,7 +40,7 @@ def reconstruct(
     out: Path,
     matter: PriorOptions = PriorOptions(),
     how: MethodOptions = MethodOptions(),
-    seed: int = 0,
+    seed: Seed = 0,
     resume: bool = False,
     reading: Reading = Reading(),
     *,
@@ -66,7 +68,6 @@ def reconstruct(
     from .motion import asks_for_motion, reconstruct_in_motion
 
     method = how.chosen()
-    whole_seed("--seed", seed)
     uncertain, refine = Uncertain(**reading.told.ranges(), **matter.ranges()), geometry.options()
     require(
         refine is None or reading.part.time_frame not in ("all", "still"),
@@ -223,10 +224,11 @@ def _export_volume(
     from ..scan import PIXEL_RANGE_M
 
     require_writable(volume)
-    detector = read_json(folder.summary)["detector"]
-    rows, columns = int(detector["rows"]), int(detector["columns"])
-    edge = float(detector["pixel_size_m"]) if voxel_size is None else voxel_size
-    x, y, z = (float(c) for c in detector.get("centre_m", (0.0, 0.0, 0.0)))
+    with as_written(folder.summary, "what reconstruct wrote"):
+        detector = read_json(folder.summary)["detector"]
+        rows, columns = int(detector["rows"]), int(detector["columns"])
+        edge = float(detector["pixel_size_m"]) if voxel_size is None else voxel_size
+        x, y, z = (float(c) for c in detector.get("centre_m", (0.0, 0.0, 0.0)))
     edge = in_range("voxel size", edge, *PIXEL_RANGE_M, unit="metres")
     grid = Grid.centred(shape or (columns, rows, columns), edge, (x, y, z))
     count = math.prod(grid.shape)

@@ -24,6 +24,7 @@ from ..io.volumes import read_volume
 from ..matter import KnownRatio, MaterialPrior
 from ..methods.method import STAND_IN_RATIO, shows_no_refraction
 from ..optics import retrieve_thickness
+from ..ranges import Metres, Natural, Positive, ranged
 from ..scan import Scan
 from ..workflows.still_light import StillLight, evened
 from .options import PriorOptions
@@ -31,18 +32,19 @@ from .progress import ProgressBar
 
 
 @dataclass(frozen=True)
+@ranged
 class WritingOptions:
     """How it is written."""
 
     png: PngKind | None = None
     """nerf-synthetic: 16-bit grey images (default), or the 8-bit RGBA that some programs insist on."""
-    camera_distance: float | None = None
+    camera_distance: Positive | None = None
     """nerf-synthetic: cameras' distance, in half fields of view (default 100); the farther, the more parallel."""
     tiff: TiffLayout | None = None
     """tiff: one stack (default), or one file a frame."""
     truth: Path | None = None
     """r2-gaussian: volume file of the truth, for its scores."""
-    seed_points: int | None = None
+    seed_points: Natural | None = None
     """nerf-synthetic, r2-gaussian: points to start from."""
 
     def for_format(self, to: ScanFormat) -> dict[str, Any]:
@@ -54,13 +56,14 @@ class WritingOptions:
 
 
 @dataclass(frozen=True)
+@ranged
 class EveningOptions:
     """Light that is the same in all frames."""
 
     still_light: int | None = None
     """Divide out what all frames for training have in common beside the matter that they show: light of up to so many
     half waves across a frame, such as 4, or any pattern (0) (default: nothing)."""
-    inside: float | None = None
+    inside: Metres | None = None
     """With it: distance from the axis within which matter lies [m] (default: anywhere)."""
 
     def applied(self, scan: Scan, prior: MaterialPrior) -> Scan:

@@ -7,7 +7,6 @@ each function imports its work where it starts, so that `holosplat COMMAND --hel
 from __future__ import annotations
 
 import os
-import re
 import sys
 from collections.abc import Callable
 from importlib import import_module
@@ -16,13 +15,12 @@ from typing import NoReturn
 import tyro
 from tyro.conf import OmitArgPrefixes
 
-from ..checks import InputError
+from ..checks import OUT_OF_MEMORY, InputError
+from ..ranges import checked_later, with_checked_numbers
 from ..version import __version__
 from .progress import INTERRUPTED
 from .signals import end_as_on_interrupt
 
-OUT_OF_MEMORY = re.compile("can't allocate memory|not enough memory|out of memory|std::bad_alloc", re.IGNORECASE)
-"""What torch says of memory, in errors of no kind of their own."""
 LONGEST = 200
 """Characters of another program's message, at most."""
 
@@ -100,12 +98,13 @@ def main() -> None:
         print(f"holosplat {__version__}")
         return
     try:
-        tyro.extras.subcommand_cli_from_dict(
-            _functions(sys.argv[1:]),
-            prog="holosplat",
-            description="Quantitative 3D maps from a handful of X-ray phase-contrast images.",
-            config=(OmitArgPrefixes,),
-        )
+        with checked_later():
+            tyro.extras.subcommand_cli_from_dict(
+                _functions(sys.argv[1:]),
+                prog="holosplat",
+                description="Quantitative 3D maps from a handful of X-ray phase-contrast images.",
+                config=(OmitArgPrefixes,),
+            )
     except InputError as error:
         _give_up(str(error))
     except MemoryError as error:
@@ -141,8 +140,8 @@ def _said(error: BaseException) -> str:
 
 
 def command(name: str) -> Callable[..., None]:
-    """The function of the command `name`, a key of `COMMANDS`; imports its module."""
-    return getattr(import_module(f".{COMMANDS[name][0]}", __package__), name)
+    """The function of the command `name`, a key of `COMMANDS`, whose numbers are checked; imports its module."""
+    return with_checked_numbers(getattr(import_module(f".{COMMANDS[name][0]}", __package__), name))
 
 
 def _functions(arguments: list[str]) -> dict[str, Callable[..., None]]:

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from tyro.conf import Positional
 
-from ..checks import positive, require, whole_seed
+from ..checks import positive, require
 from ..io.formats import read_as
 from ..io.json import write_json
 from ..io.reading import Reading, ends_of
@@ -19,6 +19,7 @@ from ..motion.cell_model import ChannelFrame
 from ..motion.dynamics import DynamicsForecast
 from ..motion.fit import MotionFit
 from ..motion.forecast import PathForecast
+from ..ranges import Natural, Positive, Seconds, Seed, Signed, Small, ranged
 from ..report.run import report_run
 from ..scan import Scan
 from ..specimens.flow.suspension import PLASMA_VISCOSITY
@@ -34,12 +35,13 @@ from .progress import ProgressBar
 
 
 @dataclass(frozen=True)
+@ranged
 class ForecastFlags:
     """How bodies move on."""
 
-    times: int = 10
+    times: Natural = 10
     """Times ahead."""
-    step: float | None = None
+    step: Seconds | None = None
     """Between them [s] (default: the median step of the run)."""
     model: Literal["auto", "paths", "rigid", "dynamics"] = "auto"
     """Paths go on, each part of the motion as far as frames tell it; rigid: shapes stay; dynamics: red cells in the
@@ -55,17 +57,17 @@ class ForecastFlags:
     effort: float = 1.0
     """Factor of the numbers of steps of these fits."""
 
-    channel: tuple[float, float] | None = None
+    channel: tuple[Small, Small] | None = None
     """Extents [m] of a rectangular channel across the flow, along the other two axes in the order x, y, z."""
     flow_axis: Literal["x", "y", "z"] = "y"
     """Along which axis of the object it leads; a flow along the rotation axis is one along y."""
-    channel_centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    channel_centre: tuple[Signed, Signed, Signed] = (0.0, 0.0, 0.0)
     """A point on its axis (x, y, z) [m]."""
     peak: str | None = None
     """Velocity of the undisturbed flow on the axis [m/s], or a range LOW:HIGH (default: by the bodies' velocities)."""
     shear_modulus: str = "2e-6:10e-6"
     """Of the membranes [N/m], or a range LOW:HIGH, within which the run's times tell it."""
-    viscosity: float = PLASMA_VISCOSITY
+    viscosity: Positive = PLASMA_VISCOSITY
     """Of the fluid in and around cells [Pa s]."""
 
     def options(self) -> ForecastOptions:
@@ -98,7 +100,7 @@ def _number_or_range(name: str, text: str) -> tuple[float, float]:
     return value, value
 
 
-def forecast(run: Positional[Path], out: Path, how: ForecastFlags = ForecastFlags(), seed: int = 0) -> None:
+def forecast(run: Positional[Path], out: Path, how: ForecastFlags = ForecastFlags(), seed: Seed = 0) -> None:
     """Carry a run of track on: its bodies and their frames at later times, with a standard error.
 
     Frames of the scan after the run's last time (track --time-frames) judge the forecast, and are used for nothing
@@ -110,7 +112,6 @@ def forecast(run: Positional[Path], out: Path, how: ForecastFlags = ForecastFlag
             forecast.csv, the standard error of each body's surface; forecast.json.
         seed: Seed of the fits to half-sets.
     """
-    whole_seed("--seed", seed)
     options, folder, new = how.options(), RunFolder(run), RunFolder(out)
     new.require_new()
     tracked = load_reconstruction(folder)

@@ -12,6 +12,22 @@ from ..beamline.light import UnevenLight
 from ..beamline.poses import Directions, Geometry
 from ..checks import InputError, require
 from ..io.reading import ends_of
+from ..ranges import (
+    Angle,
+    Frequency,
+    Grams,
+    Metres,
+    Natural,
+    Photons,
+    Pixels,
+    Seconds,
+    Seed,
+    Share,
+    Signed,
+    Small,
+    Weight,
+    ranged,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -23,23 +39,23 @@ if TYPE_CHECKING:
     from ..materials import DeltaBeta
     from ..matter import MaterialPrior, MatterKind
     from ..methods import Method
-    from ..optics.background import LightOptions
     from ..scan import Exposures
 
 
 @dataclass(frozen=True)
+@ranged
 class MeshOptions:
     """How mesh files are read."""
 
     length_unit: str = "um"
     """Unit of the mesh files' coordinates."""
-    origin: tuple[float, float, float] | None = None
+    origin: tuple[Signed, Signed, Signed] | None = None
     """Point on the rotation axis at the field's centre, in the files' coordinates (default: the meshes' centre)."""
-    snapshot_interval: float | None = None
+    snapshot_interval: Seconds | None = None
     """Series: seconds from one snapshot to the next (default: as the files say)."""
     time_unit: str | None = None
     """Series: unit of a collection's time steps (default: s)."""
-    period: tuple[float, float, float] | None = None
+    period: tuple[Weight, Weight, Weight] | None = None
     """Series: edges x, y, z of the periodic box that bodies were folded into, in the files' coordinates; 0: none."""
 
     def series(self) -> SeriesFiles:
@@ -55,16 +71,17 @@ class MeshOptions:
 
 
 @dataclass(frozen=True)
+@ranged
 class MaterialOptions:
     """What fills the meshes."""
 
     material: str | None = None
     """Formula, or a name (holosplat materials lists them); without --materials, haemoglobin."""
-    density: float | None = None
+    density: Grams | None = None
     """Its density [g/cm³]; a named one has its own."""
     medium: str | None = None
     """Formula or name of what surrounds the meshes; none means vacuum."""
-    medium_density: float | None = None
+    medium_density: Grams | None = None
     """The medium's density [g/cm³]."""
     materials: Path | None = None
     """JSON or TOML table of materials by mesh file name, for scenes of several."""
@@ -86,24 +103,25 @@ class MaterialOptions:
 
 
 @dataclass(frozen=True)
+@ranged
 class BeamlineOptions:
     """Beam, detector and views."""
 
-    detector: tuple[int, int]
+    detector: tuple[Natural, Natural]
     """Rows and columns of the detector [pixels]."""
     energy_kev: float = 20.0
     """Photon energy [keV]."""
-    distance: float = 0.1
+    distance: Metres = 0.1
     """Effective propagation distance [m]."""
-    pixel_size: float = 3.2e-6
+    pixel_size: Small = 3.2e-6
     """Effective pixel size [m]."""
-    psf_sigma_px: float = 0.0
+    psf_sigma_px: Pixels = 0.0
     """Standard deviation of the Gaussian point-spread function [pixels]."""
-    views: int | None = None
+    views: Natural | None = None
     """Number of views, evenly spaced over 180°."""
-    angles_deg: tuple[float, ...] = ()
+    angles_deg: tuple[Signed, ...] = ()
     """Or: the views' angles [degrees]."""
-    tilts_deg: tuple[float, ...] = ()
+    tilts_deg: tuple[Signed, ...] = ()
     """With these: how far each view leaves the plane normal to the axis [degrees]."""
     rotations: Path | None = None
     """Or: a .npy file of rotation matrices [V, 3, 3], x_lab = R x_obj."""
@@ -158,12 +176,13 @@ class BeamlineOptions:
 
 
 @dataclass(frozen=True)
+@ranged
 class NoiseOptions:
     """Photon noise."""
 
-    photons_per_pixel: float | None = None
+    photons_per_pixel: Photons | None = None
     """Mean photons a pixel for Poisson noise; none means noise-free."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the noise."""
 
     def simulation(self, shutter: Shutter, light: UnevenLight) -> Simulation:
@@ -174,18 +193,19 @@ class NoiseOptions:
 
 
 @dataclass(frozen=True)
+@ranged
 class MotionOptions:
     """Moving meshes: a time-resolved scan, all views of a time taken at the same instant."""
 
-    frame_rate: float | None = None
+    frame_rate: Frequency | None = None
     """Times a second [Hz]; the meshes are then snapshots of a motion, and between them move straight."""
-    frames: int | None = None
+    frames: Natural | None = None
     """Number of times (default: as many as the snapshots cover)."""
-    start: float | None = None
+    start: Seconds | None = None
     """Time of the first frames after the first snapshot [s] (default: as early as can be)."""
-    exposure: float = 0.0
+    exposure: Seconds = 0.0
     """Motion blur: how long a frame gathers light, about its time [s]."""
-    pulses: int = 1
+    pulses: Natural = 1
     """Motion blur: flashes in that, evenly spaced, whose intensities are averaged."""
     hold_out: Literal["views", "times"] = "views"
     """What --test-every counts: views, the same ones at every time, or times, with all their views."""
@@ -208,18 +228,19 @@ class MotionOptions:
 
 
 @dataclass(frozen=True)
+@ranged
 class MisalignmentOptions:
     """Errors of each view that the scan file does not know of; --true-exposures keeps them."""
 
-    misalign_shift: float = 0.0
+    misalign_shift: Pixels = 0.0
     """Standard deviation of the detector's shift along rows and columns [pixels]."""
-    misalign_rotation: float = 0.0
+    misalign_rotation: Angle = 0.0
     """Standard deviation of small turns about x, y and z [degrees]."""
-    misalign_distance: float = 0.0
+    misalign_distance: Share = 0.0
     """Standard deviation of the distance, as a share of it."""
-    misalign_magnification: float = 0.0
+    misalign_magnification: Share = 0.0
     """Standard deviation of the magnification, as a share of it."""
-    misalign_seed: int = 0
+    misalign_seed: Seed = 0
     """Seed of these errors."""
 
     def errors(self) -> Misalignment:
@@ -235,6 +256,7 @@ class MisalignmentOptions:
 
 
 @dataclass(frozen=True)
+@ranged
 class TruthOptions:
     """What is also written, for judging."""
 
@@ -270,6 +292,7 @@ class TruthOptions:
 
 
 @dataclass(frozen=True)
+@ranged
 class MethodOptions:
     """How the reconstruction proceeds."""
 
@@ -309,22 +332,23 @@ class MethodOptions:
 
 
 @dataclass(frozen=True)
+@ranged
 class PriorOptions:
     """What is known of the matter; without any of these, one material or two are found, with their δ and β."""
 
     material: str | None = None
     """Formula or name of the material, if known (then δ and β are)."""
-    density: float | None = None
+    density: Grams | None = None
     """Its density [g/cm³]; a named one has its own."""
     second_material: str | None = None
     """Formula or name of another material, where there are two."""
-    second_density: float | None = None
+    second_density: Grams | None = None
     """Its density [g/cm³]; a named one has its own."""
     medium: str | None = None
     """Formula or name of what surrounds them; none means vacuum."""
-    medium_density: float | None = None
+    medium_density: Grams | None = None
     """The medium's density [g/cm³]."""
-    delta_beta: float | str | None = None
+    delta_beta: Signed | str | None = None
     """Or: only the ratio δ/β of the one material is known, or a range LOW:HIGH of it (for `reconstruct`)."""
 
     def ranges(self) -> dict[str, tuple[float, float]]:
@@ -358,32 +382,3 @@ class PriorOptions:
 
     def _known(self, name: str, density: float | None, energy_kev: float) -> DeltaBeta:
         return MaterialOptions(name, density, self.medium, self.medium_density).filling().of("", energy_kev)
-
-
-@dataclass(frozen=True)
-class LightFlags:
-    """The light beside the flat fields."""
-
-    light: Literal["auto", "even", "smooth"] = "auto"
-    """auto: smooth where the air of frames is uneven beyond its noise, else even; even: none; smooth: in any case."""
-    air: tuple[tuple[int, int, int, int], ...] = ()
-    """Boxes without matter or fringes in any frame: first row, end row, first column, end column (default: found)."""
-
-    def options(self) -> LightOptions:
-        """What is assumed of the light."""
-        from ..optics.background import LightOptions
-
-        return LightOptions(self.light, self.air)
-
-
-@dataclass(frozen=True)
-class RunLightFlags(LightFlags):
-    """The light beside the flat fields, of several frames."""
-
-    still_light: Literal["auto", "none"] = "auto"
-    """auto: what all frames have in common in the same pixels is divided out, where their air shows that the light does
-    it; none: it is not."""
-
-    def options(self) -> LightOptions:
-        """What is assumed of the light."""
-        return replace(super().options(), still=self.still_light)

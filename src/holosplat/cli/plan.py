@@ -14,6 +14,7 @@ from tyro.conf import arg
 
 from ..checks import in_range, require
 from ..progress import Advance
+from ..ranges import Frequency, Grams, Metres, Natural, Photons, Pixels, Positive, Seconds, Signed, Small, ranged
 from .options import MaterialOptions
 from .progress import ProgressBar
 
@@ -30,26 +31,27 @@ MOST_POINTS = 20_000
 
 
 @dataclass(frozen=True)
+@ranged
 class ObjectOptions:
     """The one object to be seen."""
 
-    diameter: float | None = None
+    diameter: Small | None = None
     """Diameter of a red cell [m] (what there is unless --ball or --mesh say otherwise; default: 8e-6)."""
-    ball: float | None = None
+    ball: Small | None = None
     """Or: diameter of a ball [m]."""
     mesh: Path | None = None
     """Or: a closed mesh (VTK file), the beam along its z."""
     length_unit: str = "um"
     """Unit of the mesh file's coordinates."""
-    tilt_deg: float = 0.0
+    tilt_deg: Signed = 0.0
     """Turn of the object about x, across the beam [degrees]: a red cell is seen face-on at 0 and edge-on at 90."""
     material: str = "haemoglobin"
     """Formula, or a name (holosplat materials lists them: haemoglobin, water, soft tissue, PMMA …)."""
-    density: float | None = None
+    density: Grams | None = None
     """Its density [g/cm³]; a named one has its own."""
     medium: str | None = None
     """Formula or name of what surrounds it; none means vacuum."""
-    medium_density: float | None = None
+    medium_density: Grams | None = None
     """The medium's density [g/cm³]."""
 
     def subject(self) -> Subject:
@@ -93,40 +95,42 @@ class ObjectOptions:
 
 
 @dataclass(frozen=True)
+@ranged
 class BeamOptions:
     """Beam and detector."""
 
-    energy_kev: float = 20.0
+    energy_kev: Positive = 20.0
     """Photon energy [keV]."""
-    distance: float = 0.1
+    distance: Metres = 0.1
     """Effective propagation distance [m]."""
-    pixel_size: float = 3.2e-6
+    pixel_size: Small = 3.2e-6
     """Effective pixel size [m]."""
-    psf_sigma_px: float = 0.0
+    psf_sigma_px: Pixels = 0.0
     """Standard deviation of the Gaussian point-spread function [pixels]."""
     source_angle: float = 0.0
     """Standard deviation of the source as the object sees it [rad]; it blurs by this times the distance."""
 
 
 @dataclass(frozen=True)
+@ranged
 class AcquisitionOptions:
     """What is recorded; what is left out is not printed."""
 
-    photons_per_pixel: float = 1000.0
+    photons_per_pixel: Photons = 1000.0
     """Mean photons detected in a pixel without the object."""
-    views: int = 16
+    views: Natural = 16
     """Number of views over 180°, taken at the same instant."""
-    detector: tuple[int, int] | None = None
+    detector: tuple[Natural, Natural] | None = None
     """Rows and columns of a view [pixels]."""
-    frame_rate: float | None = None
+    frame_rate: Frequency | None = None
     """Frames a second [Hz]."""
-    exposure: float | None = None
+    exposure: Seconds | None = None
     """Time with light in a frame, such as a pulse's length [s] (default: the whole frame)."""
     velocity: float | None = None
     """Speed of the object across the beam [m/s]."""
-    bit_depth: int = 16
+    bit_depth: Natural = 16
     """Bits stored for a pixel."""
-    frames: int = 1
+    frames: Natural = 1
     """Number of instants recorded."""
 
     def recording(self) -> Recording:
@@ -137,14 +141,15 @@ class AcquisitionOptions:
 
 
 @dataclass(frozen=True)
+@ranged
 class RangeOptions:
     """Where the best distance and energy lie."""
 
-    distance_range: tuple[float, float] | None = None
+    distance_range: tuple[Metres, Metres] | None = None
     """Shortest and longest distance [m] of a survey."""
-    energy_range: tuple[float, float] | None = None
+    energy_range: tuple[Positive, Positive] | None = None
     """Lowest and highest photon energy [keV] of a survey."""
-    points: tuple[int, int] = (25, 13)
+    points: tuple[Natural, Natural] = (25, 13)
     """Distances and energies of the survey."""
     out: Path | None = None
     """Picture of the survey to write (.png); its table is written beside it (.csv)."""

@@ -14,7 +14,9 @@ from ..checks import require
 from ..io.phase_maps import PhaseMaps, is_file, require_place, write_phase_maps
 from ..io.reading import Reading
 from ..matter import DeltaBeta, KnownRatio
-from .options import LightFlags, PriorOptions
+from ..ranges import Grams, Signed, ranged
+from .light import LightFlags
+from .options import PriorOptions
 from .progress import ProgressBar
 
 if TYPE_CHECKING:
@@ -31,18 +33,19 @@ RetrievalName = Literal["tikhonov", "admm", "ctf", "paganin", "gerchberg-saxton"
 
 
 @dataclass(frozen=True)
+@ranged
 class OneMaterial:
     """The one material; give it, or δ/β."""
 
     material: str | None = None
     """Formula or name of the material (holosplat materials lists them)."""
-    density: float | None = None
+    density: Grams | None = None
     """Its density [g/cm³]; a named one has its own."""
     medium: str | None = None
     """Formula or name of what surrounds it; none means vacuum."""
-    medium_density: float | None = None
+    medium_density: Grams | None = None
     """The medium's density [g/cm³]."""
-    delta_beta: float | None = None
+    delta_beta: Signed | None = None
     """Or: only the ratio δ/β is known; it gives the phase, and no thickness."""
 
     def at(self, energy_kev: float) -> tuple[DeltaBeta, bool]:

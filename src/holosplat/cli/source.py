@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..checks import InputError, require
+from ..ranges import Metres, Natural, Positive, SomeShare, ranged
 from .options import BeamlineOptions
 
 if TYPE_CHECKING:
@@ -27,18 +28,19 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
+@ranged
 class SourceOptions:
     """What the light comes from; without any of these, a plane wave of one energy."""
 
-    source_size: float | None = None
+    source_size: Metres | None = None
     """Standard deviation of the Gaussian source [m]; it blurs by this times distance / source distance."""
-    source_distance: float | None = None
+    source_distance: Positive | None = None
     """Distance from source to sample [m]."""
     cone: bool = False
     """--distance and --pixel-size are the detector's own, in a cone beam from --source-distance."""
-    bandwidth: float | None = None
+    bandwidth: SomeShare | None = None
     """Relative full width at half maximum of a Gaussian spectrum about --energy-kev."""
-    energies: int = 7
+    energies: Natural = 7
     """Energies that stand for such a spectrum; each costs a simulation."""
     spectrum: Path | None = None
     """Or: a text file of two columns, energy [keV] and weight; the scan's energy is then their mean."""

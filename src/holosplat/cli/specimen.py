@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from ..checks import InputError, require, whole_seed
+from ..checks import InputError, require
+from ..ranges import Grams, Natural, Seed, Signed, Small, ranged
 from .options import BeamlineOptions, MeshOptions, MotionOptions
 
 if TYPE_CHECKING:
@@ -25,14 +26,15 @@ CORED = ("coated-droplets", "body-with-absorber")
 
 
 @dataclass(frozen=True)
+@ranged
 class VolumeOptions:
     """What the images of a TIFF stack show; an HDF5 volume says it itself."""
 
-    voxel_size: float | None = None
+    voxel_size: Small | None = None
     """Edge of the cubic voxels [m]."""
-    value_delta: float | None = None
+    value_delta: Signed | None = None
     """δ of a value of one (default: that of --material, so that values are its share)."""
-    value_delta_beta: float | None = None
+    value_delta_beta: Signed | None = None
     """δ/β, with --value-delta (default: no absorption)."""
     stacked: Literal["y", "z"] = "y"
     """Axis along which images follow each other: y, the rotation axis, for slices across it, or z."""
@@ -58,26 +60,27 @@ class VolumeOptions:
 
 
 @dataclass(frozen=True)
+@ranged
 class GeneratedOptions:
     """Continuous matter that is generated, in place of files."""
 
     specimen: Kind | None = None
     """Kind of specimen."""
-    specimen_size: float | None = None
+    specimen_size: Small | None = None
     """Its extent [m] (default: 0.85 of the shorter side of the field of view)."""
-    specimen_count: int = 9
+    specimen_count: Natural = 9
     """Number of cells, droplets or bubbles."""
-    specimen_edge: float | None = None
+    specimen_edge: Small | None = None
     """Width of the edges of soft cells, of the head phantom and of a foam [m] (default: 3 pixels, or 4 % of the
     extent where that is less)."""
-    specimen_seed: int = 0
+    specimen_seed: Seed = 0
     """Seed of the specimen."""
     specimen_motion: float | None = None
     """How far it goes from the first frame to the last: by how much the middle of the stirred blob turns [degrees]
     (default: 60), or which share of its gas the collapsing foam loses (default: 0.5)."""
     core: str | None = None
     """Formula or name of what is in coated droplets, or of the absorber; --material is around it."""
-    core_density: float | None = None
+    core_density: Grams | None = None
     """Its density [g/cm³]; a named one has its own."""
 
     def timing(self, motion: MotionOptions) -> np.ndarray:
@@ -105,7 +108,6 @@ class GeneratedOptions:
         size = self.specimen_size or 0.85 * min(beamline.detector) * pixel
         edge, seed, box = self.specimen_edge, self.specimen_seed, (size, size, size)
         edge = min(3 * pixel, 0.04 * size) if edge is None else edge
-        whole_seed("--specimen-seed", seed)
         matter = filling.of(self.specimen, beamline.energy_kev)
         cores, goes = self._cores(filling, beamline.energy_kev), self.specimen_motion
         require(

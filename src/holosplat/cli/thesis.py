@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from ..ranges import Seed
 from .progress import INTERRUPTED, ProgressBar
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ def thesis(
     case: Literal["thesis16", "thesis8"] = "thesis16",
     physics: Literal["declared", "contact", "far", "blurred", "noisy"] = "declared",
     snapshots: Path | None = None,
-    seed: int = 0,
+    seed: Seed = 0,
 ) -> None:
     """Rerun the thesis' study: its configurations, its schedule and loss, and all curves.
 

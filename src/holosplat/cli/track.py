@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tyro.conf import Positional
 
-from ..checks import positive, require, whole_seed
+from ..checks import positive, require
 from ..io.formats import read_as
 from ..io.json import write_json
 from ..io.reading import Reading
@@ -16,16 +16,19 @@ from ..io.run_scan import run_source
 from ..motion.known import beam_directions
 from ..motion.rest_shape import KnownBody
 from ..motion.track import TrackOptions
+from ..ranges import Metres, Natural, Seed, Share, Weight, ranged
 from ..report.run import report_run
 from ..workflows.evaluate import evaluate as score
 from ..workflows.run_folder import RunFolder, claimed
 from ..workflows.track import BODIES, COLLECTION, TRACKS
 from ..workflows.track import track as follow
-from .options import LightFlags, PriorOptions
+from .light import LightFlags
+from .options import PriorOptions
 from .progress import INTERRUPTED, ProgressBar
 
 
 @dataclass(frozen=True)
+@ranged
 class BodyFlags:
     """What is known of the bodies' shape."""
 
@@ -33,11 +36,11 @@ class BodyFlags:
     """Shape at rest of all bodies: red-cell, or a file of one closed mesh (.stl, .ply, .obj, .vtk, .vtp, .vtu)."""
     body_unit: str = "um"
     """Unit of the mesh file's coordinates."""
-    body_size: float = 0.0
+    body_size: Metres = 0.0
     """Largest extent at rest [m] (0: a red cell's 7.82 µm, or the file's)."""
-    body_uncertain: float = 0.1
+    body_uncertain: Share = 0.1
     """By which part all bodies may be larger or smaller than that, at most."""
-    body_stiffness: float = 100.0
+    body_stiffness: Weight = 100.0
     """Minus the logarithm of the probability of strains of about one."""
 
     def known(self) -> KnownBody | None:
@@ -54,6 +57,7 @@ UNKNOWN = BodyFlags()
 
 
 @dataclass(frozen=True)
+@ranged
 class MotionFlags:
     """How bodies are found and move."""
 
@@ -61,15 +65,15 @@ class MotionFlags:
     """Degree of the paths' polynomials."""
     pieces: int = 0
     """Pieces of the paths' splines over the whole time (0: as many as predict held-out frames best)."""
-    rounds: int = 4
+    rounds: Natural = 4
     """How often bodies are looked for beside those that are known, at most."""
     least_volume: float = 30.0
     """Bodies of fewer voxels, of a pixel's edge, are not followed."""
-    volume_kept: float = 0.006
+    volume_kept: Weight = 0.006
     """Standard deviation of a body's volume over time, as a share (0: volumes are free)."""
-    area_kept: float = 0.03
+    area_kept: Weight = 0.03
     """The same of its area (0: areas are free)."""
-    apart: float = 0.2
+    apart: Weight = 0.2
     """How deep bodies may lie in each other, a standard deviation in pixels (0: as they like)."""
     acceleration: float = 1e-6
     """Weight of bent paths (0: as bent as splines can be)."""
@@ -98,7 +102,7 @@ def track(
     out: Path,
     matter: PriorOptions = PriorOptions(),
     how: MotionFlags = MotionFlags(),
-    seed: int = 0,
+    seed: Seed = 0,
     resume: bool = False,
     reading: Reading = Reading(),
     *,
@@ -114,7 +118,6 @@ def track(
         seed: Seed of everything random.
         resume: Go on with an interrupted run.
     """
-    whole_seed("--seed", seed)
     require(
         reading.part.time_frame is None,
         f"bodies are followed through all times, but --time-frame is {reading.part.time_frame}; leave it.",

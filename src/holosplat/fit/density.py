@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..geometry import Views
 from ..model import Model
+from ..ranges import Natural, Share, ranged
 from ..representations.gaussians import GaussianCloud, unit_quaternions
 from .optimiser import Leaves
 from .trainable import Trainable
@@ -19,24 +20,25 @@ CENTRES = "object.centres"
 
 
 @dataclass(frozen=True)
+@ranged
 class DensityControl:
     """Options of densification and pruning."""
 
     every: int = 0
     """Steps between events (0: never, as after a phase start, which has its Gaussians)."""
-    start: float = 0.1
+    start: Share = 0.1
     """First event, as a share of all steps."""
-    stop: float = 0.7
+    stop: Share = 0.7
     """Last event that adds Gaussians, as a share of all steps: what came last needs time to settle."""
-    prune_stop: float = 0.0
+    prune_stop: Share = 0.0
     """Last event that removes some, as a share of all steps (0: as `stop`)."""
-    grow_fraction: float = 0.05
+    grow_fraction: Share = 0.05
     """Share of Gaussians that is cloned or split, those with the largest mean position gradient."""
     grow_gradient: float = 0.0
     """Mean position gradient [loss a pixel] above which Gaussians are cloned or split (0: `grow_fraction` of them)."""
     split_scale_px: float = 0.7
     """Longest axis [pixels] up to which a Gaussian is cloned; longer ones are split in two."""
-    max_count: int = 200_000
+    max_count: Natural = 200_000
     """No growth beyond so many Gaussians."""
     faint: float = 0.01
     """Gaussians whose peak is below this share of the material are removed."""

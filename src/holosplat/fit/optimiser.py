@@ -9,6 +9,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from ..ranges import ranged
 from . import adam
 
 EPSILON = 1e-12
@@ -47,6 +48,7 @@ class Optimiser(Protocol):
 
 
 @dataclass(frozen=True)
+@ranged
 class Group:
     """How Adam moves one parameter where that differs from its default.
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..checks import finite, require
 from ..model import Alignment, Instrument, LightField, Model, smooth_modes
+from ..ranges import Weight, ranged
 from ..scan import Exposures
 from ..volume import LineIntegrals, Object
 
@@ -122,17 +123,18 @@ class Residuals:
 
 
 @dataclass(frozen=True)
+@ranged
 class Allowance:
     """What a residual may have beside noise, for no model is exact."""
 
-    contrast: float = 0.05
+    contrast: Weight = 0.05
     """Share of the contrast (rms) in each band: bodies with sharp edges are fitted to 0.03 to 0.045."""
-    rough: float = 0.15
+    rough: Weight = 0.15
     """Share of the contrast of all bands (rms) at periods shorter than `resolved`, where voxels are rougher than
     frames."""
-    resolved: float = 4.0
+    resolved: Weight = 4.0
     """Shortest period that pixels resolve well [pixels]."""
-    negligible: float = 0.01
+    negligible: Weight = 0.01
     """Share of the contrast of all bands (rms) that one band may miss, however little it has itself."""
 
     def power(self, contrast: np.ndarray, rings: Rings, pixel: float) -> np.ndarray:

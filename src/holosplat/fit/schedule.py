@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ..checks import at_least, require
+from ..ranges import ranged
 
 
 @dataclass(frozen=True)
+@ranged
 class Schedule:
     """Options of the optimisation loop; the rates themselves belong to the method."""
 
@@ -37,8 +39,6 @@ class Schedule:
     """The fit stops after so many seconds, its rates in step with that (0: by steps alone, and then reproducible)."""
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "steps", "views_per_step", "warmup_steps", "oversample", "validation_views", "patience")
-        at_least(self, 0, "seconds")
         at_least(self, 1, "volume_every", "validate_every")
         at_least(self, 2, "volume_edge")
         require(0 < self.decay <= 1, f"decay must lie in (0, 1], but it is {self.decay}.")

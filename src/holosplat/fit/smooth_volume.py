@@ -11,9 +11,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import adaptive_avg_pool3d, avg_pool3d, interpolate, pad
 
-from ..checks import at_least, require
+from ..checks import require
 from ..geometry import Grid
 from ..projectors.voxels import projector_for
+from ..ranges import Weight, ranged
 from .whitened import WhitenedFrames
 
 MEMORY = 6
@@ -32,6 +33,7 @@ HALVINGS = 4
 
 
 @dataclass(frozen=True)
+@ranged
 class ContinuousPrior:
     """What is expected of continuous matter: `a Σ log(1 + (√(|∇u|² + ε²) - ε) / b) + m Σ log(1 + u / v)`.
 
@@ -40,19 +42,18 @@ class ContinuousPrior:
     (Nikolova 2005). As the misfit is in units of the noise, a and m have no unit, and hold for every noise.
     """
 
-    slopes: float = 0.4
+    slopes: Weight = 0.4
     """a: exponent of the power law of slopes."""
-    slope: float = 0.02
+    slope: Weight = 0.02
     """b: slope from one voxel to the next beyond which the law holds, as a share of the matter's level."""
-    rounding: float = 0.02
+    rounding: Weight = 0.02
     """ε: slopes below which the prior is a square, as a share of the level."""
-    values: float = 0.02
+    values: Weight = 0.02
     """m: exponent of the power law of values."""
-    value: float = 0.05
+    value: Weight = 0.05
     """v: value beyond which the law holds, as a share of the level."""
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "slopes", "values")
         for name in ("slope", "rounding", "value"):
             given = getattr(self, name)
             require(given > 0, f"{name} must be positive, but it is {given}.")

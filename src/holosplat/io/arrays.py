@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 
 from ..checks import InputError, require
-from .guard import require_declared, require_memory
+from .guard import require_archive
 from .hdf5 import open_hdf5
 from .loader import Loader
 from .raw_file import (
@@ -68,9 +68,7 @@ def _arrays(path: Path) -> Iterator[Mapping[str, Any]]:
         return
     try:
         with np.load(path, allow_pickle=False) as archive:
-            size = sum(part.file_size for part in archive.zip.infolist())
-            require_declared(str(path), size, path.stat().st_size)
-            require_memory(str(path), size)
+            require_archive(archive, path)
             arrays = {name: archive[name] for name in archive.files if name not in ("provenance",)}
     except (OSError, ValueError, zipfile.BadZipFile) as error:
         raise InputError(f"{path} must be a complete NumPy archive, but reading it failed: {error}.") from None

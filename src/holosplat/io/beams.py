@@ -11,6 +11,7 @@ import numpy as np
 
 from ..checks import InputError, require, shaped
 from ..geometry import Views, rotation_tilted
+from ..ranges import Metres, Signed, Small, ranged
 from ..scan import Exposures, Scan
 from ..tables import from_table, read_table
 from .atomic import atomic_path
@@ -18,11 +19,12 @@ from .atomic import atomic_path
 FORMAT = "holosplat geometry 1"
 ERRORS = ("shift_px", "turn_deg", "distance_share", "magnification_share")
 
-Pair = tuple[float, float]
-Triple = tuple[float, float, float]
+Pair = tuple[Signed, Signed]
+Triple = tuple[Signed, Signed, Signed]
 
 
 @dataclass(frozen=True)
+@ranged
 class ViewErrors:
     """Standard errors of what was found of a view."""
 
@@ -37,24 +39,25 @@ class ViewErrors:
 
 
 @dataclass(frozen=True)
+@ranged
 class BeamView:
     """One view of the file, an entry `[[view]]`; what is left out stays as the scan says."""
 
     rotation: tuple[Triple, Triple, Triple] | None = None
     """Rows of R, `x_lab = R x_obj`."""
-    angle_deg: float | None = None
+    angle_deg: Signed | None = None
     """Or: the angle about y [degrees]."""
-    tilt_deg: float | None = None
+    tilt_deg: Signed | None = None
     """With it: how far the beam leaves the plane normal to y [degrees]."""
     shift_m: Pair | None = None
     """Detector's shift (sx, sy) [m]."""
     shift_px: Pair | None = None
     """Or: the shift [pixels]."""
-    distance_m: float | None = None
+    distance_m: Metres | None = None
     """Effective propagation distance [m]."""
     energy_kev: float | None = None
     """Photon energy [keV]."""
-    pixel_size_m: float | None = None
+    pixel_size_m: Small | None = None
     """Effective pixel size [m]."""
     error: ViewErrors | None = None
     """Standard errors, which are kept and not used."""

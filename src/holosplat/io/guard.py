@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import os
 import re
+import zlib
+from pathlib import Path
+from typing import Any
 
-from ..checks import require
+import numpy as np
+
+from ..checks import InputError, require
 
 RATIO = 1100
 """Declared bytes over those of a file, at most: deflate, the densest that readers know, makes zeros 1032 times smaller.
@@ -15,7 +20,11 @@ SMALL = 1 << 26
 DEEPEST = 64
 """Levels of nested elements, groups or tables, at most."""
 TAG = re.compile(rb"<(/?)([A-Za-z!?][^\s>/]*)[^>]*?(/?)>")
-COUNT = re.compile(rb"\bNumberOf\w+\s*=\s*[\"']\s*(\d+)\s*[\"']")
+COUNT = re.compile(rb"\b(NumberOf\w+)\s*=\s*[\"']\s*(\d+)\s*[\"']")
+MOST_COMPONENTS = 1000
+"""Numbers of a point or cell in an array of VTK."""
+LONGEST = 18
+"""Digits of a count, at most."""
 APPENDED = b"<AppendedData"
 
 
@@ -27,22 +36,76 @@ def require_declared(label: str, declared: int, held: int) -> None:
     )
 
 
+def machine_memory() -> int:
+    """Bytes of memory that this machine has."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
 def require_memory(label: str, size: int) -> None:
     """`InputError` if `size` bytes are more than the memory of this machine."""
-    whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    whole = machine_memory()
     require(
         size <= whole,
         f"{label} takes {size / 1e9:.3g} GB, but this machine has {whole / 1e9:.3g} GB of memory; take a part of it.",
     )
 
 
+def require_inflated(label: str, packed: bytes, most: int) -> None:
+    """`InputError` if deflated bytes become more than `most`, which unpackers other than this one would find out in
+    memory. What is no deflate is left to them."""
+    try:
+        inflated = len(zlib.decompressobj().decompress(packed, most + 1))
+    except zlib.error:
+        return
+    require(inflated <= most, f"{label} unpacks to more than the {most} bytes that it declares; it is no honest file.")
+
+
+def read_array(path: Path, what: str) -> np.ndarray:
+    """The array of numbers in a .npy file, which must be `what`; `InputError` for any other, or one cut short."""
+    try:
+        with path.open("rb") as file:
+            declared = _declared(file)
+        if declared > path.stat().st_size:
+            raise ValueError(f"it declares {declared:.3g} bytes, but has {path.stat().st_size}")
+        return np.array(np.load(path, mmap_mode="r", allow_pickle=False))  # which maps no more than there is
+    except (OSError, ValueError, EOFError, TypeError, OverflowError) as error:
+        raise InputError(f"{path} must be {what} (.npy), but it is damaged or none: {error}.") from None
+
+
+def require_archive(archive: Any, path: Path) -> None:
+    """`InputError` if an open NumPy archive declares more than it can hold, or more than there is memory for."""
+    size = sum(part.file_size for part in archive.zip.infolist())
+    for part in archive.zip.infolist():
+        with archive.zip.open(part) as file:
+            declared = _declared(file)
+        require(
+            declared <= part.file_size,
+            f"{path} declares {declared:.3g} bytes of {part.filename[:40]}, but holds {part.file_size:.3g}; it is "
+            "damaged, or no honest file.",
+        )
+    require_declared(str(path), size, path.stat().st_size)
+    require_memory(str(path), size)
+
+
+def _declared(file: Any) -> int:
+    """Bytes that the header of an open .npy file declares; none where it is no such header, which others will say."""
+    try:
+        version = np.lib.format.read_magic(file)
+        header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = header(file)
+    except (OSError, ValueError, EOFError):
+        return 0
+    return int(np.prod(shape, dtype=object)) * dtype.itemsize
+
+
 def xml_fault(content: bytes) -> str:
     """Why an XML file of VTK is not given to its parser: it is nested too deeply, or declares more points or cells than
     it has room for; empty if there is no such fault. What is appended to it is no XML and is passed over."""
-    text = content[: content.index(APPENDED)] if APPENDED in content else content
-    for count in COUNT.finditer(text):
-        if int(count[1]) > max(SMALL, RATIO * len(content)):
-            return f"it declares {count[1].decode()[:30]} points or cells, but has {len(content)} bytes"
+    text = content[: content.rindex(APPENDED)] if APPENDED in content else content
+    for name, count in COUNT.findall(text):
+        most = MOST_COMPONENTS if name == b"NumberOfComponents" else RATIO * len(content)
+        if len(count) > LONGEST or int(count) > most:
+            return f"it declares {count.decode()[:LONGEST]} points, cells or components, but has {len(content)} bytes"
     depth = 0
     for tag in TAG.finditer(text):
         if tag[2][:1] in b"!?" or tag[3]:

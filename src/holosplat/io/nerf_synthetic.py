@@ -16,6 +16,7 @@ import numpy as np
 
 from ..checks import InputError, at_least, in_range, require
 from ..geometry import Views
+from ..ranges import Metres, Positive, Signed, Small, ranged
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan, checked_distance
 from .exposure_tables import beam_table, exposure_table, in_order, read_exposures
 from .folder import atomic_folder
@@ -36,6 +37,7 @@ from the axis may a point stray, per half field of view of depth."""
 
 
 @dataclass(frozen=True)
+@ranged
 class NerfOptions:
     """Options of the folder."""
 
@@ -52,18 +54,19 @@ class NerfOptions:
 
 
 @dataclass(frozen=True)
+@ranged
 class GivenOptics:
     """Values that folders of other programs lack."""
 
-    energy_kev: float
+    energy_kev: Positive
     """Photon energy [keV]."""
-    distance: float
+    distance: Metres
     """Propagation distance [m]."""
-    pixel_size: float
+    pixel_size: Small
     """Pixel size in the sample plane [m]."""
-    black: float = 0.0
+    black: Signed = 0.0
     """Intensity of black, relative to the flat field."""
-    white: float = 1.0
+    white: Signed = 1.0
     """Intensity of white, relative to the flat field."""
 
     def __post_init__(self) -> None:

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..checks import InputError, finite
+from ..checks import InputError, as_written, finite, require
+from ..ranges import LARGEST, require_plausible
 from ..representations import KINDS, Stored
 from .gaussians import FORMAT as GAUSSIANS
 from .gaussians import read_gaussians
@@ -44,18 +45,24 @@ def read_object(path: Path) -> Stored:
         kind = KINDS.get(str(file.attrs.get("kind", "")))
         if form != FORMAT or kind is None:
             raise InputError(
-                f"{path} must be a {FORMAT!r} file of the kinds {', '.join(KINDS)}, but its format is {form!r}."
+                f"{path} must be a {FORMAT!r} file of the kinds {', '.join(KINDS)}, but its format is {form[:40]!r}."
             )
         fields, names = Fields(path, file), list[str]()
         file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
-        arrays = {name: finite(fields.label(name), np.asarray(fields.dataset(name)[()])) for name in names}
-        try:
+        arrays = {name: _sound(fields.label(name), np.asarray(fields.dataset(name)[()])) for name in names}
+        with as_written(path, "a whole object"):
             plain = json.loads(str(file.attrs["state"]))
+            require_plausible(plain)
             return kind.from_state(_joined({name: torch.from_numpy(a) for name, a in arrays.items()}, plain))
-        except InputError as error:
-            raise InputError(f"{path} must hold a whole object, but it does not: {error}") from error
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
-            raise InputError(f"{path} must hold a whole object, but it lacks or garbles {error}.") from error
+
+
+def _sound(label: str, array: np.ndarray) -> np.ndarray:
+    """`array`, if it holds numbers that an Object may have."""
+    require(array.dtype.kind in "iufb", f"{label} must hold numbers, but it does not.")
+    finite(label, array)
+    most = float(np.abs(array).max(initial=0))
+    require(most <= LARGEST, f"{label} must hold numbers of at most {LARGEST:g}, but one is {most:g}.")
+    return array
 
 
 def _parted(state: Mapping[str, Any], prefix: str = "") -> tuple[dict[str, Tensor], dict[str, Any]]:

@@ -17,11 +17,13 @@ import numpy as np
 
 from ..checks import InputError, at_least, finite, in_range, positive, require, shaped
 from ..geometry import Grid, Views
+from ..ranges import ranged
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan
 from ..units import wavenumber
 from ..volume import Volume
 from .exposure_tables import beam_table, exposure_table, in_order, read_exposures
 from .folder import atomic_folder
+from .guard import read_array
 from .json import write_json
 from .loader import Loader, folder_with
 from .seeds import hull_points
@@ -37,6 +39,7 @@ SEED_DENSITY = 0.15
 
 
 @dataclass(frozen=True)
+@ranged
 class R2Options:
     """Options of the folder."""
 
@@ -205,10 +208,7 @@ def _projections(entries: list[Table], shape: tuple[int, ...]) -> np.ndarray:
     images = []
     for entry in entries:
         file = entry.file("file_path")
-        try:
-            image = np.load(file, allow_pickle=False)
-        except (OSError, ValueError, EOFError) as error:
-            raise InputError(f"{file} must be an array of numbers (.npy), but it is damaged: {error}.") from None
+        image = read_array(file, "an array of numbers")
         require(image.dtype.kind in "iuf", f"{file} must hold numbers, but its type is {image.dtype}.")
         images.append(finite(str(file), shaped(str(file), image, shape)).astype(np.float32))
     return np.stack(images)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from ..checks import InputError, finite, require, require_regular
+from ..ranges import Frequency, Natural, Signed, Small, ranged
 from ..tables import from_table, to_table
 from .tube import Tube
 
@@ -25,6 +26,7 @@ OWN_WAY = ("angles", "axis_column", "sense", "tube", "exposures", "allow_externa
 
 
 @dataclass(frozen=True)
+@ranged
 class Told:
     """What is said of a scan beside its files; it goes before what they say themselves."""
 
@@ -32,7 +34,7 @@ class Told:
     """Photon energy [keV], or a range LOW:HIGH for `reconstruct` (default: as the files say)."""
     distance: float | str | None = None
     """Effective propagation distance [m], or a range LOW:HIGH for `reconstruct` (default: as the files say)."""
-    pixel_size: float | None = None
+    pixel_size: Small | None = None
     """Effective pixel size [m] (default: as the files say)."""
     angles: Path | None = None
     """Text file of the frames' angles [degrees], one a line (default: as the files say)."""
@@ -55,9 +57,9 @@ class Told:
     """European XFEL: trains to take, counted from 0, as --views (default: all)."""
     pulses: str | None = None
     """European XFEL: pulses of a train to take, counted from 0, as --views (default: all)."""
-    frame_rate: float | None = None
+    frame_rate: Frequency | None = None
     """European XFEL: frames a second that the camera takes within a train [Hz]."""
-    axis_column: float | None = None
+    axis_column: Signed | None = None
     """Column of the rotation axis in the files' frames, 0 the middle of the first one (default: as the files say, or
     the middle)."""
     sense: Sense = "clockwise"
@@ -65,9 +67,9 @@ class Told:
     tube: str | None = None
     """INNER:OUTER:ATTENUATION of a tube about the axis whose wall is divided out: its diameters [m] and µ [1/m], such
     as 4e-3:4.5e-3:200."""
-    black: float | None = None
+    black: Signed | None = None
     """Grey images, nerf-synthetic: intensity of black pixels, relative to the flat field (default: 0)."""
-    white: float | None = None
+    white: Signed | None = None
     """Grey images, nerf-synthetic: intensity of white pixels, relative to the flat field (default: 1)."""
 
     def ranges(self) -> dict[str, tuple[float, float]]:
@@ -116,6 +118,7 @@ class Told:
 
 
 @dataclass(frozen=True)
+@ranged
 class Part:
     """Which part of a scan is taken."""
 
@@ -130,7 +133,7 @@ class Part:
     """Frames to hold out of the fit, in the same form; the others are then for training (default: as the files say)."""
     crop: str | None = None
     """Rows and columns to keep, such as 0:40,10:150, in pixels of the files' frames; : keeps all."""
-    bin: int = 1
+    bin: Natural = 1
     """Average pixels this many by this many, after cropping."""
 
     def of(self, scan: Scan) -> Scan:

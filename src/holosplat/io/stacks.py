@@ -12,6 +12,7 @@ import numpy as np
 
 from ..checks import InputError, require, require_regular
 from .leftovers import is_hidden
+from .tiff_guard import page_values
 
 IMAGES = (".tif", ".tiff", ".png")
 
@@ -134,4 +135,5 @@ def _png(file: Path) -> np.ndarray:
 def _tiff(file: Path, page: int) -> np.ndarray:
     import tifffile
 
-    return tifffile.imread(file, key=page)
+    with tifffile.TiffFile(file) as opened:
+        return page_values(opened.pages[page], file)

@@ -8,13 +8,14 @@ from typing import Literal
 
 import numpy as np
 
-from ..checks import InputError, finite, require
+from ..checks import finite, require
 from ..scan import Scan
 from .exposure_tables import beam_table, exposure_table, read_exposures
 from .folder import atomic_folder
 from .json import write_json
 from .loader import Loader
 from .table import Table
+from .tiff_guard import all_pages
 
 FORMAT = "holosplat TIFF 1"
 SCAN = "scan.json"
@@ -63,13 +64,7 @@ def read_tiff(path: str | Path) -> Scan:
 
 def _pages(file: Path, count: int) -> list[np.ndarray]:
     """The `count` pages of a TIFF file, each [H, W]."""
-    import tifffile
-
-    try:
-        with tifffile.TiffFile(file) as opened:
-            pages = [page.asarray() for page in opened.pages]
-    except Exception as error:  # tifffile raises many kinds for damaged files
-        raise InputError(f"{file} must be a complete TIFF file, but it is damaged or none: {error}.") from None
+    pages = all_pages(file)
     require(len(pages) == count, f"{file} must hold {count} pages, one a frame, but it holds {len(pages)}.")
     for page in pages:
         grey = page.ndim == 2 and page.dtype.kind in "iuf"

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..checks import InputError, require
 from ..frames import divided
+from ..ranges import ranged
 
 if TYPE_CHECKING:
     from ..geometry import Views
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
+@ranged
 class Tube:
     """A round tube about the rotation axis. inner, outer: diameters [m]; attenuation: µ of its wall [1/m]."""
 

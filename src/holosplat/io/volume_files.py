@@ -12,7 +12,9 @@ import numpy as np
 from ..checks import InputError, finite, in_range, require
 from ..geometry import Grid
 from ..matter import DeltaBeta
+from ..ranges import Small, ranged
 from ..volume import Volume
+from .tiff_guard import all_pages
 from .volumes import VOXEL_RANGE_M, read_volume
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
@@ -22,6 +24,7 @@ VOLUME_SUFFIXES = (*HDF5_SUFFIXES, *TIFF_SUFFIXES)
 
 
 @dataclass(frozen=True)
+@ranged
 class StackMeaning:
     """What a stack of TIFF images shows.
 
@@ -30,7 +33,7 @@ class StackMeaning:
     z), z for slices along it (rows of a page along y).
     """
 
-    voxel_size: float
+    voxel_size: Small
     of: DeltaBeta
     stacked: Literal["y", "z"] = "y"
 
@@ -70,14 +73,8 @@ def read_specimen(paths: Sequence[Path], meaning: StackMeaning | None) -> Volume
 
 def _pages(path: Path) -> np.ndarray:
     """The pages [P, rows, columns] of a TIFF file."""
-    import tifffile
-
     require(path.is_file(), f"{path} must be a TIFF file, but there is none; correct the path.")
-    try:
-        with tifffile.TiffFile(path) as opened:
-            pages = [page.asarray() for page in opened.pages]
-    except Exception as error:  # tifffile raises many kinds for damaged files
-        raise InputError(f"{path} must be a complete TIFF file, but it is damaged or none: {error}.") from None
+    pages = all_pages(path)
     shapes = sorted({page.shape for page in pages})
     grey = len(shapes) == 1 and len(shapes[0]) == 2 and all(page.dtype.kind in "iuf" for page in pages)
     require(grey, f"{path} must hold grey images of one size, but it holds {', '.join(map(str, shapes)) or 'none'}.")

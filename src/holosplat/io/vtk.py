@@ -23,7 +23,7 @@ from ..units import LENGTH_UNITS, unit_factor
 from .atomic import atomic_path
 from .guard import xml_fault
 from .leftovers import is_hidden
-from .vtk_guard import cells_fault, legacy_fault
+from .vtk_guard import blocks_fault, cells_fault, legacy_fault, ply_fault
 
 SUFFIXES = (".vtk", ".vtu", ".vtp")
 MERGE_TOLERANCE = 1e-6
@@ -150,7 +150,7 @@ def _read_data(path: Path) -> Any:
         raise InputError(f"{path} must be a VTK file of PolyData or UnstructuredGrid, but {what}.")
     if xml and b"</VTKFile>" not in content[-4096:]:  # VTK may fill in what is missing of appended data
         raise _damaged(path, "its closing tag </VTKFile> is missing")
-    if fault := xml_fault(content) if xml else legacy_fault(content):
+    if fault := (xml_fault(content) or blocks_fault(content)) if xml else legacy_fault(content):
         raise _damaged(path, fault)
     reader = readers[kind]()
     reader.SetFileName(str(path))
@@ -165,6 +165,8 @@ def _read_solid(path: Path, content: bytes) -> Any:
         wanted = 84 + 50 * int.from_bytes(content[80:84], "little")
         if len(content) < wanted:
             raise _damaged(path, f"it has {len(content)} bytes of {wanted}")
+    if suffix == ".ply" and (fault := ply_fault(content)):
+        raise _damaged(path, fault)
     module, name = SOLIDS[suffix]
     reader = getattr(import_module(f"vtkmodules.{module}"), name)()
     reader.SetFileName(str(path))

@@ -5,10 +5,15 @@ Both functions return the fault, or "" if there is none, for a message that name
 
 from __future__ import annotations
 
+import base64
 import re
+from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
+
+from .guard import APPENDED, LONGEST, RATIO, SMALL
 
 SECTION = re.compile(
     rb"\n[ \t]*(POLYGONS|TRIANGLE_STRIPS|LINES|VERTICES|CELLS)[ \t]+(\d+)[ \t]+(\d+)[ \t\r]*\n", re.IGNORECASE
@@ -16,6 +21,16 @@ SECTION = re.compile(
 ARRAY = re.compile(rb"\s*(OFFSETS|CONNECTIVITY)[ \t]+(\w+)[ \t\r]*\n", re.IGNORECASE)
 INTEGERS = {b"vtktypeint64": ">i8", b"vtktypeint32": ">i4", b"int": ">i4"}
 """Binary legacy files are big-endian; files before version 5 hold 32-bit cells."""
+DECLARED = re.compile(
+    rb"\n[ \t]*(?:(?:POINTS|POINT_DATA|CELL_DATA|CELL_TYPES|FIELD|SCALARS|COLOR_SCALARS|LOOKUP_TABLE|VECTORS|NORMALS|"
+    rb"TENSORS|TEXTURE_COORDINATES|DIMENSIONS|[XYZ]_COORDINATES|VERTICES|LINES|POLYGONS|TRIANGLE_STRIPS|CELLS)\b[^\n]{0,200}"
+    rb"|[^\s]{1,200}[ \t]+\d+[ \t]+\d+[ \t]+[a-z_0-9]+[ \t\r]*(?=\n))",
+    re.IGNORECASE,
+)
+"""Lines that say how many values follow: of VTK's keywords, and of arrays in a field."""
+ELEMENT = re.compile(rb"^element[ \t]+\w+[ \t]+(\d+)", re.MULTILINE)
+"""Such lines of a PLY file."""
+DATA_ARRAY = re.compile(rb"<DataArray\b([^>]*)>\s*([A-Za-z0-9+/=]{0,64})")
 CORNERS = {1: 1, 3: 2, 5: 3, 8: 4, 9: 4, 10: 4, 11: 8, 12: 8, 13: 6, 14: 5, 15: 10, 16: 12}
 CORNERS |= {21: 3, 22: 6, 23: 8, 24: 10, 25: 20, 26: 15, 27: 13, 28: 9, 29: 27}
 """Corners of VTK's cell types that have a fixed number (linear, then quadratic ones)."""
@@ -24,7 +39,11 @@ OPEN_ENDED = {2: 1, 4: 2, 6: 3, 7: 3}
 
 
 def legacy_fault(file: bytes) -> str:
-    """The fault in the counts of a legacy file's cells."""
+    """The fault in the counts of a legacy file, above all of its cells."""
+    for line in DECLARED.finditer(file):
+        for count in re.findall(rb"(?<![\w.+-])\d+(?![\w.])", line[0]):
+            if len(count) > LONGEST or int(count) > 8 * len(file):  # bits are the shortest of its values
+                return f"it declares {count.decode()[:LONGEST]} values, but has {len(file)} bytes"
     lines = file[:1024].split(b"\n", 3)
     binary = len(lines) > 2 and lines[2].strip().upper() == b"BINARY"
     version = re.match(rb".{22}[ \t]*(\d+)\.\d+", file)  # VTK too takes what it cannot read for an old version
@@ -43,6 +62,49 @@ def legacy_fault(file: bytes) -> str:
         if fault:
             return f"{name} {fault}"
     return ""
+
+
+def ply_fault(content: bytes) -> str:
+    """The fault in the counts of a PLY file."""
+    header = content[: content.find(b"end_header") + 1 or len(content)]
+    for count in ELEMENT.findall(header):
+        if len(count) > LONGEST or int(count) > len(content):
+            return f"it declares {count.decode()[:LONGEST]} elements, but has {len(content)} bytes"
+    return ""
+
+
+def blocks_fault(content: bytes) -> str:
+    """The fault in the sizes of an XML file's compressed blocks, for which VTK makes room before it unpacks them."""
+    head = content[:4096]
+    if b"compressor=" not in head:
+        return ""
+    order = ">" if b"BigEndian" in head else "<"
+    dtype = np.dtype(f"{order}u{8 if b'UInt64' in head else 4}")
+    for raw in _headers(content, 3 * dtype.itemsize):
+        if len(raw) < 3 * dtype.itemsize:
+            continue
+        count, size, last = np.frombuffer(raw, dtype, 3).tolist()
+        if count * size + last > max(SMALL, RATIO * len(content)):
+            return f"it declares {count} blocks of {size} bytes, but has {len(content)} bytes"
+    return ""
+
+
+def _headers(content: bytes, size: int) -> Iterator[bytes]:
+    """The first `size` bytes of each array of an XML file, in it or appended to it."""
+    start = content.find(b"_", content.rindex(APPENDED)) + 1 if APPENDED in content else 0
+    encoded = b'encoding="raw"' not in content[max(start - 200, 0) : start] if start else True
+    for attributes, text in DATA_ARRAY.findall(content):
+        offset = re.search(rb"\boffset\s*=\s*[\"'](\d{1,18})", attributes)
+        if b"appended" in attributes and offset and start:
+            place = start + int(offset[1])
+            text = content[place : place + 64]
+            if not encoded:
+                yield text[:size]
+                continue
+        elif b"binary" not in attributes:
+            continue
+        with suppress(ValueError):
+            yield base64.b64decode(text[: -(-size // 3) * 4])[:size]
 
 
 def cells_fault(data: Any) -> str:

@@ -15,11 +15,13 @@ from ..matter import DeltaBeta
 from ..model import Instrument, Model
 from ..optics.background import Light
 from ..optics.sampling import fringe_sampling
+from ..ranges import ranged
 from ..scan import Exposures, Scan
 from ..volume import Object
 
 
 @dataclass(frozen=True)
+@ranged
 class CrossValidation:
     """How views are set aside."""
 

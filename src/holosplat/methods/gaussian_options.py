@@ -13,6 +13,7 @@ from ..checks import at_least, require
 from ..fit.density import DensityControl
 from ..fit.schedule import Schedule
 from ..fit.terms import Objective
+from ..ranges import Pixels, Rate, Share, Weight, ranged
 from .ground import ExtraTerm
 
 Backend = Literal["auto", "cpu", "cuda", "reference"]
@@ -20,20 +21,18 @@ Backend = Literal["auto", "cpu", "cuda", "reference"]
 
 
 @dataclass(frozen=True)
+@ranged
 class GaussianRates:
     """Adam's rates of the parameters at the start of a fit."""
 
-    centres: float = 0.01
+    centres: Rate = 0.01
     """Of the centres [detector pixels]."""
-    log_scales: float = 0.01
+    log_scales: Rate = 0.01
     """Of the logarithms of the axes."""
-    quaternions: float = 0.01
+    quaternions: Rate = 0.01
     """Of the orientations."""
-    raw_amplitudes: float = 0.01
+    raw_amplitudes: Rate = 0.01
     """Of the amplitudes before softplus."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 0, *vars(self))
 
     def at(self, factor: float, moving: bool) -> Mapping[str, float]:
         """The rates by parameter, of which `factor` is left; only amplitudes move unless `moving`."""
@@ -62,14 +61,15 @@ class FitOptions:
 
 
 @dataclass(frozen=True)
+@ranged
 class GaussianOptions:
     """Options of Gaussians: their start, and their fit."""
 
     start: Literal["phase", "random"] = "phase"
     """`phase`: phase retrieval, total-variation tomography, Gaussians where there is matter; or `random`."""
-    spacing_px: float = 1.0
+    spacing_px: Pixels = 1.0
     """Distance between Gaussians at a phase start [pixels]."""
-    spacing_noise: float = 2.3
+    spacing_noise: Weight = 2.3
     """What it grows by, as a share, for the share of the frames' contrast that is noise, at most to twice."""
     max_start: int = 150_000
     """Gaussians at the start, at most: their distance grows rather than their number."""
@@ -80,7 +80,7 @@ class GaussianOptions:
     """Steps in which the Gaussians learn the starting volume."""
     approximate_rates: GaussianRates = GaussianRates(0.02, 0.02, 0.02, 0.05)
     """Adam's rates in these steps, of which a tenth is left at the last one."""
-    filled: float = 0.05
+    filled: Share = 0.05
     """Share of matter from which on a block of the starting volume becomes a Gaussian."""
     random_count: int = 8_000
     """Gaussians of a random start."""
@@ -98,7 +98,6 @@ class GaussianOptions:
 
     def __post_init__(self) -> None:
         require(self.spacing_px > 0, f"spacing_px must be positive, but it is {self.spacing_px}.")
-        at_least(self, 0, "approximate_steps", "spacing_noise", "filled")
         at_least(self, 1, "max_start", "random_count")
         require(self.start_per_pixel > 0, f"start_per_pixel must be positive, but it is {self.start_per_pixel}.")
         require(

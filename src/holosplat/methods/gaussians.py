@@ -21,6 +21,7 @@ from ..geometry import Grid
 from ..matter import Matter
 from ..optics.background import Light
 from ..optics.noise import noise_share
+from ..ranges import ranged
 from ..representations import GaussianCloud, Stored
 from ..scan import Scan
 from .field import field_of
@@ -31,6 +32,7 @@ from .start import starting_cloud
 
 
 @dataclass(frozen=True)
+@ranged
 class Gaussians(GaussianOptions):
     """Gaussians where phase retrieval and tomography find matter, or at random, fitted to the frames."""
 

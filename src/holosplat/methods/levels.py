@@ -23,6 +23,7 @@ from ..baselines.two_materials import best_levels, told_apart
 from ..checks import at_least
 from ..matter import Known, KnownRatio, KnownTwo, Matter, MatterKind
 from ..optics.noise import noise_share
+from ..ranges import Weight, ranged
 from ..representations import VoxelGrid
 from .assumed import assumed_material
 from .cross_validation import CrossValidation, MissingMatter
@@ -32,14 +33,15 @@ STAGE = "levels or continuous matter"
 
 
 @dataclass(frozen=True)
+@ranged
 class LevelTest:
     """How it is decided whether matter has levels."""
 
-    worse: float = 1.2
+    worse: Weight = 1.2
     """Factor of the misfit of the views set aside, by a flat inside, from which on matter is continuous."""
-    same: float = 1.02
+    same: Weight = 1.02
     """Factor up to which a flat inside does no harm, and matter has levels."""
-    noisy: float = 0.35
+    noisy: Weight = 0.35
     """Share of noise from which on a flat inside that does no harm says nothing: there, flattening is denoising. One
     that does harm all the same says that matter is continuous."""
     validation: CrossValidation = field(default_factory=CrossValidation)
@@ -50,7 +52,6 @@ class LevelTest:
 
     def __post_init__(self) -> None:
         at_least(self, 1, "worse", "same")
-        at_least(self, 0, "noisy")
 
     def on_backend(self, backend: Literal["cpu", "reference"]) -> LevelTest:
         """The same test computed by `backend`."""

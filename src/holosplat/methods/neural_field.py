@@ -27,6 +27,7 @@ from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..model import Model
 from ..optics.background import Light
+from ..ranges import Rate, Weight, ranged
 from ..representations import NeuralField, Stored, VoxelGrid
 from ..representations.neural_field import Network, grown
 from ..scan import Scan
@@ -53,6 +54,7 @@ def _schedule() -> Schedule:
 
 
 @dataclass(frozen=True)
+@ranged
 class NeuralFit:
     """Options of a neural field and its fit."""
 
@@ -62,23 +64,23 @@ class NeuralFit:
     """Steps towards the retrieved thickness."""
     warmup_rays: int = 4096
     """Rays of all views in each of them."""
-    rate: float = 0.02
+    rate: Rate = 0.02
     """Adam's first rate of all weights, in either stage."""
-    shrinkage: float = 0.01
+    shrinkage: Weight = 0.01
     """Weight decay of the encoding."""
-    weight: float = 0.01
+    weight: Weight = 0.01
     """Weight of total variation, in voxel edges of thickness."""
-    noise_weight: float = 0.1
+    noise_weight: Weight = 0.1
     """What it grows by for every pixel of thickness that the noise of the frames amounts to."""
     probes: int = 4096
     """Random pairs of points half a pixel apart on which total variation is measured."""
-    hull: float = 0.1
+    hull: Weight = 0.1
     """Share of the largest retrieved thickness that counts as matter: the field lives where all views show matter."""
     margin: int = 2
     """Pixels around that, and around what is kept."""
     prune_every: int = 75
     """Steps between updates of where the field is looked at (0: never)."""
-    empty: float = 0.1
+    empty: Weight = 0.1
     """Value up to which nothing is there, in these updates."""
     objective: Objective = field(default_factory=_objective)
     """How frames are compared."""
@@ -90,9 +92,6 @@ class NeuralFit:
     """What computes both stages; `cuda` pays for large fields only."""
 
     def __post_init__(self) -> None:
-        at_least(
-            self, 0, "warmup_steps", "shrinkage", "weight", "noise_weight", "hull", "prune_every", "empty", "margin"
-        )
         at_least(self, 1, "warmup_rays", "probes")
         require(self.rate > 0, f"rate must be positive, but it is {self.rate:g}.")
         steps = self.warmup_steps + self.schedule.steps

@@ -26,6 +26,7 @@ from ..matter import DeltaBeta, Matter
 from ..memory import memory_kept
 from ..optics.noise_model import NoiseModel
 from ..optics.sampling import fringe_sampling
+from ..ranges import Share, ranged
 from ..representations import VoxelGrid
 from ..scan import Scan
 from .method import Task, quiet
@@ -38,6 +39,7 @@ Constants = Mapping[str, float]
 
 
 @dataclass(frozen=True)
+@ranged
 class ProfileOptions:
     """How the likelihood of constants is computed."""
 
@@ -47,7 +49,7 @@ class ProfileOptions:
     """Part of the matter's level from which on a voxel of the first volume belongs to the support."""
     dilated: int = 2
     """Voxels by which the support is wider, for rims."""
-    doubt: float = 0.01
+    doubt: Share = 0.01
     """Part of the contrast (rms) that counts as noise besides: without any, a fit would not come to its end."""
     iterations: int = 30
     """Iterations of each of two rounds, whose second takes the level of matter from the first."""
@@ -63,7 +65,6 @@ class ProfileOptions:
 
     def __post_init__(self) -> None:
         at_least(self, 16, "width")
-        at_least(self, 0, "dilated")
         at_least(self, 1, "iterations")
         require(0 < self.faint < 1, f"faint must lie between 0 and 1, but it is {self.faint:g}.")
 

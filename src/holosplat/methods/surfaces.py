@@ -11,7 +11,7 @@ from scipy.sparse import csc_array, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
-from ..checks import at_least, in_range, positive, require
+from ..checks import in_range, positive, require
 from ..fit.freedom import Freedom, freed
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Adam, Group
@@ -25,6 +25,7 @@ from ..optics.background import Light
 from ..optics.noise import noise_share
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
+from ..ranges import Rate, Weight, ranged
 from ..representations import GaussianCloud, Stored, SurfaceMesh, isosurface
 from ..representations.isosurface import adjacency, neighbour_mean
 from ..scan import Scan
@@ -41,6 +42,7 @@ BETAS, EPSILON = (0.9, 0.99), 1e-30
 
 
 @dataclass(frozen=True)
+@ranged
 class Extraction:
     """How surfaces are cut out of the occupancy that Gaussians add up to."""
 
@@ -48,7 +50,7 @@ class Extraction:
     """Occupancy at the surface."""
     spacing: float = 1.0
     """Edge of the voxels, and about the length of the triangles' sides [pixels]."""
-    least_volume: float = 8.0
+    least_volume: Weight = 8.0
     """Bodies and cavities of fewer voxels are left out."""
     smoothing: int = 10
     """Steps that smooth away the voxels' traces."""
@@ -56,7 +58,6 @@ class Extraction:
     def __post_init__(self) -> None:
         in_range("level", self.level, 0.01, 0.99)
         in_range("spacing", self.spacing, 0.25, 8.0, unit="pixels")
-        at_least(self, 0, "least_volume", "smoothing")
 
 
 def _objective() -> Objective:
@@ -68,12 +69,13 @@ def _schedule() -> Schedule:
 
 
 @dataclass(frozen=True)
+@ranged
 class SurfaceFit:
     """Options of the fit of surfaces to frames."""
 
-    rate: float = 0.2
+    rate: Rate = 0.2
     """Length of the first steps [pixels], the same for all vertices."""
-    stiffness: float = 10.0
+    stiffness: Weight = 10.0
     """How far a vertex draws its neighbours along, λ of Nicolet et al. (2021)."""
     objective: Objective = field(default_factory=_objective)
     """How frames are compared, and what bending costs."""
@@ -83,7 +85,6 @@ class SurfaceFit:
     """Further terms by name."""
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "stiffness")
         positive("rate", self.rate, "pixels")
 
 

@@ -15,19 +15,21 @@ from ..checks import MissingError, at_least, require
 from ..geometry import Grid, Views
 from ..progress import Advance
 from ..projectors.voxels import rows_match
+from ..ranges import Positive, Signed, ranged
 
 
 @dataclass(frozen=True)
+@ranged
 class Mbir:
     """Options of `svmbir.recon`. snr_db: signal to noise assumed of the lines [dB]; sharpness: higher is sharper; p, T:
     shape and threshold of the qGGMRF prior (p near 1 keeps edges); iterations: all are done, for its own rule may stop
     after a few, far from the solution; threads: of the processor.
     """
 
-    snr_db: float = 30.0
-    sharpness: float = 1.0
-    p: float = 1.1
-    T: float = 0.3
+    snr_db: Signed = 30.0
+    sharpness: Signed = 1.0
+    p: Positive = 1.1
+    T: Positive = 0.3
     iterations: int = 20
     threads: int = 2
 

@@ -12,6 +12,7 @@ import numpy as np
 from ..baselines.material import MaterialEstimate, estimate_ratio
 from ..checks import InputError, require
 from ..matter import DeltaBeta, Known, KnownRatio, KnownTwo, MaterialPrior
+from ..ranges import ranged
 from ..scan import Scan
 from .method import Task, shows_no_refraction
 from .profile import Profile, ProfileOptions, exposed
@@ -47,6 +48,7 @@ CALLED = {"distance": "distance", "energy_kev": "energy", "delta_beta": "δ/β"}
 
 
 @dataclass(frozen=True)
+@ranged
 class Uncertain:
     """Lowest and highest values of what is not known better; None for what is."""
 

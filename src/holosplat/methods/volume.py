@@ -15,6 +15,7 @@ from ..fit.smooth_volume import ContinuousPrior
 from ..geometry import Grid
 from ..matter import Matter
 from ..optics.retrieval.spectra import contrast_level
+from ..ranges import ranged
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
 from .assumed import assumed_material
@@ -33,6 +34,7 @@ def _start() -> HolographicTV:
 
 
 @dataclass(frozen=True)
+@ranged
 class SmoothVolume:
     """Continuous matter on voxels: any value from zero up, no levels, no bound, as likely as frames and noise make it.
 
@@ -62,7 +64,6 @@ class SmoothVolume:
     """Frames are binned rather than having more voxels than this."""
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "rounds", "iterations")
         at_least(self, 1, "max_voxels", "loose")
         sizes = all(factor >= 2 for factor in self.coarser) and list(self.coarser) == sorted(self.coarser, reverse=True)
         require(sizes, f"coarser must be whole numbers from 2 on, the largest first, but it is {self.coarser}.")

@@ -22,6 +22,7 @@ from ..geometry import Grid
 from ..matter import Matter
 from ..optics.background import Light
 from ..optics.sampling import fringe_sampling
+from ..ranges import Weight, ranged
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
 from .assumed import assumed_material
@@ -69,6 +70,7 @@ def _objective() -> Objective:
 
 
 @dataclass(frozen=True)
+@ranged
 class VoxelFit:
     """Options of voxels fitted through the waves."""
 
@@ -76,13 +78,13 @@ class VoxelFit:
     """Evaluations of the wave model and its gradient with one voxel a pixel, before the finest voxels."""
     steps: int = 60
     """Evaluations with the finest voxels."""
-    weight: float = 0.05
+    weight: Weight = 0.05
     """Weight of total variation, in voxel edges of thickness."""
-    noise_weight: float = 0.03
+    noise_weight: Weight = 0.03
     """What it grows by for every pixel of thickness that the noise of the frames amounts to."""
     smoothing: float = 0.005
     """Differences between voxels below which total variation is a square."""
-    upper: float = 1.0
+    upper: Weight = 1.0
     """Bound of the occupancy of a known material (0: none)."""
     refine: int = 0
     """Voxels along a pixel's edge (0: as the first fringe needs)."""
@@ -96,7 +98,6 @@ class VoxelFit:
     """Further terms by name."""
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "coarse_steps", "weight", "noise_weight", "upper", "refine")
         at_least(self, 1, "steps", "max_voxels")
         require(self.smoothing > 0, f"smoothing must be positive, but it is {self.smoothing}.")
         require(

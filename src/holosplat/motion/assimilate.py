@@ -20,6 +20,7 @@ from ..checks import at_least, positive, require
 from ..matter import Matter
 from ..mesh import TriangleMesh
 from ..model import Instrument, Model
+from ..ranges import ranged
 from ..representations import SurfaceMesh
 from ..scan import Scan
 from .cell_flow import CellFlow, Unknowns, advanced
@@ -37,6 +38,7 @@ MEDIAN = 1.4826
 
 
 @dataclass(frozen=True)
+@ranged
 class Assimilation:
     """How a flow is fitted to frames."""
 

@@ -28,6 +28,7 @@ from ..methods import Task
 from ..methods.smooth_fit import SmoothFit
 from ..methods.volume import SmoothStage, SmoothVolume
 from ..optics.noise_model import NoiseModel
+from ..ranges import Pixels, Weight, ranged
 from ..representations import Flow, Lattice, MovingGaussians, TimeBasis, VoxelGrid, approximate, cloud_from_volume
 from ..representations.initialise import FILLED
 from ..scan import Scan
@@ -44,6 +45,7 @@ FEWEST_PIXELS = 24
 
 
 @dataclass(frozen=True)
+@ranged
 class CarriedOptions:
     """How matter in motion is reconstructed."""
 
@@ -59,9 +61,9 @@ class CarriedOptions:
     """Steps of Runge and Kutta from the first time to the last."""
     sources: bool = False
     """Whether the flow may have a divergence where no matter is, as in a foam whose bubbles shrink."""
-    strain: float = 1.0
+    strain: Weight = 1.0
     """Standard deviation expected of what is not rigid of the motion, over all times (as-rigid-as-possible)."""
-    divergence: float = 0.3
+    divergence: Weight = 0.3
     """Standard deviation expected of the divergence of sources, over all times."""
     iterations: int = 12
     """Iterations for the flow and for the volume, each time that the two take turns."""
@@ -69,14 +71,13 @@ class CarriedOptions:
     """Iterations of the volume on voxels of a pixel, twice."""
     held_out: int = 5
     """One frame in so many is held out to ask how free the flow is."""
-    spacing_px: float = 2.0
+    spacing_px: Pixels = 2.0
     """Distance between the Gaussians that stand for the volume [pixels]."""
     approximate_steps: int = 60
     """Steps in which they learn it."""
 
     def __post_init__(self) -> None:
         at_least(self, 1, "cells", "most_cells", "steps", "iterations", "final", "approximate_steps")
-        at_least(self, 0, "most_degree")
         at_least(self, 2, "held_out")
         for name in ("strain", "divergence"):
             require(getattr(self, name) > 0, f"{name} must be above zero, but it is {getattr(self, name):g}.")

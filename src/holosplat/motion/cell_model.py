@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ..checks import InputError, positive
 from ..mesh import TriangleMesh
+from ..ranges import Signed, Small, ranged
 from ..specimens.flow.channel import Channel
 from ..specimens.flow.suspension import Medium
 from ..specimens.membrane.model import Elasticity, Membrane
@@ -45,6 +46,7 @@ Range = tuple[float, float]
 
 
 @dataclass(frozen=True)
+@ranged
 class ChannelFrame:
     """A rectangular channel in the object frame.
 
@@ -52,9 +54,9 @@ class ChannelFrame:
     section, of which the part along the flow does not matter. Errors: `InputError` for extents that are none.
     """
 
-    across: tuple[float, float]
+    across: tuple[Small, Small]
     axis: Literal["x", "y", "z"] = "y"
-    centre: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    centre: tuple[Signed, Signed, Signed] = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         for extent in self.across:

@@ -11,7 +11,7 @@ from scipy.sparse import csc_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
-from ..checks import at_least, positive, require
+from ..checks import positive, require
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Adam, Group
 from ..fit.problem import Problem, Term
@@ -21,6 +21,7 @@ from ..methods.ground import Ground, ground
 from ..methods.surfaces import BETAS, EPSILON, oversampling
 from ..optics.background import Light
 from ..optics.noise import noise_share
+from ..ranges import Rate, Weight, ranged
 from ..representations import MovingSurfaces
 from ..representations.isosurface import adjacency
 from ..scan import Scan
@@ -38,20 +39,21 @@ def _objective() -> Objective:
 
 
 @dataclass(frozen=True)
+@ranged
 class MotionFit:
     """Options of a fit of moving surfaces."""
 
-    rate: float = 0.2
+    rate: Rate = 0.2
     """Length of the first steps [pixels], the same for all vertices."""
-    stiffness: float = 10.0
+    stiffness: Weight = 10.0
     """How far a vertex draws its neighbours along, λ of Nicolet et al. (2021)."""
     acceleration: float = 1e-6
     """Weight of bent paths: the sum of squared coefficients of acceleration [pixels² per piece⁴]."""
-    volume_kept: float = 0.006
+    volume_kept: Weight = 0.006
     """Standard deviation of a body's volume over time, as a share (0: volumes are free). Of red cells it is that."""
-    area_kept: float = 0.03
+    area_kept: Weight = 0.03
     """The same of its area: red cells in flow change theirs by 1 to 5 % (0: areas are free)."""
-    apart: float = 0.2
+    apart: Weight = 0.2
     """How deep bodies may lie in each other, a standard deviation [pixels] (0: as they like)."""
     objective: Objective = field(default_factory=_objective)
     """How frames are compared, and what bending costs."""
@@ -59,7 +61,6 @@ class MotionFit:
     """The loop; memory is that of the frames of one step."""
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "stiffness", "acceleration", "volume_kept", "area_kept", "apart")
         positive("rate", self.rate, "pixels")
 
 

@@ -8,8 +8,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..checks import at_least, in_range
+from ..checks import in_range
 from ..mesh import TriangleMesh
+from ..ranges import ranged
 from ..representations import MovingSurfaces, TimeBasis
 from ..representations.paths import along
 from .split import Split, Window, shrunk
@@ -23,6 +24,7 @@ SMOOTH = 3
 
 
 @dataclass(frozen=True)
+@ranged
 class PathForecast:
     """How fitted paths go on."""
 
@@ -39,7 +41,6 @@ class PathForecast:
 
     def __post_init__(self) -> None:
         in_range("degree", self.degree, 1, 5)
-        at_least(self, 0, "window")
 
     def times(self, times: np.ndarray) -> np.ndarray:
         """The times of the window, of all `times` [T] of the run: one more than the degree at least, where there are

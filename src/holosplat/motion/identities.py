@@ -13,6 +13,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from ..checks import at_least, in_range
+from ..ranges import ranged
 
 FAR = 1e9
 """Cost of a pair that cannot be."""
@@ -37,6 +38,7 @@ class Seen:
 
 
 @dataclass(frozen=True)
+@ranged
 class LinkOptions:
     """What two sightings of one body have in common."""
 
@@ -50,7 +52,6 @@ class LinkOptions:
     """Sightings that make a track, unless it is near the field's edge, where bodies enter and leave."""
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "gate", "gap")
         at_least(self, 1, "least")
         in_range("change", self.change, 0.01, 0.99)
 

@@ -10,6 +10,7 @@ import torch
 from ..checks import at_least, in_range
 from ..fit.residuals import Prediction
 from ..optics.background import Light
+from ..ranges import ranged
 from ..representations import MovingSurfaces
 from ..scan import Scan
 from .elastic import Rest
@@ -20,6 +21,7 @@ SURE = 2.0
 
 
 @dataclass(frozen=True)
+@ranged
 class PathOptions:
     """How vertices move."""
 
@@ -34,7 +36,6 @@ class PathOptions:
 
     def __post_init__(self) -> None:
         in_range("degree", self.degree, 1, 5)
-        at_least(self, 0, "pieces")
         at_least(self, 1, "most_pieces")
         at_least(self, 2, "held_out")
 

@@ -10,6 +10,7 @@ import numpy as np
 from ..checks import InputError, at_least, in_range, require
 from ..io.vtk import read_meshes
 from ..mesh import TriangleMesh
+from ..ranges import Metres, Weight, ranged
 from ..specimens.membrane.resting import FREQUENCIES, resting_cell
 from ..specimens.repair import closed
 from .sightings import centroid
@@ -22,6 +23,7 @@ COARSE, FEWEST, MOST = 180, 180, 3000
 
 
 @dataclass(frozen=True)
+@ranged
 class KnownBody:
     """What is known of the shape of all bodies."""
 
@@ -29,17 +31,16 @@ class KnownBody:
     """red-cell, or a file of one closed mesh (.stl, .ply, .obj, .vtk, .vtp, .vtu); its pose there does not matter."""
     length_unit: str = "um"
     """Unit of the file's coordinates."""
-    size: float = 0.0
+    size: Metres = 0.0
     """Largest extent at rest [m] (0: a red cell's 7.82 µm, or the file's)."""
     uncertain: float = 0.1
     """By which part all bodies may be larger or smaller than that, at most; frames tell (0: they are not)."""
-    stiffness: float = 100.0
+    stiffness: Weight = 100.0
     """Minus the logarithm of the probability of strains of about one: frames decide what they see, this the rest."""
     instants: int = 5
     """Times of the scan at which bodies are looked for together."""
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "size", "uncertain", "stiffness")
         at_least(self, 2, "instants")
         in_range("uncertain", self.uncertain, 0, 0.3)
         known = self.shape == RED_CELL or Path(self.shape).is_file()

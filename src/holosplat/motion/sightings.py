@@ -8,11 +8,12 @@ import numpy as np
 import torch
 
 from ..baselines import HolographicTV, holographic_tv
-from ..checks import InputError, at_least, in_range
+from ..checks import InputError, in_range
 from ..geometry import Views
 from ..matter import DeltaBeta, Matter
 from ..mesh import TriangleMesh
 from ..progress import Progress
+from ..ranges import Pixels, Weight, ranged
 from ..representations import SurfaceMesh, isosurface
 from ..scan import Scan
 
@@ -41,6 +42,7 @@ class Sighting:
 
 
 @dataclass(frozen=True)
+@ranged
 class SightingOptions:
     """How bodies are found in the frames of one time."""
 
@@ -48,16 +50,15 @@ class SightingOptions:
     """The volume of one time by itself: 160 iterations find no other bodies than 60 do."""
     level: float = 0.5
     """Occupancy at the surface."""
-    least_volume: float = 30.0
+    least_volume: Weight = 30.0
     """Bodies of fewer voxels are left out: noise, or too little to be followed."""
     smoothing: int = 10
     """Steps that smooth away the voxels' traces."""
-    edge: float = 1.0
+    edge: Pixels = 1.0
     """Bodies that come nearer to the field's edge than this are cut by it [pixels]."""
 
     def __post_init__(self) -> None:
         in_range("level", self.level, 0.01, 0.99)
-        at_least(self, 0, "least_volume", "smoothing", "edge")
 
 
 def sightings(

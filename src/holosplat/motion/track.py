@@ -10,13 +10,14 @@ from typing import Any, ClassVar
 
 import torch
 
-from ..checks import InputError, require
+from ..checks import InputError, as_written, require
 from ..fit.running import Record
 from ..fit.schedule import Schedule
 from ..matter import DeltaBeta
 from ..mesh import TriangleMesh
 from ..optics.background import Light
 from ..progress import FitProgress
+from ..ranges import Natural, Share, ranged
 from ..representations import MovingSurfaces, TimeBasis
 from ..scan import Scan
 from .elastic import Rest
@@ -50,6 +51,7 @@ def _soft() -> MotionFit:
 
 
 @dataclass(frozen=True)
+@ranged
 class TrackOptions:
     """How bodies are followed through time."""
 
@@ -63,9 +65,9 @@ class TrackOptions:
     """Which of them are one body."""
     paths: PathOptions = field(default_factory=PathOptions)
     """How the vertices move."""
-    rounds: int = 4
+    rounds: Natural = 4
     """How often bodies are looked for beside those that are known, at most."""
-    fainter: float = 0.6
+    fainter: Share = 0.6
     """Factor of the level there: few views smear a body, and beside what is known there is little to take it for."""
     stiff: MotionFit = field(default_factory=_stiff)
     """The first fit, in which bodies move and turn nearly as a whole."""
@@ -163,8 +165,11 @@ class _Following:
     def take_up(self) -> None:
         """Go on where the journal ends."""
         saved = self.journal.load()
-        if saved is None:
-            return
+        if saved is not None:
+            with as_written("checkpoint.pt", "a checkpoint of this run"):
+                self._take_up(saved)
+
+    def _take_up(self, saved: Mapping[str, Any]) -> None:
         self.stage, self.round, self.oversample = str(saved["next"]), int(saved["round"]), int(saved["oversample"])
         self.bodies = None if saved["bodies"] is None else MovingSurfaces.from_state(saved["bodies"])
         self.seen, self.counts = to_sightings(saved["seen"]), list(saved["counts"])

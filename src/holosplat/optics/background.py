@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..checks import InputError, require
 from ..divided_light import DividedLight
+from ..ranges import ranged
 from .air import Box, air_in_boxes, find_air, has_air
 from .modes import cosines, half_waves, smooth_modes
 from .noise_model import NoiseModel
@@ -39,6 +40,7 @@ Still = Literal["auto", "none"]
 
 
 @dataclass(frozen=True)
+@ranged
 class LightOptions:
     """What is assumed of the light beside the flat fields."""
 

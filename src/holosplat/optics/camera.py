@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.fft import dctn, idctn
 
-from ..checks import at_least, positive, require
+from ..checks import positive, require
+from ..ranges import Pixels, Positive, Weight, ranged
 
 BITS = (10, 16)
 FLAT_LEVEL = 0.4
@@ -17,26 +18,27 @@ HOT_LEVELS = (0.5, 1.2)
 
 
 @dataclass(frozen=True)
+@ranged
 class Camera:
     """A camera: photons in, whole numbers of counts out."""
 
     bits: int = 12
     """Bits of a count (10 to 16); brighter pixels are saturated."""
-    gain: float | None = None
+    gain: Positive | None = None
     """Counts a detected photon gives (default: such that a mean flat fills 40 % of the range)."""
     offset: float = 100.0
     """Counts without light."""
-    read_noise: float = 2.0
+    read_noise: Weight = 2.0
     """Standard deviation of the read-out noise [counts]."""
     gain_spread: float = 0.02
     """Standard deviation of the pixels' gains, as a part of the gain."""
-    offset_spread: float = 2.0
+    offset_spread: Weight = 2.0
     """Standard deviation of the pixels' offsets [counts]."""
     dead: float = 0.0005
     """Share of pixels that see no light."""
     hot: float = 0.0005
     """Share of pixels that are bright without light."""
-    scintillator_px: float = 0.0
+    scintillator_px: Pixels = 0.0
     """Standard deviation of a Gaussian by which the scintillator spreads the light of each photon [pixels]."""
 
     def __post_init__(self) -> None:
@@ -45,7 +47,6 @@ class Camera:
         require(whole, f"bits must be a whole number from {low} to {high}, but it is {self.bits}.")
         if self.gain is not None:
             positive("gain", self.gain, "counts a photon")
-        at_least(self, 0, "offset", "read_noise", "gain_spread", "offset_spread", "dead", "hot", "scintillator_px")
         require(
             self.offset < self.most, f"offset must be below the range of {self.most} counts, but it is {self.offset}."
         )

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..checks import at_least, positive, require
+from ..checks import positive, require
+from ..ranges import Pixels, Positive, Weight, ranged
 from .camera import spread
 
 FAINTEST = 0.02
@@ -21,12 +22,13 @@ COARSEST = 8.0
 
 
 @dataclass(frozen=True)
+@ranged
 class Illumination:
     """How the light of pulses varies, within a frame and from pulse to pulse."""
 
     energy_jitter: float = 0.1
     """Standard deviation of the pulse energy, as a part of its mean (gamma distributed)."""
-    beam_width: float = 0.6
+    beam_width: Positive = 0.6
     """Standard deviation of the beam's Gaussian profile, as a part of the longer side of the frame."""
     pointing: float = 0.03
     """Standard deviation of the beam's shift along each axis, as a part of its width."""
@@ -34,17 +36,16 @@ class Illumination:
     """Contrast (rms) of the structure that all pulses share."""
     variation: float = 0.08
     """Contrast (rms) of the structure that changes from pulse to pulse."""
-    grain_px: float = 3.0
+    grain_px: Pixels = 3.0
     """Size (standard deviation) of the finest grains [pixels]; the coarsest are eight times larger."""
     components: int = 8
     """Number of random components that change from pulse to pulse."""
-    decay: float = 1.0
+    decay: Weight = 1.0
     """Weights of component k fall off as 1/k to this power."""
 
     def __post_init__(self) -> None:
         positive("beam_width", self.beam_width, "the frame's longer side")
         positive("grain_px", self.grain_px, "pixels")
-        at_least(self, 0, "energy_jitter", "pointing", "structure", "variation", "components", "decay")
         for name, most in (("energy_jitter", 1.0), ("pointing", 0.3), ("structure", 0.3), ("variation", 0.3)):
             value = getattr(self, name)
             require(value <= most, f"{name} must be at most {most:g}, but it is {value:g}.")

@@ -18,6 +18,7 @@ from ..geometry import Views
 from ..materials import ENERGY_RANGE_KEV, DeltaBeta, Material
 from ..mesh import TriangleMesh
 from ..model import Instrument
+from ..ranges import Metres, Pixels, ranged
 from ..scan import PIXEL_RANGE_M, Exposures, checked_distance
 from ..specimens.scene import MeshScene
 from ..units import wavelength, wavenumber
@@ -81,16 +82,17 @@ class Subject:
 
 
 @dataclass(frozen=True)
+@ranged
 class Setup:
     """The beam and the detector of one frame."""
 
     energy_kev: float = 20.0
     """Photon energy [keV]."""
-    distance: float = 0.1
+    distance: Metres = 0.1
     """Effective propagation distance, in the sample plane [m]; 0: in contact."""
     pixel_size: float = 3.2e-6
     """Effective pixel size, in the sample plane [m]."""
-    psf_sigma_px: float = 0.0
+    psf_sigma_px: Pixels = 0.0
     """Standard deviation of the detector's Gaussian point-spread function [pixels]."""
     source_angle: float = 0.0
     """Standard deviation of the Gaussian source, seen from the object [rad]; times the distance it is the blur."""

@@ -12,6 +12,7 @@ from ..checks import in_range, positive, require
 from ..geometry import Grid, Views
 from ..optics.noise import PHOTON_RANGE
 from ..progress import Advance
+from ..ranges import Frequency, Photons, Seconds, ranged
 from .contrast import Setup, Subject, Visibility, visibility
 
 WANTED_SNR = 5.0
@@ -23,18 +24,19 @@ BYTES_A_VOXEL = 8
 
 
 @dataclass(frozen=True)
+@ranged
 class Recording:
     """The frames and views that are recorded."""
 
-    photons_per_pixel: float = 1000.0
+    photons_per_pixel: Photons = 1000.0
     """Mean photons detected in a pixel without the object."""
     views: int = 16
     """Number of directions over 180°, recorded at the same instant."""
     detector: tuple[int, int] | None = None
     """(rows, columns) of a frame [pixels] (default: not given, so no field and no data rate)."""
-    frame_rate: float | None = None
+    frame_rate: Frequency | None = None
     """Frames a second [Hz] (default: no rates are computed)."""
-    exposure: float | None = None
+    exposure: Seconds | None = None
     """Time with light in one frame, such as a pulse's length [s] (default: the whole frame)."""
     velocity: float | None = None
     """Velocity of the object across the beam [m/s] (default: no motion is considered)."""
@@ -45,7 +47,7 @@ class Recording:
 
     def __post_init__(self) -> None:
         in_range("photons_per_pixel", self.photons_per_pixel, *PHOTON_RANGE)
-        for name, most in (("views", 10**6), ("frames", 10**12), ("bit_depth", 64)):
+        for name, most in (("views", 10**6), ("frames", 10**9), ("bit_depth", 64)):
             value = getattr(self, name)
             require(1 <= value <= most, f"{name} must lie between 1 and {most:g}, but it is {value}.")
         if self.detector is not None:

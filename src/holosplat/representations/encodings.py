@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn.functional import embedding_bag, grid_sample
 
 from ..checks import at_least, require
+from ..ranges import Weight, ranged
 
 PRIMES = (1, 2_654_435_761, 805_459_861)
 """Multipliers of the spatial hash (Müller et al. 2022, eq. 4)."""
@@ -19,6 +20,7 @@ FIRST_FEATURES = 1e-4
 
 
 @dataclass(frozen=True)
+@ranged
 class Encoding:
     """Options of an encoding.
 
@@ -36,7 +38,7 @@ class Encoding:
     finest: float = 1.5
     log2_size: int = 17
     waves: int = 64
-    bandwidth: float = 0.06
+    bandwidth: Weight = 0.06
 
     def __post_init__(self) -> None:
         require(self.kind in ("hash", "fourier"), f"kind must be hash or fourier, but it is {self.kind!r}.")

@@ -19,6 +19,7 @@ from ..backends import device
 from ..checks import at_least, require
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
+from ..ranges import ranged
 from ..tables import from_table, to_table
 from ..volume import LineIntegrals, Volume
 from .encodings import Encoding
@@ -33,6 +34,7 @@ FIRST_VALUE = 0.05
 
 
 @dataclass(frozen=True)
+@ranged
 class Network:
     """Options of the network: the encoding, and `layers` hidden layers of `hidden` units (ReLU) behind it."""
 

@@ -18,6 +18,7 @@ import torch
 from ..checks import finite, in_range, require, shaped
 from ..geometry import Grid, Views
 from ..matter import DeltaBeta
+from ..ranges import ranged
 from ..volume import LineIntegrals, Volume
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(16)
@@ -58,6 +59,7 @@ class Profile(Protocol):
 
 
 @dataclass(frozen=True)
+@ranged
 class Soft:
     """One inside, zero outside, and half a period of a cosine between: from `1 - width / 2` to `1 + width / 2`."""
 
@@ -102,6 +104,7 @@ class Soft:
 
 
 @dataclass(frozen=True)
+@ranged
 class Bump:
     """`(1 - s²)^power` inside, which is smooth at its edge to the order `power - 1`."""
 

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from ..checks import InputError, finite, in_range, require, shaped
 from ..mesh import TriangleMesh
+from ..ranges import Stretch, ranged
 
 RADIUS = 3.91e-6
 THICKNESS = (0.81e-6, 7.83e-6, -4.39e-6)
@@ -25,6 +26,9 @@ DIAMETER = 2 * RADIUS
 """Mean diameter of a resting human red cell, 7.82 µm; cells of another diameter are scaled as a whole."""
 MAX_DEFORM = 0.1
 TRIES = 2000
+MOST_FILLED = 0.71
+"""Share of a channel that bodies fill which lie at random: that of flat ellipsoids, the densest of them (Donev et al.
+2004, Science 303, 990)."""
 SHUFFLES = 50
 STEP, TURN = 0.1, 0.2
 """Typical move of a cell in a shuffle: in diameters along each axis, in radians about each."""
@@ -35,6 +39,7 @@ COARSE_POINTS, FINE_LEVEL = 162, 4
 
 
 @dataclass(frozen=True, eq=False)
+@ranged
 class RedCell:
     """One cell: size, pose and bending. Bending and stretch keep the volume exactly (unit Jacobian)."""
 
@@ -44,7 +49,7 @@ class RedCell:
     """[3, 3], with `x = rotation @ x_cell + centre` and the cell's axis along its own z."""
     centre: np.ndarray = field(default_factory=lambda: np.zeros(3))
     """[3] [m]."""
-    stretch: float = 0.0
+    stretch: Stretch = 0.0
     """Logarithm of the stretch along the cell's x and of the shrinkage along its y."""
     bend: np.ndarray = field(default_factory=lambda: np.zeros(5))
     """[5] amplitudes of the mid-plane's bending [radii]: Zernike's bowl, two saddles, two trefoils, unit rms each."""
@@ -349,6 +354,14 @@ def _check_channel(
     for axis, extent in zip("xyz", box):
         in_range(f"box extent {axis}", extent, 1e-9, 10.0, unit="metres")
     in_range("cell diameter", diameter, 1e-9, 1.0, unit="metres")
+    room = box[0] * box[1] * box[2] if shape == "box" else 0.25 * np.pi * min(box[0], box[2]) ** 2 * box[1]
+    filled = count * evans_fung_cell(diameter).volume / room
+    require(
+        filled <= MOST_FILLED,
+        f"{count} red cells of {1e6 * diameter:.4g} µm must fit into the {shape} of "
+        f"{' x '.join(f'{1e6 * b:.4g}' for b in box)} µm, but they would fill {filled:.0%} of it, and lie at random in "
+        f"{MOST_FILLED:.0%} at most; take fewer or smaller cells, or a larger box.",
+    )
     require(0 <= deform <= MAX_DEFORM, f"deform must lie between 0 and {MAX_DEFORM}, but it is {deform!r}.")
     require(0 <= margin < diameter, f"margin must lie between 0 and the cell diameter, but it is {margin!r} m.")
     require(shape in ("box", "cylinder"), f"shape must be 'box' or 'cylinder', but it is {shape!r}.")

@@ -27,6 +27,7 @@ from ..preprocess import (
     relative_intensity,
 )
 from ..progress import Advance
+from ..ranges import ranged
 from ..scan import Scan
 from .air_light import AirLight
 
@@ -43,6 +44,7 @@ ENOUGH_FLATS = 3
 
 
 @dataclass(frozen=True)
+@ranged
 class CorrectionOptions:
     """How raw frames are corrected."""
 

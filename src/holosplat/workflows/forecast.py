@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from ..checks import InputError, at_least, positive, require
+from ..checks import InputError, positive, require
 from ..io.atomic import atomic_path
 from ..io.json import write_json
 from ..io.nxtomo import write_scan
@@ -21,6 +21,7 @@ from ..motion.fit import MotionFit
 from ..motion.forecast import Forecast, Halves, PathForecast, extrapolate
 from ..motion.half_sets import LEAST, half_sets
 from ..progress import FitProgress
+from ..ranges import Seconds, ranged
 from ..representations import MovingSurfaces
 from ..scan import Scan
 from ..tables import to_table
@@ -42,6 +43,7 @@ SAME_TIME = 1e-3
 
 
 @dataclass(frozen=True)
+@ranged
 class ForecastOptions:
     """How a run is carried on."""
 
@@ -49,7 +51,7 @@ class ForecastOptions:
 
     times: int = 10
     """Times ahead."""
-    step: float = 0.0
+    step: Seconds = 0.0
     """Between them [s] (0: the median step of the run)."""
     model: PathForecast = field(default_factory=PathForecast)
     """How paths go on."""
@@ -61,7 +63,6 @@ class ForecastOptions:
     """These fits."""
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "step")
         require(
             1 <= self.times <= MOST_TIMES,
             f"a forecast must be of 1 to {MOST_TIMES} times, but {self.times} are asked for; change --times.",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Literal
 
-from ..checks import require
+from ..checks import as_written, require
 from ..io.json import read_json
 from ..representations import MovingGaussians, MovingSurfaces
 from ..scan import Scan
@@ -15,7 +15,8 @@ from .run_folder import RunFolder
 
 def instants_of(folder: RunFolder) -> list[float]:
     """The times [s] of the frames that a run in motion was fitted to; empty for one that stands still."""
-    return [float(time) for time in read_json(folder.summary).get("times_s", ())]
+    with as_written(folder.summary, "what track wrote"):
+        return [float(time) for time in read_json(folder.summary).get("times_s", ())]
 
 
 def chosen_frames(time_frame: int | Literal["all"] | None, times: list[float]) -> list[int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
@@ -11,7 +12,7 @@ import torch
 
 from ..align.geometry import Geometry
 from ..align.poses import PoseOptions
-from ..checks import InputError, require
+from ..checks import as_written, positive, require
 from ..fit.running import Record, Running
 from ..io.json import write_json
 from ..io.light import read_still_light, write_light
@@ -23,6 +24,7 @@ from ..methods.uncertain import Determined, Uncertain
 from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling
 from ..progress import FitProgress
+from ..ranges import require_plausible
 from ..representations import KINDS, Stored
 from ..scan import Scan
 from ..tables import to_table
@@ -150,24 +152,24 @@ def check_frames(train: Scan) -> None:
 def load_reconstruction(folder: RunFolder) -> Reconstruction:
     """What a run folder holds; `InputError` if it holds no reconstruction."""
     folder.require_run()
-    summary = folder.read_summary()
-    try:
-        timing = {name: float(value) for name, value in summary["timing_s"].items()}
-        energy, oversample = float(summary["energy_kev"]), int(summary["oversample"])
-        done, method = bool(summary["finished"]), str(summary.get("method", Gaussians.kind))
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(
-            f"{folder.summary} must be what reconstruct wrote, but it lacks or garbles {error}."
-        ) from error
-    plain = summary.get("backend") == "reference"  # then it is judged without compiled kernels, too
-    found = read_object(folder.result()).on("reference" if plain else "cpu")
-    told = bool(summary.get("material", {}).get("delta_told", True))
-    said = Verdict.from_dict(summary["verdict"]) if "verdict" in summary else None
-    total = TotalMatter.from_dict(summary["total"]) if "total" in summary else None
-    constants = tuple(Determined.from_dict(each) for each in summary.get("constants", ()))
-    light, choice = read_light_options(folder.read_config(), summary), Choice.read(summary)
+    summary, config = folder.read_summary(), folder.read_config()
+    found = read_object(folder.result())
     still = read_still_light(folder.light) if folder.light.is_file() else None
-    told_of = (choice, told, said, total, constants, light, read_geometry(summary), still)
+    with as_written(folder.summary, "what reconstruct wrote"):
+        require_plausible(summary)
+        timing = {name: float(value) for name, value in summary["timing_s"].items()}
+        energy, oversample = positive("energy_kev", summary["energy_kev"]), int(summary["oversample"])
+        done, method = bool(summary["finished"]), str(summary.get("method", Gaussians.kind))
+        plain = summary.get("backend") == "reference"  # then it is judged without compiled kernels, too
+        told = bool(summary.get("material", {}).get("delta_told", True))
+        said = Verdict.from_dict(summary["verdict"]) if "verdict" in summary else None
+        total = TotalMatter.from_dict(summary["total"]) if "total" in summary else None
+        constants = tuple(Determined.from_dict(each) for each in summary.get("constants", ()))
+        choice, geometry = Choice.read(summary), read_geometry(summary)
+        with as_written(folder.config, "what reconstruct wrote"):
+            light = read_light_options(config, summary)
+    told_of = (choice, told, said, total, constants, light, geometry, still)
+    found = found.on("reference" if plain else "cpu")
     return Reconstruction(found, method, energy, oversample, timing, done, *told_of)
 
 
@@ -195,8 +197,9 @@ class _Run:
             return
         self._saved = self.folder.load_checkpoint()
         if self._saved:
-            self.timing |= self._saved["timing"]
-            self._keeper.load(self._saved["kept"])
+            with self.as_written():
+                self.timing |= self._saved["timing"]
+                self._keeper.load(self._saved["kept"])
 
     def settle(
         self, matter: MatterKind | None, uncertain: Uncertain, scan: Scan, geometry: Geometry | None = None
@@ -205,7 +208,8 @@ class _Run:
         decided before. scan: the whole one, with its test frames, in the `geometry` of its training frames."""
         began = time.perf_counter()
         if self._saved and self.folder is not None:
-            found = Settled.again(self.method, self.folder.read_config()["decided"])
+            with as_written(self.folder.config, "of a run that has begun"):
+                found = Settled.again(self.method, self.folder.read_config()["decided"])
         else:
             found = settled(self.method, self.task, matter, uncertain)
             self.timing["decision"] = time.perf_counter() - began
@@ -218,13 +222,13 @@ class _Run:
     def complete(self) -> Reconstruction:
         """Run what is left of the stages."""
         found: Stored | None = None
-        stages, first = self.method.stages(), int(self._saved["stage"]) if self._saved else 0
+        with self.as_written():
+            stages, first = self.method.stages(), int(self._saved["stage"]) if self._saved else 0
+            require(first < len(stages), f"stage must be below {len(stages)}, but it is {first}.")
         last: Running | None = None
         for number in range(first, len(stages)):
             stage, saved = stages[number], self._saved if number == first else None
-            if saved:
-                self._go_back(saved)
-            start = _restored(saved["start"]) if saved else self._started(stage, found)
+            start = self._start_again(saved) if saved else self._started(stage, found)
             fit = stage.fit(self.task, start)
             oversample = fit.oversample if fit else 0
             if saved is None and start is not found and (number == 0 or fit is None):
@@ -245,6 +249,16 @@ class _Run:
         assert self._keeper.best is not None
         self.task = replace(self.task, scan=replace(self.task.scan, exposures=self._keeper.best.exposures))
         return self._result(self._keeper.best.object, last, True)
+
+    def as_written(self) -> AbstractContextManager[None]:
+        """In which what a checkpoint lacks is an `InputError`."""
+        return as_written(self.folder.checkpoint if self.folder else "", "a checkpoint of this run")
+
+    def _start_again(self, saved: dict[str, Any]) -> Stored:
+        """What the stage of a checkpoint began with; the frames are where they were then."""
+        with self.as_written():
+            self._go_back(saved)
+            return KINDS[saved["start"]["kind"]].from_state(saved["start"]["state"])
 
     def _go_back(self, saved: dict[str, Any]) -> None:
         """To where the frames were when the stage of a checkpoint began."""
@@ -329,7 +343,8 @@ class _Journal:
     def run(self, saved: dict[str, Any] | None) -> bool:
         """Run the fit, from a saved state if there is one; whether it came to its end."""
         if saved is not None:
-            self._fit.load(saved)
+            with self._run.as_written():
+                self._fit.load(saved)
         self._run.make_folder(self._fit.backend)
         self._run.note_resolved(self._run.method.stages()[self._number].name, self._fit)
         if self._run.folder is not None:
@@ -373,7 +388,3 @@ class _Journal:
         }
         folder.save_checkpoint(state)
         self._last = time.perf_counter()
-
-
-def _restored(saved: dict[str, Any]) -> Stored:
-    return KINDS[saved["kind"]].from_state(saved["state"])

@@ -15,7 +15,7 @@ from ..align.held_out import fitted_frames, place_frames
 from ..align.poses import PoseOptions
 from ..align.poses import Uncertain as Where
 from ..align.views import KINDS
-from ..checks import require
+from ..checks import as_written, require
 from ..fit.freedom import Freedom
 from ..io.json import read_json, write_json
 from ..matter import MaterialPrior
@@ -55,8 +55,9 @@ def saved_geometry(folder: RunFolder | None, resume: bool) -> Geometry | None:
     """That of a run that goes on; None where there is none yet."""
     if folder is None or not resume or not folder.config.is_file():
         return None
-    table = folder.read_config().get("decided", {}).get("geometry")
-    return None if table is None else Geometry.from_dict(table)
+    with as_written(folder.config, "of a run that has begun"):
+        table = folder.read_config().get("decided", {}).get("geometry")
+        return None if table is None else Geometry.from_dict(table)
 
 
 def still_uncertain(geometry: Geometry, uncertain: Where) -> Where:
@@ -124,7 +125,8 @@ def where_found(folder: RunFolder, scan: Scan) -> Scan:
     """`scan` with the exposures that the run in `folder` found, if it is the one that was reconstructed, as planned."""
     if not folder.summary.is_file():
         return scan
-    geometry = read_geometry(read_json(folder.summary))
+    with as_written(folder.summary, "what reconstruct wrote"):
+        geometry = read_geometry(read_json(folder.summary))
     if geometry is None or scan_hash(scan) != folder.read_config().get("scan_hash"):
         return scan
     return geometry.applied(scan)

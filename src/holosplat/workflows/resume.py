@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from ..checks import require
+from ..checks import as_written, require
 from ..methods.presets import SCHEMA
 from ..methods.uncertain import Uncertain
 from ..optics.background import LightOptions
@@ -38,7 +38,11 @@ def goes_on(folder: RunFolder | None, config: dict[str, Any], resume: bool) -> b
 
 def require_same(folder: RunFolder, config: dict[str, Any]) -> None:
     """`InputError` unless the run in `folder` was started with this `config`; another machine may go on with it."""
-    old, same = folder.read_config(), json.loads(json.dumps(config))
+    with as_written(folder.config, "of a run that has begun"):
+        _require_same(folder, folder.read_config(), json.loads(json.dumps(config)))
+
+
+def _require_same(folder: RunFolder, old: dict[str, Any], same: dict[str, Any]) -> None:
     for name, default in (("light", LightOptions()), ("uncertain", Uncertain())):
         known = json.loads(json.dumps(to_table(default)))
         old[name] = known | old.get(name, {})  # what older versions did not know

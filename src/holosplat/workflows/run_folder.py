@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..checks import require
+from ..checks import as_written, require
 from ..io.atomic import atomic_path
 from ..io.folder import require_new, require_parent
 from ..io.json import read_json, write_json
 from ..io.lock import sole_writer
+from ..ranges import require_plausible
 from .manifest import write_manifest
 
 
@@ -66,7 +67,7 @@ class RunFolder:
 
     def read_summary(self) -> dict[str, Any]:
         """What summary.json holds; `InputError` if it is of another run than config.json."""
-        summary = read_json(self.summary)
+        summary = _with_tables(self.summary, ("timing_s", "detector", "material", "verdict", "total", "geometry"))
         require(
             summary.get("run", "") == self.name() or "run" not in summary,
             f"{self.summary} must be of the run in {self.config}, but it is of another one; bring back its own.",
@@ -78,8 +79,8 @@ class RunFolder:
         return str(self.read_config().get("run", "")) if self.config.is_file() else ""
 
     def read_config(self) -> dict[str, Any]:
-        """What config.json holds."""
-        return read_json(self.config)
+        """What config.json holds; `InputError` if a part of it is not what it was."""
+        return _with_tables(self.config, ("method", "prior", "light", "uncertain", "decided", "resolved"))
 
     def is_of(self, fingerprint: str) -> bool:
         """Whether a scan (`provenance.scan_hash`) is the one that was reconstructed, as it came or with the constants
@@ -90,7 +91,7 @@ class RunFolder:
     def source_scan(self) -> Path:
         """The scan file that was reconstructed; `InputError` if it is not known, or no longer there."""
         require(self.source.is_file(), f"{self.path} does not say which scan it is of; name it with --scan.")
-        path = Path(str(read_json(self.source).get("scan", "")))
+        path = Path(str(read_json(self.source).get("scan") or "nowhere"))
         require(path.exists(), f"the scan {path} of this run is no longer there; name it with --scan.")
         return path
 
@@ -153,7 +154,11 @@ class RunFolder:
                 f"{path} must be of the run in {self.config}, but it is of another one; bring back its own, or start "
                 "anew.",
             )
-            return found.get("state", found)
+            state = found.get("state", found)
+            with as_written(path, "a checkpoint"):
+                require(isinstance(state, dict), "its state is no table.")
+                require_plausible(state, others=False)
+            return state
         require(not damaged, f"{self.checkpoint} must be a checkpoint, but it is damaged; start anew without it.")
         return None
 
@@ -172,6 +177,15 @@ def claimed(folder: RunFolder | None) -> Iterator[None]:
         yield
         if folder.config.is_file():
             write_manifest(folder.path, folder.name())
+
+
+def _with_tables(path: Path, names: tuple[str, ...]) -> dict[str, Any]:
+    """The table of a file of ours, whose entries `names` are tables where they are there."""
+    found = read_json(path)
+    for name in names:
+        good = isinstance(found.get(name, {}), dict) or (name == "geometry" and found[name] is None)
+        require(good, f"{path} must be as it was written, but {name} is no table in it; bring back the whole file.")
+    return found
 
 
 def checkpoint_state(path: Path) -> dict[str, Any] | None:

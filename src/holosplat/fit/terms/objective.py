@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ...checks import at_least, require
+from ...checks import require
+from ...ranges import Pixels, Positive, Share, ranged
 
 IMAGE_TERMS = ("l1", "l2_amplitude", "ssim", "tv_image", "frc", "rounded", "spectral")
 """The weights of which one at least must be above zero."""
@@ -12,6 +13,7 @@ VOLUME_TERMS = ("tv_volume", "overfull", "two_levels")
 
 
 @dataclass(frozen=True)
+@ranged
 class Objective:
     """Weights of the terms; a weight of zero leaves the term out.
 
@@ -35,14 +37,14 @@ class Objective:
     """`√(r² + c²) - c` of the differences r, smooth where they may be noise."""
     spectral: float = 0.0
     """Differences of amplitudes in pixels of thickness, low frequencies raised (`fit.terms.spectral`)."""
-    frc_ramp: float = 1.0
+    frc_ramp: Share = 1.0
     """Share of the steps over which the weight of `frc` is ramped."""
     noise_width: float = 0.0
     """Differences below so many standard deviations of the frames' own noise count in `l1` by their square."""
-    coarse: float = 0.0
+    coarse: Pixels = 0.0
     """`l1` compares frames blurred by so many pixels at first, where noise is half their contrast or more (by less in
     proportion where it is less), and not blurred at the end."""
-    rounding: float = 3.0
+    rounding: Positive = 3.0
     """c of `rounded`, in standard deviations of the noise."""
     floor: float = 0.1
     """`spectral`: the smaller, the larger the shapes that are fitted, and the more of the noise."""
@@ -62,7 +64,6 @@ class Objective:
     """Surfaces: Σ |L² x|² over the pixels of a frame, L x the distance of vertices x from their neighbours' mean."""
 
     def __post_init__(self) -> None:
-        at_least(self, 0, *vars(self))
         compared = sum(getattr(self, name) for name in IMAGE_TERMS)
         require(compared > 0, f"the objective needs a term on the frames: one of {', '.join(IMAGE_TERMS)}.")
         require(self.floor > 0, f"floor must be positive, but it is {self.floor}.")

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ...progress import Advance
+from ...ranges import ranged
 from ...scan import Exposures
 from .contact import or_in_contact
 from .model import Regularised, WaveModel, view_by_view
@@ -22,6 +23,7 @@ COUPLING = 0.05
 
 
 @dataclass(frozen=True)
+@ranged
 class ADMM(Regularised):
     """Options. iterations: updates of the multipliers; weight: of total variation, relative to the mean slope of the
     estimate."""

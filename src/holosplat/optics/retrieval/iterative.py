@@ -11,6 +11,7 @@ from torch.nn.functional import pad
 
 from ...checks import at_least
 from ...progress import Advance
+from ...ranges import ranged
 from ...scan import Exposures
 from ..propagation import exit_wave_of
 from .contact import or_in_contact
@@ -19,6 +20,7 @@ from .spectra import Noise, check_noise
 
 
 @dataclass(frozen=True)
+@ranged
 class Projections:
     """Options of the alternating projections."""
 
@@ -33,7 +35,6 @@ class Projections:
 
     def __post_init__(self) -> None:
         at_least(self, 1, "iterations")
-        at_least(self, 0, "feedback")
         check_noise(self.noise)
 
 

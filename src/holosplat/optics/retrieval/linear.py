@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
-from ...checks import at_least, require
+from ...checks import require
 from ...progress import Advance
+from ...ranges import ranged
 from ...scan import Exposures
 from ...units import wavelength, wavenumber
 from .contact import or_in_contact
@@ -44,6 +45,7 @@ SHARP_EDGED = Prior()
 
 
 @dataclass(frozen=True)
+@ranged
 class Linear:
     """Options of the filters."""
 
@@ -55,7 +57,6 @@ class Linear:
     """Expected power of the phase."""
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "model_error")
         check_noise(self.noise)
 
 

@@ -13,6 +13,7 @@ from torch.nn.functional import avg_pool2d, interpolate, pad
 from ...backends import device, resolve
 from ...checks import at_least
 from ...progress import Advance
+from ...ranges import Weight, ranged
 from ...scan import Exposures
 from ...units import wavelength
 from ..hologram import hologram, optical_path
@@ -46,12 +47,13 @@ CROSS_TERM = 4.0
 
 
 @dataclass(frozen=True)
+@ranged
 class Regularised:
     """Options of the fits through the wave optics."""
 
     iterations: int = 60
     """Steps, each one evaluation of the wave optics and its gradient."""
-    weight: float = 1.0
+    weight: Weight = 1.0
     """Weight of the regularisation; 1 is the Bayesian weight under the method's assumptions on the matter."""
     noise: Noise = None
     """Standard deviation of the frames, or their noise model (default: estimated from them)."""
@@ -62,7 +64,6 @@ class Regularised:
 
     def __post_init__(self) -> None:
         at_least(self, 1, "iterations")
-        at_least(self, 0, "weight")
         check_noise(self.noise)
 
 

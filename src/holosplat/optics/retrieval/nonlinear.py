@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ...progress import Advance
+from ...ranges import Weight, ranged
 from ...scan import Exposures
 from .contact import or_in_contact
 from .model import Regularised, WaveModel, view_by_view
@@ -23,10 +24,11 @@ STIFFEST = 1.0
 
 
 @dataclass(frozen=True)
+@ranged
 class Tikhonov(Regularised):
     """Options of the fit with a quadratic penalty; its iterations are accepted or refused steps."""
 
-    weight: float = 0.5
+    weight: Weight = 0.5
     """Weight of the penalty; 1 is the Bayesian weight for Gaussian matter."""
 
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from ...checks import at_least, finite, require, shaped
+from ...ranges import Weight, ranged
 from ...scan import Exposures
 from ...units import wavelength, wavenumber
 from ..noise import noise_levels
@@ -32,15 +33,16 @@ LEAST_SIGNAL = 0.01
 
 
 @dataclass(frozen=True)
+@ranged
 class Prior:
     """Power expected of a phase: `1 / (f² + corner²)^decay`, f in cycles per field of view.
 
     Projected bodies with sharp edges fall off as f⁻³ to f⁻⁴, and are level below the frequency that their size sets.
     """
 
-    corner: float = 3.0
+    corner: Weight = 3.0
     """Frequency below which the power is level [cycles per field of view]."""
-    decay: float = 2.0
+    decay: Weight = 2.0
     """Half the exponent of the fall-off."""
 
     def __post_init__(self) -> None:

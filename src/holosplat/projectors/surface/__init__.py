@@ -28,6 +28,9 @@ from .reference import QUADRATURE, occupancy, sampled
 
 __all__ = ["surface_occupancy", "surface_thickness"]
 
+MOST_LINES = 1024
+"""Rows integrated in a pixel, at most; four are exact to a thousandth."""
+
 
 def surface_thickness(
     vertices: Tensor,
@@ -50,7 +53,7 @@ def surface_thickness(
     shapes and types, and vertices that are not finite.
     """
     _check(vertices, faces)
-    require(lines >= 1, f"lines must be at least 1, but it is {lines}.")
+    require(1 <= lines <= MOST_LINES, f"lines must be from 1 to {MOST_LINES}, but it is {lines}.")
     poses, faces = (rotations.to(vertices), shifts.to(vertices)), faces.contiguous()
     if pixels is None:
         return _Thickness.apply(vertices, *poses, None, faces, shape, lines, backend)  # type: ignore[no-any-return]
@@ -68,6 +71,7 @@ def surface_occupancy(vertices: Tensor, faces: Tensor, shape: tuple[int, int, in
     lines a voxel, in as many pieces. Errors: as above.
     """
     _check(vertices, faces)
+    require(1 <= lines <= MOST_LINES, f"lines must be from 1 to {MOST_LINES}, but it is {lines}.")
     return occupancy(vertices, faces, shape, lines)
 
 

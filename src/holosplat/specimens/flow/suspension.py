@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ...checks import in_range, require
+from ...ranges import Positive, ranged
 from ..membrane.model import Membrane
 from .channel import Channel
 from .contacts import Repulsion, contact_forces, wall_forces
@@ -19,10 +20,11 @@ PLASMA_VISCOSITY = 1.2e-3
 
 
 @dataclass(frozen=True)
+@ranged
 class Medium:
     """The fluid, the same inside and outside the cells, and the short-ranged force in place of its thin films."""
 
-    viscosity: float = PLASMA_VISCOSITY
+    viscosity: Positive = PLASMA_VISCOSITY
     """[Pa s]."""
     reach: float | None = None
     """Cells whose centres are farther apart do not feel each other's flow [m] (default: the channel's shorter side, but

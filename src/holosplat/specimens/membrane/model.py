@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from ...checks import at_least, require
 from ...mesh import TriangleMesh
+from ...ranges import ranged
 from . import energies, forces
 from .geometry import corners_of, enclosed_volume, triangle_areas
 from .rest import RestShape
 
 
 @dataclass(frozen=True)
+@ranged
 class Elasticity:
     """Elastic moduli of a membrane; a modulus of 0 leaves the energy out.
 
@@ -39,12 +39,6 @@ class Elasticity:
     volume: float = 3e3
     """Volume, k_v [N/m²]."""
 
-    def check(self) -> None:
-        """`InputError` for a modulus that is negative or not finite."""
-        at_least(self, 0, *(field.name for field in fields(self)))
-        finite = all(np.isfinite(getattr(self, field.name)) for field in fields(self))
-        require(finite, "the moduli of a membrane must be finite numbers, but one is not; correct it.")
-
 
 class Membrane:
     """The elastic surface of a cell, a closed mesh (else `InputError`, see `RestShape.of`).
@@ -53,7 +47,6 @@ class Membrane:
     """
 
     def __init__(self, mesh: TriangleMesh, elasticity: Elasticity = Elasticity()) -> None:
-        elasticity.check()
         self.mesh = mesh
         self.elasticity = elasticity
         self.rest = RestShape.of(mesh)
