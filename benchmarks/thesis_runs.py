@@ -71,11 +71,12 @@ def tasks() -> list[Task]:
     long = [Task("full", name) for name in (MAIN, *(name for name in (*SMALL, *OURS) if name != MAIN))]
     others = [Task("third", MAIN, "thesis8")]
     others += [Task("third", MAIN, physics=physics) for physics in PHYSICS if physics != "declared"]
+    short = [replace(task, schedule="short") for task in (*at_once, *others)]
     again = [replace(task, seed=seed) for seed in SEEDS[1:] for task in (*at_once[: len(SMALL)], *others)]
     again += [replace(task, seed=seed) for seed in SEEDS[1:] for task in at_once[len(SMALL) :]]
-    large = [Task(schedule, name) for schedule, name in product(("third", "full"), LARGE)]
-    shortest = [*at_once[: len(SMALL)], long[0], *others, *at_once[len(SMALL) :]]
-    return [*shortest, *large[:1], *again, *long[1:], *large[1:], Task("full", MAIN, "thesis8")]
+    large = [Task(schedule, name) for schedule, name in product(("short", "third", "full"), LARGE)]
+    first = [*at_once[: len(SMALL)], long[0], *short, *others, large[0], *at_once[len(SMALL) :]]
+    return [*first, *again, *long[1:], *large[1:], Task("full", MAIN, "thesis8")]
 
 
 def finished(runs: Path, task: Task) -> bool:

@@ -20,6 +20,7 @@ from pathlib import Path
 import doc_tables as benchmark
 import doc_tables_measured as measured
 import doc_tables_runs as runs
+import doc_tables_thesis as thesis
 
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
@@ -115,6 +116,19 @@ TABLES["bed"] = Table(
 )
 
 
+THESIS = "python benchmarks/thesis_runs.py run RUNS --snapshots DIR, then collect RUNS"
+TABLES |= {
+    f"thesis-{name}": Table(make, ("thesis_study/runs.csv",), THESIS, "a day")
+    for name, make in (
+        ("short", lambda: thesis.configurations("short")),
+        ("third", lambda: thesis.configurations("third")),
+        ("full", lambda: thesis.configurations("full")),
+        ("others", thesis.others),
+        ("findings", thesis.verdicts),
+    )
+}
+
+
 @dataclass(frozen=True)
 class Figure:
     """Pictures below docs/images: the module of docs/ that draws them, what it is given, and what makes that."""
@@ -152,6 +166,18 @@ FIGURES = {
         "holosplat track SCAN --material haemoglobin --out RUN, of a scan as benchmarks/motion.py simulates it",
         "an hour",
     ),
+    "thesis": Figure(
+        (
+            "thesis_sampling.png",
+            *(
+                f"thesis_{s}_{n}.png"
+                for s in ("short", "third", "full")
+                for n in ("curves", "psnr", "lines", "geometry")
+            ),
+        ),
+        "make_thesis",
+    ),
+    "compact": Figure(("compact.png",), "make_compact"),
     "benchmark": Figure(
         tuple(
             f"benchmark/{name}.png"
@@ -168,9 +194,6 @@ ELSEWHERE = {
     ("plan.png", "plan.csv"): "the command of docs/planning.md: two minutes",
     ("tweezers.png",): "python benchmarks/tweezers.py: minutes",
     ("espresso_flow.png",): "python benchmarks/espresso_flow.py DATA: four minutes",
-    ("thesis_curves.png", "thesis_full.png", "thesis_full_v4.png", "thesis_psnr.png"): (
-        "holosplat bench thesis --out FOLDER --snapshots DIR: hours"
-    ),
     tuple(f"real_data/{n}.png" for n in ("tooth", "dome", "dome_frames", "hair", "whole", "whole_soft")): (
         "python benchmarks/real_data.py --data FOLDER: an hour"
     ),

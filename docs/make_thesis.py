@@ -1,178 +1,19 @@
-"""The tables and pictures of thesis_study.md, from docs/data/thesis_study: `python docs/make_thesis.py`.
-
-The data come from `python benchmarks/thesis_runs.py` (hours; what is left and its commands: its `list`)."""
+"""The pictures of thesis_study.md, from docs/data/thesis_study: `python docs/figures.py thesis`."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Sequence
-from itertools import groupby
 from pathlib import Path
-from typing import Any
 
-import numpy as np
+from doc_tables_thesis import DATA, SCHEDULES, read_rows, studies
 from matplotlib.figure import Figure
 
-from holosplat.io.atomic import atomic_path
-from holosplat.report.style import CYCLE, FAINT, WIDTH, letter, new_figure, scientific, styled
-from holosplat.thesis.configurations import EVERY, PACES, THESIS_TABLE
-from holosplat.thesis.findings import Finding, findings
-from holosplat.thesis.folder import CURVES, Study
-from holosplat.thesis.pages.figures import PICTURES, pictures, save
-from holosplat.thesis.pages.page import markdown_table
+from holosplat.report.style import CYCLE, FAINT, WIDTH, letter, new_figure, styled
+from holosplat.thesis.pages.figures import pictures, save
 
-DOCS = Path(__file__).resolve().parent
-DATA, IMAGES, PAGE = DOCS / "data" / "thesis_study", DOCS / "images", DOCS / "thesis_tables.md"
+IMAGES = Path(__file__).resolve().parent / "images"
 CELL_PX = 7.8
 """Width of a cell of the case [pixels]."""
-SCHEDULES = {"third": "10 000 steps", "full": "30 000 steps"}
-PLAIN = ("thesis16", "declared")
-HEAD = ("configuration", "seeds", "SSIM", "FRCM", "best FRCM (at)", "PSNR (dB)", "Dice")
-HEAD += ("δ/β in cells", "own: mean", "own: median", "Gaussians at the end", "ms a step")
-INTRODUCTION = """# Tables of the thesis' study
-
-Made by `python docs/make_thesis.py` from `docs/data/thesis_study/runs.csv`; what they mean stands in
-[thesis_study.md](thesis_study.md). Scores are of held-out frames at the last step; where there are several seeds (of
-the scene and of the start), means, and behind ± half of what lies between the least and the greatest. “best FRCM” is
-where an early stop would end, and the step. δ/β (true: 2800) is taken inside the true cells, and as mean and median of
-the Gaussians' own ratios. Times are those of a machine that others used.
-"""
-
-Row = dict[str, str]
-
-
-def read_rows() -> list[Row]:
-    """runs.csv, a row a run."""
-    with (DATA / "runs.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def where(row: Row) -> tuple[str, str, str]:
-    """Schedule, case and physics."""
-    return row["schedule"], row["case"], row["physics"]
-
-
-def number(row: Row, key: str) -> float:
-    """A column; infinite where JSON had no number for it."""
-    return float(row[key]) if row[key] else float("inf")
-
-
-def study_of(rows: Sequence[Row]) -> Study:
-    """The study that `rows`, of one schedule, case, physics and seed, are of."""
-    first = rows[0]
-    pace = PACES[first["schedule"]]
-    table = {row["name"]: row for row in rows}
-    names = [c.name for c in EVERY if c.name in table]
-    delta, beta = (float(first[f"true_{name}"]) for name in ("delta", "beta"))
-    about: dict[str, Any] = {"true_delta": delta, "true_beta": beta}
-    about["warmup_steps"] = pace.recipe(THESIS_TABLE[0], 1, 1.0).fit.schedule.warmup_steps
-    curves = {name: read_curves(table[name]) for name in names}
-    looks = {name: {when: look(table[name], when) for when in ("last", "best")} for name in names}
-    facts = {name: {"status": table[name]["status"]} for name in names}
-    return Study(about, {name: facts[name] | looks[name] for name in names}, curves, read_maps(first))
-
-
-def look(row: Row, when: str) -> dict[str, float | None]:
-    """The last or the best look."""
-    return {key: float(text) if (text := row[f"{when}_{key}"]) else None for key in CURVES}
-
-
-def read_curves(row: Row) -> dict[str, np.ndarray]:
-    """The curves of a run."""
-    name = "_".join((*where(row), row["seed"], row["name"]))
-    with (DATA / f"{name}.csv").open(newline="") as file:
-        table = list(csv.DictReader(file))
-    return {key: np.array([float(line[key]) for line in table]) for key in CURVES}
-
-
-def read_maps(row: Row) -> dict[str, dict[str, np.ndarray]]:
-    """The maps of each configuration of a study; empty where none are kept."""
-    path = DATA / f"maps_{'_'.join((*where(row), row['seed']))}.npz"
-    maps: dict[str, dict[str, np.ndarray]] = {}
-    if path.is_file():
-        with np.load(path) as found:
-            for key in found.files:
-                name, _, kind = key.partition("/")
-                maps.setdefault(name, {})[kind] = found[key]
-    return maps
-
-
-def spread(values: Iterable[float], form: str) -> str:
-    """Mean and half the range of finite values: "0.912 ± 0.004"."""
-    found = np.array(list(values))
-    if not np.isfinite(found).all():
-        return "∞"
-    text = format(found.mean(), form)
-    return text if len(found) == 1 else f"{text} ± {format(np.ptp(found) / 2, form)}"
-
-
-def ratio(values: Iterable[float]) -> str:
-    """The geometric mean of ratios, which spread over decades."""
-    found = np.array(list(values))
-    return scientific(float(np.exp(np.log(found).mean())) if np.isfinite(found).all() else float("inf"), 3)
-
-
-def line(name: str, rows: Sequence[Row]) -> tuple[str, ...]:
-    """A line of a table: `rows` are the seeds of one configuration."""
-
-    def of(key: str) -> list[float]:
-        return [number(row, key) for row in rows]
-
-    ended = [f" (diverged at {row['diverged_at']})" for row in rows if row["status"] != "done"]
-    steps = " ".join(f"{step:.0f}" for step in of("best_step"))
-    return (
-        name + "".join(ended),
-        " ".join(row["seed"] for row in rows),
-        *(spread(of(f"last_{key}"), ".3f") for key in ("test_ssim", "test_frcm")),
-        f"{spread(of('best_test_frcm'), '.3f')} ({steps})",
-        spread(of("last_test_psnr"), ".1f"),
-        spread(of("last_dice"), ".3f"),
-        *(ratio(of(f"last_{key}")) for key in ("ratio", "own_ratio", "median_own_ratio")),
-        " ".join(f"{count:,.0f}" for count in of("last_count")),
-        spread([1e3 * number(row, "seconds") / number(row, "steps") for row in rows], ".0f"),
-    )
-
-
-def table(rows: Sequence[Row], label: str = "name") -> list[str]:
-    """A table with a line for each value of `label`, seeds taken together, in the order of the configurations."""
-    order = [c.name for c in EVERY]
-    ordered = sorted(rows, key=lambda row: (order.index(row["name"]), row["case"], row["physics"], int(row["seed"])))
-    groups = [(key, list(group)) for key, group in groupby(ordered, key=lambda row: row[label])]
-    return markdown_table(HEAD, [line(key, group) for key, group in groups])
-
-
-def verdicts(studies: dict[str, Sequence[Finding]]) -> list[str]:
-    """A line a finding and study."""
-    lines = [(f.claim, name, f.verdict, f.evidence) for name, found in studies.items() for f in found]
-    order = [f.claim for f in next(iter(studies.values()))]
-    return markdown_table(
-        ("finding", "schedule, seed", "verdict", "evidence"), sorted(lines, key=lambda made: order.index(made[0]))
-    )
-
-
-def page(rows: Sequence[Row]) -> str:
-    """thesis_tables.md."""
-    lines = [INTRODUCTION]
-    for schedule, said in SCHEDULES.items():
-        lines += [f"## {said}", "", *table([row for row in rows if where(row) == (schedule, *PLAIN)]), ""]
-    others = [row for row in rows if where(row)[1:] != PLAIN]
-    for label, column in (("fewer views (`thesis8`)", "case"), ("other physics", "physics")):
-        chosen = [row for row in others if (row["case"] != PLAIN[0]) == (column == "case")]
-        for schedule, said in SCHEDULES.items():
-            if found := [row for row in chosen if row["schedule"] == schedule]:
-                lines += [f"## 8k-v4, {label}, {said}", "", *table(found, column), ""]
-    lines += ["## Findings", "", *verdicts({name: findings(study) for name, study in studies(rows).items()})]
-    return "\n".join(lines) + "\n"
-
-
-def studies(rows: Sequence[Row]) -> dict[str, Study]:
-    """The studies of the case as declared, by schedule and seed."""
-    found = {}
-    for schedule in SCHEDULES:
-        plain = [row for row in rows if where(row) == (schedule, *PLAIN)]
-        for seed in sorted({int(row["seed"]) for row in plain}):
-            found[f"{SCHEDULES[schedule]}, {seed}"] = study_of([row for row in plain if int(row["seed"]) == seed])
-    return found
 
 
 @styled
@@ -201,14 +42,12 @@ def sampling_figure() -> Figure:
 
 
 def main() -> None:
-    """Write the page and the pictures."""
+    """Draw all of them that the data have."""
     save(sampling_figure(), IMAGES / "thesis_sampling.png")
     rows = read_rows()
-    with atomic_path(PAGE) as temporary:
-        temporary.write_text(page(rows), encoding="utf-8")
     for schedule, said in SCHEDULES.items():
         study = studies(rows).get(f"{said}, 0")
-        for picture in pictures(study) if study else PICTURES[:0]:
+        for picture in pictures(study) if study else ():
             name = picture.file.replace("thesis_", f"thesis_{schedule}_")
             assert study is not None
             save(picture.draw(study), IMAGES / name)
