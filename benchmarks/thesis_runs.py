@@ -30,7 +30,7 @@ from pathlib import Path
 import numpy as np
 
 from holosplat.io.atomic import atomic_path
-from holosplat.thesis.configurations import BESIDE, DECLARED, EVERY, EXTRA, THESIS_TABLE
+from holosplat.thesis.configurations import BESIDE, DECLARED, EVERY, EXTRA, PACES, THESIS_TABLE
 from holosplat.thesis.folder import CURVES, StudyFolder
 from holosplat.thesis.measured import PHYSICS
 
@@ -157,7 +157,7 @@ def collect(runs: Path) -> None:
             continue
         source = runs / task.study / f"{task.name}.curves.csv"
         (DATA / f"{task.study}_{task.name}.csv").write_bytes(source.read_bytes())
-    for study in ("third_thesis16_declared_0", "full_thesis16_declared_0"):
+    for study in (f"{schedule}_thesis16_declared_0" for schedule in PACES):
         if (runs / study).is_dir():
             collect_maps(runs / study, DATA / f"maps_{study}.npz")
     print(f"{len(found)} of {len(tasks())} runs, {len(CURVES)} columns of curves each, in {DATA}")

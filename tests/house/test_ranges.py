@@ -35,6 +35,7 @@ NEEDED: dict[str, dict[str, Any]] = {
     "BodyWithAbsorber": {"size": (1e-5, 1e-5, 1e-5), "bead": 1e-6},
     "Capsules": {"count": 2, "diameters": (1e-5, 2e-5), "shell": 1e-6, "box": (1e-4, 1e-4, 1e-4)},
     "ChannelFrame": {"across": (1e-4, 1e-4)},
+    "Configuration": {"name": "8k"},
     "CoatedDroplets": {"count": 2, "diameters": (1e-5, 2e-5), "coating": 1e-6, "box": (1e-4, 1e-4, 1e-4)},
     "CrowdedCells": {"haematocrit": 0.2, "diameter": 8e-6, "box": (1e-4, 1e-4, 1e-4)},
     "Detector": {"rows": 5, "columns": 13, "pixel_size": 1e-6},

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from ...checks import require
-from ...ranges import Pixels, Positive, Share, ranged
+from ...ranges import Pixels, Share, Weight, ranged
 
 IMAGE_TERMS = ("l1", "l2_amplitude", "ssim", "tv_image", "frc", "rounded", "spectral")
 """The weights of which one at least must be above zero."""
@@ -44,7 +44,7 @@ class Objective:
     coarse: Pixels = 0.0
     """`l1` compares frames blurred by so many pixels at first, where noise is half their contrast or more (by less in
     proportion where it is less), and not blurred at the end."""
-    rounding: Positive = 3.0
+    rounding: Weight = 3.0
     """c of `rounded`, in standard deviations of the noise."""
     floor: float = 0.1
     """`spectral`: the smaller, the larger the shapes that are fitted, and the more of the noise."""
