@@ -103,7 +103,7 @@ TABLES |= {
 TABLES["rerun"] = Table(
     runs.rerun,
     ("main_job.csv",),
-    "OMP_NUM_THREADS=1 python benchmarks/main_job.py --cases cells nine snapshot --surfaces --csv docs/data/main_job.csv",
+    "OMP_NUM_THREADS=1 python benchmarks/main_job.py --cases nine --surfaces --csv docs/data/main_job.csv",
     "half an hour",
 )
 REAL = "python benchmarks/real_data.py --data FOLDER"
