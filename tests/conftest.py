@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import importlib.util
 import os
 from collections.abc import Iterator
@@ -29,7 +30,7 @@ settings.register_profile(
     derandomize=True,
     database=None,
     deadline=None,
-    max_examples=60,
+    max_examples=40,
     suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
 )
 settings.load_profile("repeatable")
@@ -58,6 +59,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if not GPU and item.get_closest_marker("gpu"):
             item.add_marker(pytest.mark.skip(reason="there is no GPU here"))
+
+
+def pytest_collection_finish() -> None:
+    """What is there before the first test stays: no later collection of garbage looks through it again."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture
@@ -89,6 +96,15 @@ def undrawn_reports() -> Iterator[None]:
     from helpers.pictures import undrawn
 
     with undrawn():
+        yield
+
+
+@pytest.fixture
+def unjudged_runs() -> Iterator[None]:
+    """Runs are not judged; see `helpers.unjudged`."""
+    from helpers.unjudged import unjudged
+
+    with unjudged():
         yield
 
 
