@@ -75,7 +75,7 @@ def tasks() -> list[Task]:
     again = [replace(task, seed=seed) for seed in SEEDS[1:] for task in (*at_once[: len(SMALL)], *others)]
     again += [replace(task, seed=seed) for seed in SEEDS[1:] for task in at_once[len(SMALL) :]]
     large = [Task(schedule, name) for schedule, name in product(("short", "third", "full"), LARGE)]
-    first = [*at_once[: len(SMALL)], long[0], *short, *others, large[0], *at_once[len(SMALL) :]]
+    first = [*at_once[:3], long[0], *short, *at_once[3 : len(SMALL)], *others, large[0], *at_once[len(SMALL) :]]
     return [*first, *again, *long[1:], *large[1:], Task("full", MAIN, "thesis8")]
 
 

@@ -125,4 +125,4 @@ def test_an_early_stop_helps_only_where_the_end_is_worse():
     assert early_stop_helps(invented(test_frcm=peaked)).verdict == "reproduces"
     some = early_stop_helps(invented(test_frcm=[peaked, *[rise] * 7]))
     assert some.verdict == "reproduces in part"
-    assert "In 1 of 8 configurations; most in 8k-v1: FRCM 0.479 at step 900 against 0.300" in some.evidence
+    assert "In 1 of 8; most in 8k-v1: FRCM 0.479 at step 900 against 0.300" in some.evidence

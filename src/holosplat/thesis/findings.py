@@ -243,7 +243,7 @@ def early_stop_helps(study: Study) -> Finding:
     return Finding(
         claim,
         verdict,
-        f"In {len(helped)} of {_configurations(len(rows))}; most in {most}: FRCM {best['test_frcm']:.3f} at step "
+        f"In {len(helped)} of {len(rows)}; most in {most}: FRCM {best['test_frcm']:.3f} at step "
         f"{best['step']:,.0f} against {last['test_frcm']:.3f} at the end, Dice {best['dice']:.3f} against "
         f"{last['dice']:.3f}. A held-out frame would have to choose the step.",
     )
