@@ -411,14 +411,11 @@ def main() -> None:
     parser.add_argument("--csv", type=Path)
     given = parser.parse_args()
     warnings.simplefilter("ignore")
-    begun = time.perf_counter()
     loaded()
     with tempfile.TemporaryDirectory() as name:
         shop, rows = Shop.made(Path(name)), []
         for kind in given.kinds:
-            if time.perf_counter() - begun > given.seconds:
-                break
-            found = trials(shop, kind, given.trials, random.Random(f"{given.seed} {kind}"))
+            found = trials(shop, kind, given.trials, random.Random(f"{given.seed} {kind}"), seconds=given.seconds)
             row = {"kind": kind, "trials": found["trials"], **{name: found[name] for name in OUTCOMES}}
             rows.append(row | {"machine": f"{os.cpu_count()} × {platform.machine()}", "seed": given.seed})
             rows[-1]["commit"] = machine.commit()
