@@ -163,6 +163,11 @@ def _jobs(rows: Sequence[Mapping[str, Any]], seconds: str, called: str) -> str:
     return markdown((*head, called), lines)
 
 
+def rerun() -> str:
+    """The jobs whose rows stand in main_job.csv."""
+    return _jobs(read("main_job.csv"), "cpu_seconds", "processor time / s")
+
+
 def worst(method: str) -> dict[str, str]:
     """The worst of the three scenes; times are those of the longest fit, of surfaces beyond the Gaussians'."""
     rows = [r for r in jobs() if r["method"] == method]

@@ -100,6 +100,12 @@ TABLES |= {
     )
     for name, make in (("readme", runs.readme), ("main-job", runs.main_job), ("wanted", runs.wanted))
 }
+TABLES["rerun"] = Table(
+    runs.rerun,
+    ("main_job.csv",),
+    "OMP_NUM_THREADS=1 python benchmarks/main_job.py --cases nine --surfaces --csv docs/data/main_job.csv",
+    "half an hour",
+)
 REAL = "python benchmarks/real_data.py --data FOLDER"
 TABLES |= {
     name: Table(make, ("real_data.csv",), REAL, "half an hour")

@@ -1,4 +1,4 @@
-"""The picture of docs/cells.md: `python docs/make_cells.py FOLDER`, after
+"""The picture of docs/cells.md: `python docs/figures.py cells FOLDER`, after
 
 holosplat grow --cells 16 --box 80e-6 34e-6 26e-6 --flow 0.058 --snapshots 50 --out FOLDER
 """
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import matplotlib
 import numpy as np
+from drawing import in_few_colours
 from matplotlib.collections import PolyCollection
 
 from holosplat.io.atomic import atomic_path
@@ -21,6 +22,8 @@ from holosplat.report.surface import camera
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
 
+BAR, DPI, COLOURS = 10, 200, 128
+"""Length of the scale bar [µm], resolution, and colours that the file keeps."""
 LIGHT = np.array([-0.4, -0.7, -0.6])
 RED = np.array([0.85, 0.16, 0.13])
 
@@ -40,16 +43,21 @@ def main(folder: Path) -> None:
     """Draw docs/images/cells.png: the first, a middle and the last snapshot."""
     steps = read_pvd(folder / "cells.pvd")
     rotation = camera(20.0, 25.0)
-    figure, axes = plt.subplots(3, 1, figsize=(6.4, 8.4), constrained_layout=True, sharex=True, sharey=True)
-    for axis, step in zip(axes, (steps[0], steps[len(steps) // 2], steps[-1])):
+    figure, axes = plt.subplots(3, 1, figsize=(6.4, 9.0), constrained_layout=True, sharex=True, sharey=True)
+    for letter, axis, step in zip("abc", axes, (steps[0], steps[len(steps) // 2], steps[-1])):
         triangles, colours = seen(read_meshes(step.files, "um"), rotation)
         axis.add_collection(PolyCollection(list(triangles), facecolors=colours, edgecolors=colours, linewidths=0.2))
         axis.autoscale_view()
-        axis.set(aspect="equal", xticks=[], yticks=[], title=f"{1e6 * step.time:.0f} µs")
-        axis.title.set_fontsize(9)
+        axis.set(aspect="equal", xticks=[], yticks=[])
+        axis.set_title(letter, loc="left", fontsize=9, fontweight="bold")
+        axis.set_title(f"{1e6 * step.time:.0f} µs", fontsize=9)
     axes[0].invert_yaxis()
+    left, bottom = axes[0].get_xlim()[0] + 3, axes[0].get_ylim()[0] - 3
+    axes[0].plot([left, left + BAR], [bottom, bottom], "k", lw=2, solid_capstyle="butt")
+    axes[0].text(left + BAR / 2, bottom - 1, f"{BAR} µm", ha="center", va="bottom", fontsize=8)
     with atomic_path(Path(__file__).parent / "images" / "cells.png") as temporary:
-        figure.savefig(temporary, dpi=90, metadata={"Software": None})
+        figure.savefig(temporary, dpi=DPI, metadata={"Software": None})
+        in_few_colours(temporary, temporary, COLOURS)
 
 
 if __name__ == "__main__":

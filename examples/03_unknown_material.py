@@ -1,8 +1,8 @@
 """Unknown material: `python 03_unknown_material.py [folder]`.
 
 The prior says what is known of the matter: δ and β, only their ratio, or nothing. The same scan is reconstructed with
-each of the three. With the ratio alone, all matter has one δ, which is read off a first tomography; of cells as small
-as these it comes out too low. With nothing known, δ is free in every place, and finds its level in the fit.
+each of the three. With the ratio alone, all matter has one δ, that of the likeliest volume. With nothing known, δ is
+free in every place, and finds its level in the fit.
 """
 
 import sys
@@ -16,7 +16,7 @@ import holosplat as hs
 def main(out: Path) -> None:
     """Simulate one scan and reconstruct it with three priors."""
     out.mkdir(parents=True, exist_ok=True)
-    views = hs.Views.evenly_spaced(12, shape=(64, 64), pixel_size=0.5e-6)
+    views = hs.Views.evenly_spaced(12, shape=(48, 48), pixel_size=0.65e-6)
     material = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
     cells = hs.specimens.random_cells(4, box=(views.width,) * 3, seed=2)
     scene = hs.MeshScene.of_one_material(cells, material)

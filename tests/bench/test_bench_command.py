@@ -15,6 +15,8 @@ from holosplat.bench.folder import BenchFolder
 from holosplat.bench.measured import MEASURED
 from holosplat.bench.run import chosen, run_suite
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 # --- names and folders --------------------------------------------------------------------------------------
 
 

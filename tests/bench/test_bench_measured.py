@@ -20,6 +20,8 @@ from holosplat.projectors.voxels import SliceProjector
 from holosplat.units import wavenumber
 from holosplat.volume import Volume
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 SHAPE, COUNT, PIXEL, BETA = (3, 41), 96, 42.92e-6, 2e-10
 
 

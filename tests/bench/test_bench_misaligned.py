@@ -23,6 +23,8 @@ from holosplat.matter import Matter
 from holosplat.representations.voxels import VoxelGrid
 from holosplat.specimens.red_cells import icosphere
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 SHAPE = (31, 36)
 ERRORS = Misalignment(1.0, 0.6, 0.02, 5)
 

@@ -28,6 +28,8 @@ from holosplat.representations.voxels import VoxelGrid
 from holosplat.specimens.phantoms import star_of_balls
 from holosplat.workflows.evaluate import score_object
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 # --- rows ---------------------------------------------------------------------------------------------------
 
 

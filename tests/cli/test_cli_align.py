@@ -19,6 +19,8 @@ from holosplat.cli.options import PriorOptions
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.workflows.run_folder import RunFolder
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 BALLS = ((7.0, -3.0, 4.0, 6.0, 2e-9), (-9.0, 4.0, 5.0, 5.0, 3e-9), (2.0, 6.0, -9.0, 4.0, 4e-9))
 
 

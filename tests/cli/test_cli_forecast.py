@@ -14,6 +14,7 @@ import holosplat.cli.track as command
 import holosplat.workflows.track as workflow
 from helpers.cli import Outcome, holosplat, refused, worked
 from helpers.moving_ellipsoids import MATERIAL, PIXEL, STEP, TIMES, ellipsoid, scan
+from helpers.pictures import undrawn
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.objects import read_object
 from holosplat.io.pvd import read_pvd
@@ -49,7 +50,8 @@ def folder(tmp_path_factory) -> Path:
         patch.setattr(command, "report_run", lambda folder, *_: folder.report)  # a second one says no more
         how = ("--material", "haemoglobin", "--time-frames", f"0:{TIMES - 1}")
         worked_by("track", folder / "scan.nxs", *how, "--out", folder / "run")
-    worked_by("forecast", folder / "run", "--times", AHEAD, "--out", folder / "later")
+    with undrawn():
+        worked_by("forecast", folder / "run", "--times", AHEAD, "--out", folder / "later")
     return folder
 
 

@@ -17,6 +17,8 @@ from holosplat.workflows.evaluate import render
 from holosplat.workflows.reconstruct import load_reconstruction
 from holosplat.workflows.run_folder import RunFolder
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 START = ["volume.retrieval=20", "volume.iterations=30", "volume.corrections=2", "volume.inner=8", "volume.refine=1"]
 CLOUD = [*START, "spacing_px=2", "approximate_steps=5", "fit.schedule.steps=30"]
 QUICK: dict[str, list[str]] = {

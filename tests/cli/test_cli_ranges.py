@@ -13,6 +13,8 @@ from holosplat.io.nxtomo import write_scan
 from holosplat.methods import uncertain
 from holosplat.methods.profile import ProfileOptions
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 METHOD = ("--method", "paganin-tv")
 
 

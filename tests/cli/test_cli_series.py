@@ -20,6 +20,8 @@ from holosplat.mesh import TriangleMesh
 from holosplat.specimens.red_cells import icosphere
 from holosplat.tables import to_table
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 PIXEL = 1e-6
 BEAM = ["--material", FORMULA, "--density", "1.335", "--pixel-size", "1e-6", "--detector", "21", "34"]
 STEP = 2e-6

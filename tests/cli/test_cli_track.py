@@ -12,6 +12,7 @@ import pytest
 
 from helpers.cli import Outcome, holosplat, refused, worked
 from helpers.moving_ellipsoids import PIXEL, STEP, TIMES, scan, truth
+from helpers.pictures import undrawn
 from holosplat.geometry import Grid
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.objects import read_object
@@ -34,7 +35,8 @@ def folder(tmp_path_factory) -> Path:
     write_scan(folder / "scan.nxs", scan())
     write_voxels(folder / "truth.h5", truth().at(STEP * (TIMES - 1)), Grid.of_views(scan().views))
     how = (*KNOWN, "--effort", "0.2", "--pieces", "1", "--rounds", "0")
-    worked_by("track", folder / "scan.nxs", *how, "--out", folder / "run")
+    with undrawn():
+        worked_by("track", folder / "scan.nxs", *how, "--out", folder / "run")
     return folder
 
 

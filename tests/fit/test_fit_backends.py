@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from helpers.kernels import few_programs
 from holosplat import native
 from holosplat.checks import InputError, MissingError
 from holosplat.fit.density import DensityControl
@@ -104,8 +105,9 @@ def test_the_compiled_fit_is_the_plain_one(channels):
     assert_alike(*(run(a_fit(backend, channels, objective, steps=6)) for backend in ("cpu", "reference")))
 
 
-def test_the_gpus_fit_is_the_plain_one_and_waits_for_nothing(gpu):
+def test_the_gpus_fit_is_the_plain_one_and_waits_for_nothing(gpu, monkeypatch):
     """Every term in use; nothing in a step may look at the device's values, or a CUDA graph could not hold it."""
+    few_programs(monkeypatch, gpu, 8)
     with Waits() as waits:
         fit = a_fit("cuda", detach_worst=True)
         work, fit._work = fit._work, lambda draw: waits.watched(lambda: work(draw))

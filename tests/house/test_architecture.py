@@ -11,6 +11,7 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from fnmatch import fnmatch
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -64,6 +65,8 @@ MANY_ARGUMENTS = {
 }
 """Public functions with more arguments by position, each with its reason."""
 
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
 SOURCE = Path(__file__).resolve().parents[2] / "src" / "holosplat"
 TESTS = Path(__file__).resolve().parents[1]
 BESIDE_THE_ROOMS = ("house", "helpers")
@@ -87,23 +90,37 @@ def _room(path: str) -> str:
     return "" if first == "__init__" else first
 
 
+@cache
+def _tree(text: str) -> ast.Module:
+    """The syntax of a file; parsed once."""
+    return ast.parse(text)
+
+
+@cache
+def _imported(text: str) -> list[tuple[ast.Import | ast.ImportFrom, bool]]:
+    """The import statements of a file, and whether they stand at module level."""
+    found, outside = [], [(_tree(text), True)]
+    while outside:
+        parent, top = outside.pop()
+        for node in ast.iter_child_nodes(parent):
+            if isinstance(node, ast.Import | ast.ImportFrom):
+                found.append((node, top))
+            else:
+                outside.append((node, top and not isinstance(node, Function)))
+    return found
+
+
 def _imports(files: Files, path: str) -> Iterator[tuple[str, str, bool]]:
     """(our file or empty, full dotted name, whether at module level) of each import but the version's."""
-    tree = ast.parse(files[path])
-    inside = {
-        id(n) for f in ast.walk(tree) if isinstance(f, ast.FunctionDef | ast.AsyncFunctionDef) for n in ast.walk(f)
-    }
-    for node in ast.walk(tree):
+    for node, top in _imported(files[path]):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
+        else:
             package = ("holosplat/" + path).split("/")[: -node.level] if node.level else []
             base = ".".join([*package, *filter(None, [node.module])])
             names = [f"{base}.{alias.name}" for alias in node.names]
-        else:
-            continue
         for name in set(names):
-            yield _file_of(files, name), name, id(node) not in inside
+            yield _file_of(files, name), name, top
 
 
 def _file_of(files: Files, name: str) -> str:
@@ -117,9 +134,6 @@ def _file_of(files: Files, name: str) -> str:
             if candidate in files:
                 return candidate
     return "__init__.py"
-
-
-Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 
 def _public(files: Files) -> Iterator[tuple[str, ast.ClassDef | Function, bool]]:
@@ -136,7 +150,7 @@ def _public(files: Files) -> Iterator[tuple[str, ast.ClassDef | Function, bool]]
                 yield from walk(node.body, f"{name}{node.name}.", True)
 
     for path, text in files.items():
-        yield from walk(ast.parse(text).body, f"{path}:", False)
+        yield from walk(_tree(text).body, f"{path}:", False)
 
 
 # --- rules --------------------------------------------------------------------------------------------------
@@ -205,7 +219,7 @@ def files_are_short(files: Files) -> list[str]:
 
 def everything_public_is_described(files: Files) -> list[str]:
     """Modules, public classes, functions and methods have docstrings (the class describes `__init__`)."""
-    bare = [path for path, text in files.items() if text.strip() and not ast.get_docstring(ast.parse(text))]
+    bare = [path for path, text in files.items() if text.strip() and not ast.get_docstring(_tree(text))]
     named = [(name, node) for name, node, _ in _public(files) if node.name != "__init__"]
     return bare + [name for name, node in named if not ast.get_docstring(node)]
 

@@ -56,6 +56,8 @@ LEAST = {"neural-field": 0.4, "paganin-sirt": 0.3, "paganin-fbp": 0.1}
 """Correlation of held-out frames: after few steps, or without fringes and with streaks, it is small but there."""
 LEAST_BY_RATIO = {**LEAST, "gaussians": 0.5, "surfaces": 0.7}
 """δ is estimated at 0.6 of the balls' there, by which overfull Gaussians lose matter in their first steps."""
+REPEATED = {"surfaces": "known"}
+"""With which prior a method runs twice, where that is not `unknown`."""
 KNOWN = MaterialPrior.known(ONE.channels[0])
 PRIORS = {"known": KNOWN, "ratio": MaterialPrior.of_ratio(ONE.channels[0].ratio), "unknown": MaterialPrior.unknown()}
 
@@ -100,8 +102,9 @@ def test_a_method_makes_an_object_that_predicts_frames(name, prior, measured):
         name, 0.9
     )
     assert not any(p.requires_grad for p in found.parameters().values())
-    again = solve(QUICK[name], replace(task, on_progress=lambda stage, done: None))
-    np.testing.assert_array_equal(predicted(again, measured), frames)
+    if prior == REPEATED.get(name, "unknown"):
+        again = solve(QUICK[name], replace(task, on_progress=lambda stage, done: None))
+        np.testing.assert_array_equal(predicted(again, measured), frames)
     restored = KINDS[found.kind].from_state(found.state())
     np.testing.assert_array_equal(predicted(restored, measured), frames)
     grid = Grid.of_views(measured.views)

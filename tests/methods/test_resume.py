@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable
+from copy import deepcopy
+from functools import cache
 
 import numpy as np
 import pytest
@@ -24,6 +26,8 @@ from holosplat.methods.method import Task
 from holosplat.methods.neural_field import warmed_up, waves_fit
 from holosplat.methods.surfaces import surface_fit
 from holosplat.methods.voxels import voxel_fit
+from holosplat.representations import NeuralField
+from holosplat.scan import Scan
 
 VALIDATED = {"validation_views": 1, "validate_every": 3}
 
@@ -50,16 +54,22 @@ def surface(seed: int) -> Fit:
     return surface_fit(scan(), ball, SurfaceFit(stiffness=5.0, schedule=schedule), seed)
 
 
-def neural(seed: int) -> Fit:
-    """Random depths and probes, minibatches, and a mask that is pruned."""
+@cache
+def warm(seed: int) -> tuple[Scan, NeuralField, NeuralFit]:
+    """Frames, a field that has learnt their thickness, and the options of its fit."""
     measured = scan()
     schedule = Schedule(steps=12, views_per_step=2, decay=0.05, **VALIDATED)
     options = NeuralFit(
         NETWORK, 20 + seed, 500, 0.05, probes=100, margin=1, prune_every=4, empty=0.4, schedule=schedule
     )
     task = Task(measured, MaterialPrior.known(ONE.channels[0]), seed)
-    field = warmed_up(task, ONE, 1.3 * chords(measured.views).float(), options)
-    return waves_fit(measured, field, options, seed)
+    return measured, warmed_up(task, ONE, 1.3 * chords(measured.views).float(), options), options
+
+
+def neural(seed: int) -> Fit:
+    """Random depths and probes, minibatches, and a mask that is pruned."""
+    measured, field, options = warm(seed)
+    return waves_fit(measured, deepcopy(field), options, seed)
 
 
 FITS: dict[str, Callable[[int], Fit]] = {f.__name__: f for f in (gaussians, voxels, surface, neural)}

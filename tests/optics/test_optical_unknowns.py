@@ -32,17 +32,21 @@ CASES = {
     "thrice": ([0.4, 0.9, 1.5], 3),
 }
 
+SMALL = (2, 5), (1, 2)
+"""Frame and margin [pixels] for tests of kernels."""
+
 
 class Setup:
-    """Three views of 4 × 7 pixels in an odd, rectangular raster with unequal margins, at unequal distances.
+    """Three views in an odd, rectangular raster with unequal margins, at unequal distances.
 
+    They have 4 × 7 pixels; 2 × 5 where Triton's interpreter runs, for which every row is a program.
     Its score is a fixed random sum over the frames; distances are in `UNIT`, widths in pixels.
     """
 
-    frame, margin = (4, 7), (2, 3)
-
-    def __init__(self, case: str, matter: str, device: torch.device | str = "cpu"):
+    def __init__(self, case: str, matter: str, device: torch.device | str | None = None):
         psf, self.factor = CASES[case]
+        self.frame, self.margin = ((4, 7), (2, 3)) if device is None else SMALL
+        device = device or "cpu"
         self.matter, self.device = MATTER[matter], device
         self.raster = tuple((n + 2 * m) * self.factor | 1 for n, m in zip(self.frame, self.margin))
         draw = torch.Generator().manual_seed(0)
@@ -138,7 +142,7 @@ def test_the_check_would_catch_a_wrong_gradient(wrong, monkeypatch):
 @pytest.mark.parametrize("backend", ["cpu", "cuda"])
 def test_picked_views_get_their_gradients(backend, gpu):
     """One view twice, one not at all."""
-    setup = Setup("oversampled and blurred", "one", gpu if backend == "cuda" else "cpu")
+    setup = Setup("oversampled and blurred", "one", gpu if backend == "cuda" else None)
     found, true = (setup.gradients(b, [2, 0, 2]) for b in (backend, "reference"))
     assert error(found, true) < TOLERANCE
     assert float(found["distance"][1]) == float(found["psf"][1]) == 0
@@ -147,7 +151,7 @@ def test_picked_views_get_their_gradients(backend, gpu):
 @pytest.mark.parametrize("backend", ["cpu", "cuda", "reference"])
 @pytest.mark.parametrize("name", ["distance", "psf", "lines"])
 def test_one_unknown_alone_gets_the_same_gradient(name, backend, gpu):
-    setup = Setup("blurred", "one", gpu if backend == "cuda" else "cpu")
+    setup = Setup("blurred", "one", gpu if backend == "cuda" else None)
     leaf = setup.unknowns[name].clone().requires_grad_()
     setup.score(backend, {**setup.unknowns, name: leaf}).backward()
     assert leaf.grad is not None
@@ -199,15 +203,15 @@ def test_views_of_unequal_energies_are_those_of_single_ones(channels, backend, s
     """Frames and gradients, bit for bit; `single`: one view with a table of its own."""
     on = gpu if backend == "cuda" else torch.device("cpu")
     energies, z, sigma = np.array([17.0, 20.0, 24.5]), UNIT * np.array([1.3, 2.0, 4.0]), np.array([0.4, 0.9, 1.5])
-    frame = ((4, 7), (2, 3), 1)
+    frame, raster = (*SMALL, 1), (5, 9)
     k = [wavenumber(energy) * np.array([[6e-12, 3e-13], [1e-12, 9e-13]][:channels]) for energy in energies]
     draw = torch.Generator().manual_seed(3)
-    lines = torch.randn(3, channels, 9, 13, generator=draw).to(on)
-    weights = torch.randn(3, 4, 7, generator=draw).to(on)
+    lines = torch.randn(3, channels, *raster, generator=draw).to(on)
+    weights = torch.randn(3, *SMALL[0], generator=draw).to(on)
 
     def taken(at: slice, energy: float | np.ndarray, refraction: np.ndarray) -> list[Tensor]:
         leaf = lines[at].clone().requires_grad_()
-        path = optical_path((9, 13), PITCH, energy, z[at], sigma[at], frame).to(on)
+        path = optical_path(raster, PITCH, energy, z[at], sigma[at], frame).to(on)
         frames = hologram(leaf, refraction, path, backend)
         return [frames.detach(), torch.autograd.grad(frames, leaf, weights[at])[0]]
 

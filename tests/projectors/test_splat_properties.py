@@ -11,6 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from helpers.kernels import few_programs
 from holosplat.geometry import rotation_y
 from holosplat.projectors.splat import splat
 
@@ -18,9 +19,11 @@ SHAPE = (25, 34)
 
 
 @pytest.fixture(params=["cpu", "reference", "cuda"])
-def project(request):
+def project(request, monkeypatch):
     """`splat` on one backend: the cloud's four arrays, rotations, shifts and options in, images in main memory out."""
     place = request.getfixturevalue("gpu") if request.param == "cuda" else "cpu"
+    if request.param == "cuda":
+        few_programs(monkeypatch, place, 16)
 
     def act(arrays: list[Tensor], rotations: np.ndarray, shifts: np.ndarray, **options: float) -> Tensor:
         moved = [a.float().to(place) for a in arrays]

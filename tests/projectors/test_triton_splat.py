@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from helpers.kernels import few_programs
 from helpers.splats import DETECTOR, KINDS, NAMES, VOLUME, cloud, error, poses
 from helpers.watch import Watch
 from holosplat.projectors.splat import splat, voxelise
@@ -20,16 +21,8 @@ FORWARD_TOLERANCE, GRADIENT_TOLERANCE = 1e-5, 5e-5
 
 @pytest.fixture(autouse=True)
 def modules(gpu, monkeypatch):
-    """The modules that walk over boxes, with their usual sizes. The interpreter's time goes by programs: there, each
-    takes many Gaussians."""
-    from holosplat.projectors.splat import triton_boxes, triton_pixels
-
-    usual = {module: module.BLOCKS for module in (triton_pixels, triton_boxes)}
-    if gpu.type == "cpu":
-        for module, blocks in usual.items():
-            many = replace(blocks, gaussians=128, lanes=1024, rounds=1, large=10**6, large_programs=3)
-            monkeypatch.setattr(module, "BLOCKS", many)
-    return usual
+    """The modules that walk over boxes, with their usual sizes."""
+    return few_programs(monkeypatch, gpu)
 
 
 def draw_views(arrays, backend, **options) -> Tensor:
@@ -68,7 +61,7 @@ def assert_twins(draw, arrays: list[Tensor], gpu: torch.device) -> None:
 @pytest.mark.parametrize("channels", [1, 2])
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_same_as_the_reference(kind, channels, draw, gpu):
-    assert_twins(draw, cloud(kind, channels, 40 if kind == "large" else 120), gpu)
+    assert_twins(draw, cloud(kind, channels, 12 if kind == "large" else 120), gpu)
 
 
 @DRAWS
@@ -76,7 +69,7 @@ def test_the_same_as_the_reference(kind, channels, draw, gpu):
 def test_boxes_too_large_for_one_warp(kind, draw, gpu, modules, monkeypatch):
     for module in modules:
         monkeypatch.setattr(module, "BLOCKS", replace(module.BLOCKS, large=200, large_lanes=2048))
-    assert_twins(draw, cloud(kind, 2, 12), gpu)
+    assert_twins(draw, cloud(kind, 2, 6), gpu)
 
 
 @DRAWS

@@ -170,6 +170,7 @@ def test_the_same_seed_gives_the_same_run(request, begun_once, scan, tmp_path, s
     ],
     ids=["views drawn", "random start"],
 )
+@pytest.mark.usefixtures("unjudged_runs")
 def test_another_seed_gives_another_run_where_anything_is_random(scan, settings):
     first, other = (reconstruct(scan, KNOWN, settings, seed=seed).object.centres for seed in (3, 4))
     assert not torch.equal(first, other)

@@ -106,7 +106,7 @@ def test_what_a_folder_says_of_light():
     assert read_light_options(boxes, {"light": "uneven by 2.1%"}) == LightOptions("smooth", ((0, 9, 0, 9),))
 
 
-def test_a_run_finds_light_keeps_it_and_draws_it(tmp_path):
+def test_a_run_finds_light_keeps_it_and_draws_it(tmp_path, undrawn_reports):
     scan, _ = lit(6)
     scan = scan.cropped(slice(0, 45), slice(10, 58))
     pattern = 1 + 0.01 * np.random.default_rng(2).standard_normal(scan.views.shape)

@@ -41,7 +41,7 @@ METHODS = {
     "gaussians": SMALL,
     "surfaces": Surfaces(gaussians=replace(SMALL, volume=VOLUME), fit=SurfaceFit(schedule=Schedule(steps=4))),
     "voxels": Voxels(VOLUME, VoxelFit(steps=4)),
-    "volume": SmoothVolume(rounds=1, iterations=4),
+    "volume": SmoothVolume(replace(VOLUME, upper=0.0), rounds=1, iterations=4),
     "per-view": PerView("ctf", "tv"),
 }
 

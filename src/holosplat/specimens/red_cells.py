@@ -9,6 +9,7 @@ and its inverse tells exactly whether a point is inside.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
@@ -244,6 +245,11 @@ class _Placed:
         reach = float(np.linalg.norm(np.concatenate([mesh.vertices, outer]), axis=1).max())
         return cls(cell, mesh.vertices, outer, reach)
 
+    @property
+    def coarse(self) -> _Placed:
+        """The same with the points that reject quickly."""
+        return replace(self, points=self.points[:COARSE_POINTS], outer=self.outer[:COARSE_POINTS])
+
     def moved(self, rotation: np.ndarray, translation: np.ndarray) -> _Placed:
         """Turned about the origin, then shifted."""
         cell = self.cell
@@ -252,8 +258,9 @@ class _Placed:
         return _Placed(cell, points, outer, self.reach)
 
 
-def _overlaps_any(candidate: _Placed, placed: list[_Placed]) -> bool:
-    """Whether `candidate` comes closer than the margin to any cell of `placed`.
+def _overlaps_any(candidate: _Placed, placed: list[_Placed], counts: Sequence[int | None] = (None,)) -> bool:
+    """Whether `candidate` comes closer than the margin to any cell of `placed`, by the first points (None: all) of each
+    in `counts`, one after the other.
 
     Where two smooth bodies come closest they share the normal, so a point of one, moved the margin outwards,
     lies inside the other if they are closer than that; level-4 vertices are 1/50 of a diameter apart.
@@ -262,7 +269,7 @@ def _overlaps_any(candidate: _Placed, placed: list[_Placed]) -> bool:
         return False
     distance = np.linalg.norm([p.cell.centre - candidate.cell.centre for p in placed], axis=1)
     near = [p for p, d in zip(placed, distance) if d < p.reach + candidate.reach]
-    for count in (COARSE_POINTS, None):
+    for count in counts:
         for other in near:
             for a, b in ((candidate, other), (other, candidate)):
                 probes = np.concatenate([a.points[:count], a.outer[:count]])
@@ -292,25 +299,28 @@ class _Channel:
         x, y, z = points.T
         return bool(np.max(x**2 + z**2) <= min(half[0], half[2]) ** 2 and np.max(np.abs(y)) <= half[1])
 
-    def random_centre(self, points: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
-        """A uniform random place [3] that keeps `points` [P, 3] inside the channel, or None (try again)."""
+    def random_centre(self, points: np.ndarray, turn: np.ndarray, rng: np.random.Generator) -> np.ndarray | None:
+        """A uniform random place [3] that keeps `points` [P, 3], turned, inside the channel, or None (try again)."""
         half = self.half
         if self.shape == "box":
+            points = points @ turn.T
             low, high = -half - points.min(0), half - points.max(0)
             return rng.uniform(low, high) if np.all(low <= high) else None
         radius = min(half[0], half[2])
         centre = rng.uniform([-radius, -half[1], -radius], [radius, half[1], radius]) if radius > 0 else None
         if centre is None or half[1] <= 0:
             return None
-        return centre if self.holds(points + centre) else None
+        held = (self.holds(some @ turn.T + centre) for some in (points[:COARSE_POINTS], points))
+        return centre if all(held) else None
 
 
 def _inserted(resting: _Placed, placed: list[_Placed], channel: _Channel, rng: np.random.Generator) -> _Placed | None:
     """`resting` at a random place where it touches nothing, or None after `TRIES` tries."""
+    few = resting.coarse
     for _ in range(TRIES):
         rotation = _random_rotation(rng)
-        centre = channel.random_centre(resting.points @ rotation.T, rng)
-        if centre is None:
+        centre = channel.random_centre(resting.points, rotation, rng)
+        if centre is None or _overlaps_any(few.moved(rotation, centre), placed, (COARSE_POINTS,)):
             continue
         candidate = resting.moved(rotation, centre)
         if not _overlaps_any(candidate, placed):
@@ -326,7 +336,9 @@ def _shuffle(placed: list[_Placed], channel: _Channel, rng: np.random.Generator)
         centre = old.cell.centre
         shift = centre - turn @ centre + STEP * old.cell.diameter * rng.standard_normal(3)
         moved = old.moved(turn, shift)
-        if channel.holds(moved.points) and not _overlaps_any(moved, placed[:i] + placed[i + 1 :]):
+        if channel.holds(moved.points) and not _overlaps_any(
+            moved, placed[:i] + placed[i + 1 :], (COARSE_POINTS, None)
+        ):
             placed[i] = moved
 
 
