@@ -24,6 +24,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import machine
@@ -304,7 +305,9 @@ def _garble(file: h5py.File, rng: random.Random) -> None:
     names = list[str]()
     file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
     name = rng.choice(names)
-    shape, attributes = file[name].shape, dict(file[name].attrs)
+    found = file[name]
+    assert isinstance(found, h5py.Dataset)
+    shape, attributes = found.shape, dict(found.attrs)
     del file[name]
     act = rng.randrange(4)
     if act == 0:
@@ -354,7 +357,7 @@ def two(shop: Shop, rng: random.Random, folder: Path) -> str:
     return "" if _is_whole(folder / "out") and all(map(_alike, same[0].values(), same[1].values())) else "lost"
 
 
-def _alike(one: object, other: object) -> bool:
+def _alike(one: Any, other: Any) -> bool:
     return bool(np.array_equal(one, other)) if hasattr(one, "numpy") else one == other
 
 
