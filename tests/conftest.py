@@ -7,7 +7,7 @@ import importlib.util
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # threads that spin starve whoever shares the cores
 
@@ -24,6 +24,9 @@ TRITON = importlib.util.find_spec("triton") is not None
 GPU = TRITON and torch.cuda.is_available()
 KERNELS = ("projectors.splat", "optics.hologram", "fit.fidelity", "fit.adam")
 """Packages with Triton kernels."""
+
+TOGETHER = ("tests/cli", "tests/workflows")
+"""Folders whose files share what takes seconds to make: the run of the commands, what runs on one scan begin with."""
 
 settings.register_profile(
     "repeatable",  # the same examples at every run, on every machine, however slow it is
@@ -59,6 +62,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if not GPU and item.get_closest_marker("gpu"):
             item.add_marker(pytest.mark.skip(reason="there is no GPU here"))
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object | None:
+    """With `--dist loadfile`, tests of a folder in `TOGETHER` stay in one process, too, as those of a file do."""
+    if config.getoption("dist") != "loadfile":
+        return None
+    from xdist.scheduler import LoadFileScheduling
+
+    class ByFolder(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            folder = nodeid.split("::")[0].rpartition("/")[0]
+            return folder if folder in TOGETHER else super()._split_scope(nodeid)
+
+    return ByFolder(config, log)
 
 
 def pytest_collection_finish() -> None:

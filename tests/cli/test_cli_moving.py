@@ -18,6 +18,8 @@ from holosplat.workflows.moving import reconstruct_moving
 from holosplat.workflows.reconstruct import load_reconstruction
 from holosplat.workflows.run_folder import RunFolder
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 QUICK = CarriedOptions(
     volume=SmoothVolume(coarser=(), rounds=1, iterations=4),
     cells=2,

@@ -30,6 +30,8 @@ from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "adding.md"
 PIXEL = 3.2e-6
 CELL = HAEMOGLOBIN.delta_beta(20.0)

@@ -16,6 +16,8 @@ from holosplat.matter import MaterialPrior
 from holosplat.methods import FitOptions, Gaussians, Task
 from holosplat.methods.solve import solve
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 QUICK = Gaussians(
     spacing_px=2.0,
     approximate_steps=1,

@@ -20,6 +20,8 @@ from holosplat.workflows.keeper import Choice, Keeper
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 RUINOUS = replace(SMALL, fit=replace(SMALL.fit, rates=GaussianRates(raw_amplitudes=3.0)))
 """A fit that makes everything worse."""
 

@@ -29,6 +29,8 @@ from holosplat.workflows.evaluate import evaluate, material_found, render
 from holosplat.workflows.reconstruct import Reconstruction, load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
 
+pytestmark = pytest.mark.usefixtures("unjudged_runs")
+
 
 @pytest.fixture(scope="module")
 def truth() -> Volume:
