@@ -145,7 +145,7 @@ def test_every_number_of_a_command_is_refused_or_within_its_range():
                     with pytest.raises(InputError, match=f"--{field.replace('_', '-')} must"):
                         with_checked_numbers(_stub(field, hint, parameter.default))(value)
                     tried += 1
-            elif dataclasses.is_dataclass(hint):
+            elif isinstance(hint, type) and dataclasses.is_dataclass(hint):
                 holds = any(takes_numbers(inner) for inner in _hints(hint).values())
                 assert not holds or f"{hint.__module__}.{hint.__name__}" in all_ranged(), (name, field)
     assert tried >= 30
