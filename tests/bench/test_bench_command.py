@@ -121,7 +121,7 @@ def test_a_case_of_ones_own_is_a_file(shop, tmp_path):
     [
         (("--cases", "main99"), "--cases must be among round, wide, capsule-dome, capsule, tooth, but main99"),
         (("--methods", "magic"), "--methods must be among one, two, but magic"),
-        (("--seeds", "-3"), "seeds must be 0 or more"),
+        (("--seeds", "-3"), "--seeds must not be negative"),
     ],
 )
 def test_bad_requests_are_refused_in_one_line(shop, tmp_path, arguments, words):
