@@ -17,7 +17,7 @@ MatterKind = Literal["levels", "continuous"]
 """What matter is like: of one level of δ, or several, with sharp edges, or varying smoothly."""
 LEAST_CONTRAST = 1.6
 """Two materials whose δ differ by less than this factor pass for one."""
-MOST_DELTA = 1.0
+MOST_DELTA = 10.0
 """What no δ or β of X-rays comes near: those of gold at 1 keV are 0.002."""
 RATIO_RANGE = (1.0, 1e6)
 """Sizes of δ/β that may be given."""

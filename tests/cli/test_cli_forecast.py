@@ -101,7 +101,7 @@ def test_frames_that_were_held_out_judge_it(folder):
 
 def test_what_cannot_be_carried_on_is_refused(folder):
     run, out = folder / "run", folder / "none"
-    refused(holosplat("forecast", run, "--times", 0, "--out", out), "--times", "1 to 1000")
+    refused(holosplat("forecast", run, "--times", 0, "--out", out), "--times", "at least 1")
     refused(holosplat("forecast", run, "--step", 0, "--out", out), "--step")
     refused(holosplat("forecast", run, "--degree", 0, "--out", out), "degree")
     refused(holosplat("forecast", run, "--out", folder / "later"), "later")

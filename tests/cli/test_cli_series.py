@@ -162,7 +162,7 @@ BAD_SERIES: dict[str, tuple[list[object], list[str]]] = {
     "no rate": (["--frames", 3], ["--frames needs --frame-rate"]),
     "blur without a rate": (["--exposure", 1e-6, "--pulses", 3], ["--exposure needs --frame-rate"]),
     "a box without a rate": (["--period", 80, 0, 0], ["--period goes with --frame-rate"]),
-    "a rate of nothing": (["--frame-rate", 0], ["frame rate", "positive"]),
+    "a rate of nothing": (["--frame-rate", 0], ["--frame-rate", "positive"]),
     "too many frames": (["--frame-rate", 1e6, "--frames", 8], ["room for 7 frames", "8 are asked"]),
     "exposure alone": (["--frame-rate", 1e6, "--exposure", 1e-6], ["exposure", "pulses", "both"]),
     "blur beyond the start": (
@@ -174,8 +174,8 @@ BAD_SERIES: dict[str, tuple[list[object], list[str]]] = {
     "one file twice": (["--frame-rate", 1e6, "--truth", "s.nxs"], ["different files"]),
     "a negative box": (["--frame-rate", 1e6, "--period", -80, 0, 0], ["period", "negative"]),
     "a unit for no collection": (["--frame-rate", 1e6, "--time-unit", "us"], ["time unit", ".pvd"]),
-    "shifts of no size": (["--misalign-shift", -1], ["shift_px", "-1"]),
-    "distances that are none": (["--misalign-distance", 2], ["distance", "0.1", "2"]),
+    "shifts of no size": (["--misalign-shift", -1], ["--misalign-shift", "-1"]),
+    "distances that are none": (["--misalign-distance", 2], ["--misalign-distance", "at most 1", "2"]),
     "a tilt too many": (["--tilts-deg", 1, 2], ["--tilts-deg needs --angles-deg"]),
 }
 

@@ -231,4 +231,4 @@ def test_an_objective_compares_frames():
 @pytest.mark.parametrize("name", ["l1", "two_levels", "noise_width", "coarse"])
 def test_weights_are_not_negative(name):
     with pytest.raises(InputError, match=f"{name} must not be negative, but it is -0.5"):
-        Objective(**{name: -0.5})
+        Objective(**{"ssim": 1.0, name: -0.5})

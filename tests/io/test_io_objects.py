@@ -201,7 +201,7 @@ SOME: dict[tuple[str, str], tuple[Callable[[h5py.File], object], str]] = {
     ("surfaces", "NaN"): (replaced("vertices", first(math.nan)), "finite"),
     ("surfaces", "two materials"): (with_channels([1e-7, 1e-9], [1e-7, 1e-9]), "one material"),
     ("gaussians", "dense beyond belief"): (with_channels([1e30, 0]), "channels must be at most"),
-    ("gaussians", "δ of 2"): (with_channels([2, 0]), "δ of matter"),
+    ("gaussians", "δ of 20"): (with_channels([20, 0]), "δ of matter"),
     ("gaussians", "an infinite number"): (with_channels([1e400, 0]), "finite"),
     ("gaussians", "far away"): (replaced("centres", first(1e30)), "centres must hold numbers of at most"),
     ("surfaces", "lines of text"): (with_state(lambda s: s.update(lines="two")), "garbles"),

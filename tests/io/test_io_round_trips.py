@@ -157,8 +157,8 @@ def objects(draw: st.DrawFn) -> Stored:
         return GaussianCloud([centres, torch.log(scales), *rest], unit, matter)
     if kind == "voxels":
         grid = draw(volumes()).grid
-        finite = st.floats(width=32, allow_nan=False, allow_infinity=False)  # others are refused where they are read
-        values = draw(arrays(np.float32, (len(matter), *grid.shape), elements=finite))
+        readable = st.floats(-(2.0**39), 2.0**39, width=32)  # others are refused where they are read
+        values = draw(arrays(np.float32, (len(matter), *grid.shape), elements=readable))
         return VoxelGrid(torch.from_numpy(values), grid, matter)
     sphere, faces = (torch.from_numpy(a.copy()) for a in icosphere(1))
     return SurfaceMesh(sphere * draw(numbers(0.1, 1e3)), faces.long(), unit, one, draw(st.integers(1, 4)))

@@ -79,7 +79,7 @@ def test_a_part_is_cropped_and_then_binned_and_frames_are_not_read_before_they_a
         ({"crop": "0:10,0:5"}, "must keep some of the 9 rows, but it says '0:10'"),
         ({"crop": "0:5,6:6"}, "must keep some of the 13 columns"),
         ({"crop": "0:5:2,0:5"}, "use --bin for larger pixels"),
-        ({"bin": 0}, "--bin must be at least 1, but it is 0"),
+        ({"bin": 0}, "bin must be at least 1, but it is 0"),
         ({"bin": 10}, "cannot be binned by 10"),
     ],
 )

@@ -16,7 +16,7 @@ from ..io.run_scan import run_source
 from ..motion.known import beam_directions
 from ..motion.rest_shape import KnownBody
 from ..motion.track import TrackOptions
-from ..ranges import Metres, Natural, Seed, Share, Weight, ranged
+from ..ranges import Metres, Seed, Share, Weight, ranged
 from ..report.run import report_run
 from ..workflows.evaluate import evaluate as score
 from ..workflows.run_folder import RunFolder, claimed
@@ -65,7 +65,7 @@ class MotionFlags:
     """Degree of the paths' polynomials."""
     pieces: int = 0
     """Pieces of the paths' splines over the whole time (0: as many as predict held-out frames best)."""
-    rounds: Natural = 4
+    rounds: int = 4
     """How often bodies are looked for beside those that are known, at most."""
     least_volume: float = 30.0
     """Bodies of fewer voxels, of a pixel's edge, are not followed."""

@@ -74,7 +74,8 @@ def _sound(label: str, array: np.ndarray) -> np.ndarray:
     require(array.dtype.kind in "iufb", f"{label} must hold numbers, but it does not.")
     finite(label, array)
     most = float(np.abs(array).max(initial=0))
-    require(most <= LARGEST, f"{label} must hold numbers of at most {LARGEST:g}, but one is {most:g}.")
+    largest = 1000 * LARGEST  # of coordinates in pixels and of amplitudes, which no setting is
+    require(most <= largest, f"{label} must hold numbers of at most {largest:g}, but one is {most:g}.")
     return array
 
 

@@ -17,7 +17,7 @@ from ..matter import DeltaBeta
 from ..mesh import TriangleMesh
 from ..optics.background import Light
 from ..progress import FitProgress
-from ..ranges import Natural, Share, ranged
+from ..ranges import Share, ranged
 from ..representations import MovingSurfaces, TimeBasis
 from ..scan import Scan
 from .elastic import Rest
@@ -65,7 +65,7 @@ class TrackOptions:
     """Which of them are one body."""
     paths: PathOptions = field(default_factory=PathOptions)
     """How the vertices move."""
-    rounds: Natural = 4
+    rounds: int = 4
     """How often bodies are looked for beside those that are known, at most."""
     fainter: Share = 0.6
     """Factor of the level there: few views smear a body, and beside what is known there is little to take it for."""
