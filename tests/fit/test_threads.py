@@ -103,8 +103,8 @@ def test_steps_give_the_same_bits_for_any_number_of_threads(objective):
     assert len(found) == 1
 
 
-def test_fourier_transforms_of_the_start_differ_in_the_last_digits_at_most():
-    """They are torch's, by MKL where it is there; the same number of threads gives the same bits."""
+def test_a_retrieval_differs_in_the_last_digits_at_most():
+    """Its Fourier transforms and sums are torch's; the same number of threads gives the same bits."""
     scan, found = a_scan(), []
     frames, material = torch.from_numpy(scan.frames), HAEMOGLOBIN.delta_beta(20.0)
     for count in (*THREADS, *THREADS):
@@ -113,4 +113,4 @@ def test_fourier_transforms_of_the_start_differ_in_the_last_digits_at_most():
     scale = np.abs(found[0]).max()
     for first, again in zip(found[:3], found[3:]):
         np.testing.assert_array_equal(first, again)
-        np.testing.assert_allclose(first, found[0], atol=1e-3 * scale)
+        np.testing.assert_allclose(first, found[0], atol=1e-5 * scale)

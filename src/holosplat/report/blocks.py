@@ -79,7 +79,7 @@ def _turned(content: ReportContent) -> Block:
     if view is None:
         return Block(heading, "What would be turned here was not given.")
     first, *others = view.parts
-    kinds = {"volume": "a volume of coarser voxels", "gaussians": "its Gaussians"}
+    kinds = {"volume": "a volume", "gaussians": "its Gaussians"}
     shown = kinds.get(view.parts[first].kind, "its surfaces")
     text = (
         f"Line integrals and the hologram that they would give, of the {first} by {shown}: drag the first picture, or "
@@ -87,7 +87,7 @@ def _turned(content: ReportContent) -> Block:
         "hologram that of an even beam over the distance of the first frame, one wave sample a raster pixel. "
     )
     if others:
-        text += f"The {' and the '.join(others)} can be chosen instead, from a volume of coarser voxels. "
+        text += f"The {' and the '.join(others)} can be chosen instead, from a volume. "
     return Block(heading, text.strip(), "The object, turned.", live=html(view))
 
 

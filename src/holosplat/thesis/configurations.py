@@ -8,7 +8,7 @@ quaternions have no unit.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from ..checks import at_least, require
@@ -113,7 +113,7 @@ class Recipe:
     """How a configuration is fitted. raw_densities: the rate of the densities before softplus."""
 
     fit: FitOptions
-    raw_densities: float = field(default=0.01)
+    raw_densities: float
 
     def rates(self, factor: float, step: int) -> dict[str, float]:
         """The rate of each parameter at `step`, of which `factor` is left: until the warm-up is over only density, δ

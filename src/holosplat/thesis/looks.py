@@ -55,15 +55,12 @@ def line_integrals(obj: Object, measured: Measured) -> torch.Tensor:
 
 
 def geometry(fit: Fit, measured: Measured) -> dict[str, np.ndarray]:
-    """What shows the geometry of the cloud: a slice of δ through the middle of the field and that of the truth [Y, X],
-    and centres and mean deviations [N, 4] (x, y, z, σ) [pixels] of at most 4000 Gaussians in their order."""
+    """A slice of δ through the middle of the field, and that of the truth [Y, X]."""
     cloud, grid = cloud_of(fit), measured.truth.grid
     middle = grid.shape[0] // 2
-    centres, sigma = cloud.centres, cloud.scales.log().mean(dim=1, keepdim=True).exp()
     return {
         "slice": cloud.voxelise(grid).delta[middle].astype(np.float32),
         "true_slice": measured.truth.delta[middle].astype(np.float32),
-        "gaussians": torch.cat((centres, sigma), dim=1)[:4000].numpy().astype(np.float32),
     }
 
 
