@@ -11,7 +11,12 @@ from holosplat.report.style import CYCLE, WIDTH, letter, new_figure, styled
 
 DOCS = Path(__file__).resolve().parent
 KINDS = {"gaussians": "Gaussians", "surfaces": "surfaces"}
-FILES = {"object": ("s", "none", "as it is"), "compact": ("o", "-", "compact"), "voxels": ("^", ":", "voxels")}
+FILES = {
+    "object": ("s", "none", "as it is"),
+    "compact": ("o", "-", "compact"),
+    "voxels of 1/1 px": ("^", ":", "voxels of a pixel"),
+    "voxels of 1/2 px": ("v", "--", "of half a pixel"),
+}
 SCORES = {"frcm": "1 − FRCM of held-out frames", "error_delta": "error of δ"}
 
 
