@@ -67,7 +67,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Carry a run of track on: its bodies and their frames at later times, with a standard error.",
     ),
     "render": ("commands", "Predict the frames of a scan from a run."),
-    "export": ("export", "Write δ and β of a run as a volume, its bodies as meshes, or its object in few bytes."),
+    "export": (
+        "export",
+        "Write δ and β of a run as a volume, its bodies as meshes, or its object in few bytes or as splats.",
+    ),
     "surface": (
         "surface",
         "Cut the bodies of a run out as closed surfaces, fit these to the frames, and write them as VTK files (µm).",
