@@ -3,9 +3,10 @@
     python benchmarks/compact.py RUN TRUTH [--scene NAME] [--write]
 
 RUN is a finished run beside its scan, TRUTH its true volume. Files: that of the run (float32 Gaussians and voxels,
-float64 surfaces), compact ones of several steps of places, and for comparison the run's volume on the scan's pixels as
-8-bit and 16-bit voxels of its range and as float32, all by HDF5's gzip. Scores are of held-out frames and of the
-volume. With --write, rows stand in the table in place of earlier ones of the same scene and kind.
+float64 surfaces), compact ones of several steps of places, and for comparison the run's δ on the scan's pixels and on
+half of them, as 8-bit and 16-bit voxels of its range and as float32, in Zarr's chunks by blosc (zstd, shuffled bytes),
+as `export --volume NAME.ome.zarr` writes the last. Scores are of held-out frames and of the volume. With --write, rows
+stand in the table in place of earlier ones of the same scene and kind.
 """
 
 from __future__ import annotations
@@ -16,16 +17,18 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-import h5py
 import numpy as np
 import torch
+import zarr
 from machine import commit
+from numcodecs import Blosc
 
 import holosplat as hs
 from holosplat.geometry import Grid
 from holosplat.io.atomic import atomic_path
 from holosplat.io.compact import steps_of
 from holosplat.io.objects import read_object, write_compact
+from holosplat.io.ome_zarr import CHUNK
 from holosplat.matter import Matter
 from holosplat.representations import Stored, VoxelGrid
 from holosplat.workflows.evaluate import score_object
@@ -43,15 +46,27 @@ def files(obj: Stored, path: Path, grid: Grid, folder: Path) -> Iterator[tuple[s
     for place in PLACES:
         write_compact(made, obj, steps_of(place))
         yield f"compact 1/{round(1 / place)} px", made.stat().st_size, read_object(made)
-    volume = obj.voxelise(grid).delta
-    for bits in (8, 16, 32):
-        step = float(volume.max()) / (2**bits - 1)
-        stored = volume if bits == 32 else np.rint(volume / step).astype(f"u{bits // 8}")
-        with h5py.File(made, "w") as file:
-            file.create_dataset("delta", data=stored, compression="gzip", compression_opts=9, shuffle=True)
-        back = torch.from_numpy(np.asarray(volume if bits == 32 else step * stored, dtype=np.float32)[None])
-        matter = Matter.one(1.0, float(obj.matter.channels[0].beta / obj.matter.channels[0].delta))
-        yield f"voxels of {bits} bits", made.stat().st_size, VoxelGrid(back, grid, matter)
+    for refine in (1, 2):
+        fine = grid.divided((refine,) * 3)
+        volume = obj.voxelise(fine).delta
+        for bits in (8, 16, 32):
+            step = float(volume.max()) / (2**bits - 1)
+            stored = volume if bits == 32 else np.rint(volume / step).astype(f"u{bits // 8}")
+            size = zarr_bytes(stored, folder / f"{refine}_{bits}.zarr")
+            back = torch.from_numpy(np.asarray(volume if bits == 32 else step * stored, dtype=np.float32)[None])
+            matter = Matter.one(1.0, float(obj.matter.channels[0].beta / obj.matter.channels[0].delta))
+            yield f"voxels of 1/{refine} px and {bits} bits", size, VoxelGrid(back, fine, matter)
+
+
+def zarr_bytes(values: np.ndarray, folder: Path) -> int:
+    """Bytes of all files of a Zarr array; chunks that are empty take none."""
+    how = Blosc(cname="zstd", clevel=5, shuffle=Blosc.SHUFFLE)
+    chunks = tuple(min(CHUNK, n) for n in values.shape)
+    array = zarr.create_array(
+        folder, shape=values.shape, chunks=chunks, dtype=values.dtype, compressors=how, fill_value=0, zarr_format=2
+    )
+    array[:] = values
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def rows(run: Path, truth_path: Path, scene: str) -> Iterator[dict[str, str]]:

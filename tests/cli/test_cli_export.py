@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import tifffile
 
 from helpers.cli import holosplat, refused, worked
@@ -18,5 +20,19 @@ def test_a_run_is_exported_in_few_bytes_and_as_a_tiff(shop, tmp_path):
 
 def test_a_step_without_sense_leaves_nothing(shop, tmp_path):
     refused(holosplat("export", shop.run, "--compact", tmp_path / "c.h5", "--step-px", "7"), "step must")
-    refused(holosplat("export", shop.run), "--volume, --bodies or --compact")
+    refused(holosplat("export", shop.run), "--volume, --bodies, --compact or --splats")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_run_is_exported_for_other_programs(shop, tmp_path):
+    """Gaussians as splats, their volume as OME-Zarr; bodies need surfaces."""
+    done = worked(
+        holosplat(
+            "export", shop.run, "--splats", tmp_path / "g.ply", "--volume", tmp_path / "v.ome.zarr", "--shape", 8, 9, 10
+        )
+    )
+    assert "opacity stands for thickness" in done.err
+    assert (tmp_path / "g.ply").read_bytes().startswith(b"ply\nformat binary_little_endian 1.0\ncomment holosplat: um")
+    assert json.loads((tmp_path / "v.ome.zarr" / "0" / ".zarray").read_text())["shape"] == [2, 8, 9, 10]
+    refused(holosplat("export", shop.run, "--volume", tmp_path / "v.ome.zarr"), "must be new or empty")
+    refused(holosplat("export", shop.run, "--bodies", tmp_path / "b.glb"), "needs a run of surfaces")

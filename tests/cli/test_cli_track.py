@@ -122,6 +122,21 @@ def test_volumes_and_bodies_are_exported_at_times(folder):
     assert np.array_equal(read_volume(folder / "one.h5").delta, read_volume(folder / "v_t0003.h5").delta)
 
 
+def test_bodies_move_in_one_file_for_viewers(folder):
+    """A .glb of all times is a film, of one time a body as it is, and .stl a file a time."""
+    worked_by("export", folder / "run", "--bodies", folder / "all.glb", "--time-frame", "all")
+    worked_by("export", folder / "run", "--bodies", folder / "one.glb", "--time-frame", 1)
+    assert (b'"animations"' in (folder / "all.glb").read_bytes(), (folder / "one.glb").stat().st_size > 1000) == (
+        True,
+        True,
+    )
+    assert b'"animations"' not in (folder / "one.glb").read_bytes()
+    worked_by("export", folder / "run", "--bodies", folder / "b.stl", "--time-frame", "all")
+    (mesh,) = read_meshes(folder / f"b_t{TIMES - 1:04d}.stl", "um")
+    wanted = sum(body.volume for body in read_object(folder / "run" / "object.h5").bodies((TIMES - 1) * STEP))
+    assert mesh.volume == pytest.approx(wanted, rel=1e-4, abs=0)
+
+
 def test_what_cannot_be_followed_is_refused(folder):
     scan_file, out = folder / "scan.nxs", folder / "none"
     known = (*KNOWN, "--out", out)

@@ -58,12 +58,19 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "track",
         "Follow closed bodies through the times of a scan: their shapes on smooth paths, into a run folder.",
     ),
+    "series": (
+        "series",
+        "Reconstruct a series as tasks of their own: on this machine, by Slurm, on Dask (plan, run, status, collect).",
+    ),
     "forecast": (
         "forecast",
         "Carry a run of track on: its bodies and their frames at later times, with a standard error.",
     ),
     "render": ("commands", "Predict the frames of a scan from a run."),
-    "export": ("export", "Write δ and β of a run as a volume, its bodies as meshes, or its object in few bytes."),
+    "export": (
+        "export",
+        "Write δ and β of a run as a volume, its bodies as meshes, or its object in few bytes or as splats.",
+    ),
     "surface": (
         "surface",
         "Cut the bodies of a run out as closed surfaces, fit these to the frames, and write them as VTK files (µm).",

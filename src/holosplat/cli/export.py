@@ -20,17 +20,22 @@ if TYPE_CHECKING:
 
 MOST_VOXELS = 2**31
 """The largest volume that `export` writes: 16 GB for δ and β."""
+STL, GLB = ".stl", ".glb"
+"""Endings of files that hold all bodies."""
 
 
 @dataclass(frozen=True)
 @ranged
-class CompactFile:
-    """The object of a run, its numbers rounded to steps and compressed."""
+class ObjectFiles:
+    """The object of a run as it is, not its volume."""
 
     compact: Path | None = None
-    """File to write (HDF5); of a run of track it holds all times."""
+    """File several times smaller than the run's, its numbers rounded to steps (HDF5); of a run of track it holds all
+    times."""
     step_px: Pixels = 1 / 32
     """Step of places in it [pixels]; those of sizes, orientations and amplitudes go with it."""
+    splats: Path | None = None
+    """PLY file of splat viewers (µm), of a run of Gaussians; their opacity is no phase (docs/formats.md)."""
 
 
 def export(
@@ -40,38 +45,49 @@ def export(
     voxel_size: float | None = None,
     bodies: Path | None = None,
     time_frame: int | Literal["all"] | None = None,
-    few_bytes: CompactFile = CompactFile(),
+    objects: ObjectFiles = ObjectFiles(),
 ) -> None:
-    """Write δ and β of a run as a volume, its bodies as meshes, or its object in few bytes.
+    """Write δ and β of a run as a volume, its bodies as meshes, or its object in few bytes or as splats.
 
     Args:
         run: Run folder.
-        volume: Volume file to write: HDF5, or by its ending .ome.tif, .ome.tiff, .tif or .tiff an OME-TIFF with the
-            channels δ and β.
+        volume: Volume to write: a file of HDF5, or by its ending .ome.tif, .ome.tiff, .tif or .tiff an OME-TIFF, or
+            .ome.zarr or .zarr a folder of OME-Zarr (extra zarr), each with the channels δ and β.
         shape: Voxels along z, y, x (default: the scan's field of view, Z = X = W, Y = H).
         voxel_size: Edge of a voxel [m] (default: the pixel size).
-        bodies: Folder to make, of a run of surfaces: one VTK file a body (µm), the largest first, or of a run of track
-            the same body under the same name at all times.
+        bodies: Of a run of surfaces: a folder to make, with one VTK file a body (µm), the largest first, or of a run
+            of track the same body under the same name at all times; or by its ending one file of all bodies, .stl (µm)
+            or .glb (glTF, m).
         time_frame: Of a run of track: the time, counted from 0 (default: the first), or all, to files and folders whose
-            names end with _t0000 and so on.
-        few_bytes: The object itself in a file several times smaller than the run's.
+            names end with _t0000 and so on, or to one .glb in which the bodies move.
     """
     from ..workflows.run_folder import RunFolder
     from .scans import moments_of
 
     require(
-        any((volume, bodies, few_bytes.compact)), "export needs --volume, --bodies or --compact; name what to write."
+        any((volume, bodies, objects.compact, objects.splats)),
+        "export needs --volume, --bodies, --compact or --splats; name what to write.",
     )
     folder = RunFolder(run)
-    if few_bytes.compact is not None:
-        _export_compact(folder, few_bytes.compact, few_bytes.step_px)
-    if volume is None and bodies is None:
+    if objects.compact is not None:
+        _export_compact(folder, objects.compact, objects.step_px)
+    if bodies is not None and time_frame == "all" and bodies.suffix.lower() == GLB and _export_motion(folder, bodies):
+        bodies = None
+    if not any((volume, bodies, objects.splats)):
         return
     for one in moments_of(folder, time_frame):
         if bodies is not None:
-            _export_bodies(one, bodies.with_name(bodies.name + one.ending))
+            _export_bodies(one, bodies.with_stem(bodies.stem + one.ending))
+        if objects.splats is not None:
+            _export_splats(one.result, objects.splats.with_stem(objects.splats.stem + one.ending))
         if volume is not None:
-            _export_volume(one.result, folder, volume.with_stem(volume.stem + one.ending), shape, voxel_size)
+            _export_volume(one.result, folder, _ending(volume, one.ending), shape, voxel_size)
+
+
+def _ending(path: Path, ending: str) -> Path:
+    """The path with `ending` before its suffixes, of which .ome.zarr and .ome.tif are two."""
+    stem, ome, _ = path.stem.partition(".ome")
+    return path.with_name(f"{stem}{ending}{ome}{path.suffix}")
 
 
 def _export_compact(folder: RunFolder, out: Path, step_px: float) -> None:
@@ -87,8 +103,40 @@ def _export_compact(folder: RunFolder, out: Path, step_px: float) -> None:
     _say(f"wrote {out}: {after / 1e6:.3g} MB, {before / after:.1f} times smaller than {folder.result().name}")
 
 
+def _export_motion(folder: RunFolder, out: Path) -> bool:
+    """Write a run of track as bodies that move; False, and nothing written, of any other."""
+    from ..io.atomic import require_writable
+    from ..io.solids import write_moving_glb
+    from ..representations import MovingSurfaces
+    from ..workflows.moments import instants_of
+    from ..workflows.reconstruct import load_reconstruction
+
+    found, times = load_reconstruction(folder).object, instants_of(folder)
+    if not isinstance(found, MovingSurfaces):
+        return False
+    require_writable(out)
+    write_moving_glb(out, found, times)
+    _say(f"wrote {out}: {found.count} bodies in motion")
+    return True
+
+
+def _export_splats(result: Reconstruction, out: Path) -> None:
+    from ..io.atomic import require_writable
+    from ..io.splats import write_splats
+    from ..representations import GaussianCloud
+
+    found = result.object
+    if not isinstance(found, GaussianCloud):
+        raise InputError(f"--splats needs a run of Gaussians, but this one holds {found.described}; use --bodies.")
+    require_writable(out)
+    write_splats(out, found)
+    _say(f"wrote {out}: {found.described}, whose opacity stands for thickness")
+
+
 def _export_bodies(one: Moment, out: Path) -> None:
+    from ..io.atomic import require_writable
     from ..io.folder import require_new
+    from ..io.solids import write_glb, write_stl
     from .surface import write_bodies
 
     found = one.result.object
@@ -96,8 +144,12 @@ def _export_bodies(one: Moment, out: Path) -> None:
         raise InputError(
             f"--bodies needs a run of surfaces, but this one holds {found.described}; use holosplat surface."
         )
-    require_new(out)
-    write_bodies(out, one.bodies, found.matter, {})
+    if out.suffix.lower() in (STL, GLB):
+        require_writable(out)
+        write_stl(out, one.bodies) if out.suffix.lower() == STL else write_glb(out, one.bodies, found.matter)
+    else:
+        require_new(out)
+        write_bodies(out, one.bodies, found.matter, {})
     _say(f"wrote {out}: {len(one.bodies)} bodies")
 
 
@@ -110,12 +162,18 @@ def _export_volume(
 ) -> None:
     from ..geometry import Grid
     from ..io.atomic import require_writable
+    from ..io.folder import require_new
     from ..io.json import read_json
+    from ..io.ome_zarr import ZARR_SUFFIX, require_zarr, write_ome_zarr
     from ..io.volume_files import TIFF_SUFFIXES, write_ome_tiff
     from ..io.volumes import write_voxels
     from ..scan import PIXEL_RANGE_M
 
-    require_writable(volume)
+    if volume.suffix.lower() == ZARR_SUFFIX:
+        require_zarr()
+        require_new(volume)
+    else:
+        require_writable(volume)
     with as_written(folder.summary, "what reconstruct wrote"):
         detector = read_json(folder.summary)["detector"]
         rows, columns = int(detector["rows"]), int(detector["columns"])
@@ -127,6 +185,8 @@ def _export_volume(
     require(count <= MOST_VOXELS, f"shape must have at most {MOST_VOXELS:.0e} voxels, but it has {count:.0e}.")
     if volume.suffix.lower() in TIFF_SUFFIXES:
         write_ome_tiff(volume, result.object.voxelise(grid))
+    elif volume.suffix.lower() == ZARR_SUFFIX:
+        write_ome_zarr(volume, result.object, grid)
     else:
         write_voxels(volume, result.object, grid)
     _say(f"wrote {volume}: {' × '.join(map(str, grid.shape))} voxels of {1e6 * grid.voxel_size[0]:.4g} µm")

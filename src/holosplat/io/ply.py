@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,9 +24,15 @@ def write_ply(path: str | Path, points: np.ndarray, grey: int = 128) -> None:
         rows[name] = points[:, axis]
     for name in ("red", "green", "blue"):
         rows[name] = grey
-    names = [(name, "float" if POINT[name] == np.dtype("<f4") else "uchar") for name in POINT.names or ()]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    header += [f"property {kind} {name}" for name, kind in names] + ["end_header", ""]
+    write_vertices(path, rows)
+
+
+def write_vertices(path: str | Path, rows: np.ndarray, comments: Sequence[str] = ()) -> None:
+    """Write the vertices `rows` [N], whose fields are little-endian float32 or uint8, with lines of comment."""
+    kinds = {np.dtype("<f4"): "float", np.dtype("u1"): "uchar"}
+    header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
+    header += [f"element vertex {len(rows)}"]
+    header += [f"property {kinds[rows.dtype[name]]} {name}" for name in rows.dtype.names or ()]
     with atomic_path(path) as temporary, temporary.open("wb") as file:
-        file.write("\n".join(header).encode("ascii"))
+        file.write("\n".join([*header, "end_header", ""]).encode("ascii"))
         file.write(rows.tobytes())

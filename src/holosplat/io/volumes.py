@@ -70,17 +70,19 @@ def write_voxels(path: str | Path, obj: Object, grid: Grid, on_progress: Advance
 
     `on_progress(fraction)` is called after each slab.
     """
-    rows = grid.shape[1]
-    step = max(1, SLAB_VOXELS // (grid.shape[0] * grid.shape[2]))
+    rows = max(1, SLAB_VOXELS // (grid.shape[0] * grid.shape[2]))
+    write_slabs(path, grid, slabs_of(obj, grid, rows, on_progress))
 
-    def slabs() -> Iterator[tuple[int, Volume]]:
-        for start in range(0, rows, step):
-            stop = min(start + step, rows)
-            block = grid.block((0, start, 0), (grid.shape[0], stop - start, grid.shape[2]))
-            yield start, obj.voxelise(block)
-            on_progress(stop / rows)
 
-    write_slabs(path, grid, slabs())
+def slabs_of(
+    obj: Object, grid: Grid, rows: int, on_progress: Advance = lambda fraction: None
+) -> Iterator[tuple[int, Volume]]:
+    """`obj` voxelised on `grid` in slabs of `rows` rows along y, each with the index of its first."""
+    for start in range(0, grid.shape[1], rows):
+        stop = min(start + rows, grid.shape[1])
+        block = grid.block((0, start, 0), (grid.shape[0], stop - start, grid.shape[2]))
+        yield start, obj.voxelise(block)
+        on_progress(stop / grid.shape[1])
 
 
 def _array(fields: Fields, name: str) -> np.ndarray:

@@ -1,0 +1,130 @@
+"""Volumes as OME-Zarr 0.4 (ngff.openmicroscopy.org/0.4): δ and β as channels, in chunks, at several resolutions.
+
+The layout is Zarr's version 2 with blosc, which every reader of OME-Zarr takes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..checks import InputError
+from ..geometry import Grid
+from ..volume import Object, Volume
+from .folder import atomic_folder, require_new
+from .hdf5_writing import require_room
+from .volumes import NAMES, SLAB_VOXELS, slabs_of
+
+ZARR_SUFFIX = ".zarr"
+CHUNK = 64
+"""Voxels along the edges of a chunk: 1 MB of float32, which programs load for one picture."""
+SMALLEST = 64
+"""The last level's longest edge has at most so many voxels."""
+MICROMETRES = 1e6
+COLOURS = ("FFFFFF", "FFB000")
+"""In which viewers show δ and β at first."""
+
+
+def require_zarr() -> Any:
+    """The package zarr; `InputError` where it is not installed."""
+    try:
+        import zarr
+    except ImportError:
+        raise InputError('OME-Zarr needs zarr; install it by pip install "holosplat[zarr]".') from None
+    return zarr
+
+
+def write_ome_zarr(path: Path, obj: Object, grid: Grid) -> None:
+    """Write δ and β of `obj` on `grid` as an OME-Zarr folder at `path`, which must be new; float32, lossless.
+
+    Axes c, z, y, x; lengths in micrometres, with the places of voxel centres (`translation`). Each level has means over
+    2 × 2 × 2 voxels of the one before, of what there is of them at the far ends. At most `SLAB_VOXELS` voxels, or a row
+    of chunks, are in memory. Errors: `InputError` without the package zarr.
+    """
+    zarr = require_zarr()
+    require_new(path)
+    require_room(path, 4 * len(NAMES) * math.prod(grid.shape) // 4)
+    rows = CHUNK * max(1, SLAB_VOXELS // (grid.shape[0] * grid.shape[2] * CHUNK))
+    with atomic_folder(path) as temporary:
+        group = zarr.open_group(store=str(temporary), mode="w", zarr_format=2)
+        shapes, limits = levels_of(grid.shape), np.array([[np.inf, -np.inf]] * len(NAMES))
+        arrays = [_array(group, str(k), shape) for k, shape in enumerate(shapes)]
+        _fill(arrays[0], slabs_of(obj, grid, rows), limits)
+        for fine, coarse in pairwise(arrays):
+            for start in range(0, coarse.shape[2], CHUNK):
+                stop = min(start + CHUNK, coarse.shape[2])
+                coarse[:, :, start:stop] = halved(fine[:, :, 2 * start : 2 * stop])
+        group.attrs.update(metadata(grid, len(shapes), limits))
+
+
+def levels_of(shape: tuple[int, int, int]) -> list[tuple[int, int, int]]:
+    """Shapes (Z, Y, X) of all levels, each half of the one before, rounded up."""
+    shapes = [shape]
+    while max(shapes[-1]) > SMALLEST:
+        z, y, x = (-(-n // 2) for n in shapes[-1])
+        shapes.append((z, y, x))
+    return shapes
+
+
+def halved(values: np.ndarray) -> np.ndarray:
+    """Means [C, Z', Y', X'] over blocks of 2³ voxels of [C, Z, Y, X]; of an odd edge, the last voxels count twice."""
+    values = np.pad(values, [(0, 0), *((0, n % 2) for n in values.shape[1:])], mode="edge")
+    c, z, y, x = values.shape
+    return values.reshape(c, z // 2, 2, y // 2, 2, x // 2, 2).mean(axis=(2, 4, 6), dtype=np.float32)
+
+
+def metadata(grid: Grid, levels: int, limits: np.ndarray) -> dict[str, Any]:
+    """What OME-Zarr says of the levels: axes, units, scales, places, and how to show the channels.
+
+    limits: least and greatest value of each channel, [2, 2].
+    """
+    axes = [{"name": "c", "type": "channel"}]
+    axes += [{"name": name, "type": "space", "unit": "micrometer"} for name in "zyx"]
+    size, origin = (np.array(v[::-1]) * MICROMETRES for v in (grid.voxel_size, grid.origin))
+    datasets = []
+    for level in range(levels):
+        factor = 2**level
+        scale = {"type": "scale", "scale": [1.0, *(size * factor).tolist()]}
+        place = {"type": "translation", "translation": [0.0, *(origin + size * (factor - 1) / 2).tolist()]}
+        datasets.append({"path": str(level), "coordinateTransformations": [scale, place]})
+    image = {"version": "0.4", "name": "refractive index", "axes": axes, "datasets": datasets, "type": "mean"}
+    channels = [
+        {"label": name, "color": colour, "active": name == "delta", "window": _window(low, high)}
+        for name, colour, (low, high) in zip(NAMES, COLOURS, limits.tolist())
+    ]
+    return {"multiscales": [image], "omero": {"version": "0.4", "channels": channels}}
+
+
+def _window(low: float, high: float) -> dict[str, float]:
+    """The range of grey values, which is never empty."""
+    high = high if high > low else low + 1.0
+    return {"min": low, "max": high, "start": low, "end": high}
+
+
+def _array(group: Any, name: str, shape: tuple[int, int, int]) -> Any:
+    from numcodecs import Blosc
+
+    return group.create_array(
+        name,
+        shape=(len(NAMES), *shape),
+        chunks=(1, *(min(CHUNK, n) for n in shape)),
+        dtype="float32",
+        compressors=Blosc(cname="zstd", clevel=5, shuffle=Blosc.SHUFFLE),
+        fill_value=0.0,
+        chunk_key_encoding={"name": "v2", "separator": "/"},
+    )
+
+
+def _fill(array: Any, slabs: Iterable[tuple[int, Volume]], limits: np.ndarray) -> None:
+    """Write slabs, and keep their least and greatest values in `limits` [2, 2]."""
+    for start, part in slabs:
+        values = np.stack([part.delta, part.beta])
+        array[:, :, start : start + values.shape[2]] = values
+        flat = values.reshape(len(NAMES), -1)
+        limits[:, 0] = np.minimum(limits[:, 0], flat.min(axis=1))
+        limits[:, 1] = np.maximum(limits[:, 1], flat.max(axis=1))

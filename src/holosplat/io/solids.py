@@ -1,0 +1,166 @@
+"""Closed bodies for other programs: binary STL, and glTF 2.0 in one file (GLB), still or moving.
+
+Lengths in both files are micrometres; a node of the GLB scales them to metres, which glTF asks for, and turns them so
+that y points up (Khronos, glTF 2.0, sections 3.4 and 5).
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..checks import require
+from ..matter import Matter
+from ..mesh import TriangleMesh
+from ..representations import MovingSurfaces
+from ..version import __version__
+from .atomic import atomic_path
+
+MICROMETRES = 1e6
+PLAY_S = 4.0
+"""How long a film of moving bodies takes: their own times, microseconds say, are too short to be seen."""
+FINE = 4
+"""Key frames of the film for each time of the scan: between them weights are straight lines, paths are splines."""
+FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+FLOAT, UNSIGNED = 5126, 5125
+VERTICES, INDICES = 34962, 34963
+"""Numbers by which glTF names types and targets of buffers."""
+
+
+def write_stl(path: Path, bodies: Sequence[TriangleMesh]) -> None:
+    """Write all bodies as one binary STL file, in micrometres (which its header says), axes as ours."""
+    require(len(bodies) > 0, "an STL file needs at least one body.")
+    corners = np.concatenate([MICROMETRES * body.vertices[body.faces] for body in bodies])
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+    facets = np.zeros(len(corners), FACET)
+    facets["corners"] = corners
+    facets["normal"] = np.divide(normals, lengths, out=np.zeros_like(normals), where=lengths > 0)
+    header = f"holosplat {__version__}: {len(bodies)} bodies, lengths in um"
+    with atomic_path(path) as temporary, temporary.open("wb") as file:
+        file.write(header.encode("ascii").ljust(80) + struct.pack("<I", len(facets)))
+        file.write(facets.tobytes())
+
+
+def write_glb(path: Path, bodies: Sequence[TriangleMesh], matter: Matter) -> None:
+    """Write still bodies as a GLB file, one node a body, with δ and β of `matter` in its extras."""
+    require(len(bodies) > 0, "a GLB file needs at least one body.")
+    file = _Glb(matter)
+    for body in bodies:
+        file.add(body.name, body.vertices, body.faces)
+    file.write(path)
+
+
+def write_moving_glb(path: Path, moving: MovingSurfaces, times: Sequence[float]) -> None:
+    """Write moving bodies as a GLB file with an animation of `PLAY_S` from the first of `times` [T] [s] to the last.
+
+    Weights of B-splines add up to one, so that a path Σ w_k c_k is c_0 + Σ w_k (c_k - c_0): the differences are morph
+    targets, and the animation gives their weights.
+    """
+    file = _Glb(moving.matter)
+    shown = np.linspace(times[0], times[-1], FINE * (len(times) - 1) + 1)
+    weights = moving.basis.weights(shown)[:, 1:]
+    paths = moving.coefficients.detach().double().numpy() * moving.unit_length
+    for number in range(moving.count):
+        used, faces = moving.body(number)
+        own = paths[:, used.numpy()]
+        file.add(f"body{number:03d}", own[0], faces.numpy(), own[1:] - own[0], weights[0])
+    if len(times) > 1 and weights.shape[1] > 0:
+        file.animate(weights, {"first_s": float(times[0]), "last_s": float(times[-1])})
+    file.write(path)
+
+
+@dataclass
+class _Glb:
+    """A glTF document as it grows, and its bytes."""
+
+    matter: Matter
+    blob: bytearray = field(default_factory=bytearray)
+    views: list[dict[str, Any]] = field(default_factory=list)
+    accessors: list[dict[str, Any]] = field(default_factory=list)
+    meshes: list[dict[str, Any]] = field(default_factory=list)
+    animations: list[dict[str, Any]] = field(default_factory=list)
+
+    def add(
+        self,
+        name: str,
+        vertices: np.ndarray,
+        faces: np.ndarray,
+        targets: np.ndarray | Sequence[np.ndarray] = (),
+        weights: np.ndarray | Sequence[float] = (),
+    ) -> None:
+        """A body of `vertices` [P, 3] [m], with morph `targets` [K, P, 3] [m] and the `weights` [K] it begins with."""
+        primitive: dict[str, Any] = {"attributes": {"POSITION": self._places(vertices)}, "material": 0}
+        primitive["indices"] = self._stored(faces.reshape(-1).astype("<u4"), "SCALAR", UNSIGNED, INDICES)
+        mesh: dict[str, Any] = {"name": name, "primitives": [primitive]}
+        if len(targets):
+            primitive["targets"] = [{"POSITION": self._places(target)} for target in targets]
+            mesh["weights"] = [float(w) for w in weights]
+        self.meshes.append(mesh)
+
+    def animate(self, weights: np.ndarray, extras: dict[str, float]) -> None:
+        """Weights [T, K] of the targets of all meshes, even over `PLAY_S`."""
+        when = np.linspace(0.0, PLAY_S, len(weights)).astype("<f4")
+        times = self._stored(when, "SCALAR", FLOAT, None, limits=True)
+        values = self._stored(weights.reshape(-1).astype("<f4"), "SCALAR", FLOAT, None)
+        channels = [{"sampler": 0, "target": {"node": 1 + mesh, "path": "weights"}} for mesh in range(len(self.meshes))]
+        sampler = {"input": times, "output": values, "interpolation": "LINEAR"}
+        self.animations.append({"name": "motion", "channels": channels, "samplers": [sampler], "extras": extras})
+
+    def write(self, path: Path) -> None:
+        """The document and its bytes as one file."""
+        text = json.dumps(self._document(), separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        blob = bytes(self.blob) + b"\0" * (-len(self.blob) % 4)
+        total = 12 + 8 + len(text) + 8 + len(blob)
+        with atomic_path(path) as temporary, temporary.open("wb") as file:
+            file.write(struct.pack("<4sII", b"glTF", 2, total))
+            file.write(struct.pack("<I4s", len(text), b"JSON") + text)
+            file.write(struct.pack("<I4s", len(blob), b"BIN\0") + blob)
+
+    def _document(self) -> dict[str, Any]:
+        note = "The accessors hold micrometres, y down; the first node scales to metres and turns y up."
+        first = {
+            "name": "object",
+            "scale": [1 / MICROMETRES] * 3,
+            "rotation": [1.0, 0.0, 0.0, 0.0],
+            "children": [1 + k for k in range(len(self.meshes))],
+        }
+        nodes = [first, *({"name": mesh["name"], "mesh": k} for k, mesh in enumerate(self.meshes))]
+        colour = {"baseColorFactor": [0.75, 0.2, 0.15, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.6}
+        extras = {"delta": self.matter.delta, "beta": self.matter.beta}
+        return {
+            "asset": {"version": "2.0", "generator": f"holosplat {__version__}", "extras": {"note": note}},
+            "scene": 0,
+            "scenes": [{"nodes": [0]}],
+            "nodes": nodes,
+            "meshes": self.meshes,
+            "materials": [{"name": "matter", "pbrMetallicRoughness": colour, "extras": extras}],
+            **({"animations": self.animations} if self.animations else {}),
+            "accessors": self.accessors,
+            "bufferViews": self.views,
+            "buffers": [{"byteLength": len(self.blob) + -len(self.blob) % 4}],
+        }
+
+    def _places(self, vertices: np.ndarray) -> int:
+        """The accessor of vertices [P, 3] [m]."""
+        scaled = (MICROMETRES * vertices).astype("<f4")
+        return self._stored(scaled, "VEC3", FLOAT, VERTICES, limits=True)
+
+    def _stored(self, values: np.ndarray, kind: str, component: int, target: int | None, limits: bool = False) -> int:
+        """The accessor of values in a view of the buffer of their own."""
+        view = {"buffer": 0, "byteOffset": len(self.blob), "byteLength": values.nbytes}
+        self.views.append(view | ({"target": target} if target else {}))
+        self.blob.extend(values.tobytes())  # always whole words of four bytes
+        accessor = {"bufferView": len(self.views) - 1, "componentType": component, "count": len(values), "type": kind}
+        if limits:
+            rows = values.reshape(len(values), -1)
+            accessor |= {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
+        self.accessors.append(accessor)
+        return len(self.accessors) - 1
