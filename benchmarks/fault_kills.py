@@ -13,12 +13,15 @@ from forked import Ended, run
 
 BLOCK = 4096
 """Bytes of a page, by which a file system in memory grows."""
+HANG, SLOWER = 60.0, 10
+"""A command hangs that takes more seconds than this, and so many times what it takes undisturbed beside the same load."""
 
 
 def killed(shop: Shop, writer: Writer, seconds: float, rng: random.Random, folder: Path) -> str:
     """Kill a command at a random moment of its `seconds`, and let the next one follow; what went wrong."""
     command = writer.command(shop, folder)
-    first = run(command, kill_after=rng.uniform(0.0, 1.1 * seconds))
+    limit = max(HANG, SLOWER * seconds)
+    first = run(command, kill_after=rng.uniform(0.0, 1.1 * seconds), limit=limit)
     if first.verdict:
         return first.verdict
     out = folder / writer.out
@@ -31,7 +34,7 @@ def killed(shop: Shop, writer: Writer, seconds: float, rng: random.Random, folde
     at_once = writer.out == "out" and not writer.again and not writer.goes_on
     if at_once and out.exists():  # a folder that is there is whole
         return "" if first.code == 0 or reads(out) else "lost"
-    second = run([*command, *writer.again] if writer.again and begun else command)
+    second = run([*command, *writer.again] if writer.again and begun else command, limit=limit)
     if second.verdict:
         return second.verdict
     if second.code != 0 or _left(folder):
