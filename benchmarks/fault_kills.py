@@ -14,7 +14,8 @@ from forked import Ended, run
 BLOCK = 4096
 """Bytes of a page, by which a file system in memory grows."""
 HANG, SLOWER = 60.0, 10
-"""A command hangs that takes more seconds than this, and so many times what it takes undisturbed beside the same load."""
+"""A command hangs that takes more seconds than this, and so many times what it takes undisturbed under the same load.
+"""
 
 
 def killed(shop: Shop, writer: Writer, seconds: float, rng: random.Random, folder: Path) -> str:

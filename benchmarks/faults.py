@@ -2,10 +2,10 @@
 
 python benchmarks/faults.py --trials 200 --csv docs/data/faults.csv
 
-Each trial is one command (or two: the next one), counted as a traceback, a hang (more than 60 s and, where it is killed,
-ten times what it takes undisturbed), a crash (a signal
-that nobody sent), a wrong result taken silently, or something lost: a file that was whole before and is no more, or a
-folder that no next command takes. Trials are drawn from the seed, and repeat with it but for moments of a kill.
+Each trial is one command (or two: the next one), counted as a traceback, a hang (more than 60 s and, where it is
+killed, ten times what it takes undisturbed), a crash (a signal that nobody sent), a wrong result taken silently, or
+something lost: a file that was whole before and is no more, or a folder that no next command takes. Trials are drawn
+from the seed, and repeat with it but for moments of a kill.
 """
 
 from __future__ import annotations

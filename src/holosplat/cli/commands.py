@@ -17,6 +17,7 @@ from .align import RefineOptions
 from .light import RunLightFlags
 from .options import BeamlineOptions, MethodOptions, PriorOptions, TruthOptions
 from .progress import INTERRUPTED, ProgressBar
+from .room import tell_reconstruction
 
 if TYPE_CHECKING:
     from ..workflows.evaluate import Evaluation
@@ -69,8 +70,11 @@ def reconstruct(
         "--refine finds each frame by itself, but --time-frame all has the same beams many times; find their one "
         "geometry with holosplat align, and reconstruct the file that it writes without --refine.",
     )
-    measured = read_as(scan, replace(reading, told=reading.told.at_middle())).in_memory()
+    measured = read_as(scan, replace(reading, told=reading.told.at_middle()))
     prior = matter.without_ranges().prior(measured.exposures.reference_energy)
+    if not measured.is_series:
+        tell_reconstruction(measured.exposures[~measured.is_test], out, method, prior, how.kind_of_matter())
+    measured = measured.in_memory()
     folder = RunFolder(out)
     if asks_for_motion(
         reading, method, how.kind_of_matter(), plain=not resume and refine is None and uncertain == Uncertain()
