@@ -4,8 +4,8 @@
 
 RUN is a finished run; of one whose matter moves, the object at each time of its frames is taken, as if each had been
 written by itself. Files: all objects as runs hold them, each in a compact file of its own, and all in one file that
-shares what does not change; the largest difference of a place between the last two is given in pixels. With --write, the
-row stands in the table in place of an earlier one of the same name.
+shares what does not change; the largest difference of a place between the last two is given in pixels. With --write,
+the row stands in the table in place of an earlier one of the same name.
 """
 
 from __future__ import annotations
