@@ -32,7 +32,7 @@ TIERS = (
     ("motion",),
     ("workflows", "beamline", "planning"),
     ("report",),
-    ("bench",),
+    ("bench", "series"),
     ("thesis",),
     ("cli",),
 )
@@ -346,7 +346,7 @@ def test_the_rule_refuses_a_bad_house(rule, path, text):
 @pytest.mark.parametrize("everything", [False, True], ids=["holosplat", "all but the readers"])
 def test_imports_are_light(everything, files):
     """No package of `HEAVY` is loaded by `import holosplat`, nor by what does not draw or talk; triton neither."""
-    readers = ("cli", "report/", "bench/pages/", "thesis/pages", "__init__")
+    readers = ("cli", "report/", "bench/pages/", "series/pages/", "thesis/pages", "__init__")
     low = [p for p in files if everything and not p.startswith(readers)]
     low = [p for p in low if not fnmatch(p, "*/cuda.py") and not fnmatch(p, "*/triton_*.py")]
     modules = ["holosplat", *("holosplat." + p.removesuffix(".py").replace("/", ".") for p in low)]

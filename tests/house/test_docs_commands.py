@@ -68,7 +68,7 @@ def silent(name: str) -> Callable[..., None]:
 def misunderstood(command: str) -> str:
     """What the parser says of a command; empty where it understands it."""
     _, name, *words = shlex.split(command)
-    if name in ("data", "bench"):  # whose acts would run: their help says what they take
+    if name in ("data", "bench", "series"):  # whose acts would run: their help says what they take
         shown = parsed(name, [words[0], "--help"])[1]
         return " ".join(word for word in words[1:] if word.startswith("--") and word not in shown)
     code, said = parsed(name, words)
@@ -105,7 +105,11 @@ def test_commands_parse(name):
 @functools.cache
 def explained(name: str) -> str:
     """The help of a command, of all its acts."""
-    acts = {"bench": ("run", "report", "thesis"), "data": ("fetch",)}.get(name, ())
+    acts = {
+        "bench": ("run", "report", "thesis"),
+        "data": ("fetch",),
+        "series": ("plan", "run", "status", "collect"),
+    }.get(name, ())
     return "".join(parsed(name, words)[1] for words in ([["--help"]] if not acts else [[a, "--help"] for a in acts]))
 
 

@@ -58,6 +58,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "track",
         "Follow closed bodies through the times of a scan: their shapes on smooth paths, into a run folder.",
     ),
+    "series": (
+        "series",
+        "Reconstruct a series as tasks of their own: on this machine, by Slurm, on Dask (plan, run, status, collect).",
+    ),
     "forecast": (
         "forecast",
         "Carry a run of track on: its bodies and their frames at later times, with a standard error.",

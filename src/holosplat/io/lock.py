@@ -8,12 +8,29 @@ import socket
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ..checks import InputError
 from .folder import require_parent
 from .leftovers import LOCK, clear_all_leftovers, is_alive, temporary_name
+
+
+class TakenError(InputError):
+    """Another process writes to the folder."""
+
+
+@dataclass(frozen=True)
+class Writer:
+    """Who writes to a folder: its machine and process, since when; gone: whether it was of this machine and is no
+    more."""
+
+    host: str
+    process: int
+    since: str
+    gone: bool
+
 
 _held: set[Path] = set()
 """Folders that this process writes already."""
@@ -48,6 +65,17 @@ def sole_writer(folder: Path) -> Iterator[None]:
             path.rmdir()  # which fails unless it is empty
 
 
+def writer_of(folder: Path) -> Writer | None:
+    """Who writes to `folder` by its lock; None where nobody does."""
+    text = _text(Path(folder) / LOCK)
+    if text is None:
+        return None
+    holder = _holder(text)
+    number = holder.get("process")
+    process = number if isinstance(number, int) else 0
+    return Writer(str(holder.get("host", "?")), process, str(holder.get("since", "?")), _is_stale(holder))
+
+
 def _take(lock: Path, folder: Path) -> None:
     """Put a lock of this process there; `InputError` where there is one of another process."""
     for _ in range(5):
@@ -59,12 +87,12 @@ def _take(lock: Path, folder: Path) -> None:
         holder = _holder(seen)
         if not _is_stale(holder):
             where = f"process {holder.get('process', '?')} on {holder.get('host', 'an unknown machine')}"
-            raise InputError(
+            raise TakenError(
                 f"{folder} must have one writer, but {where} writes to it since {holder.get('since', '?')}; wait for "
                 f"its end, or remove {lock} if there is no such process any more."
             )
         _remove(lock, seen)
-    raise InputError(f"{folder} must have one writer, but several try to be it; try again.")
+    raise TakenError(f"{folder} must have one writer, but several try to be it; try again.")
 
 
 def _placed(lock: Path) -> bool:

@@ -1,0 +1,281 @@
+"""`holosplat series`: many times as tasks of their own, on this machine, by Slurm, or on a Dask cluster."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg, subcommand
+
+from ..checks import require
+from ..io.reading import Reading
+from ..ranges import Natural, Positive, Seed, ranged, with_checked_numbers
+from .light import RunLightFlags
+from .options import MethodOptions, PriorOptions
+from .progress import INTERRUPTED
+from .track import BodyFlags, MotionFlags
+
+if TYPE_CHECKING:
+    from ..series.folder import SeriesFolder
+    from ..series.plan import Cut
+    from ..series.run import Counts
+    from ..series.settings import Settings
+
+LIGHT = RunLightFlags()
+"""Even, unless the air of frames says otherwise."""
+UNFINISHED = 4
+"""Exit code of `series run` and `collect` where tasks failed or are left."""
+
+
+@dataclass(frozen=True)
+@ranged
+class WindowFlags:
+    """How times are cut into tasks."""
+
+    window: Natural = 16
+    """Times of a task. With --warm the first of them takes as long as ten others, which go on from the one before."""
+    overlap: int = 0
+    """Times before its own that a task also does: a run-in, and what says how well tasks agree."""
+
+    def cut(self) -> Cut:
+        """The cut."""
+        from ..series.plan import Cut
+
+        return Cut(self.window, self.overlap)
+
+
+@dataclass(frozen=True)
+@ranged
+class EachTime:
+    """What is done with each time."""
+
+    track: bool = False
+    """Follow closed bodies through all times of a task, as holosplat track does; else each time is reconstructed."""
+    warm: bool = True
+    """Begin each time with what the one before ended with, with fewer steps; where that does not explain its frames, it
+    begins anew, by itself. --no-warm: each begins by itself."""
+    worse: Positive = 1.25
+    """Factor of the matter left unexplained, over that of the last time begun alone, beyond which it begins anew."""
+    reports: bool = False
+    """Write report.html of each run, too, which takes seconds a time."""
+
+
+EACH, WINDOWS, MOTION, UNKNOWN = EachTime(), WindowFlags(), MotionFlags(), BodyFlags()
+"""What is done without options."""
+
+
+def settings_of(
+    each: EachTime, how: MethodOptions, motion: MotionFlags, known: BodyFlags, light: RunLightFlags, seed: int
+) -> Settings:
+    """What options say is done with each time; `InputError` for options of the other act."""
+    from dataclasses import replace
+
+    from ..series.settings import Settings, Warm
+
+    stray = _changed(motion, known) if not each.track else _changed(how)
+    other = "goes with --track" if not each.track else "is of reconstruct; leave it, or --track"
+    require(not stray, f"--{stray[0].replace('_', '-') if stray else ''} {other}.")
+    shared = {"light": light.options(), "seed": seed, "reports": each.reports}
+    if each.track:
+        return Settings("track", motion=replace(motion.options(), body=known.known()), **shared)
+    warm = Warm(each.warm, each.worse)
+    return Settings("reconstruct", how.chosen(), how.kind_of_matter(), warm, **shared)
+
+
+def _changed(*groups: object) -> list[str]:
+    """Names of fields that are not as they are without options."""
+    pairs = [(group, type(group)()) for group in groups]
+    return [name for group, usual in pairs for name, value in vars(group).items() if value != getattr(usual, name)]
+
+
+@dataclass(frozen=True)
+@ranged
+class SlurmFlags:
+    """A Slurm array script, FOLDER/slurm.sh, of the tasks that are left, one in each job."""
+
+    slurm: bool = False
+    """Write it."""
+    submit: bool = False
+    """Write it, and submit it by sbatch."""
+    partition: str = ""
+    """Partition (default: the cluster's)."""
+    time: str = "01:00:00"
+    """Time limit of a task; a minute before, it is saved."""
+    memory: str = ""
+    """Memory of a task, such as 8G (default: the cluster's; some refuse to be asked)."""
+    cpus: Natural = 4
+    """Cores of a task, and its threads."""
+    limit: int = 0
+    """Tasks that run at the same time, at most (0: as many as there is room for)."""
+    account: str = ""
+    """Account that is charged."""
+    gres: str = ""
+    """Generic resources, such as gpu:1."""
+
+    def carry_out(self, folder: SeriesFolder, retry: bool) -> None:
+        """Write the script, and submit it if that is asked for."""
+        from ..series.slurm import Slurm, submit, write_script
+
+        said = {name: value for name, value in vars(self).items() if name not in ("slurm", "submit")}
+        count, numbers = write_script(folder, Slurm(**said), retry)
+        _say(f"wrote {folder.script} for {count} task(s): {numbers}")
+        if self.submit:
+            print(submit(folder))
+            return
+        _say(f"submit it by: sbatch {folder.script}")
+
+
+NO_SLURM = SlurmFlags()
+"""It is not asked for."""
+
+
+def plan(
+    scans: Positional[tuple[Path, ...]],
+    out: Path,
+    windows: WindowFlags = WINDOWS,
+    each: EachTime = EACH,
+    matter: PriorOptions = PriorOptions(),
+    how: MethodOptions = MethodOptions(),
+    motion: MotionFlags = MOTION,
+    *,
+    known: BodyFlags = UNKNOWN,
+    illumination: RunLightFlags = LIGHT,
+    reading: Reading = Reading(),
+    seed: Seed = 0,
+) -> None:
+    """Cut a series into tasks, in a new folder; nothing is reconstructed yet.
+
+    Args:
+        scans: A scan of many times, or the scans of a series in their order, one or more times each, or a folder of
+            scan files, whose order is that of their names.
+        out: Folder of the series to make.
+        seed: Seed of everything random.
+    """
+    from ..series.folder import SeriesFolder
+    from ..series.plan import plan_series
+    from ..series.sources import listed
+
+    require(not matter.ranges(), "a series needs one number for --delta-beta; find it by reconstruct of one time.")
+    settings = settings_of(each, how, motion, known, illumination, seed)
+    folder = SeriesFolder(out)
+    found = plan_series(listed(scans), settings, matter.prior, reading, windows.cut())
+    folder.create(found)
+    tasks, times = len(found.windows()), len(found.moments())
+    _say(f"{out}: {times} times of {len(found.sources)} scan(s) in {tasks} task(s); now: holosplat series run {out}")
+
+
+def run(
+    folder: Positional[Path],
+    task: Positional[int | None] = None,
+    jobs: int = 0,
+    retry: bool = False,
+    dask: str | None = None,
+    cluster: SlurmFlags = NO_SLURM,
+) -> None:
+    """Do one task of a series, or all that are left; what is done already is not done again.
+
+    Without a task, all that are left are done in this process, one after another; any number of such processes may run
+    at once, on any machines that see the folder. Exit code 4: some failed, or are left.
+
+    Args:
+        folder: Folder of the series.
+        task: Number of the task, from 0 on.
+        jobs: Or: all that are left, by so many processes of this machine, with cores / jobs threads each.
+        retry: Do failed tasks again.
+        dask: Or: all that are left, on the Dask cluster whose scheduler has this address, such as tcp://host:8786.
+    """
+    from ..series.folder import SeriesFolder
+    from ..series.run import counted, run_left, run_processes
+    from ..series.task import run_task
+
+    ways = [task is not None, jobs != 0, dask is not None, cluster.slurm or cluster.submit]
+    require(sum(ways) < 2, "give one of a task's number, --jobs, --dask and --slurm.")
+    series = SeriesFolder(folder)
+    if cluster.slurm or cluster.submit:
+        cluster.carry_out(series, retry)
+        return
+    try:
+        if task is not None:
+            counts = counted([run_task(series, task, _tell_row)])
+        elif dask is not None:
+            from ..series.dask_cluster import run_on_dask
+
+            counts = run_on_dask(series, dask, retry, lambda state: _say(f"task {state.number}: {state.state}"))
+        elif jobs:
+            counts = run_processes(series, jobs, retry)
+        else:
+            counts = run_left(series, retry, _tell_row)
+    except KeyboardInterrupt:
+        _say(f"interrupted; what {folder} holds is whole, and the same command goes on from there")
+        raise SystemExit(INTERRUPTED) from None
+    _end(series, counts)
+
+
+def _tell_row(row: object) -> None:
+    from ..series.rows import Row
+
+    assert isinstance(row, Row)
+    said = f"{row.begun}, {row.size}, {row.seconds:.1f} s" if row.done else f"failed: {row.reason}"
+    _say(f"time {row.number}: {said}")
+
+
+def _end(series: SeriesFolder, counts: Counts) -> None:
+    """Say how far a series is; exit code 4 where something failed or is left."""
+    said = f"{counts.done} done, {counts.running} running, {counts.failed} failed, {counts.left} left"
+    _say(f"{series.path}: {said}; holosplat series status|collect {series.path} say more")
+    if counts.failed or counts.left:
+        raise SystemExit(UNFINISHED)
+
+
+def status(folder: Positional[Path]) -> None:
+    """Say how far each task of a series is: done, running where, failed why, or left, and how long the rest takes.
+
+    Args:
+        folder: Folder of the series.
+    """
+    from ..series.folder import SeriesFolder
+    from ..series.run import states
+    from ..series.words import table_of, time_left
+
+    found = states(SeriesFolder(folder))
+    for line in table_of(found):
+        print(line)
+    print(time_left(found))
+
+
+def collect(folder: Positional[Path]) -> None:
+    """Join what the tasks of a series have done: series.csv, bodies.csv, and a page; what is missing is said.
+
+    Exit code 4: something is missing.
+
+    Args:
+        folder: Folder of the series.
+    """
+    from ..series.collect import collect as join
+    from ..series.collect import some
+    from ..series.folder import SeriesFolder
+
+    found = join(series := SeriesFolder(folder))
+    for path in (series.table, series.bodies, series.page):
+        _say(f"wrote {path}")
+    if found.missing:
+        _say(f"{len(found.missing)} of {len(found.moments)} times are missing: {some(found.missing)}")
+        raise SystemExit(UNFINISHED)
+
+
+def series(
+    act: Annotated[
+        Annotated[None, subcommand("plan", constructor=with_checked_numbers(plan))]
+        | Annotated[None, subcommand("run", constructor=with_checked_numbers(run))]
+        | Annotated[None, subcommand("status", constructor=with_checked_numbers(status))]
+        | Annotated[None, subcommand("collect", constructor=with_checked_numbers(collect))],
+        arg(name=""),
+    ],
+) -> None:
+    """Reconstruct a series as tasks of their own: on this machine, by Slurm, on Dask (plan, run, status, collect)."""
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)

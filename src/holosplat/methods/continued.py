@@ -1,0 +1,102 @@
+"""A fit that goes on from the result of another run: the same matter a little later, or the same frames once more."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import ClassVar
+
+from ..checks import InputError, require
+from ..fit.loop import Fit
+from ..io.objects import read_object
+from ..ranges import Natural, ranged
+from ..representations import GaussianCloud, Stored, SurfaceMesh, VoxelGrid
+from .auto import Auto
+from .gaussians import Gaussians, GaussianStage
+from .method import Method, Stage, Task
+from .smooth_fit import SmoothFit
+from .surfaces import SurfaceOptions, Surfaces, SurfaceStage
+from .volume import SmoothStage, SmoothVolume
+
+
+@dataclass(frozen=True)
+@ranged
+class Effort:
+    """How long a fit that goes on takes: matter has moved by a pixel or less, and is else as it was."""
+
+    surfaces: Natural = 20
+    """Steps of surfaces, which take 100 from a start of Gaussians: of cells that had moved by 0.3 pixels, 15, 30 and 60
+    leave the same unexplained, to 1 part in 300."""
+    gaussians: Natural = 30
+    """Steps of Gaussians."""
+    volume: Natural = 8
+    """Iterations of a smooth volume on voxels of a pixel, in one round."""
+
+
+@dataclass(frozen=True)
+class Continued:
+    """The object of another run, fitted to these frames with few steps; no phase retrieval, no tomography."""
+
+    kind: ClassVar[str] = "continued"
+    wants_levels: ClassVar[bool] = False
+    """It was decided by the run that it goes on from."""
+
+    begin: Path
+    """The object file that it begins with (object.h5)."""
+    gaussians: Gaussians = field(default_factory=Gaussians)
+    surfaces: SurfaceOptions = field(default_factory=SurfaceOptions)
+    volume: SmoothVolume = field(default_factory=SmoothVolume)
+    effort: Effort = field(default_factory=Effort)
+
+    @classmethod
+    def of(cls, method: Method, begin: Path, effort: Effort = Effort()) -> Continued:
+        """What goes on in the way of `method`; `InputError` for one whose fits begin with nothing else than frames."""
+        if isinstance(method, Auto):
+            return cls(begin, method.gaussians, method.surfaces, method.volume, effort)
+        if isinstance(method, Surfaces):
+            return cls(begin, method.gaussians, SurfaceOptions(method.extraction, method.fit), effort=effort)
+        if isinstance(method, Gaussians):
+            return cls(begin, method, effort=effort)
+        if isinstance(method, SmoothVolume):
+            return cls(begin, volume=method, effort=effort)
+        raise InputError(
+            f"runs of auto, gaussians, surfaces and volume can be gone on from, but the method is {method.kind}; "
+            "choose one of these."
+        )
+
+    def stages(self) -> Sequence[Stage]:
+        """One: what the other run found, and the fit."""
+        return (ContinuedStage(self),)
+
+
+@dataclass(frozen=True)
+class ContinuedStage:
+    """The fit of what another run found."""
+
+    options: Continued
+    name: str = "fit from before"
+
+    def start(self, task: Task, before: Stored | None) -> Stored:
+        """The object of the other run. Errors: `InputError` for one of another field or kind."""
+        found = read_object(self.options.begin)
+        require(
+            isinstance(found, SurfaceMesh | GaussianCloud | VoxelGrid),
+            f"{self.options.begin} must hold surfaces, Gaussians or voxels to go on from, but it holds {found.kind}; "
+            "start without it.",
+        )
+        return found
+
+    def fit(self, task: Task, start: Stored) -> Fit | SmoothFit:
+        """The fit to the training frames, of few steps."""
+        options, effort = self.options, self.options.effort
+        if isinstance(start, SurfaceMesh):
+            fit = options.surfaces.fit
+            fewer = replace(fit, schedule=replace(fit.schedule, steps=effort.surfaces))
+            return SurfaceStage(replace(options.surfaces, fit=fewer)).fit(task, start)
+        if isinstance(start, GaussianCloud):
+            fit = options.gaussians.fit
+            fewer = replace(fit, schedule=replace(fit.schedule, steps=effort.gaussians))
+            return GaussianStage(replace(options.gaussians, fit=fewer)).fit(task, start)
+        short = replace(options.volume, coarser=(), rounds=1, iterations=effort.volume)
+        return SmoothStage(short).fit(task, start)

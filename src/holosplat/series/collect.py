@@ -1,0 +1,205 @@
+"""All tasks of a series in one table, one list of bodies, and one page; what is missing is said."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from ..io.atomic import atomic_path
+from .folder import SeriesFolder, TaskState
+from .plan import Moment, SeriesPlan
+from .rows import Body, Row
+from .time import PHASE
+from .words import plain, time_left
+
+if TYPE_CHECKING:
+    from .pages.page import SeriesPage
+
+COLUMNS = (
+    *("number", "scan", "frame", "time_s", "task", "status", "begun", "kind", "explained", "unexplained"),
+    *("test_ssim", "test_frcm", "train_ssim", "train_frcm", "total_m3", "total_error_m3", "bodies", "seconds"),
+    *("run", "reason"),
+)
+BODY_COLUMNS = ("number", "time_s", "body", "x_m", "y_m", "z_m", "volume_m3")
+
+
+@dataclass(frozen=True)
+class Collected:
+    """A series with what is known of it. rows: of each time, None where it is missing; task: that it is of; runs: its
+    run folder; agreement: mean distance [m] of bodies at times that two tasks have done, by the later task."""
+
+    plan: SeriesPlan
+    states: tuple[TaskState, ...]
+    moments: tuple[Moment, ...]
+    rows: tuple[Row | None, ...]
+    tasks: tuple[int, ...]
+    runs: tuple[Path, ...]
+    bodies: tuple[tuple[int, ...], ...]
+    agreement: dict[int, float] = field(default_factory=dict)
+
+    @property
+    def missing(self) -> list[int]:
+        """Numbers of the times that have no result."""
+        return [m.number for m, row in zip(self.moments, self.rows) if row is None or not row.done]
+
+
+def collected(folder: SeriesFolder) -> Collected:
+    """What the tasks of a series have done so far; of a time that two have, the result of whose own it is."""
+    plan = folder.plan()
+    windows = plan.windows()
+    found, early, task_of, run_of = dict[int, Row](), dict[int, dict[int, Row]](), dict[int, int](), dict[int, Path]()
+    for window in windows:
+        rows = {row.number: row for row in folder.rows(window)}
+        early[window.number] = {m.number: rows[m.number] for m in window.moments[: window.early] if m.number in rows}
+        for moment in window.own:
+            task_of[moment.number] = window.number
+            tracked = plan.settings.act == "track"
+            run_of[moment.number] = (
+                folder.task(window.number) / "run" if tracked else folder.run(window.number, moment.number)
+            )
+            if moment.number in rows:
+                found[moment.number] = rows[moment.number]
+    moments = tuple(plan.moments())
+    rows = tuple(found.get(m.number) for m in moments)
+    names, agreement = _named(moments, found, early, task_of)
+    return Collected(
+        plan,
+        tuple(folder.state(window) for window in windows),
+        moments,
+        rows,
+        tuple(task_of[m.number] for m in moments),
+        tuple(run_of[m.number] for m in moments),
+        tuple(names.get(m.number, ()) for m in moments),
+        agreement,
+    )
+
+
+def _named(
+    moments: Sequence[Moment], rows: dict[int, Row], early: dict[int, dict[int, Row]], task_of: dict[int, int]
+) -> tuple[dict[int, tuple[int, ...]], dict[int, float]]:
+    """Identities of the bodies at each time, and how well tasks agree.
+
+    A body keeps its name from one time to the next; a task that has times of the one before is joined at the last of
+    these, where both show the same bodies.
+    """
+    names, agreement, count = dict[int, tuple[int, ...]](), dict[int, float](), 0
+    known: tuple[Sequence[Body], tuple[int, ...]] = ((), ())
+    for moment in moments:
+        row = rows.get(moment.number)
+        if row is None or not row.bodies:
+            continue
+        task, before = task_of[moment.number], early.get(task_of[moment.number], {})
+        last = before.get(moment.number - 1)
+        if last is not None and moment.number - 1 in names and task_of[moment.number - 1] != task:
+            mine, count = same_bodies(rows[moment.number - 1].bodies, names[moment.number - 1], last.bodies, count)
+            agreement[task] = _apart(rows[moment.number - 1].bodies, names[moment.number - 1], last.bodies, mine)
+            known = last.bodies, mine
+        names[moment.number], count = same_bodies(*known, row.bodies, count)
+        known = row.bodies, names[moment.number]
+    return names, agreement
+
+
+def same_bodies(
+    before: Sequence[Body], names: tuple[int, ...], now: Sequence[Body], count: int
+) -> tuple[tuple[int, ...], int]:
+    """Names of the bodies `now`: those of the nearest `before`, one to one, within a radius; new ones go on from
+    `count`, which is returned raised."""
+    given = [-1] * len(now)
+    if before and now:
+        a, b = np.array(before), np.array(now)
+        distance = np.linalg.norm(a[:, None, :3] - b[None, :, :3], axis=-1)
+        reach = np.cbrt(0.75 / np.pi * np.maximum(a[:, 3], 0.0))[:, None]
+        for i, j in zip(*linear_sum_assignment(np.minimum(distance / np.maximum(reach, 1e-30), 10.0))):
+            if distance[i, j] <= reach[i, 0]:
+                given[j] = names[i]
+    for j, name in enumerate(given):
+        if name < 0:
+            given[j], count = count, count + 1
+    return tuple(given), count
+
+
+def _apart(first: Sequence[Body], names: tuple[int, ...], second: Sequence[Body], others: tuple[int, ...]) -> float:
+    """Mean distance [m] between bodies of one name; NaN where there is none."""
+    places = dict(zip(others, (np.array(body[:3]) for body in second)))
+    found = [float(np.linalg.norm(np.array(b[:3]) - places[n])) for b, n in zip(first, names) if n in places]
+    return float(np.mean(found)) if found else float("nan")
+
+
+def collect(folder: SeriesFolder) -> Collected:
+    """Write series.csv, bodies.csv and series.html of what is done so far."""
+    from .pages.page import write_page  # which needs matplotlib
+
+    found = collected(folder)
+    _write_csv(folder.table, COLUMNS, _lines(folder, found))
+    _write_csv(folder.bodies, BODY_COLUMNS, _body_lines(found))
+    write_page(folder.page, page_of(folder, found))
+    return found
+
+
+def _write_csv(path: Path, head: Sequence[str], lines: Iterable[Sequence[object]]) -> None:
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(head)
+        writer.writerows(lines)
+
+
+def _lines(folder: SeriesFolder, found: Collected) -> Iterable[list[object]]:
+    states = {state.number: state for state in found.states}
+    for moment, row, task, run in zip(found.moments, found.rows, found.tasks, found.runs):
+        source = str(found.plan.sources[moment.source].path)
+        where: list[object] = [moment.number, source, moment.frame, f"{moment.time:.9g}", task]
+        if row is None or not row.done:
+            status = "failed" if row is not None else states[task].state.replace("done", "left")
+            yield [*where, status, *[""] * (len(COLUMNS) - 7), row.reason if row else states[task].reason]
+            continue
+        scores = [_number(part.get(name)) for part in (row.test, row.train) for name in ("ssim", "frcm")]
+        said = [row.begun, row.kind, "" if row.good is None else int(row.good), _number(row.unexplained), *scores]
+        told = [_number(row.total), _number(row.total_error), len(row.bodies), f"{row.seconds:.3f}"]
+        yield [*where, "done", *said, *told, run.relative_to(folder.path).as_posix(), ""]
+
+
+def _body_lines(found: Collected) -> Iterable[list[object]]:
+    for moment, row, names in zip(found.moments, found.rows, found.bodies):
+        if row is not None:
+            for name, body in sorted(zip(names, row.bodies)):
+                yield [moment.number, f"{moment.time:.9g}", name, *(f"{value:.6g}" for value in body)]
+
+
+def _number(value: object) -> str:
+    return "" if value is None else f"{float(str(value)):.6g}"
+
+
+def page_of(folder: SeriesFolder, found: Collected) -> SeriesPage:
+    """What series.html shows."""
+    from .pages.page import Frame, SeriesPage
+
+    frames = []
+    for moment, row, run, names in zip(found.moments, found.rows, found.runs, found.bodies):
+        if row is not None and row.done:
+            tracked = found.plan.settings.act == "track"
+            phase = run / (f"t{moment.number:04d}.{PHASE}" if tracked else PHASE)
+            frames.append(Frame(row, moment.time, phase, run.relative_to(folder.path).as_posix(), names))
+    failed = {f"task {s.number}": plain(s.reason) for s in found.states if s.state == "failed"}
+    missing = len(found.missing)
+    verdict = "All times are done." if not missing else f"{missing} of {len(found.moments)} times are missing."
+    unexplained = [frame.row.number for frame in frames if frame.row.good is False]
+    if unexplained:
+        verdict += f" The frames of {len(unexplained)} are not explained: {some(unexplained)}."
+    notes = [
+        f"task {task}: bodies are {1e6 * apart:.3g} µm from where the task before has them"
+        for task, apart in found.agreement.items()
+        if apart == apart
+    ]
+    return SeriesPage("A series", verdict, f"{time_left(found.states)}.", tuple(frames), failed, tuple(notes))
+
+
+def some(numbers: Sequence[int], most: int = 12) -> str:
+    """The first of some numbers."""
+    shown = ", ".join(str(number) for number in numbers[:most])
+    return shown if len(numbers) <= most else f"{shown} …"

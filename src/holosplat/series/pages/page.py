@@ -1,0 +1,203 @@
+"""The page of a series: what every time gave, with a phase map to page through; of `watch`, kept up to date."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from markupsafe import Markup
+from PIL import Image
+
+from ...io.atomic import atomic_path
+from ...report.page import template
+from ...report.style import scientific
+from ..rows import Row
+from .charts import Point, chart
+
+MOST_PICTURES = 160
+"""Times whose phase map a page holds, at most: evenly chosen, about 8 kB each."""
+MOST_ROWS = 2000
+"""Times in its table, at most, the last ones."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A time that is done: its row, its time [s], the file of its phase map, its run relative to the page, and the
+    names of its bodies."""
+
+    row: Row
+    time: float
+    phase: Path
+    run: str
+    names: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class SeriesPage:
+    """What a page shows. failed: reasons by what failed; refresh: seconds after which a browser reads it again; 0:
+    never."""
+
+    title: str
+    verdict: str
+    summary: str
+    frames: tuple[Frame, ...]
+    failed: Mapping[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+    refresh: float = 0.0
+
+
+def write_page(path: Path, page: SeriesPage) -> None:
+    """Write the page as one self-contained HTML file, whole or not at all."""
+    text = render_page(page)
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def render_page(page: SeriesPage) -> str:
+    """The page as HTML."""
+    shown = [page.frames[i] for i in _evenly(len(page.frames))]
+    maps = [(frame, _read(frame.phase)) for frame in shown]
+    kept = [(frame, phase) for frame, phase in maps if phase is not None]
+    low, high = _limits([phase for _, phase in kept])
+    pictures = [
+        {
+            "number": frame.row.number,
+            "label": f"time {frame.row.number}, {frame.time:.6g} s",
+            "image": _png(phase, low, high),
+        }
+        for frame, phase in kept
+    ]
+    return template("series.html", __package__ or "").render(
+        title=page.title,
+        verdict=page.verdict,
+        summary=page.summary,
+        key_figures=key_figures(page.frames),
+        pictures=pictures,
+        limits=f"{low:.3g} to {high:.3g} rad",
+        charts=_charts(page.frames),
+        rows=[_cells(frame) for frame in page.frames[-MOST_ROWS:]],
+        failed=page.failed,
+        notes=page.notes,
+        refresh=int(1000 * page.refresh),
+    )
+
+
+def key_figures(frames: Sequence[Frame]) -> list[tuple[str, str, str]]:
+    """Name, value and remark of a few numbers."""
+    rows = [frame.row for frame in frames]
+    if not rows:
+        return []
+    warm = [row.seconds for row in rows if row.begun == "warm"]
+    alone = [row.seconds for row in rows if row.begun != "warm"]
+    found = [("Times", str(len(rows)), f"{len(warm)} begun warm")]
+    found += [("A warm time", f"{np.median(warm):.2g} s", "median")] if warm else []
+    found += [("A time by itself", f"{np.median(alone):.2g} s", "median")] if alone else []
+    if rows[-1].total is not None:
+        error = rows[-1].total_error
+        remark = "" if error is None else f"± {100 * error / abs(rows[-1].total or 1):.2g} %"
+        found.append(
+            (f"Total {rows[-1].quantity}, m³", scientific(rows[-1].total), f"of the last time {remark}".strip())
+        )
+    if rows[-1].bodies:
+        found.append(("Bodies", str(len(rows[-1].bodies)), "at the last time"))
+    return found
+
+
+def _charts(frames: Sequence[Frame]) -> list[Markup]:
+    rows = [frame.row for frame in frames]
+    totals = [Point(r.number, r.total, r.total_error or 0.0, r.good is False) for r in rows if r.total is not None]
+    left = [Point(r.number, 100 * r.unexplained, marked=r.good is False) for r in rows if r.unexplained is not None]
+    part = "test" if any(row.test for row in rows) else "train"
+    scores = [
+        Point(r.number, float(value), marked=r.good is False)
+        for r in rows
+        if isinstance(value := getattr(r, part).get("ssim"), int | float)
+    ]
+    seconds = [Point(r.number, r.seconds) for r in rows]
+    quantity = rows[-1].quantity if rows else "δ"
+    drawn = [
+        chart(totals, f"Total {quantity} [m³] over the number of the time"),
+        chart(left, "Matter that training frames leave unexplained [%]", 0.0),
+        chart(scores, f"SSIM of the {'held-out' if part == 'test' else 'training'} frames"),
+        chart(seconds, "Seconds a time", 0.0),
+    ]
+    return [one for one in drawn if one]
+
+
+def _cells(frame: Frame) -> dict[str, object]:
+    row = frame.row
+    part = row.test or row.train
+    scores = [f"{float(v):.4f}" if isinstance(v := part.get(name), int | float) else "" for name in ("ssim", "frcm")]
+    total = "" if row.total is None else scientific(row.total)
+    error = f" ± {scientific(row.total_error, 2)}" if row.total is not None and row.total_error is not None else ""
+    explained = {True: "yes", False: "no", None: ""}[row.good]
+    left = "" if row.unexplained is None else f"{100 * row.unexplained:.3g} %"
+    bodies = str(len(row.bodies)) if row.bodies else ""
+    cells = [
+        f"{frame.time:.6g}",
+        row.begun,
+        row.size,
+        explained,
+        left,
+        *scores,
+        total + error,
+        bodies,
+        f"{row.seconds:.1f}",
+    ]
+    return {"number": row.number, "run": frame.run, "cells": cells, "scan": Path(row.scan).name}
+
+
+def _evenly(count: int) -> list[int]:
+    if count <= MOST_PICTURES:
+        return list(range(count))
+    return sorted(set(np.linspace(0, count - 1, MOST_PICTURES).round().astype(int).tolist()))
+
+
+def _read(path: Path) -> np.ndarray | None:
+    """A phase map; None where there is none that can be read."""
+    try:
+        found = np.load(path, allow_pickle=False)
+    except (OSError, ValueError):
+        return None
+    return found.astype(np.float32) if found.ndim == 2 and found.dtype.kind == "f" else None
+
+
+def _limits(maps: Sequence[np.ndarray]) -> tuple[float, float]:
+    values = [m[np.isfinite(m)] for m in maps]
+    low = min((float(v.min()) for v in values if v.size), default=-1.0)
+    high = max((float(v.max()) for v in values if v.size), default=0.0)
+    return (low, high) if high > low else (low - 1.0, low)
+
+
+def _png(phase: np.ndarray, low: float, high: float) -> str:
+    """A phase map as a `data:` URI, black where it is zero and bright where it is largest."""
+    bright = (phase - low) / (high - low) if abs(high) > abs(low) else (high - phase) / (high - low)
+    image = Image.fromarray(np.rint(255 * np.clip(np.nan_to_num(bright), 0, 1)).astype(np.uint8))
+    image.putpalette(_palette())
+    content = io.BytesIO()
+    image.save(content, format="PNG", optimize=True)
+    return f"data:image/png;base64,{base64.b64encode(content.getvalue()).decode()}"
+
+
+ANCHORS = (
+    (0, 0, 4),
+    (28, 16, 68),
+    (79, 18, 123),
+    (129, 37, 129),
+    (181, 54, 122),
+    (229, 80, 100),
+    (251, 135, 97),
+    (254, 194, 135),
+    (252, 253, 191),
+)
+"""Nine colours of matplotlib's map magma, evenly spaced; what lies between them is interpolated."""
+
+
+def _palette() -> list[int]:
+    at, given = np.linspace(0, 1, 256), np.linspace(0, 1, len(ANCHORS))
+    colours = [np.interp(at, given, [anchor[c] for anchor in ANCHORS]) for c in range(3)]
+    return np.rint(np.stack(colours, 1)).astype(int).ravel().tolist()

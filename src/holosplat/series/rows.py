@@ -1,0 +1,73 @@
+"""What came of one time of a series, as a small JSON file beside its result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal
+
+from ..checks import as_written, require
+from ..io.json import read_json, write_json
+
+ROW = "row.json"
+Begun = Literal["", "cold", "warm", "anew"]
+Body = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class Row:
+    """One time. number: of the series; scan, frame, time_s: where it comes from.
+
+    - status: `done`, or `failed` for the `reason` given
+    - begun: `cold`, by itself; `warm`, with what the time before ended with; `anew`, by itself, for warm was not enough
+    - kind, size: of the object; unexplained: share of the matter that training frames leave; reference: the same of the
+      last time that began by itself; good: whether frames are explained; words: that in a sentence
+    - test, train: means over held-out and training frames: ssim, frcm, psnr [dB], l1; empty where there are none
+    - quantity, total, total_error: the total of δ or β and its standard error [m³]
+    - bodies: centre x, y, z [m] and volume [m³] of each closed body
+    - seconds: of wall time
+    """
+
+    number: int
+    scan: str
+    frame: int
+    time_s: float
+    status: Literal["done", "failed"]
+    reason: str = ""
+    begun: Begun = ""
+    kind: str = ""
+    size: str = ""
+    unexplained: float | None = None
+    reference: float | None = None
+    good: bool | None = None
+    words: str = ""
+    test: Mapping[str, Any] = field(default_factory=dict)
+    train: Mapping[str, Any] = field(default_factory=dict)
+    quantity: str = ""
+    total: float | None = None
+    total_error: float | None = None
+    bodies: tuple[Body, ...] = ()
+    seconds: float = 0.0
+
+    @property
+    def done(self) -> bool:
+        """Whether there is a result."""
+        return self.status == "done"
+
+
+def write_row(path: Path, row: Row) -> None:
+    """Write a row, whole or not at all."""
+    write_json(path, asdict(row))
+
+
+def read_row(path: Path) -> Row:
+    """The row that `write_row` wrote; `InputError` for anything else."""
+    values = read_json(path)
+    with as_written(path, "a row of a series"):
+        odd = sorted({f.name for f in fields(Row)} ^ set(values))
+        require(not odd, f"it differs in {', '.join(odd)} from this version's.")
+        bodies = tuple((float(x), float(y), float(z), float(v)) for x, y, z, v in values.pop("bodies"))
+        row = Row(**values, bodies=bodies)
+        require(row.status in ("done", "failed") and isinstance(row.number, int), "its status or number is odd.")
+        return row

@@ -1,0 +1,123 @@
+"""A Slurm array script for the tasks of a series that are left: written, and submitted only when asked for."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from ..checks import InputError, require
+from ..io.atomic import atomic_path
+from ..ranges import Natural, ranged
+from .folder import SeriesFolder
+from .run import PROGRAM, states
+
+WORD = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.,:+-]*")
+"""What partitions, accounts, memory and times may be: nothing that a shell or sbatch would read otherwise."""
+MOST_SECONDS = 60
+"""How long sbatch may take [s]."""
+
+
+@dataclass(frozen=True)
+@ranged
+class Slurm:
+    """What the script asks Slurm for. partition, account, gres, memory: left to the cluster where they are empty."""
+
+    partition: str = ""
+    time: str = "01:00:00"
+    memory: str = ""
+    cpus: Natural = 4
+    limit: int = 0
+    account: str = ""
+    gres: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("partition", "time", "memory", "account", "gres"):
+            value = getattr(self, name)
+            fits = not value or WORD.fullmatch(value) is not None
+            require(fits, f"{name} must be a word of letters, digits and -_.,:+, but it is {value!r}; correct it.")
+        require(bool(self.time), "time must be a limit such as 01:00:00, but it is empty; give one.")
+        require(self.limit >= 0, f"limit must be 0 (none) or more, but it is {self.limit}.")
+
+
+def ranges_of(numbers: Sequence[int]) -> str:
+    """Rising whole numbers as Slurm lists them: 0, 1, 2, 5 → 0-2,5."""
+    parts = list[list[int]]()
+    for number in numbers:
+        if parts and number == parts[-1][1] + 1:
+            parts[-1][1] = number
+        else:
+            parts.append([number, number])
+    return ",".join(str(low) if low == high else f"{low}-{high}" for low, high in parts)
+
+
+def script_of(folder: SeriesFolder, numbers: Sequence[int], options: Slurm) -> str:
+    """The script that runs the tasks `numbers`, one in each job of an array."""
+    path = str(folder.path.resolve())
+    require(path.isprintable() and '"' not in path, f"{path!r} cannot stand in a Slurm script; use a plainer path.")
+    array = ranges_of(numbers) + (f"%{options.limit}" if options.limit else "")
+    asked = {
+        "job-name": "holosplat",
+        "array": array,
+        "partition": options.partition,
+        "account": options.account,
+        "time": options.time,
+        "mem": options.memory,
+        "gres": options.gres,
+        "cpus-per-task": str(options.cpus),
+        "signal": "B:TERM@60",  # a minute to save before the limit ends the job
+        "output": f'"{path}/{folder.logs.name}/%A_%a.out"',
+    }
+    lines = [f"#SBATCH --{name}={value}" for name, value in asked.items() if value]
+    command = shlex.join([sys.executable, *PROGRAM, "series", "run", path])
+    return "\n".join(
+        [
+            "#!/bin/bash",
+            *lines,
+            "set -euo pipefail",
+            'export OMP_NUM_THREADS="${SLURM_CPUS_PER_TASK:-1}"',
+            f'exec {command} "$SLURM_ARRAY_TASK_ID"',
+            "",
+        ]
+    )
+
+
+def write_script(folder: SeriesFolder, options: Slurm, retry: bool = False) -> tuple[int, str]:
+    """Write slurm.sh for what is left (and, with `retry`, for what failed); the number of tasks, and their list.
+
+    Errors: `InputError` where nothing is left.
+    """
+    wanted = ("left", "failed") if retry else ("left",)
+    numbers = [state.number for state in states(folder) if state.state in wanted]
+    require(bool(numbers), f"{folder.path} has no task that is left; holosplat series status says how far it is.")
+    text = script_of(folder, numbers, options)
+    folder.logs.mkdir(exist_ok=True)
+    with atomic_path(folder.script) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+        temporary.chmod(0o755)
+    return len(numbers), ranges_of(numbers)
+
+
+def submit(folder: SeriesFolder) -> str:
+    """Submit slurm.sh; the number of the job. Errors: `InputError` without sbatch, or with what it says."""
+    try:
+        done = subprocess.run(
+            ["sbatch", "--parsable", str(folder.script.resolve())],
+            capture_output=True,
+            text=True,
+            errors="replace",
+            check=False,
+            timeout=MOST_SECONDS,
+        )
+    except FileNotFoundError:
+        raise InputError("--submit needs sbatch, but there is none here; run it where Slurm is.") from None
+    except subprocess.TimeoutExpired:
+        raise InputError(
+            f"sbatch gave no answer within {MOST_SECONDS} s; ask squeue whether the job is there."
+        ) from None
+    said = " ".join((done.stderr or done.stdout).split())
+    require(done.returncode == 0, f"sbatch must take {folder.script}, but it says: {said}; change the options.")
+    return done.stdout.strip().split(";")[0]

@@ -1,0 +1,142 @@
+"""One task of a series: a window of times, done in order; what is done already is not done again."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from ..checks import InputError, require
+from ..io.formats import read_as
+from ..io.json import write_json
+from ..io.lock import sole_writer
+from ..io.reading import Reading
+from ..io.run_scan import run_source
+from ..scan import Scan
+from ..workflows.run_folder import RunFolder
+from .folder import DONE, FAILED, SeriesFolder, TaskState
+from .plan import Moment, SeriesPlan, Source, Window, at, fingerprint
+from .rows import Row, read_row, write_row
+from .time import Before, Shot, reconstruct_time
+from .tracked import track_window
+
+Told = Callable[[Row], None]
+"""Called with every row that is written."""
+
+
+def nothing(row: Row) -> None:
+    """Nobody wants to know."""
+
+
+def run_task(folder: SeriesFolder, number: int, on_row: Told = nothing) -> TaskState:
+    """Do what is left of a task; how far it is then.
+
+    Every time has its run folder and its row, written whole: after a kill, the task goes on in the middle of the time
+    that was lost, with the same result bit for bit. What fails is said in `failed.json`, and done again by the next
+    call. Ctrl-C is passed on. Errors: `InputError` for a task that there is not, and `TakenError` where another process
+    does it.
+    """
+    plan = folder.plan()
+    windows = plan.windows()
+    require(0 <= number < len(windows), f"tasks are counted from 0 to {len(windows) - 1}, but {number} is asked for.")
+    window, path = windows[number], folder.task(number)
+    path.parent.mkdir(exist_ok=True)
+    with sole_writer(path):
+        if (path / DONE).is_file():
+            return folder.state(window)
+        (path / FAILED).unlink(missing_ok=True)
+        began = time.perf_counter()
+        reason = _attempted(lambda: _work(folder, plan, window, on_row))
+        if reason:
+            write_json(path / FAILED, {"reason": reason})
+        else:
+            write_json(path / DONE, {"times": len(window.moments), "seconds": round(time.perf_counter() - began, 3)})
+    return folder.state(window)
+
+
+def _work(folder: SeriesFolder, plan: SeriesPlan, window: Window, on_row: Told) -> str:
+    """Do the times; why not all of them could be, or nothing."""
+    scans = Scans(plan)
+    if plan.settings.act == "track":
+        run = RunFolder(folder.task(window.number) / "run")
+        moment = window.moments[0]
+        source = plan.sources[moment.source]
+        rows = [_blank(m, source) for m in window.moments]
+        for row in track_window(scans.of(moment), source, plan, rows, run):
+            write_row(folder.row(window.number, row.number), row)
+            on_row(row)
+        return ""
+    failed, before = list[Row](), None
+    for moment in window.moments:
+        path, run = folder.row(window.number, moment.number), RunFolder(folder.run(window.number, moment.number))
+        row = read_row(path) if path.is_file() else None
+        if row is None or not row.done:
+            row = _row(plan, moment, scans, run, before)
+            write_row(path, row)
+            on_row(row)
+        if row.done:
+            before = Before(run, row)
+        else:
+            failed.append(row)
+    if not failed:
+        return ""
+    return f"{len(failed)} of {len(window.moments)} times: {failed[0].reason}"
+
+
+def _row(plan: SeriesPlan, moment: Moment, scans: Scans, run: RunFolder, before: Before | None) -> Row:
+    source = plan.sources[moment.source]
+    row = _blank(moment, source)
+
+    def work() -> str:
+        nonlocal row
+        scan = at(scans.of(moment), moment.frame)
+        frame = moment.frame if len(source.times) > 1 else None
+        reading = replace(plan.reading, part=replace(plan.reading.part, time_frame=frame))
+        shot = Shot(scan, source.prior, run_source(source.path, reading), row)
+        row = reconstruct_time(shot, plan.settings, run, before)
+        return ""
+
+    reason = _attempted(work)
+    return replace(row, status="failed", reason=reason) if reason else row
+
+
+def _blank(moment: Moment, source: Source) -> Row:
+    return Row(moment.number, str(source.path), moment.frame, moment.time, "failed")
+
+
+def _attempted(work: Callable[[], str]) -> str:
+    """What `work` says, or why it failed: one fault must not take the others' results."""
+    try:
+        return work()
+    except InputError as error:
+        return str(error)
+    except Exception as error:
+        lines = str(error).strip().splitlines()
+        return ": ".join([type(error).__name__, *lines[-1:]])
+
+
+class Scans:
+    """The scans of a plan, each opened when it is first asked for, and held against the plan then; one is kept."""
+
+    def __init__(self, plan: SeriesPlan) -> None:
+        self._plan, self._kept = plan, dict[int, Scan]()
+
+    def of(self, moment: Moment) -> Scan:
+        """The whole scan of a time, whose frames are not read yet. Errors: `InputError` where it is not what it was."""
+        number = moment.source
+        if number not in self._kept:
+            source = self._plan.sources[number]
+            self._kept = {number: opened(source, self._plan.reading)}
+        return self._kept[number]
+
+
+def opened(source: Source, reading: Reading) -> Scan:
+    """The scan of a source; `InputError` if it is no longer what was planned with."""
+    require(Path(source.path).exists(), f"{source.path} must be a scan of the series, but it is gone; bring it back.")
+    scan = read_as(source.path, reading)
+    require(
+        fingerprint(scan) == source.fingerprint,
+        f"{source.path} must be as it was when the series was planned, but its frames differ; plan anew.",
+    )
+    return scan

@@ -1,0 +1,30 @@
+"""What the tests of series share: the scan of a tiny one, and a file of each of its times."""
+
+from __future__ import annotations
+
+import pytest
+
+from helpers.once import Once
+from helpers.series import TIMES, Files, moving
+from holosplat.io.nxtomo import write_scan
+
+
+@pytest.fixture(scope="session")
+def files(tmp_path_factory) -> Files:
+    path = tmp_path_factory.mktemp("series")
+    made, scan = Files(path, path / "moving.nxs", path / "each"), moving(TIMES)
+    write_scan(made.scan, scan)
+    made.each.mkdir()
+    for k in range(3):
+        write_scan(made.each / f"scan{9 + k}.nxs", scan.at_instant(k))
+    return made
+
+
+@pytest.fixture(autouse=True)
+def _unjudged(unjudged_runs: None) -> None:
+    """Verdicts and totals are tested in tests/workflows."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _once(begun_once: Once) -> None:
+    """All runs share what they begin with."""

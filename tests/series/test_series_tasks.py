@@ -1,0 +1,169 @@
+"""Tasks of a series: what they write, that nothing is done twice, and what a kill takes."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.series import SETTINGS, planned
+from holosplat.checks import InputError
+from holosplat.io.lock import TakenError, sole_writer
+from holosplat.io.objects import read_object
+from holosplat.methods import HolographicVoxels
+from holosplat.methods.continued import Continued
+from holosplat.series import time as series_time
+from holosplat.series.folder import SeriesFolder
+from holosplat.series.run import counted, run_left, states
+from holosplat.series.settings import Settings
+from holosplat.series.task import run_task
+from holosplat.workflows.run_folder import RunFolder
+
+
+@pytest.fixture(scope="module")
+def done(files, tmp_path_factory) -> SeriesFolder:
+    """A series of three tasks that are done."""
+    from helpers.unjudged import unjudged
+
+    folder = planned(tmp_path_factory.mktemp("done") / "series", files.scan)
+    with unjudged():
+        assert counted(states(folder)).left == 3
+        counts = run_left(folder)
+    assert (counts.done, counts.running, counts.failed, counts.left) == (3, 0, 0, 0)
+    return folder
+
+
+def arrays(folder: SeriesFolder, task: int, moment: int) -> dict[str, torch.Tensor]:
+    return dict(read_object(folder.run(task, moment).joinpath("object.h5")).parameters())
+
+
+def same(one: dict[str, torch.Tensor], other: dict[str, torch.Tensor]) -> bool:
+    return one.keys() == other.keys() and all(torch.equal(one[name], other[name]) for name in one)
+
+
+def test_times_have_runs_and_rows(done, files):
+    """The first time of a task begins by itself, the next one with what that ended with."""
+    windows = done.plan().windows()
+    assert [[m.number for m in w.moments] for w in windows] == [[0, 1], [2, 3], [4]]
+    rows = [row for window in windows for row in done.rows(window)]
+    assert [row.begun for row in rows] == ["cold", "warm", "cold", "warm", "cold"]
+    assert [row.time_s for row in rows] == [0.0, 0.5, 1.0, 1.5, 2.0]
+    assert all(row.done and row.good and 0 < row.test["ssim"] <= 1 for row in rows)
+    config = RunFolder(done.run(0, 1)).read_config()
+    assert config["method"]["kind"] == Continued.kind
+    assert config["method"]["begin"] == str(done.run(0, 0).resolve() / "object.h5")
+    assert not RunFolder(done.run(0, 1)).checkpoint.exists()
+    phase = np.load(done.run(0, 0) / series_time.PHASE)
+    assert phase.shape == (19, 23)
+    assert phase.min() < -0.1
+    assert json.loads((done.run(0, 1) / "source.json").read_text())["time_frame"] == 1
+
+
+def test_what_is_done_is_not_done_again(done, monkeypatch):
+    monkeypatch.setattr("holosplat.series.task.reconstruct_time", lambda *args: pytest.fail("it is done"))
+    assert run_task(done, 1).state == "done"
+    assert run_left(done).done == 3
+
+
+def test_a_task_that_is_not_there(done):
+    with pytest.raises(InputError, match="from 0 to 2, but 3 is asked for"):
+        run_task(done, 3)
+
+
+@pytest.mark.parametrize("moment", ["row", "fit"])
+def test_a_kill_takes_one_time_at_most(done, files, tmp_path, moment):
+    """Killed when a row is written, or in the middle of a fit: the rerun has the same numbers bit for bit."""
+    folder = planned(tmp_path / "series", files.scan)
+    child = os.fork()
+    if child == 0:  # from here on without pytest
+        torch.set_num_threads(1)
+        end = lambda *args: os.kill(os.getpid(), signal.SIGKILL)  # noqa: E731
+        if moment == "fit":
+            RunFolder.append_metrics = lambda self, rows: end() if self.path.name == "t0001" and rows else None
+        run_task(folder, 0, on_row=lambda row: end() if moment == "row" else None)
+        os._exit(0)
+    assert os.waitpid(child, 0)[1] == signal.SIGKILL
+    window = folder.plan().windows()[0]
+    state = folder.state(window)
+    assert (state.state, state.times) == ("left", (1, 2))
+    kept = folder.row(0, 0).read_bytes()
+    assert run_task(folder, 0).state == "done"
+    assert folder.row(0, 0).read_bytes() == kept
+    assert same(arrays(folder, 0, 0), arrays(done, 0, 0))
+    assert same(arrays(folder, 0, 1), arrays(done, 0, 1))
+
+
+def test_the_work_of_another_process_is_left_to_it(done, files, tmp_path):
+    folder = planned(tmp_path / "series", files.scan, window=5)
+    child = os.fork()
+    if child == 0:
+        with sole_writer(folder.task(0)):
+            os.kill(os.getpid(), signal.SIGSTOP)
+        os._exit(0)
+    os.waitpid(child, os.WUNTRACED)
+    try:
+        with pytest.raises(TakenError, match=f"process {child} on "):
+            run_task(folder, 0)
+        (state,) = states(folder)
+        assert state.state == "running"
+        assert state.writer is not None
+        assert state.writer.process == child
+        assert run_left(folder).running == 1
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+    assert states(folder)[0].state == "left"
+
+
+def test_what_fails_is_said_and_tried_again(files, tmp_path, monkeypatch):
+    """One time fails: the others are done, begun by themselves where need be; the next call does what is missing."""
+    folder = planned(tmp_path / "series", files.scan, window=3)
+    real = series_time.reconstruct
+
+    def broken(scan, *args, folder, **options):
+        if folder.path.name == "t0001":
+            raise ZeroDivisionError("no\nmatter here")
+        return real(scan, *args, folder=folder, **options)
+
+    monkeypatch.setattr(series_time, "reconstruct", broken)
+    state = run_task(folder, 0)
+    assert (state.state, state.times) == ("failed", (2, 3))
+    assert state.reason == "1 of 3 times: ZeroDivisionError: matter here"
+    assert run_left(folder).failed == 1  # which leaves it alone
+    monkeypatch.setattr(series_time, "reconstruct", real)
+    assert run_left(folder, retry=True).done == 2
+
+
+def test_a_warm_start_that_is_not_enough_begins_anew(done, files, tmp_path, monkeypatch):
+    """Where frames are not explained, and clearly more matter is left than when a time last began by itself."""
+    monkeypatch.setattr(series_time, "_explained", lambda result: False)
+    settings = replace(SETTINGS, warm=replace(SETTINGS.warm, worse=1e-3))
+    folder = planned(tmp_path / "series", files.scan, settings=settings)
+    run_task(folder, 0)
+    rows = folder.rows(folder.plan().windows()[0])
+    assert [row.begun for row in rows] == ["cold", "anew"]
+    assert rows[1].reference == rows[1].unexplained
+    assert RunFolder(folder.run(0, 1)).read_config()["method"]["kind"] == "gaussians"
+
+
+def test_a_scan_that_was_replaced_is_noticed(files, tmp_path):
+    scan = tmp_path / "scan.nxs"
+    shutil.copy(files.each / "scan9.nxs", scan)
+    folder = planned(tmp_path / "series", scan)
+    shutil.copy(files.each / "scan10.nxs", scan)
+    state = run_task(folder, 0)
+    assert state.state == "failed"
+    assert "as it was when the series was planned, but its frames differ" in state.reason
+    scan.unlink()
+    assert "but it is gone" in run_task(folder, 0).reason
+
+
+def test_warm_starts_need_a_method_that_takes_them():
+    with pytest.raises(InputError, match="runs of auto, gaussians, surfaces and volume can be gone on from"):
+        Settings(method=HolographicVoxels())
