@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ..geometry import Grid
-from ..io.splats import colours, opacities
+from ..io.splats import opacities
 from ..mesh import TriangleMesh
 from ..representations import GaussianCloud, MovingGaussians, MovingSurfaces, Stored, SurfaceMesh, isosurface
 
@@ -21,6 +21,8 @@ MOST_VOXELS = 1 << 21
 DEPTH = 40.0
 """Optical depth of the thickest ray: viser drops a splat whose opacity times its area squared is under a quarter of a
 pixel's, which at depths that can be seen through are all of them."""
+NEAR, FAR = (0.95, 0.85, 0.70), (0.25, 0.40, 0.65)
+"""Colours of Gaussians at the near end of the object, and at the far one: all of one colour would be a silhouette."""
 LEVEL = 0.5
 """Share of the largest |δ| at which that is."""
 TIMES = 48
@@ -106,4 +108,6 @@ def _splats(cloud: GaussianCloud) -> Splats:
     turns = Rotation.from_quat(cloud.quaternions.double().numpy()[:, [1, 2, 3, 0]]).as_matrix()
     axes = turns * (unit * cloud.scales.double().numpy())[:, None, :]
     centres = unit * cloud.centres.double().numpy()
-    return Splats(centres, axes @ axes.transpose(0, 2, 1), colours(cloud), opacities(cloud, DEPTH))
+    depth = (centres[:, 2] - centres[:, 2].min()) / max(float(np.ptp(centres[:, 2])), 1e-30)
+    colours = np.array(NEAR) + depth[:, None] * (np.array(FAR) - np.array(NEAR))
+    return Splats(centres, axes @ axes.transpose(0, 2, 1), colours, opacities(cloud, DEPTH))

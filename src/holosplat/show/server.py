@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout
@@ -37,6 +38,7 @@ class LiveView:
 
     def __init__(self, title: str, port: int = 8080) -> None:
         viser = require_viser()
+        logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # of connections that browsers break off
         self.guard = Guard(secrets.token_urlsafe(24))
         with _guarded(self.guard) as started, redirect_stdout(StringIO()):  # it prints addresses without the token
             self._server = viser.ViserServer(host=HOST, port=port, verbose=False)
@@ -105,7 +107,8 @@ class LiveView:
 
     def close(self) -> None:
         """End the server; browsers show that it is gone."""
-        self._server.stop()
+        with redirect_stdout(StringIO()):
+            self._server.stop()
 
 
 def _escaped(text: str) -> str:
