@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import threading
 from typing import ClassVar
 
 import pytest
 
 from helpers.cli import holosplat, known, refused, worked
+from holosplat.cli import view as commands
 from holosplat.io.compact import Steps
 from holosplat.io.objects import read_object
 from holosplat.io.series import write_series
@@ -42,11 +42,11 @@ class Page:
 def pages(monkeypatch) -> list[Page]:
     """The pages that were made; waiting for Ctrl-C is over at once."""
 
-    def interrupt(self, timeout=None):
+    def interrupt():
         raise KeyboardInterrupt
 
     monkeypatch.setattr(server, "LiveView", Page)
-    monkeypatch.setattr(threading.Event, "wait", interrupt)
+    monkeypatch.setattr(commands, "until_interrupted", interrupt)
     monkeypatch.setattr(Page, "made", [])
     return Page.made
 

@@ -56,11 +56,16 @@ def view(what: Positional[Path], port: Port = 8080) -> None:
     try:
         _shown(page, objects, words)
         _say_where(page)
-        threading.Event().wait()
+        until_interrupted()
     except KeyboardInterrupt:
         pass
     finally:
         page.close()
+
+
+def until_interrupted() -> None:
+    """Wait for Ctrl-C."""
+    threading.Event().wait()
 
 
 @dataclass(frozen=True)

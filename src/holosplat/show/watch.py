@@ -19,8 +19,9 @@ SHARE = 0.01
 class Watch:
     """What a fit tells a view: `on_progress` and `on_state` of `reconstruct`.
 
-    The object is taken at the end of a step, the first of a stage always, and drawn by another thread. The next update waits until the last one's
-    cost is `SHARE` of the time. While no browser is there, only words are kept, and nothing is drawn.
+    The object is taken at the end of a step, of the first one of a stage always, and drawn by another thread. The next
+    update waits until the last one's cost is `SHARE` of the time. While no browser is there, only words are kept, and
+    nothing is drawn.
     """
 
     def __init__(self, view: LiveView) -> None:
