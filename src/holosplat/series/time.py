@@ -67,7 +67,7 @@ def reconstruct_time(
     `reconstruct`.
     """
     began = time.perf_counter()
-    warm = before is not None and settings.warm.on and not _begun_alone(folder)
+    warm = before is not None and settings.warm.on and not _begun_alone(folder) and _same_field(before, shot.scan)
     alone = "cold" if before is None or not settings.warm.on else "anew"
     if warm and before is not None:
         method = Continued.of(settings.method, before.folder.object, settings.warm.effort)
@@ -80,6 +80,15 @@ def reconstruct_time(
         shutil.rmtree(folder.path)
     done = _run(shot, settings, settings.method, folder, on_progress)
     return _written(shot, settings, folder, done, replace(shot.row, begun=alone, reference=_share(done)), began)
+
+
+def _same_field(before: Before, scan: Scan) -> bool:
+    """Whether the time before was seen by the same pixels, at the same energy."""
+    summary, views = before.folder.read_summary(), scan.views
+    seen = summary["detector"]
+    alike = (seen["rows"], seen["columns"]) == views.shape
+    sizes = (seen["pixel_size_m"], views.finest), (summary["energy_kev"], scan.exposures.reference_energy)
+    return alike and all(abs(a / b - 1) < 1e-6 for a, b in sizes)
 
 
 def _begun_alone(folder: RunFolder) -> bool:
