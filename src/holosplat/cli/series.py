@@ -12,10 +12,10 @@ from tyro.conf import Positional, arg, subcommand
 from ..checks import require
 from ..io.reading import Reading
 from ..ranges import Natural, Positive, Seed, ranged, with_checked_numbers
+from .bodies import BodyFlags, MotionFlags
 from .light import RunLightFlags
 from .options import MethodOptions, PriorOptions
 from .progress import INTERRUPTED
-from .track import BodyFlags, MotionFlags
 
 if TYPE_CHECKING:
     from ..series.folder import SeriesFolder
