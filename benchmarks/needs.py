@@ -152,7 +152,12 @@ def main() -> None:
     if given.again:
         write(given.csv, again(given.csv))
         return
+    if given.csv and given.csv.exists():  # what is there is kept, so that a table may grow
+        rows = again(given.csv)
+    there = {tuple(str(row[name]) for name in vars(JOBS[0])) for row in rows}
     for job in JOBS:
+        if tuple(map(str, vars(job).values())) in there:
+            continue
         rows.append(row(job) | {"machine": f"{os.cpu_count()} × {platform.machine()}", "commit": machine.commit()})
         print(rows[-1], flush=True)
         if given.csv:

@@ -29,7 +29,6 @@ from ..optics.sampling import fringe_sampling, padding
 from ..scan import Exposures
 
 
-@dataclass(frozen=True)
 class Costs:
     """Bytes of memory and seconds that the parts of a job take."""
 
@@ -61,7 +60,6 @@ class Costs:
     """The report and the tables of a run."""
 
 
-COSTS = Costs()
 SAFETY = 1.1
 """Times the estimate that must be there: it errs by a fifth."""
 KEPT = 4
@@ -129,7 +127,7 @@ class Needs:
 
     def fit(self, path: Path) -> bool:
         """Whether there is so much memory, and disk at `path`."""
-        return SAFETY * self.memory <= free_memory() + COSTS.program and self.disk <= free_disk(path)
+        return SAFETY * self.memory <= free_memory() + Costs.program and self.disk <= free_disk(path)
 
 
 def of_reconstruction(sizes: Sizes, method: Method, matter: MatterKind | None = None) -> Needs | None:
@@ -145,25 +143,25 @@ def of_reconstruction(sizes: Sizes, method: Method, matter: MatterKind | None = 
     if parts is None:
         return None
     memory, seconds, numbers = parts
-    report = COSTS.report + 0.5 * COSTS.waves * sizes.waves()
-    disk = COSTS.written * (KEPT * numbers + sizes.pixels) + COSTS.page
-    return Needs(COSTS.frames * sizes.pixels + max(COSTS.program + memory, report), disk, seconds)
+    report = Costs.report + 0.5 * Costs.waves * sizes.waves()
+    disk = Costs.written * (KEPT * numbers + sizes.pixels) + Costs.page
+    return Needs(Costs.frames * sizes.pixels + max(Costs.program + memory, report), disk, seconds)
 
 
 def _parts(sizes: Sizes, method: Method) -> tuple[float, float, float] | None:
     """Bytes beside the program, seconds, and numbers of the object."""
     if isinstance(method, PerView):
-        memory = COSTS.plain * sizes.voxels + COSTS.rays * sizes.views * sizes.columns**2
+        memory = Costs.plain * sizes.voxels + Costs.rays * sizes.views * sizes.columns**2
         return memory, 1 + 0.35e-6 * sizes.views * sizes.voxels, sizes.voxels
     if isinstance(method, SmoothVolume):
         small = sizes.joined(method.max_voxels)
-        memory = max(COSTS.smooth * small.voxels, _start(small, method.volume))
+        memory = max(Costs.smooth * small.voxels, _start(small, method.volume))
         return memory, 10 + 4.5e-6 * sizes.views * small.voxels, small.voxels
     if isinstance(method, HolographicVoxels | Voxels | NeuralFields):
         begun, fine = _start(sizes, method.volume), _fine(sizes, method.volume)[0]
         if isinstance(method, HolographicVoxels):
             return begun, 3 + 1.5e-6 * fine, fine
-        fitted = COSTS.waves * sizes.waves() + COSTS.plain * sizes.voxels
+        fitted = Costs.waves * sizes.waves() + Costs.plain * sizes.voxels
         return max(begun, fitted), 20 + 3e-6 * fine, sizes.voxels
     gaussians = method if isinstance(method, Gaussians) else getattr(method, "gaussians", None)
     return _bodies(sizes, gaussians, gaussians is not method) if isinstance(gaussians, Gaussians) else None
@@ -173,11 +171,11 @@ def _bodies(sizes: Sizes, how: Gaussians, edges: bool) -> tuple[float, float, fl
     """The same of Gaussians, and of surfaces cut out of them where there are `edges`."""
     batch = how.fit.schedule.views_per_step
     fitted = replace(sizes, views=min(batch, sizes.views) if batch else sizes.views).waves()
-    waves = COSTS.waves * max(fitted, sizes.waves(1) if edges else 0)
+    waves = Costs.waves * max(fitted, sizes.waves(1) if edges else 0)
     begun = 0.0 if how.start == "random" else _start(sizes, how.volume)
     count = how.random_count if how.start == "random" else min(how.max_start, how.start_per_pixel * sizes.pixels)
     fine = _fine(sizes, how.volume)[0]
-    return max(begun, waves + COSTS.gaussian * count), (30 if edges else 12) + 2.3e-6 * fine, 14 * count
+    return max(begun, waves + Costs.gaussian * count), (30 if edges else 12) + 2.3e-6 * fine, 14 * count
 
 
 def _fine(sizes: Sizes, how: HolographicTV) -> tuple[int, int]:
@@ -192,11 +190,11 @@ def _start(sizes: Sizes, how: HolographicTV) -> float:
     """Bytes of the start."""
     fine, refine = _fine(sizes, how)
     small = sizes.joined(how.max_voxels)
-    alone = COSTS.plain * small.voxels + COSTS.rays * small.views * small.columns**2
+    alone = Costs.plain * small.voxels + Costs.rays * small.views * small.columns**2
     if how.corrections == 0:
         return alone
-    rays = COSTS.rays * small.views * (small.columns * refine) ** 2
-    return max(alone, COSTS.fine * fine + COSTS.coarse * small.voxels + rays)
+    rays = Costs.rays * small.views * (small.columns * refine) ** 2
+    return max(alone, Costs.fine * fine + Costs.coarse * small.voxels + rays)
 
 
 def of_simulation(exposures: Exposures, samples: int, frames: int) -> Needs:
@@ -204,14 +202,14 @@ def of_simulation(exposures: Exposures, samples: int, frames: int) -> Needs:
     margin = padding(exposures, samples)
     rows, columns = (n + 2 * m for n, m in zip(exposures.views.shape, margin))
     pixels = frames * math.prod(exposures.views.shape)
-    return Needs(COSTS.program + COSTS.simulated * rows * columns * samples**2, COSTS.written * pixels + 1e6)
+    return Needs(Costs.program + Costs.simulated * rows * columns * samples**2, Costs.written * pixels + 1e6)
 
 
 def require_room(needs: Needs, path: Path, others: Iterable[tuple[str, Needs]] = ()) -> None:
     """`InputError` if a job does not fit into memory and disk, with the first of the `others` that does."""
     if needs.fit(path):
         return
-    memory, disk = free_memory() + COSTS.program, free_disk(path)
+    memory, disk = free_memory() + Costs.program, free_disk(path)
     way = next((f"{how} takes {_size(one.memory)} and {_size(one.disk)}" for how, one in others if one.fit(path)), "")
     raise InputError(
         f"the job {needs.line()}, but {_size(memory)} of memory and {_size(disk)} of disk are free; "
