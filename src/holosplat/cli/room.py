@@ -21,6 +21,8 @@ def tell_reconstruction(
     frames nearly always say that it has levels."""
     from ..planning.needs import Sizes, of_reconstruction, require_room, smaller
 
+    if len(exposures) == 0:
+        return  # there is nothing to fit, as the fit will say
     kind = matter or ("levels" if isinstance(prior, Known) else None)
     needs = of_reconstruction(Sizes.of(exposures), method, kind)
     if needs is not None:
