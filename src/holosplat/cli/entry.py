@@ -75,6 +75,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "export",
         "Write δ and β of a run as a volume, its bodies as meshes, or its object in few bytes or as splats.",
     ),
+    "view": (
+        "view",
+        "Show a run or an object file in the browser, as Gaussians or surfaces, with sliders (Ctrl-C ends).",
+    ),
     "surface": (
         "surface",
         "Cut the bodies of a run out as closed surfaces, fit these to the frames, and write them as VTK files (µm).",
