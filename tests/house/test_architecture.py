@@ -21,7 +21,7 @@ Files = dict[str, str]
 """Path below src/holosplat → source text."""
 
 TIERS = (
-    ("units", "version", "checks", "ranges", "lazy", "tables", "native", "backends", "memory", "progress")
+    ("units", "version", "checks", "ranges", "lazy", "tables", "native", "backends", "memory", "progress", "display")
     + ("geometry", "frames", "divided_light", "scan", "volume", "mesh", "matter"),
     ("materials", "optics", "metrics", "projectors", "preprocess"),
     ("specimens", "representations", "model"),
