@@ -46,7 +46,7 @@ class Costs:
     """A voxel of a slice that a view crosses: the sparse slice matrix, its transpose, and what both are made of."""
     smooth: float = 176.0
     """A voxel of a smooth volume: six pairs of L-BFGS, gradients and priors."""
-    plain: float = 36.0
+    plain: float = 52.0
     """A voxel of a tomography by itself."""
     waves: float = 150.0
     """A wave sample of all views in a fit, with its gradient."""
