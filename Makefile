@@ -31,8 +31,9 @@ demo: setup ## simulate, reconstruct and report a small specimen into demo/
 	rm -rf demo
 	$(VENV)/bin/holosplat demo --out demo
 
+# What is compiled once is kept, also where the environment says otherwise: tests start Python many times.
 test: setup ## run the tests, in two processes
-	$(VENV)/bin/python -m pytest -n 2 --dist loadfile
+	PYTHONDONTWRITEBYTECODE= $(VENV)/bin/python -m pytest -n 2 --dist loadfile
 
 check: setup ## lint, formatting and types
 	$(VENV)/bin/ruff check .

@@ -104,7 +104,8 @@ def _code(act: Callable[[], None]) -> int:
 NEEDED = (
     "bench.specimens beamline.grow beamline.record beamline.simulate io.formats io.objects io.volumes io.nxtomo "
     "methods.presets report.run specimens.red_cells workflows.correct workflows.evaluate workflows.join "
-    "workflows.reconstruct"
+    "workflows.reconstruct workflows.track report.moving report.motion_blocks bench.run bench.methods bench.pages "
+    "align.views"
 )
 
 

@@ -202,3 +202,34 @@ def wanted() -> str:
     lines = [[label, aim, *(shown.format(**c) for c in cells)] for label, (aim, shown) in aims.items()]
     table = markdown(("", "wanted", "Gaussians, worst of three scenes", "surfaces"), lines)
     return table.replace("|  |", "| |", 1)
+
+
+SERIES = {
+    ("warm", "median CPU seconds, cold"): "a time that begins by itself [CPU s]",
+    ("warm", "median CPU seconds, warm"): "a time that goes on from the one before [CPU s]",
+    ("warm", "most CPU seconds, warm"): "the longest of these [CPU s]",
+    ("warm", "Dice of the last time, warm"): "Dice of the eighth time, warm all the way",
+    ("warm", "Dice of the last time, by itself"): "Dice of the eighth time, by itself",
+    ("volume", "median CPU seconds, cold"): "continuous matter on 64 × 64 pixels: a time by itself [CPU s]",
+    ("volume", "median CPU seconds, warm"): "continuous matter on 64 × 64 pixels: a time that goes on [CPU s]",
+    (
+        "overhead",
+        "median CPU seconds of a task beside the reconstruction itself",
+    ): "a task, beside its reconstruction [CPU s]",
+    ("overhead", "CPU seconds of a process whose task is done"): "a process, before it begins its first task [CPU s]",
+    ("processes", "times faster, two processes than one"): "times faster by two processes than by one",
+    ("kills", "kills"): "kills (kill -9) at random moments",
+    ("kills", "most times lost by a kill"): "times lost by one of them, at most",
+    ("kills", "reruns that differ in a bit"): "reruns that differ in a bit",
+}
+"""What the table of series shows, by case and measure."""
+
+
+def series() -> str:
+    """What tasks, warm starts and kills cost, with the load that the machine had."""
+    lines = []
+    for row in read("series.csv"):
+        said = SERIES.get((row["case"], row["measure"]))
+        if said is not None:
+            lines.append([said, f"{float(row['value']):.3g}", f"{row['load_before']} to {row['load_after']}"])
+    return markdown(("", "measured", "load average of the machine"), lines)

@@ -108,6 +108,15 @@ def _one_thread() -> None:
     torch.set_num_threads(1)
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _no_wait_for_the_disk() -> Iterator[None]:
+    """What tests write need not survive a power cut; that it is flushed, and when, tests/workflows/test_full_disk.py
+    asks."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", os.fstat)  # which fails as fsync does where there is no such file
+        yield
+
+
 @pytest.fixture
 def undrawn_reports() -> Iterator[None]:
     """Reports of runs have their text, and blank figures; see `helpers.pictures`."""

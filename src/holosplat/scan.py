@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .checks import finite, in_range, require, shaped
+from .display import of_scan
 from .divided_light import DividedLight
 from .frames import Binned, Cropped, Frames, binned, blocks, picked
 from .geometry import Views
@@ -215,6 +216,8 @@ class Scan:
     def __repr__(self) -> str:
         h, w = self.views.shape
         return f"Scan({len(self)} frames of {h} × {w} pixels, {int(self.is_test.sum())} of them held out)"
+
+    _repr_html_ = of_scan
 
     def __getitem__(self, index: np.ndarray | list[int] | slice) -> Scan:
         frames = picked(self.source, index)

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from .checks import finite, shaped
+from .display import of_volume
 from .geometry import Grid, Poses, Views
 
 
@@ -25,6 +26,8 @@ class Volume:
         for name in ("delta", "beta"):
             array = np.ascontiguousarray(getattr(self, name), dtype=np.float32)
             object.__setattr__(self, name, finite(name, shaped(name, array, self.grid.shape)))
+
+    _repr_html_ = of_volume
 
 
 @dataclass(frozen=True)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import tifffile
 
 from helpers.cli import holosplat, refused, worked
 from holosplat.io.objects import read_object
+from holosplat.io.series import read_series
 
 
 def test_a_run_is_exported_in_few_bytes_and_as_a_tiff(shop, tmp_path):
@@ -36,3 +38,11 @@ def test_a_run_is_exported_for_other_programs(shop, tmp_path):
     assert json.loads((tmp_path / "v.ome.zarr" / "0" / ".zarray").read_text())["shape"] == [2, 8, 9, 10]
     refused(holosplat("export", shop.run, "--volume", tmp_path / "v.ome.zarr"), "must be new or empty")
     refused(holosplat("export", shop.run, "--bodies", tmp_path / "b.glb"), "needs a run of surfaces")
+
+
+def test_runs_of_a_series_share_a_compact_file(shop, tmp_path):
+    second = shutil.copytree(shop.run, tmp_path / "second")
+    done = worked(holosplat("export", shop.run, "--compact", tmp_path / "s.h5", "--together", second))
+    assert "times smaller than 2 runs" in done.err
+    assert list(read_series(tmp_path / "s.h5")) == ["run", "second"]
+    refused(holosplat("export", shop.run, "--splats", tmp_path / "g.ply", "--together", second), "--together needs")

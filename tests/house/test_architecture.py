@@ -21,7 +21,7 @@ Files = dict[str, str]
 """Path below src/holosplat → source text."""
 
 TIERS = (
-    ("units", "version", "checks", "ranges", "lazy", "tables", "native", "backends", "memory", "progress")
+    ("units", "version", "checks", "ranges", "lazy", "tables", "native", "backends", "memory", "progress", "display")
     + ("geometry", "frames", "divided_light", "scan", "volume", "mesh", "matter"),
     ("materials", "optics", "metrics", "projectors", "preprocess"),
     ("specimens", "representations", "model"),
@@ -31,7 +31,7 @@ TIERS = (
     ("align",),
     ("motion",),
     ("workflows", "beamline", "planning"),
-    ("report",),
+    ("report", "show"),
     ("bench", "series"),
     ("thesis",),
     ("cli",),
@@ -52,6 +52,10 @@ HEAVY: dict[str, tuple[str, ...]] = {
     "skimage": (),
     "matplotlib": ("report", "bench/pages", "thesis/pages"),
     "jinja2": ("report",),
+    "viser": (),
+    "websockets": (),
+    "zarr": (),
+    "numcodecs": (),
     "tyro": ("cli",),
 }
 """Packages slow to import, and the rooms or parts of rooms that do so at module level (others inside a function)."""

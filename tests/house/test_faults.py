@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import random
 import signal
 from pathlib import Path
@@ -28,9 +29,10 @@ def faults() -> ModuleType:
 def shop(faults, tmp_path_factory):
     """One cell and its scan; nothing else is there."""
     path = tmp_path_factory.mktemp("faults")
-    (cell,) = random_cells(1, (faults.COLUMNS * faults.PIXEL,) * 3, 1, 10 * faults.PIXEL)
+    shop = importlib.import_module("fault_shop")
+    (cell,) = random_cells(1, (shop.COLUMNS * shop.PIXEL,) * 3, 1, 10 * shop.PIXEL)
     write_mesh(path / "cell.vtk", cell, "um")
-    made = faults.Shop(path, (path / "cell.vtk",), path / "scan.nxs", path / "raw", path / "run", path / "quick.json")
+    made = faults.Shop(path, (path / "cell.vtk",))
     assert faults.run(made.simulate(made.scan)).code == 0
     return made
 
@@ -46,7 +48,8 @@ def test_writers_are_disturbed(faults, shop, kind):
 
 
 def test_odd_values_and_hostile_meshes(faults, shop, monkeypatch):
-    monkeypatch.setattr(faults, "FLAGS", {"simulate": "energy-kev distance misalign-shift", "grow": "flow diameter"})
+    files = importlib.import_module("fault_files")
+    monkeypatch.setattr(files, "FLAGS", {"simulate": "energy-kev distance misalign-shift", "grow": "flow diameter"})
     assert faults.trials(shop, "odd values", 3, random.Random(1)) == {"trials": 3}
 
 
@@ -55,9 +58,9 @@ def test_a_file_that_is_lost_is_counted(faults, shop, monkeypatch):
 
     def in_place(arguments: list[object], **_: object):
         (Path(str(arguments[2])) / "frames.tif").parent.mkdir(exist_ok=True)
-        return faults.Ended(None, signal.SIGKILL, "", 0.1)
+        return importlib.import_module("forked").Ended(None, signal.SIGKILL, "", 0.1)
 
-    monkeypatch.setattr(faults, "run", in_place)
+    monkeypatch.setattr(importlib.import_module("fault_kills"), "run", in_place)
     assert faults.trials(shop, "kill -9", 1, random.Random(1), (writer(faults, "convert"),)) == {"trials": 1, "lost": 1}
 
 
@@ -73,4 +76,21 @@ def test_a_file_that_is_lost_is_counted(faults, shop, monkeypatch):
     ],
 )
 def test_ends_are_told_apart(faults, code, by, said, verdict):
-    assert faults._sentence(faults.Ended(code, int(by), said, 0.1)) == verdict
+    ended = importlib.import_module("forked").Ended(code, int(by), said, 0.1)
+    assert importlib.import_module("fault_kills").sentence(ended) == verdict
+
+
+@pytest.mark.parametrize(
+    ("noticed", "frames", "verdict"),
+    [(True, [1.0, 1.0], ""), (False, [1.0, 1.0], "silent"), (True, [1.0, 2.0], "silent")],
+)
+def test_what_an_altered_run_may_say(faults, tmp_path, monkeypatch, noticed, frames, verdict):
+    """Nothing but what it said before, and `check` has to notice."""
+    files = importlib.import_module("fault_files")
+    for name in ("config.json", "summary.json"):
+        (tmp_path / name).write_text(json.dumps({"energy_kev": 20.0}))
+    said = iter(frames)
+    monkeypatch.setattr(files, "copied_run", lambda shop, folder: tmp_path)
+    monkeypatch.setattr(files, "_predicted", lambda shop, found: next(said))
+    monkeypatch.setattr(files, "check", lambda path: (2, ["altered"] if noticed else []))
+    assert faults.SINGLE["tampered runs"](None, random.Random(2), tmp_path) == verdict

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from helpers.once import Once
-from helpers.series import TIMES, Files, moving
+from helpers.once import Once, once
+from helpers.series import TIMES, Files, moving, planned
+from helpers.unjudged import unjudged
 from holosplat.io.nxtomo import write_scan
+from holosplat.series.folder import SeriesFolder
+from holosplat.series.run import Counts, counted, run_left, states
 
 
 @pytest.fixture(scope="session")
@@ -18,6 +21,16 @@ def files(tmp_path_factory) -> Files:
     for k in range(3):
         write_scan(made.each / f"scan{9 + k}.nxs", scan.at_instant(k))
     return made
+
+
+@pytest.fixture(scope="session")
+def done(files, memory, tmp_path_factory) -> SeriesFolder:
+    """A series of three tasks that are done; nobody changes it."""
+    folder = planned(tmp_path_factory.mktemp("done") / "series", files.scan)
+    assert counted(states(folder)) == Counts(0, 0, 0, 3)
+    with unjudged(), once(memory):
+        assert run_left(folder) == Counts(3, 0, 0, 0)
+    return folder
 
 
 @pytest.fixture(autouse=True)

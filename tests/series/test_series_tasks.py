@@ -20,23 +20,10 @@ from holosplat.methods import HolographicVoxels
 from holosplat.methods.continued import Continued
 from holosplat.series import time as series_time
 from holosplat.series.folder import SeriesFolder
-from holosplat.series.run import counted, run_left, states
+from holosplat.series.run import run_left, states
 from holosplat.series.settings import Settings
 from holosplat.series.task import run_task
 from holosplat.workflows.run_folder import RunFolder
-
-
-@pytest.fixture(scope="module")
-def done(files, tmp_path_factory) -> SeriesFolder:
-    """A series of three tasks that are done."""
-    from helpers.unjudged import unjudged
-
-    folder = planned(tmp_path_factory.mktemp("done") / "series", files.scan)
-    with unjudged():
-        assert counted(states(folder)).left == 3
-        counts = run_left(folder)
-    assert (counts.done, counts.running, counts.failed, counts.left) == (3, 0, 0, 0)
-    return folder
 
 
 def arrays(folder: SeriesFolder, task: int, moment: int) -> dict[str, torch.Tensor]:

@@ -8,6 +8,7 @@ import pytest
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.materials import DeltaBeta
+from holosplat.specimens import red_cells
 from holosplat.specimens.capsules import Capsule, place_capsules
 from holosplat.specimens.foam import random_foam
 from holosplat.specimens.phantoms import Ball, packed_balls, star_of_balls, unit_ball
@@ -264,6 +265,16 @@ def test_cells_move_over_for_the_next():
         place_cells(5, box, seed=1)
     cells = place_cells(5, box, seed=1, shuffles=20)
     _hold_apart(cells, box)
+
+
+def test_a_channel_in_which_cells_jam_is_given_up(monkeypatch):
+    """Between what can be placed and what bodies fill at random: as many places are tried as all cells may have."""
+    monkeypatch.setattr(red_cells, "MOST_TRIES", 900)
+    tried, turned = [], red_cells._random_rotation
+    monkeypatch.setattr(red_cells, "_random_rotation", lambda rng: tried.append(1) or turned(rng))
+    with pytest.raises(InputError, match=r"9 red cells .* but only \d found a place"):
+        place_cells(9, (14 * UM, 13 * UM, 15 * UM), seed=1, shape="box", shuffles=1000)
+    assert 900 < len(tried) <= 900 + 9 * red_cells.TRIES_A_CELL
 
 
 def _hold_apart(cells, box) -> None:

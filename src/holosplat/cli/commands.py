@@ -17,6 +17,8 @@ from .align import RefineOptions
 from .light import RunLightFlags
 from .options import BeamlineOptions, MethodOptions, PriorOptions, TruthOptions
 from .progress import INTERRUPTED, ProgressBar
+from .room import tell_reconstruction
+from .view import LiveFlags, watched
 
 if TYPE_CHECKING:
     from ..workflows.evaluate import Evaluation
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
 
 LIGHT = RunLightFlags()
 """Even, unless the air of frames says otherwise."""
+LIVE = LiveFlags()
+"""Nobody watches."""
 AS_PLANNED = RefineOptions()
 """Beams are where the scan says."""
 UNEXPLAINED = 3
@@ -42,6 +46,7 @@ def reconstruct(
     illumination: RunLightFlags = LIGHT,
     geometry: RefineOptions = AS_PLANNED,
     strict: bool = False,
+    live: LiveFlags = LIVE,
 ) -> None:
     """Reconstruct a scan by Gaussians, or by another method, into a run folder.
 
@@ -69,18 +74,22 @@ def reconstruct(
         "--refine finds each frame by itself, but --time-frame all has the same beams many times; find their one "
         "geometry with holosplat align, and reconstruct the file that it writes without --refine.",
     )
-    measured = read_as(scan, replace(reading, told=reading.told.at_middle())).in_memory()
+    measured = read_as(scan, replace(reading, told=reading.told.at_middle()))
     prior = matter.without_ranges().prior(measured.exposures.reference_energy)
+    if not measured.is_series:
+        tell_reconstruction(measured.exposures[~measured.is_test], out, method, prior, how.kind_of_matter())
+    measured = measured.in_memory()
     folder = RunFolder(out)
     if asks_for_motion(
         reading, method, how.kind_of_matter(), plain=not resume and refine is None and uncertain == Uncertain()
     ):
+        require(not live.view, "--view shows fits of one time; choose it with --time-frame, or leave --view.")
         with claimed(folder):
             if reconstruct_in_motion(scan, reading, prior, folder, seed, illumination.options()):
                 return
         _say("nothing moves, as far as the frames tell: they are taken as of one time")
     with claimed(folder):
-        with ProgressBar() as bar:
+        with ProgressBar() as bar, watched(live, out.name, bar.show) as follow:
             result = fit(
                 measured,
                 prior,
@@ -92,7 +101,8 @@ def reconstruct(
                 refine=refine,
                 folder=folder,
                 resume=resume,
-                on_progress=bar.show,
+                on_progress=follow.on_progress,
+                on_state=follow.on_state,
             )
         found = {each.name: each.value for each in result.constants if each.name in reading.told.ranges()}
         write_json(folder.source, run_source(scan, replace(reading, told=replace(reading.told, **found))))

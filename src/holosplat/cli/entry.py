@@ -62,6 +62,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "series",
         "Reconstruct a series as tasks of their own: on this machine, by Slurm, on Dask (plan, run, status, collect).",
     ),
+    "watch": (
+        "watch",
+        "Reconstruct scans as they appear in a folder, each begun with what the last one gave, and keep a live page.",
+    ),
     "forecast": (
         "forecast",
         "Carry a run of track on: its bodies and their frames at later times, with a standard error.",
@@ -70,6 +74,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "export": (
         "export",
         "Write δ and β of a run as a volume, its bodies as meshes, or its object in few bytes or as splats.",
+    ),
+    "view": (
+        "view",
+        "Show a run or an object file in the browser, as Gaussians or surfaces, with sliders (Ctrl-C ends).",
     ),
     "surface": (
         "surface",

@@ -34,6 +34,8 @@ class ObjectFiles:
     times."""
     step_px: Pixels = 1 / 32
     """Step of places in it [pixels]; those of sizes, orientations and amplitudes go with it."""
+    together: tuple[Path, ...] = ()
+    """More runs of a series, in order, for the same file of --compact, which stores once what they have in common."""
     splats: Path | None = None
     """PLY file of splat viewers (µm), of a run of Gaussians; their opacity is no phase (docs/formats.md)."""
 
@@ -68,9 +70,10 @@ def export(
         any((volume, bodies, objects.compact, objects.splats)),
         "export needs --volume, --bodies, --compact or --splats; name what to write.",
     )
+    require(objects.compact is not None or not objects.together, "--together needs --compact; name its file.")
     folder = RunFolder(run)
     if objects.compact is not None:
-        _export_compact(folder, objects.compact, objects.step_px)
+        _export_compact(folder, objects.compact, objects.step_px, objects.together)
     if bodies is not None and time_frame == "all" and bodies.suffix.lower() == GLB and _export_motion(folder, bodies):
         bodies = None
     if not any((volume, bodies, objects.splats)):
@@ -90,17 +93,25 @@ def _ending(path: Path, ending: str) -> Path:
     return path.with_name(f"{stem}{ending}{ome}{path.suffix}")
 
 
-def _export_compact(folder: RunFolder, out: Path, step_px: float) -> None:
+def _export_compact(folder: RunFolder, out: Path, step_px: float, together: tuple[Path, ...]) -> None:
     from ..io.atomic import require_writable
     from ..io.compact import steps_of
     from ..io.objects import read_object, write_compact
+    from ..io.series import names_of, write_series
+    from ..workflows.run_folder import RunFolder
 
-    steps = steps_of(step_px)
+    steps, folders = steps_of(step_px), [folder, *map(RunFolder, together)]
     require_writable(out)
-    folder.require_run()
-    write_compact(out, read_object(folder.result()), steps)
-    before, after = folder.result().stat().st_size, out.stat().st_size
-    _say(f"wrote {out}: {after / 1e6:.3g} MB, {before / after:.1f} times smaller than {folder.result().name}")
+    for each in folders:
+        each.require_run()
+    if together:
+        names = names_of([each.path for each in folders])
+        write_series(out, {name: read_object(each.result()) for name, each in zip(names, folders)}, steps)
+    else:
+        write_compact(out, read_object(folder.result()), steps)
+    before, after = sum(each.result().stat().st_size for each in folders), out.stat().st_size
+    of = f"{len(folders)} runs" if together else folder.result().name
+    _say(f"wrote {out}: {after / 1e6:.3g} MB, {before / after:.1f} times smaller than {of}")
 
 
 def _export_motion(folder: RunFolder, out: Path) -> bool:

@@ -12,10 +12,10 @@ from tyro.conf import Positional, arg, subcommand
 from ..checks import require
 from ..io.reading import Reading
 from ..ranges import Natural, Positive, Seed, ranged, with_checked_numbers
+from .bodies import BodyFlags, MotionFlags
 from .light import RunLightFlags
 from .options import MethodOptions, PriorOptions
 from .progress import INTERRUPTED
-from .track import BodyFlags, MotionFlags
 
 if TYPE_CHECKING:
     from ..series.folder import SeriesFolder
@@ -51,8 +51,6 @@ class WindowFlags:
 class EachTime:
     """What is done with each time."""
 
-    track: bool = False
-    """Follow closed bodies through all times of a task, as holosplat track does; else each time is reconstructed."""
     warm: bool = True
     """Begin each time with what the one before ended with, with fewer steps; where that does not explain its frames, it
     begins anew, by itself. --no-warm: each begins by itself."""
@@ -67,18 +65,24 @@ EACH, WINDOWS, MOTION, UNKNOWN = EachTime(), WindowFlags(), MotionFlags(), BodyF
 
 
 def settings_of(
-    each: EachTime, how: MethodOptions, motion: MotionFlags, known: BodyFlags, light: RunLightFlags, seed: int
+    track: bool,
+    each: EachTime,
+    how: MethodOptions,
+    motion: MotionFlags,
+    known: BodyFlags,
+    light: RunLightFlags,
+    seed: int,
 ) -> Settings:
     """What options say is done with each time; `InputError` for options of the other act."""
     from dataclasses import replace
 
     from ..series.settings import Settings, Warm
 
-    stray = _changed(motion, known) if not each.track else _changed(how)
-    other = "goes with --track" if not each.track else "is of reconstruct; leave it, or --track"
+    stray = _changed(motion, known) if not track else _changed(how)
+    other = "goes with --track" if not track else "is of reconstruct; leave it, or --track"
     require(not stray, f"--{stray[0].replace('_', '-') if stray else ''} {other}.")
     shared = {"light": light.options(), "seed": seed, "reports": each.reports}
-    if each.track:
+    if track:
         return Settings("track", motion=replace(motion.options(), body=known.known()), **shared)
     warm = Warm(each.warm, each.worse)
     return Settings("reconstruct", how.chosen(), how.kind_of_matter(), warm, **shared)
@@ -144,6 +148,7 @@ def plan(
     illumination: RunLightFlags = LIGHT,
     reading: Reading = Reading(),
     seed: Seed = 0,
+    track: bool = False,
 ) -> None:
     """Cut a series into tasks, in a new folder; nothing is reconstructed yet.
 
@@ -152,13 +157,14 @@ def plan(
             scan files, whose order is that of their names.
         out: Folder of the series to make.
         seed: Seed of everything random.
+        track: Follow closed bodies through all times of a task, as holosplat track does; else each is reconstructed.
     """
     from ..series.folder import SeriesFolder
     from ..series.plan import plan_series
     from ..series.sources import listed
 
     require(not matter.ranges(), "a series needs one number for --delta-beta; find it by reconstruct of one time.")
-    settings = settings_of(each, how, motion, known, illumination, seed)
+    settings = settings_of(track, each, how, motion, known, illumination, seed)
     folder = SeriesFolder(out)
     found = plan_series(listed(scans), settings, matter.prior, reading, windows.cut())
     folder.create(found)

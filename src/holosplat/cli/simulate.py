@@ -24,6 +24,7 @@ from .options import (
     TruthOptions,
 )
 from .progress import ProgressBar
+from .room import tell_simulation
 from .source import SourceOptions
 from .specimen import SpecimenOptions
 
@@ -114,6 +115,7 @@ def simulate(
     targets = [(out, nominal, facts)]
     if truth.true_exposures:
         targets.append((truth.true_exposures, true, facts | experiment.misalignment.facts()))
+    tell_simulation(true_views, out, how.samples(true_views), len(true))
     with ProgressBar() as bar:
         _write_frames(targets, is_test, source.frames(specimen.matter, filled, true, how), bar)
     text = "{} frames of {} × {} pixels, {} of them held out".format(len(true), *beamline.detector, is_test.sum())

@@ -21,6 +21,7 @@ from ..ranges import ranged
 from ..representations import GaussianCloud, Stored
 
 FORMAT = "holosplat compact 1"
+SERIES = "holosplat compact series 1"
 COMPRESSED = {"compression": "gzip", "compression_opts": 9, "shuffle": True, "fletcher32": True}
 """How HDF5 stores the whole numbers: filters that each of its readers has."""
 FINEST, COARSEST = 1e-4, 1.0
@@ -65,50 +66,87 @@ def steps_of(place_px: float) -> Steps:
     return Steps().times(place_px / Steps.place)
 
 
-def ordered(obj: Stored) -> Stored:
-    """The object with its parts in an order that compresses well; their sum does not depend on it."""
+def order_of(obj: Stored) -> Tensor | None:
+    """The order [N] of the parts of an object that compresses well; None if it has no parts to be put in order."""
     if not isinstance(obj, GaussianCloud) or len(obj) == 0:
+        return None
+    return torch.from_numpy(_along_curve(obj.centres.detach().cpu().numpy()))
+
+
+def ordered(obj: Stored, order: Tensor | None) -> Stored:
+    """The object with its parts in `order`; their sum does not depend on it."""
+    if not isinstance(obj, GaussianCloud) or order is None:
         return obj
-    order = torch.from_numpy(_along_curve(obj.centres.detach().cpu().numpy()))
     parameters = {name: p.detach().cpu()[order] for name, p in obj.parameters().items()}
     q = torch.nn.functional.normalize(parameters["quaternions"], dim=1)
     parameters["quaternions"] = torch.where(q[:, :1] < 0, -q, q)  # q and -q are one rotation
     return obj.replaced(parameters.values())
 
 
+@dataclass(frozen=True)
+class Whole:
+    """A tensor as whole numbers of a `step`, last axis first (0: `numbers` are its values), of the type `dtype`."""
+
+    numbers: np.ndarray
+    step: float
+    dtype: np.dtype
+
+    @classmethod
+    def of(cls, name: str, tensor: Tensor, steps: Steps, step: float | None = None) -> Whole:
+        """The tensor called `name`; `step` goes before what `steps` say."""
+        values = tensor.detach().cpu().numpy()
+        step = (steps.of(name, values) or 0.0) if step is None else step
+        numbers = np.rint(values / step).astype(np.int64) if step else values
+        return cls(np.moveaxis(numbers, -1, 0) if numbers.ndim > 0 else numbers, step, values.dtype)
+
+    def values(self) -> np.ndarray:
+        """The tensor, as near as it was stored."""
+        numbers = np.moveaxis(self.numbers, 0, -1) if self.numbers.ndim > 0 else self.numbers
+        return np.ascontiguousarray(self.step * numbers if self.step else numbers, dtype=self.dtype)
+
+    @property
+    def counted(self) -> bool:
+        """Whether there are whole numbers in it that may be stored as differences."""
+        return self.numbers.dtype.kind in "iu" and self.numbers.ndim > 0
+
+
 def encode(file: h5py.File, tensors: Mapping[str, Tensor], steps: Steps) -> None:
     """A dataset for each tensor, last axis first, with the attributes `step` (0: values as they are), `differences`
     along the rows where these take less, and `dtype`."""
     for name, tensor in tensors.items():
-        values = tensor.detach().cpu().numpy()
-        step = steps.of(name, values)
-        whole = np.rint(values / step).astype(np.int64) if step else values
-        differences = False
-        if whole.ndim > 0:
-            whole = np.moveaxis(whole, -1, 0)
-        if whole.dtype.kind in "iu" and whole.ndim > 0:
-            apart = np.diff(whole, axis=-1, prepend=0)
-            differences = _size(apart) < _size(whole)
-            whole = _small(apart if differences else whole)
-        dataset = file.create_dataset(name, data=whole, **(COMPRESSED if whole.size and whole.ndim else {}))
-        dataset.attrs.update(step=step or 0.0, differences=differences, dtype=str(values.dtype))
+        put_whole(file, name, Whole.of(name, tensor, steps))
+
+
+def put_whole(group: h5py.Group, name: str, whole: Whole) -> h5py.Dataset:
+    """The dataset of one tensor."""
+    numbers, differences = whole.numbers, False
+    if whole.counted:
+        apart = np.diff(numbers, axis=-1, prepend=0)
+        differences = size_of(apart) < size_of(numbers)
+        numbers = _small(apart if differences else numbers)
+    dataset = group.create_dataset(name, data=numbers, **(COMPRESSED if numbers.size and numbers.ndim else {}))
+    dataset.attrs.update(step=whole.step, differences=differences, dtype=str(whole.dtype))
+    return dataset
 
 
 def decode(dataset: h5py.Dataset, label: str) -> np.ndarray:
     """The values of a dataset that `encode` made; `InputError` where its attributes say nothing sensible."""
+    return get_whole(dataset, label).values()
+
+
+def get_whole(dataset: h5py.Dataset, label: str) -> Whole:
+    """What `put_whole` stored; `InputError` where its attributes say nothing sensible."""
     try:
         step, dtype = float(np.asarray(dataset.attrs["step"])), np.dtype(str(dataset.attrs["dtype"]))
         differences = bool(dataset.attrs["differences"])
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{label} must say its step, type and differences, but it lacks or garbles {error}.") from None
-    values = np.asarray(dataset[()])
+    numbers = np.asarray(dataset[()])
     if not (np.isfinite(step) and step >= 0 and dtype.kind in "iufb"):
         raise InputError(f"{label} must have a step of zero or more and a type of numbers, but has {step:g}, {dtype}.")
-    if differences and values.ndim > 0:
-        values = np.cumsum(values, axis=-1, dtype=np.int64)
-    if values.ndim > 0:
-        values = np.moveaxis(values, 0, -1)
-    return np.ascontiguousarray(step * values if step else values, dtype=dtype)
+    if differences and numbers.ndim > 0:
+        numbers = np.cumsum(numbers, axis=-1, dtype=np.int64)
+    return Whole(numbers, step, dtype)
 
 
 def _small(whole: np.ndarray) -> np.ndarray:
@@ -117,7 +155,7 @@ def _small(whole: np.ndarray) -> np.ndarray:
     return whole.astype(next(t for t in (np.int8, np.int16, np.int32, np.int64) if largest <= np.iinfo(t).max))
 
 
-def _size(whole: np.ndarray) -> int:
+def size_of(whole: np.ndarray) -> int:
     """Bytes that whole numbers take compressed, about: their bytes of each significance by themselves."""
     small = np.ascontiguousarray(_small(whole))
     return len(zlib.compress(small.view(np.uint8).reshape(-1, small.itemsize).T.tobytes(), 6))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import zlib
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..checks import InputError, require
+from .room import machine_memory
 
 RATIO = 1100
 """Declared bytes over those of a file, at most: deflate, the densest that readers know, makes zeros 1032 times smaller.
@@ -36,17 +36,13 @@ def require_declared(label: str, declared: int, held: int) -> None:
     )
 
 
-def machine_memory() -> int:
-    """Bytes of memory that this machine has."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-
-
 def require_memory(label: str, size: int) -> None:
     """`InputError` if `size` bytes are more than the memory of this machine."""
     whole = machine_memory()
     require(
         size <= whole,
-        f"{label} takes {size / 1e9:.3g} GB, but this machine has {whole / 1e9:.3g} GB of memory; take a part of it.",
+        f"{label} takes {size / 1e9:.3g} GB, but this machine has {whole / 1e9:.3g} GB of memory for it; "
+        "take a part of it.",
     )
 
 

@@ -13,9 +13,13 @@ from h5py import h5d, h5l, h5o  # pyright: ignore[reportAttributeAccessIssue]  #
 
 from ..checks import InputError, require
 from .guard import DEEPEST, require_declared
+from .hdf5_chunks import require_chunks
+from .hdf5_sources import linked, require_external, virtual_sources
 
 MOST = 200_000
 """Links in a file, at most: larger ones are no scans, and take minutes to look through."""
+MOST_FILES = 10_000
+"""Files that one may bring values of: one a frame, and more than beamlines write."""
 _vouched: set[Path] = set()
 
 
@@ -26,25 +30,54 @@ def allow_external(path: Path) -> None:
 
 def require_own(file: h5py.File, path: Path) -> None:
     """`InputError` if an open file at `path` refers to other files, is nested too deeply, or declares more values than
-    it can hold."""
-    size, own = path.stat().st_size, not _is_vouched(path)
+    it can hold. Where it may refer to others (`allow_external`), the same holds for each of these."""
+    allowed = _is_vouched(path)
+    seen, later = {path.resolve()}, _others(file, path, allowed)
+    while later:
+        other = later.pop()
+        if other.resolve() in seen:
+            continue
+        seen.add(other.resolve())
+        require(len(seen) <= MOST_FILES, f"{path} must bring values of at most {MOST_FILES} files, but has more.")
+        try:
+            with h5py.File(other, "r") as opened:
+                later += _others(opened, other, allowed)
+        except OSError as error:
+            raise InputError(
+                f"{other}, of which {path} brings values, must be a complete HDF5 file, but it is not: {error}."
+            ) from None
+
+
+def _others(file: h5py.File, path: Path, allowed: bool) -> list[Path]:
+    """The HDF5 files that an open one refers to, once all else of it is in order."""
+    size, found = path.stat().st_size, list[Path]()
     for name, kind in _links(file, path):
+        label = f"{path}: /{name.decode(errors='replace')}"
         require(name.count(b"/") < DEEPEST, f"{path} must not be nested more than {DEEPEST} deep, but it is.")
         if kind == h5l.TYPE_EXTERNAL:
-            require(not own, _refers(path, name, "is a link to another file"))
-            continue
-        if kind != h5l.TYPE_HARD or h5o.get_info(file.id, name).type != h5o.TYPE_DATASET:
-            continue
-        dataset = h5d.open(file.id, name)
-        plan = dataset.get_create_plist()
-        virtual = plan.get_layout() == h5d.VIRTUAL
-        if virtual or plan.get_external_count() > 0:
-            require(not own, _refers(path, name, "has its values in another file"))
-            continue
-        declared = dataset.get_type().get_size()
-        for length in dataset.shape:
-            declared *= length
-        require_declared(f"{path}: /{name.decode(errors='replace')}", declared, size)
+            require(allowed, _refers(path, name, "is a link to another file"))
+            found += linked(path, label, file.id.links.get_val(name)[0])
+        elif kind == h5l.TYPE_HARD and h5o.get_info(file.id, name).type == h5o.TYPE_DATASET:
+            found += _dataset_files(h5d.open(file.id, name), path, name, allowed, size)
+    return found
+
+
+def _dataset_files(dataset: h5d.DatasetID, path: Path, name: bytes, allowed: bool, size: int) -> list[Path]:
+    """The HDF5 files that a dataset of the file `path` refers to, once its values are in order."""
+    label, plan = f"{path}: /{name.decode(errors='replace')}", dataset.get_create_plist()
+    declared = dataset.get_type().get_size()
+    for length in dataset.shape:
+        declared *= length
+    virtual, external = plan.get_layout() == h5d.VIRTUAL, plan.get_external_count() > 0
+    require(allowed or not (virtual or external), _refers(path, name, "has its values in another file"))
+    if virtual:
+        return virtual_sources(path, label, plan, declared)
+    if external:
+        require_external(path, label, plan, declared)
+    else:
+        require_declared(label, declared, size)
+        require_chunks(dataset, label, size)
+    return []
 
 
 def _is_vouched(path: Path) -> bool:

@@ -28,7 +28,7 @@ MOST_TEXT = 60_000
 
 def write_object(path: Path, obj: Stored) -> None:
     """Write an Object: the attributes `format`, `kind` and `state` (JSON), and a dataset for each of its tensors."""
-    tensors, plain = _parted(obj.state())
+    tensors, plain = parted(obj.state())
     text = json.dumps(plain)
     assert len(text) < MOST_TEXT
     with new_hdf5(path) as file:
@@ -39,7 +39,7 @@ def write_object(path: Path, obj: Stored) -> None:
 
 def write_compact(path: Path, obj: Stored, steps: compact.Steps) -> None:
     """Write an Object in few bytes, as near as `steps` say; `read_object` reads it."""
-    tensors, plain = _parted(compact.ordered(obj).state())
+    tensors, plain = parted(compact.ordered(obj, compact.order_of(obj)).state())
     text = json.dumps(plain)
     assert len(text) < MOST_TEXT
     with new_hdf5(path) as file:
@@ -52,6 +52,10 @@ def read_object(path: Path) -> Stored:
     for any other."""
     with open_hdf5(path) as file:
         form = str(file.attrs.get("format", ""))
+        require(
+            form != compact.SERIES,
+            f"{path} must hold one object, but it holds a series of them; choose one with holosplat.io.series.",
+        )
         if form == GAUSSIANS:
             return read_gaussians(path)
         kind = KINDS.get(str(file.attrs.get("kind", "")))
@@ -62,14 +66,14 @@ def read_object(path: Path) -> Stored:
         fields, names = Fields(path, file), list[str]()
         file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
         decoded = compact.decode if form == compact.FORMAT else lambda dataset, label: np.asarray(dataset[()])
-        arrays = {n: _sound(fields.label(n), decoded(fields.dataset(n), fields.label(n))) for n in names}
+        arrays = {n: sound(fields.label(n), decoded(fields.dataset(n), fields.label(n))) for n in names}
         with as_written(path, "a whole object"):
             plain = json.loads(str(file.attrs["state"]))
             require_plausible(plain)
-            return kind.from_state(_joined({name: torch.from_numpy(a) for name, a in arrays.items()}, plain))
+            return kind.from_state(joined({name: torch.from_numpy(a) for name, a in arrays.items()}, plain))
 
 
-def _sound(label: str, array: np.ndarray) -> np.ndarray:
+def sound(label: str, array: np.ndarray) -> np.ndarray:
     """`array`, if it holds numbers that an Object may have."""
     require(array.dtype.kind in "iufb", f"{label} must hold numbers, but it does not.")
     finite(label, array)
@@ -79,22 +83,22 @@ def _sound(label: str, array: np.ndarray) -> np.ndarray:
     return array
 
 
-def _parted(state: Mapping[str, Any], prefix: str = "") -> tuple[dict[str, Tensor], dict[str, Any]]:
+def parted(state: Mapping[str, Any], prefix: str = "") -> tuple[dict[str, Tensor], dict[str, Any]]:
     """The tensors by their path, and what is left."""
     tensors, plain = dict[str, Tensor](), dict[str, Any]()
     for name, value in state.items():
         if isinstance(value, Tensor):
             tensors[prefix + name] = value
         elif isinstance(value, Mapping):
-            inner, plain[name] = _parted(value, f"{prefix}{name}/")
+            inner, plain[name] = parted(value, f"{prefix}{name}/")
             tensors |= inner
         else:
             plain[name] = value
     return tensors, plain
 
 
-def _joined(tensors: Mapping[str, Tensor], plain: Mapping[str, Any]) -> dict[str, Any]:
-    """The state of which `_parted` made two."""
+def joined(tensors: Mapping[str, Tensor], plain: Mapping[str, Any]) -> dict[str, Any]:
+    """The state of which `parted` made two."""
     state = json.loads(json.dumps(plain))
     for path, tensor in tensors.items():
         *groups, name = path.split("/")

@@ -66,9 +66,9 @@ def splats_of(cloud: GaussianCloud) -> np.ndarray:
     return values.view([(name, "<f4") for name in NAMES]).reshape(-1)
 
 
-def opacities(cloud: GaussianCloud) -> np.ndarray:
+def opacities(cloud: GaussianCloud, deepest: float = DEPTH) -> np.ndarray:
     """α [N] at the middle of each Gaussian: its peak thickness from the mean direction, over that of the thickest ray
-    along z, which has the optical depth `DEPTH`."""
+    along z, which has the optical depth `deepest`."""
     shown = len(cloud.matter) if cloud.matter.occupancies else 1  # of free δ and β, δ
     half = float(cloud.centres[:, :2].abs().max()) + 1
     pixel = max(1.0, 2 * half / MOST_PIXELS)
@@ -77,7 +77,7 @@ def opacities(cloud: GaussianCloud) -> np.ndarray:
     thickest = float(rays.max())
     mean_scale = cloud.scales.double().prod(dim=1) ** (1 / 3)
     own = cloud.amplitudes.double()[:, :shown].sum(dim=1) * math.sqrt(2 * math.pi) * mean_scale
-    depth = own.numpy() * (DEPTH / thickest if thickest > 0 else 0.0)
+    depth = own.numpy() * (deepest / thickest if thickest > 0 else 0.0)
     return np.clip(-np.expm1(-depth), 1e-6, OPAQUE)
 
 

@@ -12,6 +12,7 @@ from torch.nn.functional import normalize, softplus
 
 from ..backends import device
 from ..checks import positive, require
+from ..display import of_object
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..projectors.splat import splat, voxelise
@@ -35,6 +36,7 @@ class GaussianCloud:
 
     kind: ClassVar[str] = "gaussians"
     """The name of this kind of Object in files."""
+    _repr_html_ = of_object
 
     def __init__(self, parameters: Iterable[Tensor], unit_length: float, matter: Matter) -> None:
         self.centres, self.log_scales, self.quaternions, self.raw_amplitudes = parameters

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..checks import positive, require
+from ..display import of_object
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..projectors.splat.reference import rotation_matrices
@@ -33,6 +34,7 @@ class MovingGaussians:
 
     kind: ClassVar[str] = "moving-gaussians"
     """The name of this kind of Object in files."""
+    _repr_html_ = of_object
 
     def __init__(self, cloud: GaussianCloud, flow: Flow, fading: Tensor | None = None) -> None:
         self.cloud, self.flow, self.fading = cloud, flow, fading

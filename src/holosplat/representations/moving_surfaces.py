@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..checks import positive, require
+from ..display import of_object
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..mesh import TriangleMesh
@@ -30,6 +31,7 @@ class MovingSurfaces:
 
     kind: ClassVar[str] = "moving-surfaces"
     """The name of this kind of Object in files."""
+    _repr_html_ = of_object
 
     def __init__(
         self,

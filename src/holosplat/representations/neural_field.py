@@ -17,6 +17,7 @@ from torch.nn.functional import max_pool3d, softplus
 
 from ..backends import device
 from ..checks import at_least, require
+from ..display import of_object
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..ranges import ranged
@@ -97,6 +98,7 @@ class NeuralField:
 
     kind: ClassVar[str] = "neural-field"
     """The name of this kind of Object in files."""
+    _repr_html_ = of_object
 
     def __init__(
         self, grid: Grid, matter: Matter, network: Network, mask: Tensor, seed: int = 0, upper: float = 1.0

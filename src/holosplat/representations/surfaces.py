@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..checks import InputError, positive, require
+from ..display import of_object
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..mesh import TriangleMesh, shell_labels, winding_number
@@ -28,6 +29,7 @@ class SurfaceMesh:
 
     kind: ClassVar[str] = "surfaces"
     """The name of this kind of Object in files."""
+    _repr_html_ = of_object
 
     def __init__(self, vertices: Tensor, faces: Tensor, unit_length: float, matter: Matter, lines: int = 2) -> None:
         shapes = [tuple(vertices.shape), tuple(faces.shape)]

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 from torch import Tensor
 
 from ..checks import require
+from ..display import of_object
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..volume import LineIntegrals, Volume
@@ -26,6 +27,7 @@ class VoxelGrid:
 
     kind: ClassVar[str] = "voxels"
     """The name of this kind of Object in files."""
+    _repr_html_ = of_object
 
     def __init__(self, values: Tensor, grid: Grid, matter: Matter) -> None:
         shape, wanted = tuple(values.shape), (len(matter), *grid.shape)

@@ -32,7 +32,7 @@ def run_on_dask(
     wanted = ("left", "failed") if retry else ("left",)
     numbers = [state.number for state in states(folder) if state.state in wanted]
     try:
-        client = Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
+        client = Client(address, timeout=CONNECT_SECONDS)
     except (OSError, ValueError) as error:
         said = str(error).split("\n", 1)[0]
         raise InputError(f"--dask must be the address of a Dask scheduler, but {address!r} gives: {said}.") from None

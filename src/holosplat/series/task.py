@@ -47,7 +47,7 @@ def run_task(folder: SeriesFolder, number: int, on_row: Told = nothing) -> TaskS
             return folder.state(window)
         (path / FAILED).unlink(missing_ok=True)
         began = time.perf_counter()
-        reason = _attempted(lambda: _work(folder, plan, window, on_row))
+        reason = attempted(lambda: _work(folder, plan, window, on_row))
         if reason:
             write_json(path / FAILED, {"reason": reason})
         else:
@@ -97,7 +97,7 @@ def _row(plan: SeriesPlan, moment: Moment, scans: Scans, run: RunFolder, before:
         row = reconstruct_time(shot, plan.settings, run, before)
         return ""
 
-    reason = _attempted(work)
+    reason = attempted(work)
     return replace(row, status="failed", reason=reason) if reason else row
 
 
@@ -105,7 +105,7 @@ def _blank(moment: Moment, source: Source) -> Row:
     return Row(moment.number, str(source.path), moment.frame, moment.time, "failed")
 
 
-def _attempted(work: Callable[[], str]) -> str:
+def attempted(work: Callable[[], str]) -> str:
     """What `work` says, or why it failed: one fault must not take the others' results."""
     try:
         return work()

@@ -25,7 +25,7 @@ from ..workflows.evaluate import Evaluation, evaluate
 from ..workflows.reconstruct import reconstruct
 from ..workflows.reconstruction import Reconstruction
 from ..workflows.run_folder import RunFolder, claimed
-from .rows import Body, Row
+from .rows import Begun, Body, Row
 from .settings import Settings
 
 PHASE = "phase.npy"
@@ -67,24 +67,41 @@ def reconstruct_time(
     `reconstruct`.
     """
     began = time.perf_counter()
-    warm = before is not None and settings.warm.on and not _begun_alone(folder)
-    alone = "cold" if before is None or not settings.warm.on else "anew"
-    if warm and before is not None:
-        method = Continued.of(settings.method, before.folder.object, settings.warm.effort)
-        done = _run(shot, settings, method, folder, on_progress, before)
-        allowed = settings.warm.worse * (before.row.reference or 0.0)
-        if _explained(done) or _share(done) <= allowed:
-            return _written(
-                shot, settings, folder, done, replace(shot.row, begun="warm", reference=before.row.reference), began
-            )
-        shutil.rmtree(folder.path)
+    alone: Begun = "cold"
+    if before is not None and settings.warm.on and _same_field(before, shot.scan):
+        method = Continued.of(settings.method, before.folder.object.resolve(), settings.warm.effort)
+        alone = "anew"
+        if not _begun_alone(folder, method):
+            done = _run(shot, settings, method, folder, on_progress, before)
+            allowed = settings.warm.worse * (before.row.reference or 0.0)
+            if _explained(done) or _share(done) <= allowed:
+                row = replace(shot.row, begun="warm", reference=before.row.reference)
+                return _written(shot, settings, folder, done, row, began)
+            shutil.rmtree(folder.path)
     done = _run(shot, settings, settings.method, folder, on_progress)
     return _written(shot, settings, folder, done, replace(shot.row, begun=alone, reference=_share(done)), began)
 
 
-def _begun_alone(folder: RunFolder) -> bool:
-    """Whether a run that is there began by itself."""
-    return folder.config.is_file() and folder.read_config().get("method", {}).get("kind") != Continued.kind
+def _same_field(before: Before, scan: Scan) -> bool:
+    """Whether the time before was seen by the same pixels, at the same energy."""
+    summary, views = before.folder.read_summary(), scan.views
+    seen = summary["detector"]
+    alike = (seen["rows"], seen["columns"]) == views.shape
+    sizes = (seen["pixel_size_m"], views.finest), (summary["energy_kev"], scan.exposures.reference_energy)
+    return alike and all(abs(a / b - 1) < 1e-6 for a, b in sizes)
+
+
+def _begun_alone(folder: RunFolder, method: Continued) -> bool:
+    """Whether a run that is there began by itself. One that went on from another file, as before its folder was moved,
+    is removed: it is done again with the same numbers."""
+    if not folder.config.is_file():
+        return False
+    was = folder.read_config().get("method", {})
+    if was.get("kind") != Continued.kind:
+        return True
+    if was.get("begin") != str(method.begin):
+        shutil.rmtree(folder.path)
+    return False
 
 
 def _run(

@@ -23,7 +23,7 @@ from ..methods.still import prepared
 from ..methods.uncertain import Determined, Uncertain
 from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling
-from ..progress import FitProgress
+from ..progress import FitProgress, FitState
 from ..ranges import require_plausible
 from ..representations import KINDS, Stored
 from ..scan import Scan
@@ -72,6 +72,7 @@ def reconstruct(
     folder: RunFolder | None = None,
     resume: bool = False,
     on_progress: FitProgress = lambda stage, fraction, record: None,
+    on_state: FitState = lambda stage, fraction, record, state: None,
 ) -> Reconstruction:
     """The Object that `method` makes of the training frames of `scan`: the best of its states by these frames.
 
@@ -105,7 +106,7 @@ def reconstruct(
             scan = geometry.applied(scan)
         train = scan.train()
         task = prepared(Task(train, prior, seed, tell, assumed, freedom=freedom_of(geometry, refine)), method)
-        run = _Run(task, method, folder, on_progress)
+        run = _Run(task, method, folder, on_progress, on_state)
         run.begin(config, resume)
         run.settle(matter, ranges, scan, geometry)
         done = run.complete()
@@ -181,6 +182,7 @@ class _Run:
     method: Method
     folder: RunFolder | None
     on_progress: FitProgress
+    on_state: FitState
     timing: dict[str, float] = field(default_factory=dict)
     asked: str = ""
     why: str = ""
@@ -368,6 +370,7 @@ class _Journal:
         fit = self._fit
         name = self._run.method.stages()[self._number].name
         self._run.on_progress(name, fit.share, record)
+        self._run.on_state(name, fit.share, record, lambda: fit.result().object)
         up_to_date = record["step"] == fit.step  # on a GPU, records come late and in batches
         if up_to_date and time.perf_counter() - self._last > CHECKPOINT_SECONDS:
             self._save()

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..align.geometry import Geometry
+from ..display import card, of_object
 from ..methods.uncertain import Determined, placed
 from ..optics.background import LightOptions
 from ..representations import Stored
@@ -51,6 +52,14 @@ class Reconstruction:
     light: LightOptions = EVEN
     geometry: Geometry | None = None
     still: np.ndarray | None = None
+
+    def _repr_html_(self) -> str:
+        """What Jupyter shows: what was decided and found, and the object."""
+        rows = {"method": self.method, "photon energy": f"{self.energy_kev:.4g} keV", "finished": str(self.finished)}
+        rows["time"] = f"{sum(self.timing.values()):.1f} s"
+        rows |= {"frames": " ".join(self.verdict.lines("training frames"))} if self.verdict else {}
+        rows |= {"total": self.total.words} if self.total else {}
+        return card("Reconstruction", rows) + "<br/>" + of_object(self.object)
 
     def placed(self, scan: Scan) -> Scan:
         """`scan`, as it was given to the reconstruction, at the distance and energy, or in the poses, that were

@@ -16,10 +16,12 @@ import numpy as np
 import torch
 
 from ..checks import as_written, require
+from ..display import card, of_object
 from ..io.atomic import atomic_path
 from ..io.folder import require_new, require_parent
 from ..io.json import read_json, write_json
 from ..io.lock import sole_writer
+from ..io.objects import read_object
 from ..ranges import require_plausible
 from .manifest import write_manifest
 
@@ -39,6 +41,15 @@ class RunFolder:
         self.source = self.path / "source.json"
         self.report = self.path / "report.html"
         self._columns: list[str] = []
+
+    def _repr_html_(self) -> str:
+        """What Jupyter shows: the folder, what its summary says, and the object; of a run that is not finished, so."""
+        rows = {"folder": str(self.path)}
+        if not (self.config.is_file() and self.result().is_file()):
+            return card("RunFolder", rows | {"state": "begun" if self.config.is_file() else "empty"})
+        summary = self.read_summary()
+        rows |= {name: str(summary[name]) for name in ("method", "kind", "finished") if name in summary}
+        return card("RunFolder", rows | {"report": str(self.report)}) + "<br/>" + of_object(read_object(self.result()))
 
     def require_new(self, advise_resume: bool = False) -> None:
         """`InputError` if something is there already; the message may point to --resume."""

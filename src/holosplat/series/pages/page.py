@@ -66,18 +66,20 @@ def render_page(page: SeriesPage) -> str:
     pictures = [
         {
             "number": frame.row.number,
-            "label": f"time {frame.row.number}, {frame.time:.6g} s",
+            "label": f"time {frame.row.number}: {frame.time:.6g} s of {Path(frame.row.scan).name}",
             "image": _png(phase, low, high),
         }
         for frame, phase in kept
     ]
-    return template("series.html", __package__ or "").render(
+    return template(
+        "series.html", __package__ or ""
+    ).render(
         title=page.title,
         verdict=page.verdict,
         summary=page.summary,
         key_figures=key_figures(page.frames),
         pictures=pictures,
-        limits=f"{low:.3g} to {high:.3g} rad",
+        limits=f"{low + 0.0:.3g} to {high + 0.0:.3g} rad".replace("-", "−"),  # −0 is 0
         charts=_charts(page.frames),
         rows=[_cells(frame) for frame in page.frames[-MOST_ROWS:]],
         failed=page.failed,

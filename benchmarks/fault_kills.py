@@ -1,0 +1,95 @@
+"""Commands that are killed, and commands on a disk that is full."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from fault_shop import Shop, Writer, is_whole, reads, snapshots
+from forked import Ended, run
+
+BLOCK = 4096
+"""Bytes of a page, by which a file system in memory grows."""
+HANG, SLOWER = 60.0, 10
+"""A command hangs that takes more seconds than this, and so many times what it takes undisturbed under the same load.
+"""
+
+
+def killed(shop: Shop, writer: Writer, seconds: float, rng: random.Random, folder: Path) -> str:
+    """Kill a command at a random moment of its `seconds`, and let the next one follow; what went wrong."""
+    command = writer.command(shop, folder)
+    limit = max(HANG, SLOWER * seconds)
+    first = run(command, kill_after=rng.uniform(0.0, 1.1 * seconds), limit=limit)
+    if first.verdict:
+        return first.verdict
+    out = folder / writer.out
+    if out.is_file() and not is_whole(out):
+        return "lost"
+    begun = any((out / name).is_file() for name in writer.begun)
+    done = writer.again and (first.code == 0 or ((out / "grow.json").is_file() and snapshots(out) == 4))
+    if done:
+        return ""
+    at_once = writer.out == "out" and not writer.again and not writer.goes_on
+    if at_once and out.exists():  # a folder that is there is whole
+        return "" if first.code == 0 or reads(out) else "lost"
+    second = run([*command, *writer.again] if writer.again and begun else command, limit=limit)
+    if second.verdict:
+        return second.verdict
+    if second.code != 0 or _left(folder):
+        return "lost"
+    return "" if is_whole(out) else "lost"
+
+
+def _left(folder: Path) -> list[Path]:
+    """Hidden files that the next command should have cleared, or a lock."""
+    return [path for path in folder.rglob(".*") if path.is_file()]
+
+
+def full(shop: Shop, writer: Writer, largest: int, rng: random.Random, folder: Path) -> str:
+    """No room for all of it: one sentence, and what is there is whole. By turns no file grows beyond a random size, and
+    a file system in memory is full, where one can be mounted (as root)."""
+    if rng.random() < 0.5:
+        ended = run(writer.command(shop, folder), file_size=rng.randrange(largest + 1))
+        return _judged(ended, folder / writer.out)
+    disk = folder / "disk"
+    disk.mkdir()
+    with _mounted(disk) as mounted:
+        if not mounted:
+            return _judged(run(writer.command(shop, disk), file_size=rng.randrange(largest + 1)), disk / writer.out)
+        command = writer.command(shop, disk)  # which may put its input there
+        used = sum(BLOCK * (1 + path.stat().st_size // BLOCK) for path in disk.rglob("*"))
+        _mount("-o", f"remount,size={used + BLOCK + rng.randrange(largest + 1)}", disk)
+        return _judged(run(command), disk / writer.out)
+
+
+@contextmanager
+def _mounted(disk: Path) -> Iterator[bool]:
+    """A file system in memory at `disk`; False where it cannot be mounted."""
+    if not _mount("-t", "tmpfs", "-o", "size=64m", "faults", disk):
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        subprocess.run(["umount", str(disk)], check=True, capture_output=True)
+
+
+def _mount(*arguments: object) -> bool:
+    try:
+        return subprocess.run(["mount", *map(str, arguments)], capture_output=True, check=False).returncode == 0
+    except FileNotFoundError:
+        return False
+
+
+def _judged(ended: Ended, out: Path) -> str:
+    return sentence(ended) or ("lost" if out.is_file() and not is_whole(out) else "")
+
+
+def sentence(ended: Ended) -> str:
+    """What is wrong with how a command ended: it must work, or say one sentence."""
+    if ended.verdict or ended.code == 0:
+        return ended.verdict
+    return "" if "holosplat: " in ended.said or "helptext" in ended.said else "traceback"

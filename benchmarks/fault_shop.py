@@ -1,0 +1,225 @@
+"""What commands read in `faults.py`, and the commands that write: small enough that each takes a second or a few."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from forked import run
+
+from holosplat.checks import InputError
+from holosplat.io.formats import read
+from holosplat.io.vtk import read_meshes, write_mesh
+from holosplat.mesh import TriangleMesh
+from holosplat.specimens.red_cells import random_cells
+from holosplat.workflows.check import check
+
+PIXEL, ROWS, COLUMNS = 3.2e-6, 18, 20
+MATERIAL = ["--material", "haemoglobin"]
+BEAM = ["--length-unit", "um", *MATERIAL, "--pixel-size", PIXEL, "--detector", ROWS, COLUMNS]
+QUICK = {
+    "kind": "gaussians",
+    "approximate_steps": 2,
+    "spacing_px": 2.0,
+    "volume": {"retrieval": 8, "iterations": 10, "corrections": 1, "inner": 4, "refine": 1},
+    "fit": {"objective": {"tv_volume": 0.05}, "schedule": {"steps": 12}},
+}
+CASE = f"""summary = "Two cells of a benchmark of one's own"
+prior = "known"
+[specimen]
+kind = "red cells"
+count = 2
+diameter = 24e-6
+box = [{COLUMNS * PIXEL}, {ROWS * PIXEL}, {COLUMNS * PIXEL}]
+[matter]
+material = "haemoglobin"
+[beam]
+energy_kev = 20.0
+distance = 0.1
+[detector]
+rows = {ROWS}
+columns = {COLUMNS}
+pixel_size = {PIXEL}
+psf_sigma_px = 0.05
+[views]
+kind = "between"
+train = 5
+test = 2
+"""
+METHODS = ("paganin-sirt", "paganin-tv")
+TIMES, STEP = 3, 1e-4
+"""Moments of the scan in which the cells move, and seconds between two."""
+
+
+@dataclass(frozen=True)
+class Shop:
+    """A folder with what commands read: two cells, their scan, its raw counts, a run, and a scan of them in motion."""
+
+    path: Path
+    cells: tuple[Path, ...]
+
+    @property
+    def scan(self) -> Path:
+        """Six frames of the cells at rest."""
+        return self.path / "scan.nxs"
+
+    @property
+    def raw(self) -> Path:
+        """The same as raw counts."""
+        return self.path / "raw.nxs"
+
+    @property
+    def moving(self) -> Path:
+        """Frames of the cells in motion."""
+        return self.path / "moving.nxs"
+
+    @property
+    def run(self) -> Path:
+        """A run on the scan."""
+        return self.path / "run"
+
+    @property
+    def quick(self) -> Path:
+        """Options of that."""
+        return self.path / "quick.json"
+
+    @property
+    def case(self) -> Path:
+        """A case of the benchmark."""
+        return self.path / "own.toml"
+
+    @classmethod
+    def made(cls, path: Path) -> Shop:
+        """All of it, made in an empty folder."""
+        cells = random_cells(2, (COLUMNS * PIXEL, ROWS * PIXEL, COLUMNS * PIXEL), 1, 10 * PIXEL)
+        files = tuple(path / f"{cell.name}.vtk" for cell in cells)
+        for cell, file in zip(cells, files):
+            write_mesh(file, cell, "um")
+        shop = cls(path, files)
+        shop.quick.write_text(json.dumps(QUICK))
+        shop.case.write_text(CASE)
+        for command in (
+            shop.simulate(shop.scan),
+            shop.record(shop.raw),
+            shop.reconstruct(shop.run),
+            shop.in_motion(cells),
+        ):
+            ended = run(command, limit=600)
+            if ended.code != 0:
+                raise SystemExit(f"{command[0]} must work before it is disturbed, but: {ended.said}")
+        return shop
+
+    def simulate(self, out: Path) -> list[object]:
+        """Six frames."""
+        return ["simulate", *self.cells, *BEAM, "--views", 6, "--out", out]
+
+    def in_motion(self, cells: list[TriangleMesh]) -> list[object]:
+        """Four frames at each of three times; the cells go half a pixel from one to the next."""
+        files = list[Path]()
+        for time in range(TIMES):
+            for cell in cells:
+                moved = TriangleMesh(cell.vertices + [0.0, 0.5 * time * PIXEL, 0.0], cell.faces)
+                files.append(self.path / f"moving_{cell.name}_{time:03d}.vtk")
+                write_mesh(files[-1], moved, "um")
+        when = ["--snapshot-interval", STEP, "--frame-rate", 1 / STEP]
+        return ["simulate", *files, *BEAM, "--views", 4, *when, "--test-every", 0, "--out", self.moving]
+
+    def record(self, out: Path) -> list[object]:
+        """Their raw counts."""
+        return ["record", self.scan, "--out", out, "--flats", 4, "--darks", 2]
+
+    def reconstruct(self, out: Path) -> list[object]:
+        """A short run."""
+        return ["reconstruct", self.scan, "--out", out, *MATERIAL, "--matter", "levels", "--config", self.quick]
+
+
+@dataclass(frozen=True)
+class Writer:
+    """A command that writes `out` in a folder. again: what the command needs where `out` is begun, that is, has one of
+    the files `begun`; goes_on: whether the command goes on with what is there as it is."""
+
+    name: str
+    command: Callable[[Shop, Path], list[object]]
+    out: str
+    again: tuple[object, ...] = ()
+    begun: tuple[str, ...] = ("config.json", "grow.json")
+    goes_on: bool = False
+
+
+def copied_run(shop: Shop, folder: Path) -> Path:
+    """A copy of the run in `folder`."""
+    if not (folder / "run").exists():
+        shutil.copytree(shop.run, folder / "run")
+    return folder / "run"
+
+
+GROWTH = ["--cells", 1, "--box", "30e-6", "20e-6", "20e-6", "--snapshots", 4, "--frequency", 3, "--interval", "1e-6"]
+TRACK = [*MATERIAL, "--effort", 0.05, "--pieces", 1, "--rounds", 0, "--no-intervals"]
+SURFACE = ["--steps", 8]
+
+WRITERS = (
+    Writer("simulate", lambda shop, folder: shop.simulate(folder / "out.nxs"), "out.nxs"),
+    Writer("record", lambda shop, folder: shop.record(folder / "out.nxs"), "out.nxs"),
+    Writer("correct", lambda shop, folder: ["correct", shop.raw, "--out", folder / "out.nxs"], "out.nxs"),
+    Writer("join", lambda shop, folder: ["join", shop.scan, shop.scan, "--out", folder / "out.nxs"], "out.nxs"),
+    Writer("convert", lambda shop, folder: ["convert", shop.scan, folder / "out", "--to", "tiff"], "out"),
+    Writer(
+        "render", lambda shop, folder: ["render", shop.run, "--scan", shop.scan, "--out", folder / "out.nxs"], "out.nxs"
+    ),
+    Writer("export", lambda shop, folder: ["export", shop.run, "--volume", folder / "out.h5"], "out.h5"),
+    Writer("reconstruct", lambda shop, folder: shop.reconstruct(folder / "out"), "out", ("--resume",)),
+    Writer("evaluate", lambda shop, folder: ["evaluate", copied_run(shop, folder)], "run"),
+    Writer("grow", lambda shop, folder: ["grow", "--out", folder / "out", *GROWTH], "out", ("--resume",)),
+    Writer("track", lambda shop, folder: ["track", shop.moving, "--out", folder / "out", *TRACK], "out", ("--resume",)),
+    Writer("align", lambda shop, folder: ["align", shop.scan, "--out", folder / "out.nxs", *MATERIAL], "out.nxs"),
+    Writer(
+        "surface",
+        lambda shop, folder: ["surface", shop.run, "--scan", shop.scan, "--out", folder / "out", *SURFACE],
+        "out",
+    ),
+    Writer(
+        "bench",
+        lambda shop, folder: (["bench", "run", "--cases", shop.case, "--methods", *METHODS, "--out", folder / "out"]),
+        "out",
+        begun=("bench.json",),
+        goes_on=True,
+    ),
+)
+
+
+def is_whole(out: Path) -> bool:
+    """Whether a file, a run folder, or another folder that a command makes, is what it is when it is done."""
+    if out.is_dir() and not (out / "config.json").is_file():
+        return reads(out)
+    try:
+        return not check(out)[1]
+    except InputError:
+        return False
+
+
+def reads(out: Path) -> bool:
+    """Whether a folder of images, of meshes, or of a benchmark, is whole."""
+    if (out / "bench.json").is_file():
+        return run(["bench", "report", out]).code == 0 and len(list((out / "rows").glob("*.json"))) >= len(METHODS)
+    try:
+        if list(out.glob("*.vt[kp]")):
+            read_meshes([out], "um")
+        else:
+            read_scan_of(out)
+    except InputError:
+        return False
+    return True
+
+
+def read_scan_of(path: Path) -> np.ndarray:
+    """The frames of a scan of any format."""
+    return np.asarray(read(path).in_memory().frames)
+
+
+def snapshots(out: Path) -> int:
+    """Snapshots of a folder of `grow` whose state is there."""
+    return len(list(out.glob("rbc00_*.vtp"))) if (out / "state.npz").is_file() else 0

@@ -1,0 +1,96 @@
+"""How much memory and disk there is for this process, by what limits it: the machine, its container, the shell."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+PROC, CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
+"""Where Linux says what there is."""
+UNLIMITED = 1 << 60
+"""Bytes from which on a limit is none: the first control groups say nearly 2⁶³ where there is no limit."""
+
+
+def machine_memory() -> int:
+    """Bytes of memory that this process could ever have: of the machine, its control group and its address space."""
+    return min([_physical(), *(limit for limit, _ in _groups()), *(limit for limit, _ in _address_space())])
+
+
+def free_memory() -> int:
+    """Bytes of memory that this process can still take: what is available on the machine, and what its control group
+    (a container, a cluster's job) and its address space (`ulimit -v`) have left. At least 0."""
+    left = [limit - used for limit, used in (*_groups(), *_address_space())]
+    return max(0, min([_entry("meminfo", "MemAvailable") or _physical(), *left]))
+
+
+def free_disk(path: str | Path) -> int:
+    """Bytes that are free where `path` is, or is to be made."""
+    place = Path(os.path.realpath(path))
+    while not place.exists() and place != place.parent:
+        place = place.parent
+    return shutil.disk_usage(place).free
+
+
+def _physical() -> int:
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+
+
+def _entry(file: str, key: str) -> int:
+    """An entry in kB of a file of /proc, in bytes; 0 where there is none."""
+    try:
+        lines = (PROC / file).read_text().splitlines()
+    except OSError:
+        return 0
+    return next((1024 * int(line.split()[1]) for line in lines if line.startswith(f"{key}:")), 0)
+
+
+def _groups() -> Iterator[tuple[int, int]]:
+    """Limit and use [bytes] of the control groups of this process, of either version, and of those that these are in.
+
+    Memory that only caches files counts as used there, but is given back when it is wanted.
+    """
+    try:
+        lines = (PROC / "self/cgroup").read_text().splitlines()
+    except OSError:
+        return
+    for line in lines:
+        number, kinds, name = line.split(":", 2)
+        if number == "0":
+            yield from _up(CGROUPS, name, "memory.max", "memory.current", "file")
+        elif "memory" in kinds.split(","):
+            names = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_cache")
+            yield from _up(CGROUPS / "memory", name, *names)
+
+
+def _up(top: Path, name: str, limit: str, used: str, cache: str) -> Iterator[tuple[int, int]]:
+    """Limits and uses of the group `name` below `top`, and of all above it. Within a container the group's own name may
+    not be there, but its files stand at the top."""
+    place = top / name.lstrip("/")
+    for folder in (place, *(p for p in place.parents if p == top or top in p.parents)):
+        try:
+            most, now = (int((folder / file).read_text()) for file in (limit, used))
+        except (OSError, ValueError):  # no such file, or "max"
+            continue
+        if most < UNLIMITED:
+            yield most, max(0, now - _cached(folder / "memory.stat", cache))
+
+
+def _cached(path: Path, key: str) -> int:
+    try:
+        lines = path.read_text().splitlines()
+    except OSError:
+        return 0
+    return next((int(line.split()[1]) for line in lines if line.split()[:1] == [key]), 0)
+
+
+def _address_space() -> Iterator[tuple[int, int]]:
+    """The limit of this process' address space and what it has taken of it [bytes], where there is a limit."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit != resource.RLIM_INFINITY:
+        yield limit, _entry("self/status", "VmSize")

@@ -1,0 +1,252 @@
+"""What a job takes, by the sizes of its arrays: memory, room on the disk and time, told before it starts.
+
+`benchmarks/needs.py` measures what the constants below stand for, and writes docs/data/needs.csv.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from ..baselines import HolographicTV
+from ..checks import InputError
+from ..io.room import free_disk, free_memory
+from ..matter import MatterKind
+from ..methods import (
+    Auto,
+    Gaussians,
+    HolographicVoxels,
+    Method,
+    NeuralFields,
+    PerView,
+    SmoothVolume,
+    Surfaces,
+    Voxels,
+)
+from ..optics.sampling import fringe_sampling, padding
+from ..scan import Exposures
+
+
+class Costs:
+    """Bytes of memory and seconds that the parts of a job take."""
+
+    program: float = 0.42e9
+    """The program and its libraries."""
+    report: float = 0.75e9
+    """All of it while a run is judged and its report drawn."""
+    frames: float = 24.0
+    """A pixel of a frame: itself, and copies that are corrected, evened and compared."""
+    fine: float = 55.0
+    """A voxel of the rounds of agreement: the volume, its dual, and what both are extrapolated to."""
+    coarse: float = 22.0
+    """A voxel of one pixel beside these."""
+    rays: float = 450.0
+    """A voxel of a slice that a view crosses: the sparse slice matrix, its transpose, and what both are made of."""
+    smooth: float = 176.0
+    """A voxel of a smooth volume: six pairs of L-BFGS, gradients and priors."""
+    plain: float = 36.0
+    """A voxel of a tomography by itself."""
+    waves: float = 150.0
+    """A wave sample of all views in a fit, with its gradient."""
+    gaussian: float = 700.0
+    """A Gaussian with gradients, Adam's moments and its tiles."""
+    simulated: float = 85.0
+    """A wave sample of one view of a simulation."""
+    written: float = 4.0
+    """A number that is written."""
+    page: float = 8e6
+    """The report and the tables of a run."""
+
+
+SAFETY = 1.1
+"""Times the estimate that must be there: it errs by a fifth."""
+KEPT = 4
+"""Copies of an object that a run folder may hold: itself, two checkpoints with their optimiser, one being written."""
+BINNINGS, FEWEST_COLUMNS = range(2, 9), 11
+"""What is tried for --bin, and columns that must be left."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """views, rows and columns of frames; samples: of waves along a pixel; margin: rows and columns of it beside."""
+
+    views: int
+    rows: int
+    columns: int
+    samples: int
+    margin: tuple[int, int]
+
+    @classmethod
+    def of(cls, exposures: Exposures, binning: int = 1) -> Sizes:
+        """Those of exposures, on pixels `binning` times larger."""
+        if binning > 1:
+            views = exposures.views
+            shape = (max(1, views.shape[0] // binning), max(1, views.shape[1] // binning))
+            views = replace(views, shape=shape, pitch=views.pitch * binning)
+            exposures = replace(exposures, views=views, psf_sigma_px=exposures.psf_sigma_px / binning)
+        samples = fringe_sampling(exposures)
+        return cls(len(exposures), *exposures.views.shape, samples, padding(exposures, samples))
+
+    @property
+    def pixels(self) -> int:
+        """Of all frames."""
+        return self.views * self.rows * self.columns
+
+    @property
+    def voxels(self) -> int:
+        """Of one pixel."""
+        return self.rows * self.columns**2
+
+    def waves(self, extra: int = 0) -> int:
+        """Samples of all waves, with `extra` more along a pixel."""
+        rows, columns = (n + 2 * m for n, m in zip((self.rows, self.columns), self.margin))
+        return self.views * rows * columns * (self.samples + extra) ** 2
+
+    def joined(self, most: int) -> Sizes:
+        """On pixels so many times larger that there are `most` voxels of one at most."""
+        factor = 1
+        while self.voxels / factor**3 > most and factor < min(self.rows, self.columns):
+            factor += 1
+        return replace(self, rows=self.rows // factor, columns=self.columns // factor)
+
+
+@dataclass(frozen=True)
+class Needs:
+    """What a job takes at its peak: memory and disk [bytes], time [s], the last to a factor of three."""
+
+    memory: float
+    disk: float
+    seconds: float = 0.0
+
+    def line(self) -> str:
+        """In words."""
+        time = f", and about {_time(self.seconds)}" if self.seconds else ""
+        return f"takes about {_size(self.memory)} of memory, {_size(self.disk)} on the disk{time}"
+
+    def fit(self, path: Path) -> bool:
+        """Whether there is so much memory, and disk at `path`."""
+        return SAFETY * self.memory <= free_memory() + Costs.program and self.disk <= free_disk(path)
+
+
+def of_reconstruction(sizes: Sizes, method: Method, matter: MatterKind | None = None) -> Needs | None:
+    """What `reconstruct` takes for training frames of such sizes; None for a method of which nothing is known.
+
+    matter: its kind, where that is settled.
+    """
+    if isinstance(method, Auto):
+        kinds: tuple[MatterKind, ...] = (matter,) if matter else ("levels", "continuous")
+        each = [of_reconstruction(sizes, method.suited(kind)) for kind in kinds]
+        return max((one for one in each if one is not None), key=lambda one: one.memory)
+    parts = _parts(sizes, method)
+    if parts is None:
+        return None
+    memory, seconds, numbers = parts
+    report = Costs.report + 0.5 * Costs.waves * sizes.waves()
+    disk = Costs.written * (KEPT * numbers + sizes.pixels) + Costs.page
+    return Needs(Costs.frames * sizes.pixels + max(Costs.program + memory, report), disk, seconds)
+
+
+def _parts(sizes: Sizes, method: Method) -> tuple[float, float, float] | None:
+    """Bytes beside the program, seconds, and numbers of the object."""
+    if isinstance(method, PerView):
+        memory = Costs.plain * sizes.voxels + Costs.rays * sizes.views * sizes.columns**2
+        return memory, 1 + 0.35e-6 * sizes.views * sizes.voxels, sizes.voxels
+    if isinstance(method, SmoothVolume):
+        small = sizes.joined(method.max_voxels)
+        memory = max(Costs.smooth * small.voxels, _start(small, method.volume))
+        return memory, 10 + 4.5e-6 * sizes.views * small.voxels, small.voxels
+    if isinstance(method, HolographicVoxels | Voxels | NeuralFields):
+        begun, fine = _start(sizes, method.volume), _fine(sizes, method.volume)[0]
+        if isinstance(method, HolographicVoxels):
+            return begun, 3 + 1.5e-6 * fine, fine
+        fitted = Costs.waves * sizes.waves() + Costs.plain * sizes.voxels
+        return max(begun, fitted), 20 + 3e-6 * fine, sizes.voxels
+    gaussians = method if isinstance(method, Gaussians) else getattr(method, "gaussians", None)
+    return _bodies(sizes, gaussians, gaussians is not method) if isinstance(gaussians, Gaussians) else None
+
+
+def _bodies(sizes: Sizes, how: Gaussians, edges: bool) -> tuple[float, float, float]:
+    """The same of Gaussians, and of surfaces cut out of them where there are `edges`."""
+    batch = how.fit.schedule.views_per_step
+    fitted = replace(sizes, views=min(batch, sizes.views) if batch else sizes.views).waves()
+    waves = Costs.waves * max(fitted, sizes.waves(1) if edges else 0)
+    begun = 0.0 if how.start == "random" else _start(sizes, how.volume)
+    count = how.random_count if how.start == "random" else min(how.max_start, how.start_per_pixel * sizes.pixels)
+    fine = _fine(sizes, how.volume)[0]
+    return max(begun, waves + Costs.gaussian * count), (30 if edges else 12) + 2.3e-6 * fine, 14 * count
+
+
+def _fine(sizes: Sizes, how: HolographicTV) -> tuple[int, int]:
+    """Voxels of the rounds of agreement, and how many lie along a pixel."""
+    refine = how.refine or sizes.samples
+    while refine > 1 and sizes.voxels * refine**3 > how.max_voxels:
+        refine -= 1
+    return sizes.joined(how.max_voxels).voxels * refine**3, refine
+
+
+def _start(sizes: Sizes, how: HolographicTV) -> float:
+    """Bytes of the start."""
+    fine, refine = _fine(sizes, how)
+    small = sizes.joined(how.max_voxels)
+    alone = Costs.plain * small.voxels + Costs.rays * small.views * small.columns**2
+    if how.corrections == 0:
+        return alone
+    rays = Costs.rays * small.views * (small.columns * refine) ** 2
+    return max(alone, Costs.fine * fine + Costs.coarse * small.voxels + rays)
+
+
+def of_simulation(exposures: Exposures, samples: int, frames: int) -> Needs:
+    """What `simulate` takes: one view of waves at a time, and `frames` that are written. samples: along a pixel."""
+    margin = padding(exposures, samples)
+    rows, columns = (n + 2 * m for n, m in zip(exposures.views.shape, margin))
+    pixels = frames * math.prod(exposures.views.shape)
+    return Needs(Costs.program + Costs.simulated * rows * columns * samples**2, Costs.written * pixels + 1e6)
+
+
+def require_room(needs: Needs, path: Path, others: Iterable[tuple[str, Needs]] = ()) -> None:
+    """`InputError` if a job does not fit into memory and disk, with the first of the `others` that does."""
+    if needs.fit(path):
+        return
+    memory, disk = free_memory() + Costs.program, free_disk(path)
+    way = next((f"{how} takes {_size(one.memory)} and {_size(one.disk)}" for how, one in others if one.fit(path)), "")
+    raise InputError(
+        f"the job {needs.line()}, but {_size(memory)} of memory and {_size(disk)} of disk are free; "
+        f"{way or 'take a part of the frames (--crop, --views), or a larger machine'}."
+    )
+
+
+def smaller(exposures: Exposures, method: Method, matter: MatterKind | None) -> Iterator[tuple[str, Needs]]:
+    """The same reconstruction on larger voxels in the start, and on larger pixels; how, and what it takes then."""
+    flag, coarse = _one_voxel_a_pixel(method)
+    for factor in (1, *BINNINGS):
+        if factor > 1 and exposures.views.shape[1] // factor < FEWEST_COLUMNS:
+            return
+        sizes, bins = Sizes.of(exposures, factor), f"--bin {factor}" if factor > 1 else ""
+        for how, tried in ((bins, method), (f"{bins} {flag}".strip(), coarse)):
+            needs = of_reconstruction(sizes, tried, matter)
+            if needs is not None and how:
+                yield how, needs
+
+
+def _one_voxel_a_pixel(method: Method) -> tuple[str, Method]:
+    """A method whose start has voxels of one pixel, and the flag that makes it so; none where it has no such start."""
+    start = getattr(method, "volume", None)
+    if isinstance(start, HolographicTV) and isinstance(method, Gaussians | HolographicVoxels | Voxels | NeuralFields):
+        return "--set volume.refine=1", replace(method, volume=replace(start, refine=1))
+    if isinstance(method, Auto | Surfaces):
+        gaussians = method.gaussians
+        coarse = replace(gaussians, volume=replace(gaussians.volume, refine=1))
+        return "--set gaussians.volume.refine=1", replace(method, gaussians=coarse)
+    return "", method
+
+
+def _size(bytes_: float) -> str:
+    return f"{bytes_ / 1e9:.2g} GB" if bytes_ >= 0.95e9 else f"{max(1.0, bytes_ / 1e6):.0f} MB"
+
+
+def _time(seconds: float) -> str:
+    if seconds < 90:
+        return f"{max(1, round(seconds, -1)):.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"

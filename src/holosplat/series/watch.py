@@ -1,0 +1,232 @@
+"""Scans reconstructed as they appear in a folder, each begun with what the last one gave, and a page of them."""
+
+from __future__ import annotations
+
+import csv
+import os
+import socket
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from ..checks import require
+from ..io.atomic import atomic_path
+from ..io.formats import read_as
+from ..io.lock import sole_writer
+from ..io.reading import Reading
+from ..io.run_scan import run_source
+from ..matter import MaterialPrior
+from ..ranges import Positive, Seconds, ranged
+from ..scan import Scan
+from .appearing import Folder, Found
+from .plan import at, times_of
+from .rows import Row, write_row
+from .settings import Settings
+from .task import attempted
+from .time import PHASE, Before, Shot, reconstruct_time
+from .watch_folder import Seen, WatchFolder
+from .words import plain
+
+COLUMNS = (
+    *("number", "scan", "frame", "time_s", "status", "begun", "explained", "unexplained", "total_m3", "total_error_m3"),
+    *("seconds", "run", "reason"),
+)
+HEARTBEAT_SECONDS = 30.0
+"""How often the page says that somebody looks, where nothing happens."""
+
+
+@dataclass(frozen=True)
+@ranged
+class Watching:
+    """How a folder is watched."""
+
+    pattern: str = "*"
+    """Names of the files that are looked at, such as '*.nxs'."""
+    poll: Positive = 1.0
+    """How often they are looked at [s]."""
+    settle: Seconds = 2.0
+    """How long a file must have stayed as it is before it counts as complete [s]."""
+    retry: Positive = 30.0
+    """After how long what could not be read is read again [s]; sooner where it has changed."""
+    stop_after: int = 0
+    """End after so many scans (0: never)."""
+    idle: Seconds = 0.0
+    """End when nothing has come for so long [s] (0: never)."""
+    refresh: Positive = 5.0
+    """How often a browser reads the page again [s]."""
+
+
+@dataclass
+class _Failure:
+    reason: str
+    again: float
+
+
+@dataclass
+class Watch:
+    """A watch of `source` into `folder`; `run` does it. prior: of the matter, at a photon energy [keV]; say: tells
+    people what happens, a line each time."""
+
+    source: Path
+    folder: WatchFolder
+    settings: Settings
+    prior: Callable[[float], MaterialPrior]
+    reading: Reading
+    how: Watching
+    say: Callable[[str], None] = lambda text: None
+    clock: Callable[[], float] = time.monotonic
+    sleep: Callable[[float], None] = time.sleep
+    _failures: dict[tuple[str, int, int], _Failure] = field(default_factory=dict)
+    _times: list[tuple[Row, Path]] = field(default_factory=list)
+    _before: Before | None = None
+    _done: set[tuple[str, int, int]] = field(default_factory=set)
+    _said: float = 0.0
+
+    def run(self, said: dict[str, object]) -> int:
+        """Watch until the end that is asked for, or Ctrl-C, which is passed on; how many scans were done.
+
+        said: what the folder keeps of the options, which must be the same when a watch goes on. What a watch that was
+        cut off has begun is finished first. Errors: `InputError` for folders that do not fit.
+        """
+        require(self.source.is_dir(), f"{self.source} must be a folder to watch, but it is none; check the path.")
+        self.folder.require_usable()
+        with sole_writer(self.folder.path):
+            self.folder.begin(dict(said))
+            self._take_up()
+            running = f"Process {os.getpid()} on {socket.gethostname()} looks for scans."
+            try:
+                return self._loop(running)
+            finally:
+                self._show("The watch has ended; the same command goes on.", 0.0)
+
+    def _take_up(self) -> None:
+        """What was done before."""
+        for seen in self.folder.seen():
+            rows = [(run, row) for run, row in self.folder.rows(seen) if row.done]  # others are tried again
+            for run, row in rows:
+                self._remember(run.path, row)
+            if len(rows) == seen.times:
+                self._done.add(seen.key)
+
+    def _remember(self, run: Path, row: Row) -> None:
+        self._times.append((row, run))
+        if row.done:
+            self._before = Before(self.folder.run(int(run.parent.name), row.frame), row)
+
+    def _loop(self, running: str) -> int:
+        files = Folder(self.source, self.how.pattern, self.how.settle)
+        count, last = 0, self.clock()
+        self._show(running, self.how.refresh)
+        while True:
+            came = [found for found in files.complete(self.clock()) if self._wanted(found)]
+            for found in came:
+                if self._do(found, running):
+                    count += 1
+                    last = self.clock()
+                if self.how.stop_after and count >= self.how.stop_after:
+                    return count
+            if self.how.idle and self.clock() - last >= self.how.idle:
+                return count
+            if came or self.clock() - self._said >= HEARTBEAT_SECONDS:
+                self._show(running, self.how.refresh)
+            if not came:
+                self.sleep(self.how.poll)
+
+    def _wanted(self, found: Found) -> bool:
+        if found.key in self._done:
+            return False
+        failure = self._failures.get(found.key)
+        return failure is None or self.clock() >= failure.again
+
+    def _do(self, found: Found, running: str) -> bool:
+        """Reconstruct a scan; False where it cannot be read (yet), which is said once."""
+        scans = list[Scan]()
+
+        def read() -> str:
+            scan = read_as(found.path, self.reading)
+            at(scan, 0)  # the first frames can be read, and their values are numbers
+            scans.append(scan)
+            return ""
+
+        reason = attempted(read)
+        if reason:
+            name = found.path.name
+            if not any(key[0] == name and one.reason == reason for key, one in self._failures.items()):
+                self.say(f"cannot read {plain(found.path.name)} (it is tried again): {plain(reason)}")
+            self._forget(name)
+            self._failures[found.key] = _Failure(reason, self.clock() + self.how.retry)
+            return False
+        self._forget(found.path.name)
+        seen = self._begun(found, scans[0])
+        done = {row.frame for _, row in self.folder.rows(seen) if row.done}
+        for frame in range(seen.times):
+            if frame not in done:
+                self._time(found.path, scans[0], seen, frame)
+                self._show(running, self.how.refresh)
+        self._done.add(found.key)
+        return True
+
+    def _forget(self, name: str) -> None:
+        self._failures = {key: one for key, one in self._failures.items() if key[0] != name}
+
+    def _begun(self, found: Found, scan: Scan) -> Seen:
+        """The number of a scan, which it keeps when a watch was cut off in it."""
+        before = self.folder.seen()
+        for seen in before:
+            if seen.key == found.key:
+                return seen
+        first = before[-1].first + before[-1].times if before else 0
+        seen = Seen(len(before), found.key, first, len(times_of(scan)))
+        self.folder.add(seen)
+        return seen
+
+    def _time(self, path: Path, scan: Scan, seen: Seen, frame: int) -> None:
+        run, times = self.folder.run(seen.number, frame), times_of(scan)
+        row = Row(seen.first + frame, str(path.resolve()), frame, times[frame], "failed")
+
+        def work() -> str:
+            nonlocal row
+            shown, part = at(scan, frame), self.reading.part
+            reading = replace(self.reading, part=replace(part, time_frame=frame if len(times) > 1 else None))
+            prior = self.prior(scan.exposures.reference_energy)
+            row = reconstruct_time(Shot(shown, prior, run_source(path, reading), row), self.settings, run, self._before)
+            return ""
+
+        reason = attempted(work)
+        if reason:
+            row = replace(row, status="failed", reason=reason)
+        write_row(self.folder.row(seen.number, frame), row)
+        self._remember(run.path, row)
+        name = plain(path.name) if len(times) == 1 else f"{plain(path.name)}, time {frame}"
+        self.say(f"{name}: {f'{row.begun}, {row.size}, {row.seconds:.1f} s' if row.done else plain(reason)}")
+
+    def _show(self, state: str, refresh: float) -> None:
+        """Bring the page and the table up to date."""
+        from .pages.page import Frame, SeriesPage, write_page  # which need matplotlib
+
+        self._said = self.clock()
+        with atomic_path(self.folder.table) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(COLUMNS)
+            writer.writerows(self._line(row, run) for row, run in self._times)
+        frames = tuple(Frame(row, row.time_s, run / PHASE, self._relative(run)) for row, run in self._times if row.done)
+        bad = [row for row, _ in self._times if not row.done]
+        failed = {f"{plain(Path(row.scan).name)}, time {row.frame}": plain(row.reason) for row in bad}
+        failed |= {plain(key[0]): plain(one.reason) for key, one in self._failures.items()}
+        when = time.strftime("%Y-%m-%d %H:%M:%S")
+        verdict = f"{len(frames)} times are done." if frames else "No scan has come yet."
+        unexplained = sum(frame.row.good is False for frame in frames)
+        if unexplained:
+            verdict += f" The frames of {unexplained} are not explained."
+        title = f"Scans of {plain(self.source.resolve().name)}"
+        write_page(self.folder.page, SeriesPage(title, verdict, f"{state} {when}", frames, failed, (), refresh))
+
+    def _relative(self, run: Path) -> str:
+        return run.relative_to(self.folder.path).as_posix()
+
+    def _line(self, row: Row, run: Path) -> list[object]:
+        numbers = ["" if v is None else f"{v:.6g}" for v in (row.unexplained, row.total, row.total_error)]
+        explained = "" if row.good is None else int(row.good)
+        where = [row.number, row.scan, row.frame, f"{row.time_s:.9g}", row.status, row.begun, explained]
+        return [*where, *numbers, f"{row.seconds:.3f}", self._relative(run), row.reason]

@@ -1,0 +1,125 @@
+"""Volumes, objects and runs as layers of napari, by its plug-in `holosplat` (napari.yaml); napari itself is not needed.
+
+Axes are (z, y, x), with the time before them where matter moves; lengths are micrometres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from ..checks import InputError
+from ..geometry import Grid
+from ..io.compact import FORMAT as COMPACT
+from ..io.gaussians import FORMAT as GAUSSIANS
+from ..io.objects import FORMAT, read_object
+from ..io.volumes import NAMES, read_volume
+from ..representations import MovingGaussians, MovingSurfaces, Stored, SurfaceMesh
+from ..volume import Volume
+from ..workflows.moments import instants_of
+from ..workflows.run_folder import RunFolder
+from .parts import at_times
+
+Layer = tuple[Any, dict[str, Any], str]
+"""Data, options of the layer, and its kind."""
+MICROMETRES = 1e6
+MOST_VOXELS = 1 << 24
+"""Voxels of the images of an object, of all times together (64 MB of each of δ and β)."""
+COLOURS = {"delta": "gray", "beta": "inferno"}
+
+
+def get_reader(path: str | Sequence[str]) -> Callable[[str], list[Layer]] | None:
+    """`layers` for a volume file, an object file or a run folder; None for anything else, as napari asks for it."""
+    if not isinstance(path, str):
+        return None
+    found = Path(path)
+    if found.is_dir():
+        return layers if _is_run(found) else None
+    if found.suffix.lower() not in (".h5", ".hdf5"):
+        return None
+    try:
+        with h5py.File(found) as file:
+            form = str(file.attrs.get("format", ""))
+            return layers if form in (FORMAT, COMPACT, GAUSSIANS) or all(name in file for name in NAMES) else None
+    except OSError:
+        return None
+
+
+def layers(path: str) -> list[Layer]:
+    """The layers of a path that `get_reader` takes: images of δ and β, or surfaces.
+
+    Gaussians, voxels and neural fields become images on a grid around them, moving ones at each time of their frames.
+    Errors: `InputError` for damaged files.
+    """
+    found = Path(path)
+    times: list[float] = []
+    if found.is_dir():
+        folder = RunFolder(found)
+        folder.require_run()
+        obj, times = read_object(folder.result()), instants_of(folder)
+    else:
+        with h5py.File(found) as file:
+            volume = all(name in file for name in NAMES)
+        if volume:
+            return _images(found.stem, [read_volume(found)], {})
+        obj = read_object(found)
+    moving = isinstance(obj, MovingSurfaces | MovingGaussians)
+    about = {"kind": obj.kind, "described": obj.described} | ({"times_s": times} if moving and times else {})
+    moments = list(at_times(obj, times).values())
+    if all(isinstance(moment, SurfaceMesh) for moment in moments):
+        return [_surface(found.stem, moments, moving, about)]
+    grid = obj.enclosing_grid(MOST_VOXELS // len(moments))
+    return _images(found.stem, [moment.voxelise(grid) for moment in moments], about, moving)
+
+
+def _is_run(folder: Path) -> bool:
+    try:
+        RunFolder(folder).require_run()
+    except InputError:
+        return False
+    return True
+
+
+def _images(name: str, volumes: list[Volume], about: dict[str, Any], moving: bool = False) -> list[Layer]:
+    """An image of each of δ and β [Z, Y, X], or [T, Z, Y, X] of what moves."""
+    scale, translate = _placed(volumes[0].grid, moving)
+    found = []
+    for channel in NAMES:
+        stack = np.stack([getattr(volume, channel) for volume in volumes])
+        data = stack if moving else stack[0]
+        low, high = float(data.min()), float(data.max())
+        options = {
+            "name": f"{name} {channel}",
+            "scale": scale,
+            "translate": translate,
+            "colormap": COLOURS[channel],
+            "contrast_limits": (low, high if high > low else low + 1.0),
+            "visible": channel == "delta",
+            "metadata": {"unit": "µm", **about},
+        }
+        found.append((data, options, "image"))
+    return found
+
+
+def _placed(grid: Grid, moving: bool) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Scale and place of an image [µm], with the number of the time before them."""
+    size, origin = (tuple(MICROMETRES * v for v in reversed(found)) for found in (grid.voxel_size, grid.origin))
+    return ((1.0, *size), (0.0, *origin)) if moving else (size, origin)
+
+
+def _surface(name: str, moments: Sequence[Stored], moving: bool, about: dict[str, Any]) -> Layer:
+    """Triangles, whose vertices begin with the number of the time where they move."""
+    vertices, faces, before = [], [], 0
+    for number, moment in enumerate(moments):
+        assert isinstance(moment, SurfaceMesh)
+        mesh = moment.mesh()
+        places = MICROMETRES * mesh.vertices[:, ::-1]
+        vertices.append(np.insert(places, 0, number, axis=1) if moving else places)
+        faces.append(mesh.faces + before)
+        before += len(places)
+    data = (np.concatenate(vertices), np.concatenate(faces))
+    return data, {"name": name, "metadata": {"unit": "µm", **about}}, "surface"

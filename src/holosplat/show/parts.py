@@ -1,0 +1,113 @@
+"""Objects as viewers draw them: Gaussians with opacities, or triangles, in a scene of ten units to each side."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+from ..geometry import Grid
+from ..io.splats import opacities
+from ..mesh import TriangleMesh
+from ..representations import GaussianCloud, MovingGaussians, MovingSurfaces, Stored, SurfaceMesh, isosurface
+
+HALF_EDGE = 10.0
+"""Units of the scene from its middle to its farthest side, which suits the cameras of viewers."""
+MOST_VOXELS = 1 << 21
+"""Voxels of the volume that an object without Gaussians or surfaces is cut from."""
+DEPTH = 40.0
+"""Optical depth of the thickest ray: viser drops a splat whose opacity times its area squared is under a quarter of a
+pixel's, which at depths that can be seen through are all of them."""
+NEAR, FAR = (0.95, 0.85, 0.70), (0.25, 0.40, 0.65)
+"""Colours of Gaussians at the near end of the object, and at the far one: all of one colour would be a silhouette."""
+LEVEL = 0.5
+"""Share of the largest |δ| at which that is."""
+TIMES = 48
+"""Steps of the slider of time, at most."""
+
+
+@dataclass(frozen=True)
+class Splats:
+    """centres [N, 3], covariances [N, 3, 3] [m, m²]; colours [N, 3] and opacities [N] from 0 to 1."""
+
+    centres: np.ndarray
+    covariances: np.ndarray
+    colours: np.ndarray
+    opacities: np.ndarray
+
+
+Shown = Splats | TriangleMesh
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Where the scene lies. middle: (x, y, z) [m]; scale: units a metre."""
+
+    middle: np.ndarray
+    scale: float
+
+    @classmethod
+    def around(cls, grid: Grid) -> Frame:
+        """That which holds a grid."""
+        half = 0.5 * float((np.array(grid.shape[::-1]) * np.array(grid.voxel_size)).max())
+        return cls(grid.centre, HALF_EDGE / half)
+
+    def places(self, points: np.ndarray) -> np.ndarray:
+        """Points [N, 3] [m] in units of the scene, float32."""
+        return ((points - self.middle) * self.scale).astype(np.float32)
+
+
+def shown(obj: Stored) -> Shown:
+    """What is drawn of an object as it is: Gaussians, surfaces, or the surface at half of the largest |δ| of others.
+
+    Errors: `InputError` where there is no surface.
+    """
+    with torch.no_grad():
+        if isinstance(obj, GaussianCloud):
+            return _splats(obj)
+        if isinstance(obj, SurfaceMesh):
+            return obj.mesh()
+        grid = obj.enclosing_grid(MOST_VOXELS)
+        delta = np.abs(obj.voxelise(grid).delta)
+    return isosurface(delta, grid, LEVEL * float(delta.max()))
+
+
+def at_times(obj: Stored, times: Sequence[float]) -> dict[str, Stored]:
+    """What the slider of time leads through, by its label: a moving object at up to `TIMES` of `times` [s], or from the
+    first of its basis to the last where there are none; any other object alone."""
+    if not isinstance(obj, MovingSurfaces | MovingGaussians):
+        return {"": obj}
+    basis = obj.basis if isinstance(obj, MovingSurfaces) else obj.flow.basis
+    chosen = np.array(times) if len(times) else np.linspace(basis.first, basis.last, TIMES)
+    chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, min(TIMES, len(chosen))).astype(int))]
+    return {f"{1e6 * t:.6g} µs": obj.at(float(t)) for t in chosen}
+
+
+def cut(part: Shown, axis: int, share: float) -> Shown:
+    """What is left where the nearest `share` (0 to 1) of the matter's extent along `axis` is taken away."""
+    if share <= 0:
+        return part
+    if isinstance(part, Splats):
+        kept = _beyond(part.centres[:, axis], share)
+        return Splats(part.centres[kept], part.covariances[kept], part.colours[kept], part.opacities[kept])
+    faces = part.faces[_beyond(part.vertices[part.faces].mean(axis=1)[:, axis], share)]
+    return replace(part, faces=faces)
+
+
+def _beyond(places: np.ndarray, share: float) -> np.ndarray:
+    """Which of `places` [N] stay; the farthest always does."""
+    low, high = places.min(), places.max()
+    return (places >= low + min(share, 1.0) * (high - low)) | (places == high)
+
+
+def _splats(cloud: GaussianCloud) -> Splats:
+    unit = cloud.unit_length
+    turns = Rotation.from_quat(cloud.quaternions.double().numpy()[:, [1, 2, 3, 0]]).as_matrix()
+    axes = turns * (unit * cloud.scales.double().numpy())[:, None, :]
+    centres = unit * cloud.centres.double().numpy()
+    depth = (centres[:, 2] - centres[:, 2].min()) / max(float(np.ptp(centres[:, 2])), 1e-30)
+    colours = np.array(NEAR) + depth[:, None] * (np.array(FAR) - np.array(NEAR))
+    return Splats(centres, axes @ axes.transpose(0, 2, 1), colours, opacities(cloud, DEPTH))

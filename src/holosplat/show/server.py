@@ -1,0 +1,158 @@
+"""The live view: viser's server, on the loopback address only and behind a token (`guard`)."""
+
+from __future__ import annotations
+
+import logging
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
+from io import StringIO
+from typing import Any
+
+import numpy as np
+
+from ..checks import InputError, require
+from ..mesh import TriangleMesh
+from .guard import HOST, REFUSED, Guard
+from .parts import Frame, Shown, Splats
+
+COLOUR = (205, 80, 60)
+"""Of surfaces."""
+
+
+def require_viser() -> Any:
+    """The package viser; `InputError` where it is not installed."""
+    try:
+        import viser
+    except ImportError:
+        raise InputError('The live view needs viser; install it by pip install "holosplat[view]".') from None
+    return viser
+
+
+class LiveView:
+    """A page in the browser that shows an object, what is said of it, and sliders.
+
+    port: the first that is tried; the next free one is taken. Errors: `InputError` without the package viser, or for a
+    version of it that starts its server in another way, which could not be guarded.
+    """
+
+    def __init__(self, title: str, port: int = 8080) -> None:
+        viser = require_viser()
+        logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # of connections that browsers break off
+        self.guard = Guard(secrets.token_urlsafe(24))
+        with _guarded(self.guard) as started, redirect_stdout(StringIO()):  # it prints addresses without the token
+            self._server = viser.ViserServer(host=HOST, port=port, verbose=False)
+        if not started:
+            self._server.stop()
+            raise InputError(
+                'This version of viser cannot be guarded by a token; pip install "holosplat[view]" has one.'
+            )
+        self._server._websock_server.unregister_handler(viser._messages.ShareUrlRequest)  # a way out of this machine
+        self._server.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True)
+        self._server.scene.set_up_direction("-y")
+        self._server.initial_camera.position = (0.0, -6.0, -24.0)
+        self._server.initial_camera.look_at = (0.0, 0.0, 0.0)
+        self._words = self._server.gui.add_markdown(_escaped(title))
+        self._title, self._part = title, None
+        self.frame: Frame | None = None
+
+    @property
+    def url(self) -> str:
+        """The address to open, with the token."""
+        return f"http://{HOST}:{self.port}/?token={self.guard.token}"
+
+    @property
+    def port(self) -> int:
+        """The port that is listened on."""
+        return int(self._server.get_port())
+
+    @property
+    def watched(self) -> bool:
+        """Whether a browser shows it now."""
+        return len(self._server.get_clients()) > 0
+
+    def tell(self, *lines: str) -> None:
+        """Show lines of text below the title."""
+        self._words.content = "  \n".join(map(_escaped, (self._title, *lines)))
+
+    def show(self, part: Shown) -> None:
+        """Show Gaussians or triangles in place of what was there; `frame` must be set."""
+        assert self.frame is not None
+        scene = self._server.scene
+        if isinstance(part, TriangleMesh):
+            scene.add_mesh_simple(
+                "/object", self.frame.places(part.vertices), part.faces.astype(np.uint32), color=COLOUR, side="double"
+            )
+        else:
+            self._show_splats(part)
+        if self._part is not None and self._part is not type(part):
+            scene.remove_by_name("/splats" if self._part is Splats else "/object")
+        self._part = type(part)
+
+    def _show_splats(self, part: Splats) -> None:
+        assert self.frame is not None
+        self._server.scene.add_gaussian_splats(
+            "/splats",
+            self.frame.places(part.centres),
+            part.covariances * self.frame.scale**2,
+            part.colours,
+            part.opacities[:, None],
+        )
+
+    def slider(self, label: str, steps: int, on_step: Any, first: int = 0) -> None:
+        """A slider from 0 to `steps` - 1; `on_step(k)` is called when it is moved."""
+        require(steps > 1, f"a slider needs two steps at least, but {label} has {steps}.")
+        handle = self._server.gui.add_slider(label, min=0, max=steps - 1, step=1, initial_value=first)
+        handle.on_update(lambda event: on_step(int(event.target.value)))
+
+    def close(self) -> None:
+        """End the server; browsers show that it is gone."""
+        with redirect_stdout(StringIO()):
+            self._server.stop()
+
+
+def _escaped(text: str) -> str:
+    """Text without what Markdown or HTML would take for marks."""
+    return "".join(f"&#{ord(c)};" if c in "<>&*_`[]()#|\\!~" else c for c in text)
+
+
+@contextmanager
+def _guarded(guard: Guard) -> Iterator[list[bool]]:
+    """While it lasts, servers of the package websockets, on which viser's stands, ask `guard` before they answer; the
+    list then holds something. viser itself has no place for such a question."""
+    from websockets.asyncio import server as module
+
+    original, started = module.serve, list[bool]()
+
+    def serve(*args: Any, process_request: Any = None, **rest: Any) -> Any:
+        started.append(True)
+        return original(*args, process_request=_asking(guard, process_request), **rest)
+
+    module.serve = serve
+    try:
+        yield started
+    finally:
+        module.serve = original
+
+
+def _asking(guard: Guard, otherwise: Any) -> Any:
+    """A function that answers requests as `otherwise` does, where the guard lets them pass."""
+    from websockets.datastructures import Headers
+    from websockets.http11 import Response
+
+    fixed = {"Cache-Control": "no-store", "Referrer-Policy": "no-referrer", "Content-Type": "text/plain; charset=utf-8"}
+
+    def answer(connection: Any, request: Any) -> Any:
+        headers: dict[str, list[str]] = {}
+        for name, value in request.headers.raw_items():
+            headers.setdefault(name.lower(), []).append(value)
+        found = guard.answer(request.path, headers)
+        if found == "pass":
+            return otherwise(connection, request)
+        if found == "enter":
+            said = Headers({**fixed, "Location": "/", "Set-Cookie": guard.set_cookie(), "Content-Length": "0"})
+            return Response(303, "See Other", said, b"")
+        body = REFUSED.encode()
+        return Response(403, "Forbidden", Headers({**fixed, "Content-Length": str(len(body))}), body)
+
+    return answer
