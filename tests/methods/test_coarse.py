@@ -30,7 +30,7 @@ from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
 
 PITCH = 0.5e-6
-QUICK = CoarseToFine(columns=32, cloud_steps=10, coarse_steps=15, steps=10, approximate_steps=8, fit_steps=3)
+QUICK = CoarseToFine(columns=32, cloud_steps=10, coarse_steps=15, last_steps=10, approximate_steps=8, fit_steps=3)
 MATTER = HAEMOGLOBIN.delta_beta(20.0)
 
 
@@ -189,7 +189,7 @@ def test_a_run_goes_on_from_a_near_start_with_as_few_steps(scan, near, tmp_path,
     assert isinstance(whole.object, SurfaceMesh)
     assert torch.equal(again.object.vertices, whole.object.vertices)
     rows = folder.metrics.read_text(encoding="utf-8").strip().splitlines()
-    assert len(rows) == 1 + QUICK.steps
+    assert len(rows) == 1 + QUICK.last_steps
     assert isinstance(load_reconstruction(folder).object, SurfaceMesh)
 
 

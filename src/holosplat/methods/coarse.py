@@ -49,11 +49,15 @@ class CoarseToFine:
     coarse_steps: int = 60
     """Steps of the coarse surfaces."""
     steps: int = 40
-    """Steps of the surfaces on each finer pixel."""
+    """Steps of the surfaces on each finer pixel but the frames' own."""
+    last_steps: int = 25
+    """Steps on these, which cost most."""
     rate: Weight = 0.1
     """Length of their first steps [pixels]: half of what surfaces cut out of Gaussians need."""
-    edge: Pixels = 2.5
-    """Mean length of triangles' edges [pixels] from which on they are divided."""
+    edge: Pixels = 1.5
+    """Mean length of triangles' edges [pixels] from which on they are divided on pixels between."""
+    last_edge: Pixels = 2.5
+    """The same on the frames' own pixels."""
     sizes: int = 3
     """Sizes of Gaussians that fill the surfaces, from one pixel on, each twice the last."""
     approximate_steps: int = 40
@@ -63,7 +67,8 @@ class CoarseToFine:
 
     def __post_init__(self) -> None:
         at_least(self, 0, "columns")
-        at_least(self, 1, "cloud_steps", "coarse_steps", "steps", "sizes", "approximate_steps", "fit_steps")
+        at_least(self, 1, "cloud_steps", "coarse_steps", "steps", "last_steps", "sizes")
+        at_least(self, 1, "approximate_steps", "fit_steps")
 
     def factor(self, scan: Scan) -> int:
         """Pixels of `scan` along an edge of the coarsest: a power of two, 1 where its frames are small."""
@@ -73,12 +78,19 @@ class CoarseToFine:
         return factor
 
     def nearby(self, fit: SurfaceFit) -> SurfaceFit:
-        """The fit of surfaces that are near: fewer and shorter steps."""
-        return replace(fit, schedule=replace(fit.schedule, steps=self.steps), rate=self.rate)
+        """The fit of surfaces that are near to those of the frames' own pixels: fewer and shorter steps."""
+        return self._short(fit, self.last_steps)
+
+    def between(self, fit: SurfaceFit) -> SurfaceFit:
+        """The fit on pixels between the coarsest and the frames' own."""
+        return self._short(fit, self.steps)
+
+    def _short(self, fit: SurfaceFit, steps: int) -> SurfaceFit:
+        return replace(fit, schedule=replace(fit.schedule, steps=steps), rate=self.rate)
 
     def with_effort(self, effort: float) -> CoarseToFine:
         """The same with `effort` times the steps, at least one."""
-        names = ("cloud_steps", "coarse_steps", "steps", "approximate_steps", "fit_steps")
+        names = ("cloud_steps", "coarse_steps", "steps", "last_steps", "approximate_steps", "fit_steps")
         return replace(self, **{name: max(1, round(effort * getattr(self, name))) for name in names})
 
 
@@ -99,7 +111,7 @@ def coarse_surfaces(
     while factor > 1:
         found = _fitted(binned(task, factor), found, surfaces, how)
         factor //= 2
-    found = on_pixels(found, task.scan.views.finest, how.edge)
+    found = on_pixels(found, task.scan.views.finest, how.last_edge)
     return found if unexplained(found, task.scan, surfaces) <= how.missing else None
 
 
@@ -130,7 +142,7 @@ def _first(
 def _fitted(task: Task, found: SurfaceMesh, surfaces: SurfaceOptions, how: CoarseToFine) -> SurfaceMesh:
     """The surfaces on the pixels of `task`."""
     start = on_pixels(found, task.scan.views.finest, how.edge)
-    return _run(task, start, how.nearby(surfaces.fit))
+    return _run(task, start, how.between(surfaces.fit))
 
 
 def _run(task: Task, start: SurfaceMesh, options: SurfaceFit) -> SurfaceMesh:
