@@ -12,7 +12,6 @@ row to a file as it comes, and leaves out what the file has.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import os
 import time
@@ -26,11 +25,12 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 import numpy as np
 import torch
 from machine import commit
+from rows import read, write
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from holosplat.bench.declaration import Between
-from holosplat.methods.surfaces import oversampling
+from holosplat.methods.surface_fit import oversampling
 from holosplat.workflows.evaluate import Scores, score_object
 from holosplat.workflows.provenance import environment
 
@@ -161,7 +161,7 @@ def main() -> None:
     if "snapshot" in options.cases and not options.meshes:
         parser.error("the case snapshot needs --meshes")
     rows: list[dict[str, Any]] = []
-    kept = read(options.csv)
+    kept = read(options.csv) if options.csv else []
     for name in options.cases:
         for seed in [0] if name == "snapshot" else options.seeds:
             if any((r["case"], r["seed"]) == (name, str(seed)) for r in kept):
@@ -169,7 +169,7 @@ def main() -> None:
             case = snapshot(options.meshes) if name == "snapshot" else CASES[name](seed)
             rows += [{"case": name, **row} for row in run(case, options.preset, seed, options.surfaces)]
             if options.csv:
-                write(kept + [flat(row) for row in rows], options.csv)
+                write(kept + [flat(row) for row in rows], options.csv, COLUMNS)
     report = {"commit": commit(), **environment("cpu"), "rows": rows}
     print(json.dumps(report, indent=2) if options.json else table(report))
 
@@ -195,22 +195,6 @@ def flat(row: dict[str, Any]) -> dict[str, Any]:
     """A row as the file has it."""
     said = row | row["material"] | {"threads": torch.get_num_threads(), "commit": commit()}
     return {name: f"{said[name]:.6g}" if isinstance(said[name], float) else said[name] for name in COLUMNS}
-
-
-def read(path: Path | None) -> list[dict[str, Any]]:
-    """The rows of a file; none where there is no file."""
-    if path is None or not path.exists():
-        return []
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
-def write(rows: list[dict[str, Any]], path: Path) -> None:
-    """All rows."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 def table(report: dict[str, Any]) -> str:

@@ -19,7 +19,6 @@ Cases that differ only in noise or light have the same frames before it, and sta
 from __future__ import annotations
 
 import argparse
-import csv
 import importlib
 import math
 import os
@@ -35,6 +34,7 @@ import multislice as other
 import numpy as np
 import torch
 from machine import commit
+from rows import read, write
 from scipy import fft
 
 from holosplat.beamline.simulate import Simulation, simulated_frames
@@ -180,7 +180,7 @@ def main() -> None:
     if given.summary:
         print(*summary(read(given.summary)), sep="\n")
         return
-    rows = read(given.csv) if given.csv and given.csv.exists() else []
+    rows: list[dict[str, Any]] = read(given.csv) if given.csv else []
     done = {r["case"] for r in rows}
     for case, also in alike(given.cases, given.snapshots):
         if case.name in done:
@@ -189,22 +189,8 @@ def main() -> None:
             rows.append(row(case, view) | {"also": " ".join(also), "machine": given.machine, "commit": commit()})
             print(rows[-1], flush=True)
         if given.csv:
-            write(rows, given.csv)
+            write(rows, given.csv, COLUMNS)
     print(*summary(rows), sep="\n")
-
-
-def read(path: Path) -> list[dict[str, str]]:
-    """The rows of a file."""
-    with path.open(newline="", encoding="utf-8") as file:
-        return list(csv.DictReader(file))
-
-
-def write(rows: list[dict[str, Any]], path: Path) -> None:
-    """All rows."""
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
 
 
 if __name__ == "__main__":

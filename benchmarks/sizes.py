@@ -1,69 +1,111 @@
 """How quality, time and memory grow with the frames: the first case of the suite on finer and finer pixels.
 
-    python benchmarks/sizes.py                       # 64, 128 and 256 pixels across the same field
-    python benchmarks/sizes.py --pixels 512          # four minutes, 6 GB
+    python benchmarks/sizes.py                                          # 64, 128 and 256 pixels across the same field
+    python benchmarks/sizes.py --pixels 512 1024 --method auto --csv docs/data/sizes.csv
+    python benchmarks/sizes.py --pixels 256 --bodies 60 --diameter 88   # pixels of 1.6 µm: a third of the field is full
 
 24 generated cells in a field of 410 µm, 20 keV, 10 cm, 12 views for the fit and 4 held out, haemoglobin known, without
-noise. Prints a Markdown table. Each size runs in a process of its own, whose peak of memory is told; where that was
-reached in the simulation, the table says so.
+noise. Prints a Markdown table; `--csv` adds each row to a file as it comes. Each size runs in a process of its own,
+whose peak of memory during the reconstruction is told.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-import resource
 import subprocess
 import sys
+import threading
 import time
+from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
+import rows
 from machine import commit
 
 import holosplat as hs
+from holosplat.methods import METHODS
 
 FIELD = 128 * 3.2e-6
 DIAMETER = 20 * 3.2e-6
 MATERIAL = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
+SCORES = ("ssim", "frcm", "dice", "relative_error_delta")
 
 
-def measure(pixels: int, seed: int) -> str:
+class Peak:
+    """The largest resident size [GiB] while it is entered, looked at every 20 ms."""
+
+    def __enter__(self) -> Peak:
+        self.gib, self._done = 0.0, threading.Event()
+        self._thread = threading.Thread(target=self._look, daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._done.set()
+        self._thread.join()
+
+    def _look(self) -> None:
+        while not self._done.wait(0.02):
+            pages = int(Path("/proc/self/statm").read_text().split()[1])
+            self.gib = max(self.gib, pages * os.sysconf("SC_PAGE_SIZE") / 2**30)
+
+
+def measure(pixels: int, seed: int, method: str, bodies: int, diameter: float) -> dict[str, object]:
     """A row of the table."""
     pitch = FIELD / pixels
-    scene = hs.MeshScene.of_one_material(hs.specimens.random_cells(24, (FIELD,) * 3, seed, DIAMETER), MATERIAL)
+    scene = hs.MeshScene.of_one_material(hs.specimens.random_cells(bodies, (FIELD,) * 3, seed, diameter), MATERIAL)
     views = hs.Views.evenly_spaced(16, (pixels, pixels), pitch)
     scan = hs.simulate(scene, hs.Exposures.of(views, 20.0, 0.1, 0.05), seed=seed)
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    began = time.perf_counter()
-    result = hs.reconstruct(scan, hs.MaterialPrior.known(MATERIAL), hs.preset("default"), seed)
-    seconds = time.perf_counter() - began
-    assert isinstance(result.object, hs.representations.GaussianCloud)
-    after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    began, cpu = time.perf_counter(), time.process_time()
+    with Peak() as peak:
+        result = hs.reconstruct(scan, hs.MaterialPrior.known(MATERIAL), METHODS[method], seed)
+    seconds, cpu = time.perf_counter() - began, time.process_time() - cpu
     found = hs.evaluate(result, scan, scene.voxelise(hs.Grid.of_views(views))).headline()
-    scores = " | ".join(f"{found[name]:.3f}" for name in ("ssim", "frcm", "dice", "relative_error_delta"))
-    times = f"{result.timing['start']:.0f} + {result.timing['fit']:.0f} = {seconds:.0f}"
-    memory = f"{max(before, after) / 2**20:.1f}" + ("" if after > before else " (simulation)")
-    return f"| {pixels} | {1e6 * pitch:.2g} | {scores} | {len(result.object)} | {times} | {memory} |"
+    return {
+        "pixels": pixels,
+        "pitch_um": f"{1e6 * pitch:.3g}",
+        "bodies": bodies,
+        "diameter_um": f"{1e6 * diameter:.3g}",
+        "method": method,
+        "seed": seed,
+        **{name: f"{found[name]:.4f}" for name in SCORES},
+        "result": result.object.described,
+        "seconds": f"{seconds:.1f}",
+        "cpu_seconds": f"{cpu:.1f}",
+        "start_seconds": f"{result.timing['start']:.1f}",
+        "peak_gib": f"{peak.gib:.2f}",
+        "load": f"{os.getloadavg()[0]:.1f}",
+        "machine": f"{os.cpu_count()} × {os.uname().machine}",
+        "commit": commit(),
+    }
 
 
 def main() -> None:
     """One process a size, in turn."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--pixels", type=int, nargs="+", default=[64, 128, 256])
-    parser.add_argument("--seed", type=int, default=101)
-    parser.add_argument("--one", action="store_true", help="in this process, without the table's head")
+    parser.add_argument("--method", nargs="+", default=["gaussians"], choices=sorted(METHODS))
+    parser.add_argument("--bodies", type=int, default=24)
+    parser.add_argument("--diameter", type=float, default=1e6 * DIAMETER, help="of the bodies [µm]")
+    parser.add_argument("--seed", type=int, default=103)
+    parser.add_argument("--csv", type=Path)
+    parser.add_argument("--one", action="store_true", help="in this process")
     options = parser.parse_args()
     if options.one:
-        print(measure(options.pixels[0], options.seed))
+        scene = (options.bodies, 1e-6 * options.diameter)
+        row = measure(options.pixels[0], options.seed, options.method[0], *scene)
+        print("| " + " | ".join(str(value) for value in row.values()) + " |", flush=True)
+        if options.csv:
+            rows.write([*rows.read(options.csv), row], options.csv)
         return
-    print(f"commit {commit()}, seed {options.seed}\n")
-    print("| pixels | pitch / µm | SSIM | FRCM | Dice | error of δ | Gaussians | start + fit / s | peak / GiB |")
-    print("| --- " * 9 + "|", flush=True)
+    same = ["--bodies", str(options.bodies), "--diameter", str(options.diameter), "--seed", str(options.seed)]
+    same += ["--csv", str(options.csv)] if options.csv else []
     for pixels in options.pixels:
-        subprocess.run(
-            [sys.executable, __file__, "--one", "--pixels", str(pixels), "--seed", str(options.seed)], check=True
-        )
+        for method in options.method:
+            one = ["--one", "--pixels", str(pixels), "--method", method, *same]
+            subprocess.run([sys.executable, __file__, *one], check=True)
 
 
 if __name__ == "__main__":

@@ -28,7 +28,7 @@ import holosplat as hs
 from holosplat.bench.case import load_case
 from holosplat.io.json import write_json
 from holosplat.methods import Extraction, SurfaceFit, SurfaceOptions, finished
-from holosplat.methods.surfaces import extract_surfaces, oversampling, surface_fit
+from holosplat.methods.surface_fit import extract_surfaces, oversampling, surface_fit
 from holosplat.representations import GaussianCloud, SurfaceMesh
 from holosplat.workflows.evaluate import Scores, score_object
 from holosplat.workflows.provenance import environment

@@ -17,7 +17,7 @@ from holosplat.align.untold import beside, motions
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.geometry import Grid
 from holosplat.matter import Matter
-from holosplat.methods.surfaces import oversampling
+from holosplat.methods.surface_fit import oversampling
 from holosplat.representations import SurfaceMesh, isosurface
 
 FEW = PoseOptions(Uncertain(shift=1.0, angle=0.5, roll=0.5), rounds=1, retrieval=10, first=8, steps=3, edges=0)

@@ -25,7 +25,7 @@ from holosplat.matter import MaterialPrior, Matter
 from holosplat.methods import Gaussians, Task
 from holosplat.methods.presets import preset
 from holosplat.methods.start import starting_cloud
-from holosplat.methods.surfaces import extract_surfaces
+from holosplat.methods.surface_fit import extract_surfaces
 from holosplat.model import Instrument, measure
 from holosplat.representations import GaussianCloud, VoxelLines, approximate, cloud_from_two
 from holosplat.representations.gaussians import raw_of

@@ -26,7 +26,7 @@ from holosplat.io.vtk import read_meshes
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import MaterialPrior
 from holosplat.methods import FitOptions, Gaussians
-from holosplat.methods.surfaces import extract_surfaces
+from holosplat.methods.surface_fit import extract_surfaces
 from holosplat.representations import freed
 from holosplat.scan import Exposures, interleaved_split
 from holosplat.specimens.red_cells import random_cells

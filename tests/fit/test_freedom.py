@@ -17,7 +17,7 @@ from holosplat.fit.batch import Batch
 from holosplat.fit.freedom import Expected, Freedom, mean_distance_error, moved, projection
 from holosplat.fit.schedule import Schedule
 from holosplat.geometry import Views, rotation_y
-from holosplat.methods.surfaces import SurfaceFit, surface_fit
+from holosplat.methods.surface_fit import SurfaceFit, surface_fit
 from holosplat.model import Alignment, Instrument, Model, measure
 from holosplat.scan import Exposures, Scan
 

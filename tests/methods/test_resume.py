@@ -24,7 +24,7 @@ from holosplat.matter import MaterialPrior
 from holosplat.methods import NeuralFit, SurfaceFit, VoxelFit
 from holosplat.methods.method import Task
 from holosplat.methods.neural_field import warmed_up, waves_fit
-from holosplat.methods.surfaces import surface_fit
+from holosplat.methods.surface_fit import surface_fit
 from holosplat.methods.voxels import voxel_fit
 from holosplat.representations import NeuralField
 from holosplat.scan import Scan

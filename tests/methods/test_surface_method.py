@@ -19,7 +19,7 @@ from holosplat.geometry import Grid
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.mesh import TriangleMesh
 from holosplat.methods import SurfaceFit, finished
-from holosplat.methods.surfaces import surface_fit
+from holosplat.methods.surface_fit import surface_fit
 from holosplat.model import measure
 from holosplat.representations import SurfaceMesh
 from holosplat.scan import Exposures, Scan

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from ..geometry import Grid
-from ..methods.surfaces import oversampling
+from ..methods.surface_fit import oversampling
 from ..optics.sampling import fringe_sampling
 from ..representations import SurfaceMesh
 from ..scan import Scan

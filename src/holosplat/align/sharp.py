@@ -18,7 +18,7 @@ from ..fit.freedom import Freedom, mean_distance_error
 from ..fit.schedule import Schedule
 from ..geometry import Grid
 from ..matter import DeltaBeta, Matter
-from ..methods.surfaces import SurfaceFit, oversampling, surface_fit
+from ..methods.surface_fit import SurfaceFit, oversampling, surface_fit
 from ..optics.noise import noise_levels
 from ..progress import Advance
 from ..representations import SurfaceMesh, isosurface

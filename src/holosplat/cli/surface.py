@@ -19,7 +19,8 @@ from ..io.volumes import read_volume
 from ..io.vtk import write_mesh
 from ..matter import Matter
 from ..mesh import TriangleMesh
-from ..methods.surfaces import SurfaceOptions, oversampling, refine_surfaces
+from ..methods.surface_fit import SurfaceOptions, oversampling
+from ..methods.surfaces import refine_surfaces
 from ..representations import MovingSurfaces
 from ..workflows.evaluate import evaluate as score
 from ..workflows.evaluate import score_object

@@ -6,11 +6,12 @@ from .auto import Auto
 from .gaussian_options import FitOptions, GaussianRates
 from .gaussians import Gaussians, gaussian_fit
 from .ground import ExtraTerm
-from .method import Method, Stage, Task, finished
+from .method import Method, Near, Stage, Task, begun, finished
 from .neural_field import NeuralFields, NeuralFit
 from .per_view import PerView
 from .solve import Settled, settled, solve
-from .surfaces import Extraction, SurfaceFit, SurfaceOptions, Surfaces, refine_surfaces
+from .surface_fit import Extraction, SurfaceFit, SurfaceOptions
+from .surfaces import Surfaces, refine_surfaces
 from .uncertain import Determined, Uncertain
 from .volume import SmoothVolume
 from .voxels import HolographicVoxels, VoxelFit, Voxels
@@ -42,6 +43,7 @@ __all__ = [
     "Gaussians",
     "HolographicVoxels",
     "Method",
+    "Near",
     "NeuralFields",
     "NeuralFit",
     "PerView",
@@ -55,6 +57,7 @@ __all__ = [
     "Uncertain",
     "VoxelFit",
     "Voxels",
+    "begun",
     "finished",
     "gaussian_fit",
     "refine_surfaces",

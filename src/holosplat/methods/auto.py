@@ -16,7 +16,8 @@ from .gaussian_options import Backend
 from .gaussians import Gaussians
 from .levels import Decision, LevelTest
 from .method import Method, Stage, Task, solve_stages
-from .surfaces import SurfaceOptions, SurfaceStage
+from .surface_fit import SurfaceOptions
+from .surfaces import BodiesStage, SurfaceStage
 from .volume import SmoothVolume
 
 TRIAL = "trial of methods"
@@ -100,7 +101,8 @@ class Bodies:
 
     def stages(self) -> Sequence[Stage]:
         """Those of the Gaussians, and the surfaces."""
-        return (*self.gaussians.stages(), SurfacesWhereClosed(self.surfaces))
+        last = SurfacesWhereClosed(self.surfaces, self.gaussians.coarse)
+        return (BodiesStage(self.gaussians, surfaces=self.surfaces), last)
 
 
 @dataclass(frozen=True)
@@ -108,7 +110,9 @@ class SurfacesWhereClosed(SurfaceStage):
     """Surfaces of one material of known level; where there are none, what came before stays as it is."""
 
     def start(self, task: Task, before: Stored | None) -> Stored:  # type: ignore[override]
-        """The surfaces cut out of Gaussians, or these."""
+        """The surfaces cut out of Gaussians, or these; surfaces as they are."""
+        if isinstance(before, SurfaceMesh):
+            return before
         assert isinstance(before, GaussianCloud)
         if not (before.matter.single and task.bounded):
             return before

@@ -16,7 +16,8 @@ from .auto import Auto
 from .gaussians import Gaussians, GaussianStage
 from .method import Method, Stage, Task
 from .smooth_fit import SmoothFit
-from .surfaces import SurfaceOptions, Surfaces, SurfaceStage
+from .surface_fit import SurfaceOptions
+from .surfaces import Surfaces, SurfaceStage
 from .volume import SmoothStage, SmoothVolume
 
 

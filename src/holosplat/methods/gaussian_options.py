@@ -14,6 +14,7 @@ from ..fit.density import DensityControl
 from ..fit.schedule import Schedule
 from ..fit.terms import Objective
 from ..ranges import Pixels, Rate, Share, Weight, ranged
+from .coarse import CoarseToFine
 from .ground import ExtraTerm
 
 Backend = Literal["auto", "cpu", "cuda", "reference"]
@@ -94,6 +95,8 @@ class GaussianOptions:
     """How two materials are told apart."""
     volume: HolographicTV = field(default_factory=HolographicTV)
     """The starting volume."""
+    coarse: CoarseToFine = field(default_factory=CoarseToFine)
+    """How large frames of closed bodies start."""
     fit: FitOptions = field(default_factory=FitOptions)
 
     def __post_init__(self) -> None:

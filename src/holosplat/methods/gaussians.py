@@ -22,13 +22,17 @@ from ..matter import Matter
 from ..optics.background import Light
 from ..optics.noise import noise_share
 from ..ranges import ranged
-from ..representations import GaussianCloud, Stored
+from ..representations import GaussianCloud, Stored, SurfaceMesh
 from ..scan import Scan
+from .coarse import STAGE as COARSE
+from .coarse import coarse_surfaces
+from .coarse_cloud import cloud_of_surfaces
 from .field import field_of
 from .gaussian_options import Backend, FitOptions, GaussianOptions
 from .ground import Ground, ground
-from .method import Stage, Task
+from .method import Near, Stage, Task, run_quietly
 from .start import starting_cloud
+from .surface_fit import SurfaceOptions
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,13 @@ class Gaussians(GaussianOptions):
         weights = self.fit.objective
         return self.start == "phase" or weights.overfull > 0 or weights.two_levels > 0
 
+    def for_surfaces(self) -> Gaussians:
+        """The same for the first surfaces of large frames, which need no finished Gaussians: voxels of one pixel, and
+        fewer steps."""
+        schedule = replace(self.fit.schedule, steps=self.coarse.cloud_steps)
+        volume = replace(self.volume, refine=self.volume.refine or 1)
+        return replace(self, fit=replace(self.fit, schedule=schedule), volume=volume)
+
     def on_backend(self, backend: Backend) -> Gaussians:
         """The same method computed by `backend`; the start runs on the CPU, or in plain torch."""
         volume = replace(self.volume, backend="reference" if backend == "reference" else "cpu")
@@ -57,7 +68,8 @@ class Gaussians(GaussianOptions):
         """The same method with `effort` times the steps, at least one."""
         steps, first = (max(1, round(effort * n)) for n in (self.fit.schedule.steps, self.approximate_steps))
         schedule = replace(self.fit.schedule, steps=steps)
-        return replace(self, approximate_steps=first, fit=replace(self.fit, schedule=schedule))
+        coarse, fit = self.coarse.with_effort(effort), replace(self.fit, schedule=schedule)
+        return replace(self, approximate_steps=first, fit=fit, coarse=coarse)
 
 
 @dataclass(frozen=True)
@@ -67,8 +79,15 @@ class GaussianStage:
     options: Gaussians
     name: str = "fit"
 
-    def start(self, task: Task, before: Stored | None) -> GaussianCloud:
-        """The starting cloud."""
+    def start(self, task: Task, before: Stored | None) -> Stored | Near:
+        """The starting cloud: of surfaces on coarse pixels, or its own."""
+        surfaces = self.coarse_surfaces(task, SurfaceOptions())
+        if surfaces is None:
+            return self.own_start(task)
+        return Near(cloud_of_surfaces(surfaces, task, self.options.coarse).on(self.options.volume.backend))
+
+    def own_start(self, task: Task) -> GaussianCloud:
+        """The starting cloud on the pixels of `task`."""
         if resolve(self.options.fit.backend) == "cuda":
             resolve("cpu")  # the start and the judging run there
         train, _ = split_validation(task.scan, self.options.fit.schedule.validation_views)
@@ -78,7 +97,24 @@ class GaussianStage:
         """The fit of the cloud to the training frames."""
         assert isinstance(start, GaussianCloud)
         options = resolved(self.options.fit, task, start.matter)
+        if task.near:
+            options = replace(options, schedule=replace(options.schedule, steps=self.options.coarse.fit_steps))
         return gaussian_fit(task.scan, start, options, task.seed, task.uneven, task.freedom)
+
+    def coarse_surfaces(self, task: Task, surfaces: SurfaceOptions) -> SurfaceMesh | None:
+        """Surfaces near to those of the frames, where these are large and coarse pixels show the bodies."""
+        how, options = self.options.coarse, self.options
+        if how.factor(task.scan) == 1 or options.start != "phase" or not task.bounded:
+            return None
+        train, _ = split_validation(task.scan, options.fit.schedule.validation_views)
+        coarse = GaussianStage(options.for_surfaces())
+        return coarse_surfaces(replace(task, scan=train), coarse.solved, surfaces, how)
+
+    def solved(self, task: Task) -> GaussianCloud:
+        """The cloud fitted to the frames of `task`."""
+        found = run_quietly(self.fit(task, self.own_start(task)), task.report(f"{COARSE}: Gaussians"))
+        assert isinstance(found, GaussianCloud)
+        return found
 
 
 def resolved(options: FitOptions, task: Task, matter: Matter) -> FitOptions:

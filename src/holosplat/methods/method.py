@@ -48,6 +48,7 @@ class Task:
     matter: whether matter has levels, each with sharp edges, or is continuous (see `settled`)
     delta_told: whether prior or frames say what δ is
     freedom: of where the frames are, which fits then find, too; None: they are where the scan says
+    near: whether what the next fit starts from is near to where it ends (see `Near`)
     """
 
     scan: Scan
@@ -59,6 +60,7 @@ class Task:
     matter: MatterKind = "levels"
     delta_told: bool = True
     freedom: Freedom | None = None
+    near: bool = False
 
     def __post_init__(self) -> None:
         if not self.prior.fixes_ratio and shows_no_refraction(self.scan):
@@ -119,6 +121,13 @@ class Task:
         return lambda fraction: self.on_progress(stage, fraction)
 
 
+@dataclass(frozen=True)
+class Near:
+    """A start that is near to where its fit ends, which then takes few steps."""
+
+    object: Stored
+
+
 class Stage(Protocol):
     """A piece of a reconstruction: an Object is made, and then perhaps fitted."""
 
@@ -127,7 +136,7 @@ class Stage(Protocol):
         """For progress and summaries."""
         ...
 
-    def start(self, task: Task, before: Stored | None) -> Stored:
+    def start(self, task: Task, before: Stored | None) -> Stored | Near:
         """The Object that this stage begins with; before: what the stage before ended with. It cannot be resumed."""
         ...
 
@@ -147,6 +156,14 @@ class Method(Protocol):
         ...
 
 
+def begun(stage: Stage, task: Task, before: Stored | None) -> tuple[Stored, Task]:
+    """What `stage` starts from, and the task with how near that is; what was near stays so if it is handed on."""
+    start = stage.start(task, before)
+    if isinstance(start, Near):
+        return start.object, replace(task, near=True)
+    return start, replace(task, near=task.near and start is before)
+
+
 def finished(fit: Running) -> Stored:
     """The object that a fit ended with, in main memory."""
     found = fit.result().object
@@ -164,10 +181,10 @@ def solve_stages(method: Method, task: Task) -> Stored:
     """Run all stages of `method` in memory, without a folder; Ctrl-C is passed on."""
     task, found = task.evened(), None
     for stage in method.stages():
-        found = stage.start(task, found)
+        found, task = begun(stage, task, found)
         fit = stage.fit(task, found)
         if fit is not None:
             found = run_quietly(fit, task.report(stage.name))
-            task = task.moved(fit.result())
+            task = replace(task.moved(fit.result()), near=False)
     assert found is not None
     return found

@@ -2,98 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
-import torch
-from scipy.sparse import csc_array, csr_array, diags_array, eye_array
-from scipy.sparse.linalg import splu
-from torch import Tensor
-
-from ..checks import in_range, positive, require
-from ..fit.freedom import Freedom, freed
-from ..fit.loop import Fit, Plan
-from ..fit.optimiser import Adam, Group
-from ..fit.problem import Problem, Term
-from ..fit.schedule import Schedule
-from ..fit.terms import Objective
-from ..fit.terms.object import Bending
-from ..geometry import Grid
+from ..checks import require
+from ..fit.loop import Fit
 from ..matter import MaterialPrior
-from ..optics.background import Light
-from ..optics.noise import noise_share
-from ..optics.sampling import fringe_sampling
 from ..progress import Progress
-from ..ranges import Rate, Weight, ranged
-from ..representations import GaussianCloud, Stored, SurfaceMesh, isosurface
-from ..representations.isosurface import adjacency, neighbour_mean
+from ..representations import GaussianCloud, Stored, SurfaceMesh
 from ..scan import Scan
-from .field import field_of
+from .coarse import CoarseToFine
 from .gaussian_options import Backend
-from .gaussians import Gaussians
-from .ground import ExtraTerm, ground
-from .method import Stage, Task, quiet, run_quietly
+from .gaussians import Gaussians, GaussianStage
+from .method import Near, Stage, Task, quiet, run_quietly
+from .surface_fit import SurfaceOptions, extract_surfaces, surface_fit
 
 STAGE = "surfaces"
-VERTICES = "object.vertices"
-BETAS, EPSILON = (0.9, 0.99), 1e-30
-"""Adam's constants for vertices (Nicolet et al. 2021)."""
-
-
-@dataclass(frozen=True)
-@ranged
-class Extraction:
-    """How surfaces are cut out of the occupancy that Gaussians add up to."""
-
-    level: float = 0.5
-    """Occupancy at the surface."""
-    spacing: float = 1.0
-    """Edge of the voxels, and about the length of the triangles' sides [pixels]."""
-    least_volume: Weight = 8.0
-    """Bodies and cavities of fewer voxels are left out."""
-    smoothing: int = 10
-    """Steps that smooth away the voxels' traces."""
-
-    def __post_init__(self) -> None:
-        in_range("level", self.level, 0.01, 0.99)
-        in_range("spacing", self.spacing, 0.25, 8.0, unit="pixels")
-
-
-def _objective() -> Objective:
-    return Objective(l1=0.0, rounded=1.0, rounding=3.0, bending=1.0, noise_gain=3.0)
-
-
-def _schedule() -> Schedule:
-    return Schedule(steps=100, decay=0.1)
-
-
-@dataclass(frozen=True)
-@ranged
-class SurfaceFit:
-    """Options of the fit of surfaces to frames."""
-
-    rate: Rate = 0.2
-    """Length of the first steps [pixels], the same for all vertices."""
-    stiffness: Weight = 10.0
-    """How far a vertex draws its neighbours along, λ of Nicolet et al. (2021)."""
-    objective: Objective = field(default_factory=_objective)
-    """How frames are compared, and what bending costs."""
-    schedule: Schedule = field(default_factory=_schedule)
-    """The loop; waves are sampled one finer than for Gaussians unless it says how, for edges are sharper."""
-    terms: tuple[ExtraTerm, ...] = ()
-    """Further terms by name."""
-
-    def __post_init__(self) -> None:
-        positive("rate", self.rate, "pixels")
-
-
-@dataclass(frozen=True)
-class SurfaceOptions:
-    """How surfaces are cut out, and how they are fitted."""
-
-    extraction: Extraction = field(default_factory=Extraction)
-    fit: SurfaceFit = field(default_factory=SurfaceFit)
 
 
 @dataclass(frozen=True)
@@ -106,7 +31,7 @@ class Surfaces(SurfaceOptions):
 
     def stages(self) -> Sequence[Stage]:
         """Those of the Gaussians, and the surfaces."""
-        return (*self.gaussians.stages(), SurfaceStage(self))
+        return (BodiesStage(self.gaussians, surfaces=self), SurfaceStage(self, self.gaussians.coarse))
 
     def on_backend(self, backend: Backend) -> Surfaces:
         """The same method whose Gaussians are computed by `backend`; surfaces are fitted on the CPU."""
@@ -119,13 +44,32 @@ class Surfaces(SurfaceOptions):
 
 
 @dataclass(frozen=True)
+class BodiesStage(GaussianStage):
+    """What surfaces begin with: those of coarse pixels where frames are large and these show the bodies, and Gaussians
+    elsewhere."""
+
+    surfaces: SurfaceOptions = field(default_factory=SurfaceOptions)
+
+    def start(self, task: Task, before: Stored | None) -> Stored | Near:
+        """Surfaces near to the frames', or the starting cloud."""
+        found = self.coarse_surfaces(task, self.surfaces)
+        return self.own_start(task) if found is None else Near(found)
+
+    def fit(self, task: Task, start: Stored) -> Fit | None:  # type: ignore[override]
+        """The fit of the cloud; none of surfaces, for the next stage has it."""
+        return super().fit(task, start) if isinstance(start, GaussianCloud) else None
+
+
+@dataclass(frozen=True)
 class SurfaceStage:
     """Surfaces from what came before."""
 
     options: SurfaceOptions
+    coarse: CoarseToFine = field(default_factory=CoarseToFine)
+    """How few steps a near start takes."""
     name: str = STAGE
 
-    def start(self, task: Task, before: Stored | None) -> SurfaceMesh:
+    def start(self, task: Task, before: Stored | None) -> Stored:
         """The surfaces cut out of Gaussians; closed surfaces are taken as they are."""
         if isinstance(before, SurfaceMesh):
             return before
@@ -141,28 +85,9 @@ class SurfaceStage:
     def fit(self, task: Task, start: Stored) -> Fit:
         """The fit of the surfaces to the training frames."""
         assert isinstance(start, SurfaceMesh)
+        options = self.coarse.nearby(self.options.fit) if task.near else self.options.fit
         freedom = task.freedom and replace(task.freedom, edges=task.prior.kind == "known")
-        return surface_fit(task.scan, start, self.options.fit, task.seed, task.uneven, freedom)
-
-
-def extract_surfaces(cloud: GaussianCloud, scan: Scan, options: Extraction = Extraction()) -> SurfaceMesh:
-    """The surfaces where the occupancy of `cloud` crosses the level, in the field of view of `scan` and the
-    rows beyond that the cloud fills.
-
-    Errors: `InputError` if the cloud is not of one material, or there is no such surface.
-    """
-    has = "two materials" if cloud.matter.second else "δ and β apart"
-    require(
-        cloud.matter.single,
-        f"surfaces need one material of known δ and β, but this run has {has}; "
-        "reconstruct with --material or --delta-beta.",
-    )
-    grid = Grid.of_views(field_of(cloud, scan.views), 1 / options.spacing)
-    with torch.no_grad():
-        density = cloud.density(grid)[0].cpu().numpy()
-    mesh = isosurface(density, grid, options.level, options.least_volume, options.smoothing)
-    vertices = torch.from_numpy(mesh.vertices / cloud.unit_length)
-    return SurfaceMesh(vertices, torch.from_numpy(mesh.faces), cloud.unit_length, cloud.matter)
+        return surface_fit(task.scan, start, options, task.seed, task.uneven, freedom)
 
 
 def refine_surfaces(
@@ -178,54 +103,3 @@ def refine_surfaces(
     found = run_quietly(fit, task.report(STAGE))
     assert isinstance(found, SurfaceMesh)
     return found
-
-
-def surface_fit(
-    scan: Scan,
-    start: SurfaceMesh,
-    options: SurfaceFit = SurfaceFit(),
-    seed: int = 0,
-    light: Light | None = None,
-    freedom: Freedom | None = None,
-) -> Fit:
-    """The fit of the surfaces `start` to the training frames of `scan`, of the same triangles, made ready.
-
-    freedom: of where these frames are, which is then fitted, too. Steps are Adam's in the coordinates (1 + λΔ) x, one
-    length for all vertices (Nicolet, Jacobson & Jakob 2021, "Large steps in inverse rendering of geometry", section 3).
-    """
-    finer = oversampling(scan.train(), options)
-    base = ground(scan, start, start.matter, options.objective, options.schedule, "cpu", finer=finer, light=light)
-    terms = (base.frames, *_bending(base.train, start, options.objective), *base.extra(options.terms))
-    group = Group(BETAS, EPSILON, solve=_membrane(start, options.stiffness), together=True)
-    plan = Plan(
-        problem=Problem(base.model, terms),
-        schedule=options.schedule,
-        optimiser=lambda leaves: Adam(leaves, "cpu", {VERTICES: group}),
-        rates=lambda factor, step: {VERTICES: options.rate * factor},
-        judge=base.judge,
-    )
-    return Fit(freed(plan, freedom, base.train), seed)
-
-
-def oversampling(scan: Scan, options: SurfaceFit = SurfaceFit()) -> int:
-    """Wave samples along a pixel at which surfaces are fitted and judged: their edges are sharper than Gaussians'."""
-    return options.schedule.oversample or fringe_sampling(scan.exposures, extra=1)
-
-
-def _bending(train: Scan, start: SurfaceMesh, objective: Objective) -> list[Term]:
-    if objective.bending == 0:
-        return []
-    frames = torch.from_numpy(train.frames)
-    weight = objective.bending * (1 + objective.noise_gain * noise_share(frames)) / frames[0].numel()
-    count = len(start.vertices)
-    away = csr_array(eye_array(count) - neighbour_mean(start.faces.numpy(), count))
-    return [Bending(weight, csr_array(away @ away))]
-
-
-def _membrane(start: SurfaceMesh, stiffness: float) -> Callable[[Tensor], Tensor]:
-    """The inverse of 1 + λΔ of a mesh: gradients [P, 3] in, smooth directions out."""
-    faces, count = start.faces.numpy(), len(start.vertices)
-    edges = adjacency(faces, count)
-    laplacian = diags_array(edges.sum(1)) - edges
-    solve = splu(csc_array(eye_array(count) + stiffness * laplacian)).solve
-    return lambda gradient: torch.from_numpy(solve(gradient.numpy()))

@@ -18,7 +18,7 @@ from ..fit.problem import Problem, Term
 from ..fit.schedule import Schedule
 from ..fit.terms import Objective
 from ..methods.ground import Ground, ground
-from ..methods.surfaces import BETAS, EPSILON, oversampling
+from ..methods.surface_fit import BETAS, EPSILON, oversampling
 from ..optics.background import Light
 from ..optics.noise import noise_share
 from ..ranges import Rate, Weight, ranged

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 import torch
@@ -113,12 +113,14 @@ def approximate(
     steps: int,
     on_progress: Callable[[str, float], None],
     rates: Sequence[float] = RATES,
+    *,
+    most_voxels: int = 0,
 ) -> GaussianCloud:
     """The cloud after `steps` of Adam towards `occupancy` on `grid`, by mean squared difference.
 
     occupancy: [Z, Y, X], or [C, Z, Y, X] of each of the cloud's channels. It starts a hologram fit where the classical
     reconstruction ended. `on_progress(stage, fraction)`. rates: first ones of centres, log-scales, quaternions and
-    amplitudes.
+    amplitudes. most_voxels: of slabs that are looked at one after another in each step (0: the whole volume at once).
     """
     leaves = [p.detach().clone().requires_grad_() for p in cloud.parameters().values()]
     cloud = cloud.replaced(leaves)
@@ -127,14 +129,24 @@ def approximate(
     with memory_kept():
         for step in range(steps):
             on_progress("Gaussians for the volume", step / steps)
-            density = cloud.density(grid)
-            # The gradient of Σ (density - occupancy)² / power, without the arrays that autograd would keep.
-            density.backward((density.detach() - occupancy).mul_(2 / power))
+            for slab, part in _slabs(grid, occupancy, most_voxels):
+                density = cloud.density(slab)
+                # The gradient of Σ (density - occupancy)² / power, without the arrays that autograd would keep.
+                density.backward((density.detach() - part).mul_(2 / power))
             for group, rate in zip(optimiser.param_groups, rates):
                 group["lr"] = rate * 0.1 ** (step / steps)
             optimiser.step()
             optimiser.zero_grad(set_to_none=True)
     return cloud.detached()
+
+
+def _slabs(grid: Grid, values: Tensor, most: int) -> Iterator[tuple[Grid, Tensor]]:
+    """Parts along z of `grid`, and of `values` […, Z, Y, X] on it, of at most so many voxels (0: all)."""
+    count, rows, columns = grid.shape
+    depth = max(1, most // (rows * columns)) if most else count
+    for first in range(0, count, depth):
+        some = min(depth, count - first)
+        yield grid.block((first, 0, 0), (some, rows, columns)), values[..., first : first + some, :, :]
 
 
 def random_cloud(count: int, views: Views, matter: Matter, thickness: float, seed: int) -> GaussianCloud:

@@ -18,7 +18,7 @@ from ..io.json import write_json
 from ..io.light import read_still_light, write_light
 from ..io.objects import read_object, write_object
 from ..matter import MaterialPrior, MatterKind
-from ..methods import Auto, Gaussians, Method, Settled, Stage, Task, finished, settled
+from ..methods import Auto, Gaussians, Method, Settled, Stage, Task, begun, finished, settled
 from ..methods.still import prepared
 from ..methods.uncertain import Determined, Uncertain
 from ..optics.background import LightOptions
@@ -243,7 +243,7 @@ class _Run:
             complete = journal.run(saved["fit"] if saved else None)
             self.timing[stage.name] = fit.seconds
             found = cast(Stored, finished(fit))
-            self.task = self.task.moved(fit.result())
+            self.task = replace(self.task.moved(fit.result()), near=False)
             self._keeper.moved(self.task.scan)
             if not complete:
                 return self._result(found, fit, False)
@@ -260,6 +260,7 @@ class _Run:
         """What the stage of a checkpoint began with; the frames are where they were then."""
         with self.as_written():
             self._go_back(saved)
+            self.task = replace(self.task, near=bool(saved.get("near", False)))
             return KINDS[saved["start"]["kind"]].from_state(saved["start"]["state"])
 
     def _go_back(self, saved: dict[str, Any]) -> None:
@@ -286,7 +287,7 @@ class _Run:
 
     def _started(self, stage: Stage, before: Stored | None) -> Stored:
         began = time.perf_counter()
-        start = cast(Stored, stage.start(self.task, before))
+        start, self.task = begun(stage, self.task, before)
         self.timing["start"] = self.timing.get("start", 0.0) + time.perf_counter() - began
         return start
 
@@ -387,6 +388,7 @@ class _Journal:
             "fit": self._fit.state_dict(),
             "timing": self._run.timing,
             "kept": self._run.kept(),
+            "near": self._run.task.near,
             **self._run.placed(),
         }
         folder.save_checkpoint(state)

@@ -1,0 +1,185 @@
+"""Large frames of closed bodies: surfaces on coarse pixels first, and from there to finer ones.
+
+A volume costs the cube of the pixels across it, and the surface of a body their square. So bodies are found on frames
+binned to few pixels, as surfaces, which hold edges far finer than these pixels; on finer ones a few steps then do. What
+coarse pixels cannot show (bodies too small for them) is seen by what it leaves unexplained in the fine ones, and such
+frames start on their own pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from ..checks import InputError, at_least
+from ..optics.noise import noise_levels
+from ..ranges import Pixels, Share, Weight, ranged
+from ..representations import GaussianCloud, SurfaceMesh
+from ..representations.subdivision import edge_lengths, subdivided
+from ..scan import Scan
+from .cross_validation import predicted_frames
+from .method import Task, run_quietly
+from .surface_fit import SurfaceFit, SurfaceOptions, extract_surfaces, oversampling, surface_fit
+
+STAGE = "coarse pixels"
+FEWEST_ROWS = 32
+"""Rows and columns that binned frames keep, at least: fewer show no body."""
+DOUBT = 0.2
+"""Part of the noise's power that its estimate may be wrong by: what is less in the frames is not seen."""
+
+
+@dataclass(frozen=True)
+@ranged
+class CoarseToFine:
+    """How large frames of closed bodies start."""
+
+    columns: int = 128
+    """Binned frames have so many pixels squared, at least (0: all frames start on their own pixels). Coarser ones are
+    no cheaper than what follows."""
+    chord: Pixels = 6.0
+    """Mean chord of the bodies [coarse pixels] below which these do not show their shapes, and finer ones are tried."""
+    missing: Share = 0.25
+    """Part of the fine structure of the frames, by its power, that surfaces of coarse pixels may leave unexplained."""
+    cloud_steps: int = 150
+    """Steps of the Gaussians that coarse surfaces are cut out of; surfaces do not remember more."""
+    coarse_steps: int = 60
+    """Steps of the coarse surfaces."""
+    steps: int = 40
+    """Steps of the surfaces on each finer pixel but the frames' own."""
+    last_steps: int = 25
+    """Steps on these, which cost most."""
+    rate: Weight = 0.1
+    """Length of their first steps [pixels]: half of what surfaces cut out of Gaussians need."""
+    edge: Pixels = 1.5
+    """Mean length of triangles' edges [pixels] from which on they are divided on pixels between."""
+    last_edge: Pixels = 2.5
+    """The same on the frames' own pixels."""
+    sizes: int = 3
+    """Sizes of Gaussians that fill the surfaces, from one pixel on, each twice the last."""
+    approximate_steps: int = 40
+    """Steps in which these Gaussians learn the surfaces' volume."""
+    fit_steps: int = 40
+    """Steps of the fit of Gaussians from there."""
+
+    def __post_init__(self) -> None:
+        at_least(self, 0, "columns")
+        at_least(self, 1, "cloud_steps", "coarse_steps", "steps", "last_steps", "sizes")
+        at_least(self, 1, "approximate_steps", "fit_steps")
+
+    def factor(self, scan: Scan) -> int:
+        """Pixels of `scan` along an edge of the coarsest: a power of two, 1 where its frames are small."""
+        (h, w), factor = scan.views.shape, 1
+        while self.columns and h * w >= (2 * factor * self.columns) ** 2 and min(h, w) >= 2 * factor * FEWEST_ROWS:
+            factor *= 2
+        return factor
+
+    def nearby(self, fit: SurfaceFit) -> SurfaceFit:
+        """The fit of surfaces that are near to those of the frames' own pixels: fewer and shorter steps."""
+        return self._short(fit, self.last_steps)
+
+    def between(self, fit: SurfaceFit) -> SurfaceFit:
+        """The fit on pixels between the coarsest and the frames' own."""
+        return self._short(fit, self.steps)
+
+    def _short(self, fit: SurfaceFit, steps: int) -> SurfaceFit:
+        return replace(fit, schedule=replace(fit.schedule, steps=steps), rate=self.rate)
+
+    def with_effort(self, effort: float) -> CoarseToFine:
+        """The same with `effort` times the steps, at least one."""
+        names = ("cloud_steps", "coarse_steps", "steps", "last_steps", "approximate_steps", "fit_steps")
+        return replace(self, **{name: max(1, round(effort * getattr(self, name))) for name in names})
+
+
+def coarse_surfaces(
+    task: Task, cloud_of: Callable[[Task], GaussianCloud], surfaces: SurfaceOptions, how: CoarseToFine
+) -> SurfaceMesh | None:
+    """Surfaces near to those of the frames of `task`, by frames on coarser pixels; None where these do not show them.
+
+    cloud_of: Gaussians fitted to the frames of a task. The frames are not small (`how.factor`), and the matter is one
+    of a known level.
+    """
+    factor, found = how.factor(task.scan), None
+    while factor > 1 and found is None:
+        found = _first(binned(task, factor), cloud_of, surfaces, how)
+        factor //= 2
+    if found is None:
+        return None
+    while factor > 1:
+        found = _fitted(binned(task, factor), found, surfaces, how)
+        factor //= 2
+    found = on_pixels(found, task.scan.views.finest, how.last_edge)
+    return found if unexplained(found, task.scan, surfaces) <= how.missing else None
+
+
+def binned(task: Task, factor: int) -> Task:
+    """`task` on pixels `factor` times larger; frames are where it says."""
+    task.on_progress(f"{STAGE}: {factor} × {factor}", 0.0)
+    every = torch.arange(len(task.scan))
+    light = None if task.lit is None else task.lit.part(every, factor)
+    return replace(task, scan=task.scan.binned(factor), lit=light, freedom=None)
+
+
+def _first(
+    task: Task, cloud_of: Callable[[Task], GaussianCloud], surfaces: SurfaceOptions, how: CoarseToFine
+) -> SurfaceMesh | None:
+    """The first surfaces; None where there are none, or their bodies are too thin for the pixels."""
+    try:
+        cloud = cloud_of(task)
+        if not cloud.matter.single:
+            return None
+        start = extract_surfaces(cloud, task.scan, surfaces.extraction)
+    except InputError:  # there is no matter, or no surface
+        return None
+    schedule = replace(surfaces.fit.schedule, steps=how.coarse_steps)
+    found = _run(task, start, replace(surfaces.fit, schedule=schedule))
+    return found if mean_chord(found) >= how.chord * task.scan.views.finest else None
+
+
+def _fitted(task: Task, found: SurfaceMesh, surfaces: SurfaceOptions, how: CoarseToFine) -> SurfaceMesh:
+    """The surfaces on the pixels of `task`."""
+    start = on_pixels(found, task.scan.views.finest, how.edge)
+    return _run(task, start, how.between(surfaces.fit))
+
+
+def _run(task: Task, start: SurfaceMesh, options: SurfaceFit) -> SurfaceMesh:
+    fit = surface_fit(task.scan, start, options, task.seed, task.uneven)
+    found = run_quietly(fit, task.report(f"{STAGE}: surfaces"))
+    assert isinstance(found, SurfaceMesh)
+    return found
+
+
+def on_pixels(mesh: SurfaceMesh, pixel: float, edge: float) -> SurfaceMesh:
+    """The surfaces in units of `pixel` [m], their triangles divided where their edges are longer than `edge` [pixels]
+    in the mean."""
+    vertices, faces = mesh.vertices * (mesh.unit_length / pixel), mesh.faces
+    while float(edge_lengths(vertices, faces).mean()) > edge:
+        vertices, faces = subdivided(vertices, faces)
+    return SurfaceMesh(vertices, faces, pixel, mesh.matter, mesh.lines)
+
+
+def mean_chord(mesh: SurfaceMesh) -> float:
+    """Mean length [m] of all straight lines through the bodies, 4 V / S (Cauchy 1841)."""
+    a, b, c = (mesh.vertices[mesh.faces[:, k]] for k in range(3))
+    normals = torch.linalg.cross(b - a, c - a)
+    volume = float((a * normals).sum()) / 6
+    return 4 * volume / (0.5 * float(normals.norm(dim=1).sum())) * mesh.unit_length
+
+
+def unexplained(mesh: SurfaceMesh, scan: Scan, surfaces: SurfaceOptions) -> float:
+    """Part of the power of the frames' finest structure that `mesh` leaves unexplained, noise taken off; 0 where noise
+    hides all of it. Finest is what two pixels in one do not show."""
+    measured = torch.from_numpy(scan.frames).double()
+    predicted = predicted_frames(scan.exposures, mesh, oversampling(scan, surfaces.fit)).double()
+    noise = 0.75 * float(noise_levels(measured).square().mean())  # one of four orthogonal patterns is left out
+    seen, left = (float(_finest(frames).square().mean()) - noise for frames in (measured, measured - predicted))
+    return 0.0 if seen <= DOUBT * noise else max(left - DOUBT * noise, 0.0) / seen
+
+
+def _finest(frames: Tensor) -> Tensor:
+    """Frames [V, H, W] less their means over 2 × 2 pixels; an odd row and column are left out."""
+    even = frames[:, : frames.shape[1] // 2 * 2, : frames.shape[2] // 2 * 2]
+    return even - avg_pool2d(even[None], 2)[0].repeat_interleave(2, 1).repeat_interleave(2, 2)

@@ -1,0 +1,221 @@
+"""Large frames: surfaces on coarse pixels first."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from helpers.bumpy import DELTA, bumpy, poses, surfaces
+from holosplat.baselines import HolographicTV
+from holosplat.beamline.simulate import simulate
+from holosplat.geometry import Grid
+from holosplat.materials import HAEMOGLOBIN
+from holosplat.matter import MaterialPrior
+from holosplat.mesh import TriangleMesh
+from holosplat.methods import Gaussians, Near, SurfaceOptions, Surfaces, Task, begun
+from holosplat.methods.auto import Bodies
+from holosplat.methods.coarse import CoarseToFine, mean_chord, on_pixels, unexplained
+from holosplat.methods.coarse_cloud import occupancy_of, slabs
+from holosplat.methods.gaussians import GaussianStage
+from holosplat.methods.method import run_quietly
+from holosplat.model import measure
+from holosplat.representations import GaussianCloud, SurfaceMesh
+from holosplat.scan import Exposures, Scan
+from holosplat.specimens.scene import MeshScene
+from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
+from holosplat.workflows.run_folder import RunFolder
+
+PITCH = 0.5e-6
+QUICK = CoarseToFine(columns=32, cloud_steps=10, coarse_steps=15, last_steps=10, approximate_steps=8, fit_steps=3)
+MATTER = HAEMOGLOBIN.delta_beta(20.0)
+
+
+def body(radius: float = 20.0, centre=(1.2, -0.8, 0.6)) -> TriangleMesh:
+    """In pixels."""
+    return bumpy(4, radius, centre, depth=0.2)
+
+
+def scan_of(*bodies: TriangleMesh, shape=(67, 73), photons: float | None = None) -> Scan:
+    """Six views from all directions of bodies in pixels."""
+    scene = MeshScene.of_one_material([replace(b, vertices=PITCH * b.vertices) for b in bodies], MATTER)
+    return simulate(scene, Exposures.of(poses(6, shape, 3, PITCH), 20.0, 0.05, 0.3), photons_per_pixel=photons, seed=1)
+
+
+@pytest.fixture(scope="module")
+def scan() -> Scan:
+    return scan_of(body())
+
+
+def quick(coarse: CoarseToFine = QUICK) -> Gaussians:
+    """Gaussians with few steps."""
+    few = Gaussians(
+        approximate_steps=5, coarse=coarse, volume=HolographicTV(retrieval=10, iterations=30, corrections=0)
+    )
+    return replace(few, fit=replace(few.fit, schedule=replace(few.fit.schedule, steps=5)))
+
+
+def task_of(scan: Scan) -> Task:
+    return Task(scan, MaterialPrior.known(MATTER)).evened()
+
+
+def dice(found, *true: TriangleMesh) -> float:
+    grid = Grid.centred((60, 60, 60), PITCH)
+    a, b = (s.voxelise(grid).delta > 0.5 * DELTA for s in (found, surfaces(*true, unit=PITCH)))
+    return float(2 * (a & b).sum() / (a.sum() + b.sum()))
+
+
+# --- when, and what counts ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("shape", "factor"), [((128, 128), 1), ((255, 256), 1), ((256, 256), 2), ((512, 700), 4), ((1024, 1024), 8),
+                          ((40, 4000), 1), ((64, 1024), 2), ((200, 400), 2)]
+)  # fmt: skip
+def test_only_large_frames_are_binned(shape, factor):
+    exposures = Exposures.of(poses(1, shape, pitch=PITCH), 20.0, 0.1)
+    scan = Scan.of(np.ones((1, *shape), dtype=np.float32), exposures, np.zeros(1, dtype=bool), {})
+    assert CoarseToFine().factor(scan) == factor
+    assert CoarseToFine(columns=0).factor(scan) == 1
+
+
+def test_the_mean_chord_of_a_ball_is_four_thirds_of_its_radius():
+    ball = surfaces(bumpy(4, 9.0, (3.0, 1.0, -2.0), depth=0.0), unit=1e-6)
+    assert mean_chord(ball) == pytest.approx(12e-6, rel=0.01)
+    two = surfaces(bumpy(4, 9.0, depth=0.0), bumpy(4, 3.0, (20.0, 0, 0), depth=0.0), unit=1e-6)
+    expected = 4 / 3 * (9**3 + 3**3) / (9**2 + 3**2) * 1e-6
+    assert mean_chord(two) == pytest.approx(expected, rel=0.01)
+
+
+def test_surfaces_in_finer_pixels_are_where_they_were():
+    coarse = surfaces(bumpy(2, 9.0, (0.5, 0.2, 0.0)), unit=1e-6)
+    same = on_pixels(coarse, 0.5e-6, edge=100.0)
+    assert torch.allclose(same.vertices * same.unit_length, coarse.vertices * coarse.unit_length)
+    finer = on_pixels(coarse, 0.5e-6, edge=3.0)
+    assert len(finer.faces) == 4 * len(coarse.faces)
+    assert finer.mesh().volume == pytest.approx(coarse.mesh().volume, rel=0.03)
+
+
+def test_fine_structure_tells_what_is_missing(scan):
+    options = SurfaceOptions()
+    true, larger = surfaces(body(), unit=PITCH), surfaces(body(21.5), unit=PITCH)
+    assert unexplained(true, scan, options) < 0.02
+    assert unexplained(larger, scan, options) > 0.25
+    nothing = surfaces(bumpy(1, 0.01), unit=PITCH)
+    assert unexplained(nothing, scan, options) == pytest.approx(1.0, abs=0.02)
+    noisy = scan_of(body(), photons=50.0)
+    assert unexplained(true, noisy, options) < 0.1
+    flat = replace(scan, frames=np.random.default_rng(0).normal(1, 0.1, scan.frames.shape).astype(np.float32))
+    assert unexplained(true, flat, options) == 0.0
+
+
+# --- from coarse to fine ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def near(scan):
+    """What coarse pixels show, and the task then."""
+    return begun(Bodies(quick(), SurfaceOptions()).stages()[0], task_of(scan), None)
+
+
+def test_surfaces_of_coarse_pixels_are_near_those_of_fine_ones(near):
+    start, task = near
+    assert isinstance(start, SurfaceMesh)
+    assert task.near
+    assert start.unit_length == PITCH
+    assert dice(start, body()) > 0.97
+
+
+def test_few_steps_on_fine_pixels_end_it(scan, near):
+    first, last = Bodies(quick(), SurfaceOptions()).stages()
+    assert first.fit(near[1], near[0]) is None
+    start, task = begun(last, near[1], near[0])
+    assert task.near
+    fit = last.fit(task, start)
+    assert fit is not None
+    found = run_quietly(fit, lambda share: None)
+    assert isinstance(found, SurfaceMesh)
+    assert dice(found, body()) > 0.985
+    left = measure(found, scan.exposures, 2) - torch.from_numpy(scan.frames)
+    assert float(left.square().mean()) < 0.02 * float(np.square(scan.frames - 1).mean())
+
+
+def test_gaussians_of_large_frames_fill_the_coarse_surfaces(scan):
+    stage = quick().stages()[0]
+    start, task = begun(stage, task_of(scan), None)
+    assert isinstance(start, GaussianCloud)
+    assert task.near
+    assert dice(start, body()) > 0.97
+    fit = stage.fit(task, start)
+    assert fit is not None
+    assert fit.schedule.steps == QUICK.fit_steps
+    far = stage.fit(replace(task, near=False), start)
+    assert far is not None
+    assert far.schedule.steps == 5
+
+
+def test_bodies_too_thin_for_coarse_pixels_start_on_their_own(scan):
+    for coarse in (replace(QUICK, chord=1000.0), replace(QUICK, columns=0)):
+        assert GaussianStage(quick(coarse)).coarse_surfaces(task_of(scan), SurfaceOptions()) is None
+
+
+def test_small_bodies_beside_a_large_one_are_not_lost():
+    """What coarse pixels do not show is in the fine structure of the frames, which then start on their own pixels."""
+    specks = [bumpy(2, 1.6, centre, depth=0.0) for centre in np.random.default_rng(2).uniform(-24, 24, (60, 3))]
+    task = task_of(scan_of(body(12.0), *specks))
+    assert GaussianStage(quick()).coarse_surfaces(task, SurfaceOptions()) is None
+
+
+def test_a_run_goes_on_from_a_near_start_with_as_few_steps(scan, near, tmp_path, monkeypatch, unjudged_runs):
+    """Cut off in the fit of surfaces, it goes on without looking at coarse pixels again, to the same surfaces."""
+    folder, prior = RunFolder(tmp_path / "run"), MaterialPrior.known(MATTER)
+    method = Surfaces(gaussians=quick())
+    monkeypatch.setattr(GaussianStage, "coarse_surfaces", lambda stage, task, how: near[0])
+    whole = reconstruct(scan, prior, method, matter="levels")
+
+    def stop(stage, part, record):
+        if stage == "surfaces" and record.get("step") == 4:
+            raise KeyboardInterrupt
+
+    cut = reconstruct(scan, prior, method, matter="levels", folder=folder, on_progress=stop)
+    assert not cut.finished
+    monkeypatch.delattr(GaussianStage, "coarse_surfaces")
+    again = reconstruct(scan, prior, method, matter="levels", folder=folder, resume=True)
+    assert again.finished
+    assert isinstance(again.object, SurfaceMesh)
+    assert isinstance(whole.object, SurfaceMesh)
+    assert torch.equal(again.object.vertices, whole.object.vertices)
+    rows = folder.metrics.read_text(encoding="utf-8").strip().splitlines()
+    assert len(rows) == 1 + QUICK.last_steps
+    assert isinstance(load_reconstruction(folder).object, SurfaceMesh)
+
+
+def test_occupancy_slab_by_slab(scan):
+    mesh = surfaces(body(5.0), unit=PITCH)
+    grid = Grid.centred((15, 17, 13), PITCH)
+    whole = mesh.voxelise(grid).delta / DELTA
+    assert np.abs(occupancy_of(mesh, grid).numpy() - whole).max() < 1e-6
+    assert slabs((10, 4, 5), 60) == [(0, 3), (3, 3), (6, 3), (9, 1)]
+    assert slabs((2, 40, 50), 60) == [(0, 1), (1, 1)]
+    assert math.prod((10, 4, 5)) == sum(20 * count for _, count in slabs((10, 4, 5), 60))
+
+
+def test_a_near_start_says_so(scan):
+    class Stage:
+        name = "s"
+
+        def start(self, task, before):
+            return before or Near(surfaces(body()))
+
+        def fit(self, task, start):
+            return None
+
+    found, task = begun(Stage(), task_of(scan), None)
+    assert task.near
+    _, task = begun(Stage(), task, found)  # handed on
+    assert task.near
+    _, task = begun(Stage(), task, surfaces(body(3.0)))
+    assert not replace(task, near=False).near
