@@ -30,7 +30,7 @@ from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
 
 PITCH = 0.5e-6
-QUICK = CoarseToFine(columns=32, cloud_steps=10, coarse_steps=15, last_steps=10, approximate_steps=8, fit_steps=3)
+QUICK = CoarseToFine(columns=32, coarse_steps=15, last_steps=10, approximate_steps=8, fit_steps=3)
 MATTER = HAEMOGLOBIN.delta_beta(20.0)
 
 
@@ -55,7 +55,7 @@ def quick(coarse: CoarseToFine = QUICK) -> Gaussians:
     few = Gaussians(
         approximate_steps=5, coarse=coarse, volume=HolographicTV(retrieval=10, iterations=30, corrections=0)
     )
-    return replace(few, fit=replace(few.fit, schedule=replace(few.fit.schedule, steps=5)))
+    return replace(few, fit=replace(few.fit, schedule=replace(few.fit.schedule, steps=10)))
 
 
 def task_of(scan: Scan) -> Task:
@@ -154,7 +154,7 @@ def test_gaussians_of_large_frames_fill_the_coarse_surfaces(scan):
     assert fit.schedule.steps == QUICK.fit_steps
     far = stage.fit(replace(task, near=False), start)
     assert far is not None
-    assert far.schedule.steps == 5
+    assert far.schedule.steps == 10
 
 
 def test_bodies_too_thin_for_coarse_pixels_start_on_their_own(scan):

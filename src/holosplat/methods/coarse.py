@@ -44,8 +44,6 @@ class CoarseToFine:
     """Mean chord of the bodies [coarse pixels] below which these do not show their shapes, and finer ones are tried."""
     missing: Share = 0.25
     """Part of the fine structure of the frames, by its power, that surfaces of coarse pixels may leave unexplained."""
-    cloud_steps: int = 150
-    """Steps of the Gaussians that coarse surfaces are cut out of; surfaces do not remember more."""
     coarse_steps: int = 60
     """Steps of the coarse surfaces."""
     steps: int = 40
@@ -67,7 +65,7 @@ class CoarseToFine:
 
     def __post_init__(self) -> None:
         at_least(self, 0, "columns")
-        at_least(self, 1, "cloud_steps", "coarse_steps", "steps", "last_steps", "sizes")
+        at_least(self, 1, "coarse_steps", "steps", "last_steps", "sizes")
         at_least(self, 1, "approximate_steps", "fit_steps")
 
     def factor(self, scan: Scan) -> int:
@@ -90,7 +88,7 @@ class CoarseToFine:
 
     def with_effort(self, effort: float) -> CoarseToFine:
         """The same with `effort` times the steps, at least one."""
-        names = ("cloud_steps", "coarse_steps", "steps", "last_steps", "approximate_steps", "fit_steps")
+        names = ("coarse_steps", "steps", "last_steps", "approximate_steps", "fit_steps")
         return replace(self, **{name: max(1, round(effort * getattr(self, name))) for name in names})
 
 

@@ -53,11 +53,8 @@ class Gaussians(GaussianOptions):
         return self.start == "phase" or weights.overfull > 0 or weights.two_levels > 0
 
     def for_surfaces(self) -> Gaussians:
-        """The same for the first surfaces of large frames, which need no finished Gaussians: voxels of one pixel, and
-        fewer steps."""
-        schedule = replace(self.fit.schedule, steps=self.coarse.cloud_steps)
-        volume = replace(self.volume, refine=self.volume.refine or 1)
-        return replace(self, fit=replace(self.fit, schedule=schedule), volume=volume)
+        """The same for the first surfaces of large frames: its start has voxels of one pixel, for edges come later."""
+        return replace(self, volume=replace(self.volume, refine=self.volume.refine or 1))
 
     def on_backend(self, backend: Backend) -> Gaussians:
         """The same method computed by `backend`; the start runs on the CPU, or in plain torch."""
