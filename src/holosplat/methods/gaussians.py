@@ -52,10 +52,6 @@ class Gaussians(GaussianOptions):
         weights = self.fit.objective
         return self.start == "phase" or weights.overfull > 0 or weights.two_levels > 0
 
-    def for_surfaces(self) -> Gaussians:
-        """The same for the first surfaces of large frames: its start has voxels of one pixel, for edges come later."""
-        return replace(self, volume=replace(self.volume, refine=self.volume.refine or 1))
-
     def on_backend(self, backend: Backend) -> Gaussians:
         """The same method computed by `backend`; the start runs on the CPU, or in plain torch."""
         volume = replace(self.volume, backend="reference" if backend == "reference" else "cpu")
@@ -104,8 +100,7 @@ class GaussianStage:
         if how.factor(task.scan) == 1 or options.start != "phase" or not task.bounded:
             return None
         train, _ = split_validation(task.scan, options.fit.schedule.validation_views)
-        coarse = GaussianStage(options.for_surfaces())
-        return coarse_surfaces(replace(task, scan=train), coarse.solved, surfaces, how)
+        return coarse_surfaces(replace(task, scan=train), self.solved, surfaces, how)
 
     def solved(self, task: Task) -> GaussianCloud:
         """The cloud fitted to the frames of `task`."""
