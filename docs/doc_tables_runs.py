@@ -168,6 +168,19 @@ def rerun() -> str:
     return _jobs(read("main_job.csv"), "cpu_seconds", "processor time / s")
 
 
+def sizes() -> str:
+    """Frames of more and more pixels across the same field."""
+    lines = []
+    for row in read("sizes.csv"):
+        scores = [row["ssim"], row["frcm"], row["dice"], row["relative_error_delta"]]
+        scores = [rounded(score, 3) for score in scores]
+        times = [f"{float(row[name]):.0f}" for name in ("seconds", "cpu_seconds")]
+        of = [row["pixels"], row["pitch_um"], row["method"], row["seed"]]
+        lines.append([*of, *scores, row["result"], *times, f"{float(row['peak_gib']):.1f}", row["load"], row["commit"]])
+    head = ("pixels", "pitch / µm", "method", "seed", "SSIM", "FRCM", "Dice", "error of δ", "result", "time / s")
+    return markdown((*head, "of processors / s", "peak / GiB", "load", "commit"), lines)
+
+
 def worst(method: str) -> dict[str, str]:
     """The worst of the three scenes; times are those of the longest fit, of surfaces beyond the Gaussians'."""
     rows = [r for r in jobs() if r["method"] == method]

@@ -108,6 +108,12 @@ TABLES["rerun"] = Table(
     "OMP_NUM_THREADS=1 python benchmarks/main_job.py --cases nine --surfaces --csv docs/data/main_job.csv",
     "half an hour",
 )
+TABLES["sizes"] = Table(
+    runs.sizes,
+    ("sizes.csv",),
+    "python benchmarks/sizes.py --pixels 512 --method auto --csv docs/data/sizes.csv",
+    "minutes",
+)
 REAL = "python benchmarks/real_data.py --data FOLDER"
 TABLES |= {
     name: Table(make, ("real_data.csv",), REAL, "half an hour")
