@@ -30,7 +30,7 @@ from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
 
 PITCH = 0.5e-6
-QUICK = CoarseToFine(columns=32, coarse_steps=15, last_steps=10, approximate_steps=8, fit_steps=3)
+QUICK = CoarseToFine(columns=32, coarse_steps=15, last_steps=10, volume_steps=8, fit_steps=3)
 MATTER = HAEMOGLOBIN.delta_beta(20.0)
 
 

@@ -15,10 +15,10 @@ from ..io.reading import Reading
 from ..ranges import Seed
 from .align import RefineOptions
 from .light import RunLightFlags
+from .live import LiveFlags, watched
 from .options import BeamlineOptions, MethodOptions, PriorOptions, TruthOptions
 from .progress import INTERRUPTED, ProgressBar
 from .room import tell_reconstruction
-from .view import LiveFlags, watched
 
 if TYPE_CHECKING:
     from ..workflows.evaluate import Evaluation

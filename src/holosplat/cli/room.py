@@ -6,8 +6,6 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..matter import Known
-
 if TYPE_CHECKING:
     from ..matter import MaterialPrior, MatterKind
     from ..methods import Method
@@ -19,6 +17,7 @@ def tell_reconstruction(
 ) -> None:
     """Say what the reconstruction of training frames takes; `InputError` where there is less. Of a known material
     frames nearly always say that it has levels."""
+    from ..matter import Known
     from ..planning.needs import Sizes, of_reconstruction, require_room, smaller
 
     if len(exposures) == 0:

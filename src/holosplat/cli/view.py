@@ -1,42 +1,24 @@
-"""`holosplat view`, and the live view of `reconstruct --view`."""
+"""`holosplat view`."""
 
 from __future__ import annotations
 
-import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
 from ..checks import require
-from ..progress import FitProgress, FitState
-from ..ranges import Within, ranged
+from .live import Port, say_where
 
 if TYPE_CHECKING:
     from ..representations import Stored
     from ..show.server import LiveView
 
-Port = Annotated[int, Within(1024, 65535)]
-"""Ports that anybody may listen on."""
 CUTS = 50
 """Steps of the slider that cuts matter away."""
 BOX = 1000
 """Voxels of the grid that only says where the object lies."""
-
-
-@dataclass(frozen=True)
-@ranged
-class LiveFlags:
-    """The live view of a fit (extra view)."""
-
-    view: bool = False
-    """Show the object in the browser while it is fitted; the address, with its token, is printed."""
-    port: Port = 8080
-    """Port of the view on this machine; the next free one is taken."""
 
 
 def view(what: Positional[Path], port: Port = 8080) -> None:
@@ -55,47 +37,10 @@ def view(what: Positional[Path], port: Port = 8080) -> None:
     page = LiveView(what.name or "holosplat", port)
     try:
         _shown(page, objects, words)
-        _say_where(page)
-        until_interrupted()
+        say_where(page)
+        threading.Event().wait()
     except KeyboardInterrupt:
         pass
-    finally:
-        page.close()
-
-
-def until_interrupted() -> None:
-    """Wait for Ctrl-C."""
-    threading.Event().wait()
-
-
-@dataclass(frozen=True)
-class Follow:
-    """What `reconstruct` tells while it runs."""
-
-    on_progress: FitProgress
-    on_state: FitState = lambda stage, fraction, record, state: None
-
-
-@contextmanager
-def watched(flags: LiveFlags, title: str, on_progress: FitProgress) -> Iterator[Follow]:
-    """With --view, a view of a fit while it lasts, which is told what `on_progress` is."""
-    if not flags.view:
-        yield Follow(on_progress)
-        return
-    from ..show.server import LiveView
-    from ..show.watch import Watch
-
-    page = LiveView(title, flags.port)
-    try:
-        page.tell("the start")
-        _say_where(page)
-        watch = Watch(page)
-
-        def both(stage: str, fraction: float, record: dict[str, float]) -> None:
-            on_progress(stage, fraction, record)
-            watch.on_progress(stage, fraction, record)
-
-        yield Follow(both, watch.on_state)
     finally:
         page.close()
 
@@ -147,7 +92,3 @@ def _shown(page: LiveView, objects: dict[str, Stored], words: list[str]) -> None
     if len(labels) > 1:
         page.slider("time", len(labels), lambda k: draw(time=k))
     page.slider("cut along z", CUTS, lambda k: draw(cut=k))
-
-
-def _say_where(page: LiveView) -> None:
-    print(f"view: {page.url}", file=sys.stderr, flush=True)

@@ -46,11 +46,11 @@ class CoarseToFine:
     """Part of the fine structure of the frames, by its power, that surfaces of coarse pixels may leave unexplained."""
     coarse_steps: int = 60
     """Steps of the coarse surfaces."""
-    steps: int = 40
+    finer_steps: int = 40
     """Steps of the surfaces on each finer pixel but the frames' own."""
     last_steps: int = 25
     """Steps on these, which cost most."""
-    rate: Weight = 0.1
+    near_rate: Weight = 0.1
     """Length of their first steps [pixels]: half of what surfaces cut out of Gaussians need."""
     edge: Pixels = 1.5
     """Mean length of triangles' edges [pixels] from which on they are divided on pixels between."""
@@ -58,15 +58,15 @@ class CoarseToFine:
     """The same on the frames' own pixels."""
     sizes: int = 3
     """Sizes of Gaussians that fill the surfaces, from one pixel on, each twice the last."""
-    approximate_steps: int = 40
+    volume_steps: int = 40
     """Steps in which these Gaussians learn the surfaces' volume."""
     fit_steps: int = 40
     """Steps of the fit of Gaussians from there."""
 
     def __post_init__(self) -> None:
         at_least(self, 0, "columns")
-        at_least(self, 1, "coarse_steps", "steps", "last_steps", "sizes")
-        at_least(self, 1, "approximate_steps", "fit_steps")
+        at_least(self, 1, "coarse_steps", "finer_steps", "last_steps", "sizes")
+        at_least(self, 1, "volume_steps", "fit_steps")
 
     def factor(self, scan: Scan) -> int:
         """Pixels of `scan` along an edge of the coarsest: a power of two, 1 where its frames are small."""
@@ -81,14 +81,14 @@ class CoarseToFine:
 
     def between(self, fit: SurfaceFit) -> SurfaceFit:
         """The fit on pixels between the coarsest and the frames' own."""
-        return self._short(fit, self.steps)
+        return self._short(fit, self.finer_steps)
 
     def _short(self, fit: SurfaceFit, steps: int) -> SurfaceFit:
-        return replace(fit, schedule=replace(fit.schedule, steps=steps), rate=self.rate)
+        return replace(fit, schedule=replace(fit.schedule, steps=steps), rate=self.near_rate)
 
     def with_effort(self, effort: float) -> CoarseToFine:
         """The same with `effort` times the steps, at least one."""
-        names = ("coarse_steps", "steps", "last_steps", "approximate_steps", "fit_steps")
+        names = ("coarse_steps", "finer_steps", "last_steps", "volume_steps", "fit_steps")
         return replace(self, **{name: max(1, round(effort * getattr(self, name))) for name in names})
 
 

@@ -27,7 +27,7 @@ def cloud_of_surfaces(mesh: SurfaceMesh, task: Task, how: CoarseToFine) -> Gauss
     while len(found) > MOST_GAUSSIANS:
         edge *= 2
         found = cloud_in_octree(occupancy, grid, channel, mesh.unit_length, how.sizes, edge)
-    return approximate(found, occupancy, grid, how.approximate_steps, task.on_progress, most_voxels=MOST_VOXELS)
+    return approximate(found, occupancy, grid, how.volume_steps, task.on_progress, most_voxels=MOST_VOXELS)
 
 
 def occupancy_of(mesh: SurfaceMesh, grid: Grid) -> Tensor:
