@@ -62,4 +62,5 @@ def watched(flags: LiveFlags, title: str, on_progress: FitProgress) -> Iterator[
 
 
 def say_where(page: LiveView) -> None:
+    """Print the address of the page, with its token."""
     print(f"view: {page.url}", file=sys.stderr, flush=True)
