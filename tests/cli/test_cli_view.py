@@ -46,7 +46,7 @@ def pages(monkeypatch) -> list[Page]:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(server, "LiveView", Page)
-    monkeypatch.setattr(commands, "until_interrupted", interrupt)
+    monkeypatch.setattr(commands, "_until_interrupted", interrupt)
     monkeypatch.setattr(Page, "made", [])
     return Page.made
 

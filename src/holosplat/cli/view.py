@@ -38,11 +38,16 @@ def view(what: Positional[Path], port: Port = 8080) -> None:
     try:
         _shown(page, objects, words)
         say_where(page)
-        threading.Event().wait()
+        _until_interrupted()
     except KeyboardInterrupt:
         pass
     finally:
         page.close()
+
+
+def _until_interrupted() -> None:
+    """Wait for Ctrl-C."""
+    threading.Event().wait()
 
 
 def _objects(what: Path) -> tuple[dict[str, Stored], list[str]]:
