@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -16,10 +15,10 @@ from holosplat.geometry import Grid
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import MaterialPrior
 from holosplat.mesh import TriangleMesh
-from holosplat.methods import Gaussians, Near, SurfaceOptions, Surfaces, Task, begun
+from holosplat.methods import Gaussians, Near, SurfaceOptions, Surfaces, Task, begun, coarse_cloud
 from holosplat.methods.auto import Bodies
 from holosplat.methods.coarse import CoarseToFine, mean_chord, on_pixels, unexplained
-from holosplat.methods.coarse_cloud import occupancy_of, slabs
+from holosplat.methods.coarse_cloud import occupancy_of
 from holosplat.methods.gaussians import GaussianStage
 from holosplat.methods.method import run_quietly
 from holosplat.model import measure
@@ -193,14 +192,26 @@ def test_a_run_goes_on_from_a_near_start_with_as_few_steps(scan, near, tmp_path,
     assert isinstance(load_reconstruction(folder).object, SurfaceMesh)
 
 
-def test_occupancy_slab_by_slab(scan):
+def test_occupancy_slab_by_slab(monkeypatch):
     mesh = surfaces(body(5.0), unit=PITCH)
     grid = Grid.centred((15, 17, 13), PITCH)
     whole = mesh.voxelise(grid).delta / DELTA
     assert np.abs(occupancy_of(mesh, grid).numpy() - whole).max() < 1e-6
-    assert slabs((10, 4, 5), 60) == [(0, 3), (3, 3), (6, 3), (9, 1)]
-    assert slabs((2, 40, 50), 60) == [(0, 1), (1, 1)]
-    assert math.prod((10, 4, 5)) == sum(20 * count for _, count in slabs((10, 4, 5), 60))
+    monkeypatch.setattr(coarse_cloud, "MOST_VOXELS", 4 * 4 * 17 * 13)
+    assert [first for first, _ in grid.slabs(coarse_cloud.MOST_VOXELS // 4)] == [0, 4, 8, 12]
+    assert np.abs(occupancy_of(mesh, grid).numpy() - whole).max() < 1e-6
+
+
+def test_slabs_of_a_grid():
+    def cut(shape: tuple[int, int, int], most: int) -> list[tuple[int, int]]:
+        return [(first, slab.shape[0]) for first, slab in Grid.centred(shape, PITCH).slabs(most)]
+
+    assert cut((10, 4, 5), 60) == [(0, 3), (3, 3), (6, 3), (9, 1)]
+    assert cut((2, 40, 50), 60) == [(0, 1), (1, 1)]
+    assert cut((10, 4, 5), 0) == [(0, 10)]
+    grid = Grid.centred((10, 4, 5), PITCH)
+    last = list(grid.slabs(60))[-1][1]
+    assert last.axes()[2][-1] == pytest.approx(grid.axes()[2][-1], rel=1e-12)
 
 
 def test_a_near_start_says_so(scan):

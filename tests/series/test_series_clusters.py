@@ -15,10 +15,11 @@ from helpers.cli import holosplat, refused, worked
 from helpers.series import planned
 from holosplat.checks import InputError, MissingError
 from holosplat.series import run as running
+from holosplat.series.asked import Slurm
 from holosplat.series.dask_cluster import run_on_dask
 from holosplat.series.folder import SeriesFolder
 from holosplat.series.run import Counts, run_processes
-from holosplat.series.slurm import Slurm, ranges_of, script_of
+from holosplat.series.slurm import ranges_of, script_of
 
 
 @pytest.fixture

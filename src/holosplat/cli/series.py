@@ -11,7 +11,8 @@ from tyro.conf import Positional, arg, subcommand
 
 from ..checks import require
 from ..io.reading import Reading
-from ..ranges import Natural, Positive, Seed, ranged, with_checked_numbers
+from ..ranges import Positive, Seed, ranged, with_checked_numbers
+from ..series.asked import Cut, Slurm
 from .bodies import BodyFlags, MotionFlags
 from .light import RunLightFlags
 from .options import MethodOptions, PriorOptions
@@ -19,7 +20,6 @@ from .progress import INTERRUPTED
 
 if TYPE_CHECKING:
     from ..series.folder import SeriesFolder
-    from ..series.plan import Cut
     from ..series.run import Counts
     from ..series.settings import Settings
 
@@ -27,23 +27,6 @@ LIGHT = RunLightFlags()
 """Even, unless the air of frames says otherwise."""
 UNFINISHED = 4
 """Exit code of `series run` and `collect` where tasks failed or are left."""
-
-
-@dataclass(frozen=True)
-@ranged
-class WindowFlags:
-    """How times are cut into tasks."""
-
-    window: Natural = 16
-    """Times of a task. With --warm the first of them takes as long as ten others, which go on from the one before."""
-    overlap: int = 0
-    """Times before its own that a task also does: a run-in, and what says how well tasks agree."""
-
-    def cut(self) -> Cut:
-        """The cut."""
-        from ..series.plan import Cut
-
-        return Cut(self.window, self.overlap)
 
 
 @dataclass(frozen=True)
@@ -60,7 +43,7 @@ class EachTime:
     """Write report.html of each run, too, which takes seconds a time."""
 
 
-EACH, WINDOWS, MOTION, UNKNOWN = EachTime(), WindowFlags(), MotionFlags(), BodyFlags()
+EACH, WINDOWS, MOTION, UNKNOWN = EachTime(), Cut(), MotionFlags(), BodyFlags()
 """What is done without options."""
 
 
@@ -96,34 +79,19 @@ def _changed(*groups: object) -> list[str]:
 
 @dataclass(frozen=True)
 @ranged
-class SlurmFlags:
+class SlurmFlags(Slurm):
     """A Slurm array script, FOLDER/slurm.sh, of the tasks that are left, one in each job."""
 
     slurm: bool = False
     """Write it."""
     submit: bool = False
     """Write it, and submit it by sbatch."""
-    partition: str = ""
-    """Partition (default: the cluster's)."""
-    time: str = "01:00:00"
-    """Time limit of a task; a minute before, it is saved."""
-    memory: str = ""
-    """Memory of a task, such as 8G (default: the cluster's; some refuse to be asked)."""
-    cpus: Natural = 4
-    """Cores of a task, and its threads."""
-    limit: int = 0
-    """Tasks that run at the same time, at most (0: as many as there is room for)."""
-    account: str = ""
-    """Account that is charged."""
-    gres: str = ""
-    """Generic resources, such as gpu:1."""
 
     def carry_out(self, folder: SeriesFolder, retry: bool) -> None:
         """Write the script, and submit it if that is asked for."""
-        from ..series.slurm import Slurm, submit, write_script
+        from ..series.slurm import submit, write_script
 
-        said = {name: value for name, value in vars(self).items() if name not in ("slurm", "submit")}
-        count, numbers = write_script(folder, Slurm(**said), retry)
+        count, numbers = write_script(folder, self, retry)
         _say(f"wrote {folder.script} for {count} task(s): {numbers}")
         if self.submit:
             print(submit(folder))
@@ -138,7 +106,7 @@ NO_SLURM = SlurmFlags()
 def plan(
     scans: Positional[tuple[Path, ...]],
     out: Path,
-    windows: WindowFlags = WINDOWS,
+    windows: Cut = WINDOWS,
     each: EachTime = EACH,
     matter: PriorOptions = PriorOptions(),
     how: MethodOptions = MethodOptions(),
@@ -166,7 +134,7 @@ def plan(
     require(not matter.ranges(), "a series needs one number for --delta-beta; find it by reconstruct of one time.")
     settings = settings_of(track, each, how, motion, known, illumination, seed)
     folder = SeriesFolder(out)
-    found = plan_series(listed(scans), settings, matter.prior, reading, windows.cut())
+    found = plan_series(listed(scans), settings, matter.prior, reading, windows)
     folder.create(found)
     tasks, times = len(found.windows()), len(found.moments())
     _say(f"{out}: {times} times of {len(found.sources)} scan(s) in {tasks} task(s); now: holosplat series run {out}")

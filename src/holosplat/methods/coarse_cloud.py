@@ -35,13 +35,7 @@ def occupancy_of(mesh: SurfaceMesh, grid: Grid) -> Tensor:
     voxel, origin = (torch.tensor(values, dtype=torch.float64) for values in (grid.voxel_size, grid.origin))
     vertices = (mesh.vertices.detach() * mesh.unit_length - origin) / voxel
     found = torch.zeros(grid.shape)
-    for first, count in slabs(grid.shape):
+    for first, slab in grid.slabs(MOST_VOXELS // 4):
         moved = vertices - torch.tensor([0.0, 0.0, first], dtype=torch.float64)
-        found[first : first + count] = surface_occupancy(moved, mesh.faces, (count, *grid.shape[1:]))
+        found[first : first + slab.shape[0]] = surface_occupancy(moved, mesh.faces, slab.shape)
     return found
-
-
-def slabs(shape: tuple[int, int, int], most: int = MOST_VOXELS // 4) -> list[tuple[int, int]]:
-    """First slice and number of slices of slabs of at most `most` voxels, or of one slice."""
-    depth = max(1, most // (shape[1] * shape[2]))
-    return [(first, min(depth, shape[0] - first)) for first in range(0, shape[0], depth)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -129,7 +129,8 @@ def approximate(
     with memory_kept():
         for step in range(steps):
             on_progress("Gaussians for the volume", step / steps)
-            for slab, part in _slabs(grid, occupancy, most_voxels):
+            for first, slab in grid.slabs(most_voxels):
+                part = occupancy[..., first : first + slab.shape[0], :, :]
                 density = cloud.density(slab)
                 # The gradient of Σ (density - occupancy)² / power, without the arrays that autograd would keep.
                 density.backward((density.detach() - part).mul_(2 / power))
@@ -138,15 +139,6 @@ def approximate(
             optimiser.step()
             optimiser.zero_grad(set_to_none=True)
     return cloud.detached()
-
-
-def _slabs(grid: Grid, values: Tensor, most: int) -> Iterator[tuple[Grid, Tensor]]:
-    """Parts along z of `grid`, and of `values` […, Z, Y, X] on it, of at most so many voxels (0: all)."""
-    count, rows, columns = grid.shape
-    depth = max(1, most // (rows * columns)) if most else count
-    for first in range(0, count, depth):
-        some = min(depth, count - first)
-        yield grid.block((first, 0, 0), (some, rows, columns)), values[..., first : first + some, :, :]
 
 
 def random_cloud(count: int, views: Views, matter: Matter, thickness: float, seed: int) -> GaussianCloud:

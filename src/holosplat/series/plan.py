@@ -14,28 +14,13 @@ from ..checks import as_written, require
 from ..io.formats import read_as
 from ..io.reading import Reading
 from ..matter import MaterialPrior
-from ..ranges import Natural, ranged
 from ..scan import Scan
+from .asked import Cut
 from .settings import Settings, prior_of
 
 FORMAT = "holosplat series 1"
 MOST_TASKS = 100_000
 """Tasks of a series, at most: each is a folder."""
-
-
-@dataclass(frozen=True)
-@ranged
-class Cut:
-    """How times are cut into tasks."""
-
-    window: Natural = 16
-    """Times of a task: of these, the first begins by itself, which takes as long as ten that go on."""
-    overlap: int = 0
-    """Times before its own that a task also does: a run-in, and what says whether tasks agree."""
-
-    def __post_init__(self) -> None:
-        require(self.overlap >= 0, f"overlap must not be negative, but it is {self.overlap}.")
-        require(self.overlap <= self.window, f"overlap must be at most the window, {self.window}, but is larger.")
 
 
 @dataclass(frozen=True)

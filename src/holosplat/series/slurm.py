@@ -2,45 +2,19 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from ..checks import InputError, require
 from ..io.atomic import atomic_path
-from ..ranges import Natural, ranged
+from .asked import Slurm
 from .folder import SeriesFolder
 from .run import PROGRAM, states
 
-WORD = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.,:+-]*")
-"""What partitions, accounts, memory and times may be: nothing that a shell or sbatch would read otherwise."""
 MOST_SECONDS = 60
 """How long sbatch may take [s]."""
-
-
-@dataclass(frozen=True)
-@ranged
-class Slurm:
-    """What the script asks Slurm for. partition, account, gres, memory: left to the cluster where they are empty."""
-
-    partition: str = ""
-    time: str = "01:00:00"
-    memory: str = ""
-    cpus: Natural = 4
-    limit: int = 0
-    account: str = ""
-    gres: str = ""
-
-    def __post_init__(self) -> None:
-        for name in ("partition", "time", "memory", "account", "gres"):
-            value = getattr(self, name)
-            fits = not value or WORD.fullmatch(value) is not None
-            require(fits, f"{name} must be a word of letters, digits and -_.,:+, but it is {value!r}; correct it.")
-        require(bool(self.time), "time must be a limit such as 01:00:00, but it is empty; give one.")
-        require(self.limit >= 0, f"limit must be 0 (none) or more, but it is {self.limit}.")
 
 
 def ranges_of(numbers: Sequence[int]) -> str:
