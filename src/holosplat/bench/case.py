@@ -21,7 +21,7 @@ from ..specimens.continuous import ContinuousScene
 from ..specimens.phantoms import Ball
 from ..specimens.scene import MeshScene
 from ..volume import Volume
-from .declaration import declared_names, read_declaration
+from .declaration import Declaration, declared_names, read_declaration
 
 FOLDER = Path(__file__).with_name("cases")
 """The suite: a TOML file for each case, or for several that differ little."""
@@ -117,12 +117,17 @@ def load_case(name: str | Path, seed: int = 0, snapshots: Path | None = None) ->
     path, called = _found(str(name))
     declared = read_declaration(path, called, snapshots is not None)
     try:
-        scene, text, balls = declared.scene(seed, snapshots)
+        return case_of(declared, called, seed, snapshots)
     except InputError as error:
         raise InputError(f"{path}, case {called}: {error}") from None
+
+
+def case_of(declared: Declaration, name: str, seed: int, snapshots: Path | None = None) -> Case:
+    """The case that is `declared`, with the scene and the noise of `seed`; errors as those of `load_case`."""
+    scene, text, balls = declared.scene(seed, snapshots)
     exposures, is_test = declared.exposures()
     return Case(
-        name=called,
+        name=name,
         seed=seed,
         scene=scene,
         exposures=exposures,

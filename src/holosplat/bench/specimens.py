@@ -41,7 +41,8 @@ class Bodies:
 @dataclass(frozen=True)
 @ranged
 class RedCells:
-    """`random_cells`: `count` cells of `diameter` [m] in the channel `box` [m], of the given `shape` and `deform`.
+    """`random_cells`: `count` cells of `diameter` [m] in the channel `box` [m], of the given `shape`, `deform` and
+    `stretch` (without it: as `deform`).
 
     first_seed: what the case's seed is added to.
     """
@@ -54,11 +55,13 @@ class RedCells:
     shape: Literal["cylinder", "box"] = "cylinder"
     deform: Share = 0.03
     first_seed: Seed = 0
+    stretch: Share | None = None
 
     def bodies(self, seed: int, snapshots: Path | None) -> Bodies:
         """The cells that `seed` gives."""
         seed += self.first_seed
-        cells = random_cells(self.count, self.box, seed, self.diameter, self.deform, shape=self.shape)
+        how = {"shape": self.shape, "stretch": self.stretch}
+        cells = random_cells(self.count, self.box, seed, self.diameter, self.deform, **how)
         return Bodies(f"{self.count} generated red cells, seed {seed}", cells)
 
 

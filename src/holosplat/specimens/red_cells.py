@@ -104,9 +104,11 @@ def random_cells(
     deform: float = 0.03,
     margin: float | None = None,
     shape: str = "cylinder",
+    *,
+    stretch: float | None = None,
 ) -> list[TriangleMesh]:
     """Meshes (642 vertices each, named cell00, cell01, …) of `place_cells`, which explains the arguments."""
-    cells = place_cells(count, box, seed, diameter, deform, margin, shape)
+    cells = place_cells(count, box, seed, diameter, deform, margin, shape, stretch=stretch)
     return [cell.mesh(name=f"cell{i:02d}") for i, cell in enumerate(cells)]
 
 
@@ -120,6 +122,7 @@ def place_cells(
     shape: str = "cylinder",
     *,
     shuffles: int = 0,
+    stretch: float | None = None,
 ) -> list[RedCell]:
     """`count` cells, turned and placed uniformly at random in a channel about the origin, none touching.
 
@@ -128,7 +131,8 @@ def place_cells(
     grows by 1 % on average and 5 % at most; margin: clear distance [m] between cells and to the walls,
     by default 2 % of the diameter; shape: "box", or "cylinder" about y of diameter min(x, z), which
     every tomographic view sees whole; shuffles: how often all cells placed may move a little to make room for the
-    next. `InputError` when the cells do not fit: after `TRIES` random tries for one cell (and after each shuffle), or
+    next; stretch: typical logarithm of the stretch of a cell along one of its diameters, which it shrinks by along the
+    other (default: `deform`; cells in a fast flow have 0.2 and more). `InputError` when the cells do not fit: after `TRIES` random tries for one cell (and after each shuffle), or
     `MOST_TRIES` and more for all.
     """
     margin = 0.02 * diameter if margin is None else margin
@@ -138,7 +142,7 @@ def place_cells(
     placed: list[_Placed] = []
     left = MOST_TRIES + TRIES_A_CELL * count
     for _ in range(count):
-        resting = _Placed.resting(diameter, margin, deform, rng)
+        resting = _Placed.resting(diameter, margin, deform, rng, stretch)
         found, left = _inserted(resting, placed, channel, rng, left)
         for _ in range(shuffles if placed else 0):
             if found is not None or left <= 0:
@@ -240,11 +244,14 @@ class _Placed:
     reach: float
 
     @classmethod
-    def resting(cls, diameter: float, margin: float, deform: float, rng: np.random.Generator) -> _Placed:
+    def resting(
+        cls, diameter: float, margin: float, deform: float, rng: np.random.Generator, stretch: float | None = None
+    ) -> _Placed:
         """A randomly deformed cell at the origin."""
         weights = np.array([1, 1, 1, 0.5, 0.5]) / 3.5**0.5
         bend = 2 * deform * weights * rng.standard_normal(5)
-        cell = RedCell(diameter, stretch=deform * rng.standard_normal(), bend=bend)
+        typical = deform if stretch is None else stretch
+        cell = RedCell(diameter, stretch=typical * rng.standard_normal(), bend=bend)
         mesh = cell.mesh(FINE_LEVEL)
         outer = mesh.vertices + margin * _vertex_normals(mesh)
         reach = float(np.linalg.norm(np.concatenate([mesh.vertices, outer]), axis=1).max())
