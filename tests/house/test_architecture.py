@@ -26,14 +26,14 @@ TIERS = (
     ("materials", "optics", "metrics", "projectors", "preprocess"),
     ("specimens", "representations", "model"),
     ("io",),
-    ("fit", "baselines"),
+    ("fit", "baselines", "learning"),
     ("methods",),
     ("align",),
     ("motion",),
     ("workflows", "beamline", "planning"),
     ("report", "show"),
     ("bench", "series"),
-    ("thesis",),
+    ("thesis", "training"),
     ("cli",),
 )
 """Rooms, lowest first. A room imports rooms of lower tiers."""

@@ -93,6 +93,14 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Say whether a run folder or an HDF5 file is as it was written, by manifest and checksums.",
     ),
     "data": ("data", "Sample data of other people: list it, or fetch one into the cache (list, fetch NAME)."),
+    "dataset": (
+        "dataset",
+        "Simulate scenes for learning, drawn at random from stated ranges, into a folder of shards with a datasheet.",
+    ),
+    "train": (
+        "train",
+        "Train the network of `--start learned` on scenes of `holosplat dataset`: weights with a card, and curves.",
+    ),
     "demo": ("commands", "Run the whole chain on generated red cells: simulate, reconstruct, evaluate, report."),
     "bench": (
         "bench",

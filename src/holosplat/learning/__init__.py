@@ -1,0 +1,1 @@
+"""Networks that have seen many scenes: what they guess from few views, and their weights."""

@@ -8,12 +8,12 @@ from torch import Tensor
 from ..materials import DeltaBeta
 from ..optics.retrieval import Tikhonov, tikhonov
 from ..scan import Exposures
+from .network import THICKNESS
 
 RETRIEVAL = Tikhonov(iterations=20)
 """Of each frame by itself: a third of the steps of the other starts, as a network mends what is left."""
-TYPICAL = (0.5, 0.25, 0.5)
-"""Factors of the channels, which then are of order one: of the contrast over its root mean square, of the thickness in
-pixels, and of the noise over the contrast."""
+CONTRAST = 0.5
+"""Of the contrast's root mean square, in the images."""
 
 
 def retrieved_thickness(frames: Tensor, exposures: Exposures, material: DeltaBeta) -> Tensor:
@@ -30,5 +30,4 @@ def images(contrast: Tensor, thickness: Tensor, noise: Tensor) -> Tensor:
     """
     rms = contrast.float().square().mean().sqrt().clamp_min(torch.finfo(torch.float16).tiny)
     level = (noise.float() / rms)[:, None, None].expand(contrast.shape)
-    of_contrast, of_thickness, of_noise = TYPICAL
-    return torch.stack([of_contrast * contrast / rms, of_thickness * thickness, of_noise * level], 1).float()
+    return torch.stack([CONTRAST * contrast / rms, THICKNESS * thickness, CONTRAST * level], 1).float()

@@ -64,6 +64,10 @@ class Taps:
             images = images.scatter_add(1, self.index[..., tap], self.weight[..., tap] * values)
         return images.unflatten(1, (h, w))
 
+    def on(self, device: torch.device | str) -> Taps:
+        """The same on a device."""
+        return Taps(self.index.to(device), self.weight.to(device), self.shape, self.grid)
+
     def part(self, views: Tensor) -> Taps:
         """Those of some views [K]."""
         return Taps(self.index[views], self.weight[views], self.shape, self.grid)

@@ -9,38 +9,24 @@ them, the differences are lifted in turn, and a second U-Net corrects the guess:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, avg_pool3d, interpolate
 
-from ..checks import at_least
-from ..ranges import ranged
 from .lattice import Taps
+from .size import Size
 
 FINE = 2
 """Voxels of the answer along the edge of one of the lattice, which has the images' pixels as its voxels."""
+DEFAULT = Size()
 INPUTS = 3
 """Channels of an image: contrast of the hologram, retrieved thickness, its noise."""
+THICKNESS = 0.25
+"""Of a pixel's length of matter, in the images: thickness is then of order one."""
 SLOPE = 0.1
 """Of the leaky rectifiers."""
-
-
-@dataclass(frozen=True)
-@ranged
-class Size:
-    """How large a network is; about a million weights by default."""
-
-    image: tuple[int, ...] = (16, 24, 32, 32)
-    """Channels of the views' encoder, from its finest level to its coarsest."""
-    features: int = 12
-    """Channels that are lifted along the rays, of each view."""
-    volume: tuple[int, ...] = (16, 40, 80)
-    """Channels of the volumes' U-Nets, from the finest level to the coarsest."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 1, "features")
 
 
 def _rectified(module: nn.Module) -> nn.Sequential:
@@ -58,11 +44,9 @@ class Images(nn.Module):
             nn.Sequential(
                 _rectified(nn.Conv2d(a, b, 4, stride=2, padding=1)), _rectified(nn.Conv2d(b, b, 3, padding=1))
             )
-            for a, b in zip(widths, widths[1:])
+            for a, b in pairwise(widths)
         )
-        self.up = nn.ModuleList(
-            _rectified(nn.Conv2d(a + b, a, 3, padding=1)) for a, b in zip(widths[1:], widths[2:])
-        )
+        self.up = nn.ModuleList(_rectified(nn.Conv2d(a + b, a, 3, padding=1)) for a, b in pairwise(widths[1:]))
         self.last = nn.Conv2d(widths[1], size.features, 1)
 
     def forward(self, images: Tensor) -> Tensor:
@@ -84,9 +68,9 @@ class Volumes(nn.Module):
         self.first = nn.Sequential(_rectified(nn.Conv3d(inputs, widths[0], 1)), _block(widths[0], widths[0]))
         self.down = nn.ModuleList(
             nn.Sequential(_rectified(nn.Conv3d(a, b, 2, stride=2)), _block(b, b), _block(b, b))
-            for a, b in zip(widths, widths[1:])
+            for a, b in pairwise(widths)
         )
-        self.up = nn.ModuleList(nn.Conv3d(b, a, 1) for a, b in zip(widths, widths[1:]))
+        self.up = nn.ModuleList(nn.Conv3d(b, a, 1) for a, b in pairwise(widths))
         self.mix = nn.ModuleList(_block(a, a) for a in widths[:-1])
         self.last = nn.Conv3d(widths[0], outputs, 1)
 
@@ -105,7 +89,7 @@ class Volumes(nn.Module):
 class Guess(nn.Module):
     """The whole network: images of some views and where voxels lie in them → logits of occupancy, twice."""
 
-    def __init__(self, size: Size = Size()) -> None:
+    def __init__(self, size: Size = DEFAULT) -> None:
         super().__init__()
         self.size = size
         self.images = Images(size)
@@ -116,7 +100,7 @@ class Guess(nn.Module):
     def forward(self, images: Tensor, taps: Taps) -> tuple[Tensor, Tensor]:
         """Logits [2Z, 2Y, 2X] of the first guess and of the corrected one.
 
-        images: [V, 3, 2H, 2W]: hologram's contrast, retrieved thickness [lattice voxels], noise; taps: of the lattice
+        images: [V, 3, 2H, 2W] (`learning.images`); taps: of the lattice
         [Z, Y, X] in images of half as many pixels.
         """
         thickness = avg_pool2d(images[:, 1:2], 2)
@@ -125,10 +109,15 @@ class Guess(nn.Module):
         first = self.guess(seen)
         logits, state = first[:, : FINE**3], first[:, FINE**3 :]
         matter = torch.sigmoid(logits.float()).mean(1).flatten()
-        missing = thickness[:, 0] - taps.project(matter)
+        missing = thickness[:, 0] - thickness_of(matter, taps)
         differences = _extremes(taps.lift(missing[:, None])).unflatten(1, taps.grid)[None]
         corrected = logits + self.correct(torch.cat([seen, logits, state, differences], 1))
         return _fine(logits), _fine(corrected)
+
+
+def thickness_of(matter: Tensor, taps: Taps) -> Tensor:
+    """What images [V, H, W] show of occupancy [N], as their channel of thickness does."""
+    return THICKNESS * FINE * taps.project(matter)
 
 
 def _over_views(features: Tensor, thickness: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from ..checks import at_least, require
 from ..fit.density import DensityControl
 from ..fit.schedule import Schedule
 from ..fit.terms import Objective
+from ..learning.start import LearnedStart
 from ..ranges import Pixels, Rate, Share, Weight, ranged
 from .coarse import CoarseToFine
 from .ground import ExtraTerm
@@ -66,8 +67,11 @@ class FitOptions:
 class GaussianOptions:
     """Options of Gaussians: their start, and their fit."""
 
-    start: Literal["phase", "random"] = "phase"
-    """`phase`: phase retrieval, total-variation tomography, Gaussians where there is matter; or `random`."""
+    start: Literal["phase", "learned", "random"] = "phase"
+    """`phase`: phase retrieval, total-variation tomography, Gaussians where there is matter; `learned`: the same where
+    a network that has seen such bodies guesses it, as far as frames bear it out; or `random`."""
+    learned: LearnedStart = field(default_factory=LearnedStart)
+    """The network, and when its guess is taken."""
     spacing_px: Pixels = 1.0
     """Distance between Gaussians at a phase start [pixels]."""
     spacing_noise: Weight = 2.3

@@ -13,6 +13,7 @@ from torch import Tensor
 from ..baselines import holographic_tv
 from ..baselines.two_materials import Shares, absorption, at_one_ratio, told_apart, two_levels
 from ..geometry import Grid
+from ..learning.start import guessed
 from ..materials import WATER
 from ..matter import DeltaBeta, KnownRatio, Matter
 from ..optics.noise import noise_share
@@ -47,6 +48,9 @@ def _from_phase_retrieval(task: Task, options: GaussianOptions) -> GaussianCloud
     how = replace(options.volume, upper=options.volume.upper if task.bounded else 0.0)
 
     def retrieve(frames: Scan) -> tuple[Tensor, Grid]:
+        if options.start == "learned":
+            found = guessed(frames, material, options.learned.network.network, task.on_progress)
+            return found.values, found.grid
         return holographic_tv(frames, material, how, task.on_progress, task.uneven)
 
     volume, grid = retrieve(scan)

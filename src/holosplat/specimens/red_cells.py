@@ -131,9 +131,9 @@ def place_cells(
     grows by 1 % on average and 5 % at most; margin: clear distance [m] between cells and to the walls,
     by default 2 % of the diameter; shape: "box", or "cylinder" about y of diameter min(x, z), which
     every tomographic view sees whole; shuffles: how often all cells placed may move a little to make room for the
-    next; stretch: typical logarithm of the stretch of a cell along one of its diameters, which it shrinks by along the
-    other (default: `deform`; cells in a fast flow have 0.2 and more). `InputError` when the cells do not fit: after `TRIES` random tries for one cell (and after each shuffle), or
-    `MOST_TRIES` and more for all.
+    next; stretch: typical logarithm of the stretch of a cell along one of its diameters, by which it shrinks along the
+    other (default: `deform`; in a fast flow it is 0.2 and more). `InputError` when the cells do not fit: after `TRIES`
+    random tries for one cell (and after each shuffle), or `MOST_TRIES` and more for all.
     """
     margin = 0.02 * diameter if margin is None else margin
     _check_channel(count, box, diameter, deform, margin, shape)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,7 @@ from ..io.hdf5 import open_hdf5
 from ..io.hdf5_writing import new_hdf5
 from ..io.json import read_json, write_json
 from ..progress import Advance
-from ..tables import from_table
+from ..tables import from_table, to_table
 from ..version import __version__
 from .ranges import Ranges
 from .sample import Sample, sample_of
@@ -59,7 +59,7 @@ class Dataset:
             raise InputError(f"{self.folder} must be new, empty, or a dataset, but it is none of these.")
         self.folder.mkdir(parents=True, exist_ok=True)
         said = {"version": VERSION, "seed": self.seed, "count": self.count, "holosplat": __version__}
-        write_json(path, said | {"ranges": asdict(self.ranges)})
+        write_json(path, said | {"ranges": to_table(self.ranges)})
 
     def shards(self) -> Sequence[range]:
         """The scenes of each file."""
@@ -78,6 +78,15 @@ class Dataset:
             return False
         with open_hdf5(self.file(shard)) as file:
             return len(file[Sample.names()[0]]) >= len(shard)
+
+    def require_whole(self) -> None:
+        """`InputError` unless all scenes are there."""
+        missing = self.missing()
+        require(
+            not missing,
+            f"{self.folder} lacks {len(missing)} of {len(self.shards())} files; run holosplat dataset again, with the "
+            "same options.",
+        )
 
     def make(self, shard: range, on_progress: Advance = lambda fraction: None) -> None:
         """Simulate the scenes of `shard` and write their file, whole or not at all."""

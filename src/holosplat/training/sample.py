@@ -14,7 +14,8 @@ from ..geometry import Grid
 from ..learning.images import retrieved_thickness
 from ..optics.noise import noise_levels
 from ..specimens.scene import MeshScene
-from .ranges import PURPOSE, Ranges, drawn
+from .draw import PURPOSE, drawn
+from .ranges import Ranges
 
 FEWER = 0.8
 """What is left of the bodies asked for where they found no place."""
@@ -30,8 +31,8 @@ class Sample:
     rotations, shifts: [V, 3, 3] and [V, 2] [pixels] float64, as `Views` has them
     is_test: [V] bool, frames without noise that are held out
     occupancy: [Z, Y, X] uint8, share of matter in voxels of a pixel, 255 for all; Z = X = W, Y = H
-    facts: [8] float64: pixel size [m], photon energy [keV], distance [m], standard deviation of the point-spread function
-        [pixels], photons a pixel (inf: no noise), δ, β, and the bodies' number or 0
+    facts: [8] float64: pixel size [m], photon energy [keV], distance [m], standard deviation of the point-spread
+        function [pixels], photons a pixel (inf: no noise), δ, β, and the bodies' number or 0
     """
 
     contrast: np.ndarray

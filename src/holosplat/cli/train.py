@@ -1,0 +1,48 @@
+"""`holosplat train`: from a dataset to the weights of a network."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+from tyro.conf import OmitArgPrefixes, Positional
+
+from ..training.options import TrainOptions
+from .progress import INTERRUPTED, ProgressBar
+
+A_NIGHT = TrainOptions()
+"""What the shipped weights were made with."""
+
+
+def train(
+    data: Positional[Path], out: Path, how: Annotated[TrainOptions, OmitArgPrefixes] = A_NIGHT, resume: bool = False
+) -> None:
+    """Train the network of `--start learned` on scenes of `holosplat dataset`: weights with a card, and curves.
+
+    Args:
+        data: Folder of scenes.
+        out: Folder to make.
+        resume: Go on with an interrupted training.
+    """
+    from ..report.learning import training_curves
+    from ..training.folder import Dataset
+    from ..training.train import Training
+    from ..training.validate import Validation
+    from ..workflows.provenance import environment
+
+    scenes = Dataset.read(data)
+    scenes.require_whole()
+    training = (Training.resumed if resume else Training.begun)(scenes, out, how)
+    with ProgressBar() as bar:
+        told = Validation.of(
+            scenes.ranges, scenes.seed, how.validation, lambda fraction: bar.show("scenes to validate", fraction, {})
+        )
+        try:
+            training.run(told, lambda now: bar.show("training", now.step / how.steps, now.record))
+        except KeyboardInterrupt:
+            print(f"interrupted; {out} keeps the last checkpoint, go on with --resume", file=sys.stderr)
+            raise SystemExit(INTERRUPTED) from None
+    weights = training.finish(told, environment("cuda" if how.device == "cuda" else "cpu"))
+    print(f"Dice of scenes of another seed: {told.last()}")
+    print(f"wrote {weights} and {training_curves(out)}")

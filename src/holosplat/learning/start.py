@@ -1,0 +1,131 @@
+"""A volume to start from, as a trained network guesses it from few views."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, pad
+
+from ..geometry import Grid, Views
+from ..materials import DeltaBeta
+from ..optics.noise import noise_levels
+from ..progress import Progress
+from ..ranges import Weight, ranged
+from ..scan import Scan
+from .images import images, retrieved_thickness
+from .lattice import Taps
+from .network import FINE, Guess, coarse, thickness_of
+from .weights import Trained, read_weights
+
+STAGE = "learned start"
+MOST_COLUMNS = 128
+"""Pixels across that the network sees, at most: larger frames are binned."""
+FEWEST = 32
+"""Rows and columns of binned frames, at least."""
+
+
+@dataclass(frozen=True)
+@ranged
+class LearnedStart:
+    """Options of a start that a network guesses."""
+
+    weights: str = ""
+    """File of the network's weights (default: those that come with the package)."""
+    doubt: Weight = 1.5
+    """What a guess may leave unexplained of the retrieved thickness, in what 95 % of the scenes leave that the network
+    was trained for: where it leaves more, the bodies are others."""
+
+    @property
+    def network(self) -> Trained:
+        """The network and its card; errors: those of `read_weights`."""
+        return read_weights(Path(self.weights)) if self.weights else read_weights()
+
+
+@dataclass(frozen=True)
+class Guessed:
+    """What a network guesses.
+
+    values: [Z, Y, X] float32, occupancy from 0 to 1
+    grid: its voxels, of a pixel of the (binned) frames
+    images, taps: what the network saw
+    """
+
+    values: Tensor
+    grid: Grid
+    images: Tensor
+    taps: Taps
+
+    def left(self, factor: int = 1) -> float:
+        """What the volume leaves `unexplained` on pixels `factor` times larger."""
+        return unexplained(self.values, self.images, self.taps, factor)
+
+
+def guessed(scan: Scan, material: DeltaBeta, network: Guess, on_progress: Progress) -> Guessed:
+    """The occupancy of `material` that `network` guesses from the frames of `scan`.
+
+    The network knows bodies of some pixels across. So frames are shown on pixels of several sizes, and what explains
+    the retrieved thickness best is taken, by what the largest of these pixels show. Errors: those of phase retrieval.
+    """
+    on_progress(STAGE, 0.0)
+    factors, found = _factors(scan), list[Guessed]()
+    for done, factor in enumerate(factors):
+        found.append(_on_pixels(scan.binned(factor) if factor > 1 else scan, material, network))
+        on_progress(STAGE, (done + 1) / len(factors))
+    left = [each.left(factors[-1] // factor) for each, factor in zip(found, factors)]
+    return found[left.index(min(left))]
+
+
+def _factors(scan: Scan) -> Sequence[int]:
+    """By what frames are binned: as little as the network allows, and twice that where enough is left of them."""
+    least = max(1, math.ceil(max(scan.views.shape) / MOST_COLUMNS))
+    return [least * times for times in (1, 2) if times == 1 or min(scan.views.shape) >= 2 * least * FEWEST]
+
+
+def _on_pixels(scan: Scan, material: DeltaBeta, network: Guess) -> Guessed:
+    seen, views, grid = _shown(scan, material)
+    taps = Taps.of(grid, views)
+    with torch.inference_mode():
+        values = torch.sigmoid(network(seen, taps)[1])
+    return Guessed(values.clone(), grid.divided((FINE, FINE, FINE)), seen, taps)
+
+
+def unexplained(values: Tensor, seen: Tensor, taps: Taps, factor: int = 1) -> float:
+    """Root mean square of the thickness in images [V, 3, 2H, 2W] that occupancy [2Z, 2Y, 2X] does not explain, over
+    that of the thickness, on H × W pixels or such as are `factor` times larger."""
+    thickness = avg_pool2d(seen[:, 1:2], FINE)[:, 0]
+    missing = thickness - thickness_of(coarse(values).flatten(), taps)
+    left, there = (float(avg_pool2d(part, factor).norm()) for part in (missing, thickness))
+    return left / max(there, torch.finfo(torch.float32).tiny)
+
+
+def spread(found: Guessed, network: Guess) -> Tensor:
+    """Standard deviation [Z, Y, X] of what `network` guesses without one of the views each: where it is large, few
+    frames say what is there. Zeros for two views, one of which says too little."""
+    count = len(found.images)
+    if count < 3:
+        return torch.zeros_like(found.values)
+    every = torch.arange(count)
+    with torch.inference_mode():
+        rest = [every[every != left_out] for left_out in range(count)]
+        guesses = [torch.sigmoid(network(found.images[some], found.taps.part(some))[1]) for some in rest]
+    return torch.stack(guesses).std(0).clone()
+
+
+def _shown(scan: Scan, material: DeltaBeta) -> tuple[Tensor, Views, Grid]:
+    """The network's images [V, 3, 2H, 2W], the views of H × W pixels twice as large, and the lattice in them.
+
+    Odd frames get a row or a column of air more.
+    """
+    frames, views = torch.from_numpy(scan.frames), scan.views
+    thickness = retrieved_thickness(frames, scan.exposures, material) / views.finest
+    (h, w), more = views.shape, [n % FINE for n in views.shape]
+    seen = images(frames - 1, thickness, noise_levels(frames))
+    seen = pad(seen, (0, more[1], 0, more[0]))
+    whole = views.cropped(slice(0, h + more[0]), slice(0, w + more[1]))
+    large = replace(whole, shape=(seen.shape[2] // FINE, seen.shape[3] // FINE), pitch=FINE * views.pitch)
+    return seen, large, Grid.of_views(large)

@@ -1,0 +1,156 @@
+"""Scenes for learning: the declaration that a seed and a number give."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ..beamline.light import UnevenLight
+from ..beamline.misalignment import Misalignment
+from ..bench.declaration import Beam, Declaration, Detector, Listed, Matter, Substance
+from ..bench.soft_specimens import SoftCells
+from ..bench.specimens import Capsules, FoamDrop, RedCells, Specimen
+from ..specimens.red_cells import DIAMETER, evans_fung_cell
+from ..units import wavelength
+from .ranges import Kind, Ranges
+
+PURPOSE = 2101
+"""Keeps the numbers that are drawn here apart from those that other parts draw with the same seed."""
+FITS = 0.97
+"""Share of the field of view within which a scene lies in every view."""
+MOST_BODIES = 60
+"""Bodies of a scene: more of them take longer to place than to image."""
+LEAST_GAP = 0.35
+"""Least distance of two free directions, in the distance of even ones."""
+THICKEST = 0.33
+"""Thickness of a resting red cell at most, in diameters (Evans & Fung 1972)."""
+
+
+def drawn(ranges: Ranges, seed: int, index: int) -> Declaration:
+    """The scene number `index` of `seed`; the same for ever, whatever else is drawn."""
+    rng = np.random.default_rng([PURPOSE, seed, index])
+    kind = ranges.kinds[index % len(ranges.kinds)]
+    diameter = DIAMETER * rng.uniform(0.9, 1.1)
+    pixel = diameter / rng.uniform(*ranges.across)
+    tilted = rng.random() < ranges.tilted
+    room = _room(rng, ranges, pixel, tilted)
+    specimen = SPECIMENS[kind](rng, ranges, diameter, room)
+    energy = _log(rng, ranges.energy_kev)
+    distance = pixel**2 / (wavelength(energy) * _log(rng, ranges.fresnel))
+    phase = _log(rng, ranges.phase)
+    delta = phase * wavelength(energy) / (2 * math.pi * THICKEST * diameter)
+    material = Substance(delta=delta, beta=delta / _log(rng, ranges.ratio))
+    directions = _directions(rng, ranges, tilted)
+    quiet = rng.random() < ranges.noiseless
+    photons = (_log(rng, ranges.noise) * phase) ** -2
+    return Declaration(
+        summary=f"{kind} drawn for learning",
+        specimen=specimen,
+        matter=Matter(material, Substance("vacuum") if specimen.has_core else None),
+        beam=Beam(energy, distance),
+        detector=Detector(ranges.rows, ranges.columns, pixel, rng.uniform(*ranges.blur_px)),
+        views=Listed(directions[: ranges.views], directions[ranges.views :]),
+        prior="known",
+        photons=None if quiet else photons,
+        light=UnevenLight(light_smooth=rng.uniform(*ranges.uneven)),
+        misalignment=Misalignment(shift_px=rng.uniform(*ranges.misaligned_px)),
+    )
+
+
+@dataclass(frozen=True)
+class Room:
+    """Where bodies may be: extents `(x, y, z)` [m] about the origin, a box or a cylinder about y."""
+
+    box: tuple[float, float, float]
+    shape: Literal["box", "cylinder"]
+
+    @property
+    def volume(self) -> float:
+        """[m³]."""
+        x, y, z = self.box
+        return x * y * z if self.shape == "box" else math.pi / 4 * min(x, z) ** 2 * y
+
+    @property
+    def least(self) -> float:
+        """The shortest extent [m]."""
+        return min(self.box)
+
+
+def _room(rng: np.random.Generator, ranges: Ranges, pixel: float, tilted: bool) -> Room:
+    """Within the field of view in every direction; tilted beams see a ball of its smaller side."""
+    across, high = FITS * ranges.columns * pixel, FITS * ranges.rows * pixel
+    if tilted:
+        across = high = min(across, high) / math.sqrt(2)
+    high *= rng.uniform(0.7, 1.0)
+    if rng.random() < 0.4:
+        side = across * rng.uniform(0.5, 1.0)
+        return Room((side, high, side), "cylinder")
+    x, z = rng.uniform(0.3, 1.0, 2)
+    scale = across / math.hypot(x, z) * rng.uniform(0.7, 1.0)
+    return Room((x * scale, high, z * scale), "box")
+
+
+def _directions(rng: np.random.Generator, ranges: Ranges, tilted: bool) -> tuple[tuple[float, float], ...]:
+    """Angles and tilts [degrees]. The angles of half of the scenes are even over half a turn, the others' are free but
+    for a least distance; there, the first two views are nearly at right angles, so that there are such pairs."""
+    count = ranges.views + ranges.held_out
+    first = rng.uniform(0, 180)
+    if tilted or rng.random() < 0.5:
+        angles = first + np.arange(count) * (180 / count)
+        rng.shuffle(angles)
+    else:
+        angles = _apart(rng, first, count)
+        angles[1] = first + rng.uniform(80, 100)
+    tilts = rng.uniform(-ranges.tilt, ranges.tilt, count) if tilted else np.zeros(count)
+    return tuple((float(angle % 180), float(tilt)) for angle, tilt in zip(angles, tilts))
+
+
+def _apart(rng: np.random.Generator, first: float, count: int) -> np.ndarray:
+    """Angles [count] [degrees] about an axis, free but for a least distance."""
+    least = 180 / count * LEAST_GAP
+    gaps = least + (180 - count * least) * rng.dirichlet(np.ones(count))
+    angles = first + np.concatenate([[0.0], np.cumsum(gaps)[:-1]])
+    rng.shuffle(angles[1:])
+    return angles
+
+
+def _log(rng: np.random.Generator, pair: tuple[float, float]) -> float:
+    """Evenly in the logarithm."""
+    return float(math.exp(rng.uniform(*np.log(pair))))
+
+
+def _cells(rng: np.random.Generator, ranges: Ranges, diameter: float, room: Room) -> Specimen:
+    """As many red cells as fill the drawn share of the room, of those that found a place one after the other."""
+    one = evans_fung_cell(diameter).volume
+    count = min(MOST_BODIES, max(1, round(_log(rng, ranges.filled) * room.volume / one)))
+    deform, stretch = rng.uniform(*ranges.deform), rng.uniform(*ranges.stretch)
+    return RedCells(count, diameter, room.box, room.shape, deform, 0, stretch)
+
+
+def _capsules(rng: np.random.Generator, ranges: Ranges, diameter: float, room: Room) -> Specimen:
+    """Shells with empty cores."""
+    count = min(MOST_BODIES, max(1, round(_log(rng, ranges.filled) * room.volume / (0.5 * diameter**3))))
+    return Capsules(count, (0.6 * diameter, diameter), diameter * rng.uniform(0.08, 0.2), room.box)
+
+
+def _foam(rng: np.random.Generator, ranges: Ranges, diameter: float, room: Room) -> Specimen:
+    """A drop as large as the room with bubbles."""
+    return FoamDrop(0.95 * room.least, int(rng.integers(5, 25)), rng.uniform(0.3, 0.6) * diameter)
+
+
+def _soft_cells(rng: np.random.Generator, ranges: Ranges, diameter: float, room: Room) -> Specimen:
+    """Continuous cells with nuclei and vacuoles."""
+    count = min(MOST_BODIES, max(1, round(_log(rng, ranges.filled) * room.volume / (0.5 * diameter**3))))
+    return SoftCells(count, (0.7 * diameter, 1.3 * diameter), room.box, 0.1 * diameter)
+
+
+SPECIMENS: Mapping[Kind, Callable[[np.random.Generator, Ranges, float, Room], Specimen]] = {
+    "red-cells": _cells,
+    "capsules": _capsules,
+    "foam": _foam,
+    "soft-cells": _soft_cells,
+}

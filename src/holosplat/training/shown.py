@@ -1,0 +1,81 @@
+"""What a network sees of a sample in one step: some of its views, mirrored and turned, and what they should give."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..geometry import Grid, Views
+from ..learning.images import images
+from ..learning.lattice import Taps
+from ..learning.network import FINE
+from .options import Shown
+from .sample import Sample
+
+UPSIDE_DOWN = np.diag([1.0, -1.0, 1.0])
+QUARTER = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+"""Takes the object frame's z to its x, and x to -z."""
+
+
+@dataclass(frozen=True)
+class Lesson:
+    """images: [V, 3, H, W]; taps: of the lattice [W/2, H/2, W/2] in images of half as many pixels; occupancy: [W, H, W]
+    float32, what the network should say."""
+
+    images: Tensor
+    taps: Taps
+    occupancy: Tensor
+
+    def on(self, device: str) -> Lesson:
+        """The same on a device."""
+        return Lesson(self.images.to(device), self.taps.on(device), self.occupancy.to(device))
+
+
+def lesson(sample: Sample, how: Shown, rng: np.random.Generator) -> Lesson:
+    """`sample` as it is shown once: views are chosen, rows cut out, up and down exchanged, and the object is turned
+    about its y axis by quarter turns, all at random."""
+    training = np.flatnonzero(~sample.is_test)
+    count = min(int(rng.choice(how.views)), len(training))
+    pair = count == 2 and rng.random() < how.first_two
+    chosen = training[:2] if pair else rng.permutation(training)[:count]
+    rows = _rows(sample, how, rng)
+    return as_shown(sample, chosen, rows, bool(rng.random() < 0.5), int(rng.integers(4)))
+
+
+def whole(sample: Sample, count: int) -> Lesson:
+    """The first `count` views for training as they are."""
+    return as_shown(sample, np.flatnonzero(~sample.is_test)[:count], slice(None), False, 0)
+
+
+def as_shown(sample: Sample, views: Sequence[int] | np.ndarray, rows: slice, flipped: bool, turns: int) -> Lesson:
+    """Some `views` and some `rows` of `sample`, upside down or not, after quarter turns about y."""
+    contrast, thickness = (array[views][:, rows] for array in (sample.contrast, sample.thickness))
+    rotations, shifts, occupancy = sample.rotations[views], sample.shifts[views], sample.occupancy[:, rows]
+    if flipped:
+        contrast, thickness, occupancy = contrast[:, ::-1], thickness[:, ::-1], occupancy[:, ::-1]
+        rotations, shifts = UPSIDE_DOWN @ rotations @ UPSIDE_DOWN, shifts * [1, -1]
+    for _ in range(turns):
+        rotations, occupancy = rotations @ QUARTER.T, occupancy.transpose(2, 1, 0)[::-1]
+    h, w = contrast.shape[1:]
+    large = Views(rotations, shifts, (h // FINE, w // FINE), float(FINE))
+    taps = Taps.of(Grid.centred((w // FINE, h // FINE, w // FINE), float(FINE)), large)
+    seen = images(_tensor(contrast), _tensor(thickness), _tensor(sample.noise[views]))
+    return Lesson(seen, taps, _tensor(occupancy) / 255)
+
+
+def _rows(sample: Sample, how: Shown, rng: np.random.Generator) -> slice:
+    """An even number of rows from an even one on; all of them where beams are tilted."""
+    height = sample.contrast.shape[1]
+    count = min(int(rng.choice(how.rows)), height) // FINE * FINE
+    if not np.allclose(sample.rotations[:, 1], [0, 1, 0]):
+        return slice(None)
+    first = FINE * int(rng.integers((height - count) // FINE + 1))
+    return slice(first, first + count)
+
+
+def _tensor(array: np.ndarray) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))

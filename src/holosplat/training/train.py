@@ -1,0 +1,153 @@
+"""Training: from a dataset to weights, in a folder that can be taken up again."""
+
+from __future__ import annotations
+
+import csv
+import math
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch.nn.utils import clip_grad_norm_
+
+from ..checks import InputError, require
+from ..io.atomic import atomic_path
+from ..io.json import read_json, write_json
+from ..learning.network import Guess
+from ..learning.weights import write_weights
+from ..tables import to_table
+from .folder import Dataset
+from .objective import loss
+from .options import TrainOptions
+from .shown import lesson
+from .validate import Validation
+
+PURPOSE = 2102
+"""Keeps the numbers that are drawn here apart from others of the same seed."""
+BETAS = (0.9, 0.98)
+"""AdamW's constants: gradients of single scenes are rough, and their squares are averaged over fifty."""
+SETTINGS, CHECKPOINT, CURVES, WEIGHTS = "train.json", "checkpoint.pt", "curves.csv", "weights.safetensors"
+"""Files of a training's folder."""
+COLUMNS = ("step", "loss", "dice_guess", "dice", "rate")
+
+
+def has_bfloat16() -> bool:
+    """Whether the processor multiplies bfloat16 (AVX-512 BF16 or AMX), as far as torch says it."""
+    found = getattr(torch.cpu, "get_capabilities", dict)()
+    return bool(found.get("avx512_bf16") or found.get("amx_bf16"))
+
+
+class Training:
+    """A training in its folder: what is learnt, the optimiser, and the step that comes next."""
+
+    def __init__(self, data: Dataset, folder: Path, options: TrainOptions) -> None:
+        self.data, self.folder, self.options = data, folder, options
+        torch.manual_seed(options.seed)
+        self.network = Guess(options.size).to(options.device)
+        self.optimiser = torch.optim.AdamW(
+            self.network.parameters(), lr=options.rate, weight_decay=options.decay, betas=BETAS
+        )
+        self.step = self._first = 0
+        self._began = time.monotonic()
+        self.rows: list[tuple[float, ...]] = []
+
+    @classmethod
+    def begun(cls, data: Dataset, folder: Path, options: TrainOptions) -> Training:
+        """A training in a new folder; `InputError` where there is something in it."""
+        if folder.exists() and any(folder.iterdir()):
+            raise InputError(f"{folder} must be new or empty, but it is not; choose another --out, or --resume.")
+        folder.mkdir(parents=True, exist_ok=True)
+        write_json(folder / SETTINGS, _settings(data, options))
+        return cls(data, folder, options)
+
+    @classmethod
+    def resumed(cls, data: Dataset, folder: Path, options: TrainOptions) -> Training:
+        """The training in `folder` after its last checkpoint; `InputError` where it is one of other options or data."""
+        settings = folder / SETTINGS
+        require(settings.is_file(), f"{folder} holds no training that could go on; leave --resume.")
+        require(
+            read_json(settings) == _settings(data, options),
+            f"{folder} holds a training with other options or scenes; give the same, or choose another --out.",
+        )
+        training, checkpoint = cls(data, folder, options), folder / CHECKPOINT
+        if checkpoint.is_file():
+            kept = torch.load(checkpoint, weights_only=True, map_location=options.device)
+            training.network.load_state_dict(kept["network"])
+            training.optimiser.load_state_dict(kept["optimiser"])
+            training.step, training.rows = kept["step"], [tuple(row) for row in kept["rows"]]
+        return training
+
+    def run(self, validation: Validation, on_step: Callable[[Training], None]) -> None:
+        """All steps that are left; a checkpoint, curves and a validation every `keep_every` steps and at the end.
+
+        on_step: called after each step. What is interrupted goes on from the last checkpoint.
+        """
+        self._first, self._began = self.step, time.monotonic()
+        while self.step < self.options.steps:
+            self.advance()
+            if self.step % self.options.keep_every == 0 or self.step == self.options.steps:
+                validation.judge(self.network, self.step)
+                self.keep(validation)
+            on_step(self)
+
+    def advance(self) -> None:
+        """One step: a scene as it is shown once. Its random numbers depend on the seed and the step alone."""
+        options = self.options
+        rng = np.random.default_rng([PURPOSE, options.seed, self.step])
+        shown = lesson(self.data.sample(int(rng.integers(self.data.count))), options.shown, rng)
+        rate = options.rate_at(self.step)
+        for group in self.optimiser.param_groups:
+            group["lr"] = rate
+        with self._precision():
+            value, scores = loss(self.network, shown.on(options.device), options.goal)
+        self.optimiser.zero_grad()
+        value.backward()
+        norm = float(clip_grad_norm_(self.network.parameters(), options.longest))
+        if math.isfinite(norm):  # a step that is none, where sums overflowed
+            self.optimiser.step()
+        self.step += 1
+        self.rows.append((self.step, float(value.detach()), *scores.tolist(), rate))
+
+    def keep(self, validation: Validation) -> None:
+        """Write the checkpoint, the curves and the validation, each whole or not at all."""
+        state = {"network": self.network.state_dict(), "optimiser": self.optimiser.state_dict()}
+        with atomic_path(self.folder / CHECKPOINT) as temporary:
+            torch.save(state | {"step": self.step, "rows": [list(row) for row in self.rows]}, temporary)
+        _write_rows(self.folder / CURVES, COLUMNS, self.rows)
+        validation.write(self.folder)
+
+    def finish(self, validation: Validation, made_by: dict[str, str]) -> Path:
+        """Write the weights with their card; their file."""
+        card = validation.card(self.network, to_table(self.data.ranges) | {"seed": self.data.seed}, made_by)
+        card = replace(card, training=_settings(self.data, self.options)["options"])
+        path = self.folder / WEIGHTS
+        write_weights(path, self.network, card)
+        return path
+
+    @property
+    def record(self) -> dict[str, float]:
+        """Of the last step, for progress: steps and seconds since the training began, or went on."""
+        return {"step": self.step - self._first, "loss": self.rows[-1][1], "seconds": time.monotonic() - self._began}
+
+    def _precision(self) -> AbstractContextManager[Any]:
+        asked, device = self.options.precision, self.options.device
+        short = device == "cuda" or has_bfloat16() if asked == "auto" else asked == "bfloat16"
+        return torch.autocast(device, torch.bfloat16) if short else nullcontext()
+
+
+def _settings(data: Dataset, options: TrainOptions) -> dict[str, Any]:
+    """What a training is resumed with again."""
+    scenes = {"ranges": to_table(data.ranges), "seed": data.seed, "count": data.count}
+    return {"options": to_table(options), "scenes": scenes}
+
+
+def _write_rows(path: Path, columns: Sequence[str], rows: Sequence[tuple[float, ...]]) -> None:
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(columns)
+        writer.writerows([f"{value:.6g}" for value in row] for row in rows)

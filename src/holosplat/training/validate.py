@@ -1,0 +1,91 @@
+"""How a network does on scenes of another seed, while it learns and at its end."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ..io.atomic import atomic_path
+from ..learning.network import Guess
+from ..learning.start import unexplained
+from ..learning.weights import Card
+from .objective import dice
+from .ranges import Ranges
+from .sample import Sample, sample_of
+from .shown import Lesson, whole
+
+COUNTS = (2, 3, 4, 6)
+"""Numbers of views."""
+OTHER_SEED = 1
+"""Added to the seed of the scenes that are learnt from."""
+MOST = 95
+"""Per cent of the scenes that leave less unexplained than what counts as typical."""
+FILE = "validation.csv"
+
+
+@dataclass
+class Validation:
+    """Scenes of another seed, and what networks scored on them: rows of step, number of views, Dice of the guess and of
+    the corrected one."""
+
+    samples: Sequence[Sample]
+    rows: list[tuple[float, ...]] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, ranges: Ranges, seed: int, count: int, on_progress: Callable[[float], None]) -> Validation:
+        """The first `count` scenes of the seed that follows `seed`, simulated."""
+        samples = []
+        for index in range(count):
+            samples.append(sample_of(ranges, seed + OTHER_SEED, index))
+            on_progress((index + 1) / count)
+        return cls(samples)
+
+    def judge(self, network: Guess, step: int) -> None:
+        """A row for each number of views."""
+        for count in self._counts():
+            scores = [_scores(network, each)[:2] for each in self._lessons(count)]
+            self.rows.append((step, count, *np.mean(scores, axis=0)))
+
+    def last(self) -> str:
+        """The newest rows in words."""
+        counts = len(self._counts())
+        return ", ".join(f"{int(views)} views {best:.3f}" for _, views, _, best in self.rows[-counts:])
+
+    def write(self, folder: Path) -> None:
+        """Write all rows, whole or not at all."""
+        with atomic_path(folder / FILE) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(("step", "views", "dice_guess", "dice"))
+            writer.writerows([f"{value:.6g}" for value in row] for row in self.rows)
+
+    def card(self, network: Guess, trained_on: dict[str, Any], made_by: dict[str, str]) -> Card:
+        """What `network` scores here, as a card."""
+        scores, typical = {}, {}
+        for count in self._counts():
+            found = np.array([_scores(network, each) for each in self._lessons(count)])
+            scores[str(count)] = {"dice": float(found[:, 1].mean()), "scenes": float(len(found))}
+            typical[str(count)] = float(np.percentile(found[:, 2], MOST))
+        return Card(trained_on, {}, made_by, scores, typical)
+
+    def _counts(self) -> list[int]:
+        most = min(int((~sample.is_test).sum()) for sample in self.samples)
+        return [count for count in COUNTS if count <= most]
+
+    def _lessons(self, count: int) -> Sequence[Lesson]:
+        return [whole(sample, count) for sample in self.samples]
+
+
+def _scores(network: Guess, shown: Lesson) -> tuple[float, float, float]:
+    """Dice of the guess and of the corrected one, and what that leaves unexplained."""
+    device = next(network.parameters()).device
+    shown = shown.on(str(device))
+    with torch.inference_mode():
+        first, second = network(shown.images, shown.taps)
+        left = unexplained(torch.sigmoid(second), shown.images, shown.taps)
+    return dice(first, shown.occupancy), dice(second, shown.occupancy), left
