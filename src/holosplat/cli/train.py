@@ -27,9 +27,9 @@ def train(
     """
     from ..report.learning import training_curves
     from ..training.folder import Dataset
+    from ..training.made_by import made_by
     from ..training.train import Training
     from ..training.validate import Validation
-    from ..workflows.provenance import environment
 
     scenes = Dataset.read(data)
     scenes.require_whole()
@@ -43,6 +43,6 @@ def train(
         except KeyboardInterrupt:
             print(f"interrupted; {out} keeps the last checkpoint, go on with --resume", file=sys.stderr)
             raise SystemExit(INTERRUPTED) from None
-    weights = training.finish(told, environment("cuda" if how.device == "cuda" else "cpu"))
+    weights = training.finish(told, made_by(how.device))
     print(f"Dice of scenes of another seed: {told.last()}")
     print(f"wrote {weights} and {training_curves(out)}")

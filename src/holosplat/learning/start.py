@@ -25,6 +25,8 @@ from .weights import Trained, read_weights
 STAGE = "learned start"
 MOST_COLUMNS = 128
 """Pixels across that the network sees, at most: larger frames are binned."""
+CLEARLY = 0.75
+"""What larger pixels may leave unexplained, over what smaller ones leave: these show shapes better."""
 FEWEST = 32
 """Rows and columns of binned frames, at least."""
 
@@ -68,16 +70,18 @@ class Guessed:
 def guessed(scan: Scan, material: DeltaBeta, network: Guess, on_progress: Progress) -> Guessed:
     """The occupancy of `material` that `network` guesses from the frames of `scan`.
 
-    The network knows bodies of some pixels across. So frames are shown on pixels of several sizes, and what explains
-    the retrieved thickness best is taken, by what the largest of these pixels show. Errors: those of phase retrieval.
+    The network knows bodies of some pixels across. So frames are shown on pixels of two sizes, and the larger ones are
+    taken where they explain the retrieved thickness clearly better, by what they show of it. Errors: those of phase retrieval.
     """
     on_progress(STAGE, 0.0)
     factors, found = _factors(scan), list[Guessed]()
     for done, factor in enumerate(factors):
         found.append(_on_pixels(scan.binned(factor) if factor > 1 else scan, material, network))
         on_progress(STAGE, (done + 1) / len(factors))
-    left = [each.left(factors[-1] // factor) for each, factor in zip(found, factors)]
-    return found[left.index(min(left))]
+    finer, *coarser = found
+    if coarser and coarser[0].left() < CLEARLY * finer.left(factors[1] // factors[0]):
+        return coarser[0]
+    return finer
 
 
 def _factors(scan: Scan) -> Sequence[int]:

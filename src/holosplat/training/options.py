@@ -16,7 +16,7 @@ from ..ranges import Natural, Positive, Rate, Seed, Share, Weight, ranged
 class Shown:
     """How samples are shown, so that few scenes stand for many."""
 
-    views: tuple[Natural, ...] = (2, 2, 2, 3, 3, 3, 4, 4, 5, 6)
+    views: tuple[Natural, ...] = (2, 2, 2, 2, 3, 3, 3, 4, 5, 6)
     """Numbers of views, each as often as it stands here."""
     first_two: Share = 0.6
     """Share of pairs of views that are the first two, which are nearly at right angles in many scenes."""
