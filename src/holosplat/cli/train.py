@@ -34,6 +34,7 @@ def train(
     scenes = Dataset.read(data)
     scenes.require_whole()
     training = (Training.resumed if resume else Training.begun)(scenes, out, how)
+    who = made_by(how.device)  # before files change under a night's work
     with ProgressBar() as bar:
         told = Validation.of(
             scenes.ranges, scenes.seed, how.validation, lambda fraction: bar.show("scenes to validate", fraction, {})
@@ -43,6 +44,6 @@ def train(
         except KeyboardInterrupt:
             print(f"interrupted; {out} keeps the last checkpoint, go on with --resume", file=sys.stderr)
             raise SystemExit(INTERRUPTED) from None
-    weights = training.finish(told, made_by(how.device))
+    weights = training.finish(told, who)
     print(f"Dice of scenes of another seed: {told.last()}")
     print(f"wrote {weights} and {training_curves(out)}")

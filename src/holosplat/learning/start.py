@@ -71,7 +71,8 @@ def guessed(scan: Scan, material: DeltaBeta, network: Guess, on_progress: Progre
     """The occupancy of `material` that `network` guesses from the frames of `scan`.
 
     The network knows bodies of some pixels across. So frames are shown on pixels of two sizes, and the larger ones are
-    taken where they explain the retrieved thickness clearly better, by what they show of it. Errors: those of phase retrieval.
+    taken where they explain the retrieved thickness clearly better, by what they show of it. Errors: those of phase
+    retrieval.
     """
     on_progress(STAGE, 0.0)
     factors, found = _factors(scan), list[Guessed]()
