@@ -1,0 +1,134 @@
+"""Objects that take holograms for photographs: splats laid over each other, and a radiance field. No waves.
+
+Their frames are composited front to back (`projectors.compositing`), whatever the distance, the energy and the blur of
+an exposure are. As matter they are what makes them opaque: a Gaussian's opacity is its peak value (the density of
+Guédon & Lepetit 2024, SuGaR, eq. 1), a field's density its value, in the unit of `matter`.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterable
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+from torch.nn.functional import softplus
+
+from ..checks import require
+from ..geometry import Grid, Poses, Views
+from ..matter import Matter
+from ..projectors.compositing import composite, photograph
+from .gaussians import PARAMETERS, GaussianCloud, raw_of
+from .initialise import random_cloud
+from .neural_field import CHUNK, Network, NeuralField, uniform
+
+FIRST_OPACITY = 0.1
+"""Of every Gaussian at a random start (as in the published program of Kerbl et al. 2023)."""
+FIRST_THICKNESS = 1.0
+"""Optical thickness of a radiance field's box at its start, so that its far side is seen, too."""
+
+
+class AlphaCloud(GaussianCloud):
+    """Gaussians with an opacity and a grey value each, which hide what is behind them (Kerbl et al. 2023).
+
+    raw_amplitudes [N, 1]: opacities before the logistic function; raw_greys [N, 1]: grey values, relative to the flat
+    field, before softplus; the others are those of `GaussianCloud`. `matter` is one: its δ and β are those of a value
+    of one of `Σ opacity exp(-½ (x-c)ᵀ Σ⁻¹ (x-c))`. Errors: `InputError` if the arrays do not fit together.
+    """
+
+    kind: ClassVar[str] = "alpha-gaussians"
+    names = (*PARAMETERS, "raw_greys")
+
+    def __init__(self, parameters: Iterable[Tensor], unit_length: float, matter: Matter) -> None:
+        *shared, self.raw_greys = parameters
+        super().__init__(shared, unit_length, matter)
+        shape = tuple(self.raw_greys.shape)
+        require(shape == (len(self), 1), f"raw_greys must have the shape ({len(self)}, 1), but they have {shape}.")
+        require(matter.single, f"splats with opacities are of one material, but matter has {len(matter)} channels.")
+
+    @classmethod
+    def random(cls, count: int, views: Views, matter: Matter, seed: int) -> AlphaCloud:
+        """`count` Gaussians, uniform in the ball that every view sees, of grey values uniform in [0, 2]."""
+        cloud = random_cloud(count, views, matter, 0.0, seed)
+        greys = raw_of(2 * torch.rand(count, 1, generator=torch.Generator().manual_seed(seed)))
+        opacities = torch.full((count, 1), math.log(FIRST_OPACITY / (1 - FIRST_OPACITY)))
+        return cls((cloud.centres, cloud.log_scales, cloud.quaternions, opacities, greys), cloud.unit_length, matter)
+
+    @property
+    def amplitudes(self) -> Tensor:
+        """Opacities [N, 1] at the middle of each Gaussian."""
+        return torch.sigmoid(self.raw_amplitudes)
+
+    def values_times(self, factor: float, index: Tensor) -> dict[str, Tensor]:
+        """Opacities and grey values of the Gaussians `index`: children keep those of their parent, as published."""
+        return {name: getattr(self, name).detach()[index] for name in ("raw_amplitudes", "raw_greys")}
+
+    def made_of(self, matter: Matter) -> AlphaCloud:
+        """The same cloud, whose values stand for other matter."""
+        return self.replaced(self.parameters().values(), matter)
+
+    def photographs(self, views: Views | Poses) -> Tensor:
+        """Photographs [V, H, W], differentiable in the parameters and in the rotations and shifts of poses."""
+        poses = Poses.of(views, self.centres.device) if isinstance(views, Views) else views
+        scale = self.unit_length / poses.pitch
+        values = torch.cat((self.amplitudes, softplus(self.raw_greys)), dim=1)
+        cloud = (*self._scaled(scale), values)
+        views_px = zip(poses.matrices, poses.offsets / poses.pitch)
+        return torch.stack([photograph(*cloud, matrix, shift, poses.shape) for matrix, shift in views_px])
+
+
+class RadianceField(NeuralField):
+    """A field of density and grey value that shines and hides what is behind it (NeRF, Mildenhall et al. 2020).
+
+    It is a `NeuralField` whose network says a grey value, too. The density [1 / voxel edge] is what `project` and
+    `voxelise` see, in the unit of `matter`. The grey value does not depend on the direction of view, and there is one
+    network, without a second, finer sampling. A sample in every depth step of a voxel edge, jittered while gradients
+    are taken.
+    """
+
+    kind: ClassVar[str] = "radiance-field"
+    beside: ClassVar[int] = 1
+
+    def __init__(
+        self, grid: Grid, matter: Matter, network: Network, mask: Tensor, seed: int = 0, upper: float = 0.0
+    ) -> None:
+        super().__init__(grid, matter, network, mask, seed, upper)
+        require(matter.single, f"a radiance field is of one material, but matter has {len(matter)} channels.")
+        first = torch.tensor([FIRST_THICKNESS / max(grid.shape), 1.0])
+        self._weights["output.bias"] = raw_of(first)
+
+    @classmethod
+    def filling(cls, grid: Grid, matter: Matter, network: Network, seed: int) -> RadianceField:
+        """A random field everywhere on `grid`."""
+        return cls(grid, matter, network, torch.ones(grid.shape, dtype=torch.bool), seed)
+
+    def __call__(self, positions: Tensor) -> Tensor:
+        """Densities [N, 1] at positions [N, 3], as `NeuralField` has them."""
+        return self.shining(positions)[:, :1]
+
+    def shining(self, positions: Tensor) -> Tensor:
+        """Densities and grey values [N, 2]."""
+        return softplus(self.raw(positions))
+
+    def made_of(self, matter: Matter) -> RadianceField:
+        """The same field, whose values stand for other matter."""
+        field = copy.copy(self)
+        field.matter = matter
+        return field
+
+    def photographs(self, views: Views | Poses) -> Tensor:
+        """Photographs [V, H, W], differentiable in the weights and in the rotations and shifts of poses."""
+        count = views.shape[0] * views.shape[1]
+        most = count if torch.is_grad_enabled() else max(1, CHUNK // (2 * self._reach()))
+        parts = torch.arange(count, device=self._like.device).split(most)
+        images = [torch.cat([self.rays(views, v, part) for part in parts]) for v in range(len(views))]
+        return torch.stack(images).reshape(-1, *views.shape)
+
+    def rays(self, views: Views | Poses, v: int, chosen: Tensor, jitter: torch.Generator | None = None) -> Tensor:
+        """Intensities [R] of the flat pixels `chosen` [R], ascending, of view `v`; jitter: as for the field."""
+        samples = self.samples(views, v, chosen)
+        offset = 0.5 if jitter is None else uniform(jitter, len(samples.pixel))
+        density, grey = self.shining(self._positions(views, v, samples.pixel, samples.depth + offset)).unbind(1)
+        return composite(density, grey, torch.searchsorted(chosen, samples.pixel), len(chosen))
