@@ -8,20 +8,23 @@ thickness that Paganin's filter finds in the same training frames. The truth is 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 
 from ..checks import at_least, require
 from ..fit.density import DensityControl, DensityEvent
 from ..fit.loop import Fit, Plan
-from ..fit.optimiser import Adam
+from ..fit.optimiser import Adam, Leaves
 from ..fit.problem import Problem
+from ..fit.running import Record
 from ..fit.schedule import Schedule
 from ..fit.terms import Objective
 from ..fit.terms.rays import RandomRays
+from ..fit.trainable import Trainable
 from ..geometry import Grid
 from ..matter import Matter
 from ..model import Instrument, Model
@@ -47,12 +50,12 @@ class AlphaRates(GaussianRates):
     """Of the orientations."""
     raw_amplitudes: Rate = 0.05
     """Of the opacities before the logistic function (0.05 as published)."""
-    raw_greys: Rate = 0.02
-    """Of the grey values before softplus."""
+    raw_greys: Rate = 0.03
+    """Of the grey values before the logistic function."""
 
 
 def _density() -> DensityControl:
-    return DensityControl(every=100, stop=0.5, faint=0.005, max_count=20_000)
+    return DensityControl(every=50, stop=0.5, faint=0.005, max_count=20_000)
 
 
 @dataclass(frozen=True)
@@ -65,19 +68,24 @@ class AlphaSplats:
 
     kind: ClassVar[str] = "alpha-3dgs"
 
-    count: int = 5_000
-    """Gaussians at the start, uniform in the ball that every view sees."""
+    start_per_pixel: float = 0.2
+    """Gaussians at the start for each pixel of a frame, uniform in the ball that every view sees."""
     similarity: Share = 0.2
     """Share of 1 - SSIM in the loss, beside the mean absolute difference (0.2 as published)."""
-    schedule: Schedule = field(default_factory=lambda: Schedule(2000, views_per_step=1, decay=0.01, oversample=1))
+    schedule: Schedule = field(default_factory=lambda: Schedule(1000, views_per_step=1, decay=0.01, oversample=1))
     """Steps, each on one frame as published."""
     rates: AlphaRates = field(default_factory=AlphaRates)
     """Adam's rates."""
     density: DensityControl = field(default_factory=_density)
     """Where Gaussians come and go; children keep the opacity of their parent, as published."""
 
+    reset_every: int = 200
+    """Steps between resets of all opacities (0: never)."""
+    reset_to: Share = 0.01
+    """Opacity that is left then, at most (0.01 as published)."""
+
     def __post_init__(self) -> None:
-        at_least(self, 1, "count")
+        require(self.start_per_pixel > 0, f"start_per_pixel must be positive, but it is {self.start_per_pixel:g}.")
 
     wants_levels: ClassVar[bool] = False
 
@@ -88,8 +96,37 @@ class AlphaSplats:
     def with_effort(self, effort: float) -> AlphaSplats:
         """The same method with `effort` times the steps, at least one."""
         steps = max(1, round(effort * self.schedule.steps))
-        every = max(1, round(effort * self.density.every))
-        return replace(self, schedule=replace(self.schedule, steps=steps), density=replace(self.density, every=every))
+        every, reset = (max(1, round(effort * n)) for n in (self.density.every, self.reset_every))
+        schedule, density = replace(self.schedule, steps=steps), replace(self.density, every=every)
+        return replace(self, schedule=schedule, density=density, reset_every=reset)
+
+
+class OpacityResets:
+    """An event of a fit of splats: every so many steps all become faint, and those that frames need come back."""
+
+    def __init__(self, every: int, opacity: float) -> None:
+        self._every, self._raw = every, math.log(opacity / (1 - opacity))
+
+    def on_gradients(self, leaves: Leaves) -> None:
+        """Nothing."""
+
+    def after_step(self, trainable: Trainable, step: int, steps: int, generator: torch.Generator) -> bool:
+        """Reset, where it is due; not in the second half, in which opacities come back."""
+        if self._every and (step + 1) % self._every == 0 and step + 1 < 0.5 * steps:
+            with torch.no_grad():
+                trainable.leaves["object.raw_amplitudes"].clamp_(max=self._raw)
+        return False
+
+    def columns(self, model: Model) -> Record:
+        """Nothing."""
+        return {}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing: what is due follows from the step."""
+        return {}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Nothing."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +139,9 @@ class SplatStage:
     def start(self, task: Task, before: Stored | None) -> AlphaCloud:
         """Random Gaussians; what their matter is, is not known yet."""
         matter = Matter.one(*assumed_material(task.scan, task.prior, task.on_progress))
-        return AlphaCloud.random(self.options.count, task.scan.views, matter, task.seed)
+        frames = torch.from_numpy(task.scan.frames)
+        count = max(1, round(self.options.start_per_pixel * frames[0].numel()))
+        return AlphaCloud.random(count, task.scan.views, frames, matter, task.seed)
 
     def fit(self, task: Task, start: Stored) -> Fit:
         """The fit to the training frames."""
@@ -115,14 +154,14 @@ class SplatStage:
             how.schedule,
             lambda leaves: Adam(leaves, "cpu"),
             rates=lambda factor, step: how.rates.at(factor, True),
-            events=(DensityEvent(how.density, base.train.views),),
+            events=(DensityEvent(how.density, base.train.views), OpacityResets(how.reset_every, how.reset_to)),
             judge=base.judge,
         )
         return Fit(plan, task.seed)
 
 
 def _network() -> Network:
-    return Network(Encoding(kind="octaves"), hidden=64, layers=4)
+    return Network(Encoding(kind="octaves"), hidden=64, layers=3)
 
 
 @dataclass(frozen=True)
@@ -136,12 +175,12 @@ class RadianceFields:
     kind: ClassVar[str] = "nerf"
 
     network: Network = field(default_factory=_network)
-    """Waves whose periods halve down to about 2 pixels, and four layers of 64 units behind them."""
-    rays: int = 512
+    """Waves whose periods halve down to about 2 pixels, and three layers of 64 units behind them."""
+    rays: int = 256
     """Rays of all frames in a step."""
-    rate: Rate = 0.003
+    rate: Rate = 0.005
     """Adam's first rate of all weights."""
-    schedule: Schedule = field(default_factory=lambda: Schedule(2000, decay=0.1, oversample=1))
+    schedule: Schedule = field(default_factory=lambda: Schedule(1000, decay=0.1, oversample=1))
     """Steps; they look at rays of all frames."""
 
     def __post_init__(self) -> None:
@@ -169,7 +208,8 @@ class RadianceStage:
     def start(self, task: Task, before: Stored | None) -> RadianceField:
         """A random field in the box of all views; what its matter is, is not known yet."""
         matter = Matter.one(*assumed_material(task.scan, task.prior, task.on_progress))
-        return RadianceField.filling(Grid.of_views(task.scan.views), matter, self.options.network, task.seed)
+        frames = torch.from_numpy(task.scan.frames)
+        return RadianceField.filling(Grid.of_views(task.scan.views), frames, matter, self.options.network, task.seed)
 
     def fit(self, task: Task, start: Stored) -> Fit:
         """The fit to the training frames."""

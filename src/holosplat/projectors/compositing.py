@@ -54,11 +54,13 @@ def photograph(
         owner, pixel, _ = pairs(mean, low, high, shape)
         pixel, sorting = pixel.sort(stable=True)
         owner = owner[sorting]
-        at = torch.stack((pixel % shape[1] + 0.5 - shape[1] / 2, pixel // shape[1] + 0.5 - shape[0] / 2), 1)
-    offset, conic = at.to(mean) - mean[owner], torch.linalg.inv(covariance)
-    (xx, xy), yy = conic[:, 0].unbind(1), conic[:, 1, 1]
-    x, y = offset.unbind(1)
-    square = xx[owner] * x * x + 2 * xy[owner] * x * y + yy[owner] * y * y
-    alpha = (opacity[owner] * torch.exp(-0.5 * square)).clamp_max(MOST_OPACITY)
+        column, row = (
+            (n + 0.5 - 0.5 * m).to(mean) for n, m in ((pixel % shape[1], shape[1]), (pixel // shape[1], shape[0]))
+        )
+    conic = torch.linalg.inv(covariance)
+    each = torch.stack((*mean.unbind(1), conic[:, 0, 0], conic[:, 0, 1], conic[:, 1, 1], opacity, grey))
+    mx, my, xx, xy, yy, opacity, grey = each.index_select(1, owner)
+    x, y = column - mx, row - my
+    alpha = (opacity * torch.exp(-0.5 * (xx * x * x + yy * y * y) - xy * x * y)).clamp_max(MOST_OPACITY)
     alpha = torch.where(alpha < LEAST_OPACITY, 0.0, alpha)
-    return composite(-torch.log1p(-alpha), grey[owner], pixel, shape[0] * shape[1]).reshape(shape)
+    return composite(-torch.log1p(-alpha), grey, pixel, shape[0] * shape[1]).reshape(shape)

@@ -8,9 +8,8 @@ Guédon & Lepetit 2024, SuGaR, eq. 1), a field's density its value, in the unit 
 from __future__ import annotations
 
 import copy
-import math
-from collections.abc import Iterable
-from typing import ClassVar
+from collections.abc import Iterable, Mapping
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -26,16 +25,16 @@ from .neural_field import CHUNK, Network, NeuralField, uniform
 
 FIRST_OPACITY = 0.1
 """Of every Gaussian at a random start (as in the published program of Kerbl et al. 2023)."""
-FIRST_THICKNESS = 1.0
-"""Optical thickness of a radiance field's box at its start, so that its far side is seen, too."""
+FIRST_THICKNESS = 0.1
+"""Optical thickness of a radiance field's box at its start: what frames do not ask for is then hardly there."""
 
 
 class AlphaCloud(GaussianCloud):
     """Gaussians with an opacity and a grey value each, which hide what is behind them (Kerbl et al. 2023).
 
-    raw_amplitudes [N, 1]: opacities before the logistic function; raw_greys [N, 1]: grey values, relative to the flat
-    field, before softplus; the others are those of `GaussianCloud`. `matter` is one: its δ and β are those of a value
-    of one of `Σ opacity exp(-½ (x-c)ᵀ Σ⁻¹ (x-c))`. Errors: `InputError` if the arrays do not fit together.
+    raw_amplitudes, raw_greys [N, 1]: opacities, and grey values between the two of `greys`, before the logistic
+    function; the others are those of `GaussianCloud`. `matter` is one: its δ and β are those of a value of one of `Σ
+    opacity exp(-½ (x-c)ᵀ Σ⁻¹ (x-c))`. Errors: `InputError` if the arrays do not fit together.
     """
 
     kind: ClassVar[str] = "alpha-gaussians"
@@ -44,17 +43,41 @@ class AlphaCloud(GaussianCloud):
     def __init__(self, parameters: Iterable[Tensor], unit_length: float, matter: Matter) -> None:
         *shared, self.raw_greys = parameters
         super().__init__(shared, unit_length, matter)
+        self.greys = (0.0, 1.0)
+        """The darkest and the brightest grey value, relative to the flat field."""
         shape = tuple(self.raw_greys.shape)
         require(shape == (len(self), 1), f"raw_greys must have the shape ({len(self)}, 1), but they have {shape}.")
         require(matter.single, f"splats with opacities are of one material, but matter has {len(matter)} channels.")
 
     @classmethod
-    def random(cls, count: int, views: Views, matter: Matter, seed: int) -> AlphaCloud:
-        """`count` Gaussians, uniform in the ball that every view sees, of grey values uniform in [0, 2]."""
-        cloud = random_cloud(count, views, matter, 0.0, seed)
-        greys = raw_of(2 * torch.rand(count, 1, generator=torch.Generator().manual_seed(seed)))
-        opacities = torch.full((count, 1), math.log(FIRST_OPACITY / (1 - FIRST_OPACITY)))
-        return cls((cloud.centres, cloud.log_scales, cloud.quaternions, opacities, greys), cloud.unit_length, matter)
+    def random(cls, count: int, views: Views, frames: Tensor, matter: Matter, seed: int) -> AlphaCloud:
+        """`count` Gaussians, uniform in the ball that every view sees, of grey values that random pixels of `frames`
+        have; the darkest and the brightest of these bound all grey values."""
+        start = random_cloud(count, views, matter, 0.0, seed)
+        chosen = torch.randint(frames.numel(), (count, 1), generator=torch.Generator().manual_seed(seed))
+        low, high = range_of(frames)
+        raw = torch.logit((frames.flatten()[chosen] - low) / (high - low), 0.01)
+        opacities = torch.full((count, 1), FIRST_OPACITY).logit()
+        cloud = cls((start.centres, start.log_scales, start.quaternions, opacities, raw), start.unit_length, matter)
+        cloud.greys = low, high
+        return cloud
+
+    def replaced(self, parameters: Iterable[Tensor], matter: Matter | None = None) -> AlphaCloud:
+        """A cloud of other tensors in the same units."""
+        cloud = super().replaced(parameters, matter)
+        cloud.greys = self.greys
+        return cloud
+
+    def state(self) -> dict[str, Any]:
+        """Tensors and plain values that `from_state` makes the same cloud of."""
+        return {**super().state(), "greys": list(self.greys)}
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> AlphaCloud:
+        """The cloud that `state` described; `InputError` where it does not fit together."""
+        cloud = super().from_state(state)
+        cloud.greys = checked_range(state["greys"])
+        return cloud
 
     @property
     def amplitudes(self) -> Tensor:
@@ -73,7 +96,7 @@ class AlphaCloud(GaussianCloud):
         """Photographs [V, H, W], differentiable in the parameters and in the rotations and shifts of poses."""
         poses = Poses.of(views, self.centres.device) if isinstance(views, Views) else views
         scale = self.unit_length / poses.pitch
-        values = torch.cat((self.amplitudes, softplus(self.raw_greys)), dim=1)
+        values = torch.cat((self.amplitudes, between(self.greys, self.raw_greys)), dim=1)
         cloud = (*self._scaled(scale), values)
         views_px = zip(poses.matrices, poses.offsets / poses.pitch)
         return torch.stack([photograph(*cloud, matrix, shift, poses.shape) for matrix, shift in views_px])
@@ -95,14 +118,30 @@ class RadianceField(NeuralField):
         self, grid: Grid, matter: Matter, network: Network, mask: Tensor, seed: int = 0, upper: float = 0.0
     ) -> None:
         super().__init__(grid, matter, network, mask, seed, upper)
+        self.greys = (0.0, 1.0)
+        """The darkest and the brightest grey value, relative to the flat field."""
         require(matter.single, f"a radiance field is of one material, but matter has {len(matter)} channels.")
-        first = torch.tensor([FIRST_THICKNESS / max(grid.shape), 1.0])
-        self._weights["output.bias"] = raw_of(first)
+        density = raw_of(torch.tensor([FIRST_THICKNESS / max(grid.shape)]))
+        self._weights["output.bias"] = torch.cat((density, torch.zeros(1)))
 
     @classmethod
-    def filling(cls, grid: Grid, matter: Matter, network: Network, seed: int) -> RadianceField:
-        """A random field everywhere on `grid`."""
-        return cls(grid, matter, network, torch.ones(grid.shape, dtype=torch.bool), seed)
+    def filling(cls, grid: Grid, frames: Tensor, matter: Matter, network: Network, seed: int) -> RadianceField:
+        """A random field everywhere on `grid`; the darkest and brightest of `frames` bound its grey values."""
+        field = cls(grid, matter, network, torch.ones(grid.shape, dtype=torch.bool), seed)
+        field.greys = range_of(frames)
+        return field
+
+    def state(self) -> dict[str, Any]:
+        """Tensors and plain values that `from_state` makes the same field of."""
+        return {**super().state(), "greys": list(self.greys)}
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> RadianceField:
+        """The field that `state` described; `InputError` where it does not fit together."""
+        field = super().from_state(state)
+        assert isinstance(field, RadianceField)
+        field.greys = checked_range(state["greys"])
+        return field
 
     def __call__(self, positions: Tensor) -> Tensor:
         """Densities [N, 1] at positions [N, 3], as `NeuralField` has them."""
@@ -110,7 +149,8 @@ class RadianceField(NeuralField):
 
     def shining(self, positions: Tensor) -> Tensor:
         """Densities and grey values [N, 2]."""
-        return softplus(self.raw(positions))
+        density, grey = self.raw(positions).split(1, dim=1)
+        return torch.cat((softplus(density), between(self.greys, grey)), dim=1)
 
     def made_of(self, matter: Matter) -> RadianceField:
         """The same field, whose values stand for other matter."""
@@ -123,12 +163,40 @@ class RadianceField(NeuralField):
         count = views.shape[0] * views.shape[1]
         most = count if torch.is_grad_enabled() else max(1, CHUNK // (2 * self._reach()))
         parts = torch.arange(count, device=self._like.device).split(most)
-        images = [torch.cat([self.rays(views, v, part) for part in parts]) for v in range(len(views))]
-        return torch.stack(images).reshape(-1, *views.shape)
+        rays = ((self.along(views, v, part), len(part)) for v in range(len(views)) for part in parts)
+        return torch.cat([self.intensities(*at, number) for at, number in rays]).reshape(-1, *views.shape)
 
-    def rays(self, views: Views | Poses, v: int, chosen: Tensor, jitter: torch.Generator | None = None) -> Tensor:
-        """Intensities [R] of the flat pixels `chosen` [R], ascending, of view `v`; jitter: as for the field."""
+    def along(
+        self, views: Views | Poses, v: int, chosen: Tensor, jitter: torch.Generator | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Positions [S, 3] on rays of the flat pixels `chosen` [R], ascending, of view `v`, and the ray [S] of each.
+
+        jitter: draws where in its depth step each lies (None: in the middle).
+        """
         samples = self.samples(views, v, chosen)
         offset = 0.5 if jitter is None else uniform(jitter, len(samples.pixel))
-        density, grey = self.shining(self._positions(views, v, samples.pixel, samples.depth + offset)).unbind(1)
-        return composite(density, grey, torch.searchsorted(chosen, samples.pixel), len(chosen))
+        ray = torch.searchsorted(chosen, samples.pixel)
+        return self._positions(views, v, samples.pixel, samples.depth + offset), ray
+
+    def intensities(self, positions: Tensor, ray: Tensor, count: int) -> Tensor:
+        """Intensities [count] of rays by what `along` says of them."""
+        density, grey = self.shining(positions).unbind(1)
+        return composite(density, grey, ray, count)
+
+
+def between(greys: tuple[float, float], raw: Tensor) -> Tensor:
+    """Numbers between the two of `greys`: all of a photograph's range, however small the contrast of the frames is."""
+    low, high = greys
+    return low + (high - low) * torch.sigmoid(raw)
+
+
+def range_of(frames: Tensor) -> tuple[float, float]:
+    """The darkest and the brightest pixel."""
+    return float(frames.min()), float(frames.max())
+
+
+def checked_range(greys: Any) -> tuple[float, float]:
+    """`greys` of a file; `InputError` for what is no range."""
+    low, high = (float(value) for value in greys)
+    require(low < high, f"greys must be the darkest and the brightest grey value, but they are {low:g} and {high:g}.")
+    return low, high

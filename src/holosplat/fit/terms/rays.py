@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
+from torch import Tensor
 
 from ...model import Model
 from ...representations import RadianceField
@@ -31,8 +32,12 @@ class RandomRays:
         """The one part."""
         field, generator = model.object, self._generator
         assert isinstance(field, RadianceField)
-        parts = []
+        positions, rays, measured = list[Tensor](), list[Tensor](), self._frames.new_zeros(0)
         for v, frame in enumerate(self._frames):
             chosen = (uniform(generator, self._of_each) * len(frame)).long().unique()
-            parts.append((field.rays(self._views, v, chosen, generator) - frame[chosen]).square())
-        return [Part("rays", 1.0, torch.cat(parts).mean())]
+            at, ray = field.along(self._views, v, chosen, generator)
+            positions.append(at)
+            rays.append(ray + len(measured))
+            measured = torch.cat((measured, frame[chosen]))
+        found = field.intensities(torch.cat(positions), torch.cat(rays), len(measured))
+        return [Part("rays", 1.0, (found - measured).square().mean())]
