@@ -76,6 +76,7 @@ class AlphaCloud(GaussianCloud):
     def from_state(cls, state: Mapping[str, Any]) -> AlphaCloud:
         """The cloud that `state` described; `InputError` where it does not fit together."""
         cloud = super().from_state(state)
+        assert isinstance(cloud, AlphaCloud)
         cloud.greys = checked_range(state["greys"])
         return cloud
 
