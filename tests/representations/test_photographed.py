@@ -89,6 +89,19 @@ def test_an_even_field_is_an_even_slab():
     assert torch.allclose(lines, torch.tensor(0.05 * SHAPE[1] * PIXEL * MATTER.delta), rtol=1e-5, atol=0)
 
 
+def test_a_black_field_casts_the_shadow_of_its_density():
+    """By Beer and Lambert, of line integrals that neural fields have anyway; from any side."""
+    black = field()
+    weights = {name: p.clone() for name, p in black.parameters().items()}
+    weights["output.weight"] *= torch.tensor([[30.0], [0.0]])
+    weights["output.bias"][1] = -40.0
+    black = black.with_parameters(weights)
+    black.greys = 0.0, 1.0
+    depth = black.project(VIEWS)[1] / (MATTER.delta * PIXEL)
+    assert float(depth.max() - depth.min()) > 0.5
+    assert torch.allclose(black.photographs(VIEWS), torch.exp(-depth), atol=1e-5)
+
+
 def test_gradients_of_a_field_are_those_of_finite_differences():
     start = field().to(dtype=torch.float64)
     names = list(start.parameters())
