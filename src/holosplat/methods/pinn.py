@@ -39,7 +39,7 @@ def _objective() -> Objective:
 
 
 def _schedule() -> Schedule:
-    return Schedule(steps=300, views_per_step=8, decay=0.1)
+    return Schedule(steps=200, views_per_step=8, decay=0.1)
 
 
 def _start() -> HolographicTV:
@@ -59,7 +59,7 @@ class PinnFit:
     """Adam's first rate of the coefficients of the matter, logarithms of odds."""
     flow_rate: Rate = 0.01
     """The same of the velocity's weights."""
-    flow_steps: int = 200
+    flow_steps: int = 150
     """Steps of the velocity alone, beside the matter of each time by itself."""
     weight: Weight = 0.05
     """Weight of total variation, in voxel edges of thickness."""

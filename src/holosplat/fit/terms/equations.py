@@ -38,7 +38,7 @@ class Equations:
     squares of thickness [pixels], mean over frames. A weight of zero leaves the equation out.
     """
 
-    continuity: Weight = 1.0
+    continuity: Weight = 0.3
     """r: what an occupancy changes by, from one time to the next, that the flow does not explain."""
     divergence: Weight = 10.0
     """r: what a volume grows by, from one time to the next, as a share. A velocity without divergence by construction
@@ -48,7 +48,7 @@ class Equations:
     next]."""
     viscosity: Small | None = None
     """Kinematic viscosity ν [m²/s], with which inertia counts (Navier and Stokes); without, it does not (Stokes)."""
-    points: int = 2048
+    points: int = 1024
     """Random places of a step, all at one random time, for continuity."""
     momentum_points: int = 128
     """The same for momentum, whose derivatives are of third order."""
