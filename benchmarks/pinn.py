@@ -53,9 +53,9 @@ EQUATIONS = ("none", "curl", "free")
 
 @dataclass(frozen=True)
 class Row:
-    """Of one field. dice, error: of occupancy, means over the times; least_dice: of the worst time; velocity_error: mean
-    distance from the true velocity over its mean size, at the nodes of the membranes half way from one time to the next;
-    aligned: cosine between the two; cpu_seconds: of the fit, and start_seconds of the start."""
+    """Of one field. dice, error: of occupancy, means over the times; least_dice: of the worst time; velocity_error:
+    mean distance from the true velocity over its mean size, at the nodes of the membranes half way from one time to
+    the next; aligned: cosine between the two; cpu_seconds: of the fit, and start_seconds of the start."""
 
     case: str
     views: int
