@@ -4,10 +4,11 @@
 
 `channel`: four red cells of 8 µm that Poiseuille's flow between the walls of a round tube carries along the rotation
 axis, at six times, two pixels a time on the tube's axis; every point of a membrane goes with the flow, so that cells
-shear and turn, and the equations hold exactly. Images of 64 × 48 pixels of 0.5 µm (20 keV, 10 cm, 1000 photons a
+shear and turn, and the equations hold exactly. `swirl`: the same cells, which turn about the axis like a solid body, by
+40° over all times; that obeys the equations, too. Images of 64 × 48 pixels of 0.5 µm (20 keV, 10 cm, 1000 photons a
 pixel, haemoglobin, which is known). `espresso` (with DATA, the snapshots of an ESPResSo run, as for motion.py): cells
 with membranes of their own in a rectangular channel, every second snapshot, on 64 × 48 pixels of 1 µm; there cells also
-enter and leave. Views are even over 180°. Each seed has other photons and another start; in `channel` other cells, too.
+enter and leave. Views are even over 180°. Each seed has other photons and another start, and but for `espresso` other cells.
 
 Three fields are fitted to the same frames from the same start, each time by itself: without equations, with a velocity
 without divergence by construction, and with three free components whose divergence is a term. With --write rows stand
@@ -20,7 +21,7 @@ import argparse
 import csv
 import platform
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import astuple, dataclass, fields, replace
 from itertools import product
 from pathlib import Path
@@ -45,7 +46,9 @@ MATERIAL = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
 CELLS, BOX, WALL, PEAK = 4, (22e-6, 22e-6, 22e-6), 14e-6, 5e-6
 """Of `channel`: red cells, the box in which they are at half time [m], radius of the tube [m], and way of the fluid on
 its axis over all times [m]."""
-PIXELS = {"channel": 0.5e-6, "espresso": 1e-6}
+TURN = np.radians(40)
+"""Of `swirl`: over all times."""
+PIXELS = {"channel": 0.5e-6, "swirl": 0.5e-6, "espresso": 1e-6}
 EVERY = 2
 """Snapshots of ESPResSo from one time to the next."""
 EQUATIONS = ("none", "curl", "free")
@@ -72,18 +75,28 @@ class Row:
     commit: str
 
 
-def channel(seed: int) -> MeshSeries:
-    """Red cells that a flow along y carries, whose speed falls with the square of the distance from the axis."""
+def carried(seed: int, motion: Callable[[np.ndarray, float], np.ndarray]) -> MeshSeries:
+    """Red cells whose nodes [P, 3] a `motion` carries; its time goes from -1/2 to 1/2."""
     cells = hs.specimens.random_cells(CELLS, BOX, seed)
-    snapshots = []
-    for part in np.linspace(-0.5, 0.5, TIMES):
-        moved = []
-        for cell in cells:
-            x, _, z = cell.vertices.T
-            way = part * PEAK * (1 - (x**2 + z**2) / WALL**2)
-            moved.append(TriangleMesh(cell.vertices + way[:, None] * [0.0, 1.0, 0.0], cell.faces, cell.name))
-        snapshots.append(hs.MeshScene.of_one_material(moved, MATERIAL))
-    return MeshSeries(tuple(snapshots), np.linspace(0.0, 1e-3, TIMES))
+    snapshots = tuple(
+        hs.MeshScene.of_one_material(
+            [TriangleMesh(motion(cell.vertices, part), cell.faces, cell.name) for cell in cells], MATERIAL
+        )
+        for part in np.linspace(-0.5, 0.5, TIMES)
+    )
+    return MeshSeries(snapshots, np.linspace(0.0, 1e-3, TIMES))
+
+
+def channel(nodes: np.ndarray, part: float) -> np.ndarray:
+    """A flow along y, whose speed falls with the square of the distance from the axis."""
+    x, _, z = nodes.T
+    return nodes + (part * PEAK * (1 - (x**2 + z**2) / WALL**2))[:, None] * [0.0, 1.0, 0.0]
+
+
+def swirl(nodes: np.ndarray, part: float) -> np.ndarray:
+    """A turn about y."""
+    c, s = np.cos(TURN * part), np.sin(TURN * part)
+    return nodes @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]).T
 
 
 def espresso(data: Path) -> MeshSeries:
@@ -146,7 +159,7 @@ def fitted(how: Pinn, start: SpaceTimeField, task: Task) -> SpaceTimeField:
 
 def rows_of(case: str, views: int, seed: int, chosen: list[str], data: Path | None) -> Iterator[Row]:
     """The start, and the field of each of the `chosen` equations."""
-    cells = channel(seed) if data is None else espresso(data)
+    cells = espresso(data) if data is not None else carried(seed, {"channel": channel, "swirl": swirl}[case])
     scan = imaged(cells, views, PIXELS[case], seed)
     grid = Grid.of_views(scan.views)
     truth = [cells.at(t).voxelise(grid) for t in cells.times]

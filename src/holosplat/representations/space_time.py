@@ -162,7 +162,7 @@ class SpaceTimeField:
         raw = torch.logit(inner / upper) if upper else inner + torch.log(-torch.expm1(-inner))
         inverse = tuple(torch.linalg.pinv(axis.double(), rtol=1e-3) for axis in start._axes)
         nodes = torch.stack([along_axes(each, inverse) for each in raw.double()])  # pyright: ignore[reportArgumentType]
-        fitted = basis.fitted(times, nodes.numpy())
+        fitted = basis.fitted(*_between(times, nodes.numpy(), basis.count))
         return start.with_parameters({"coefficients": torch.from_numpy(fitted).float()})
 
     def parameters(self) -> dict[str, Tensor]:
@@ -270,6 +270,16 @@ class SpaceTimeField:
         options = from_table(SpaceTime, state["options"], "options")
         matter, upper = Matter.from_dict(state["matter"]), float(state["upper"])
         return cls(state["coefficients"], state["weights"], grid, basis, matter, options, upper)
+
+
+def _between(times: np.ndarray, nodes: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Times and values [T, …] as they are, or, where they are fewer than `count`, on straight lines between them."""
+    if len(times) >= count:
+        return times, nodes
+    finer = np.linspace(times[0], times[-1], 2 * count)
+    index = np.clip(np.searchsorted(times, finer, side="right") - 1, 0, len(times) - 2)
+    part = ((finer - times[index]) / (times[index + 1] - times[index])).reshape(-1, *[1] * (nodes.ndim - 1))
+    return finer, (1 - part) * nodes[index] + part * nodes[index + 1]
 
 
 def lattice_of(grid: Grid, cell: float) -> Lattice:
