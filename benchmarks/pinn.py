@@ -4,11 +4,12 @@
 
 `channel`: four red cells of 8 µm that Poiseuille's flow between the walls of a round tube carries along the rotation
 axis, at six times, two pixels a time on the tube's axis; every point of a membrane goes with the flow, so that cells
-shear and turn, and the equations hold exactly. `swirl`: the same cells, which turn about the axis like a solid body, by
-40° over all times; that obeys the equations, too. Images of 64 × 48 pixels of 0.5 µm (20 keV, 10 cm, 1000 photons a
+shear and turn, and the equations hold exactly. `swirl`: such cells, which turn about the axis like a solid body, by 40°
+over all times; that obeys the equations, too. Images of 64 × 48 pixels of 0.5 µm (20 keV, 10 cm, 1000 photons a
 pixel, haemoglobin, which is known). `espresso` (with DATA, the snapshots of an ESPResSo run, as for motion.py): cells
 with membranes of their own in a rectangular channel, every second snapshot, on 64 × 48 pixels of 1 µm; there cells also
-enter and leave. Views are even over 180°. Each seed has other photons and another start, and but for `espresso` other cells.
+enter and leave. Views are even over 180°. Each seed has other photons and another start, and but for `espresso` other
+cells.
 
 Three fields are fitted to the same frames from the same start, each time by itself: without equations, with a velocity
 without divergence by construction, and with three free components whose divergence is a term. With --write rows stand

@@ -19,7 +19,6 @@ from ..method import Method
 SCHEMA = 2
 """Version of what config.json says of a method. Version 1 is that of holosplat 0.1, which did not name it."""
 FOLDER = Path(__file__).parent
-EVERY = METHODS | OF_SERIES
 DEFAULT = "default"
 OLD_RATES = {
     "rate_position": "centres",
@@ -47,9 +46,10 @@ def preset(name: str) -> Gaussians:
 
 def method_called(name: str) -> Method:
     """The method called `name` with its options by default; `InputError` listing the names otherwise."""
-    if name not in EVERY:
-        raise InputError(f"method must be one of {', '.join(EVERY)}, but it is {name!r}.")
-    return EVERY[name]
+    every = METHODS | OF_SERIES
+    if name not in every:
+        raise InputError(f"method must be one of {', '.join(every)}, but it is {name!r}.")
+    return every[name]
 
 
 def chosen_method(
@@ -89,7 +89,7 @@ def method_of(table: dict[str, Any], where: str = "options") -> Method:
     """
     values = dict(_modern(table))
     base, kind = values.pop("base", None), values.get("kind")
-    kinds = {type(method).kind: type(method) for method in EVERY.values()}
+    kinds = {type(method).kind: type(method) for method in (METHODS | OF_SERIES).values()}
     known = kind is None or kind in list(kinds)
     require(known, f"{where}.kind must be one of {', '.join(kinds)}, but it is {kind!r}.")
     if base is None:
@@ -102,9 +102,10 @@ def method_of(table: dict[str, Any], where: str = "options") -> Method:
 
 
 def _based_on(name: str) -> Method:
-    known = dict.fromkeys((*preset_names(), *EVERY))
+    every = METHODS | OF_SERIES
+    known = dict.fromkeys((*preset_names(), *every))
     require(name in known, f"base must be one of {', '.join(known)}, but it is {name!r}.")
-    return EVERY[name] if name in EVERY else preset(name)
+    return every[name] if name in every else preset(name)
 
 
 def _modern(options: dict[str, Any]) -> dict[str, Any]:
