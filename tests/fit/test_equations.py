@@ -195,7 +195,7 @@ def test_terms_are_integrals_over_the_field_in_voxel_edges_and_steps():
     still = {n: torch.zeros_like(p) for n, p in field.parameters().items()}
     still["coefficients"] += torch.tensor([-0.01, 0.0, 0.01])[:, None, None, None]
     found = made.with_parameters({f"object.{n}": p for n, p in still.items()})
-    parts = {p.name: p for p in term(Equations(momentum=0.0))(found, NOW)}
+    parts = {p.name: p for p in term(Equations(continuity=1.0, momentum=0.0))(found, NOW)}
     assert set(parts) == {"continuity", "divergence"}
     assert float(parts["divergence"].value) == 0
     assert parts["continuity"].weight == 0.5  # of two frames a time
