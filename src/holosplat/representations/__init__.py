@@ -19,6 +19,7 @@ from .moving_gaussians import MovingGaussians
 from .moving_surfaces import MovingSurfaces
 from .neural_field import Network, NeuralField
 from .paths import TimeBasis
+from .photographed import AlphaCloud, RadianceField
 from .space_time import SpaceTime, SpaceTimeField
 from .surfaces import SurfaceMesh
 from .voxel_lines import VoxelLines
@@ -71,7 +72,10 @@ class Stored(TrainableObject, Protocol):
 
 KINDS: dict[str, type[Stored]] = {
     kind.kind: kind
-    for kind in (GaussianCloud, VoxelGrid, SurfaceMesh, MovingSurfaces, MovingGaussians, NeuralField, SpaceTimeField)
+    for kind in (
+        *(GaussianCloud, VoxelGrid, SurfaceMesh, MovingSurfaces, MovingGaussians, NeuralField),
+        *(SpaceTimeField, AlphaCloud, RadianceField),
+    )
 }
 """Every kind of Object that files hold, by name."""
 MOVING = (MovingSurfaces, MovingGaussians, SpaceTimeField)
@@ -80,6 +84,7 @@ MOVING = (MovingSurfaces, MovingGaussians, SpaceTimeField)
 __all__ = [
     "KINDS",
     "MOVING",
+    "AlphaCloud",
     "Encoding",
     "Flow",
     "GaussianCloud",
@@ -88,6 +93,7 @@ __all__ = [
     "MovingSurfaces",
     "Network",
     "NeuralField",
+    "RadianceField",
     "SpaceTime",
     "SpaceTimeField",
     "Stored",
