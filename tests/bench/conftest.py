@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import pytest
 
@@ -10,12 +11,21 @@ import holosplat as hs
 from helpers.bench_shop import Recorder
 from helpers.contract import two_balls
 from helpers.once import Once, once
+from helpers.short import in_one_go
 from holosplat.bench.methods import METHODS
 
 
 @pytest.fixture
 def recorder() -> Recorder:
     return Recorder()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _no_search_for_garbage() -> Iterator[None]:
+    """The benchmark looks for garbage before each method, for its memory; here that is a third of a row."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("holosplat.bench.run.gc", SimpleNamespace(collect=lambda: None))
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -28,6 +38,6 @@ def scan() -> hs.Scan:
 def decided() -> Iterator[None]:
     """All methods ask the same of the same frames: what their matter is, and what a first volume shows."""
     memory = Once()
-    with once(memory):
+    with once(memory), in_one_go():
         yield
     assert 0 < len(memory.made) < len(METHODS)
