@@ -21,13 +21,11 @@ pytestmark = pytest.mark.usefixtures("unjudged_runs")
 
 START = ["volume.retrieval=20", "volume.iterations=30", "volume.corrections=2", "volume.inner=8", "volume.refine=1"]
 CLOUD = [*START, "spacing_px=2", "approximate_steps=5", "fit.schedule.steps=30"]
-NETWORK = ["fit.network.encoding.levels=3", "fit.network.encoding.features=2", "fit.network.hidden=16"]
-FEW = ["fit.network.layers=1", "fit.schedule.steps=8"]
 QUICK: dict[str, list[str]] = {
     "gaussians": CLOUD,
     "surfaces": [*(f"gaussians.{change}" for change in CLOUD), "fit.schedule.steps=6"],
     "voxels": [*START, "fit.steps=6", "fit.coarse_steps=4"],
-    "neural-field": [*START, *NETWORK, "fit.warmup_steps=40", "fit.warmup_rays=1024", "fit.probes=512", *FEW],
+    "neural-field": [*START, "fit.warmup_steps=40", "fit.warmup_rays=1024", "fit.probes=512", "fit.schedule.steps=8"],
     "holographic-tv": START,
     "tikhonov-tv": [],
 }

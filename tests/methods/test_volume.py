@@ -188,7 +188,8 @@ def plainly(scan: Scan, options: SmoothVolume) -> torch.Tensor:
 def test_a_fit_in_steps_is_one_descent_after_another(quiet, sigma, monkeypatch):
     """Bit for bit, and so is one that goes on from a saved state, wherever it was stopped."""
     monkeypatch.setattr(smooth_fit, "EXPLAINED", math.inf)  # so short a fit explains nothing
-    scan = noisy(quiet, sigma, 1) if sigma else quiet
+    few = quiet[[0, 2, 4, 6]]
+    scan = noisy(few, sigma, 1) if sigma else few
     options = SmoothVolume(QUICK, coarser=(2,), rounds=2, iterations=2)
     wanted = plainly(scan, options)
     task = Task(scan, RATIO)
