@@ -11,7 +11,6 @@ import holosplat as hs
 from helpers.bench_shop import Recorder
 from helpers.contract import two_balls
 from helpers.once import Once, once
-from helpers.short import in_one_go
 from holosplat.bench.methods import METHODS
 
 
@@ -38,6 +37,6 @@ def scan() -> hs.Scan:
 def decided() -> Iterator[None]:
     """All methods ask the same of the same frames: what their matter is, and what a first volume shows."""
     memory = Once()
-    with once(memory), in_one_go():
+    with once(memory):
         yield
     assert 0 < len(memory.made) < len(METHODS)
