@@ -142,6 +142,18 @@ def test_frames_whose_last_column_alone_is_quiet_are_no_error():
     assert not find_air(tensor(frame[None])).any()
 
 
+@pytest.mark.parametrize("shape", [(64, 64), (45, 71)])
+def test_fringes_in_air_without_any_noise_are_neither_air_nor_noise(shape):
+    y, x = np.mgrid[: shape[0], : shape[1]]
+    edge = np.exp(-0.5 * (np.hypot(y - 22, x - 30) - 9) ** 2)
+    frame = torch.from_numpy(1 + np.where(edge > 1e-4, 0.05 * edge * np.cos(3 * edge), 0.0))[None]
+
+    air = find_air(frame)[0]
+
+    assert not air[frame[0] != 1].any() and float(air.float().mean()) > 0.2
+    assert float(NoiseModel.of_frames(frame).white) < 1e-6
+
+
 @pytest.mark.parametrize("box", [(0, 0, 0, 5), (0, 5, 3, 40), (-1, 5, 0, 5)])
 def test_boxes_must_lie_in_the_frame(box):
     with pytest.raises(InputError, match="--air"):

@@ -24,6 +24,9 @@ QUIET, QUIET_POWER = 0.1, 0.62
 one pixel (measured on frames of 96²)."""
 CAP = 10.0
 """Power counts up to so many times the noise's: an edge of metal does not hide the air far beside it."""
+ROUNDED = 1e-10
+"""Noise has this part of the largest power at least: simulated air may be even to the last digit, and without noise at
+all the strongest fringe would not stand out."""
 ACTIVE = 2.2
 """From so many times the noise's power on there are fringes; noise has as much in two pixels of a thousand."""
 MARGIN = 3
@@ -86,7 +89,8 @@ def _air(frame: np.ndarray) -> np.ndarray:
     bright = smooth >= DARKER * min(np.quantile(smooth, BRIGHT), np.quantile(smooth[:, [0, -1]], BRIGHT_BESIDE))
     unbound = gaussian_filter(power, WINDOW, mode="nearest")
     limit = float(np.quantile(unbound[bright], QUIET))
-    noise, found = limit / QUIET_POWER, np.zeros(frame.shape, dtype=bool)
+    noise = max(limit / QUIET_POWER, ROUNDED * float(power.max()))
+    found = np.zeros(frame.shape, dtype=bool)
     quiet = _finest(frame / level)[(unbound <= limit)[:-1, :-1]]
     fine = WHITE_POWER * float(quiet.mean()) if quiet.size else 0.0
     if noise > max(NOISE_LIKE * fine, FAINT * float(power.mean())):
