@@ -19,6 +19,7 @@ from .moving_gaussians import MovingGaussians
 from .moving_surfaces import MovingSurfaces
 from .neural_field import Network, NeuralField
 from .paths import TimeBasis
+from .photographed import AlphaCloud, RadianceField
 from .surfaces import SurfaceMesh
 from .voxel_lines import VoxelLines
 from .voxels import VoxelGrid
@@ -69,12 +70,17 @@ class Stored(TrainableObject, Protocol):
 
 
 KINDS: dict[str, type[Stored]] = {
-    kind.kind: kind for kind in (GaussianCloud, VoxelGrid, SurfaceMesh, MovingSurfaces, MovingGaussians, NeuralField)
+    kind.kind: kind
+    for kind in (
+        *(GaussianCloud, VoxelGrid, SurfaceMesh, MovingSurfaces, MovingGaussians, NeuralField),
+        *(AlphaCloud, RadianceField),
+    )
 }
 """Every kind of Object that files hold, by name."""
 
 __all__ = [
     "KINDS",
+    "AlphaCloud",
     "Encoding",
     "Flow",
     "GaussianCloud",
@@ -83,6 +89,7 @@ __all__ = [
     "MovingSurfaces",
     "Network",
     "NeuralField",
+    "RadianceField",
     "Stored",
     "SurfaceMesh",
     "TimeBasis",
