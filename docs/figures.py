@@ -131,6 +131,9 @@ TABLES |= {
         ("hair", measured.hair),
     )
 }
+TABLES["pinn"] = Table(
+    runs.pinn, ("pinn.csv",), "python benchmarks/pinn.py --cases channel swirl --write", "half an hour"
+)
 TABLES["bed"] = Table(
     measured.bed, ("real_data.csv",), "python benchmarks/packed_bed.py --data FOLDER --work FOLDER", "an hour"
 )
