@@ -45,7 +45,10 @@ def _bind_kernels_to_the_interpreter() -> None:
     Triton decides so when a kernel is defined, by an environment variable. It is taken away again: only tests that
     ask for the fixture `gpu` shall see it, no other test and no subprocess.
     """
+    from helpers.interpreter import spare_repetitions
+
     os.environ["TRITON_INTERPRET"] = "1"
+    spare_repetitions()
     try:
         for package in KERNELS:
             importlib.import_module(f"holosplat.{package}.cuda")

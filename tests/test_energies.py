@@ -197,6 +197,7 @@ def test_an_instrument_of_several_energies_is_several_instruments(backend, dtype
         assert found[[i]].numpy() == pytest.approx(wanted.numpy(), abs=1e-6)
 
 
+@pytest.mark.usefixtures("unjudged_runs")
 def test_a_reconstruction_takes_each_frame_at_its_own_energy():
     """Frames of 16 and 28 keV in turn, of the formula's own values: as well as of one energy, and far better than as if
     all had the same."""

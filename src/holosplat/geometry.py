@@ -68,8 +68,8 @@ class Views:
     def __post_init__(self) -> None:
         rotations = finite("view rotation", np.asarray(self.rotations, dtype=np.float64))
         shaped("view rotation", rotations, (None, 3, 3))
-        gram = rotations @ rotations.transpose(0, 2, 1)
-        proper = np.allclose(gram, np.eye(3), atol=1e-6) and np.all(np.linalg.det(rotations) > 0)
+        off = np.abs(rotations @ rotations.transpose(0, 2, 1) - np.eye(3))
+        proper = np.all(off <= 1e-6 + 1e-5 * np.eye(3)) and np.all(np.linalg.det(rotations) > 0)
         require(bool(proper), "view rotation must hold proper rotation matrices (R Rᵀ = 1, det R = 1).")
         shifts = finite("detector shift", np.asarray(self.shifts, dtype=np.float64))
         shaped("detector shift", shifts, (len(rotations), 2))

@@ -199,6 +199,7 @@ def _library(forced: str) -> ctypes.CDLL:
     return _open(_folder(), forced or choices[-1])
 
 
+@cache
 def _open(folder: Path, isa: str) -> ctypes.CDLL:
     """One build, if it was compiled from the same interface as this file."""
     path = _path(folder, isa)

@@ -58,6 +58,7 @@ def test_weights_are_the_light_that_is_left():
     assert photons_left(0.02 * lines, scan.exposures, DeltaBeta(RATIO * SOFT, SOFT)) is None
 
 
+@pytest.mark.usefixtures("unjudged_runs")
 @pytest.mark.parametrize("name", ["holographic-tv", "voxels"])
 def test_gelatine_beside_a_metal_bead(name):
     """Mean δ of the gelatine within 5 %, of the bead within 15 %, at 5000 photons."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import pytest
 
 import holosplat as hs
 from helpers.bench_shop import Recorder
-from helpers.contract import two_balls
+from helpers.contract import PHOTOGRAPHS, two_balls
 from helpers.once import Once, once
 from holosplat.bench.methods import METHODS
 
@@ -18,6 +19,14 @@ def recorder() -> Recorder:
     return Recorder()
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _no_search_for_garbage() -> Iterator[None]:
+    """The benchmark looks for garbage before each method, for its memory; here that is a third of a row."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("holosplat.bench.run.gc", SimpleNamespace(collect=lambda: None))
+        yield
+
+
 @pytest.fixture(scope="module")
 def scan() -> hs.Scan:
     """The frames of the contract of methods."""
@@ -25,9 +34,13 @@ def scan() -> hs.Scan:
 
 
 @pytest.fixture(scope="module")
-def decided() -> Iterator[None]:
-    """All methods ask the same of the same frames: what their matter is, and what a first volume shows."""
+def decided(request) -> Iterator[None]:
+    """All methods but those of photographs ask the same of the same frames: what their matter is, and what a first
+    volume shows."""
     memory = Once()
     with once(memory):
         yield
-    assert 0 < len(memory.made) < len(METHODS)
+    asking = [name for name in METHODS if name not in PHOTOGRAPHS]
+    here = [item.name for item in request.session.items if item.path == request.path]
+    asked = any(test.endswith(f"{name}]") for test in here for name in asking)
+    assert asked <= len(memory.made) < len(METHODS)

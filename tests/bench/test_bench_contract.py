@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import holosplat as hs
-from helpers.contract import MATERIAL, PITCH, QUICK, SCENE, SHAPE, run, usable
+from helpers.contract import MATERIAL, PHOTOGRAPHS, PITCH, QUICK, SCENE, SHAPE, run, usable
 from holosplat.bench.method import Method
 from holosplat.bench.methods import METHODS
 from holosplat.model import Instrument, Model
@@ -71,14 +71,15 @@ def test_a_method_gives_an_object(result, scan):
     assert bool(torch.isfinite(frames).all())
 
 
-def test_a_method_finds_the_matter_where_it_is(result, scan):
-    """Even in a few steps: not mirrored, not shifted, and with the sign of δ."""
+def test_a_method_finds_the_matter_where_it_is(result, scan, method):
+    """Even in a few steps: not mirrored, not shifted, and with the sign of δ; without waves, in fog and with rims."""
     grid = hs.Grid.of_views(scan.views)
     found, true = (obj.voxelise(grid).delta.astype(np.float64) for obj in (result, SCENE))
     mirrored = [np.flip(true, axis) for axis in range(3)]
     correlation = [np.corrcoef(found.ravel(), other.ravel())[0, 1] for other in (true, *mirrored)]
-    assert correlation[0] > 0.4
-    assert correlation[0] > max(correlation[1:]) + 0.2
+    least, ahead = (0.2, 0.1) if method.name in PHOTOGRAPHS else (0.4, 0.2)
+    assert correlation[0] > least
+    assert correlation[0] > max(correlation[1:]) + ahead
 
 
 def test_a_method_is_right_whatever_the_unit_of_length(method, result, scan):

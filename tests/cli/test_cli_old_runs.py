@@ -74,6 +74,7 @@ def test_surfaces_are_cut_out_of_it(run, tmp_path):
     assert "2 bodies of" in done.err
 
 
+@pytest.mark.usefixtures("unjudged_runs")
 def test_its_settings_run_today(run, tmp_path):
     options = ["--config", run / "config.json", "--material", "haemoglobin", "--seed", 7]
     worked(holosplat("reconstruct", SCAN, "--out", tmp_path / "new", *options))

@@ -83,6 +83,7 @@ def test_what_cannot_be_shown_is_refused(shop, pages, tmp_path):
     assert pages == []
 
 
+@pytest.mark.usefixtures("unjudged_runs")
 def test_a_fit_is_followed(shop, pages, tmp_path):
     worked(holosplat("reconstruct", shop.scan, "--out", tmp_path / "run", *known(shop), "--view"))
     (page,) = pages

@@ -13,12 +13,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import h5py
+from tyro import _unsafe_cache
 
 from holosplat.baselines import HolographicTV
 from holosplat.cli import main
 from holosplat.fit.schedule import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.methods import FitOptions, Gaussians
+
+_unsafe_cache.clear_cache = lambda: None  # what the parser has read of docstrings and types it reads once a process
 
 PIXEL = 3.2e-6
 ROWS, COLUMNS = 24, 28

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,15 +11,28 @@ import pytest
 import holosplat as hs
 from helpers.unjudged import unjudged
 from holosplat.bench.method import Method
+from holosplat.bench.methods import PHOTOGRAPHS as PHOTOGRAPHIC
 from holosplat.bench.methods import methods
+from holosplat.fit.density import DensityControl
+from holosplat.methods.photographs import AlphaRates, AlphaSplats, RadianceFields
+from holosplat.representations import Encoding, Network
 from holosplat.specimens.red_cells import icosphere
 
 MATERIAL = hs.DeltaBeta(2e-7, 2e-10)
 PITCH = 1e-6
 SHAPE = (24, 31)
-QUICK = methods(effort=0.05) | {"neural-field": methods(effort=0.12)["neural-field"]}
+SPLATS = AlphaSplats(0.15, rates=AlphaRates(0.05, 0.03, 0.01, 0.2, 0.1), reset_every=0)
+SPLATS = replace(SPLATS, schedule=replace(SPLATS.schedule, steps=30, decay=0.2), density=DensityControl(20))
+FIELD = RadianceFields(Network(Encoding(kind="octaves"), hidden=32), rays=96, rate=0.02).with_effort(0.06)
+PHOTOGRAPHS = {
+    method.name: replace(method, options=SPLATS if method.name == "alpha-3dgs" else FIELD)
+    for method in methods().values()
+    if method.family == PHOTOGRAPHIC
+}
+"""Methods without waves, in few and larger steps."""
+QUICK = methods(effort=0.05) | {"neural-field": methods(effort=0.12)["neural-field"]} | PHOTOGRAPHS
 """The same methods with a small part of their steps: the contract is about form, not about quality."""
-QUICKER = methods(effort=0.05)
+QUICKER = methods(effort=0.05) | PHOTOGRAPHS
 """With a still smaller part, where finite numbers are all that is asked for."""
 NEEDS = {"paganin-svmbir": "svmbir"}
 """Methods that need a package of the extra `bench`."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from importlib import import_module
 
 import numpy as np
 import pytest
@@ -15,12 +16,14 @@ from holosplat.geometry import Views
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import Auto, Gaussians, Task, levels, settled
 from holosplat.methods.cross_validation import CrossValidation, MissingMatter
-from holosplat.methods.levels import LevelTest, decide_matter, flattened
+from holosplat.methods.levels import Decision, LevelTest, decide_matter, flattened
 from holosplat.optics.background import Light, LightOptions
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
 from holosplat.specimens.soft_matter import soft_cells
+
+pytestmark = pytest.mark.usefixtures("begun_once")
 
 MATERIAL = DeltaBeta(4e-7, 4e-7 / 1500)
 PIXEL, SHAPE = 1e-6, (45, 52)  # rectangular, and odd
@@ -30,6 +33,11 @@ RATIO = MaterialPrior.of_ratio(MATERIAL.ratio)
 def measured(scene, photons: float | None = None) -> Scan:
     exposures = Exposures.of(Views.evenly_spaced(9, SHAPE, PIXEL), 20.0, 0.1)
     return simulate(scene, exposures, photons_per_pixel=photons, seed=3, is_test=np.zeros(9, dtype=bool))
+
+
+def decided(task: Task) -> Decision:
+    """As runs decide, once for the same frames (`begun_once`)."""
+    return import_module("holosplat.methods.solve").decide_matter(task, LevelTest())
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +53,7 @@ def sharp() -> Scan:
 
 @pytest.mark.parametrize("prior", [RATIO, MaterialPrior.known(MATERIAL)], ids=["ratio", "known"])
 def test_a_continuum_is_told_from_levels_whatever_is_known(soft, sharp, prior):
-    continuous, levels = (decide_matter(Task(scan, prior)) for scan in (soft, sharp))
+    continuous, levels = (decided(Task(scan, prior)) for scan in (soft, sharp))
     assert (continuous.matter, continuous.sure) == ("continuous", True)
     assert (levels.matter, levels.sure) == ("levels", True)
     assert "views set aside" in continuous.why
@@ -89,7 +97,7 @@ def test_in_uneven_light_a_known_material_has_levels(soft):
     found = decide_matter(Task(soft, MaterialPrior.known(MATERIAL), lit=lit))
     assert (found.matter, found.sure) == ("levels", True)
     assert "uneven light" in found.why
-    assert decide_matter(Task(soft, MaterialPrior.known(MATERIAL))).matter == "continuous"
+    assert decided(Task(soft, MaterialPrior.known(MATERIAL))).matter == "continuous"
     assert decide_matter(Task(soft, RATIO, lit=lit)).matter == "continuous"
 
 

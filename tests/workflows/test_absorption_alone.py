@@ -144,6 +144,7 @@ def test_a_wide_fan_of_few_rows_reconstructs_by_default():
     assert found.verdict.good
 
 
+@pytest.mark.usefixtures("undrawn_reports")
 def test_the_commands_run_in_contact_on_one_row(tmp_path):
     """reconstruct, evaluate, render; what is said of δ is that it is not told."""
     scan, run = contact_scan([BALL], (1, 41), photons=20000), tmp_path / "run"

@@ -33,6 +33,7 @@ def scan(photons: float | None) -> Scan:
     return simulate(MeshScene.of_one_material(cells, CELL), exposures, photons_per_pixel=photons)
 
 
+@pytest.mark.usefixtures("unjudged_runs")
 @pytest.mark.parametrize("photons", [None, 300.0])
 def test_the_weights_that_noise_and_views_make_are_kept(tmp_path, photons):
     folder = RunFolder(tmp_path / "run")
@@ -49,6 +50,7 @@ def test_the_weights_that_noise_and_views_make_are_kept(tmp_path, photons):
     assert 0 < found["noise_width"] < 1
 
 
+@pytest.mark.usefixtures("unjudged_runs")
 def test_a_prior_that_knows_no_level_leaves_its_terms_out(tmp_path):
     folder = RunFolder(tmp_path / "run")
     reconstruct(scan(None), MaterialPrior.unknown(), QUICK, folder=folder)

@@ -13,6 +13,7 @@ import torch
 
 import holosplat.workflows.reconstruct as module
 from helpers.runs import KNOWN, PIXEL, RANDOM, scene
+from helpers.short import in_one_go
 from helpers.two_balls import NETWORK
 from helpers.unjudged import unjudged
 from holosplat.baselines import HolographicTV
@@ -87,7 +88,7 @@ CASES = {
 
 @pytest.fixture(scope="module", autouse=True)
 def _unjudged() -> Iterator[None]:
-    with unjudged():
+    with unjudged(), in_one_go():
         yield
 
 
@@ -156,7 +157,7 @@ def test_every_stage_has_its_metrics(case, whole):
     """Those of the last one in metrics.csv, of the others beside it."""
     assert {path.name for path in whole.path.glob("metrics*.csv")} == {"metrics.csv", *case.first}
     kind = "volume" if case.method is SMOOTH else load_reconstruction(whole).object.kind
-    steps = {"surfaces": 6, "voxels": 7, "volume": 24, "neural-field": 7, "gaussians": 12}[kind]
+    steps = {"surfaces": 6, "voxels": 7, "volume": 12, "neural-field": 7, "gaussians": 12}[kind]
     assert [int(row["step"]) for row in rows(whole.metrics)] == list(range(1, steps + 1))
     assert all(float(row["loss"]) > 0 for row in rows(whole.metrics))
 

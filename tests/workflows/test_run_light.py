@@ -122,6 +122,7 @@ def test_a_run_finds_light_keeps_it_and_draws_it(tmp_path, undrawn_reports):
     assert "Uneven light." in page
 
 
+@pytest.mark.usefixtures("unjudged_runs")
 def test_light_in_common_is_kept_with_the_run_and_evaluated_in(tmp_path):
     scan, _ = lit(8, 0.0)
     pattern = 1 + 0.01 * np.random.default_rng(2).standard_normal(SHAPE)
@@ -144,6 +145,7 @@ def test_light_in_common_is_kept_with_the_run_and_evaluated_in(tmp_path):
     assert other.light is None  # of another raster
 
 
+@pytest.mark.usefixtures("unjudged_runs")
 def test_light_that_a_method_solves_for_is_kept_with_the_run():
     scan, _ = lit(6, 0.0)
     rows = np.cos(np.pi * (np.arange(SHAPE[0]) + 0.5) / SHAPE[0])

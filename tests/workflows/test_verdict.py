@@ -142,7 +142,7 @@ def test_runs_carry_their_verdict(tmp_path, scan):
 
 @pytest.mark.usefixtures("undrawn_reports")
 def test_strict_runs_end_with_3_where_frames_are_not_explained(tmp_path):
-    """Uneven light: a warning and 0, with --strict 3; the same scan with even light: 0."""
+    """Uneven light: with --strict 3; without, when the finished run is resumed, a warning and 0. Even light: 0."""
     method = ["--method", "holographic-tv", "--delta-beta", f"{MATERIAL[0] / MATERIAL[1]:.0f}"]
     even = a_scan(soft(3.0))
     modes = smooth_modes(SHAPE, 3)
@@ -160,9 +160,10 @@ def test_strict_runs_end_with_3_where_frames_are_not_explained(tmp_path):
     worked(outcomes["even"])
     assert "warning" not in outcomes["even"].err
     assert re.search(r"total δ \S+ m³ ± \S+ %", outcomes["even"].out)
-    lax = worked(holosplat("reconstruct", tmp_path / "uneven.nxs", "--out", tmp_path / "lax", *method))
+    uneven_again = ("reconstruct", tmp_path / "uneven.nxs", "--out", tmp_path / "uneven", *method, "--resume")
+    lax = worked(holosplat(*uneven_again))
     assert "warning: the frames are not explained" in lax.err
-    page = (tmp_path / "lax" / "report.html").read_text()
+    page = (tmp_path / "uneven" / "report.html").read_text()
     assert "Are the frames explained?" in page
     assert "What is left of the training frames." in page
     assert "what the volume holds" in page

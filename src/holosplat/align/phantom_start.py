@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import torch
 from scipy.ndimage import gaussian_filter, maximum_filter
-from scipy.signal import fftconvolve
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -109,6 +108,8 @@ def find_beads(thickness: Tensor, views: Views, radius: float) -> np.ndarray:
     A centre is where a ball holds more of the occupancy than anywhere within `APART` radii, and enough (`SEEN`).
     Errors: `InputError` where there is none, and for balls of less than a pixel.
     """
+    from scipy.signal import fftconvolve  # which imports all of scipy.stats
+
     pixel = views.pixel_size
     reach = radius / pixel
     require(reach >= 1, f"beads must have a radius of a pixel at least, but --beads is {reach:.2g} pixels; correct it.")

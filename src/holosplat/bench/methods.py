@@ -8,6 +8,7 @@ from typing import Any
 
 from ..methods import Auto, Gaussians, HolographicVoxels, NeuralFields, PerView, SmoothVolume, Surfaces, Voxels
 from ..methods.per_view import SVMBIR
+from ..methods.photographs import AlphaSplats, RadianceFields
 from ..methods.presets import preset
 from .aligners import ALIGNERS
 from .method import Method
@@ -17,12 +18,13 @@ VOXELS = "voxels through the waves"
 NEURAL = "neural field through the waves"
 GAUSSIANS = "Gaussians through the waves"
 SURFACES = "surfaces through the waves"
+PHOTOGRAPHS = "holograms taken for photographs, without waves"
 AUTO = "chosen by the frames"
 
 
 def methods(effort: float = 1.0) -> dict[str, Method]:
     """Name → method. effort: share of the steps of those that fit in many steps (1: as published)."""
-    table = (*_per_view(), *_through_waves(effort))
+    table = (*_as_photographs(effort), *_per_view(), *_through_waves(effort))
     return {method.name: method for method in table}
 
 
@@ -49,6 +51,15 @@ def _per_view() -> list[Method]:
     }
     rows += [(f"{name}-tv", f"{what}, total variation in [0, 1]", PerView(name, "tv")) for name, what in others.items()]
     return [Method(name, PER_VIEW, summary, options) for name, summary, options in rows]
+
+
+def _as_photographs(effort: float) -> list[Method]:
+    """Both from a random start."""
+    splats, field = AlphaSplats().with_effort(effort), RadianceFields().with_effort(effort)
+    return [
+        Method(splats.kind, PHOTOGRAPHS, "opaque Gaussians laid over each other (Kerbl et al. 2023)", splats),
+        Method(field.kind, PHOTOGRAPHS, "radiance field with positional encoding (Mildenhall et al. 2020)", field),
+    ]
 
 
 def _through_waves(effort: float) -> list[Method]:

@@ -12,7 +12,7 @@ from ..checks import finite, require
 from ..model import Alignment, Instrument, LightField, Model, smooth_modes
 from ..ranges import Weight, ranged
 from ..scan import Exposures
-from ..volume import LineIntegrals, Object
+from ..volume import LineIntegrals, Object, Photographed
 
 COMMON = ("mass", "absorption", "distance", "blur", "shift_x", "shift_y")
 """Changes that all views share, whose effect on frames is measured."""
@@ -213,7 +213,8 @@ def _changes(one: Model) -> Tensor:
     """[P, h, w//2 + 1] derivatives of one view's frame, transformed: by each of `COMMON`, and by modes of the light.
 
     Mass and absorption by a relative change of δ and β, and of β alone; distance by a relative change; blur by the
-    variance of the point-spread function [pixels²]; shifts of the detector [pixels]; light by a factor's modes.
+    variance of the point-spread function [pixels²]; shifts of the detector [pixels]; light by a factor's modes. Of
+    photographs the first four explain nothing.
     """
     exposures, time = one.instrument.exposures, float(one.instrument.times[0])
     planned = one.alignment or Alignment()
@@ -234,12 +235,20 @@ def _changes(one: Model) -> Tensor:
         shifts = moved if planned.shifts is None else planned.shifts.cpu() + moved
         return replace(one, alignment=replace(planned, shifts=shifts)).frames().double().cpu()
 
-    here, more = seen(), 1 + STEP
+    photographed = isinstance(one.object, Photographed)
+    here, more = one.frames().double().cpu() if photographed else seen(), 1 + STEP
+    waves = (
+        [here.new_zeros(here.shape)] * 4
+        if photographed
+        else [
+            (seen(of(more, more)) - here) / STEP,
+            (seen(of(1.0, more)) - here) / STEP,
+            (seen(z=distance * more) - here) / STEP,
+            (seen(s=(sigma.square() + STEP_BLUR).sqrt()) - here) / STEP_BLUR,
+        ]
+    )
     found = [
-        (seen(of(more, more)) - here) / STEP,
-        (seen(of(1.0, more)) - here) / STEP,
-        (seen(z=distance * more) - here) / STEP,
-        (seen(s=(sigma.square() + STEP_BLUR).sqrt()) - here) / STEP_BLUR,
+        *waves,
         (shifted(STEP_PX, 0.0) - here) / STEP_PX,
         (shifted(0.0, STEP_PX) - here) / STEP_PX,
     ]

@@ -65,6 +65,11 @@ class Instrument:
         return Poses.of(self.views, self.device)
 
     @cached_property
+    def detector(self) -> Poses:
+        """The views on the detector's own pixels, for what is no wave."""
+        return Poses.of(self.exposures.views, self.device)
+
+    @cached_property
     def times(self) -> np.ndarray:
         """The distinct times of the exposures [s], in order."""
         return np.unique(self.exposures.time)

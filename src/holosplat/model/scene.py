@@ -13,7 +13,7 @@ from torch import Tensor
 from ..checks import require
 from ..geometry import Poses, Views
 from ..scan import Exposures
-from ..volume import Component, LineIntegrals, Object, TrainableObject
+from ..volume import Component, LineIntegrals, Object, Photographed, TrainableObject
 from .alignment import Alignment
 from .instrument import Instrument
 from .light import LightField, SolvedLight
@@ -88,10 +88,13 @@ class Model:
         matter = self.object.at(float(time))
         if isinstance(matter, Component):  # it takes poses, which cost no time to make
             assert isinstance(matter, TrainableObject)
-            return LineIntegrals.of_any(matter.project(self._poses(index)))
+            return LineIntegrals.of_any(matter.project(self._poses(self.instrument.poses, index)))
         return LineIntegrals.of_any(matter.project(self._views(index)))
 
     def _seen(self, time: float, index: Tensor | None) -> Tensor:
+        matter = self.object.at(time)
+        if isinstance(matter, Photographed):
+            return matter.photographs(self._poses(self.instrument.detector, index))
         lines, planned, alignment = self.lines(time, index), self.instrument.exposures, self.alignment
         if alignment is None:
             return self.instrument.frames(lines, index)
@@ -107,15 +110,14 @@ class Model:
         parts = [self._seen(float(of[at[0]]) + delay, torch.from_numpy(chosen[at]).to(device)) for at in places]
         return torch.cat(parts)[torch.from_numpy(np.argsort(np.concatenate(places))).to(device)]
 
-    def _poses(self, index: Tensor | None) -> Poses:
-        planned, pixel = self.instrument.poses, self.instrument.exposures.views.pitch
+    def _poses(self, planned: Poses, index: Tensor | None) -> Poses:
         if self.alignment is not None:
-            return self.alignment.poses(planned, pixel, index)
+            return self.alignment.poses(planned, self.instrument.exposures.views.pitch, index)
         return planned if index is None else planned[index]
 
     def _views(self, index: Tensor | None) -> Views:
         if self.alignment is not None:
-            return self._poses(index).views()
+            return self._poses(self.instrument.poses, index).views()
         return self.instrument.views if index is None else self.instrument.views[index.cpu().numpy()]
 
 

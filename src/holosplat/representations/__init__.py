@@ -19,6 +19,8 @@ from .moving_gaussians import MovingGaussians
 from .moving_surfaces import MovingSurfaces
 from .neural_field import Network, NeuralField
 from .paths import TimeBasis
+from .photographed import AlphaCloud, RadianceField
+from .space_time import SpaceTime, SpaceTimeField
 from .surfaces import SurfaceMesh
 from .voxel_lines import VoxelLines
 from .voxels import VoxelGrid
@@ -69,12 +71,20 @@ class Stored(TrainableObject, Protocol):
 
 
 KINDS: dict[str, type[Stored]] = {
-    kind.kind: kind for kind in (GaussianCloud, VoxelGrid, SurfaceMesh, MovingSurfaces, MovingGaussians, NeuralField)
+    kind.kind: kind
+    for kind in (
+        *(GaussianCloud, VoxelGrid, SurfaceMesh, MovingSurfaces, MovingGaussians, NeuralField),
+        *(SpaceTimeField, AlphaCloud, RadianceField),
+    )
 }
 """Every kind of Object that files hold, by name."""
+MOVING = (MovingSurfaces, MovingGaussians, SpaceTimeField)
+"""Those that are of several times."""
 
 __all__ = [
     "KINDS",
+    "MOVING",
+    "AlphaCloud",
     "Encoding",
     "Flow",
     "GaussianCloud",
@@ -83,6 +93,9 @@ __all__ = [
     "MovingSurfaces",
     "Network",
     "NeuralField",
+    "RadianceField",
+    "SpaceTime",
+    "SpaceTimeField",
     "Stored",
     "SurfaceMesh",
     "TimeBasis",

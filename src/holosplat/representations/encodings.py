@@ -25,13 +25,15 @@ class Encoding:
     """Options of an encoding.
 
     kind: `hash`, grids of features of several resolutions (Müller et al. 2022), stored in full where they fit into
-    `2^log2_size` entries and hashed beyond; or `fourier`, sines and cosines of random waves (Tancik et al. 2020).
+    `2^log2_size` entries and hashed beyond; `fourier`, sines and cosines of random waves (Tancik et al. 2020); or
+    `octaves`, of waves along the axes whose periods halve from the box's to no shorter ones than `finest` [pixels]
+    (Mildenhall et al. 2020, eq. 4).
     hash: `levels` grids of `features` numbers a corner, from cells of `coarsest` to cells of `finest` [pixels];
     fourier: `waves` directions, their frequencies normally distributed with a standard deviation of `bandwidth`
     [cycles a pixel].
     """
 
-    kind: Literal["hash", "fourier"] = "hash"
+    kind: Literal["hash", "fourier", "octaves"] = "hash"
     levels: int = 4
     features: int = 4
     coarsest: float = 16.0
@@ -41,7 +43,7 @@ class Encoding:
     bandwidth: Weight = 0.06
 
     def __post_init__(self) -> None:
-        require(self.kind in ("hash", "fourier"), f"kind must be hash or fourier, but it is {self.kind!r}.")
+        require(self.kind in ENCODINGS, f"kind must be one of {', '.join(ENCODINGS)}, but it is {self.kind!r}.")
         at_least(self, 1, "levels", "features", "waves")
         at_least(self, 4, "log2_size")
         require(
@@ -52,7 +54,7 @@ class Encoding:
 
     def build(self, extent: float, generator: torch.Generator) -> HashGrid | FourierWaves:
         """The encoding of positions in a box whose longest edge is `extent` [pixels]."""
-        return (HashGrid if self.kind == "hash" else FourierWaves)(self, extent, generator)
+        return ENCODINGS[self.kind](self, extent, generator)
 
 
 class HashGrid(nn.Module):
@@ -103,11 +105,27 @@ class FourierWaves(nn.Module):
 
     def __init__(self, options: Encoding, extent: float, generator: torch.Generator) -> None:
         super().__init__()
-        self.width = 2 * options.waves
-        waves = 2 * math.pi * options.bandwidth * torch.randn(3, options.waves, generator=generator)
+        waves = 2 * math.pi * self._frequencies(options, extent, generator)
+        self.width = 2 * waves.shape[1]
         self.register_buffer("waves", waves)
+
+    def _frequencies(self, options: Encoding, extent: float, generator: torch.Generator) -> Tensor:
+        """b [3, waves] [cycles a pixel]."""
+        return options.bandwidth * torch.randn(3, options.waves, generator=generator)
 
     def forward(self, positions: Tensor) -> Tensor:
         """The waves at the positions."""
         phases = positions @ self.get_buffer("waves")
         return torch.cat((phases.sin(), phases.cos()), dim=1)
+
+
+class Octaves(FourierWaves):
+    """The same of waves along each axis, whose frequencies double (Mildenhall et al. 2020, eq. 4)."""
+
+    def _frequencies(self, options: Encoding, extent: float, generator: torch.Generator) -> Tensor:
+        count = 1 + max(0, math.floor(math.log2(extent / options.finest)))
+        return torch.cat([2.0**k / extent * torch.eye(3) for k in range(count)], dim=1)
+
+
+ENCODINGS = {"hash": HashGrid, "fourier": FourierWaves, "octaves": Octaves}
+"""Every encoding by its kind."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
@@ -36,6 +36,8 @@ class GaussianCloud:
 
     kind: ClassVar[str] = "gaussians"
     """The name of this kind of Object in files."""
+    names: ClassVar[tuple[str, ...]] = PARAMETERS
+    """The names of the trainable tensors, in the order in which the cloud is made of them."""
     _repr_html_ = of_object
 
     def __init__(self, parameters: Iterable[Tensor], unit_length: float, matter: Matter) -> None:
@@ -56,7 +58,7 @@ class GaussianCloud:
 
     def parameters(self) -> dict[str, Tensor]:
         """The trainable tensors by name."""
-        return {name: getattr(self, name) for name in PARAMETERS}
+        return {name: getattr(self, name) for name in self.names}
 
     def with_parameters(self, parameters: Mapping[str, Tensor]) -> GaussianCloud:
         """The cloud with other tensors in the place of those named."""
@@ -91,9 +93,9 @@ class GaussianCloud:
         """Size of the parameters as a run folder stores them, float32."""
         return 4 * sum(p.numel() for p in self.parameters().values())
 
-    def replaced(self, parameters: Iterable[Tensor], matter: Matter | None = None) -> GaussianCloud:
+    def replaced(self, parameters: Iterable[Tensor], matter: Matter | None = None) -> Self:
         """A cloud of other tensors in the same units, of the same matter or another."""
-        cloud = GaussianCloud(parameters, self.unit_length, matter or self.matter)
+        cloud = type(self)(parameters, self.unit_length, matter or self.matter)
         cloud.backend = self.backend
         return cloud
 
@@ -116,7 +118,7 @@ class GaussianCloud:
         """The cloud that `state` described; `InputError` where it does not fit together."""
         matter = Matter.from_dict(state["matter"])
         unit = positive("unit_length", state["unit_length"], "metres")
-        return cls([state[name] for name in PARAMETERS], unit, matter)
+        return cls([state[name] for name in cls.names], unit, matter)
 
     def enclosing_grid(self, most_voxels: int) -> Grid:
         """A grid around all centres, of `unit_length` a voxel, or coarser where those would be over `most_voxels`."""

@@ -98,6 +98,8 @@ class NeuralField:
 
     kind: ClassVar[str] = "neural-field"
     """The name of this kind of Object in files."""
+    beside: ClassVar[int] = 0
+    """Outputs of the network beside the channels of matter."""
     _repr_html_ = of_object
 
     def __init__(
@@ -111,7 +113,7 @@ class NeuralField:
         self.grid, self.matter, self.network, self.upper = grid, matter, network, float(upper)
         self.pitch, self.backend = grid.voxel_size[0], "cpu"
         self.jitter: torch.Generator | None = None
-        self._net = Perceptron(network, float(max(grid.shape)), len(matter), seed)
+        self._net = Perceptron(network, float(max(grid.shape)), len(matter) + self.beside, seed)
         self._weights = {name: weight.detach() for name, weight in self._net.named_parameters()}
         self._constants = dict(self._net.named_buffers())
         self.corner = torch.tensor([o - 0.5 * self.pitch for o in grid.origin], dtype=torch.float64) / self.pitch
@@ -189,8 +191,12 @@ class NeuralField:
 
     def __call__(self, positions: Tensor) -> Tensor:
         """Values [N, C] at positions [N, 3] `(x, y, z)` in voxel edges from the box's corner, mask or not."""
-        raw = functional_call(self._net, {**self._weights, **self._constants}, (positions,))
+        raw = self.raw(positions)
         return self.upper * torch.sigmoid(raw) if self.matter.single and self.upper > 0 else softplus(raw)
+
+    def raw(self, positions: Tensor) -> Tensor:
+        """What the network says [N, C + `beside`] at the same positions."""
+        return functional_call(self._net, {**self._weights, **self._constants}, (positions,))
 
     def at(self, time: float) -> NeuralField:
         """The field itself: it does not move."""

@@ -23,15 +23,13 @@ class DenseCloud(GaussianCloud):
     Errors: `InputError` if the arrays do not fit together.
     """
 
+    names = (*PARAMETERS, "raw_densities")
+
     def __init__(self, parameters: Iterable[Tensor], unit_length: float, matter: Matter) -> None:
         *shared, self.raw_densities = parameters
         super().__init__(shared, unit_length, matter)
         shape = tuple(self.raw_densities.shape)
         require(shape == (len(self), 1), f"raw_densities must have the shape ({len(self)}, 1), but they have {shape}.")
-
-    def parameters(self) -> dict[str, Tensor]:
-        """The trainable tensors by name."""
-        return {name: getattr(self, name) for name in (*PARAMETERS, "raw_densities")}
 
     @property
     def densities(self) -> Tensor:
@@ -57,12 +55,6 @@ class DenseCloud(GaussianCloud):
         """The parameters of the Gaussians `index` whose density is `factor` times theirs, with δ and β as they are."""
         weaker = raw_of(self.densities.detach()[index] * factor)
         return {"raw_amplitudes": self.raw_amplitudes.detach()[index], "raw_densities": weaker}
-
-    def replaced(self, parameters: Iterable[Tensor], matter: Matter | None = None) -> DenseCloud:
-        """A cloud of other tensors in the same units."""
-        cloud = DenseCloud(parameters, self.unit_length, matter or self.matter)
-        cloud.backend = self.backend
-        return cloud
 
     def ratios(self) -> Tensor:
         """δ/β [N] of each Gaussian, as its parameters have them."""

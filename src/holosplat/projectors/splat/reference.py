@@ -36,7 +36,7 @@ def splat(
         covariance = covariance + pixel_variance * torch.eye(2).to(covariance)
         with torch.no_grad():
             exact = _projected(centres.double(), scales.double(), quaternions.double(), rotation, shift)
-            low, high = _boxes(*exact, shape, cutoff, pixel_variance)
+            low, high = boxes(*exact, shape, cutoff, pixel_variance)
         peak = mass / (2 * math.pi * torch.linalg.det(covariance).sqrt()[:, None])
         images.append(_draw(mean, covariance, peak, low, high, shape)[None])
     return torch.cat(images)
@@ -56,7 +56,7 @@ def voxelise(
     covariance = axes @ axes.mT + voxel_variance * torch.eye(3).to(axes)
     with torch.no_grad():
         exact = rotation_matrices(quaternions.double()) * scales.double()[:, None]
-        low, high = _boxes(centres.double(), exact @ exact.mT, shape, cutoff, voxel_variance)
+        low, high = boxes(centres.double(), exact @ exact.mT, shape, cutoff, voxel_variance)
     # sqrt(det Σ) is the product of the scales: a determinant would lose thin Gaussians to rounding.
     peak = amplitudes * (scales.prod(1) / torch.linalg.det(covariance).sqrt())[:, None]
     return _draw(centres, covariance, peak, low, high, shape)
@@ -82,13 +82,13 @@ def _projected(
     return centres @ across.mT - shift.to(centres), axes @ axes.mT
 
 
-def _boxes(
-    mean: Tensor, covariance: Tensor, shape: tuple[int, ...], cutoff: float, variance: float
+def boxes(
+    mean: Tensor, covariance: Tensor, shape: tuple[int, ...], cutoff: float | Tensor, variance: float
 ) -> tuple[Tensor, Tensor]:
     """First and last pixel [N, D], as `(x, y[, z])`, of the boxes of the cutoff ellipses, cut to the raster.
 
     A box has the pixels whose centres lie, along every dimension d, within `cutoff · sqrt(Σ_dd + variance)`
-    of the mean. An empty box has its last pixel before its first.
+    of the mean; cutoff: one, or [N, 1]. An empty box has its last pixel before its first.
     """
     counts = torch.tensor(shape[::-1]).to(mean)
     middle = mean + counts / 2 - 0.5
@@ -100,10 +100,21 @@ def _boxes(
 
 def _draw(mean: Tensor, covariance: Tensor, peak: Tensor, low: Tensor, high: Tensor, shape: tuple[int, ...]) -> Tensor:
     """The sum [C, *shape] of Gaussians of peak [N, C] on their boxes, by a list of (Gaussian, pixel)."""
+    owner, address, offset = pairs(mean, low, high, shape)
+    conic = torch.linalg.inv(covariance)
+    square = torch.einsum("pi,pij,pj->p", offset, conic[owner], offset)
+    values = peak[owner] * torch.exp(-0.5 * square)[:, None]
+    image = peak.new_zeros((math.prod(shape), peak.shape[1])).index_add(0, address, values)
+    return image.T.reshape(peak.shape[1], *shape)
+
+
+def pairs(mean: Tensor, low: Tensor, high: Tensor, shape: tuple[int, ...]) -> tuple[Tensor, Tensor, Tensor]:
+    """What boxes from pixel `low` to `high` [N, D] hold: the Gaussian [P], the pixel's place in the flat raster [P] and
+    its distance [P, D] from the Gaussian's mean, one Gaussian after another."""
     extent = (high - low + 1).clamp(min=0)
-    pairs = extent.prod(1)
-    owner = torch.arange(len(mean), device=mean.device).repeat_interleave(pairs)
-    rest = torch.arange(int(pairs.sum()), device=mean.device) - (pairs.cumsum(0) - pairs)[owner]
+    counts = extent.prod(1)
+    owner = torch.arange(len(mean), device=mean.device).repeat_interleave(counts)
+    rest = torch.arange(int(counts.sum()), device=mean.device) - (counts.cumsum(0) - counts)[owner]
     address, stride, offsets = torch.zeros_like(rest), 1, []
     for axis, count in enumerate(shape[::-1]):
         length = extent[owner, axis]
@@ -111,9 +122,4 @@ def _draw(mean: Tensor, covariance: Tensor, peak: Tensor, low: Tensor, high: Ten
         rest = rest // length
         address, stride = address + index * stride, stride * count
         offsets.append(index.to(mean) + (0.5 - count / 2) - mean[owner, axis])
-    offset = torch.stack(offsets, 1)
-    conic = torch.linalg.inv(covariance)
-    square = torch.einsum("pi,pij,pj->p", offset, conic[owner], offset)
-    values = peak[owner] * torch.exp(-0.5 * square)[:, None]
-    image = peak.new_zeros((stride, peak.shape[1])).index_add(0, address, values)
-    return image.T.reshape(peak.shape[1], *shape)
+    return owner, address, torch.stack(offsets, 1)

@@ -100,7 +100,7 @@ def invert(xx, xy, yy):
 
 @triton.jit
 def box(middle, reach, count):
-    """First pixel, and how many, of the boxes `middle ± reach` cut to `count` pixels: as `reference._boxes`."""
+    """First pixel, and how many, of the boxes `middle ± reach` cut to `count` pixels: as `reference.boxes`."""
     first = tl.minimum(tl.maximum(tl.ceil(middle - reach), 0.0), count)
     last = tl.minimum(tl.maximum(tl.floor(middle + reach), -1.0), count - 1)
     return first, tl.maximum(last - first + 1, 0.0)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+from functools import lru_cache
+
 import numpy as np
 import scipy.sparse
 import torch
@@ -10,6 +13,11 @@ from torch import Tensor
 from ...checks import require
 from ...geometry import Grid, Views
 from ..sparse import torch_csr
+
+SMALL = 1 << 16
+"""Voxels of a slice times views, at most, of matrices that are kept: about 4 MB each, with its transpose."""
+KEPT = 16
+"""Small matrices that are kept: a run asks for the same ones for its start, its cross-validation and its verdict."""
 
 
 class SliceProjector:
@@ -27,8 +35,8 @@ class SliceProjector:
         self.grid, self.views = grid, views
         nz, ny, nx = grid.shape
         self.array_shape = (nz, nx, ny)
-        matrix = slice_matrix(grid, views)
-        self._forward, self._adjoint = (torch_csr(m, torch.float32) for m in (matrix, matrix.T.tocsr()))
+        asked = _Asked(grid, views.fingerprint(), views)
+        self._forward, self._adjoint = (_kept if nz * nx * len(views) <= SMALL else _made)(asked)
 
     def project(self, array: Tensor) -> Tensor:
         """Line integrals [V, W, H] in metres × value of a volume in the order [Z, X, Y]."""
@@ -50,6 +58,24 @@ class SliceProjector:
         return images.transpose(1, 2).contiguous()
 
     lines_out = lines_in
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """Grid and views of a projector; equal to those of the same views."""
+
+    grid: Grid
+    mark: bytes
+    views: Views = field(compare=False)
+
+
+def _made(asked: _Asked) -> tuple[Tensor, Tensor]:
+    """The matrix [V·W, Z·X] of a projector and its transpose, CSR, float32; nobody writes to them."""
+    matrix = slice_matrix(asked.grid, asked.views)
+    return torch_csr(matrix, torch.float32), torch_csr(matrix.T.tocsr(), torch.float32)
+
+
+_kept = lru_cache(maxsize=KEPT)(_made)
 
 
 def rows_match(grid: Grid, views: Views) -> bool:
