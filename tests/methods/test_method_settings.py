@@ -114,7 +114,7 @@ def test_methods_go_round_through_config_json(name, tmp_path):
         ("speed = 3", "options.speed is not known; remove it, or use one of start, spacing_px"),
         ("[fit.schedule]\nstepz = 3", r"options\.fit\.schedule\.stepz is not known"),
         ('[fit.schedule]\nsteps = "many"', r"options\.fit\.schedule\.steps must be a whole number, but it is 'many'"),
-        ('start = "guess"', r"options\.start must be one of phase, random, but it is 'guess'"),
+        ('start = "guess"', r"options\.start must be one of phase, learned, random, but it is 'guess'"),
         ("volume = 4", r"options\.volume must be a table, but it is 4"),
         ("[fit.schedule]\nsteps = -1", "steps must not be negative"),
         ("[fit.schedule]\ndecay = 0.0", "decay must lie in"),

@@ -308,6 +308,9 @@ class MethodOptions:
     """Or: a JSON or TOML file of options, whole or partial, such as the config.json of another run."""
     changes: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="PATH=VALUE")] = ()
     """Change one option, such as fit.schedule.steps=500 or fit.steps=500; may be given again and again."""
+    start: Literal["phase", "learned", "random"] | None = None
+    """What Gaussians begin with: phase retrieval and tomography, what a trained network guesses (for bodies such as it
+    has seen, in few views), or nothing (default: as the options say, phase)."""
     backend: Literal["auto", "cpu", "cuda", "reference"] | None = None
     """What computes the fit (default: as the options say, auto); `holosplat backends` lists what there is."""
 
@@ -322,7 +325,8 @@ class MethodOptions:
 
         given = [f"--{name}" for name in ("method", "preset", "config") if getattr(self, name) is not None]
         require(len(given) < 2, f"give one of --method, --preset and --config, but there are {' and '.join(given)}.")
-        method = chosen_method(self.method, self.preset, self.config, self.changes)
+        start = () if self.start is None else (f"start={self.start}",)
+        method = chosen_method(self.method, self.preset, self.config, (*self.changes, *start))
         if self.backend:
             move = getattr(method, "on_backend", None)
             if move is None:

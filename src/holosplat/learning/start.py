@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
+from ..checks import require
 from ..geometry import Grid, Views
 from ..materials import DeltaBeta
 from ..optics.noise import noise_levels
@@ -83,6 +84,24 @@ def guessed(scan: Scan, material: DeltaBeta, network: Guess, on_progress: Progre
     if coarser and coarser[0].left() < CLEARLY * finer.left(factors[1] // factors[0]):
         return coarser[0]
     return finer
+
+
+def guessed_volume(scan: Scan, material: DeltaBeta, how: LearnedStart, on_progress: Progress) -> tuple[Tensor, Grid]:
+    """Occupancy [Z, Y, X] of `material` and its grid, as the network of `how` guesses it from the frames of `scan`.
+
+    Errors: `InputError` where the frames contradict the guess (`how.doubt`), and those of the weights' file and of
+    phase retrieval.
+    """
+    trained = how.network
+    found = guessed(scan, material, trained.network, on_progress)
+    left, allowed = found.left(), how.doubt * trained.card.typical(len(scan))
+    require(
+        left <= allowed,
+        f"the frames contradict the learned start: it leaves {100 * left:.0f} % of the retrieved thickness "
+        f"unexplained, and where bodies are such as its network knows at most {100 * allowed:.0f} %; reconstruct "
+        "without --start learned, or with weights that know such bodies (--set weights=FILE).",
+    )
+    return found.values, found.grid
 
 
 def _factors(scan: Scan) -> Sequence[int]:

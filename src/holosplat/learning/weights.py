@@ -38,6 +38,13 @@ class Card:
     typical_misfit: dict[str, float] = field(default_factory=dict)
     limits: str = ""
 
+    def typical(self, views: int) -> float:
+        """What guesses from so many views typically leave unexplained: by the next smaller number that was tried."""
+        known = sorted(int(count) for count in self.typical_misfit)
+        if not known:
+            return 1.0
+        return self.typical_misfit[str(max([count for count in known if count <= views] or known[:1]))]
+
 
 @dataclass(frozen=True)
 class Trained:

@@ -70,8 +70,6 @@ class GaussianOptions:
     start: Literal["phase", "learned", "random"] = "phase"
     """`phase`: phase retrieval, total-variation tomography, Gaussians where there is matter; `learned`: the same where
     a network that has seen such bodies guesses it, as far as frames bear it out; or `random`."""
-    learned: LearnedStart = field(default_factory=LearnedStart)
-    """The network, and when its guess is taken."""
     spacing_px: Pixels = 1.0
     """Distance between Gaussians at a phase start [pixels]."""
     spacing_noise: Weight = 2.3
@@ -99,6 +97,8 @@ class GaussianOptions:
     """How two materials are told apart."""
     volume: HolographicTV = field(default_factory=HolographicTV)
     """The starting volume."""
+    learned: LearnedStart = field(default_factory=LearnedStart)
+    """The network, and when its guess is taken."""
     coarse: CoarseToFine = field(default_factory=CoarseToFine)
     """How large frames of closed bodies start."""
     fit: FitOptions = field(default_factory=FitOptions)

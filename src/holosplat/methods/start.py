@@ -13,7 +13,7 @@ from torch import Tensor
 from ..baselines import holographic_tv
 from ..baselines.two_materials import Shares, absorption, at_one_ratio, told_apart, two_levels
 from ..geometry import Grid
-from ..learning.start import guessed
+from ..learning.start import guessed_volume
 from ..materials import WATER
 from ..matter import DeltaBeta, KnownRatio, Matter
 from ..optics.noise import noise_share
@@ -49,8 +49,7 @@ def _from_phase_retrieval(task: Task, options: GaussianOptions) -> GaussianCloud
 
     def retrieve(frames: Scan) -> tuple[Tensor, Grid]:
         if options.start == "learned":
-            found = guessed(frames, material, options.learned.network.network, task.on_progress)
-            return found.values, found.grid
+            return guessed_volume(frames, material, options.learned, task.on_progress)
         return holographic_tv(frames, material, how, task.on_progress, task.uneven)
 
     volume, grid = retrieve(scan)
