@@ -246,3 +246,33 @@ def series() -> str:
         if said is not None:
             lines.append([said, f"{float(row['value']):.3g}", f"{row['load_before']} to {row['load_after']}"])
     return markdown(("", "measured", "load average of the machine"), lines)
+
+
+EQUATIONS = {
+    "start": "each time by itself",
+    "none": "one field, no equations",
+    "curl": "one field, equations, v = ∇ × A",
+    "free": "one field, equations, v free",
+}
+"""What the table of pinn calls its fields, in order."""
+
+
+def pinn() -> str:
+    """Fields of space and time with and without equations, each seed."""
+    rows = read("pinn.csv")
+    lines = []
+    for case, views, name in sorted(
+        {(r["case"], r["views"], r["equations"]) for r in rows},
+        key=lambda key: (key[0], key[1], list(EQUATIONS).index(key[2])),
+    ):
+        own = [r for r in rows if (r["case"], r["views"], r["equations"]) == (case, views, name)]
+        own.sort(key=lambda r: int(r["seed"]))
+        dice, error = (", ".join(rounded(r[n], 3) for r in own) for n in ("dice", "error"))
+        told = name in ("curl", "free")
+        moving = (
+            ", ".join(f"{rounded(r['velocity_error'], 2)} ({rounded(r['aligned'], 3)})" for r in own) if told else ""
+        )
+        seconds = max(float(r["cpu_seconds"]) + float(r["start_seconds"]) for r in own)
+        lines.append([f"{case}, {views} views", EQUATIONS[name], dice, error, moving, f"{seconds:.0f} s"])
+    columns = ("case", "field", "Dice", "error of δ", "error of the velocity (cosine)", "processor time")
+    return markdown(columns, lines)

@@ -13,7 +13,7 @@ from holosplat.io.nxtomo import read_scan
 from holosplat.io.volumes import read_volume
 from holosplat.methods import SmoothVolume
 from holosplat.motion.carried import CarriedOptions
-from holosplat.representations import MovingGaussians
+from holosplat.representations import MovingGaussians, SpaceTimeField
 from holosplat.workflows.moving import reconstruct_moving
 from holosplat.workflows.reconstruct import load_reconstruction
 from holosplat.workflows.run_folder import RunFolder
@@ -64,3 +64,23 @@ def test_a_series_in_motion_is_one_object_that_all_commands_read(quick):
     assert len(read_scan(quick / "p.nxs")) == 9
     refused = holosplat("export", quick / "run", "--bodies", quick / "b")
     assert refused.code == 2
+
+
+FEW = ["volume.iterations=5", "volume.retrieval=5", "volume.corrections=0", "fit.flow_steps=3", "fit.schedule.steps=3"]
+"""Settings of pinn that take no time."""
+
+
+def test_all_times_as_one_field_of_matter_and_velocity(quick):
+    how = ["--method", "pinn", *(word for one in FEW for word in ("--set", one)), "--seed", 4]
+    scan, run = quick / "s.nxs", quick / "run"
+    said = worked(holosplat("reconstruct", scan, "--material", "PMMA", *how, "--time-frame", "all", "--out", run))
+    assert "a field of" in said.err
+    found = load_reconstruction(RunFolder(run))
+    assert isinstance(found.object, SpaceTimeField)
+    assert json.loads((run / "summary.json").read_text())["times_s"] == pytest.approx([0, 1e-3, 2e-3], abs=0)
+    worked(holosplat("export", run, "--volume", quick / "w.h5", "--time-frame", 2))
+    scored = worked(holosplat("evaluate", run, "--truth", quick / "t_t0002.h5", "--time-frame", 2, "--json"))
+    assert json.loads(scored.out)["relative_error_delta"] < 1
+    refused = holosplat("reconstruct", scan, "--material", "PMMA", *how, "--time-frame", 0, "--out", quick / "one")
+    assert refused.code == 2
+    assert "of 2 times or more" in refused.err

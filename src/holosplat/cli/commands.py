@@ -60,14 +60,17 @@ def reconstruct(
     from ..io.formats import read_as
     from ..io.json import read_json, write_json
     from ..io.run_scan import run_source
+    from ..methods.method import takes_series
     from ..methods.uncertain import Uncertain
     from ..report.run import report_run
     from ..workflows.evaluate import evaluate as score
     from ..workflows.reconstruct import reconstruct as fit
     from ..workflows.run_folder import RunFolder, claimed
-    from .motion import asks_for_motion, reconstruct_in_motion
+    from .motion import asks_for_motion, reconstruct_in_motion, report_of_middle
 
     method = how.chosen()
+    if takes_series(method) and reading.part.time_frame == "all":
+        reading = replace(reading, part=replace(reading.part, time_frame=None))
     uncertain, refine = Uncertain(**reading.told.ranges(), **matter.ranges()), geometry.options()
     require(
         refine is None or reading.part.time_frame not in ("all", "still"),
@@ -108,7 +111,10 @@ def reconstruct(
         write_json(folder.source, run_source(scan, replace(reading, told=replace(reading.told, **found))))
         measured = result.placed(measured)
         evaluation = score(result, measured, None)
-        report = report_run(folder, result, measured, evaluation, None)
+        if takes_series(method):
+            report = report_of_middle(folder, result, measured)
+        else:
+            report = report_run(folder, result, measured, evaluation, None)
     _print_scores(evaluation)
     if folder.light.is_file():
         _say(f"light: {read_json(folder.summary)['light']}, by the frames' air ({folder.light})")

@@ -14,9 +14,11 @@ from ..matter import KnownTwo, MaterialPrior, MatterKind
 from ..methods import Auto, Method
 from ..optics.background import LightOptions
 from ..report.run import report_run
+from ..scan import Scan
 from ..workflows.evaluate import evaluate as score
 from ..workflows.moments import moment
 from ..workflows.moving import reconstruct_moving
+from ..workflows.reconstruction import Reconstruction
 from ..workflows.run_folder import RunFolder
 from .progress import ProgressBar
 
@@ -44,11 +46,7 @@ def reconstruct_in_motion(
         return False
     result = found.reconstruction
     write_json(folder.source, run_source(scan, reading))
-    evaluation, times = score(result, measured, None), measured.train().instants.tolist()
-    middle = len(times) // 2
-    shown = measured[(measured.exposures.time == times[middle]).nonzero()[0]].as_static()
-    now = moment(result, times, middle)
-    report = report_run(folder, now, shown, score(now, shown, None), None)
+    evaluation, report = score(result, measured, None), report_of_middle(folder, result, measured)
     for line in (*evaluation.lines(), *(result.verdict.lines("training frames") if result.verdict else ())):
         print(line)
     seconds = sum(result.timing.values())
@@ -56,3 +54,12 @@ def reconstruct_in_motion(
         print(line, file=sys.stderr)
     print(f"{seconds:.1f} s, {result.object.described}; report: {report}", file=sys.stderr)
     return True
+
+
+def report_of_middle(folder: RunFolder, result: Reconstruction, measured: Scan) -> Path:
+    """The report of a run of several times at the one in the middle."""
+    times = measured.train().instants.tolist()
+    middle = len(times) // 2
+    shown = measured[(measured.exposures.time == times[middle]).nonzero()[0]].as_static()
+    now = moment(result, times, middle)
+    return report_run(folder, now, shown, score(now, shown, None), None)

@@ -298,7 +298,8 @@ class MethodOptions:
 
     method: str | None = None
     """Name of the method: auto (what you get without), gaussians, surfaces, volume (continuous matter),
-    voxels, neural-field, holographic-tv, tikhonov-tv and other pairs of phase retrieval and tomography."""
+    voxels, neural-field, holographic-tv, tikhonov-tv and other pairs of phase retrieval and tomography; pinn
+    (all times of a scan at once, bound by equations of flow)."""
     matter: Literal["auto", "levels", "continuous"] = "auto"
     """Whether matter has levels of density with sharp edges, or is continuous; auto: the frames decide."""
     preset: str | None = None

@@ -12,13 +12,14 @@ from ..io.formats import read_as
 from ..io.reading import Reading, at_time
 from ..io.run_scan import run_reading
 from ..mesh import TriangleMesh
-from ..representations import MovingGaussians, MovingSurfaces, SurfaceMesh
+from ..representations import MOVING, MovingSurfaces, SurfaceMesh
 from ..scan import Scan
 from ..workflows.moments import chosen_frames, instants_of, moment
-from ..workflows.reconstruct import load_reconstruction, require_one_time
+from ..workflows.reconstruct import load_reconstruction
 from ..workflows.reconstruction import Reconstruction
 from ..workflows.refine import where_found
 from ..workflows.run_folder import RunFolder
+from ..workflows.suitable import require_one_time
 
 
 def scan_for(folder: RunFolder, scan: Path | None, reading: Reading) -> Scan:
@@ -74,7 +75,7 @@ def moments_of(folder: RunFolder, time_frame: int | Literal["all"] | None) -> It
     """
     result, times = load_reconstruction(folder), instants_of(folder)
     found = result.object
-    if not isinstance(found, MovingSurfaces | MovingGaussians):
+    if not isinstance(found, MOVING):
         require(time_frame is None, f"{folder.path} is of one time; leave --time-frame.")
         yield Moment("", result, found.bodies() if isinstance(found, SurfaceMesh) else None)
         return

@@ -9,6 +9,7 @@ from .ground import ExtraTerm
 from .method import Method, Near, Stage, Task, begun, finished
 from .neural_field import NeuralFields, NeuralFit
 from .per_view import PerView
+from .pinn import Pinn, PinnFit
 from .solve import Settled, settled, solve
 from .surface_fit import Extraction, SurfaceFit, SurfaceOptions
 from .surfaces import Surfaces, refine_surfaces
@@ -31,9 +32,12 @@ METHODS: dict[str, Method] = {
     "paganin-sirt": PerView("paganin", "sirt", bounded=False),
 }
 """Every method by the name that the command line knows, with its options by default."""
+OF_SERIES: dict[str, Method] = {"pinn": Pinn()}
+"""Those that take all times of a scan at once, and need several."""
 
 __all__ = [
     "METHODS",
+    "OF_SERIES",
     "Auto",
     "Determined",
     "ExtraTerm",
@@ -47,6 +51,8 @@ __all__ = [
     "NeuralFields",
     "NeuralFit",
     "PerView",
+    "Pinn",
+    "PinnFit",
     "Settled",
     "SmoothVolume",
     "Stage",

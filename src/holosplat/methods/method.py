@@ -145,9 +145,17 @@ class Stage(Protocol):
         ...
 
 
+def takes_series(method: Method) -> bool:
+    """Whether `method` takes all times of a scan at once."""
+    return bool(getattr(method, "of_series", False))
+
+
 @runtime_checkable
 class Method(Protocol):
-    """Options of a method, as a frozen dataclass; `kind` is its name in tables, files and on the command line."""
+    """Options of a method, as a frozen dataclass; `kind` is its name in tables, files and on the command line.
+
+    One that takes all times of a scan at once says so by `of_series`; all others take frames of one time.
+    """
 
     kind: ClassVar[str]
 

@@ -23,12 +23,14 @@ STAGE = "still light"
 def prepared(task: Task, method: Method | None = None) -> Task:
     """The task with frames in even light: that of each frame by its air (`Task.evened`), then what all have in common.
 
-    A first volume tells the latter from the matter; without light in common in the air there is none, nor where the
-    `method` itself takes it for an unknown.
+    A first volume of frames of one time tells the latter from the matter; without light in common in the air there is
+    none, nor where the `method` itself takes it for an unknown.
     """
     if task.lit is not None:
         return task
     task = task.evened()
+    if task.scan.is_series:
+        return task  # no one volume tells its matter from light
     light, frames = task.lit, torch.from_numpy(task.scan.frames)
     assert light is not None
     wanted = task.light.still == "auto" and task.light.kind != "even" and not still_order(method)

@@ -90,6 +90,7 @@ NAMES = {
     "surfaces": "Reconstruction as closed surfaces",
     "moving-surfaces": "Reconstruction as closed surfaces in motion",
     "moving-gaussians": "Reconstruction as Gaussians that a flow carries",
+    "space-time-field": "Reconstruction as a field of space and time",
     "voxels": "Voxel reconstruction",
     "neural-field": "Reconstruction as a neural field",
 }

@@ -20,6 +20,7 @@ from .moving_surfaces import MovingSurfaces
 from .neural_field import Network, NeuralField
 from .paths import TimeBasis
 from .photographed import AlphaCloud, RadianceField
+from .space_time import SpaceTime, SpaceTimeField
 from .surfaces import SurfaceMesh
 from .voxel_lines import VoxelLines
 from .voxels import VoxelGrid
@@ -73,13 +74,16 @@ KINDS: dict[str, type[Stored]] = {
     kind.kind: kind
     for kind in (
         *(GaussianCloud, VoxelGrid, SurfaceMesh, MovingSurfaces, MovingGaussians, NeuralField),
-        *(AlphaCloud, RadianceField),
+        *(SpaceTimeField, AlphaCloud, RadianceField),
     )
 }
 """Every kind of Object that files hold, by name."""
+MOVING = (MovingSurfaces, MovingGaussians, SpaceTimeField)
+"""Those that are of several times."""
 
 __all__ = [
     "KINDS",
+    "MOVING",
     "AlphaCloud",
     "Encoding",
     "Flow",
@@ -90,6 +94,8 @@ __all__ = [
     "Network",
     "NeuralField",
     "RadianceField",
+    "SpaceTime",
+    "SpaceTimeField",
     "Stored",
     "SurfaceMesh",
     "TimeBasis",

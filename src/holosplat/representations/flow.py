@@ -53,6 +53,10 @@ class Lattice:
         count = self.counts[2 - axis]
         places = torch.arange(count, dtype=points.dtype, device=points.device)
         away = (points[:, axis, None] - self.first[axis]) / self.cell - places
+        return self.splines(away, derivatives)
+
+    def splines(self, away: Tensor, derivatives: int) -> list[Tensor]:
+        """A cubic B-spline `away` cells from its node, and its first `derivatives`."""
         size, sign = away.abs(), away.sign()
         outer, inner = (2 - size).clamp_min(0), (1 - size).clamp_min(0)
         found = [(outer**3 - 4 * inner**3) / 6]

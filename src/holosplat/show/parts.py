@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from ..geometry import Grid
 from ..io.splats import opacities
 from ..mesh import TriangleMesh
-from ..representations import GaussianCloud, MovingGaussians, MovingSurfaces, Stored, SurfaceMesh, isosurface
+from ..representations import MOVING, GaussianCloud, MovingGaussians, Stored, SurfaceMesh, isosurface
 
 HALF_EDGE = 10.0
 """Units of the scene from its middle to its farthest side, which suits the cameras of viewers."""
@@ -78,9 +78,9 @@ def shown(obj: Stored) -> Shown:
 def at_times(obj: Stored, times: Sequence[float]) -> dict[str, Stored]:
     """What the slider of time leads through, by its label: a moving object at up to `TIMES` of `times` [s], or from the
     first of its basis to the last where there are none; any other object alone."""
-    if not isinstance(obj, MovingSurfaces | MovingGaussians):
+    if not isinstance(obj, MOVING):
         return {"": obj}
-    basis = obj.basis if isinstance(obj, MovingSurfaces) else obj.flow.basis
+    basis = obj.flow.basis if isinstance(obj, MovingGaussians) else obj.basis
     chosen = np.array(times) if len(times) else np.linspace(basis.first, basis.last, TIMES)
     chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, min(TIMES, len(chosen))).astype(int))]
     return {f"{1e6 * t:.6g} µs": obj.at(float(t)) for t in chosen}

@@ -21,11 +21,11 @@ from ..scan import Scan
 from ..tables import to_table
 from .keeper import Choice
 from .provenance import environment, scan_hash
-from .reconstruct import check_frames
 from .reconstruction import Reconstruction
 from .run_folder import RunFolder
 from .run_light import found_in
 from .run_record import summary_of
+from .suitable import check_frames
 from .verdict import judge
 
 KIND = "carried"

@@ -7,7 +7,6 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
-import numpy as np
 import torch
 
 from ..align.geometry import Geometry
@@ -19,6 +18,7 @@ from ..io.light import read_still_light, write_light
 from ..io.objects import read_object, write_object
 from ..matter import MaterialPrior, MatterKind
 from ..methods import Auto, Gaussians, Method, Settled, Stage, Task, begun, finished, settled
+from ..methods.method import takes_series
 from ..methods.still import prepared
 from ..methods.uncertain import Determined, Uncertain
 from ..optics.background import LightOptions
@@ -45,18 +45,11 @@ from .resume import goes_on
 from .run_folder import RunFolder, claimed
 from .run_light import found_in, read_light_options, still_in
 from .run_record import config_of, summary_of
+from .suitable import check_frames, require_one_time
 from .totals import TotalMatter, total_of_run
 from .verdict import Verdict, judge_run, said_of_run
 
 CHECKPOINT_SECONDS = 20.0
-FEWEST_COLUMNS = 11
-"""Pixels across the axis that are a field of view; rows may be as few as one."""
-FLAT_LEVELS = (0.2, 5.0)
-"""Between these lies the median of frames that are relative to the flat field."""
-
-
-MOST_NEGATIVE = 0.25
-"""Share of the pixels that may be below zero: noise makes half of those so that an absorber darkens wholly."""
 
 
 def reconstruct(
@@ -85,10 +78,11 @@ def reconstruct(
     With a `folder`, everything is written there, and a later call with `resume=True` goes on from the last
     checkpoint, with the same result as if nothing had happened. Ctrl-C (KeyboardInterrupt) ends a fit with what it has
     reached (`finished` is False); during a start there is nothing yet, and it is passed on. Errors: `InputError` for
-    scans without training frames or matter, or of several times (`Scan.is_series`), for folders that do not fit, and
-    for what the method cannot do.
+    scans without training frames or matter, or of several times (`Scan.is_series`) where `method` takes one, for
+    folders that do not fit, and for what the method cannot do.
     """
-    require_one_time(scan)
+    if not takes_series(method):
+        require_one_time(scan)
     check_frames(scan.train())
     assumed, ranges, planned = light or LightOptions(), uncertain or Uncertain(), scan
     said = {"light": to_table(assumed), "uncertain": to_table(ranges), "refine": refine and to_table(refine)}
@@ -117,37 +111,6 @@ def reconstruct(
         if folder is not None:
             keep_geometry(folder, geometry, planned)
         return replace(done, geometry=geometry)
-
-
-def require_one_time(scan: Scan) -> None:
-    """`InputError` for a time-resolved scan: one still volume cannot be all of its times."""
-    times = scan.instants
-    require(
-        not scan.is_series,
-        f"the scan must show one time, but its frames are of {len(times)}, from {times[0]:g} to {times[-1]:g} s, and "
-        f"the reconstruction stands still; choose a time with --time-frame 0 … {len(times) - 1} (Scan.at_instant), or "
-        "--time-frame all, which finds out whether anything moves (Scan.as_static: nothing does).",
-    )
-
-
-def check_frames(train: Scan) -> None:
-    """`InputError` for too few columns, and for frames that are not relative to the flat field."""
-    h, w = train.views.shape
-    require(
-        w >= FEWEST_COLUMNS,
-        f"frames must have at least {FEWEST_COLUMNS} columns, but they are {h} × {w} pixels; take a wider part.",
-    )
-    level = float(np.median(train.frames))
-    require(
-        FLAT_LEVELS[0] < level < FLAT_LEVELS[1],
-        f"frames must be relative to the flat field (about 1 beside the sample), but their median is {level:.4g}; "
-        "add flats (image_key 1) to the scan, or divide by them.",
-    )
-    negative = float((train.frames < 0).mean())
-    require(
-        negative <= MOST_NEGATIVE,
-        f"frames must be intensities, but {negative:.0%} of their pixels are below zero; take off less of the dark.",
-    )
 
 
 def load_reconstruction(folder: RunFolder) -> Reconstruction:
@@ -318,7 +281,7 @@ class _Run:
             Choice(self.task.matter, self.why, dict(self._keeper.judged), best.name if best else ""),
             self.task.delta_told,
             judge_run(found, fit, self.task, oversample),
-            total_of_run(*said_of_run(found, fit, self.task, oversample), self.task, self.constants),
+            self._total(found, fit, oversample),
             self.constants,
             found_in(self.task),
             still=still_in(self.task, self.method, found, oversample),
@@ -331,8 +294,16 @@ class _Run:
             background = self.task.uneven and self.task.uneven.background
             if background is not None or done.still is not None:
                 write_light(self.folder.light, background, done.still)
-            self.folder.write_summary(summary_of(done, fit, self.task.scan) | {"light": self.task.light_in_words})
+            said = {"times_s": self.task.scan.instants.tolist()} if takes_series(self.method) else {}
+            said |= {"light": self.task.light_in_words}
+            self.folder.write_summary(summary_of(done, fit, self.task.scan) | said)
         return done
+
+    def _total(self, found: Stored, fit: Running | None, oversample: int) -> TotalMatter | None:
+        """The total of the matter; None of several times, at which it may differ."""
+        if takes_series(self.method):
+            return None
+        return total_of_run(*said_of_run(found, fit, self.task, oversample), self.task, self.constants)
 
 
 class _Journal:

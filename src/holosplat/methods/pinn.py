@@ -1,0 +1,216 @@
+"""Fields of space and time whose matter and velocity obey equations of motion, fitted through the waves (a
+physics-informed field, as in 4D-PIONIX, but on holograms and with splines for the matter)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+import torch
+
+from ..baselines import HolographicTV, holographic_tv
+from ..checks import at_least, require
+from ..fit.loop import Fit, Plan
+from ..fit.optimiser import Adam
+from ..fit.problem import Problem, Term
+from ..fit.schedule import Schedule
+from ..fit.terms import Objective
+from ..fit.terms.equations import Equations, EquationTerm, SpaceTimeVariation
+from ..matter import Matter
+from ..ranges import Rate, Weight, ranged
+from ..representations import SpaceTime, SpaceTimeField, Stored
+from ..representations.space_time import FLOW
+from .assumed import assumed_material
+from .ground import ExtraTerm, Ground, ground
+from .method import Stage, Task
+
+EACH, FLOW_ALONE, THROUGH_WAVES = "each time by itself", "flow of these", "field through the waves"
+FEWEST_TIMES = 2
+"""Times from which on something moves."""
+OCCUPANCY = "object.coefficients"
+"""The parameter of the matter; all others are the velocity's."""
+SECOND_STAGE = 1_000_003
+"""Added to the seed for the stage through the waves."""
+
+
+def _objective() -> Objective:
+    return Objective(l1=0.0, spectral=1.0, floor=0.1)
+
+
+def _schedule() -> Schedule:
+    return Schedule(steps=200, views_per_step=8, decay=0.1)
+
+
+def _start() -> HolographicTV:
+    return HolographicTV(refine=1)
+
+
+@dataclass(frozen=True)
+@ranged
+class PinnFit:
+    """Options of a space-time field and its fit."""
+
+    space_time: SpaceTime = field(default_factory=SpaceTime)
+    """The splines of the matter and the network of the velocity."""
+    equations: Equations = field(default_factory=Equations)
+    """What binds the two."""
+    rate: Rate = 0.05
+    """Adam's first rate of the coefficients of the matter, logarithms of odds."""
+    flow_rate: Rate = 0.01
+    """The same of the velocity's weights."""
+    flow_steps: int = 150
+    """Steps of the velocity alone, beside the matter of each time by itself."""
+    weight: Weight = 0.05
+    """Weight of total variation, in voxel edges of thickness."""
+    noise_weight: Weight = 0.03
+    """What it grows by for every pixel of thickness that the noise of the frames amounts to."""
+    smoothing: float = 0.005
+    """Differences between voxels below which total variation is a square."""
+    objective: Objective = field(default_factory=_objective)
+    """How frames are compared."""
+    schedule: Schedule = field(default_factory=_schedule)
+    """Of the stage through the waves."""
+    terms: tuple[ExtraTerm, ...] = ()
+    """Further terms by name, through the waves."""
+
+    def __post_init__(self) -> None:
+        at_least(self, 1, "flow_steps")
+        require(self.smoothing > 0, f"smoothing must be positive, but it is {self.smoothing:g}.")
+        for name in ("rate", "flow_rate"):
+            require(getattr(self, name) > 0, f"{name} must be positive, but it is {getattr(self, name):g}.")
+
+
+@dataclass(frozen=True)
+class Pinn:
+    """All times of a scan as one field of matter and velocity, bound by continuity and the equations of slow flow."""
+
+    kind: ClassVar[str] = "pinn"
+    wants_levels: ClassVar[bool] = False
+    of_series: ClassVar[bool] = True
+
+    volume: HolographicTV = field(default_factory=_start)
+    fit: PinnFit = field(default_factory=PinnFit)
+
+    def stages(self) -> Sequence[Stage]:
+        """Each time by itself, the flow that leads from one to the next where equations ask for one, and the fit."""
+        begin = EachTime(self.volume, self.fit)
+        if self.fit.equations.continuity == 0:
+            return (begin, Waves(self.fit))
+        return (begin, FlowAlone(self.fit), Waves(self.fit))
+
+
+@dataclass(frozen=True)
+class EachTime:
+    """The start: a volume of each time by itself."""
+
+    volume: HolographicTV
+    options: PinnFit
+    name: str = EACH
+
+    def start(self, task: Task, before: Stored | None) -> SpaceTimeField:
+        """The field through the volumes of all times; `InputError` for a scan of one time."""
+        times = task.scan.instants
+        require(
+            len(times) >= FEWEST_TIMES,
+            f"pinn needs training frames of {FEWEST_TIMES} times or more, but theirs are of one; give a scan of "
+            "several times, with --time-frame all, or choose another method.",
+        )
+        middle = task.scan.at_instant(len(times) // 2)
+        material = assumed_material(middle, task.prior, task.on_progress, self.volume.backend)
+        bounded, volumes = replace(self.volume, upper=task.bound(1.0)), list[torch.Tensor]()
+        for k in range(len(times)):
+            task.on_progress(EACH, k / len(times))
+            scan = task.scan.at_instant(k)
+            values, grid = holographic_tv(scan, material, bounded, lambda stage, part: None)
+            volumes.append(values)
+        matter = Matter.one(*material)
+        return SpaceTimeField.still(
+            torch.stack(volumes), grid, times, matter, self.options.space_time, task.seed, task.bound(1.0)
+        )
+
+    def fit(self, task: Task, start: Stored) -> None:
+        """Nothing is fitted."""
+
+
+@dataclass(frozen=True)
+class FlowAlone:
+    """The velocity alone, by the equations: the matter stays as it is."""
+
+    options: PinnFit
+    name: str = FLOW_ALONE
+    likelier: bool = True
+
+    def start(self, task: Task, before: Stored | None) -> Stored:
+        """What came before."""
+        assert before is not None
+        return before
+
+    def fit(self, task: Task, start: Stored) -> Fit:
+        """The fit of the velocity."""
+        options = self.options
+        schedule = replace(options.schedule, steps=options.flow_steps, validation_views=0)
+        base, generator = _ground(task, start, options, schedule), torch.Generator().manual_seed(task.seed)
+        free = tuple(name for name in base.model.parameters() if name.startswith(f"object.{FLOW}"))
+        problem = Problem(base.model, (_equations(task, options, generator),), free)
+        return Fit(_plan(problem, schedule, options, generator), task.seed)
+
+
+@dataclass(frozen=True)
+class Waves:
+    """Matter and velocity together, through the waves."""
+
+    options: PinnFit
+    name: str = THROUGH_WAVES
+    likelier: bool = True
+
+    def start(self, task: Task, before: Stored | None) -> Stored:
+        """What came before."""
+        assert before is not None
+        return before
+
+    def fit(self, task: Task, start: Stored) -> Fit:
+        """The fit of the field to the training frames."""
+        options, schedule = self.options, self.options.schedule
+        base = _ground(task, start, options, schedule)
+        generator = torch.Generator().manual_seed(task.seed + SECOND_STAGE)
+        times, views = base.train.instants, _views(base)
+        spectral = base.frames.spectral
+        weight = options.weight + options.noise_weight * (0.0 if spectral is None else spectral.noise)
+        terms: list[Term] = [
+            base.frames,
+            SpaceTimeVariation(weight / views, options.smoothing, times.tolist(), generator),
+            *base.extra(options.terms),
+        ]
+        bound = options.equations.continuity > 0
+        if bound:
+            terms.append(_equations(task, options, generator))
+        problem = Problem(base.model, tuple(terms), None if bound else (OCCUPANCY,))
+        return Fit(replace(_plan(problem, schedule, options, generator), judge=base.judge), task.seed)
+
+
+def _ground(task: Task, start: Stored, options: PinnFit, schedule: Schedule) -> Ground:
+    return ground(task.scan, start, start.matter, options.objective, schedule, "cpu", light=task.uneven)
+
+
+def _views(base: Ground) -> float:
+    """Frames of a time."""
+    return len(base.train) / len(base.train.instants)
+
+
+def _equations(task: Task, options: PinnFit, generator: torch.Generator) -> EquationTerm:
+    times = task.scan.instants
+    interval = float(times[-1] - times[0]) / (len(times) - 1)
+    return EquationTerm(options.equations, len(task.scan) / len(times), interval, generator)
+
+
+def _plan(problem: Problem, schedule: Schedule, options: PinnFit, generator: torch.Generator) -> Plan:
+    names = problem.free or tuple(problem.model.parameters())
+    first = {name: options.rate if name == OCCUPANCY else options.flow_rate for name in names}
+    return Plan(
+        problem=problem,
+        schedule=schedule,
+        optimiser=lambda leaves: Adam(leaves, "cpu", {}),
+        rates=lambda factor, step: {name: rate * factor for name, rate in first.items()},
+        generator=generator,
+    )
