@@ -38,6 +38,8 @@ STANDING = {"ssim": 1, "frcm": 1, "dice": 1, "relative_error_delta": -1}
 CONTINUOUS = ("soft12", "soft12-5000", "light12-5000", "drift", "tissue16", "coated")
 ABSORBERS = ("absorber12", "contact91")
 MEASURED = ("capsule-dome", "capsule", "tooth")
+PHOTOGRAPHED = ("cells12", "cells4")
+PHOTOGRAPHS = ("alpha-3dgs", "nerf")
 SHARP = ("sharp-even", "sharp-light", "sharp-drift")
 
 
@@ -141,13 +143,13 @@ def _four(numbers: dict[str, float]) -> str:
 
 
 def by_method(
-    file: str, cases: Sequence[str], cell: Sequence[str], rest: Sequence[str] = (), call: str = "`{}`"
+    rows: list[Row], cases: Sequence[str], cell: Sequence[str], rest: Sequence[str] = (), call: str = "`{}`"
 ) -> str:
-    """A line for each method of a benchmark's file, a column for each case, numbers `cell` in it, one after another.
+    """A line for each method of a benchmark's rows, a column for each case, numbers `cell` in it, one after another.
 
     rest: methods, in their order (default: all that are there, references left out).
     """
-    found = means(read(file))
+    found = means(rows)
     there = list(dict.fromkeys(m for (c, m) in found if c in cases and m not in REFERENCES))
     lines = []
     for method in rest or there:
@@ -171,27 +173,34 @@ METHODS += ("auto",)
 def continuous() -> str:
     """Continuous matter under real light."""
     return by_method(
-        "benchmark_continuous.csv", CONTINUOUS, ("ssim", "relative_error_delta", "delta_deviation"), METHODS
+        read("benchmark_continuous.csv"), CONTINUOUS, ("ssim", "relative_error_delta", "delta_deviation"), METHODS
     )
 
 
 def absorbers() -> str:
     """A strong absorber, and contact."""
     several = [m for m in METHODS if m not in ("paganin-tv", "ctf-tv", "gerchberg-saxton-tv", "admm-tv", "gaussians")]
-    return by_method("benchmark_continuous.csv", ABSORBERS, ("ssim", "relative_error_beta", "dice"), several)
+    return by_method(read("benchmark_continuous.csv"), ABSORBERS, ("ssim", "relative_error_beta", "dice"), several)
 
 
 def measured() -> str:
     """Measured frames."""
     left_out = ("paganin-tv", "ctf-tv", "gerchberg-saxton-tv", "admm-tv", "gaussians", "neural-field")
     several = [m for m in METHODS if m not in left_out]
-    return by_method("benchmark_continuous.csv", MEASURED, ("ssim", "relative_error_beta"), several)
+    return by_method(read("benchmark_continuous.csv"), MEASURED, ("ssim", "relative_error_beta"), several)
 
 
 def sharp_light() -> str:
     """Sharp cells in uneven light."""
     several = ("holographic-tv", "gaussians", "surfaces", "auto")
-    return by_method("sharp_light.csv", SHARP, ("relative_error_delta", "dice"), several)
+    return by_method(read("sharp_light.csv"), SHARP, ("relative_error_delta", "dice"), several)
+
+
+def photographs() -> str:
+    """Methods without waves, beside some with them, on one scene a case."""
+    rows = [row for row in read("photographs.csv") + read("benchmark.csv") if row["seed"] == "101"]
+    several = (*PHOTOGRAPHS, "paganin-fbp", "paganin-tv", "gaussians-random", "gaussians", "surfaces")
+    return by_method(rows, PHOTOGRAPHED, tuple(STANDING), several)
 
 
 def misaligned() -> str:

@@ -61,6 +61,13 @@ TABLES = {
         "an hour",
     ),
     "sharp-light": Table(benchmark.sharp_light, ("sharp_light.csv",), f"{BENCH} docs/data/sharp_light.csv", "an hour"),
+    "photographs": Table(
+        benchmark.photographs,
+        ("photographs.csv", "benchmark.csv"),
+        "holosplat bench run --cases cells12 cells4 --methods alpha-3dgs nerf --seeds 101 --snapshots DIR --out bench, "
+        "then python docs/make_benchmark.py bench docs/data/photographs.csv",
+        "ten minutes",
+    ),
     "misaligned": Table(
         benchmark.misaligned, ("benchmark_misaligned.csv",), f"{BENCH} docs/data/benchmark_misaligned.csv", "hours"
     ),

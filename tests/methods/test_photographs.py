@@ -10,6 +10,8 @@ import torch
 
 import holosplat as hs
 from helpers.contract import MATERIAL, two_balls
+from holosplat.fit.causes import scores
+from holosplat.fit.residuals import Prediction, residuals
 from holosplat.matter import Matter
 from holosplat.methods import Task
 from holosplat.methods.photographs import AlphaRates, AlphaSplats, ReadDelta
@@ -60,6 +62,18 @@ def test_opacities_are_reset_in_the_first_half(scan, task):
         opacity.append(float(fit.model.object.amplitudes.detach().max()))
     assert np.allclose(opacity, [0.1, 0.01, 0.01, 0.01, 0.01], rtol=1e-4)
     assert torch.equal(fit.model.object.raw_greys, start(scan).raw_greys)
+
+
+def test_wave_optics_explains_nothing_of_photographs(scan):
+    """Photographs of a detector that is elsewhere ask for its shift alone, not for matter, distances or blurs."""
+    seen, views = start(scan), scan.views
+    moved = replace(views, shifts=views.shifts + np.array([0.3 * views.pitch, 0.0]))
+    found = residuals(
+        Prediction(seen, scan.exposures, 1), seen.photographs(moved).detach(), torch.tensor(1e-9).expand(6, 24, 16)
+    )
+    cause = scores(found)
+    assert [cause[name].gain for name in ("mass", "absorption", "distance", "blur")] == [0.0] * 4
+    assert cause["shift_x"].value[0] == pytest.approx(0.3, rel=0.1)
 
 
 def test_splats_need_a_start():
