@@ -70,7 +70,7 @@ def pairs(arrays: list[Tensor], poses: tuple[Tensor, Tensor], sizes: Sizes) -> i
     total = 0
     for rotation, shift in zip(*poses):
         projected = reference._projected(centres, scales, quaternions, rotation, shift)
-        low, high = reference._boxes(*projected, (sizes.side, sizes.side), CUTOFF, VARIANCE)
+        low, high = reference.boxes(*projected, (sizes.side, sizes.side), CUTOFF, VARIANCE)
         total += int((high - low + 1).clamp(min=0).prod(1).sum())
     return total
 

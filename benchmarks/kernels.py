@@ -86,7 +86,7 @@ def splat_pairs(work: Workload) -> int:
     total = 0
     for rotation, shift in zip(*work.poses()):
         exact = reference._projected(centres, scales, quaternions, rotation, shift)
-        low, high = reference._boxes(*exact, (work.size,) * 2, work.cutoff, VARIANCE)
+        low, high = reference.boxes(*exact, (work.size,) * 2, work.cutoff, VARIANCE)
         total += int((high - low + 1).clamp(min=0).prod(1).sum())
     return total
 
@@ -95,7 +95,7 @@ def voxel_pairs(work: Workload) -> int:
     """Pairs of one pass over the volume."""
     centres, scales, quaternions, _ = (a.double() for a in work.cloud())
     axes = reference.rotation_matrices(quaternions) * scales[:, None]
-    low, high = reference._boxes(centres, axes @ axes.mT, (work.size,) * 3, work.cutoff, VARIANCE)
+    low, high = reference.boxes(centres, axes @ axes.mT, (work.size,) * 3, work.cutoff, VARIANCE)
     return int((high - low + 1).clamp(min=0).prod(1).sum())
 
 

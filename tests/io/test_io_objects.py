@@ -22,6 +22,7 @@ from holosplat.io.objects import FORMAT, read_object, write_object
 from holosplat.matter import Matter
 from holosplat.representations import (
     KINDS,
+    AlphaCloud,
     Encoding,
     Flow,
     GaussianCloud,
@@ -30,6 +31,7 @@ from holosplat.representations import (
     MovingSurfaces,
     Network,
     NeuralField,
+    RadianceField,
     SpaceTime,
     SpaceTimeField,
     Stored,
@@ -42,7 +44,7 @@ from holosplat.specimens.red_cells import icosphere
 PITCH = 2e-6
 GRID = Grid((7, 5, 9), (PITCH, PITCH, PITCH), (-8e-6, 1e-6, -5e-6))
 CELL = Matter.one(3e-7, 2e-10)
-KNOWN = "kinds gaussians, voxels, surfaces, moving-surfaces, moving-gaussians, neural-field, space-time-field"
+KNOWN = "kinds " + ", ".join(KINDS)
 OLD = Path(__file__).resolve().parents[1] / "data/run_0_1_0/gaussians.h5"
 
 
@@ -66,6 +68,8 @@ def objects() -> dict[str, Stored]:
             torch.stack([3 * sphere, 3 * sphere + 1]), faces.long(), 0 * faces[:, 0], TimeBasis(0, 1e-5, 1), PITCH, CELL
         ),
         "neural-field": NeuralField(GRID, CELL, small, mask, seed=4, upper=0.7),
+        "alpha-gaussians": AlphaCloud((*cloud[:3], torch.randn(n, 1), torch.randn(n, 1)), PITCH, CELL),
+        "radiance-field": RadianceField(GRID, CELL, small, mask, seed=4),
         "space-time-field": SpaceTimeField.still(
             torch.rand(3, *GRID.shape), GRID, np.array([0, 1e-5, 3e-5]), CELL, SpaceTime(pieces=1), 5, 0.9
         ),

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..checks import InputError, require
-from ..io.hdf5 import open_hdf5
+from ..io.hdf5 import Fields, open_hdf5
 from ..io.hdf5_writing import new_hdf5
 from ..io.json import read_json, write_json
 from ..progress import Advance
@@ -77,7 +77,7 @@ class Dataset:
         if not self.file(shard).is_file():
             return False
         with open_hdf5(self.file(shard)) as file:
-            return len(file[Sample.names()[0]]) >= len(shard)
+            return len(Fields(self.file(shard), file).dataset(Sample.names()[0])) >= len(shard)
 
     def require_whole(self) -> None:
         """`InputError` unless all scenes are there."""
@@ -108,4 +108,5 @@ class Dataset:
         path = self.file(shard)
         require(path.is_file(), f"{path} is missing; run holosplat dataset with the same options again.")
         with open_hdf5(path) as file:
-            return Sample(**{name: file[name][index % SHARD] for name in Sample.names()})
+            fields = Fields(path, file)
+            return Sample(**{name: np.asarray(fields.dataset(name)[index % SHARD]) for name in Sample.names()})
