@@ -38,7 +38,7 @@ class LearnedStart:
     """Options of a start that a network guesses."""
 
     weights: str = ""
-    """File of the network's weights (default: those that come with the package)."""
+    """File of the network's weights (default: those of the package, if it has any)."""
     doubt: Weight = 1.5
     """What a guess may leave unexplained of the retrieved thickness, in what 95 % of the scenes leave that the network
     was trained for: where it leaves more, the bodies are others."""

@@ -17,7 +17,7 @@ from ..tables import from_table
 from .network import Guess, Size
 
 SHIPPED = Path(__file__).with_name("red_cells.safetensors")
-"""The weights that come with the package."""
+"""Weights that may come with the package."""
 VERSION = 1
 """Of the network's layout."""
 
@@ -65,6 +65,11 @@ def write_weights(path: Path, network: Guess, card: Card) -> None:
 @lru_cache(maxsize=2)
 def read_weights(path: Path = SHIPPED) -> Trained:
     """The network in a file; `InputError` for one that `holosplat train` did not write, or of another version."""
+    if path == SHIPPED and not path.exists():
+        raise InputError(
+            "no weights come with this version of holosplat; train a network (holosplat dataset, holosplat train) and "
+            "name its file with --set weights=FILE."
+        )
     require_regular(path, "a file of weights")
     try:
         with safe_open(path, framework="pt") as file:
