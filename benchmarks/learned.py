@@ -4,7 +4,7 @@
         [--write]
 
 espresso: one time of red cells in flow, of an ESPResSo run in DATA (as for motion.py), on 128 × 96 pixels of 0.5 µm
-(20 keV, 10 cm), at 0/90°, 0/30/48° and even directions. cells, capsules, foam: scenes that `holosplat dataset` draws with
+(20 keV, 10 cm), at 0/90°, 0/30/48° and even directions. cells, capsules, foam: scenes that `holosplat dataset` draws by
 a seed that nothing was learnt from, in the first of their views. Haemoglobin, or the material, is known; there is no
 noise. Every scene is reconstructed by surfaces after Gaussians that begin with phase retrieval and with the network's
 guess, and scored against the true volume. A guess that the frames contradict is not taken: its row says so.
@@ -20,7 +20,6 @@ from pathlib import Path
 
 import numpy as np
 from machine import commit
-from motion import MATERIAL, PIXEL, SHAPE, cells_in_flow
 from rows import read, write
 
 import holosplat as hs
@@ -31,6 +30,7 @@ from holosplat.metrics import volume_scores
 from holosplat.specimens.scene import MeshScene
 from holosplat.training.ranges import Ranges
 from holosplat.training.sample import drawn_case
+from motion import MATERIAL, PIXEL, SHAPE, cells_in_flow
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "learned.csv"
 UNEQUAL = {2: (0.0, 90.0), 3: (0.0, 30.0, 48.0)}
