@@ -8,7 +8,6 @@ import pytest
 import xraydb
 
 from holosplat.checks import InputError
-from holosplat.formulas import atoms, delta_beta_per_density
 from holosplat.materials import (
     HAEMOGLOBIN,
     PLASMA,
@@ -72,64 +71,6 @@ def test_beta_is_photoabsorption_alone():
     for kind, ratio in (("photo", 2683), ("total", 1694)):
         mu = 100 * xraydb.material_mu(HAEMOGLOBIN.formula, 20e3, HAEMOGLOBIN.density_g_cm3, kind)
         assert delta / (mu * wavelength(20.0) / (4 * math.pi)) == near(ratio, rel=1e-3)
-
-
-ENERGIES = (0.1, 0.1003, 0.2842, 1.7, 7.112, 20.0, 33.3, 399.9, 400.0)
-"""From end to end of the tables [keV], at edges of carbon and iron, and between."""
-
-
-def test_tables_are_read_as_xraydb_reads_them():
-    """For all elements, each at two of the energies, to the last bits of a float."""
-    for number in range(1, 93):
-        symbol = xraydb.atomic_symbol(number)
-        for energy in (ENERGIES[number % 9], ENERGIES[(number + 4) % 9]):
-            delta, beta, _ = xraydb.xray_delta_beta(symbol, 1.0, 1e3 * energy)
-            assert delta_beta_per_density(symbol, energy) == near((delta, beta), rel=1e-13)
-
-
-@pytest.mark.parametrize(
-    "formula",
-    [
-        "H2O",
-        "CaMg(CO3)2",
-        "La1.9Sr0.1CuO4",
-        "Mn(SO4)2(H2O)7",
-        "Zn1.e-5Fe3O4",
-        "Fe.7Mg.3O",
-        "D2O",
-        "(Al(OH)3)2.5",
-        "Na Cl",
-    ],
-)
-def test_formulas_are_read_as_xraydb_reads_them(formula):
-    assert atoms(formula) == xraydb.chemparse(formula)
-    delta, beta, _ = xraydb.xray_delta_beta(formula, 1.0, 20e3)
-    assert delta_beta_per_density(formula, 20.0) == near((delta, beta), rel=1e-13)
-
-
-@pytest.mark.parametrize(
-    "formula",
-    [
-        "",
-        "h2o",
-        "H2O)",
-        "(H2O",
-        "2H",
-        "H2.3.4",
-        "Xx",
-        "H2O-",
-        "H(2)",
-        "Pu",
-        "Unh",
-        "()",
-        "()2",
-        "H0",
-        "H1e999",
-        9999 * "(",
-    ],
-)
-def test_what_is_no_formula_has_no_atoms(formula):
-    assert atoms(formula) == {}
 
 
 def test_delta_beta_differences_and_ratios():

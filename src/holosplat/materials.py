@@ -1,8 +1,9 @@
 """Matter to refractive index: δ and β of formulas and mixtures, n = 1 - δ + iβ (docs/conventions.md).
 
-Atomic scattering factors come from Chantler (1995, J. Phys. Chem. Ref. Data 24, 71; 2000, ibid. 29, 597; `formulas`):
-δ = r_e λ² Σ n_j f1_j / 2π, β = r_e λ² Σ n_j f2_j / 2π. β is photoabsorption only: photons scattered out of the beam (a
-third of water's attenuation at 20 keV) are not in it. Densities are in g/cm³, as in chemists' tables; energies in keV.
+Atomic scattering factors come from Chantler (1995, J. Phys. Chem. Ref. Data 24, 71; 2000, ibid. 29, 597) through
+`xraydb`: δ = r_e λ² Σ n_j f1_j / 2π, β = r_e λ² Σ n_j f2_j / 2π. β is photoabsorption only: photons scattered out of
+the beam (a third of water's attenuation at 20 keV) are not in it. Densities are in g/cm³, the unit chemists and tables
+use; energies in keV.
 """
 
 from __future__ import annotations
@@ -15,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import xraydb
 
 from .checks import InputError, in_range, require
-from .formulas import atoms, delta_beta_per_density
 from .matter import DeltaBeta as DeltaBeta
 from .scan import far_from_edges
 from .tables import read_table
@@ -39,8 +40,10 @@ def _density(name: str, value: Any) -> float:
 
 @lru_cache(maxsize=256)
 def _checked_formula(formula: str) -> str:
-    if isinstance(formula, str) and atoms(formula):
-        return formula
+    if isinstance(formula, str) and xraydb.validate_formula(formula):
+        atoms = xraydb.chemparse(formula)
+        if sum(atoms.values()) > 0 and max(xraydb.atomic_number(symbol) for symbol in atoms) <= 92:
+            return formula
     raise InputError(
         f"material {formula!r} must be a chemical formula of elements up to uranium, such as 'H2O' or 'SiO2' "
         f"(mind the capitals), or {NAMES}."
@@ -50,7 +53,8 @@ def _checked_formula(formula: str) -> str:
 @lru_cache(maxsize=1024)
 def _per_density(formula: str, energy_kev: float) -> DeltaBeta:
     """δ and β of `formula` at 1 g/cm³ (both are proportional to the density)."""
-    return DeltaBeta(*delta_beta_per_density(formula, energy_kev))
+    delta, beta, _ = xraydb.xray_delta_beta(formula, 1.0, 1e3 * energy_kev)
+    return DeltaBeta(float(delta), float(beta))
 
 
 @dataclass(frozen=True)

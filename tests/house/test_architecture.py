@@ -22,7 +22,6 @@ Files = dict[str, str]
 
 TIERS = (
     ("units", "version", "checks", "ranges", "lazy", "tables", "native", "backends", "memory", "progress", "display")
-    + ("formulas",)
     + ("geometry", "frames", "divided_light", "scan", "volume", "mesh", "matter"),
     ("materials", "optics", "metrics", "projectors", "preprocess"),
     ("specimens", "representations", "model"),
