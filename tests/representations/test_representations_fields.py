@@ -300,7 +300,7 @@ CUBE = Grid.centred((3, 3, 3), 1.0)
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Encoding("wavelet"), "kind must be hash or fourier"),  # type: ignore[arg-type]
+        (lambda: Encoding("wavelet"), "kind must be one of hash, fourier, octaves"),  # type: ignore[arg-type]
         (lambda: Encoding(levels=0), "levels must be at least 1"),
         (lambda: Encoding(coarsest=1.0, finest=2.0), "finest must lie between"),
         (lambda: Encoding(bandwidth=0.0), "bandwidth must be positive"),

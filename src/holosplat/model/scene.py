@@ -85,7 +85,9 @@ class Model:
 
     def lines(self, time: float, index: Tensor | None = None) -> LineIntegrals:
         """Line integrals of the matter at `time` [s] on the instrument's raster, in the exposures `index`."""
-        matter = self.object.at(float(time))
+        return self._lines_of(self.object.at(float(time)), index)
+
+    def _lines_of(self, matter: Object, index: Tensor | None) -> LineIntegrals:
         if isinstance(matter, Component):  # it takes poses, which cost no time to make
             assert isinstance(matter, TrainableObject)
             return LineIntegrals.of_any(matter.project(self._poses(self.instrument.poses, index)))
@@ -95,7 +97,7 @@ class Model:
         matter = self.object.at(time)
         if isinstance(matter, Photographed):
             return matter.photographs(self._poses(self.instrument.detector, index))
-        lines, planned, alignment = self.lines(time, index), self.instrument.exposures, self.alignment
+        lines, planned, alignment = self._lines_of(matter, index), self.instrument.exposures, self.alignment
         if alignment is None:
             return self.instrument.frames(lines, index)
         distance, sigma = alignment.optical_distance(planned, index), alignment.psf_sigma_px(planned, index)
