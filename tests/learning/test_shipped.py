@@ -1,0 +1,33 @@
+"""The weights of the package: what they are, and that they know red cells of a seed that nothing was learnt from."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from holosplat.learning.weights import SHIPPED, read_weights
+from holosplat.training.objective import dice
+from holosplat.training.ranges import Ranges
+from holosplat.training.sample import sample_of
+from holosplat.training.shown import whole
+
+CELLS = Ranges(rows=48, columns=48, views=4, held_out=1, tilted=0.0, noiseless=1.0, across=(12.0, 14.0), fresnel=(0.02, 0.1))
+
+
+def test_they_are_small_and_say_what_they_were_trained_on():
+    card = read_weights().card
+
+    assert SHIPPED.stat().st_size < 5e6
+    assert not card.made_by["commit"].endswith("dirty")
+    assert card.trained_on["kinds"] == ["red-cells"]
+    assert set(card.typical_misfit) == {"2", "3", "4", "6"}
+
+
+@pytest.mark.parametrize(("views", "least"), [(2, 0.5), (4, 0.7)])
+def test_they_know_red_cells(views, least):
+    lesson = whole(sample_of(CELLS, 77, 1), views)
+
+    with torch.inference_mode():
+        found = read_weights().network(lesson.images, lesson.taps)[1]
+
+    assert dice(found, lesson.occupancy) > least
