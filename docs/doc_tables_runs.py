@@ -276,3 +276,23 @@ def pinn() -> str:
         lines.append([f"{case}, {views} views", EQUATIONS[name], dice, error, moving, f"{seconds:.0f} s"])
     columns = ("case", "field", "Dice", "error of δ", "error of the velocity (cosine)", "processor time")
     return markdown(columns, lines)
+
+
+def learned() -> str:
+    """Both starts and the guess itself, by case, scene and number of views."""
+    rows = {(r["case"], r["scene"], int(r["views"]), r["start"]): r for r in read("learned.csv")}
+    lines = []
+    for case, scene, views in sorted({key[:3] for key in rows}):
+        guess, phase, taken = (rows[case, scene, views, start] for start in ("guess", "phase", "learned"))
+        fitted = [
+            f"{rounded(r['dice'], 3)} / {rounded(r['error'], 3)}" if r["dice"] else "refused" for r in (phase, taken)
+        ]
+        lines.append([f"{case}, scene {scene}", str(views), rounded(guess["dice"], 3), *fitted])
+    columns = (
+        "",
+        "views",
+        "Dice of the guess",
+        "phase retrieval, then fitted: Dice / error of δ",
+        "guess, then fitted",
+    )
+    return markdown(columns, lines)

@@ -134,6 +134,12 @@ TABLES |= {
 TABLES["pinn"] = Table(
     runs.pinn, ("pinn.csv",), "python benchmarks/pinn.py --cases channel swirl --write", "half an hour"
 )
+TABLES["learned"] = Table(
+    runs.learned,
+    ("learned.csv",),
+    "python benchmarks/learned.py DATA --cases espresso --views 2 3 4 --write",
+    "minutes",
+)
 TABLES["bed"] = Table(
     measured.bed, ("real_data.csv",), "python benchmarks/packed_bed.py --data FOLDER --work FOLDER", "an hour"
 )

@@ -11,7 +11,9 @@ from holosplat.training.ranges import Ranges
 from holosplat.training.sample import sample_of
 from holosplat.training.shown import whole
 
-CELLS = Ranges(rows=48, columns=48, views=4, held_out=1, tilted=0.0, noiseless=1.0, across=(12.0, 14.0), fresnel=(0.02, 0.1))
+CELLS = Ranges(
+    rows=48, columns=48, views=4, held_out=1, tilted=0.0, noiseless=1.0, across=(12.0, 14.0), fresnel=(0.02, 0.1)
+)
 
 
 def test_they_are_small_and_say_what_they_were_trained_on():
