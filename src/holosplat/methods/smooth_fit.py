@@ -212,8 +212,8 @@ class SmoothFit:
 
         Where a descent fell into the trap of an empty volume, which does not explain the frames, it is begun again with
         shorter steps. How strong a prior noise allows depends on how many views and how much matter there are; so it is
-        halved where an empty volume is likelier still, and where voxels of a pixel do not explain the frames to within their noise
-        (Morozov's discrepancy principle, 1966), as long as that helps.
+        halved where an empty volume is likelier still, and where voxels of a pixel do not explain the frames to within
+        their noise (Morozov's discrepancy principle, 1966), as long as that helps.
         """
         problem, u = descent.problem, descent.u
         assert isinstance(problem, VolumeProblem)
