@@ -9,6 +9,7 @@ from typing import ClassVar
 from ..checks import InputError
 from ..fit.loop import Fit
 from ..matter import DeltaBeta, MatterKind
+from ..ranges import Share, ranged
 from ..representations import GaussianCloud, Stored, SurfaceMesh, VoxelGrid
 from .assumed import assumed_material
 from .cross_validation import CrossValidation, MissingMatter
@@ -22,12 +23,10 @@ from .surfaces import BodiesStage, SurfaceStage
 from .volume import SmoothStage, SmoothVolume
 
 TRIAL = "trial of methods"
-UNEXPLAINED = 0.25
-"""Share of all matter that bodies may leave unexplained before a smooth volume is tried: wrong levels leave more, right
-ones less than a sixth even of crowded scenes in noise."""
 
 
 @dataclass(frozen=True)
+@ranged
 class Auto:
     """Matter with levels: Gaussians, and closed surfaces where there are bodies. Continuous matter: a smooth volume.
 
@@ -44,6 +43,9 @@ class Auto:
     """How it is decided whether matter has levels."""
     trials: CrossValidation = field(default_factory=CrossValidation)
     """How views are set aside for trials."""
+    unexplained: Share = 0.25
+    """Share of all matter that bodies may leave unexplained before a smooth volume is tried: right levels leave less
+    than a sixth even of crowded scenes in noise."""
 
     def stages(self) -> Sequence[Stage]:
         """Those for matter with levels; `chosen` decides."""
@@ -51,7 +53,11 @@ class Auto:
 
     def suited(self, matter: MatterKind) -> Method:
         """What is done with a kind of matter."""
-        return self.volume if matter == "continuous" else Bodies(self.gaussians, self.surfaces, self.volume)
+        return (
+            self.volume
+            if matter == "continuous"
+            else Bodies(self.gaussians, self.surfaces, self.volume, self.unexplained)
+        )
 
     def chosen(self, task: Task, decision: Decision) -> tuple[Method, Decision]:
         """The method for `task`, of whose matter there is a `decision`; and that, if a trial has changed it."""
@@ -103,11 +109,13 @@ class Bodies:
     gaussians: Gaussians
     surfaces: SurfaceOptions
     volume: SmoothVolume
+    unexplained: float
 
     def stages(self) -> Sequence[Stage]:
         """Those of the Gaussians, the surfaces, and the volume."""
         closed = SurfacesWhereClosed(self.surfaces, self.gaussians.coarse)
-        return (BodiesStage(self.gaussians, surfaces=self.surfaces), closed, VolumeWhereUnexplained(self.volume))
+        last = VolumeWhereUnexplained(self.volume, most=self.unexplained)
+        return (BodiesStage(self.gaussians, surfaces=self.surfaces), closed, last)
 
 
 @dataclass(frozen=True)
@@ -138,6 +146,8 @@ class VolumeWhereUnexplained(SmoothStage):
     better: ClassVar[float] = 2.0
     """So many times less must it leave unexplained than bodies do: it is freer, and follows the frames' errors, too."""
     likelier: ClassVar[bool] = False
+    most: float = 0.25
+    """Share of all matter that bodies may leave unexplained before it is tried."""
 
     def start(self, task: Task, before: Stored | None) -> Stored:  # type: ignore[override]
         """A first volume; what came before, where that explains the frames or has two materials."""
@@ -146,7 +156,7 @@ class VolumeWhereUnexplained(SmoothStage):
         if not matter.single or task.scan.is_series:
             return before
         judge = MissingMatter(task.scan, DeltaBeta(matter.delta, matter.beta))
-        return before if judge.share(before) <= UNEXPLAINED else super().start(_continuous(task), None)
+        return before if judge.share(before) <= self.most else super().start(_continuous(task), None)
 
     def fit(self, task: Task, start: Stored) -> SmoothFit | None:  # type: ignore[override]
         """The fit of the volume; None for what came before."""
