@@ -75,7 +75,7 @@ class Trap:
     def __call__(self, u: torch.Tensor) -> tuple[float, torch.Tensor]:
         return float(((u - 1) ** 2 * (u + 0.05)).sum()), 2 * (u - 1) * (u + 0.05) + (u - 1) ** 2
 
-    def preconditioner(self, at: torch.Tensor):
+    def preconditioner(self, u: torch.Tensor):
         return lambda gradient: gradient
 
 

@@ -114,7 +114,7 @@ class Bodies:
     def stages(self) -> Sequence[Stage]:
         """Those of the Gaussians, the surfaces, and the volume."""
         closed = SurfacesWhereClosed(self.surfaces, self.gaussians.coarse)
-        last = VolumeWhereUnexplained(self.volume, most=self.unexplained)
+        last = VolumeWhereUnexplained(self.volume, self.unexplained)
         return (BodiesStage(self.gaussians, surfaces=self.surfaces), closed, last)
 
 
@@ -140,27 +140,30 @@ class SurfacesWhereClosed(SurfaceStage):
 
 
 @dataclass(frozen=True)
-class VolumeWhereUnexplained(SmoothStage):
-    """A smooth volume, where matter with levels explains the frames badly: then there are no such levels."""
+class VolumeWhereUnexplained:
+    """A smooth volume, where matter with levels explains the frames badly: then there are no such levels.
 
+    most: share of all matter that what came before may leave unexplained
+    """
+
+    options: SmoothVolume
+    most: float
+    name: str = "smooth volume"
     better: ClassVar[float] = 2.0
     """So many times less must it leave unexplained than bodies do: it is freer, and follows the frames' errors, too."""
-    likelier: ClassVar[bool] = False
-    most: float = 0.25
-    """Share of all matter that bodies may leave unexplained before it is tried."""
 
-    def start(self, task: Task, before: Stored | None) -> Stored:  # type: ignore[override]
+    def start(self, task: Task, before: Stored | None) -> Stored:
         """A first volume; what came before, where that explains the frames or has two materials."""
         assert before is not None
         matter = before.matter
         if not matter.single or task.scan.is_series:
             return before
         judge = MissingMatter(task.scan, DeltaBeta(matter.delta, matter.beta))
-        return before if judge.share(before) <= self.most else super().start(_continuous(task), None)
+        return before if judge.share(before) <= self.most else SmoothStage(self.options).start(_continuous(task), None)
 
-    def fit(self, task: Task, start: Stored) -> SmoothFit | None:  # type: ignore[override]
+    def fit(self, task: Task, start: Stored) -> SmoothFit | None:
         """The fit of the volume; None for what came before."""
-        return super().fit(_continuous(task), start) if isinstance(start, VoxelGrid) else None
+        return SmoothStage(self.options).fit(_continuous(task), start) if isinstance(start, VoxelGrid) else None
 
 
 def _continuous(task: Task) -> Task:
