@@ -23,7 +23,7 @@ MOST = 200_000
 MOST_FILES = 10_000
 """Files that one may bring values of: one a frame, and more than beamlines write."""
 AGED = 1_000_000_000
-"""Nanoseconds without a change after which the times of a file tell the next change: clocks of file systems are coarse."""
+"""Nanoseconds without a change after which the times of a file tell the next one: clocks of file systems are coarse."""
 MOST_KNOWN = 1000
 """Files that are remembered, at most."""
 _vouched: set[Path] = set()
