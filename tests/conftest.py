@@ -30,6 +30,7 @@ TOGETHER = ("tests/cli", "tests/workflows")
 
 LONG = (
     *TOGETHER,
+    "tests/house/test_triton_compile.py",
     "tests/house/test_examples.py",
     "tests/bench",
     "tests/align",
