@@ -8,6 +8,7 @@ less of the matter in the frames unexplained than that; where it does not, the r
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -48,9 +49,7 @@ def learned_cloud(task: Task, options: GaussianOptions, fitted: Fitted) -> Gauss
         return _begun(task, Beginning("phase", why, guess), starting_cloud(task, ordinary))
     clouds = starting_cloud(task, ordinary), cloud_of(found.values, found.grid, material, task, options)
     plain, learned = (_Trial.of(task, cloud, material, how, fitted) for cloud in clouds)
-    told = (
-        f"leaves {100 * learned.share:.2g} % of the matter unexplained, and phase retrieval {100 * plain.share:.2g} %"
-    )
+    told = f"leaves {100 * learned.left:.2g} % of the frames unexplained, and phase retrieval {100 * plain.left:.2g} %"
     if learned.clearly_better(plain, how):
         why = f"The run began with the network's guess: fitted for a while, it {told}."
         return _begun(task, Beginning("learned", why, guess), clouds[1])
@@ -72,6 +71,12 @@ class _Trial:
     contrast: float
     closed: bool
 
+    @property
+    def left(self) -> float:
+        """Their geometric mean: the one does not see fringes that are out of place, the other hardly sees how much
+        matter there is."""
+        return math.sqrt(self.share * self.contrast)
+
     @classmethod
     def of(cls, task: Task, cloud: GaussianCloud, material: DeltaBeta, how: LearnedStart, fitted: Fitted) -> _Trial:
         """That of `cloud`, as Gaussians, and then as surfaces where it has some: they hold edges, and cannot explain by
@@ -86,9 +91,7 @@ class _Trial:
 
     def clearly_better(self, other: _Trial, how: LearnedStart) -> bool:
         """Whether it explains the frames clearly better than another one, of the same kind."""
-        if self.closed != other.closed:
-            return False
-        return self.share < how.clearly * other.share and self.contrast < how.clearly * other.contrast
+        return self.closed == other.closed and self.left < how.clearly * other.left
 
 
 def _surfaces(task: Task, cloud: GaussianCloud, steps: int) -> SurfaceMesh | None:
