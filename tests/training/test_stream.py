@@ -43,7 +43,7 @@ def test_numbers_beyond_the_last_scene_are_none():
     scenes = Scenes(TINY, count=2, shown=lambda sample: 1)
 
     assert len(scenes) == 2
-    assert list(scenes) == [1, 1]
+    assert [scenes[k] for k in range(-2, 2)] == [1, 1, 1, 1]
     for number in (2, -3):
         with pytest.raises(IndexError, match="from 0 to 1"):
             scenes[number]
