@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from helpers.cli import MATTER, holosplat, known, refused, worked
+from holosplat.cli.options import MethodOptions
 from holosplat.io.guess import read_guess
 from holosplat.learning.network import Guess
 from holosplat.learning.size import Size
@@ -59,6 +60,13 @@ def test_a_guess_that_the_frames_contradict_is_not_begun_with_and_the_run_says_s
     guess, spread = read_guess(tmp_path / "run" / "guess.h5")
     assert spread is not None
     assert guess.delta.shape == spread.shape
+
+
+@pytest.mark.parametrize("method", [None, "auto", "gaussians", "surfaces"])
+def test_every_method_with_gaussians_takes_the_start(method):
+    chosen = MethodOptions(method, start="learned").chosen()
+
+    assert getattr(chosen, "gaussians", chosen).start == "learned"
 
 
 def test_a_start_is_refused_by_methods_without_one(shop, tmp_path):
