@@ -24,6 +24,8 @@ ROUNDS = 30
 UNEVEN, SEEN = 6.0, 0.07
 """Light is uneven if the squares of its lowest modes in air exceed those of noise by so many of their deviations, and
 it is so large a part of the frames' contrast."""
+SURE, FAINT = 60.0, 0.03
+"""The same of light that is faint beside the contrast: far fringes, which pass for air, leave as much, but less sure."""
 GRAINY, HALVED = 4, 0.5
 """Rounds, at most, in which light is divided out and the noise of the rest gives better light. Grain that falls below
 this part of what it was may still be steep light; true grain stays as it is, and there is one round."""
@@ -304,7 +306,8 @@ def _surely_uneven(frames: Tensor, air: Tensor, noise: NoiseModel, usable: Tenso
     freedom = float(right.numel())
     size = float((((found @ modes).reshape(lit.shape) * seen).square().sum() - len(modes) * power.sum()) / seen.sum())
     contrast = float((lit - 1).square().mean())
-    return squares > freedom + UNEVEN * (2 * freedom) ** 0.5 and size > SEEN**2 * contrast
+    deviations = (squares - freedom) / (2 * freedom) ** 0.5
+    return any(deviations > most and size > least**2 * contrast for most, least in ((UNEVEN, SEEN), (SURE, FAINT)))
 
 
 def _deviation(factor: Tensor) -> float:
