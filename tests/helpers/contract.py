@@ -15,7 +15,7 @@ from holosplat.bench.method import Method
 from holosplat.bench.methods import METHODS, methods
 from holosplat.bench.methods import PHOTOGRAPHS as PHOTOGRAPHIC
 from holosplat.fit.density import DensityControl
-from holosplat.methods import SmoothVolume
+from holosplat.methods import NeuralFields, NeuralFit, SmoothVolume
 from holosplat.methods.photographs import AlphaRates, AlphaSplats, RadianceFields
 from holosplat.representations import Encoding, Network
 from holosplat.specimens.red_cells import icosphere
@@ -35,7 +35,9 @@ PHOTOGRAPHS = {
 START = HolographicTV(retrieval=20, iterations=40, corrections=2, inner=6, noisy=1.0, refine=1, upper=0.0)
 VOLUME = {"volume": replace(METHODS["volume"], options=SmoothVolume(START, coarser=(2,), rounds=1, iterations=4))}
 """The method that takes no share of its steps, in few."""
-QUICK = methods(effort=0.05) | {"neural-field": methods(effort=0.12)["neural-field"]} | PHOTOGRAPHS | VOLUME
+FEW_RAYS = NeuralFields(fit=NeuralFit(warmup_rays=1024, probes=512)).with_effort(0.12)
+QUICK = methods(effort=0.05) | PHOTOGRAPHS | VOLUME
+QUICK["neural-field"] = replace(METHODS["neural-field"], options=FEW_RAYS)
 """The same methods with a small part of their steps: the contract is about form, not about quality."""
 QUICKER = methods(effort=0.05) | PHOTOGRAPHS | VOLUME
 """With a still smaller part, where finite numbers are all that is asked for."""

@@ -220,6 +220,6 @@ def test_a_method_without_a_fit_is_an_object_all_the_same(scan, tmp_path, name):
 @pytest.mark.parametrize("case_name", ["voxels", "neural-field"])
 def test_with_nothing_known_delta_and_beta_are_free_in_files_too(scan: Scan, tmp_path, case_name):
     folder = RunFolder(tmp_path / "run")
-    found = reconstruct(scan, MaterialPrior.unknown(), CASES[case_name].method, folder=folder)
+    found = reconstruct(scan, MaterialPrior.unknown(), CASES[case_name].method, matter="levels", folder=folder)
     assert not found.object.matter.occupancies
     assert load_reconstruction(folder).object.matter == found.object.matter
