@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from helpers.cli import MATTER, holosplat, known, refused, worked
+from holosplat.cli.options import MethodOptions
 from holosplat.io.guess import read_guess
 from holosplat.learning.network import Guess
 from holosplat.learning.size import Size
@@ -61,6 +62,13 @@ def test_a_guess_that_the_frames_contradict_is_not_begun_with_and_the_run_says_s
     assert guess.delta.shape == spread.shape
 
 
+@pytest.mark.parametrize("method", [None, "auto", "gaussians", "surfaces"])
+def test_every_method_with_gaussians_takes_the_start(method):
+    chosen = MethodOptions(method, start="learned").chosen()
+
+    assert getattr(chosen, "gaussians", chosen).start == "learned"
+
+
 def test_a_start_is_refused_by_methods_without_one(shop, tmp_path):
     asked = holosplat(
         *("reconstruct", shop.scan, "--out", tmp_path / "run", "--method", "voxels", "--start", "learned", *MATTER[2:])
@@ -79,4 +87,4 @@ def test_scenes_are_exported_to_layouts_of_others(tmp_path):
     )
 
     for layout in ("nerf-synthetic", "r2-gaussian", "onix"):
-        assert f"wrote 1 scenes into {tmp_path / 'scenes' / layout}" in done.out
+        assert f"wrote 1 scene into {tmp_path / 'scenes' / layout}" in done.out
