@@ -274,7 +274,7 @@ def test_two_materials_are_found_where_nothing_is_known(scan, truth):
     assert low == pytest.approx(OIL.delta, rel=0.2)
     assert dark == pytest.approx(SILICA.beta, rel=0.35)
     scores = evaluate(found, scan, truth)
-    one = reconstruct(scan, MaterialPrior.of_ratio(SILICA.ratio), settings(), matter="levels")
+    one = reconstruct(scan, MaterialPrior.of_ratio(SILICA.ratio), settings())
     alone = evaluate(one, scan, truth)
     assert scores.volume.relative_error_delta < min(0.12, alone.volume.relative_error_delta)
     assert "of two; the other: δ " in scores.lines()[-1]
