@@ -1,13 +1,13 @@
 """What a learned start is worth: rows of docs/data/learned.csv.
 
-    python benchmarks/learned.py [DATA] [--cases espresso cells capsules foam] [--views 2 3 4 6 8] [--weights FILE]
-        [--write]
+    python benchmarks/learned.py [DATA] [--cases espresso cells capsules foam crowd ellipsoids soft-cells]
+        [--views 2 3 4 6 8] [--scenes 0] [--starts phase learned] [--weights FILE] [--write]
 
 espresso: one time of red cells in flow, of an ESPResSo run in DATA (as for motion.py), on 128 × 96 pixels of 0.5 µm
-(20 keV, 10 cm), at 0/90°, 0/30/48° and even directions. cells, capsules, foam: scenes that `holosplat dataset` draws by
-a seed that nothing was learnt from, in the first of their views. Haemoglobin, or the material, is known; there is no
-noise. Every scene is reconstructed by surfaces after Gaussians that begin with phase retrieval and with the network's
-guess, and scored against the true volume. A guess that the frames contradict is not taken: its row says so.
+(20 keV, 10 cm), at 0/90°, 0/30/48° and even directions. The others: scenes of 64 × 64 pixels that `holosplat dataset`
+draws by a seed that nothing was learnt from, in the first of their views. Haemoglobin, or the material, is known; there
+is no noise. Every scene is reconstructed by `auto`, with and without `--start learned`, and scored against the true
+volume and in two views that are held out. Of continuous cells the kind of matter is not told.
 """
 
 from __future__ import annotations
@@ -15,8 +15,10 @@ from __future__ import annotations
 import argparse
 import platform
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from machine import commit
@@ -25,10 +27,11 @@ from rows import read, write
 import holosplat as hs
 from holosplat.geometry import Grid
 from holosplat.learning.start import LearnedStart, guessed
-from holosplat.methods import Surfaces
+from holosplat.methods import Auto
 from holosplat.metrics import volume_scores
+from holosplat.specimens.continuous import ContinuousScene
 from holosplat.specimens.scene import MeshScene
-from holosplat.training.ranges import Ranges
+from holosplat.training.ranges import Kind, Ranges
 from holosplat.training.sample import drawn_case
 from motion import MATERIAL, PIXEL, SHAPE, cells_in_flow
 
@@ -37,14 +40,23 @@ UNEQUAL = {2: (0.0, 90.0), 3: (0.0, 30.0, 48.0)}
 """Angles of two and three beams [degrees], as instruments have them; more are even."""
 SEED = 77
 """Of drawn scenes; networks learn from seed 0 and are validated by seed 1."""
-KINDS = {"cells": "red-cells", "capsules": "capsules", "foam": "foam"}
+KINDS: dict[str, Kind] = {
+    **{"cells": "red-cells", "capsules": "capsules", "foam": "foam"},
+    **{"crowd": "crowd", "ellipsoids": "ellipsoids", "soft-cells": "soft-cells"},
+}
+SCENES = {"espresso": (5, 40)}
+"""Which are taken; of the others the first."""
+FIELD = 64
+"""Rows and columns of drawn scenes."""
+BESIDE = (17.0, 73.0)
+"""Angles of the flowing cells' views that are held out [degrees]."""
 
 
 @dataclass(frozen=True)
 class Row:
     """case, scene: which snapshot, or number of a drawn scene; start: phase, learned, or guess (the network's volume
-    itself); dice, error: of occupancy and relative of δ, empty where frames contradict the guess; left: what the guess
-    leaves unexplained of the retrieved thickness."""
+    itself); dice, error: of occupancy and relative of δ; ssim, frcm: of two views that are held out; left: what the
+    guess leaves unexplained of the retrieved thickness; begun: what the run said of its start."""
 
     case: str
     scene: int
@@ -52,59 +64,67 @@ class Row:
     start: str
     dice: float | str
     error: float | str
+    ssim: float | str
+    frcm: float | str
     left: float | str
+    begun: str
     seconds: float
     machine: str
     commit: str
 
 
+UNSAID: dict[str, Any] = dict.fromkeys(("ssim", "frcm", "left", "begun"), "")
+"""What some rows do not say."""
+
+
 @dataclass(frozen=True)
 class Setting:
-    """A scan with its true scene and material."""
+    """A scan with its true scene and material; levels: whether that it has such is told."""
 
     scan: hs.Scan
-    scene: MeshScene
+    scene: MeshScene | ContinuousScene
     material: hs.DeltaBeta
+    levels: bool = True
 
 
 def espresso(data: Path, snapshot: int, views: int) -> Setting:
     """One time of the flowing cells."""
     scene = cells_in_flow(data, snapshot, 1).snapshots[0]
     angles = UNEQUAL.get(views) or tuple(np.arange(views) * 180 / views)
-    exposures = hs.Exposures.of(hs.Views.from_angles(np.array(angles), SHAPE, PIXEL), 20.0, 0.1)
-    return Setting(hs.simulate(scene, exposures, is_test=np.zeros(views, dtype=bool)), scene, MATERIAL)
+    exposures = hs.Exposures.of(hs.Views.from_angles(np.array((*angles, *BESIDE)), SHAPE, PIXEL), 20.0, 0.1)
+    return Setting(hs.simulate(scene, exposures, is_test=np.arange(views + 2) >= views), scene, MATERIAL)
 
 
-def drawn(kind: str, number: int, views: int) -> Setting:
+def drawn(kind: Kind, number: int, views: int) -> Setting:
     """A drawn scene, without noise, in the first of its views."""
-    ranges = Ranges(kinds=(kind,), noiseless=1.0, tilted=0.0, views=max(views, 2))  # type: ignore[arg-type]
+    ranges = Ranges(kinds=(kind,), rows=FIELD, columns=FIELD, noiseless=1.0, tilted=0.0, views=views)
     case = drawn_case(ranges, SEED, number)
-    scan = case.scan().train()[np.arange(views)]
-    assert isinstance(case.scene, MeshScene)
-    return Setting(scan, case.scene, case.prior.materials[0])
+    return Setting(case.scan(), case.scene, case.prior.materials[0], kind != "soft-cells")
 
 
-def rows(setting: Setting, weights: str) -> list[tuple[str, float | str, float | str, float | str, float]]:
-    """(start, Dice, error, left, seconds) of the guess and of both starts."""
-    how, known = LearnedStart(weights=weights), hs.MaterialPrior.known(setting.material)
+def rows(setting: Setting, weights: str, starts: Sequence[str]) -> list[tuple[str, dict[str, Any]]]:
+    """Start and values of the row, for the guess and for each of `starts`."""
+    how, known, train = LearnedStart(weights=weights), hs.MaterialPrior.known(setting.material), setting.scan.train()
     began = time.perf_counter()
-    guess = guessed(setting.scan, setting.material, how.network.network, lambda stage, fraction: None)
+    guess = guessed(train, setting.material, how.network.network, lambda stage, fraction: None)
+    seconds = time.perf_counter() - began
     truth, found = setting.scene.voxelise(guess.grid), guess.values.numpy() * setting.material.delta
     scores = volume_scores(hs.Volume(found, found / setting.material.ratio, guess.grid), truth)
-    left = guess.left()
-    table = [("guess", scores.dice, scores.relative_error_delta, left, time.perf_counter() - began)]
-    grid, plain = Grid.of_views(setting.scan.views), Surfaces()
-    for start in ("phase", "learned"):
+    said = {"dice": scores.dice, "error": scores.relative_error_delta, "left": guess.left(), "seconds": seconds}
+    table: list[tuple[str, dict[str, Any]]] = [("guess", said)]
+    whole, plain = setting.scene.voxelise(Grid.of_views(setting.scan.views)), Auto()
+    for start in starts:
         method = replace(plain, gaussians=replace(plain.gaussians, start=start, learned=how))
         began = time.perf_counter()
-        try:
-            result = hs.reconstruct(setting.scan, known, method, matter="levels")
-        except hs.InputError as error:
-            print(f"  {start}: {error}")
-            table.append((start, "", "", left, time.perf_counter() - began))
-            continue
-        scores = volume_scores(result.object.voxelise(grid), setting.scene.voxelise(grid))
-        table.append((start, scores.dice, scores.relative_error_delta, "", time.perf_counter() - began))
+        result = hs.reconstruct(setting.scan, known, method, matter="levels" if setting.levels else None)
+        seconds = time.perf_counter() - began
+        scored = hs.evaluate(result, setting.scan, whole)
+        assert scored.volume is not None
+        assert scored.test is not None
+        said = {"dice": scored.volume.dice, "error": scored.volume.relative_error_delta}
+        said |= {name: scored.test.mean[name] for name in ("ssim", "frcm")}
+        begun = result.choice.begun if result.choice.matter == "levels" else "continuous: no Gaussians"
+        table.append((start, said | {"begun": begun, "seconds": seconds}))
     return table
 
 
@@ -122,19 +142,22 @@ def main() -> None:
     parser.add_argument("data", nargs="?", type=Path)
     parser.add_argument("--cases", nargs="+", default=["espresso", *KINDS], choices=["espresso", *KINDS])
     parser.add_argument("--views", nargs="+", type=int, default=[2, 3, 4, 6, 8])
-    parser.add_argument("--scenes", nargs="+", type=int, default=[5, 40])
+    parser.add_argument("--scenes", nargs="+", type=int)
+    parser.add_argument("--starts", nargs="+", default=["phase", "learned"], choices=["phase", "learned"])
     parser.add_argument("--weights", default="")
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    for case in options.cases:
-        for scene in options.scenes:
-            for views in options.views:
-                given = espresso(options.data, scene, views) if case == "espresso" else drawn(KINDS[case], scene, views)
-                for start, dice, error, left, seconds in rows(given, options.weights):
-                    row = Row(case, scene, views, start, dice, error, left, seconds, platform.machine(), commit())
-                    print(row, flush=True)
-                    if options.write:
-                        keep(row)
+    every = [
+        (v, case, n) for v in options.views for case in options.cases for n in options.scenes or SCENES.get(case, (0,))
+    ]
+    for views, case, scene in every:
+        given = espresso(options.data, scene, views) if case == "espresso" else drawn(KINDS[case], scene, views)
+        for start, said in rows(given, options.weights, options.starts):
+            who = {"machine": platform.machine(), "commit": commit()}
+            row = Row(case, scene, views, start, **(UNSAID | said | who))
+            print(row, flush=True)
+            if options.write:
+                keep(row)
 
 
 if __name__ == "__main__":

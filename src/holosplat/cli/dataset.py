@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
-from tyro.conf import OmitArgPrefixes
+from tyro.conf import OmitArgPrefixes, arg
 
 from ..ranges import Natural, Seed
 from ..training.ranges import Ranges
 from .progress import INTERRUPTED, ProgressBar
 
+Layout = Literal["nerf-synthetic", "r2-gaussian", "onix"]
+"""Those of `training.export`, which loads torch."""
 DRAWN = Ranges()
 """Red cells under ideal light."""
 
@@ -22,6 +24,7 @@ def dataset(
     drawn: Annotated[Ranges, OmitArgPrefixes] = DRAWN,
     seed: Seed = 0,
     jobs: Natural = 1,
+    layouts: Annotated[tuple[Layout, ...], arg(name="export")] = (),
 ) -> None:
     """Simulate scenes for learning, drawn at random from stated ranges, into a folder of shards with a datasheet.
 
@@ -32,7 +35,9 @@ def dataset(
         count: Number of scenes.
         seed: Seed of the scenes.
         jobs: Processes that simulate.
+        layouts: Layouts of other programs into which the scenes are written too, each into a folder of its name in out.
     """
+    from ..training.export import export
     from ..training.folder import Dataset
     from ..training.make import make
 
@@ -43,4 +48,11 @@ def dataset(
         except KeyboardInterrupt:
             print(f"interrupted; {out} keeps its whole files, and the same command goes on", file=sys.stderr)
             raise SystemExit(INTERRUPTED) from None
+        done = [
+            export(wanted, layout, lambda part, layout=layout: bar.show(f"{layout} files", part, {}))
+            for layout in layouts
+        ]
     print(f"wrote {made} files of scenes; {out / 'datasheet.md'} says what they are")
+    for each in done:
+        left_out = f"; left out, for their views have no common axis: {len(each.left_out)}" if each.left_out else ""
+        print(f"wrote {each.count} scenes into {each.folder}{left_out}")

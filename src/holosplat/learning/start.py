@@ -7,21 +7,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
-from ..checks import require
 from ..geometry import Grid, Views
 from ..materials import DeltaBeta
 from ..optics.noise import noise_levels
 from ..progress import Progress
-from ..ranges import Weight, ranged
+from ..ranges import Natural, Share, Weight, ranged
 from ..scan import Scan
+from ..volume import Volume
 from .images import images, retrieved_thickness
 from .lattice import Taps
 from .network import FINE, Guess, coarse, thickness_of
-from .weights import Trained, read_weights
+from .weights import Card, Trained, read_weights
 
 STAGE = "learned start"
 MOST_COLUMNS = 128
@@ -41,7 +42,14 @@ class LearnedStart:
     """File of the network's weights (default: those of the package, if it has any)."""
     doubt: Weight = 1.5
     """What a guess may leave unexplained of the retrieved thickness, in what 95 % of the scenes leave that the network
-    was trained for: where it leaves more, the bodies are others."""
+    was trained for: where it leaves more, the bodies are others, and it is not taken."""
+    trial_steps: Natural = 100
+    """Steps of the fit of Gaussians from either start, before they are compared."""
+    trial_surfaces: Natural = 60
+    """Steps of the fit of surfaces that follow, where matter has one known level."""
+    clearly: Share = 0.95
+    """What the guess may leave unexplained after them, of what phase retrieval leaves: where it leaves more, the run is
+    the same as without the network."""
 
     @property
     def network(self) -> Trained:
@@ -86,22 +94,34 @@ def guessed(scan: Scan, material: DeltaBeta, network: Guess, on_progress: Progre
     return finer
 
 
-def guessed_volume(scan: Scan, material: DeltaBeta, how: LearnedStart, on_progress: Progress) -> tuple[Tensor, Grid]:
-    """Occupancy [Z, Y, X] of `material` and its grid, as the network of `how` guesses it from the frames of `scan`.
-
-    Errors: `InputError` where the frames contradict the guess (`how.doubt`), and those of the weights' file and of
-    phase retrieval.
-    """
-    trained = how.network
-    found = guessed(scan, material, trained.network, on_progress)
-    left, allowed = found.left(), how.doubt * trained.card.typical(len(scan))
-    require(
-        left <= allowed,
-        f"the frames contradict the learned start: it leaves {100 * left:.0f} % of the retrieved thickness "
-        f"unexplained, and where bodies are such as its network knows at most {100 * allowed:.0f} %; reconstruct "
-        "without --start learned, or with weights that know such bodies (--set weights=FILE).",
+def contradicted(found: Guessed, how: LearnedStart, card: Card) -> str:
+    """Why the frames contradict a guess, as a part of a sentence; empty where they do not (`how.doubt`)."""
+    left, allowed = found.left(), how.doubt * card.typical(len(found.images))
+    if left <= allowed:
+        return ""
+    return (
+        f"it leaves {100 * left:.0f} % of the retrieved thickness unexplained, and of bodies that it knows at most "
+        f"{100 * allowed:.0f} %"
     )
-    return found.values, found.grid
+
+
+@dataclass(frozen=True)
+class GuessedMatter:
+    """What a network guessed, to be kept and shown.
+
+    volume: δ and β; spread: [Z, Y, X] float32, standard deviation of occupancy in guesses without one of the views
+    each; None for two views, one of which says too little
+    """
+
+    volume: Volume
+    spread: np.ndarray | None
+
+    @classmethod
+    def of(cls, found: Guessed, material: DeltaBeta, network: Guess) -> GuessedMatter:
+        """What `network` guesses of `material`, and what it guesses without one of the views each."""
+        values = found.values.numpy()
+        volume = Volume(values * material.delta, values * material.beta, found.grid)
+        return cls(volume, spread(found, network).numpy() if len(found.images) > 2 else None)
 
 
 def _factors(scan: Scan) -> Sequence[int]:

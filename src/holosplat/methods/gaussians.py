@@ -30,6 +30,7 @@ from .coarse_cloud import cloud_of_surfaces
 from .field import field_of
 from .gaussian_options import Backend, FitOptions, GaussianOptions
 from .ground import Ground, ground
+from .learned import learned_cloud
 from .method import Near, Stage, Task, run_quietly
 from .start import starting_cloud
 from .surface_fit import SurfaceOptions
@@ -50,7 +51,7 @@ class Gaussians(GaussianOptions):
     def wants_levels(self) -> bool:
         """Whether it matters to these options whether matter has levels."""
         weights = self.fit.objective
-        return self.start == "phase" or weights.overfull > 0 or weights.two_levels > 0
+        return self.start != "random" or weights.overfull > 0 or weights.two_levels > 0
 
     def on_backend(self, backend: Backend) -> Gaussians:
         """The same method computed by `backend`; the start runs on the CPU, or in plain torch."""
@@ -84,7 +85,19 @@ class GaussianStage:
         if resolve(self.options.fit.backend) == "cuda":
             resolve("cpu")  # the start and the judging run there
         train, _ = split_validation(task.scan, self.options.fit.schedule.validation_views)
-        return starting_cloud(replace(task, scan=train), self.options)
+        seen = replace(task, scan=train)
+        if self.options.start == "learned":
+            return learned_cloud(seen, self.options, self._fitted)
+        return starting_cloud(seen, self.options)
+
+    def _fitted(self, task: Task, cloud: GaussianCloud, steps: int) -> GaussianCloud:
+        """`cloud` after so many steps, on the frames of `task` alone."""
+        fit, schedule = self.options.fit, self.options.fit.schedule
+        short = replace(fit, schedule=replace(schedule, steps=min(steps, schedule.steps), validation_views=0))
+        run = GaussianStage(replace(self.options, fit=short)).fit(replace(task, near=False, freedom=None), cloud)
+        found = run_quietly(run, task.report(self.name))
+        assert isinstance(found, GaussianCloud)
+        return found
 
     def fit(self, task: Task, start: Stored) -> Fit:
         """The fit of the cloud to the training frames."""
@@ -97,7 +110,7 @@ class GaussianStage:
     def coarse_surfaces(self, task: Task, surfaces: SurfaceOptions) -> SurfaceMesh | None:
         """Surfaces near to those of the frames, where these are large and coarse pixels show the bodies."""
         how, options = self.options.coarse, self.options
-        if how.factor(task.scan) == 1 or options.start != "phase" or not task.bounded:
+        if how.factor(task.scan) == 1 or options.start == "random" or not task.bounded:
             return None
         train, _ = split_validation(task.scan, options.fit.schedule.validation_views)
         return coarse_surfaces(replace(task, scan=train), self.solved, surfaces, how)

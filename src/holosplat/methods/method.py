@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar, Protocol, runtime_checkable
 
@@ -19,10 +19,15 @@ from ..optics.retrieval import absorption_alone
 from ..progress import Advance, Progress
 from ..representations import KINDS, Stored
 from ..scan import Scan
+from .beginning import Beginning
 
 
 def quiet(stage: str, fraction: float) -> None:
     """Progress that nobody looks at."""
+
+
+def unheard(beginning: Beginning) -> None:
+    """What was begun with, which nobody asks."""
 
 
 STAND_IN_RATIO = 1.0
@@ -49,6 +54,7 @@ class Task:
     delta_told: whether prior or frames say what δ is
     freedom: of where the frames are, which fits then find, too; None: they are where the scan says
     near: whether what the next fit starts from is near to where it ends (see `Near`)
+    on_beginning: called with what Gaussians begin with, where a network was asked
     """
 
     scan: Scan
@@ -61,6 +67,7 @@ class Task:
     delta_told: bool = True
     freedom: Freedom | None = None
     near: bool = False
+    on_beginning: Callable[[Beginning], None] = unheard
 
     def __post_init__(self) -> None:
         if not self.prior.fixes_ratio and shows_no_refraction(self.scan):

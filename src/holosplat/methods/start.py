@@ -13,7 +13,6 @@ from torch import Tensor
 from ..baselines import holographic_tv
 from ..baselines.two_materials import Shares, absorption, at_one_ratio, told_apart, two_levels
 from ..geometry import Grid
-from ..learning.start import guessed_volume
 from ..materials import WATER
 from ..matter import DeltaBeta, KnownRatio, Matter
 from ..optics.noise import noise_share
@@ -37,36 +36,49 @@ Retrieve = Callable[[Scan], tuple[Tensor, Grid]]
 
 
 def starting_cloud(task: Task, options: GaussianOptions) -> GaussianCloud:
-    """The cloud to start from, by the training frames of `task`; where nothing is known of the matter, δ and β are free
-    (`options.separate`, and at a random start), or those of the one material or the two that frames suggest."""
+    """The cloud to start from without a network, by the training frames of `task`.
+
+    Where nothing is known of the matter, δ and β are free (`options.separate`, and at a random start), or those of the
+    one material or the two that frames suggest.
+    """
     return (_random if options.start == "random" else _from_phase_retrieval)(task, options)
 
 
+def cloud_of(volume: Tensor, grid: Grid, material: DeltaBeta, task: Task, options: GaussianOptions) -> GaussianCloud:
+    """Gaussians that approximate occupancy [Z, Y, X] of one `material` on `grid`, on the pixels of `task`."""
+    scan, pitch = task.scan, task.scan.views.finest
+    most = min(options.max_start, math.ceil(options.start_per_pixel * len(scan) * math.prod(scan.views.shape)))
+    whole, spacing = at_pitch(volume, grid, pitch), _spacing_px(scan, options) * pitch
+    cloud = cloud_from_volume(*whole, material, spacing, pitch, most, options.filled)
+    return _approximate(cloud, volume, grid, task, options)
+
+
 def _from_phase_retrieval(task: Task, options: GaussianOptions) -> GaussianCloud:
-    scan, prior, backend = task.scan, task.prior, options.volume.backend
+    scan, backend = task.scan, options.volume.backend
     material = material_of_levels(task, backend, options.estimate)
     how = replace(options.volume, upper=options.volume.upper if task.bounded else 0.0)
 
     def retrieve(frames: Scan) -> tuple[Tensor, Grid]:
-        if options.start == "learned":
-            return guessed_volume(frames, material, options.learned, task.on_progress)
         return holographic_tv(frames, material, how, task.on_progress, task.uneven)
 
     volume, grid = retrieve(scan)
     shares = _shares(task, options, material, (volume, grid), retrieve)
-    pitch = scan.views.finest
-    spacing = _spacing_px(scan, options) * pitch
     if shares is None:
-        whole = at_pitch(volume, grid, pitch)
-        most = min(options.max_start, math.ceil(options.start_per_pixel * len(scan) * math.prod(scan.views.shape)))
-        cloud = cloud_from_volume(*whole, material, spacing, pitch, most, options.filled)
-    else:
-        volume, grid = shares.values, shares.grid
-        whole = at_pitch(volume, grid, pitch)
-        cloud = cloud_from_two(*whole, shares.materials, spacing, pitch, options.max_start, options.filled)
+        return cloud_of(volume, grid, material, task, options)
+    pitch, (volume, grid) = scan.views.finest, (shares.values, shares.grid)
+    whole, spacing = at_pitch(volume, grid, pitch), _spacing_px(scan, options) * pitch
+    cloud = cloud_from_two(*whole, shares.materials, spacing, pitch, options.max_start, options.filled)
+    return _approximate(cloud, volume, grid, task, options)
+
+
+def _approximate(
+    cloud: GaussianCloud, volume: Tensor, grid: Grid, task: Task, options: GaussianOptions
+) -> GaussianCloud:
+    """`cloud` after it has learned the volume."""
     rates = tuple(vars(options.approximate_rates).values())
-    cloud = approximate(cloud.on(backend), volume, grid, options.approximate_steps, task.on_progress, rates)
-    return freed(cloud) if options.separate and not prior.fixes_ratio else cloud
+    cloud = cloud.on(options.volume.backend)
+    cloud = approximate(cloud, volume, grid, options.approximate_steps, task.on_progress, rates)
+    return freed(cloud) if options.separate and not task.prior.fixes_ratio else cloud
 
 
 def _shares(

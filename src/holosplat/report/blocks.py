@@ -22,6 +22,7 @@ from .figures import (
     scene_figure,
     slices_figure,
 )
+from .guess import guess_block
 from .light import light_figure
 from .motion_blocks import motion_blocks
 from .style import format_length, scientific
@@ -46,7 +47,10 @@ def make_blocks(content: ReportContent) -> list[Block]:
     )
     blocks, number = [], 0
     first = [] if content.moving is None else motion_blocks(content.moving)
-    for block in (*first, *(make(content) for make in makers)):
+    drawn = [make(content) for make in makers]
+    guessed = [] if content.guess is None else [guess_block(content.guess)]
+    after = makers.index(_slices) + 1
+    for block in (*first, *drawn[:after], *guessed, *drawn[after:]):
         number += block.drawn
         blocks.append(replace(block, number=number) if block.drawn else block)
     return blocks

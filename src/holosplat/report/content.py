@@ -16,6 +16,7 @@ from ..metrics import ImageScores, VolumeScores, require_same_grid, robust_mater
 from ..volume import Volume
 from ..workflows.totals import TotalMatter
 from ..workflows.verdict import Verdict
+from .guess_shown import GuessShown
 from .moving import Moving
 from .view3d.view import View3D
 
@@ -109,6 +110,7 @@ class ReportContent:
     - total: the total δ by these frames; None: not told
     - moving: bodies in motion, whose volumes are those of one time; None: matter stands still
     - view: what can be turned; None: nothing
+    - guess: what a network guessed before the fit; None: none was asked
     - geometry: where the frames were found to be; None: as the scan says
     - history: columns of metrics.csv, each [S]: step, seconds, loss, the loss' terms, count, val_ssim …
     - seconds: time of the reconstruction [s]
@@ -132,6 +134,7 @@ class ReportContent:
     lit: LitViews | None = None
     moving: Moving | None = None
     view: View3D | None = None
+    guess: GuessShown | None = None
     history: Mapping[str, np.ndarray] = field(default_factory=dict)
     seconds: float | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)

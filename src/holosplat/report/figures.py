@@ -235,18 +235,18 @@ def slices_figure(reconstruction: Volume, truth: Volume | None, positions: tuple
     scale, power = decimal_scale(max(float(np.abs(v).max()) for _, v in volumes))
     limits = value_limits([v / scale for _, v in volumes])
     colours = from_dark(DELTA_MAP, limits)
-    widths, heights = _plane_sizes(reconstruction.grid)
+    widths, heights = plane_sizes(reconstruction.grid)
     panels = PanelGrid(1 if truth is None else 3, widths, heights, (2,))
     for row, (name, values) in enumerate(volumes):
-        drawn = _slice_row(panels.axes[row], values / scale, reconstruction.grid, positions, colours, limits)
-        _slice_titles(panels.axes[row], 3 * row, name, reconstruction.grid, positions)
+        drawn = slice_row(panels.axes[row], values / scale, reconstruction.grid, positions, colours, limits)
+        slice_titles(panels.axes[row], 3 * row, name, reconstruction.grid, positions)
     label = f"δ ({power})" if power else "δ"
     panels.bar(drawn, 2, (0, len(volumes) - 1), label)
     if truth is not None:
         difference = (reconstruction.delta - truth.delta) / scale
         limit = float(np.percentile(np.abs(difference), 99.9)) or 1.0
-        drawn = _slice_row(panels.axes[2], difference, truth.grid, positions, SIGNED_MAP, (-limit, limit))
-        _slice_titles(panels.axes[2], 6, "Difference", truth.grid, positions)
+        drawn = slice_row(panels.axes[2], difference, truth.grid, positions, SIGNED_MAP, (-limit, limit))
+        slice_titles(panels.axes[2], 6, "Difference", truth.grid, positions)
         panels.bar(drawn, 2, (2, 2), f"difference of {label}", "both")
     return panels.figure
 
@@ -263,12 +263,13 @@ def _slice(values: np.ndarray, axis: int, index: int) -> np.ndarray:
     return plane.T if axis == 2 else plane  # [Z, Y] is shown with z along columns and y down
 
 
-def _plane_sizes(grid: Grid) -> tuple[list[float], list[float]]:
+def plane_sizes(grid: Grid) -> tuple[list[float], list[float]]:
+    """Widths and heights [m] of the three planes of `slice_row`."""
     x, y, z = (n * d for n, d in zip(grid.shape[::-1], grid.voxel_size))
     return [x, x, z], [y, z, y]
 
 
-def _slice_row(
+def slice_row(
     axes: list[Axes],
     values: np.ndarray,
     grid: Grid,
@@ -276,8 +277,9 @@ def _slice_row(
     colours: str,
     limits: tuple[float, float],
 ) -> AxesImage:
+    """Draw the three orthogonal planes of `values` [Z, Y, X] at voxel `positions` (z, y, x)."""
     edge = dict(zip("xyz", grid.voxel_size))
-    widths, _ = _plane_sizes(grid)
+    widths, _ = plane_sizes(grid)
     for panel, (_, axis, (across, down)), width in zip(axes, PLANES, widths):
         plane = _slice(values, axis, positions[axis])
         drawn = image_panel(panel, plane, (edge[across], edge[down]), colours, limits)
@@ -285,7 +287,8 @@ def _slice_row(
     return drawn
 
 
-def _slice_titles(axes: list[Axes], first: int, name: str, grid: Grid, positions: tuple[int, int, int]) -> None:
+def slice_titles(axes: list[Axes], first: int, name: str, grid: Grid, positions: tuple[int, int, int]) -> None:
+    """Letters from number `first` on, and where each plane lies."""
     centres = grid.axes()[::-1]
     unit, factor = length_unit(max(n * d for n, d in zip(grid.shape[::-1], grid.voxel_size)))
     for i, (panel, (plane, axis, _)) in enumerate(zip(axes, PLANES)):
@@ -339,9 +342,9 @@ def _banner_slices(
     if truth is None:
         panels = [place(6.6, 0.05, 2.8, 2.8)]
         letter(panels[0], 2, "Slice of δ")
-        return _slice_row(panels, reconstruction.delta / scale, grid, planes, from_dark(DELTA_MAP, limits), limits)
+        return slice_row(panels, reconstruction.delta / scale, grid, planes, from_dark(DELTA_MAP, limits), limits)
     for i, (name, volume) in enumerate((("truth", truth), ("reconstruction", reconstruction))):
         panels = [place(left, 1.56 - 1.51 * i, 1.29, 1.29) for left in (6.72, 8.11)]
-        drawn = _slice_row(panels, volume.delta / scale, grid, planes, from_dark(DELTA_MAP, limits), limits)
+        drawn = slice_row(panels, volume.delta / scale, grid, planes, from_dark(DELTA_MAP, limits), limits)
         letter(panels[0], 2 + i, f"Slices of δ, {name}")
     return drawn

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from ..geometry import Grid, Views
+from ..io.guess import read_guess
 from ..motion.measures import columns, measured
 from ..optics.background import Light
 from ..projectors.voxels import voxel_line_integrals
@@ -24,6 +25,7 @@ from ..workflows.run_folder import RunFolder
 from ..workflows.track import read_errors
 from .content import HeldOutViews, LitViews, ProjectedMaps, ReportContent, view_labels
 from .figures import evenly_chosen
+from .guess_shown import GuessShown
 from .moving import Moving
 from .page import write_report
 from .view3d.of_run import view_of
@@ -73,6 +75,7 @@ def report_run(
         geometry=reconstruction.geometry,
         lit=_lit(reconstruction, scan, evaluation),
         moving=moving,
+        guess=_guess(folder, reconstruction),
         view=view_of(turned, volume, truth, scan),
         history=folder.history(),
         seconds=sum(reconstruction.timing.values()),
@@ -95,6 +98,17 @@ NAMES = {
     "neural-field": "Reconstruction as a neural field",
 }
 """What a report is called, by the kind of object."""
+
+
+def _guess(folder: RunFolder, reconstruction: Reconstruction) -> GuessShown | None:
+    """What a network guessed, beside what was found; None where none was asked."""
+    if not folder.guess.is_file():
+        return None
+    volume, spread = read_guess(folder.guess)
+    delta = float(np.abs(volume.delta).max()) or 1.0
+    unit = reconstruction.object.matter.delta if reconstruction.object.matter.single else delta
+    found = reconstruction.object.voxelise(volume.grid).delta / unit
+    return GuessShown(volume.delta / unit, found, spread, volume.grid, reconstruction.choice.begun)
 
 
 def _title(config: Mapping[str, Any], reconstruction: Reconstruction) -> str:

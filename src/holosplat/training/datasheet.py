@@ -24,8 +24,9 @@ same, so that the files can be made again from `dataset.json`. Bodies are closed
 propagated on a raster at least four times finer than the pixels and integrated over them; counts are Poisson.
 `thickness` is no measurement: it is what nonlinear phase retrieval of each frame by itself finds, the true δ/β given.
 
-**Not in it.** Absorption edges, several materials in one scene, scatter, drifting light and defective pixels; uneven
-light and misaligned views only where the ranges below say so. Networks trained on it know the bodies that are in it.
+**Not in it.** Absorption edges, materials of different δ/β in one scene, scatter, drifting light and defective pixels;
+a medium, uneven light and misaligned views only where the ranges below say so. Two materials are in filled capsules
+alone. Networks trained on it know the bodies that are in it.
 
 **Licence.** Made by you with BSD-3-Clause software, which claims nothing in its output.
 

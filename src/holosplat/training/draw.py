@@ -13,7 +13,8 @@ from ..beamline.light import UnevenLight
 from ..beamline.misalignment import Misalignment
 from ..bench.declaration import Beam, Declaration, Detector, Listed, Matter, Substance
 from ..bench.soft_specimens import SoftCells
-from ..bench.specimens import Capsules, FoamDrop, RedCells, Specimen
+from ..bench.specimens import Capsules, CrowdedCells, FoamDrop, RedCells, Specimen
+from ..materials import DeltaBeta
 from ..specimens.red_cells import DIAMETER, evans_fung_cell
 from ..units import wavelength
 from .ranges import Kind, Ranges
@@ -43,14 +44,14 @@ def drawn(ranges: Ranges, seed: int, index: int) -> Declaration:
     distance = pixel**2 / (wavelength(energy) * _log(rng, ranges.fresnel))
     phase = _log(rng, ranges.phase)
     delta = phase * wavelength(energy) / (2 * math.pi * THICKEST * diameter)
-    material = Substance(delta=delta, beta=delta / _log(rng, ranges.ratio))
+    contrast = DeltaBeta(delta, delta / _log(rng, ranges.ratio))
     directions = _directions(rng, ranges, tilted)
     quiet = rng.random() < ranges.noiseless
     photons = (_log(rng, ranges.noise) * phase) ** -2
     return Declaration(
         summary=f"{kind} drawn for learning",
         specimen=specimen,
-        matter=Matter(material, Substance("vacuum") if specimen.has_core else None),
+        matter=_matter(np.random.default_rng([PURPOSE, seed, index, 2]), ranges, kind, contrast),
         beam=Beam(energy, distance),
         detector=Detector(ranges.rows, ranges.columns, pixel, rng.uniform(*ranges.blur_px)),
         views=Listed(directions[: ranges.views], directions[ranges.views :]),
@@ -59,6 +60,29 @@ def drawn(ranges: Ranges, seed: int, index: int) -> Declaration:
         light=UnevenLight(light_smooth=rng.uniform(*ranges.uneven)),
         misalignment=Misalignment(shift_px=rng.uniform(*ranges.misaligned_px)),
     )
+
+
+def _matter(rng: np.random.Generator, ranges: Ranges, kind: Kind, contrast: DeltaBeta) -> Matter:
+    """Matter that differs from its medium by `contrast`, or by its δ and less absorption; what is inside of it.
+
+    rng: of its own, so that what was drawn before there were media stays as it was.
+    """
+    inside, share = rng.uniform(*ranges.core), CORES.get(kind)
+    if share is None and kind == "filled-capsules":
+        share = inside
+    medium = Substance("vacuum")
+    outside = DeltaBeta(0.0, 0.0)
+    if rng.random() < ranges.medium:
+        outside = DeltaBeta(rng.uniform(1, 10) * contrast.delta, 2 * contrast.beta)
+        medium = Substance(delta=outside.delta, beta=outside.beta)
+        contrast = DeltaBeta(contrast.delta, -contrast.beta)
+    core = None if share is None else _against(outside, contrast, share)
+    return Matter(_against(outside, contrast, 1.0), core, medium)
+
+
+def _against(medium: DeltaBeta, contrast: DeltaBeta, share: float) -> Substance:
+    """What differs from `medium` by a share of `contrast`."""
+    return Substance(delta=medium.delta + share * contrast.delta, beta=medium.beta + share * contrast.beta)
 
 
 @dataclass(frozen=True)
@@ -132,7 +156,7 @@ def _cells(rng: np.random.Generator, ranges: Ranges, diameter: float, room: Room
 
 
 def _capsules(rng: np.random.Generator, ranges: Ranges, diameter: float, room: Room) -> Specimen:
-    """Shells with empty cores."""
+    """Shells about nothing, or about another material."""
     count = min(MOST_BODIES, max(1, round(_log(rng, ranges.filled) * room.volume / (0.5 * diameter**3))))
     return Capsules(count, (0.6 * diameter, diameter), diameter * rng.uniform(0.08, 0.2), room.box)
 
@@ -148,9 +172,28 @@ def _soft_cells(rng: np.random.Generator, ranges: Ranges, diameter: float, room:
     return SoftCells(count, (0.7 * diameter, 1.3 * diameter), room.box, 0.1 * diameter)
 
 
+def _crowd(rng: np.random.Generator, ranges: Ranges, diameter: float, room: Room) -> Specimen:
+    """Red cells in a cylinder, which is made smaller where they would be too many."""
+    share, x, y = rng.uniform(*ranges.crowded), min(room.box[0], room.box[2]), room.box[1]
+    count = share * math.pi / 4 * x**2 * y / evans_fung_cell(diameter).volume
+    smaller = min(1.0, (MOST_BODIES / count) ** (1 / 3))
+    return CrowdedCells(share, diameter, (smaller * x, smaller * y, smaller * x), rng.uniform(*ranges.deform))
+
+
+def _ellipsoids(rng: np.random.Generator, ranges: Ranges, diameter: float, room: Room) -> Specimen:
+    """Solid, flattened by half at most: capsules of which the core is the shell's material."""
+    count = min(MOST_BODIES, max(1, round(_log(rng, ranges.filled) * room.volume / (0.4 * diameter**3))))
+    return Capsules(count, (0.6 * diameter, diameter), 0.1 * diameter, room.box, rng.uniform(0, 0.5))
+
+
+CORES: Mapping[Kind, float] = {"capsules": 0.0, "foam": 0.0, "ellipsoids": 1.0}
+"""What is inside bodies with cores, as a share of the material's contrast."""
 SPECIMENS: Mapping[Kind, Callable[[np.random.Generator, Ranges, float, Room], Specimen]] = {
     "red-cells": _cells,
+    "crowd": _crowd,
+    "ellipsoids": _ellipsoids,
     "capsules": _capsules,
+    "filled-capsules": _capsules,
     "foam": _foam,
     "soft-cells": _soft_cells,
 }

@@ -8,8 +8,9 @@ from typing import Literal
 from ..checks import at_least, require
 from ..ranges import Angle, Natural, Pixels, Positive, Share, SomeShare, Weight, ranged
 
-Kind = Literal["red-cells", "capsules", "foam", "soft-cells"]
-"""What a scene may be made of."""
+Kind = Literal["red-cells", "crowd", "ellipsoids", "capsules", "filled-capsules", "foam", "soft-cells"]
+"""What a scene may be made of. crowd: red cells as close as they can be put; capsules: shells about nothing;
+filled-capsules: shells about another material; soft-cells: continuous, with nuclei and vacuoles."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,13 @@ class Ranges:
     """Diameter of a body [pixels], evenly."""
     filled: tuple[SomeShare, SomeShare] = (0.01, 0.15)
     """Share of the room that bodies fill, evenly in its logarithm."""
+    crowded: tuple[SomeShare, SomeShare] = (0.15, 0.22)
+    """Share of the room that a crowd fills, evenly."""
+    core: tuple[Share, Share] = (0.2, 0.8)
+    """δ inside filled capsules over that of their shells, of the same δ/β, evenly."""
+    medium: Share = 0.0
+    """Share of scenes whose bodies lie in a medium that absorbs more than they do, as red cells in plasma: δ/β is then
+    negative."""
     deform: tuple[Share, Share] = (0.0, 0.08)
     """Bending of red cells [diameters], evenly."""
     stretch: tuple[Share, Share] = (0.0, 0.35)

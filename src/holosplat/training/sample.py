@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from ..bench.case import Case, case_of
+from ..bench.specimens import CrowdedCells, Specimen
 from ..checks import InputError
 from ..geometry import Grid
 from ..learning.images import retrieved_thickness
@@ -30,9 +31,11 @@ class Sample:
     noise: [V] float32, standard deviation of the noise of frames
     rotations, shifts: [V, 3, 3] and [V, 2] [pixels] float64, as `Views` has them
     is_test: [V] bool, frames without noise that are held out
-    occupancy: [Z, Y, X] uint8, share of matter in voxels of a pixel, 255 for all; Z = X = W, Y = H
+    occupancy: [Z, Y, X] uint8, share of matter in voxels of a pixel, 255 for all; Z = X = W, Y = H; of two materials δ
+        over that of the denser one
     facts: [8] float64: pixel size [m], photon energy [keV], distance [m], standard deviation of the point-spread
-        function [pixels], photons a pixel (inf: no noise), δ, β, and the bodies' number or 0
+        function [pixels], photons a pixel (inf: no noise), δ, β (against the medium), and
+        the bodies' number or 0
     """
 
     contrast: np.ndarray
@@ -58,11 +61,17 @@ def drawn_case(ranges: Ranges, seed: int, index: int) -> Case:
         try:
             return case_of(declared, f"{seed}-{index}", own)
         except InputError:
-            count = getattr(declared.specimen, "count", 1)
-            if count == 1:
+            if getattr(declared.specimen, "count", 2) == 1:
                 raise
-            fewer = replace(declared.specimen, count=max(1, int(FEWER * count)))  # type: ignore[call-arg]
-            declared = replace(declared, specimen=fewer)
+            declared = replace(declared, specimen=_fewer(declared.specimen))
+
+
+def _fewer(specimen: Specimen) -> Specimen:
+    """The same with fewer bodies."""
+    if isinstance(specimen, CrowdedCells):
+        return replace(specimen, haematocrit=FEWER * specimen.haematocrit)
+    count: int = getattr(specimen, "count")  # noqa: B009 (all others have one)
+    return replace(specimen, count=max(1, int(FEWER * count)))  # type: ignore[call-arg]
 
 
 def sample_of(ranges: Ranges, seed: int, index: int) -> Sample:
@@ -88,5 +97,5 @@ def sample_of(ranges: Ranges, seed: int, index: int) -> Sample:
 
 
 def _bodies(case: Case) -> int:
-    """How many bodies a case has; 0 where they are no meshes."""
+    """How many closed meshes a case has, those of cores among them; 0 where there are none."""
     return len(case.scene.meshes) if isinstance(case.scene, MeshScene) else 0

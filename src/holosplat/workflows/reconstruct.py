@@ -13,11 +13,14 @@ from ..align.geometry import Geometry
 from ..align.poses import PoseOptions
 from ..checks import as_written, positive, require
 from ..fit.running import Record, Running
+from ..io.guess import write_guess
 from ..io.json import write_json
 from ..io.light import read_still_light, write_light
 from ..io.objects import read_object, write_object
+from ..learning.start import GuessedMatter
 from ..matter import MaterialPrior, MatterKind
 from ..methods import Auto, Gaussians, Method, Settled, Stage, Task, begun, finished, settled
+from ..methods.beginning import Beginning
 from ..methods.method import takes_series
 from ..methods.still import prepared
 from ..methods.uncertain import Determined, Uncertain
@@ -150,13 +153,16 @@ class _Run:
     asked: str = ""
     why: str = ""
     constants: tuple[Determined, ...] = ()
+    begun: str = ""
     _keeper: Keeper = field(init=False)
     _saved: dict[str, Any] | None = None
     _config: dict[str, Any] = field(default_factory=dict)
+    _guess: GuessedMatter | None = None
 
     def begin(self, config: dict[str, Any], resume: bool) -> None:
         """Look at the folder, and at what of the run is there already; writes nothing."""
         self._config, self.asked = config, self.method.kind
+        self.task = replace(self.task, on_beginning=self._told_beginning)
         self._keeper = Keeper(self.task.scan, mixed=isinstance(self.method, Auto))
         if self.folder is None or not goes_on(self.folder, config, resume):
             return
@@ -164,6 +170,7 @@ class _Run:
         if self._saved:
             with self.as_written():
                 self.timing |= self._saved["timing"]
+                self.begun = str(self._saved.get("begun", ""))
                 self._keeper.load(self._saved["kept"])
 
     def settle(
@@ -254,10 +261,15 @@ class _Run:
         self.timing["start"] = self.timing.get("start", 0.0) + time.perf_counter() - began
         return start
 
+    def _told_beginning(self, beginning: Beginning) -> None:
+        self.begun, self._guess = beginning.why, beginning.guess
+
     def make_folder(self, backend: str) -> None:
         """Make the folder, once there is something to put in it."""
         if self.folder is not None and not self.folder.config.is_file():
             self.folder.begin(self._config | environment(backend))
+            if self._guess is not None:
+                write_guess(self.folder.guess, self._guess.volume, self._guess.spread)
 
     def note_resolved(self, stage: str, fit: Running) -> None:
         """Add to config.json what the options have become in a stage: wave samples a pixel, weights and widths."""
@@ -278,7 +290,7 @@ class _Run:
             oversample,
             dict(self.timing),
             complete,
-            Choice(self.task.matter, self.why, dict(self._keeper.judged), best.name if best else ""),
+            Choice(self.task.matter, self.why, dict(self._keeper.judged), best.name if best else "", self.begun),
             self.task.delta_told,
             judge_run(found, fit, self.task, oversample),
             self._total(found, fit, oversample),
@@ -360,6 +372,7 @@ class _Journal:
             "timing": self._run.timing,
             "kept": self._run.kept(),
             "near": self._run.task.near,
+            "begun": self._run.begun,
             **self._run.placed(),
         }
         folder.save_checkpoint(state)

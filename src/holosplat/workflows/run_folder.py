@@ -37,6 +37,7 @@ class RunFolder:
         self.earlier_checkpoint = self.path / "checkpoint_before.pt"
         self.object = self.path / "object.h5"
         self.light = self.path / "light.h5"
+        self.guess = self.path / "guess.h5"
         self.summary = self.path / "summary.json"
         self.source = self.path / "source.json"
         self.report = self.path / "report.html"
