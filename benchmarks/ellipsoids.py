@@ -1,18 +1,20 @@
 """Ellipsoids as ONIX' simulated set has them, in parallel absorption projections: rows of docs/data/ellipsoids.csv.
 
-    python benchmarks/ellipsoids.py [--kinds one mixed] [--views 4 7 9] [--seeds 1 2 3] [--methods auto ...] [--write]
+    python benchmarks/ellipsoids.py [--kinds apart mixed filled] [--views 4 7 9] [--seeds 1 2 3] [--methods NAME ...]
+        [--write]
 
-Zhang et al. (2023, ONIX) and OX-NeRF (2026) say of these scenes that ellipsoids lie at random in a cylinder, and show
-them in parallel projections; neither numbers nor sizes are told, so they are chosen here: 8 to 16 ellipsoids with
-semi-axes of 5 to 14 % of the field's width, turned at random, in a cylinder of 94 % of it, 96³ voxels. `one`: all of one
-attenuation, apart from each other. `mixed`: each with an attenuation of its own, from 0.3 to 1 of the largest, and they
-may overlap, where attenuations add up. Frames are means over 5 × 5 rays a pixel of exp(-Σ µ l), with the exact chords l
-of the rays in the ellipsoids; no projector of the package has a part in them. Nothing is told of the matter, and there is
-no noise. Views are even over 180°, and nine others between them are held out.
+Of ONIX' set (Zhang et al. 2023) it is told that ellipsoids lie at random inside a cylinder, and not how many, how large
+or how dense they are. So there are three kinds of scenes here, from easy to hard. `apart`: 8 to 16 ellipsoids of one
+attenuation, with semi-axes of 5 to 14 % of the field's width and turned at random, apart from each other in an empty
+cylinder of 94 % of it. `mixed`: each with an attenuation of its own, 0.3 to 1 of the largest, and they may overlap,
+where attenuations add up. `filled`: 24 to 40 such ellipsoids, of 0.2 to 0.7, in a cylinder that attenuates by 0.3
+itself. There are 64³ voxels. Frames are means over 5 × 5 rays a pixel of exp(-Σ µ l) with the exact chords l of the
+rays; no projector of the package has a part in them. Nothing is told of the matter, and there is no noise. Views are
+even over 180°, and nine others between them are held out.
 
-psnr: -10 log₁₀ of the mean squared error of µ over all voxels, over the square of the truth's largest µ (the usual one
-for volumes from 0 to 1); ssim: of slices normal to each of the three axes, their mean, on that range; held_out: SSIM of
-the frames held out (`metrics.image_scores`).
+psnr: -10 log₁₀ of the mean squared error of µ over all voxels, over the square of the truth's largest µ (as volumes
+from 0 to 1 have it); empty: that of an empty volume, which says how hard a scene is; ssim: of slices normal to each of
+the three axes, their mean, on that range; held_out: SSIM of the frames held out (`metrics.image_scores`).
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ from holosplat.model import Instrument, Model
 from holosplat.units import wavenumber
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "ellipsoids.csv"
-SIDE = 96
+SIDE = 64
 """Pixels of a frame along each edge."""
 PIXEL, ENERGY = 1e-6, 12.0
 """[m], [keV]; nothing depends on them but units."""
@@ -51,16 +53,21 @@ DEFAULT = ("auto", "tikhonov-tv", "voxels-waves", "volume")
 
 @dataclass(frozen=True)
 class Ellipsoids:
-    """E ellipsoids. centres: [E, 3] [m]; inward: [E, 3, 3] takes a point about a centre to the unit ball; mu: [E]
-    attenuation [1/m]."""
+    """E ellipsoids in a cylinder about y. centres: [E, 3] [m]; inward: [E, 3, 3] takes a point about a centre to the
+    unit ball; mu: [E] attenuation [1/m]; radius, height: of the cylinder [m]; filling: its own attenuation [1/m]."""
 
     centres: np.ndarray
     inward: np.ndarray
     mu: np.ndarray
+    radius: float
+    height: float
+    filling: float
 
     def chords(self, points: np.ndarray, direction: np.ndarray) -> np.ndarray:
-        """Σ µ l [N] along rays through points [N, 3] [m] in a direction [3]: exact lengths of chords."""
-        total = np.zeros(len(points))
+        """Σ µ l [N] along rays through points [N, 3] [m] in a direction [3] normal to y: exact lengths of chords."""
+        across = points @ np.cross([0.0, 1.0, 0.0], direction)
+        total = self.filling * 2 * np.sqrt(np.maximum(0, self.radius**2 - across**2))
+        total *= np.abs(points[:, 1]) <= self.height / 2
         for centre, inward, mu in zip(self.centres, self.inward, self.mu):
             p, d = (points - centre) @ inward.T, inward @ direction
             square, along = d @ d, p @ d
@@ -70,7 +77,8 @@ class Ellipsoids:
     def at(self, axes: tuple[np.ndarray, ...]) -> np.ndarray:
         """µ [Z, Y, X] [1/m] at the points of a grid with these coordinates x, y, z [m], ascending."""
         x, y, z = axes
-        total = np.zeros((len(z), len(y), len(x)), dtype=np.float32)
+        around = (x**2 + z[:, None, None] ** 2 <= self.radius**2) & (np.abs(y)[:, None] <= self.height / 2)
+        total = self.filling * around.astype(np.float32)
         for centre, inward, mu in zip(self.centres, self.inward, self.mu):
             half = np.sqrt((np.linalg.inv(inward) ** 2).sum(1))  # of the box around the ellipsoid
             bounds = zip(axes, centre - half, centre + half)
@@ -83,26 +91,31 @@ class Ellipsoids:
         return total
 
 
+COUNTS = {"apart": (8, 16), "mixed": (8, 16), "filled": (24, 40)}
+LEVELS = {"apart": (1.0, 1.0), "mixed": (0.3, 1.0), "filled": (0.2, 0.7)}
+
+
 def drawn(kind: str, seed: int) -> Ellipsoids:
-    """A scene: `one` or `mixed`."""
-    rng, width = np.random.default_rng([2023, seed, len(kind)]), SIDE * PIXEL
+    """A scene of one of the kinds."""
+    rng, width = np.random.default_rng([2023, seed, list(COUNTS).index(kind)]), SIDE * PIXEL
     radius = 0.47 * width
-    centres, inward, mu, sizes = list[np.ndarray](), [], [], list[float]()
-    wanted = int(rng.integers(8, 17))
+    centres, inward, sizes = list[np.ndarray](), list[np.ndarray](), list[float]()
+    low, high = COUNTS[kind]
+    wanted = int(rng.integers(low, high + 1))
     while len(centres) < wanted:
         axes = width * rng.uniform(0.05, 0.14, 3)
         size, angle = float(axes.max()), rng.uniform(0, 2 * np.pi)
         away = (radius - size) * np.sqrt(rng.uniform())
         centre = np.array([away * np.cos(angle), rng.uniform(-1, 1) * (radius - size), away * np.sin(angle)])
         apart = all(np.linalg.norm(centre - other) > size + s for other, s in zip(centres, sizes))
-        if kind == "one" and not apart:
+        if kind == "apart" and not apart:
             continue
-        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         centres.append(centre)
         sizes.append(size)
-        inward.append((turn / axes).T)
-        mu.append(PATH / radius * (1.0 if kind == "one" else rng.uniform(0.3, 1.0)))
-    return Ellipsoids(np.array(centres), np.array(inward), np.array(mu))
+        inward.append((np.linalg.qr(rng.normal(size=(3, 3)))[0] / axes).T)
+    mu = PATH / radius * rng.uniform(*LEVELS[kind], wanted)
+    filling = 0.3 * PATH / radius if kind == "filled" else 0.0
+    return Ellipsoids(np.array(centres), np.array(inward), mu, radius, 2 * radius, filling)
 
 
 def frames_of(scene: Ellipsoids, views: hs.Views) -> np.ndarray:
@@ -134,6 +147,7 @@ class Row:
     views: int
     method: str
     psnr: float
+    empty: float
     ssim: float
     held_out: float
     seconds: float
@@ -182,7 +196,8 @@ def row(kind: str, seed: int, views: int, name: str) -> Row:
     found = METHODS[name].run(scan.train(), hs.MaterialPrior.unknown(), 0, lambda stage, fraction: None)
     seconds = time.perf_counter() - began
     psnr, ssim, held_out = scored(scan, truth, found)
-    return Row(kind, seed, views, name, psnr, ssim, held_out, seconds, platform.machine(), commit())
+    empty = float(-10 * np.log10(np.mean(truth**2) / truth.max() ** 2))
+    return Row(kind, seed, views, name, psnr, empty, ssim, held_out, seconds, platform.machine(), commit())
 
 
 def keep(found: Row) -> None:
@@ -196,7 +211,7 @@ def keep(found: Row) -> None:
 def main() -> None:
     """Run what is asked for, and print and write the rows."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kinds", nargs="+", default=["one", "mixed"], choices=["one", "mixed"])
+    parser.add_argument("--kinds", nargs="+", default=list(COUNTS), choices=list(COUNTS))
     parser.add_argument("--views", nargs="+", type=int, default=[4, 7, 9])
     parser.add_argument("--seeds", nargs="+", type=int, default=[1, 2, 3])
     parser.add_argument("--methods", nargs="+", default=list(DEFAULT), choices=list(METHODS))
