@@ -14,8 +14,9 @@ from holosplat.bench.method import Method
 from holosplat.bench.methods import PHOTOGRAPHS as PHOTOGRAPHIC
 from holosplat.bench.methods import methods
 from holosplat.fit.density import DensityControl
+from holosplat.methods import AlignedFit, Onix, PixelNerf
 from holosplat.methods.photographs import AlphaRates, AlphaSplats, RadianceFields
-from holosplat.representations import Encoding, Network
+from holosplat.representations import AlignedNetwork, Encoding, Network
 from holosplat.specimens.red_cells import icosphere
 
 MATERIAL = hs.DeltaBeta(2e-7, 2e-10)
@@ -30,9 +31,16 @@ PHOTOGRAPHS = {
     if method.family == PHOTOGRAPHIC
 }
 """Methods without waves, in few and larger steps."""
-QUICK = methods(effort=0.05) | {"neural-field": methods(effort=0.12)["neural-field"]} | PHOTOGRAPHS
+_ALIGNED = AlignedFit(network=AlignedNetwork((4, 6), 8, 2), rate=0.05)
+_ALIGNED = replace(_ALIGNED, schedule=replace(_ALIGNED.schedule, steps=20))
+ALIGNED = {
+    name: replace(methods()[name], options=options)
+    for name, options in {"onix": Onix(_ALIGNED), "pixelnerf": PixelNerf(_ALIGNED)}.items()
+}
+"""Pixel-aligned networks, small ones in few and larger steps."""
+QUICK = methods(effort=0.05) | {"neural-field": methods(effort=0.12)["neural-field"]} | PHOTOGRAPHS | ALIGNED
 """The same methods with a small part of their steps: the contract is about form, not about quality."""
-QUICKER = methods(effort=0.05) | PHOTOGRAPHS
+QUICKER = methods(effort=0.05) | PHOTOGRAPHS | ALIGNED
 """With a still smaller part, where finite numbers are all that is asked for."""
 NEEDS = {"paganin-svmbir": "svmbir"}
 """Methods that need a package of the extra `bench`."""

@@ -103,7 +103,7 @@ def _through_waves(effort: float) -> list[Method]:
         (
             "onix",
             NEURAL,
-            "pixel-aligned network of all views (Zhang et al. 2023), fitted to the holograms, without having seen others",
+            "pixel-aligned network (Zhang et al. 2023) that saw no other scene, fitted to the holograms",
             Onix().with_effort(effort),
         ),
         (

@@ -44,7 +44,7 @@ def _objective() -> Objective:
 
 
 def _schedule() -> Schedule:
-    return Schedule(steps=150, decay=0.1)
+    return Schedule(steps=80, decay=0.1)
 
 
 @dataclass(frozen=True)

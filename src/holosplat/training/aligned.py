@@ -37,6 +37,7 @@ class AlignedTraining(Training):
         self.size = size
         super().__init__(data, folder, options)
         self.critic: Critic | None = None
+        self._shown: tuple[Tensor, Tensor] | None = None
         if options.frames.adversary > 0:
             self.critic = Critic()
             self.judge = torch.optim.AdamW(self.critic.parameters(), options.frames.adversary_rate, betas=BETAS)
@@ -58,11 +59,17 @@ class AlignedTraining(Training):
             drawn = np.random.default_rng([PURPOSE, DIRECTIONS, self.options.seed, self.step])
             made = lesson.unseen(voxels, float(drawn.uniform(0, np.pi)))
             misled = self.critic.misled(made)
-            self._teach(self.critic, made.detach(), lesson.real())
+            self._shown = made.detach(), lesson.real()
         return goal.mse * misfit + goal.adversary * misled, [float(misfit.detach()), float(misled.detach())]
 
+    def advance(self) -> None:
+        """One step of the network, and then of the discriminator, where there is one and it has been shown images."""
+        super().advance()
+        if self.critic is not None and self._shown is not None:
+            self._teach(self.critic, *self._shown)
+            self._shown = None
+
     def _teach(self, critic: Critic, made: Tensor, measured: Tensor) -> None:
-        """A step of the discriminator."""
         value = critic.loss(made, measured)
         self.judge.zero_grad()
         gradients = torch.autograd.grad(value, list(critic.parameters()))
