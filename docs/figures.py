@@ -140,6 +140,12 @@ TABLES["learned"] = Table(
     "python benchmarks/learned.py DATA --cases espresso --views 2 3 4 --write",
     "minutes",
 )
+TABLES["ellipsoids"] = Table(
+    runs.ellipsoids,
+    ("ellipsoids.csv",),
+    "python benchmarks/ellipsoids.py --write",
+    "hours",
+)
 TABLES["bed"] = Table(
     measured.bed, ("real_data.csv",), "python benchmarks/packed_bed.py --data FOLDER --work FOLDER", "an hour"
 )

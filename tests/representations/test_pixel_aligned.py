@@ -146,7 +146,7 @@ def test_what_does_not_fit_together_is_refused():
         made(images=first.images[:1])
     with pytest.raises(InputError, match="the mask must have the grid's shape"):
         made(mask=first.mask[1:])
-    with pytest.raises(InputError, match="weights/features.weight of the network must have the shape"):
+    with pytest.raises(InputError, match=r"weights/features\.weight of the network must have the shape"):
         made(network=AlignedNetwork((3, 4), 6, 2))
     with pytest.raises(InputError, match="one material, or has δ and β free, but there are two"):
         made(matter=Matter.two((1e-6, 1e-9), (5e-7, 1e-9)))

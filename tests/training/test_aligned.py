@@ -1,4 +1,4 @@
-"""Pixel-aligned networks learn from frames alone, go on where they stopped, and are read by the methods of their name."""
+"""Pixel-aligned networks learn from frames alone, go on where they stopped, and go to the methods of their name."""
 
 from __future__ import annotations
 
