@@ -26,19 +26,17 @@ QUICK: dict[str, list[str]] = {
     "surfaces": [*(f"gaussians.{change}" for change in CLOUD), "fit.schedule.steps=6"],
     "voxels": [*START, "fit.steps=6", "fit.coarse_steps=4"],
     "neural-field": [*START, "fit.warmup_steps=40", "fit.warmup_rays=1024", "fit.probes=512", "fit.schedule.steps=8"],
-    "onix": ["fit.network.image=[4,6]", "fit.network.hidden=8", "fit.rate=0.05", "fit.schedule.steps=20"],
     "holographic-tv": START,
     "tikhonov-tv": [],
 }
 """Methods of every kind, in a few steps."""
-KINDS = {"holographic-tv": "voxels", "tikhonov-tv": "voxels", "onix": "pixel-aligned-field"}
+KINDS = {"holographic-tv": "voxels", "tikhonov-tv": "voxels"}
 """What a method makes where that is not called as the method is."""
 TITLES = {
     "gaussians": "Gaussian reconstruction",
     "surfaces": "Reconstruction as closed surfaces",
     "voxels": "Voxel reconstruction",
     "neural-field": "Reconstruction as a neural field",
-    "pixel-aligned-field": "Reconstruction as a pixel-aligned field",
 }
 FILES = {"manifest.json", "config.json", "metrics.csv", "object.h5", "summary.json", "source.json", "report.html"}
 
@@ -64,7 +62,7 @@ def run(shop, method, tmp_path_factory) -> Path:
 def test_a_run_folder_says_what_made_it(method, run):
     kind = KINDS.get(method, method)
     stages = {"surfaces": {"metrics_0.csv"}, "voxels": {"metrics_1.csv"}}.get(method, set())
-    fitted = set() if kind == "voxels" and method != "voxels" else {"checkpoint.pt", "checkpoint_before.pt"}
+    fitted = set() if method in KINDS else {"checkpoint.pt", "checkpoint_before.pt"}
     assert {path.name for path in run.iterdir()} == FILES | stages | fitted
     config, summary = (json.loads((run / f"{name}.json").read_text()) for name in ("config", "summary"))
     assert config["method"]["kind"] == summary["method"]
