@@ -153,8 +153,8 @@ def main() -> None:
     for views, case, scene in every:
         given = espresso(options.data, scene, views) if case == "espresso" else drawn(KINDS[case], scene, views)
         for start, said in rows(given, options.weights, options.starts):
-            who = {"machine": platform.machine(), "commit": commit()}
-            row = Row(case, scene, views, start, **(UNSAID | said | who))
+            values: dict[str, Any] = {**UNSAID, **said, "machine": platform.machine(), "commit": commit()}
+            row = Row(case, scene, views, start, **values)
             print(row, flush=True)
             if options.write:
                 keep(row)

@@ -278,22 +278,29 @@ def pinn() -> str:
     return markdown(columns, lines)
 
 
+STARTS = {"The run began with the": "guess", "The run began with phase": "phase", "The frames contradict": "refused"}
+"""What a run says of its start, by its first words, and what the table says."""
+SCORES = ("dice", "ssim", "frcm")
+"""Scores of which more is better."""
+
+
 def learned() -> str:
-    """Both starts and the guess itself, by case, scene and number of views."""
-    rows = {(r["case"], r["scene"], int(r["views"]), r["start"]): r for r in read("learned.csv")}
+    """Runs with and without a learned start, and the guess itself, by case, scene and number of views."""
     lines = []
-    for case, scene, views in sorted({key[:3] for key in rows}):
-        guess, phase, taken = (rows[case, scene, views, start] for start in ("guess", "phase", "learned"))
-        fitted = [
-            f"{rounded(r['dice'], 3)} / {rounded(r['error'], 3)}" if r["dice"] else "refused" for r in (phase, taken)
-        ]
-        lines.append([f"{case}, scene {scene}", str(views), rounded(guess["dice"], 3), *fitted])
+    for (case, scene, views), rows in sorted(_learned().items()):
+        fitted = [[rounded(r[name], 3) for name in ("dice", "error", "frcm")] for r in (rows["phase"], rows["learned"])]
+        said = rows["learned"]["begun"]
+        begun = next((word for first, word in STARTS.items() if said.startswith(first)), "not asked")
+        lines.append(
+            [f"{case}, {scene}", str(views), rounded(rows["guess"]["dice"], 3), *map(" / ".join, fitted), begun]
+        )
     columns = (
-        "",
+        "scene",
         "views",
         "Dice of the guess",
-        "phase retrieval, then fitted: Dice / error of δ",
-        "guess, then fitted",
+        "without: Dice / error of δ / FRCM",
+        "with `--start learned`",
+        "begun with",
     )
     return markdown(columns, lines)
 
@@ -317,3 +324,26 @@ def ellipsoids() -> str:
             if any(cell != "–" for cell in cells):
                 lines.append([kind, f"`{method}`", *cells])
     return markdown(("scenes", "method", "4 views", "7 views", "9 views"), lines)
+
+
+def learned_change() -> str:
+    """By what scores of runs with a learned start differ from those without, by case."""
+    found: dict[str, list[dict[str, dict[str, str]]]] = {}
+    for (case, _, _), rows in sorted(_learned().items()):
+        found.setdefault(case, []).append(rows)
+    lines = []
+    for case, each in found.items():
+        changes = [[float(r["learned"][name]) - float(r["phase"][name]) for r in each] for name in (*SCORES, "error")]
+        spans = [f"{min(values):+.3f} to {max(values):+.3f}".replace("-", "−") for values in changes]
+        taken = sum(r["learned"]["begun"].startswith("The run began with the") for r in each)
+        lines.append([case, str(len(each)), str(taken), *spans])
+    columns = ("bodies", "runs", "began with the guess", "Dice", "SSIM", "FRCM", "error of δ")
+    return markdown(columns, lines)
+
+
+def _learned() -> dict[tuple[str, int, int], dict[str, dict[str, str]]]:
+    """Rows by case, scene and number of views, and then by start; of those that were run to their end."""
+    found: dict[tuple[str, int, int], dict[str, dict[str, str]]] = {}
+    for row in read("learned.csv"):
+        found.setdefault((row["case"], int(row["scene"]), int(row["views"])), {})[row["start"]] = row
+    return {key: rows for key, rows in found.items() if len(rows) == 3}

@@ -6,10 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from helpers.cli import MATTER, holosplat, refused, worked
+from helpers.cli import MATTER, holosplat, known, refused, worked
+from holosplat.io.guess import read_guess
 from holosplat.learning.network import Guess
 from holosplat.learning.size import Size
 from holosplat.learning.weights import Card, read_weights, write_weights
+from holosplat.workflows.run_folder import RunFolder
 
 SMALL = ("--image", "4", "4", "4", "4", "--features", "3", "--volume", "4", "4", "4")
 SCENES = ("--rows", "24", "--columns", "24", "--views", "2", "--held-out", "1", "--across", "8", "10")
@@ -41,14 +43,40 @@ def test_a_dataset_of_other_ranges_is_refused_and_a_part_of_it_is_no_dataset(sce
     refused(holosplat("train", tmp_path, "--out", tmp_path / "out"), "holosplat dataset made")
 
 
-def test_a_guess_that_the_frames_contradict_is_refused(shop, tmp_path):
+def test_a_guess_that_the_frames_contradict_is_not_begun_with_and_the_run_says_so(shop, tmp_path):
     weights = tmp_path / "weights.safetensors"
     write_weights(weights, Guess(Size((4, 4, 4, 4), 3, (4, 4, 4))), Card(typical_misfit={"2": 0.01}))
 
-    asked = holosplat(
-        *("reconstruct", shop.scan, "--out", tmp_path / "run", "--method", "gaussians", "--material", MATTER[3]),
-        *("--density", "1.335", "--matter", "levels", "--start", "learned", "--set", f"weights={weights}"),
+    done = worked(
+        holosplat(
+            *("reconstruct", shop.scan, "--out", tmp_path / "run", *known(shop)),
+            *("--start", "learned", "--set", f"weights={weights}"),
+        )
     )
 
-    refused(asked, "the frames contradict the learned start")
+    assert "start: The frames contradict the network's guess" in done.out
+    assert RunFolder(tmp_path / "run").read_summary()["decided"]["begun"].endswith("began with phase retrieval.")
+    guess, spread = read_guess(tmp_path / "run" / "guess.h5")
+    assert spread is not None
+    assert guess.delta.shape == spread.shape
+
+
+def test_a_start_is_refused_by_methods_without_one(shop, tmp_path):
+    asked = holosplat(
+        *("reconstruct", shop.scan, "--out", tmp_path / "run", "--method", "voxels", "--start", "learned", *MATTER[2:])
+    )
+
+    refused(asked, "--start says what Gaussians begin with")
     assert not (tmp_path / "run").exists()
+
+
+def test_scenes_are_exported_to_layouts_of_others(tmp_path):
+    done = worked(
+        holosplat(
+            *("dataset", "--out", tmp_path / "scenes", "--count", "1", *SCENES, "--tilted", "0"),
+            *("--export", "nerf-synthetic", "r2-gaussian", "onix"),
+        )
+    )
+
+    for layout in ("nerf-synthetic", "r2-gaussian", "onix"):
+        assert f"wrote 1 scenes into {tmp_path / 'scenes' / layout}" in done.out

@@ -43,12 +43,33 @@ def test_what_is_drawn_lies_in_its_ranges():
         assert 0.9 * 7.82e-6 / 22 <= pixel <= 1.1 * 7.82e-6 / 10
 
 
-@pytest.mark.parametrize("kind", ["capsules", "foam", "soft-cells"])
+@pytest.mark.parametrize("kind", ["capsules", "filled-capsules", "ellipsoids", "crowd", "foam", "soft-cells"])
 def test_every_kind_can_be_imaged(kind):
     found = sample_of(replace(TINY, kinds=(kind,), views=2, rows=40, columns=40), 0, 0)
 
     assert 0 < found.occupancy.mean() / 255 < 0.6
     assert np.abs(found.contrast).max() > 0
+
+
+def test_a_medium_turns_the_sign_of_the_absorption_and_changes_nothing_else_that_is_drawn():
+    dry, wet = (drawn(replace(TINY, medium=share), 0, 0) for share in (0.0, 1.0))
+    told = [scene.material_prior().materials[0] for scene in (dry, wet)]
+
+    assert told[1].delta == pytest.approx(told[0].delta)
+    assert told[1].beta == pytest.approx(-told[0].beta)
+    assert wet.matter.medium.delta_beta(20.0).delta > told[0].delta
+    assert (wet.specimen, wet.beam, wet.views) == (dry.specimen, dry.beam, dry.views)
+
+
+def test_filled_capsules_are_of_two_levels_of_one_ratio():
+    found = drawn(replace(TINY, kinds=("filled-capsules",), medium=1.0), 0, 0)
+    assert found.matter.core is not None
+    core, shell, medium = (
+        part.delta_beta(20.0) for part in (found.matter.core, found.matter.material, found.matter.medium)
+    )
+    inside, outside = core.against(medium), shell.against(medium)
+    assert 0.2 <= inside.delta / outside.delta <= 0.8
+    assert inside.ratio == pytest.approx(outside.ratio)
 
 
 @pytest.mark.parametrize(("flipped", "turns"), [(False, 0), (True, 0), (False, 1), (True, 3)])

@@ -309,8 +309,8 @@ class MethodOptions:
     changes: Annotated[UseAppendAction[tuple[str, ...]], arg(name="set", metavar="PATH=VALUE")] = ()
     """Change one option, such as fit.schedule.steps=500 or fit.steps=500; may be given again and again."""
     start: Literal["phase", "learned", "random"] | None = None
-    """What Gaussians begin with: phase retrieval and tomography, what a trained network guesses (for bodies such as it
-    has seen, in few views), or nothing (default: as the options say, phase)."""
+    """What Gaussians begin with: phase retrieval and tomography; what a trained network guesses, where that explains
+    the frames clearly better; or nothing (default: as the options say, phase)."""
     backend: Literal["auto", "cpu", "cuda", "reference"] | None = None
     """What computes the fit (default: as the options say, auto); `holosplat backends` lists what there is."""
 
@@ -321,12 +321,19 @@ class MethodOptions:
     def chosen(self) -> Method:
         """The method that the options name; `InputError` if its backend cannot be used here."""
         from ..backends import resolve
+        from ..methods import Auto, Gaussians, Surfaces
         from ..methods.presets import chosen_method
 
         given = [f"--{name}" for name in ("method", "preset", "config") if getattr(self, name) is not None]
         require(len(given) < 2, f"give one of --method, --preset and --config, but there are {' and '.join(given)}.")
-        start = () if self.start is None else (f"start={self.start}",)
-        method = chosen_method(self.method, self.preset, self.config, (*self.changes, *start))
+        method = chosen_method(self.method, self.preset, self.config, self.changes)
+        if self.start is not None:
+            require(
+                isinstance(method, Auto | Gaussians | Surfaces),
+                f"--start says what Gaussians begin with (--method auto, gaussians or surfaces), but the method is "
+                f"{method.kind}; leave --start.",
+            )
+            method = chosen_method(self.method, self.preset, self.config, (*self.changes, f"start={self.start}"))
         if self.backend:
             move = getattr(method, "on_backend", None)
             if move is None:

@@ -47,7 +47,7 @@ class LearnedStart:
     """Steps of the fit of Gaussians from either start, before they are compared."""
     trial_surfaces: Natural = 60
     """Steps of the fit of surfaces that follow, where matter has one known level."""
-    clearly: Share = 0.95
+    clearly: Share = 0.9
     """What the guess may leave unexplained after them, of what phase retrieval leaves: where it leaves more, the run is
     the same as without the network."""
 

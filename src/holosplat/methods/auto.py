@@ -63,7 +63,8 @@ class Auto:
         seen, aside = split
         judge = MissingMatter(aside, assumed_material(seen, task.prior, task.on_progress))
         shares = dict[MatterKind, float]()
-        candidates: dict[MatterKind, Method] = {"levels": self.gaussians, "continuous": self.volume}
+        plain = replace(self.gaussians, start="phase") if self.gaussians.start == "learned" else self.gaussians
+        candidates: dict[MatterKind, Method] = {"levels": plain, "continuous": self.volume}
         for matter, method in candidates.items():
             task.on_progress(f"{TRIAL}: {method.kind}", 0.0)
             trial = replace(task, scan=seen, lit=self.trials.light(task.scan, task.lit), matter=matter)

@@ -69,7 +69,7 @@ class GaussianOptions:
 
     start: Literal["phase", "learned", "random"] = "phase"
     """`phase`: phase retrieval, total-variation tomography, Gaussians where there is matter; `learned`: the same where
-    a network that has seen such bodies guesses it, as far as frames bear it out; or `random`."""
+    a network guesses it, if that explains the frames clearly better; or `random`."""
     spacing_px: Pixels = 1.0
     """Distance between Gaussians at a phase start [pixels]."""
     spacing_noise: Weight = 2.3

@@ -185,6 +185,8 @@ class _Run:
         else:
             found = settled(self.method, self.task, matter, uncertain)
             self.timing["decision"] = time.perf_counter() - began
+        if isinstance(self.method, Auto) and self.method.gaussians.start == "learned" and found.matter == "continuous":
+            self.begun = "The matter is continuous, and the network guesses bodies: it was not asked."
         self.method, self.why, self.constants = found.method, found.why, found.constants
         self.task = found.task(self.task)
         self._keeper.train = self.task.scan

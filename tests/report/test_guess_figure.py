@@ -1,0 +1,34 @@
+"""What a report shows of a network's guess."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from holosplat.geometry import Grid
+from holosplat.report.guess import guess_block
+from holosplat.report.guess_shown import GuessShown
+
+GRID = Grid.centred((6, 5, 6), 1e-6)
+
+
+def test_the_caption_says_how_much_of_the_matter_is_guessed():
+    found, spread = np.zeros(GRID.shape, np.float32), np.zeros(GRID.shape, np.float32)
+    found[2, 2, 1:5] = 1.0
+    spread[2, 2, 4] = 0.4
+    shown = GuessShown(found, found, spread, GRID, "The run began with the network's guess.")
+
+    block = guess_block(shown)
+
+    assert shown.unsure == pytest.approx(0.25)
+    assert "25 % of its matter lies where guesses differ by more than 0.2" in block.caption
+    assert block.caption.startswith("The run began with the network's guess.")
+    assert block.drawn
+
+
+def test_two_views_have_no_spread_and_the_caption_says_so():
+    found = np.ones(GRID.shape, np.float32)
+
+    block = guess_block(GuessShown(found, found, None, GRID, "Begun."))
+
+    assert "one of two views alone says too little" in block.caption
