@@ -31,8 +31,8 @@ PHOTOGRAPHS = {
     if method.family == PHOTOGRAPHIC
 }
 """Methods without waves, in few and larger steps."""
-_ALIGNED = AlignedFit(network=AlignedNetwork((4, 6), 8, 2), rate=0.1)
-_ALIGNED = replace(_ALIGNED, schedule=replace(_ALIGNED.schedule, steps=8))
+_ALIGNED = AlignedFit(network=AlignedNetwork((4, 6), 8, 2), rate=0.05)
+_ALIGNED = replace(_ALIGNED, schedule=replace(_ALIGNED.schedule, steps=20))
 ALIGNED = {
     name: replace(methods()[name], options=options)
     for name, options in {"onix": Onix(_ALIGNED), "pixelnerf": PixelNerf(_ALIGNED)}.items()

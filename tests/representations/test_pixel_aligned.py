@@ -20,7 +20,7 @@ from holosplat.scan import Exposures
 PIXEL = 1e-6
 ONE = Matter.one(1e-6, 1e-9)
 SMALL = AlignedNetwork((3, 4), 5, 2)
-TILTED = Views.from_rotations(Rotation.random(3, random_state=4).as_matrix(), (9, 13), PIXEL)
+TILTED = Views.from_rotations(Rotation.random(3, np.random.default_rng(4)).as_matrix(), (9, 13), PIXEL)
 
 
 def directions(count: int) -> Views:
