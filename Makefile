@@ -20,18 +20,19 @@ help: ## list the targets
 setup: $(STAMP) ## make .venv, install the pinned dependencies, compile the kernels
 
 # Done again only when the dependencies or the C++ sources change: the Python sources are used where they lie.
+# Not compiled to bytecode while it is installed: Python does so where it is imported, which most of it never is.
 $(STAMP): pyproject.toml constraints.txt $(NATIVE)
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "holosplat needs Python 3.11 or newer: make PYTHON=/path/to/python3.11 ..."; exit 1; }
 	test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV)
-	$(VENV)/bin/python -m pip install -c constraints.txt -e ".[dev]"
+	$(VENV)/bin/python -m pip install --no-compile -c constraints.txt -e ".[dev]"
 	touch $@
 
 demo: setup ## simulate, reconstruct and report a small specimen into demo/
 	rm -rf demo
-	$(VENV)/bin/holosplat demo --out demo
+	PYTHONDONTWRITEBYTECODE= $(VENV)/bin/holosplat demo --out demo
 
-# What is compiled once is kept, also where the environment says otherwise: tests start Python many times.
+# Bytecode is kept, also where the environment says otherwise: tests start Python many times.
 test: setup ## run the tests, in two processes
 	PYTHONDONTWRITEBYTECODE= $(VENV)/bin/python -m pytest -n 2 --dist loadfile
 

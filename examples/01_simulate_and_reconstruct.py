@@ -14,9 +14,9 @@ def main(out: Path) -> None:
     """Simulate, reconstruct, evaluate, export."""
     out.mkdir(parents=True, exist_ok=True)
 
-    # Detector and beam, in SI units: 64 × 80 pixels of 0.5 µm, twelve views over 180°, 20 keV, 10 cm behind the sample.
+    # Detector and beam, in SI units: 48 × 60 pixels of 0.65 µm, twelve views over 180°, 20 keV, 10 cm behind the cells.
     # These are effective values in the sample plane: of a cone beam, those of the equivalent parallel one.
-    views = hs.Views.evenly_spaced(12, shape=(64, 80), pixel_size=0.5e-6)
+    views = hs.Views.evenly_spaced(12, shape=(48, 60), pixel_size=0.65e-6)
     exposures = hs.Exposures.of(views, energy_kev=20.0, distance=0.1, psf_sigma_px=0.5)
 
     # The specimen: eight red cells, turned and placed at random about the origin, which lies on the rotation axis (y).

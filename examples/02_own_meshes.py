@@ -25,8 +25,8 @@ def main(out: Path) -> None:
     filling = hs.beamline.Filling(hs.materials.HAEMOGLOBIN, medium=None)
     scene = hs.beamline.read_scene(sorted(out.glob("cell*.vtk")), filling, ENERGY_KEV, length_unit="um")
 
-    # 48 × 48 pixels of 0.65 µm show a field of 31 µm; a mesh that leaves it would be cut off in some views.
-    views = hs.Views.evenly_spaced(12, shape=(48, 48), pixel_size=0.65e-6)
+    # 40 × 40 pixels of 0.78 µm show a field of 31 µm; a mesh that leaves it would be cut off in some views.
+    views = hs.Views.evenly_spaced(12, shape=(40, 40), pixel_size=0.78e-6)
     print(f"{len(scene.meshes)} meshes, with {-1e6 * scene.missing_field(views):.1f} µm of free field around them")
     hs.io.write_scan(out / "scan.nxs", hs.simulate(scene, hs.Exposures.of(views, ENERGY_KEV, distance=0.1)))
 

@@ -15,7 +15,7 @@ import holosplat as hs
 def main(out: Path) -> None:
     """Gaussians and surfaces of the same scan, both against the truth; the bodies as a VTK file."""
     out.mkdir(parents=True, exist_ok=True)
-    views = hs.Views.evenly_spaced(12, shape=(48, 48), pixel_size=0.65e-6)
+    views = hs.Views.evenly_spaced(12, shape=(40, 40), pixel_size=0.78e-6)
     material = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
     scene = hs.MeshScene.of_one_material(hs.specimens.random_cells(4, box=(views.width,) * 3, seed=4), material)
     scan = hs.simulate(scene, hs.Exposures.of(views, energy_kev=20.0, distance=0.1), photons_per_pixel=10_000, seed=4)

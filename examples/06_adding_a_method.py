@@ -48,7 +48,7 @@ if __name__ == "__main__":
     material = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
     scene = hs.MeshScene.of_one_material(hs.specimens.random_cells(4, box=(views.width,) * 3, seed=6), material)
     scan = hs.simulate(scene, hs.Exposures.of(views, energy_kev=20.0, distance=0.1))
-    for method in (hs.methods.PerView("tikhonov", "tv"), Thresholded(), hs.preset("fast")):
+    for method in (hs.methods.PerView("tikhonov", "tv"), Thresholded()):
         result = hs.reconstruct(scan, hs.MaterialPrior.known(material), method)
         print(
             f"{method.kind}:", *hs.evaluate(result, scan, scene.voxelise(hs.Grid.of_views(views))).lines(), sep="\n  "

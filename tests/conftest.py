@@ -28,6 +28,21 @@ KERNELS = ("projectors.splat", "optics.hologram", "fit.fidelity", "fit.adam")
 TOGETHER = ("tests/cli", "tests/workflows")
 """Folders whose files share what takes seconds to make: the run of the commands, what runs on one scan begin with."""
 
+LONG = (
+    *TOGETHER,
+    "tests/house/test_triton_compile.py",
+    "tests/house/test_examples.py",
+    "tests/bench",
+    "tests/align",
+    "tests/baselines",
+    "tests/methods",
+    "tests/optics/test_retrieval_methods.py",
+    "tests/training",
+    "tests/motion",
+    "tests/series",
+)
+"""What takes longest, and so begins first where there are several processes: none has a long file left at the end."""
+
 settings.register_profile(
     "repeatable",  # the same examples at every run, on every machine, however slow it is
     derandomize=True,
@@ -60,19 +75,31 @@ if TRITON and not GPU:
     _bind_kernels_to_the_interpreter()
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests marked `gpu` need one."""
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Tests marked `gpu` need one; in one of several processes, what is `LONG` comes first."""
     for item in items:
         if not GPU and item.get_closest_marker("gpu"):
             item.add_marker(pytest.mark.skip(reason="there is no GPU here"))
+    if hasattr(config, "workerinput"):
+        items.sort(key=_place)  # a stable sort: the tests of a file keep their order
+
+
+def _place(item: pytest.Item) -> int:
+    """The number in `LONG` of the folder or file of a test; what is not there comes last."""
+    return next((k for k, start in enumerate(LONG) if item.nodeid.startswith(start)), len(LONG))
 
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> object | None:
-    """With `--dist loadfile`, tests of a folder in `TOGETHER` stay in one process, too, as those of a file do."""
+    """With `--dist loadfile`, tests of a folder in `TOGETHER` stay in one process, too, as those of a file do.
+
+    Their order is that of the collection, in which what is `LONG` comes first.
+    """
     if config.getoption("dist") != "loadfile":
         return None
     from xdist.scheduler import LoadFileScheduling
+
+    config.option.loadscopereorder = False  # by the number of tests, which says little of their time
 
     class ByFolder(LoadFileScheduling):
         def _split_scope(self, nodeid: str) -> str:

@@ -66,11 +66,9 @@ def resolve(name: str) -> str:
     """
     if name not in NAMES:
         raise InputError(f"backend must be one of {', '.join(NAMES)}, but it is {name!r}.")
-    if name == "reference":  # needs nothing, and is asked for once a frame in simulations
+    if name == "reference" or (name != "auto" and not missing(name)):  # asked for once a frame: look for no other
         return name
     reasons = {backend: missing(backend) for backend in ("cuda", "cpu")}
-    if name in reasons and not reasons[name]:
-        return name
     if name == "auto" and not reasons["cuda"] and not interpreted():
         return "cuda"
     if name == "auto" and not reasons["cpu"]:

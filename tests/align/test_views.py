@@ -24,8 +24,8 @@ from holosplat.geometry import Grid, Views
 from holosplat.matter import MaterialPrior
 from holosplat.scan import Exposures, Scan
 
-QUICK = PoseOptions(rounds=2, retrieval=15, first=20, edges=0)
-"""Options of tests that do not ask how near the poses come."""
+QUICK = PoseOptions(rounds=2, retrieval=15, first=20, edges=0, few_views=2)
+"""Options of tests that do not ask how near the poses come; test_rehearsal.py has what few views need beside."""
 
 
 def apart(found: Exposures, true: Exposures) -> tuple[float, float, float]:
@@ -108,7 +108,7 @@ def test_what_is_said_to_be_known_stays():
 def test_a_good_plan_is_kept():
     """It loses nothing, for what differs by less than can be known is put back."""
     scan, _ = scan_of(Misalignment(), 8)
-    found = align_views(scan, MaterialPrior.known(MATERIAL), replace(QUICK, rounds=4))
+    found = align_views(scan, MaterialPrior.known(MATERIAL), replace(QUICK, rounds=3))
     assert {word.split(" is as planned")[0] for word in found.words} & {"shift", "all"}
     np.testing.assert_allclose(found.exposures.views.shifts, scan.views.shifts, atol=1e-9 * PIXEL)
 

@@ -259,10 +259,10 @@ def truth(grid):
     return capsules().voxelise(grid)
 
 
-def settings() -> Gaussians:
+def settings(refine: int = 0) -> Gaussians:
     quick = preset("default")
-    schedule = replace(quick.fit.schedule, steps=40)
-    return replace(quick, fit=replace(quick.fit, schedule=schedule))
+    schedule, volume = replace(quick.fit.schedule, steps=40), replace(quick.volume, refine=refine)
+    return replace(quick, volume=volume, fit=replace(quick.fit, schedule=schedule))
 
 
 def test_two_materials_are_found_where_nothing_is_known(scan, truth):
@@ -283,7 +283,7 @@ def test_two_materials_are_found_where_nothing_is_known(scan, truth):
 
 
 def test_two_known_materials_are_taken_as_they_are(scan, truth):
-    found = reconstruct(scan, PRIOR, settings())
+    found = reconstruct(scan, PRIOR, settings(refine=1))
     assert found.object.matter.channels == BOTH
     scores = evaluate(found, scan, truth)
     assert scores.volume.relative_error_delta < 0.18
@@ -353,7 +353,7 @@ def test_surfaces_of_two_materials_are_refused(scan, tmp_path):
 
 def test_frames_of_a_cloud_of_two_go_through_the_same_optics(scan):
     """`measure` of the start is near the frames: the materials reach the waves in metres, not in pixels."""
-    cloud = starting_cloud(Task(scan.train(), PRIOR), settings())
+    cloud = starting_cloud(Task(scan.train(), PRIOR), settings(refine=1))
     with torch.no_grad():
         frames = measure(cloud, scan.train().exposures)
     misfit = np.square(frames.numpy() - scan.train().frames).mean() / scan.train().frames.var()

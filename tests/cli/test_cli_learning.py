@@ -79,4 +79,4 @@ def test_scenes_are_exported_to_layouts_of_others(tmp_path):
     )
 
     for layout in ("nerf-synthetic", "r2-gaussian", "onix"):
-        assert f"wrote 1 scenes into {tmp_path / 'scenes' / layout}" in done.out
+        assert f"wrote 1 scene into {tmp_path / 'scenes' / layout}" in done.out

@@ -25,7 +25,7 @@ QUICK: dict[str, list[str]] = {
     "gaussians": CLOUD,
     "surfaces": [*(f"gaussians.{change}" for change in CLOUD), "fit.schedule.steps=6"],
     "voxels": [*START, "fit.steps=6", "fit.coarse_steps=4"],
-    "neural-field": [*START, "fit.warmup_steps=40", "fit.warmup_rays=1024", "fit.probes=512", "fit.schedule.steps=8"],
+    "neural-field": [*START, "fit.warmup_steps=30", "fit.warmup_rays=512", "fit.probes=256", "fit.schedule.steps=4"],
     "holographic-tv": START,
     "tikhonov-tv": [],
 }

@@ -10,18 +10,19 @@ import pytest
 
 import holosplat as hs
 from helpers.unjudged import unjudged
+from holosplat.baselines import HolographicTV
 from holosplat.bench.method import Method
+from holosplat.bench.methods import METHODS, methods
 from holosplat.bench.methods import PHOTOGRAPHS as PHOTOGRAPHIC
-from holosplat.bench.methods import methods
 from holosplat.fit.density import DensityControl
-from holosplat.methods import AlignedFit, Onix, PixelNerf
+from holosplat.methods import AlignedFit, Onix, PixelNerf, SmoothVolume
 from holosplat.methods.photographs import AlphaRates, AlphaSplats, RadianceFields
 from holosplat.representations import AlignedNetwork, Encoding, Network
 from holosplat.specimens.red_cells import icosphere
 
 MATERIAL = hs.DeltaBeta(2e-7, 2e-10)
 PITCH = 1e-6
-SHAPE = (24, 31)
+SHAPE = (18, 25)
 SPLATS = AlphaSplats(0.15, rates=AlphaRates(0.05, 0.03, 0.01, 0.2, 0.1), reset_every=0)
 SPLATS = replace(SPLATS, schedule=replace(SPLATS.schedule, steps=30, decay=0.2), density=DensityControl(20))
 FIELD = RadianceFields(Network(Encoding(kind="octaves"), hidden=32), rays=96, rate=0.02).with_effort(0.06)
@@ -34,13 +35,16 @@ PHOTOGRAPHS = {
 _ALIGNED = AlignedFit(network=AlignedNetwork((4, 6), 8, 2), rate=0.05)
 _ALIGNED = replace(_ALIGNED, schedule=replace(_ALIGNED.schedule, steps=20))
 ALIGNED = {
-    name: replace(methods()[name], options=options)
+    name: replace(METHODS[name], options=options)
     for name, options in {"onix": Onix(_ALIGNED), "pixelnerf": PixelNerf(_ALIGNED)}.items()
 }
 """Pixel-aligned networks, small ones in few and larger steps."""
-QUICK = methods(effort=0.05) | {"neural-field": methods(effort=0.12)["neural-field"]} | PHOTOGRAPHS | ALIGNED
+START = HolographicTV(retrieval=20, iterations=40, corrections=2, inner=6, noisy=1.0, refine=1, upper=0.0)
+VOLUME = {"volume": replace(METHODS["volume"], options=SmoothVolume(START, coarser=(2,), rounds=1, iterations=4))}
+"""The method that takes no share of its steps, in few."""
+QUICK = methods(effort=0.05) | {"neural-field": methods(effort=0.12)["neural-field"]} | PHOTOGRAPHS | VOLUME | ALIGNED
 """The same methods with a small part of their steps: the contract is about form, not about quality."""
-QUICKER = methods(effort=0.05) | PHOTOGRAPHS | ALIGNED
+QUICKER = methods(effort=0.05) | PHOTOGRAPHS | VOLUME | ALIGNED
 """With a still smaller part, where finite numbers are all that is asked for."""
 NEEDS = {"paganin-svmbir": "svmbir"}
 """Methods that need a package of the extra `bench`."""

@@ -21,7 +21,7 @@ STEPS = 12
 SMALL = Gaussians(
     spacing_px=1.5,
     approximate_steps=10,
-    volume=HolographicTV(iterations=40, corrections=3, inner=10),
+    volume=HolographicTV(iterations=40, corrections=3, inner=10, refine=1),
     fit=FitOptions(Objective(tv_volume=0.05, overfull=10.0), Schedule(steps=STEPS)),
 )
 RANDOM = Gaussians(

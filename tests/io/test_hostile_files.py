@@ -112,6 +112,28 @@ def test_nesting_and_numbers_of_entries_are_bounded(tmp_path, monkeypatch):
         hdf5_guard.require_own(file, path)
 
 
+def test_a_file_is_looked_through_once_and_again_where_it_changed(good, tmp_path, monkeypatch):
+    """But one that changed within the last second each time: its times may not tell the next change."""
+    path, looks, look = tmp_path / "scan.nxs", [], hdf5_guard._others
+    shutil.copy(good, path)
+    monkeypatch.setattr(hdf5_guard, "_known", {})
+    monkeypatch.setattr(hdf5_guard, "_others", lambda *asked: looks.append(asked) or look(*asked))
+
+    def opened() -> int:
+        with h5py.File(path) as file:
+            hdf5_guard.require_own(file, path)
+        return len(looks)
+
+    monkeypatch.setattr(hdf5_guard, "AGED", 10**15)
+    assert (opened(), opened()) == (1, 2)
+    monkeypatch.setattr(hdf5_guard, "AGED", 0)
+    assert (opened(), opened()) == (3, 3)
+    with h5py.File(path, "r+") as file:
+        file["entry/elsewhere"] = h5py.ExternalLink("/etc/passwd", "/")
+    with pytest.raises(InputError, match="is a link to another file"):
+        opened()
+
+
 def test_what_memory_cannot_hold_is_refused_before_it_is_read():
     with pytest.raises(InputError, match=r"frames takes 1.15e\+09 GB, but this machine has"):
         require_memory("frames", 1 << 60)

@@ -21,7 +21,7 @@ from holosplat.methods.uncertain import Determined, Search, Uncertain, at_energy
 
 RATIO = MaterialPrior.of_ratio(MATERIAL.ratio)
 QUICK = ProfileOptions(
-    iterations=10, start=HolographicTV(retrieval=15, iterations=30, corrections=0, noisy=1.0, refine=1, upper=0.0)
+    iterations=5, start=HolographicTV(retrieval=15, iterations=30, corrections=0, noisy=1.0, refine=1, upper=0.0)
 )
 
 

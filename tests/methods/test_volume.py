@@ -32,6 +32,8 @@ pytestmark = pytest.mark.usefixtures("begun_once")
 
 RATIO = MaterialPrior.of_ratio(1500.0)
 QUICK = HolographicTV(retrieval=10, iterations=20, corrections=0, upper=0.0)
+SHORT = SmoothVolume(iterations=10)
+"""Half of the iterations by default."""
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +57,7 @@ def judged(found, scan: Scan) -> tuple[float, float]:
 
 def test_it_is_better_than_the_start_without_noise(quiet):
     task = Task(quiet, RATIO)
-    error, total = judged(solve(SmoothVolume(), task), quiet)
+    error, total = judged(solve(SHORT, task), quiet)
     start, _ = judged(solve(HolographicVoxels(), task), quiet)
     assert error < min(0.05, start)
     assert total == pytest.approx(1.0, abs=0.05)
@@ -65,7 +67,7 @@ def test_noise_of_half_the_contrast_keeps_the_mass(quiet):
     """Of eight small views, to 15 %."""
     contrast = float(np.sqrt(np.square(quiet.frames - 1).mean()))
     scan = noisy(quiet, 0.5 * contrast, 1)
-    error, total = judged(solve(SmoothVolume(), Task(scan, RATIO)), scan)
+    error, total = judged(solve(SHORT, Task(scan, RATIO)), scan)
     start, _ = judged(solve(HolographicVoxels(), Task(scan, RATIO)), scan)
     assert error < min(0.15, 0.5 * start)
     assert total == pytest.approx(1.0, abs=0.15)
@@ -80,7 +82,7 @@ def test_noise_wipes_nothing_out():
     start = SmoothStage(SmoothVolume()).start(Task(scan, RATIO), None)
     grid, totals = Grid.of_views(scan.views), []
     true = float(np.asarray(cell.voxelise(grid).delta, dtype=np.float64).sum())
-    for found in (start, solve(SmoothVolume(), Task(scan, RATIO), "continuous")):
+    for found in (start, solve(SHORT, Task(scan, RATIO), "continuous")):
         totals.append(float(np.asarray(found.voxelise(grid).delta, dtype=np.float64).sum()) / true)
     assert totals[0] < 0.5
     assert totals[1] == pytest.approx(1.0, abs=0.25)

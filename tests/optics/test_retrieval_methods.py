@@ -213,12 +213,13 @@ def test_bodies_are_found(name, photons, ball, found):
 
 
 @METHODS
-def test_blurred_frames(name, ball):
+def test_blurred_frames(name):
     """A point-spread function of 0.7 px, and one of 0.2 px in the second exposure, are known and undone."""
-    where = replace(ball[0], psf_sigma_px=np.array([0.7, 0.2]))
+    sharp = exposures((49, 59), np.array([at(24.8), at(12.4)]), count=2)
+    where = replace(sharp, psf_sigma_px=np.array([0.7, 0.2]))
     truth, frames = taken(bodies, where)
     told = relative_error(RETRIEVALS[name](frames.float(), where, DELTA, BETA), truth)
-    untold = relative_error(RETRIEVALS[name](frames.float(), ball[0], DELTA, BETA), truth)
+    untold = relative_error(RETRIEVALS[name](frames.float(), sharp, DELTA, BETA), truth)
     assert told < untold
 
 
@@ -257,11 +258,13 @@ def test_each_view_is_on_its_own(name, monkeypatch):
 
 
 @METHODS
-def test_single_precision_suffices(name, ball, found):
-    where, truth, frames = ball
-    double = RETRIEVALS[name](noisy(frames, 2000.0), where, DELTA, BETA)
+def test_single_precision_suffices(name):
+    where = exposures((35, 45))
+    truth, frames = taken(bodies, where)
+    seen = noisy(frames, 2000.0)
+    single, double = (RETRIEVALS[name](images, where, DELTA, BETA) for images in (seen.float(), seen))
     assert double.dtype == DOUBLE
-    assert relative_error(found(name, 2000.0), truth) == pytest.approx(relative_error(double, truth), abs=0.01)
+    assert relative_error(single, truth) == pytest.approx(relative_error(double, truth), abs=0.01)
 
 
 @METHODS

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
@@ -21,30 +21,54 @@ from .progress import INTERRUPTED, ProgressBar
 from .room import tell_reconstruction
 
 if TYPE_CHECKING:
+    from ..scan import Scan
     from ..workflows.evaluate import Evaluation
     from ..workflows.reconstruct import Reconstruction
+    from ..workflows.run_folder import RunFolder
 
-LIGHT = RunLightFlags()
-"""Even, unless the air of frames says otherwise."""
 LIVE = LiveFlags()
 """Nobody watches."""
-AS_PLANNED = RefineOptions()
-"""Beams are where the scan says."""
 UNEXPLAINED = 3
 """Exit code of `reconstruct --strict` where frames are not explained."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is asked of a reconstruction: what is known of the matter, how it is found, in which light, and from where
+    it was seen."""
+
+    matter: PriorOptions = field(default_factory=PriorOptions)
+    how: MethodOptions = field(default_factory=MethodOptions)
+    illumination: RunLightFlags = field(default_factory=RunLightFlags)
+    geometry: RefineOptions = field(default_factory=RefineOptions)
+
+    def ways(self, reading: Reading) -> dict[str, Any]:
+        """What `workflows.reconstruct` takes by name; `InputError` for what does not go together."""
+        from ..methods.uncertain import Uncertain
+
+        refine = self.geometry.options()
+        require(
+            refine is None or reading.part.time_frame not in ("all", "still"),
+            "--refine finds each frame by itself, but --time-frame all has the same beams many times; find their one "
+            "geometry with holosplat align, and reconstruct the file that it writes without --refine.",
+        )
+        uncertain = Uncertain(**reading.told.ranges(), **self.matter.ranges())
+        kind, light = self.how.kind_of_matter(), self.illumination.options()
+        return {"matter": kind, "light": light, "uncertain": uncertain, "refine": refine}
+
+
+USUAL = Asked()
+"""What is asked without options."""
 
 
 def reconstruct(
     scan: Positional[Path],
     out: Path,
-    matter: PriorOptions = PriorOptions(),
-    how: MethodOptions = MethodOptions(),
+    asked: Annotated[Asked, arg(name="")] = USUAL,
     seed: Seed = 0,
     resume: bool = False,
     reading: Reading = Reading(),
     *,
-    illumination: RunLightFlags = LIGHT,
-    geometry: RefineOptions = AS_PLANNED,
     strict: bool = False,
     live: LiveFlags = LIVE,
 ) -> None:
@@ -58,67 +82,60 @@ def reconstruct(
         strict: Exit with 3 where the frames are not explained to within their noise; without it, that is a warning.
     """
     from ..io.formats import read_as
-    from ..io.json import read_json, write_json
-    from ..io.run_scan import run_source
     from ..methods.method import takes_series
     from ..methods.uncertain import Uncertain
-    from ..report.run import report_run
-    from ..workflows.evaluate import evaluate as score
     from ..workflows.reconstruct import reconstruct as fit
     from ..workflows.run_folder import RunFolder, claimed
-    from .motion import asks_for_motion, reconstruct_in_motion, report_of_middle
+    from .motion import asks_for_motion, reconstruct_in_motion
 
-    method = how.chosen()
+    method = asked.how.chosen()
     if takes_series(method) and reading.part.time_frame == "all":
         reading = replace(reading, part=replace(reading.part, time_frame=None))
-    uncertain, refine = Uncertain(**reading.told.ranges(), **matter.ranges()), geometry.options()
-    require(
-        refine is None or reading.part.time_frame not in ("all", "still"),
-        "--refine finds each frame by itself, but --time-frame all has the same beams many times; find their one "
-        "geometry with holosplat align, and reconstruct the file that it writes without --refine.",
-    )
+    ways, folder = asked.ways(reading), RunFolder(out)
     measured = read_as(scan, replace(reading, told=reading.told.at_middle()))
-    prior = matter.without_ranges().prior(measured.exposures.reference_energy)
+    prior = asked.matter.without_ranges().prior(measured.exposures.reference_energy)
     if not measured.is_series:
-        tell_reconstruction(measured.exposures[~measured.is_test], out, method, prior, how.kind_of_matter())
+        tell_reconstruction(measured.exposures[~measured.is_test], out, method, prior, ways["matter"])
     measured = measured.in_memory()
-    folder = RunFolder(out)
-    if asks_for_motion(
-        reading, method, how.kind_of_matter(), plain=not resume and refine is None and uncertain == Uncertain()
-    ):
+    plain = not resume and ways["refine"] is None and ways["uncertain"] == Uncertain()
+    if asks_for_motion(reading, method, ways["matter"], plain):
         require(not live.view, "--view shows fits of one time; choose it with --time-frame, or leave --view.")
         with claimed(folder):
-            if reconstruct_in_motion(scan, reading, prior, folder, seed, illumination.options()):
+            if reconstruct_in_motion(scan, reading, prior, folder, seed, ways["light"]):
                 return
         _say("nothing moves, as far as the frames tell: they are taken as of one time")
     with claimed(folder):
         with ProgressBar() as bar, watched(live, out.name, bar.show) as follow:
-            result = fit(
-                measured,
-                prior,
-                method,
-                seed,
-                matter=how.kind_of_matter(),
-                light=illumination.options(),
-                uncertain=uncertain,
-                refine=refine,
-                folder=folder,
-                resume=resume,
-                on_progress=follow.on_progress,
-                on_state=follow.on_state,
-            )
-        found = {each.name: each.value for each in result.constants if each.name in reading.told.ranges()}
-        write_json(folder.source, run_source(scan, replace(reading, told=replace(reading.told, **found))))
-        measured = result.placed(measured)
-        evaluation = score(result, measured, None)
-        if takes_series(method):
-            report = report_of_middle(folder, result, measured)
-        else:
-            report = report_run(folder, result, measured, evaluation, None)
+            told = {"on_progress": follow.on_progress, "on_state": follow.on_state}
+            result = fit(measured, prior, method, seed, folder=folder, resume=resume, **ways, **told)
+        evaluation, report = _scored(folder, result, measured, scan, reading)
     _print_scores(evaluation)
-    if folder.light.is_file():
-        _say(f"light: {read_json(folder.summary)['light']}, by the frames' air ({folder.light})")
-    _print_result(result, report)
+    _print_result(folder, result, report)
+    _end(result, out, strict)
+
+
+def _scored(
+    folder: RunFolder, result: Reconstruction, measured: Scan, scan: Path, reading: Reading
+) -> tuple[Evaluation, Path]:
+    """The scores of a run on its frames, and its report; the folder then knows where its frames are."""
+    from ..io.json import write_json
+    from ..io.run_scan import run_source
+    from ..report.run import report_run
+    from ..workflows.evaluate import evaluate as score
+    from ..workflows.moments import instants_of
+    from .motion import report_of_middle
+
+    found = {each.name: each.value for each in result.constants if each.name in reading.told.ranges()}
+    write_json(folder.source, run_source(scan, replace(reading, told=replace(reading.told, **found))))
+    placed = result.placed(measured)
+    evaluation = score(result, placed, None)
+    if instants_of(folder):
+        return evaluation, report_of_middle(folder, result, placed)
+    return evaluation, report_run(folder, result, placed, evaluation, None)
+
+
+def _end(result: Reconstruction, out: Path, strict: bool) -> None:
+    """Warn of what is not explained or not finished; exit with 3 or 130 where that is so."""
     unexplained = result.verdict is not None and not result.verdict.good
     if unexplained:
         _say("warning: the frames are not explained; do not trust the volume before the cause is found")
@@ -129,8 +146,12 @@ def reconstruct(
         raise SystemExit(UNEXPLAINED)
 
 
-def _print_result(result: Reconstruction, report: Path) -> None:
+def _print_result(folder: RunFolder, result: Reconstruction, report: Path) -> None:
     """What was found and decided, and whether it explains the frames."""
+    from ..io.json import read_json
+
+    if folder.light.is_file():
+        _say(f"light: {read_json(folder.summary)['light']}, by the frames' air ({folder.light})")
     for constant in result.constants:
         print(constant.line())
     for line in result.geometry.lines() if result.geometry else ():
@@ -238,7 +259,7 @@ def demo(out: Path = Path("demo")) -> None:
     beamline = BeamlineOptions(DETECTOR, psf_sigma_px=0.05, views=16)
     simulate(tuple(paths), beamline=beamline, out=scan, truth=TruthOptions(truth))
     _say(f"\n$ holosplat reconstruct {scan} --material haemoglobin --out {run}")
-    reconstruct(scan, run, PriorOptions("haemoglobin"))
+    reconstruct(scan, run, Asked(PriorOptions("haemoglobin")))
     _say(f"\n$ holosplat evaluate {run} --truth {truth}")
     evaluate(run, truth=truth)
 

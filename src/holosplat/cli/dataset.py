@@ -55,4 +55,4 @@ def dataset(
     print(f"wrote {made} files of scenes; {out / 'datasheet.md'} says what they are")
     for each in done:
         left_out = f"; left out, for their views have no common axis: {len(each.left_out)}" if each.left_out else ""
-        print(f"wrote {each.count} scenes into {each.folder}{left_out}")
+        print(f"wrote {each.count} scene{'s' * (each.count > 1)} into {each.folder}{left_out}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from ..series.run import Counts
     from ..series.settings import Settings
 
-LIGHT = RunLightFlags()
-"""Even, unless the air of frames says otherwise."""
 UNFINISHED = 4
 """Exit code of `series run` and `collect` where tasks failed or are left."""
 
@@ -43,32 +41,32 @@ class EachTime:
     """Write report.html of each run, too, which takes seconds a time."""
 
 
-EACH, WINDOWS, MOTION, UNKNOWN = EachTime(), Cut(), MotionFlags(), BodyFlags()
+@dataclass(frozen=True)
+class Act:
+    """What is done with the times of a series: the options of `reconstruct`, and of `track`."""
+
+    each: EachTime = field(default_factory=EachTime)
+    how: MethodOptions = field(default_factory=MethodOptions)
+    motion: MotionFlags = field(default_factory=MotionFlags)
+    known: BodyFlags = field(default_factory=BodyFlags)
+    illumination: RunLightFlags = field(default_factory=RunLightFlags)
+
+    def settings(self, track: bool, seed: int) -> Settings:
+        """The settings of each task; `InputError` for options of the other act."""
+        from ..series.settings import Settings, Warm
+
+        stray = _changed(self.motion, self.known) if not track else _changed(self.how)
+        other = "goes with --track" if not track else "is of reconstruct; leave it, or --track"
+        require(not stray, f"--{stray[0].replace('_', '-') if stray else ''} {other}.")
+        shared = {"light": self.illumination.options(), "seed": seed, "reports": self.each.reports}
+        if track:
+            return Settings("track", motion=replace(self.motion.options(), body=self.known.known()), **shared)
+        warm = Warm(self.each.warm, self.each.worse)
+        return Settings("reconstruct", self.how.chosen(), self.how.kind_of_matter(), warm, **shared)
+
+
+ACT, WINDOWS = Act(), Cut()
 """What is done without options."""
-
-
-def settings_of(
-    track: bool,
-    each: EachTime,
-    how: MethodOptions,
-    motion: MotionFlags,
-    known: BodyFlags,
-    light: RunLightFlags,
-    seed: int,
-) -> Settings:
-    """What options say is done with each time; `InputError` for options of the other act."""
-    from dataclasses import replace
-
-    from ..series.settings import Settings, Warm
-
-    stray = _changed(motion, known) if not track else _changed(how)
-    other = "goes with --track" if not track else "is of reconstruct; leave it, or --track"
-    require(not stray, f"--{stray[0].replace('_', '-') if stray else ''} {other}.")
-    shared = {"light": light.options(), "seed": seed, "reports": each.reports}
-    if track:
-        return Settings("track", motion=replace(motion.options(), body=known.known()), **shared)
-    warm = Warm(each.warm, each.worse)
-    return Settings("reconstruct", how.chosen(), how.kind_of_matter(), warm, **shared)
 
 
 def _changed(*groups: object) -> list[str]:
@@ -107,14 +105,10 @@ def plan(
     scans: Positional[tuple[Path, ...]],
     out: Path,
     windows: Cut = WINDOWS,
-    each: EachTime = EACH,
     matter: PriorOptions = PriorOptions(),
-    how: MethodOptions = MethodOptions(),
-    motion: MotionFlags = MOTION,
-    *,
-    known: BodyFlags = UNKNOWN,
-    illumination: RunLightFlags = LIGHT,
+    act: Annotated[Act, arg(name="")] = ACT,
     reading: Reading = Reading(),
+    *,
     seed: Seed = 0,
     track: bool = False,
 ) -> None:
@@ -132,7 +126,7 @@ def plan(
     from ..series.sources import listed
 
     require(not matter.ranges(), "a series needs one number for --delta-beta; find it by reconstruct of one time.")
-    settings = settings_of(track, each, how, motion, known, illumination, seed)
+    settings = act.settings(track, seed)
     folder = SeriesFolder(out)
     found = plan_series(listed(scans), settings, matter.prior, reading, windows)
     folder.create(found)

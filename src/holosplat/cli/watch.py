@@ -17,9 +17,9 @@ from ..tables import to_table
 from .light import RunLightFlags
 from .options import MethodOptions, PriorOptions
 from .progress import INTERRUPTED
-from .series import LIGHT, MOTION, UNKNOWN, EachTime, settings_of
+from .series import Act, EachTime
 
-HOW, EACH = Watching(), EachTime()
+HOW, EACH, LIGHT = Watching(), EachTime(), RunLightFlags()
 """What is done without options."""
 
 
@@ -47,7 +47,7 @@ def watch(
     """
     require(not matter.ranges(), "a watch needs one number for --delta-beta; find it by reconstruct of one scan.")
     require(reading.part.time_frame is None, "a watch takes all times of a scan; choose some with --time-frames.")
-    settings = settings_of(False, each, method, MOTION, UNKNOWN, illumination, seed)
+    settings = Act(each, method, illumination=illumination).settings(track=False, seed=seed)
     said = {
         "folder": str(folder.resolve()),
         "settings": to_table(settings.as_table()),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
@@ -17,10 +16,9 @@ from ..optics.noise import noise_levels
 from ..optics.sampling import fringes
 from ..scan import Exposures, Scan
 from .batch import Batch
-from .loop import Plan
+from .loop import Plan, Stateless
 from .optimiser import Adam, Apart, Leaves, Optimiser
 from .problem import Part
-from .running import Record
 from .trainable import Trainable
 from .validation import set_aside
 
@@ -187,7 +185,7 @@ class Expected:
         return [Part("geometry", self._weight, (0.5 * torch.stack(total).sum()).float())]
 
 
-class Gauge:
+class Gauge(Stateless):
     """What no frame tells stays: a motion and a turn of the whole object, its size (the mean magnification), and a mean
     distance that sampling would move.
 
@@ -219,17 +217,6 @@ class Gauge:
         """Adam's steps have their own length for each number, and leave the projection."""
         self._each(trainable.leaves, lambda leaf: leaf.detach())
         return False
-
-    def columns(self, model: Model) -> Record:
-        """None."""
-        return {}
-
-    def state_dict(self) -> dict[str, Any]:
-        """It has no state."""
-        return {}
-
-    def load(self, state: dict[str, Any]) -> None:
-        """It has no state."""
 
 
 def _turns(views: Views) -> np.ndarray:

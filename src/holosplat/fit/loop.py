@@ -68,6 +68,25 @@ class Event(Protocol):
         ...
 
 
+class Stateless:
+    """Of an `Event`, what one that follows from the step alone need not say: it looks at no gradients, adds nothing to
+    the record, and has no state."""
+
+    def on_gradients(self, leaves: Leaves) -> None:
+        """Nothing."""
+
+    def columns(self, model: Model) -> Record:
+        """Nothing."""
+        return {}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing."""
+        return {}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Nothing."""
+
+
 def _no_rates(factor: float, step: int) -> Mapping[str, float]:
     return {}
 

@@ -5,6 +5,8 @@ A link, a virtual dataset or external storage can make a reader copy any file of
 
 from __future__ import annotations
 
+import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -20,7 +22,13 @@ MOST = 200_000
 """Links in a file, at most: larger ones are no scans, and take minutes to look through."""
 MOST_FILES = 10_000
 """Files that one may bring values of: one a frame, and more than beamlines write."""
+AGED = 1_000_000_000
+"""Nanoseconds without a change after which the times of a file tell the next one: clocks of file systems are coarse."""
+MOST_KNOWN = 1000
+"""Files that are remembered, at most."""
 _vouched: set[Path] = set()
+_known: dict[tuple[int, ...], None] = {}
+"""Files that hold all that they are read for, by device, number, size and times: a command opens one several times."""
 
 
 def allow_external(path: Path) -> None:
@@ -31,8 +39,16 @@ def allow_external(path: Path) -> None:
 def require_own(file: h5py.File, path: Path) -> None:
     """`InputError` if an open file at `path` refers to other files, is nested too deeply, or declares more values than
     it can hold. Where it may refer to others (`allow_external`), the same holds for each of these."""
-    allowed = _is_vouched(path)
+    state = os.fstat(file.id.get_vfd_handle())
+    stamp = (state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
+    if stamp in _known:
+        return
+    allowed, now = _is_vouched(path), time.time_ns()
     seen, later = {path.resolve()}, _others(file, path, allowed)
+    if not allowed and now - max(state.st_mtime_ns, state.st_ctime_ns) > AGED:
+        if len(_known) >= MOST_KNOWN:
+            _known.clear()
+        _known[stamp] = None
     while later:
         other = later.pop()
         if other.resolve() in seen:

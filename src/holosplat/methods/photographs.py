@@ -11,16 +11,15 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import torch
 
 from ..checks import at_least, require
 from ..fit.density import DensityControl, DensityEvent
-from ..fit.loop import Fit, Plan
-from ..fit.optimiser import Adam, Leaves
+from ..fit.loop import Fit, Plan, Stateless
+from ..fit.optimiser import Adam
 from ..fit.problem import Problem
-from ..fit.running import Record
 from ..fit.schedule import Schedule
 from ..fit.terms import Objective
 from ..fit.terms.rays import RandomRays
@@ -101,14 +100,11 @@ class AlphaSplats:
         return replace(self, schedule=schedule, density=density, reset_every=reset)
 
 
-class OpacityResets:
+class OpacityResets(Stateless):
     """An event of a fit of splats: every so many steps all become faint, and those that frames need come back."""
 
     def __init__(self, every: int, opacity: float) -> None:
         self._every, self._raw = every, math.log(opacity / (1 - opacity))
-
-    def on_gradients(self, leaves: Leaves) -> None:
-        """Nothing."""
 
     def after_step(self, trainable: Trainable, step: int, steps: int, generator: torch.Generator) -> bool:
         """Reset, where it is due; not in the second half, in which opacities come back."""
@@ -116,17 +112,6 @@ class OpacityResets:
             with torch.no_grad():
                 trainable.leaves["object.raw_amplitudes"].clamp_(max=self._raw)
         return False
-
-    def columns(self, model: Model) -> Record:
-        """Nothing."""
-        return {}
-
-    def state_dict(self) -> dict[str, Any]:
-        """Nothing: what is due follows from the step."""
-        return {}
-
-    def load(self, state: dict[str, Any]) -> None:
-        """Nothing."""
 
 
 @dataclass(frozen=True)

@@ -134,17 +134,24 @@ class EachTime:
 
 
 @dataclass(frozen=True)
-class FlowAlone:
-    """The velocity alone, by the equations: the matter stays as it is."""
+class GoesOn:
+    """A stage that fits further what the one before has found."""
 
     options: PinnFit
-    name: str = FLOW_ALONE
+    name: str
     likelier: bool = True
 
     def start(self, task: Task, before: Stored | None) -> Stored:
         """What came before."""
         assert before is not None
         return before
+
+
+@dataclass(frozen=True)
+class FlowAlone(GoesOn):
+    """The velocity alone, by the equations: the matter stays as it is."""
+
+    name: str = FLOW_ALONE
 
     def fit(self, task: Task, start: Stored) -> Fit:
         """The fit of the velocity."""
@@ -157,17 +164,10 @@ class FlowAlone:
 
 
 @dataclass(frozen=True)
-class Waves:
+class Waves(GoesOn):
     """Matter and velocity together, through the waves."""
 
-    options: PinnFit
     name: str = THROUGH_WAVES
-    likelier: bool = True
-
-    def start(self, task: Task, before: Stored | None) -> Stored:
-        """What came before."""
-        assert before is not None
-        return before
 
     def fit(self, task: Task, start: Stored) -> Fit:
         """The fit of the field to the training frames."""

@@ -60,7 +60,7 @@ class TrainOptions:
     validation: Natural = 16
     """Scenes of another seed that validate."""
     precision: Literal["auto", "bfloat16", "float32"] = "auto"
-    """Of the network's sums; auto: bfloat16 where the processor has it, which is several times as fast there."""
+    """Of the network's sums; auto: bfloat16 where the processor multiplies it, to save time."""
     device: Literal["cpu", "cuda"] = "cpu"
     """Where it is computed."""
     seed: Seed = 0

@@ -9,8 +9,7 @@ from ..checks import at_least, require
 from ..ranges import Angle, Natural, Pixels, Positive, Share, SomeShare, Weight, ranged
 
 Kind = Literal["red-cells", "crowd", "ellipsoids", "capsules", "filled-capsules", "foam", "soft-cells"]
-"""What a scene may be made of. crowd: red cells as close as they can be put; capsules: shells about nothing;
-filled-capsules: shells about another material; soft-cells: continuous, with nuclei and vacuoles."""
+"""What a scene may be made of."""
 
 
 @dataclass(frozen=True)
@@ -20,7 +19,8 @@ class Ranges:
     magnification are the same to a network."""
 
     kinds: tuple[Kind, ...] = ("red-cells",)
-    """What scenes are made of, each kind as often as the others."""
+    """What scenes are made of, each kind as often as the others; crowd: red cells as close as they can be; capsules:
+    shells about nothing; filled-capsules: about another material; soft-cells: continuous, with nuclei and vacuoles."""
     rows: Natural = 80
     """Of a frame [pixels]."""
     columns: Natural = 80
