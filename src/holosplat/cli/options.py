@@ -333,7 +333,8 @@ class MethodOptions:
                 f"--start says what Gaussians begin with (--method auto, gaussians or surfaces), but the method is "
                 f"{method.kind}; leave --start.",
             )
-            method = chosen_method(self.method, self.preset, self.config, (*self.changes, f"start={self.start}"))
+            where = "start" if isinstance(method, Gaussians) else "gaussians.start"
+            method = chosen_method(self.method, self.preset, self.config, (*self.changes, f"{where}={self.start}"))
         if self.backend:
             move = getattr(method, "on_backend", None)
             if move is None:
