@@ -12,6 +12,7 @@ from holosplat.io.guess import read_guess
 from holosplat.learning.network import Guess
 from holosplat.learning.size import Size
 from holosplat.learning.weights import Card, read_weights, write_weights
+from holosplat.methods import Gaussians
 from holosplat.workflows.run_folder import RunFolder
 
 SMALL = ("--image", "4", "4", "4", "4", "--features", "3", "--volume", "4", "4", "4")
@@ -66,7 +67,9 @@ def test_a_guess_that_the_frames_contradict_is_not_begun_with_and_the_run_says_s
 def test_every_method_with_gaussians_takes_the_start(method):
     chosen = MethodOptions(method, start="learned").chosen()
 
-    assert getattr(chosen, "gaussians", chosen).start == "learned"
+    of_gaussians = chosen if isinstance(chosen, Gaussians) else getattr(chosen, "gaussians", None)
+    assert isinstance(of_gaussians, Gaussians)
+    assert of_gaussians.start == "learned"
 
 
 def test_a_start_is_refused_by_methods_without_one(shop, tmp_path):

@@ -10,7 +10,7 @@ import torch
 
 from helpers.blobs import MATERIAL, SHAPE, blob_scan, blobs
 from holosplat.checks import InputError
-from holosplat.fit.smooth_volume import ContinuousPrior, VolumeProblem, descend, modulated, modulations
+from holosplat.fit.smooth_volume import ContinuousPrior, Descent, VolumeProblem, descend, modulated, modulations
 from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid
 from holosplat.optics.noise_model import NoiseModel
@@ -67,6 +67,25 @@ def test_the_descent_never_rises_and_keeps_matter_positive():
     assert float(found.min()) >= 0
     error = [float((u - matter()).norm() / matter().norm()) for u in (start, found)]
     assert error[1] < 0.7 * error[0]
+
+
+class Trap:
+    """Σ (u - 1)² (u + 0.05): a second, higher minimum at zero, where a first step from far above ends."""
+
+    def __call__(self, u: torch.Tensor) -> tuple[float, torch.Tensor]:
+        return float(((u - 1) ** 2 * (u + 0.05)).sum()), 2 * (u - 1) * (u + 0.05) + (u - 1) ** 2
+
+    def preconditioner(self, u: torch.Tensor):
+        return lambda gradient: gradient
+
+
+@pytest.mark.parametrize(("kept", "end"), [(False, 0.0), (True, 1.0)])
+def test_an_empty_volume_is_a_trap_that_shorter_steps_avoid(kept, end):
+    descent = Descent(Trap(), torch.full((3, 4, 5), 3.0), kept)
+    while not descent.ended and descent.done < 60:
+        descent.step()
+    assert descent.u.numpy() == pytest.approx(end, abs=1e-3)
+    assert Descent.again(Trap(), descent.state_dict()).kept is kept
 
 
 def test_modulations_give_back_what_was_taken():

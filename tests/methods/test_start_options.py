@@ -54,19 +54,32 @@ def test_how_much_makes_two_materials_is_an_option():
     assert not found.are_two(TwoMaterials(largest_deviation=0.1))
 
 
+class Frames:
+    class views:
+        shape = (8, 8)
+
+    def coarsened(self, factor):
+        return self
+
+
+def test_a_ratio_that_leaves_no_matter_is_none_that_is_found(monkeypatch):
+    def volume(scan, ratio, backend, options):
+        return torch.full((2, 2, 2), {10: 1.0, 100: 2.0}.get(round(ratio), 0.0))
+
+    monkeypatch.setattr("holosplat.baselines.material._trial_volume", volume)
+    how = MaterialEstimate(lowest=1.0, highest=4.0, tried=4)
+    assert estimate_ratio(Frames(), quiet, options=how) == pytest.approx(10 ** (2 - 1 / 6))  # pyright: ignore[reportArgumentType]
+    monkeypatch.setattr("holosplat.baselines.material._trial_volume", lambda *given: torch.zeros(2, 2, 2))
+    with pytest.raises(InputError, match="found no matter"):
+        estimate_ratio(Frames(), quiet, options=how)  # pyright: ignore[reportArgumentType]
+
+
 def test_as_many_ratios_are_tried_as_are_asked_for(monkeypatch):
     tried = []
 
     def volume(scan, ratio, backend, options):
         tried.append(ratio)
         return torch.ones(2, 2, 2)
-
-    class Frames:
-        class views:
-            shape = (8, 8)
-
-        def coarsened(self, factor):
-            return self
 
     monkeypatch.setattr("holosplat.baselines.material._trial_volume", volume)
     estimate_ratio(Frames(), quiet, options=MaterialEstimate(lowest=1.0, highest=3.0, tried=5))  # pyright: ignore[reportArgumentType]

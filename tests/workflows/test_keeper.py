@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from helpers.runs import KNOWN, SMALL
+from helpers.runs import CELL, KNOWN, SMALL
 from helpers.soft import two_cells
 from holosplat.checks import InputError
 from holosplat.geometry import Grid
 from holosplat.io.json import read_json
-from holosplat.matter import MaterialPrior
-from holosplat.methods import GaussianRates, SmoothVolume, solve
+from holosplat.matter import DeltaBeta, MaterialPrior
+from holosplat.methods import Auto, GaussianRates, SmoothVolume, solve
 from holosplat.methods.method import Task
 from holosplat.representations import VoxelGrid
 from holosplat.workflows.keeper import Choice, Keeper
@@ -88,6 +88,16 @@ def test_steps_of_a_method_and_other_kinds_are_no_rivals(scan):
         assert keeper.best is not None
         assert keeper.best.name == kept
         assert keeper.judged["second"] > keeper.judged["first"]
+
+
+@pytest.mark.parametrize("denser", [1.0, 0.2])
+def test_a_smooth_volume_takes_over_where_no_bodies_of_that_level_explain_the_frames(scan, denser):
+    quick = SmoothVolume(coarser=(), rounds=1, iterations=6)
+    known = MaterialPrior.known(DeltaBeta(denser * CELL.delta, denser * CELL.beta))
+    method = replace(Auto(gaussians=SMALL, volume=quick).with_effort(0.1), volume=quick)
+    done = reconstruct(scan, known, method, matter="levels")
+    assert (done.choice.kept == "smooth volume") is (denser < 1)
+    assert ("smooth volume" in done.choice.judged) is (denser < 1)
 
 
 def test_old_summaries_say_nothing():

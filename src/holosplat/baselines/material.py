@@ -21,6 +21,7 @@ from .tomography import TotalVariation, tv_solver
 
 TRIAL_DELTA = 1e-6
 """Any value will do: the retrieved D = δT does not depend on it."""
+NO_MATTER = "the start found no matter in the holograms; check material, energy and distance."
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,9 @@ def estimate_ratio(
     levels = np.empty(len(ratios))
     for i, ratio in enumerate(ratios):
         on_progress("estimate of delta/beta", i / len(ratios))
-        levels[i] = plateau(_trial_volume(coarse, ratio, backend, options))
+        trial = _trial_volume(coarse, ratio, backend, options)
+        levels[i] = plateau(trial) if bool((trial > 0).any()) else 0.0  # a wrong ratio may leave nothing
+    require(bool(levels.any()), NO_MATTER)
     best = _first_peak(levels)
     left, middle, right = levels[best - 1 : best + 2]
     curvature = left - 2 * middle + right
@@ -98,7 +101,7 @@ def estimate_delta(
 def plateau(occupancy: Tensor) -> float:
     """The level [units of `occupancy`] that most of the matter has: the mass-weighted median of [Z, Y, X] ≥ 0."""
     values = occupancy[occupancy > 0].sort().values
-    require(len(values) > 0, "the start found no matter in the holograms; check material, energy and distance.")
+    require(len(values) > 0, NO_MATTER)
     mass = values.double().cumsum(0)
     return float(values[int(torch.searchsorted(mass, 0.5 * mass[-1]))])
 

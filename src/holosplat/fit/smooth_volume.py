@@ -183,11 +183,13 @@ class Descent:
     cut off at zero (two-metric projection: Bertsekas 1982; Nocedal & Wright 2006, algorithm 7.4, for the step, with the
     problem's preconditioner as first inverse).
 
-    u: the volume; value: its objective; done: how many iterations; ended: whether none lowers the objective further.
+    u: the volume; value: its objective; done: how many iterations; ended: whether none lowers the objective further;
+    kept: whether steps that would leave nothing are shortened, for an empty volume is a trap: there the prior of
+    continuous matter is steepest.
     """
 
-    def __init__(self, problem: Penalised, start: Tensor) -> None:
-        self.problem, self.u = problem, start.clamp_min(0)
+    def __init__(self, problem: Penalised, start: Tensor, kept: bool = False) -> None:
+        self.problem, self.u, self.kept = problem, start.clamp_min(0), kept
         self.value, self._gradient = problem(self.u)
         self.done, self.ended = 0, False
         self._pairs = list[tuple[Tensor, Tensor]]()
@@ -203,12 +205,10 @@ class Descent:
         u, gradient = self.u, self._gradient
         free = ((u > 0) | (gradient < 0)).to(u)
         direction = _direction(gradient, free, self._pairs, self._inverse)
-        found = _searched(self.problem, u, self.value, gradient, direction)
+        found = self._searched(direction)
         if found is None and self._pairs:
             self._pairs = []
-            found = _searched(
-                self.problem, u, self.value, gradient, _direction(gradient, free, self._pairs, self._inverse)
-            )
+            found = self._searched(_direction(gradient, free, self._pairs, self._inverse))
         if found is None:
             self.ended = True
             return
@@ -218,6 +218,19 @@ class Descent:
             self._pairs = [*self._pairs[1 - MEMORY :], (step, change)]
         self.u, self._gradient, self.value = moved, slope, value
         self.done += 1
+
+    def _searched(self, direction: Tensor) -> tuple[Tensor, float, Tensor] | None:
+        """The first point of a shrinking series along the projected `direction` that lowers the objective enough."""
+        length, u, gradient = 1.0, self.u, self._gradient
+        for _ in range(TRIALS):
+            moved = (u + length * direction).clamp_min(0)
+            length *= SHRINK
+            if self.kept and not bool((moved > 0).any()):
+                continue
+            found, slope = self.problem(moved)
+            if found <= self.value + SUFFICIENT * min(0.0, float((gradient * (moved - u)).sum())):
+                return moved, found, slope
+        return None
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that `again` needs, for the same steps to the last bit."""
@@ -229,6 +242,7 @@ class Descent:
             "pairs": [list(pair) for pair in self._pairs],
             "done": self.done,
             "ended": self.ended,
+            "kept": self.kept,
         }
 
     @classmethod
@@ -237,6 +251,7 @@ class Descent:
         found = cls.__new__(cls)
         found.problem, found.u, found.value = problem, state["u"], float(state["value"])
         found._gradient, found.done, found.ended = state["gradient"], int(state["done"]), bool(state["ended"])
+        found.kept = bool(state["kept"])
         found._pairs = [(step, change) for step, change in state["pairs"]]
         found._conditioned(state["anchor"])
         return found
@@ -273,20 +288,6 @@ def _direction(
     for s, y, curved, share in reversed(used):
         result = result + (share - float((y * result).sum()) / curved) * s
     return -result if float((result * gradient).sum()) > 0 else -(inverse(gradient * free) * free)
-
-
-def _searched(
-    problem: Penalised, u: Tensor, value: float, gradient: Tensor, direction: Tensor
-) -> tuple[Tensor, float, Tensor] | None:
-    """The first point of a shrinking series along the projected `direction` that lowers the objective enough."""
-    length = 1.0
-    for _ in range(TRIALS):
-        moved = (u + length * direction).clamp_min(0)
-        found, slope = problem(moved)
-        if found <= value + SUFFICIENT * min(0.0, float((gradient * (moved - u)).sum())):
-            return moved, found, slope
-        length *= SHRINK
-    return None
 
 
 def modulations(u: Tensor, level: float) -> list[Tensor]:

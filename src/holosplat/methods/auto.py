@@ -8,22 +8,25 @@ from typing import ClassVar
 
 from ..checks import InputError
 from ..fit.loop import Fit
-from ..matter import MatterKind
-from ..representations import GaussianCloud, Stored, SurfaceMesh
+from ..matter import DeltaBeta, MatterKind
+from ..ranges import Share, ranged
+from ..representations import GaussianCloud, Stored, SurfaceMesh, VoxelGrid
 from .assumed import assumed_material
 from .cross_validation import CrossValidation, MissingMatter
 from .gaussian_options import Backend
 from .gaussians import Gaussians
 from .levels import Decision, LevelTest
 from .method import Method, Stage, Task, solve_stages
+from .smooth_fit import SmoothFit
 from .surface_fit import SurfaceOptions
 from .surfaces import BodiesStage, SurfaceStage
-from .volume import SmoothVolume
+from .volume import SmoothStage, SmoothVolume
 
 TRIAL = "trial of methods"
 
 
 @dataclass(frozen=True)
+@ranged
 class Auto:
     """Matter with levels: Gaussians, and closed surfaces where there are bodies. Continuous matter: a smooth volume.
 
@@ -40,6 +43,9 @@ class Auto:
     """How it is decided whether matter has levels."""
     trials: CrossValidation = field(default_factory=CrossValidation)
     """How views are set aside for trials."""
+    unexplained: Share = 0.25
+    """Share of all matter that bodies may leave unexplained before a smooth volume is tried: right levels leave less
+    than a sixth even of crowded scenes in noise."""
 
     def stages(self) -> Sequence[Stage]:
         """Those for matter with levels; `chosen` decides."""
@@ -47,7 +53,11 @@ class Auto:
 
     def suited(self, matter: MatterKind) -> Method:
         """What is done with a kind of matter."""
-        return self.volume if matter == "continuous" else Bodies(self.gaussians, self.surfaces)
+        return (
+            self.volume
+            if matter == "continuous"
+            else Bodies(self.gaussians, self.surfaces, self.volume, self.unexplained)
+        )
 
     def chosen(self, task: Task, decision: Decision) -> tuple[Method, Decision]:
         """The method for `task`, of whose matter there is a `decision`; and that, if a trial has changed it."""
@@ -93,17 +103,20 @@ class Auto:
 
 @dataclass(frozen=True)
 class Bodies:
-    """Gaussians, and surfaces where these enclose bodies of one material."""
+    """Gaussians, surfaces where these enclose bodies of one material; a smooth volume where neither explains much."""
 
     kind: ClassVar[str] = "bodies"
 
     gaussians: Gaussians
     surfaces: SurfaceOptions
+    volume: SmoothVolume
+    unexplained: float
 
     def stages(self) -> Sequence[Stage]:
-        """Those of the Gaussians, and the surfaces."""
-        last = SurfacesWhereClosed(self.surfaces, self.gaussians.coarse)
-        return (BodiesStage(self.gaussians, surfaces=self.surfaces), last)
+        """Those of the Gaussians, the surfaces, and the volume."""
+        closed = SurfacesWhereClosed(self.surfaces, self.gaussians.coarse)
+        last = VolumeWhereUnexplained(self.volume, self.unexplained)
+        return (BodiesStage(self.gaussians, surfaces=self.surfaces), closed, last)
 
 
 @dataclass(frozen=True)
@@ -125,3 +138,34 @@ class SurfacesWhereClosed(SurfaceStage):
     def fit(self, task: Task, start: Stored) -> Fit | None:  # type: ignore[override]
         """The fit of the surfaces; None for Gaussians."""
         return super().fit(task, start) if isinstance(start, SurfaceMesh) else None
+
+
+@dataclass(frozen=True)
+class VolumeWhereUnexplained:
+    """A smooth volume, where matter with levels explains the frames badly: then there are no such levels.
+
+    most: share of all matter that what came before may leave unexplained
+    """
+
+    options: SmoothVolume
+    most: float
+    name: str = "smooth volume"
+    better: ClassVar[float] = 2.0
+    """So many times less must it leave unexplained than bodies do: it is freer, and follows the frames' errors, too."""
+
+    def start(self, task: Task, before: Stored | None) -> Stored:
+        """A first volume; what came before, where that explains the frames or has two materials."""
+        assert before is not None
+        matter = before.matter
+        if not matter.single or task.scan.is_series:
+            return before
+        judge = MissingMatter(task.scan, DeltaBeta(matter.delta, matter.beta))
+        return before if judge.share(before) <= self.most else SmoothStage(self.options).start(_continuous(task), None)
+
+    def fit(self, task: Task, start: Stored) -> SmoothFit | None:
+        """The fit of the volume; None for what came before."""
+        return SmoothStage(self.options).fit(_continuous(task), start) if isinstance(start, VoxelGrid) else None
+
+
+def _continuous(task: Task) -> Task:
+    return replace(task, matter="continuous")

@@ -9,6 +9,8 @@ from .method import Task
 from .volume import SmoothStage, SmoothVolume
 
 STAGE = "level of the matter"
+EDGE = 96
+"""Voxels along an edge of the volume whose level is taken, at most: it takes some ten seconds on one core."""
 
 
 def material_of_levels(task: Task, backend: Backend = "cpu", options: MaterialEstimate = DEFAULT) -> DeltaBeta:
@@ -17,19 +19,20 @@ def material_of_levels(task: Task, backend: Backend = "cpu", options: MaterialEs
 
     Tomography takes noise off its volume, and with it a tenth to a third of the level in noise of a fifth of the
     contrast, and a third to a half in noise of half of it. The likeliest volume under noise and prior
-    (`SmoothVolume`, on frames of at most `options.width` pixels) keeps it, for its prior hardly shrinks what is
-    large (docs/data/level.csv). Where that volume is empty, the material is that of tomography.
+    (`SmoothVolume`, of at most `EDGE`³ voxels) keeps it, for its prior hardly shrinks what is large
+    (docs/data/level.csv). Where that volume is empty, or its level lower, the material is that of tomography: larger
+    voxels than thin shells dilute them.
     """
     material = assumed_material(task.scan, task.prior, task.on_progress, backend, options)
     if not (task.bounded and isinstance(task.prior, KnownRatio)):
         return material
     task.on_progress(STAGE, 0.0)
-    stage = SmoothStage(SmoothVolume(estimate=options, max_voxels=options.width**3))
+    stage = SmoothStage(SmoothVolume(estimate=options, max_voxels=EDGE**3, rounds=1))
     fit = stage.fit(task, stage.start(task, None))
     fit.run(lambda record: task.on_progress(STAGE, fit.share))
     found = fit.voxels
     values = found.values[0]
     if not bool((values > 0).any()):
         return material
-    delta = level_of(values) * found.matter.channels[0].delta
+    delta = max(material.delta, level_of(values) * found.matter.channels[0].delta)
     return DeltaBeta(delta, delta / task.prior.ratio)

@@ -106,7 +106,7 @@ class SmoothFit:
         self._volume = plan.begun
         self._rival: tuple[Tensor, float] | None = None
         self._level = 0.0
-        self._strength, self._settled = 1.0, False
+        self._strength, self._settled, self._kept = 1.0, False, False
         self._stronger: tuple[VoxelGrid, float] | None = None
         self._descent: Descent | None = None
         self._frames: tuple[int, WhitenedFrames] | None = None
@@ -189,7 +189,7 @@ class SmoothFit:
         if leg.kind == "from start":
             if self._rival is None:
                 return False
-            self._descent = Descent(self._problem(frames, leg.factor), begun.values[0])
+            self._descent = Descent(self._problem(frames, leg.factor), begun.values[0], self._kept)
             return True
         grid = begun.grid if leg.factor == 1 else Grid.of_views(frames.field)
         if self._volume.grid != grid:
@@ -200,7 +200,7 @@ class SmoothFit:
                 self._volume = begun
             return False
         self._level = leg.loose * plateau(u)
-        self._descent = Descent(self._problem(frames, leg.factor), u)
+        self._descent = Descent(self._problem(frames, leg.factor), u, self._kept)
         return True
 
     def _end(self, leg: Leg, descent: Descent) -> None:
@@ -210,13 +210,17 @@ class SmoothFit:
         it explains its frames to within their noise after half a round, or else the likelier one. Without noise, the
         details that large voxels lack disturb them, and the start is nearer.
 
-        How strong a prior noise allows depends on how many views and how much matter there are; so it is halved where
-        it wipes out all matter, and where voxels of a pixel do not explain the frames to within their noise
-        (Morozov's discrepancy principle, 1966), as long as that helps.
+        Where a descent fell into the trap of an empty volume, which does not explain the frames, it is begun again with
+        shorter steps. How strong a prior noise allows depends on how many views and how much matter there are; so it is
+        halved where an empty volume is likelier still, and where voxels of a pixel do not explain the frames to within
+        their noise (Morozov's discrepancy principle, 1966), as long as that helps.
         """
         problem, u = descent.problem, descent.u
         assert isinstance(problem, VolumeProblem)
         self._descent = None
+        if self._kept and self._leg == len(self._legs) - 1:
+            empty = torch.zeros_like(u)
+            u = empty if problem(empty)[0] <= descent.value else u
         unexplained = 2 * problem.frames(problem.lines(u)).value / problem.frames.count
         if leg.kind == "round" and bool((u > 0).any()):
             u = modulated(problem, u)
@@ -234,7 +238,8 @@ class SmoothFit:
         if not bool((found.values > 0).any()):
             if unexplained <= EMPTY or self._strength <= WEAKEST:
                 return False
-            self._again(self._strength / 2)
+            self._again(self._strength / 2 if self._kept else self._strength)
+            self._kept = True
             return True
         late = self._leg >= len(self._legs) - max(1, self.plan.rounds - 1)  # a first round is often not at its end yet
         if not late or self._settled:
@@ -271,6 +276,7 @@ class SmoothFit:
             "leg": self._leg,
             "strength": self._strength,
             "settled": self._settled,
+            "kept": self._kept,
             "stronger": self._stronger and [self._stronger[0].state(), self._stronger[1]],
             "volume": self._volume.state(),
             "level": self._level,
@@ -282,7 +288,7 @@ class SmoothFit:
         """Go back to a saved state."""
         self.step, self.seconds = int(state["step"]), float(state["seconds"])
         self._leg, self._level, self._strength = int(state["leg"]), float(state["level"]), float(state["strength"])
-        self._settled, before = bool(state["settled"]), state["stronger"]
+        self._settled, self._kept, before = bool(state["settled"]), bool(state["kept"]), state["stronger"]
         self._stronger = before and (VoxelGrid.from_state(before[0]), float(before[1]))
         self._volume = VoxelGrid.from_state(state["volume"])
         self._rival = None if state["rival"] is None else (state["rival"][0], float(state["rival"][1]))

@@ -244,7 +244,7 @@ class Search:
 
     def run(self) -> Carried:
         """The whole way, from the middle time on."""
-        volume = self.by_itself(self.frames.scans[self.middle], "middle time")
+        volume = self.first()
         began = clock.perf_counter()
         state = _State(self.steady(self.options.cells), self.on(volume, self.factor))
         windows = self.windows()
@@ -254,6 +254,14 @@ class Search:
         state = self.freer(state)
         self.timing["flow"] = clock.perf_counter() - began
         return self.finished(state)
+
+    def first(self) -> VoxelGrid:
+        """The volume of the middle time; of all times, as if nothing moved, where noise hides a single one."""
+        volume = self.by_itself(self.frames.scans[self.middle], "middle time")
+        if bool((volume.values > 0).any()):
+            return volume
+        self.history.append("the middle time by itself shows no matter: begun with the mean of all times")
+        return self.by_itself(merged(self.task.scan), "mean of all times")
 
     def freer(self, state: _State) -> _State:
         """The state with the flow as free in time and space as held-out frames ask for."""

@@ -29,6 +29,9 @@ GRAINY, HALVED = 4, 0.5
 this part of what it was may still be steep light; true grain stays as it is, and there is one round."""
 FAINTEST = 1e-4
 """Noise [relative intensity] assumed at least: light is not known better."""
+FINER = 0.15
+"""Part of the light's unevenness in air that counts as noise at least: the modes do not describe the rest of it, and
+fitted to that as if it were known they run away where there is no air (measured by benchmarks/air_light.py)."""
 OUTER = 0.1
 """Part of the columns at either side in which light must be uneven, too."""
 DARKEST = 0.05
@@ -183,8 +186,9 @@ class Background:
         """
         shape = (frames.shape[-2], frames.shape[-1])
         modes, bands = _modes(shape), _bands()
-        seen, powers = air & (frames > DARKEST), _lowest_power(noise)
+        seen = air & (frames > DARKEST)
         values = torch.where(seen, frames.double(), 1.0).log().flatten(1)
+        powers = torch.maximum(_lowest_power(noise), FINER**2 * _unevenness(values, seen.flatten(1)))
         normal, right = _sums(values, seen.double().flatten(1), modes)
         variances = torch.full((len(modes),), 1e-2, dtype=torch.float64)
         usable = has_air(air)
@@ -317,6 +321,13 @@ def _found(frames: Tensor, noise: NoiseModel, air: Tensor, kind: Kind) -> Backgr
             "--light even."
         )
     return Background.of_air(frames, air, noise)
+
+
+def _unevenness(values: Tensor, seen: Tensor) -> Tensor:
+    """Mean square deviation of values [V, P] from each frame's own mean, where they are seen [V, P] bool; a scalar."""
+    count = seen.sum(dim=1, keepdim=True).clamp_min(1)
+    mean = (values * seen).sum(dim=1, keepdim=True) / count
+    return ((values - mean).square() * seen).sum() / count.sum()
 
 
 def _modes(shape: tuple[int, int]) -> Tensor:

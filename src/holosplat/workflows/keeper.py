@@ -91,15 +91,23 @@ class Keeper:
         if train.exposures is not self.train.exposures:
             self.train, self._judge = train, None
 
-    def look(self, name: str, found: Stored, oversample: int, fitted: bool = True) -> None:
-        """Take in the latest state. What is not `fitted` is a step of the method, and takes the place of all others."""
+    def look(self, name: str, found: Stored, oversample: int, fitted: bool = True, better: float = 0.0) -> None:
+        """Take in the latest state. What is not `fitted` is a step of the method, and takes the place of all others.
+
+        better: how many times less than the best of the others it must leave unexplained to be taken (0: `CLEARLY`).
+        """
         if self._judge is None:
             self._judge = MissingMatter(self.train, _material(self.best.object if self.best else found))
         share, contrast = self._judge.shares(found, oversample)
         self.judged[name] = share
         best = self.best
         rivals = best is not None and fitted and (self.mixed or best.object.kind == found.kind)
-        if best is None or not rivals or CLEARLY * share <= best.share or contrast < best.contrast:
+        wins = best is None or not rivals
+        if best is not None and better > 0:
+            wins = wins or better * share <= best.share
+        elif best is not None:
+            wins = wins or CLEARLY * share <= best.share or contrast < best.contrast
+        if wins:
             self.best = State(name, found, oversample, share, contrast, self.train.exposures)
 
     def state_dict(self) -> dict[str, Any] | None:

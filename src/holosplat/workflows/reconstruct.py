@@ -219,7 +219,8 @@ class _Run:
             self._keeper.moved(self.task.scan)
             if not complete:
                 return self._result(found, fit, False)
-            self._keeper.look(stage.name, found, oversample, fitted=not getattr(stage, "likelier", False))
+            fitted, better = not getattr(stage, "likelier", False), float(getattr(stage, "better", 0.0))
+            self._keeper.look(stage.name, found, oversample, fitted, better)
         assert self._keeper.best is not None
         self.task = replace(self.task, scan=replace(self.task.scan, exposures=self._keeper.best.exposures))
         return self._result(self._keeper.best.object, last, True)
