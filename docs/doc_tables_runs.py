@@ -305,6 +305,27 @@ def learned() -> str:
     return markdown(columns, lines)
 
 
+def ellipsoids() -> str:
+    """PSNR, SSIM of the volume and SSIM of held-out frames, by kind of scene, method and number of views."""
+    rows = read("ellipsoids.csv")
+    found = {(r["kind"], r["method"], r["views"], r["seed"]): r for r in rows}
+    kinds, methods = (list(dict.fromkeys(r[name] for r in rows)) for name in ("kind", "method"))
+    lines = []
+    for kind in kinds:
+        empty = {r["seed"]: float(r["empty"]) for r in rows if r["kind"] == kind}
+        lines.append([kind, "an empty volume", *[rounded(f"{sum(empty.values()) / len(empty):.6f}", 1)] * 3])
+        for method in methods:
+            cells = list[str]()
+            for views in ("4", "7", "9"):
+                own = [found[key] for key in sorted(found) if key[:3] == (kind, method, views)]
+                means = [f"{sum(float(r[n]) for r in own) / len(own):.6f}" for n in ("psnr", "ssim", "held_out") if own]
+                said = " / ".join(rounded(v, d) for v, d in zip(means, (1, 3, 3)))
+                cells.append(f"{said} ({len(own)})" if own else "–")
+            if any(cell != "–" for cell in cells):
+                lines.append([kind, f"`{method}`", *cells])
+    return markdown(("scenes", "method", "4 views", "7 views", "9 views"), lines)
+
+
 def learned_change() -> str:
     """By what scores of runs with a learned start differ from those without, by case."""
     found: dict[str, list[dict[str, dict[str, str]]]] = {}

@@ -143,6 +143,12 @@ TABLES["learned"] = Table(
 TABLES["learned_change"] = Table(
     runs.learned_change, ("learned.csv",), "python benchmarks/learned.py DATA --write", "half an hour"
 )
+TABLES["ellipsoids"] = Table(
+    runs.ellipsoids,
+    ("ellipsoids.csv",),
+    "python benchmarks/ellipsoids.py --write",
+    "hours",
+)
 TABLES["bed"] = Table(
     measured.bed, ("real_data.csv",), "python benchmarks/packed_bed.py --data FOLDER --work FOLDER", "an hour"
 )

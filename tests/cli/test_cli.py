@@ -23,7 +23,6 @@ from helpers.cli import (
     ROWS,
     altered,
     holosplat,
-    in_a_shell,
     worked,
 )
 from holosplat.cli import main
@@ -44,14 +43,11 @@ def test_every_command_explains_itself(command):
 
 
 def test_the_whole_chain(shop, tmp_path):
-    """simulate, reconstruct with a preset, render, export, evaluate: files in, files out, nothing else.
-
-    The first runs as a process, the others within this one.
-    """
+    """simulate, reconstruct with a preset, render, export, evaluate: files in, files out, nothing else."""
     cells = [os.path.relpath(cell, tmp_path) for cell in shop.cells]
     options = [*MATTER, *BEAM, "--views", 8, "--psf-sigma-px", 0.3, "--photons-per-pixel", 20000, "--seed", 3]
-    worked(in_a_shell("simulate", *cells, *options, "--out", "scan.nxs", "--truth", "truth.h5", cwd=tmp_path))
     with contextlib.chdir(tmp_path):
+        worked(holosplat("simulate", *cells, *options, "--out", "scan.nxs", "--truth", "truth.h5"))
         material = ["--material", FORMULA, "--density", 1.335]
         fitted = holosplat("reconstruct", "scan.nxs", "--out", "RUN", *material, "--preset", "fast", "--seed", 4)
         assert "held-out frames: SSIM" in worked(fitted).out

@@ -110,8 +110,8 @@ def test_bad_input_in_a_shell_gives_one_line_and_no_traceback(shop, tmp_path):
     scan = truncated(shop.scan, tmp_path)
     views = ["simulate", shop.cells[0], *MATTER, *BEAM, "--views", 0, "--out", tmp_path / "o.nxs"]
     for outcome, word in (
-        (in_a_shell("reconstruct", "scan.nxs", "--out", "run", cwd=tmp_path), "truncated"),
-        (holosplat("evaluate", tmp_path / "nowhere"), "nowhere"),
+        (in_a_shell("evaluate", "nowhere", cwd=tmp_path), "nowhere"),
+        (holosplat("reconstruct", scan, "--out", tmp_path / "run"), "truncated"),
         (holosplat(*views), "views"),
     ):
         refused(outcome, word)

@@ -15,9 +15,9 @@ from holosplat.bench.method import Method
 from holosplat.bench.methods import METHODS, methods
 from holosplat.bench.methods import PHOTOGRAPHS as PHOTOGRAPHIC
 from holosplat.fit.density import DensityControl
-from holosplat.methods import SmoothVolume
+from holosplat.methods import AlignedFit, Onix, PixelNerf, SmoothVolume
 from holosplat.methods.photographs import AlphaRates, AlphaSplats, RadianceFields
-from holosplat.representations import Encoding, Network
+from holosplat.representations import AlignedNetwork, Encoding, Network
 from holosplat.specimens.red_cells import icosphere
 
 MATERIAL = hs.DeltaBeta(2e-7, 2e-10)
@@ -32,12 +32,19 @@ PHOTOGRAPHS = {
     if method.family == PHOTOGRAPHIC
 }
 """Methods without waves, in few and larger steps."""
+_ALIGNED = AlignedFit(network=AlignedNetwork((4, 6), 8, 2), rate=0.05)
+_ALIGNED = replace(_ALIGNED, schedule=replace(_ALIGNED.schedule, steps=20))
+ALIGNED = {
+    name: replace(METHODS[name], options=options)
+    for name, options in {"onix": Onix(_ALIGNED), "pixelnerf": PixelNerf(_ALIGNED)}.items()
+}
+"""Pixel-aligned networks, small ones in few and larger steps."""
 START = HolographicTV(retrieval=20, iterations=40, corrections=2, inner=6, noisy=1.0, refine=1, upper=0.0)
 VOLUME = {"volume": replace(METHODS["volume"], options=SmoothVolume(START, coarser=(2,), rounds=1, iterations=4))}
 """The method that takes no share of its steps, in few."""
-QUICK = methods(effort=0.05) | {"neural-field": methods(effort=0.12)["neural-field"]} | PHOTOGRAPHS | VOLUME
+QUICK = methods(effort=0.05) | {"neural-field": methods(effort=0.12)["neural-field"]} | PHOTOGRAPHS | VOLUME | ALIGNED
 """The same methods with a small part of their steps: the contract is about form, not about quality."""
-QUICKER = methods(effort=0.05) | PHOTOGRAPHS | VOLUME
+QUICKER = methods(effort=0.05) | PHOTOGRAPHS | VOLUME | ALIGNED
 """With a still smaller part, where finite numbers are all that is asked for."""
 NEEDS = {"paganin-svmbir": "svmbir"}
 """Methods that need a package of the extra `bench`."""

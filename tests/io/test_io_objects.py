@@ -22,6 +22,7 @@ from holosplat.io.objects import FORMAT, read_object, write_object
 from holosplat.matter import Matter
 from holosplat.representations import (
     KINDS,
+    AlignedNetwork,
     AlphaCloud,
     Encoding,
     Flow,
@@ -31,6 +32,8 @@ from holosplat.representations import (
     MovingSurfaces,
     Network,
     NeuralField,
+    PixelAligned,
+    PixelAlignedField,
     RadianceField,
     SpaceTime,
     SpaceTimeField,
@@ -44,6 +47,7 @@ from holosplat.specimens.red_cells import icosphere
 PITCH = 2e-6
 GRID = Grid((7, 5, 9), (PITCH, PITCH, PITCH), (-8e-6, 1e-6, -5e-6))
 CELL = Matter.one(3e-7, 2e-10)
+ALIGNED = AlignedNetwork((4, 6), 5, 1)
 KNOWN = "kinds " + ", ".join(KINDS)
 OLD = Path(__file__).resolve().parents[1] / "data/run_0_1_0/gaussians.h5"
 
@@ -70,6 +74,16 @@ def objects() -> dict[str, Stored]:
         "neural-field": NeuralField(GRID, CELL, small, mask, seed=4, upper=0.7),
         "alpha-gaussians": AlphaCloud((*cloud[:3], torch.randn(n, 1), torch.randn(n, 1)), PITCH, CELL),
         "radiance-field": RadianceField(GRID, CELL, small, mask, seed=4),
+        "pixel-aligned-field": PixelAlignedField(
+            dict(PixelAligned(ALIGNED, 3).named_parameters()),
+            torch.randn(2, 3, 11, 14),
+            Views.from_angles([5.0, 70.0], (11, 14), PITCH),
+            mask,
+            GRID,
+            CELL,
+            network=ALIGNED,
+            upper=0.8,
+        ),
         "space-time-field": SpaceTimeField.still(
             torch.rand(3, *GRID.shape), GRID, np.array([0, 1e-5, 3e-5]), CELL, SpaceTime(pieces=1), 5, 0.9
         ),

@@ -17,6 +17,7 @@ from holosplat.geometry import Grid
 from holosplat.matter import MaterialPrior
 from holosplat.methods import (
     METHODS,
+    AlignedFit,
     Auto,
     FitOptions,
     Gaussians,
@@ -24,7 +25,9 @@ from holosplat.methods import (
     Method,
     NeuralFields,
     NeuralFit,
+    Onix,
     PerView,
+    PixelNerf,
     SmoothVolume,
     SurfaceFit,
     Surfaces,
@@ -34,25 +37,28 @@ from holosplat.methods import (
     solve,
 )
 from holosplat.model import Instrument, Model
-from holosplat.representations import KINDS, Stored
+from holosplat.representations import KINDS, AlignedNetwork, Stored
 from holosplat.scan import Scan
 
 VOLUME = HolographicTV(iterations=30, corrections=1, inner=5, refine=1)
 GAUSSIANS = Gaussians(volume=VOLUME, approximate_steps=10, fit=FitOptions(schedule=Schedule(steps=10)))
 NEURAL = NeuralFit(NETWORK, 20, 1000, rate=0.05, probes=100, schedule=Schedule(steps=4, views_per_step=2, decay=0.05))
+ALIGNED = AlignedFit(network=AlignedNetwork((4, 6), 8, 2), rate=0.05, schedule=Schedule(steps=25))
 QUICK: dict[str, Method] = {
     **METHODS,
     "gaussians": GAUSSIANS,
     "surfaces": Surfaces(gaussians=GAUSSIANS, fit=SurfaceFit(schedule=Schedule(steps=4))),
     "voxels": Voxels(VOLUME, VoxelFit(coarse_steps=2, steps=4, refine=1)),
     "neural-field": NeuralFields(VOLUME, NEURAL),
+    "onix": Onix(ALIGNED),
+    "pixelnerf": PixelNerf(ALIGNED),
     "holographic-tv": HolographicVoxels(VOLUME),
     "volume": SmoothVolume(VOLUME, rounds=1, iterations=5),
     "auto": Auto().with_effort(0.1),
 }
 """Every method, with options that take seconds."""
-FITTED = ("gaussians", "surfaces", "voxels", "neural-field")
-LEAST = {"neural-field": 0.4, "paganin-sirt": 0.3, "paganin-fbp": 0.1}
+FITTED = ("gaussians", "surfaces", "voxels", "neural-field", "onix", "pixelnerf")
+LEAST = {"neural-field": 0.4, "pixelnerf": 0.4, "paganin-sirt": 0.3, "paganin-fbp": 0.1}
 """Correlation of held-out frames: after few steps, or without fringes and with streaks, it is small but there."""
 LEAST_BY_RATIO = {**LEAST, "gaussians": 0.5, "surfaces": 0.7}
 """δ is estimated at 0.6 of the balls' there, by which overfull Gaussians lose matter in their first steps."""

@@ -112,7 +112,7 @@ def test_an_empty_field_is_refused_and_leaves_no_folder(scan, tmp_path, settings
 
 
 def test_with_the_ratio_alone_delta_is_found(scan, truth):
-    result = reconstruct(scan, MaterialPrior.of_ratio(CELL.ratio), SMALL)
+    result = reconstruct(scan, MaterialPrior.of_ratio(CELL.ratio), SMALL, matter="levels")
     found = evaluate(result, scan, truth)
     assert found.material.single_material
     assert found.material.ratio == pytest.approx(CELL.ratio)

@@ -24,12 +24,14 @@ from holosplat.geometry import Views
 from holosplat.io.objects import read_object
 from holosplat.matter import MaterialPrior
 from holosplat.methods import (
+    AlignedFit,
     FitOptions,
     Gaussians,
     HolographicVoxels,
     Method,
     NeuralFields,
     NeuralFit,
+    Onix,
     PerView,
     SmoothVolume,
     SurfaceFit,
@@ -37,7 +39,7 @@ from holosplat.methods import (
     VoxelFit,
     Voxels,
 )
-from holosplat.representations import NeuralField
+from holosplat.representations import AlignedNetwork, NeuralField
 from holosplat.scan import Exposures, Scan
 from holosplat.volume import Object
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
@@ -61,6 +63,7 @@ FIELD = NeuralFit(
     prune_every=2,
     schedule=Schedule(steps=7, views_per_step=1, validation_views=1, validate_every=2),
 )
+ALIGNED = AlignedFit(network=AlignedNetwork((4, 6), 8, 2), schedule=Schedule(steps=4, views_per_step=2))
 
 
 @dataclass(frozen=True)
@@ -83,6 +86,7 @@ CASES = {
     "volume, coarse": Case(SMOOTH, "smooth volume", 3),
     "volume": Case(SMOOTH, "smooth volume", 9),
     "neural-field": Case(NeuralFields(VOLUME, FIELD), "field through the waves", 3),
+    "onix": Case(Onix(ALIGNED), "pixel-aligned field through the waves", 3),
 }
 
 
@@ -157,7 +161,9 @@ def test_every_stage_has_its_metrics(case, whole):
     """Those of the last one in metrics.csv, of the others beside it."""
     assert {path.name for path in whole.path.glob("metrics*.csv")} == {"metrics.csv", *case.first}
     kind = "volume" if case.method is SMOOTH else load_reconstruction(whole).object.kind
-    steps = {"surfaces": 6, "voxels": 7, "volume": 12, "neural-field": 7, "gaussians": 12}[kind]
+    steps = {"surfaces": 6, "voxels": 7, "volume": 12, "neural-field": 7, "gaussians": 12, "pixel-aligned-field": 4}[
+        kind
+    ]
     assert [int(row["step"]) for row in rows(whole.metrics)] == list(range(1, steps + 1))
     assert all(float(row["loss"]) > 0 for row in rows(whole.metrics))
 
@@ -220,6 +226,6 @@ def test_a_method_without_a_fit_is_an_object_all_the_same(scan, tmp_path, name):
 @pytest.mark.parametrize("case_name", ["voxels", "neural-field"])
 def test_with_nothing_known_delta_and_beta_are_free_in_files_too(scan: Scan, tmp_path, case_name):
     folder = RunFolder(tmp_path / "run")
-    found = reconstruct(scan, MaterialPrior.unknown(), CASES[case_name].method, folder=folder)
+    found = reconstruct(scan, MaterialPrior.unknown(), CASES[case_name].method, matter="levels", folder=folder)
     assert not found.object.matter.occupancies
     assert load_reconstruction(folder).object.matter == found.object.matter

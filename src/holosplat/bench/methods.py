@@ -6,7 +6,18 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from ..methods import Auto, Gaussians, HolographicVoxels, NeuralFields, PerView, SmoothVolume, Surfaces, Voxels
+from ..methods import (
+    Auto,
+    Gaussians,
+    HolographicVoxels,
+    NeuralFields,
+    Onix,
+    PerView,
+    PixelNerf,
+    SmoothVolume,
+    Surfaces,
+    Voxels,
+)
 from ..methods.per_view import SVMBIR
 from ..methods.photographs import AlphaSplats, RadianceFields
 from ..methods.presets import preset
@@ -18,6 +29,7 @@ VOXELS = "voxels through the waves"
 NEURAL = "neural field through the waves"
 GAUSSIANS = "Gaussians through the waves"
 SURFACES = "surfaces through the waves"
+ALIGNED_LINES = "phase retrieval of each view, then a network"
 PHOTOGRAPHS = "holograms taken for photographs, without waves"
 AUTO = "chosen by the frames"
 
@@ -87,6 +99,18 @@ def _through_waves(effort: float) -> list[Method]:
             NEURAL,
             "hash grid and small network, fitted to the projections of holographic-tv, then to the holograms",
             NeuralFields().with_effort(effort),
+        ),
+        (
+            "onix",
+            NEURAL,
+            "pixel-aligned network (Zhang et al. 2023) that saw no other scene, fitted to the holograms",
+            Onix().with_effort(effort),
+        ),
+        (
+            "pixelnerf",
+            ALIGNED_LINES,
+            "the same (Yu et al. 2021), fitted to the thickness that phase retrieval finds in each view",
+            PixelNerf().with_effort(effort),
         ),
         (
             "gaussians-random",

@@ -18,7 +18,9 @@ A_NIGHT = TrainOptions()
 def train(
     data: Positional[Path], out: Path, how: Annotated[TrainOptions, OmitArgPrefixes] = A_NIGHT, resume: bool = False
 ) -> None:
-    """Train the network of `--start learned` on scenes of `holosplat dataset`: weights with a card, and curves.
+    """Train a network on scenes of `holosplat dataset`: weights with a card, and curves.
+
+    That of `--start learned`, or, by --network, those of the methods onix and pixelnerf, which see frames alone.
 
     Args:
         data: Folder of scenes.
@@ -26,6 +28,7 @@ def train(
         resume: Go on with an interrupted training.
     """
     from ..report.learning import training_curves
+    from ..training.aligned import AlignedTraining, AlignedValidation
     from ..training.folder import Dataset
     from ..training.made_by import made_by
     from ..training.train import Training
@@ -33,12 +36,15 @@ def train(
 
     scenes = Dataset.read(data)
     scenes.require_whole()
-    training = (Training.resumed if resume else Training.begun)(scenes, out, how)
+    kind = Training if how.network == "start" else AlignedTraining
+    training = (kind.resumed if resume else kind.begun)(scenes, out, how)
     who = made_by(how.device)  # before files change under a night's work
     with ProgressBar() as bar:
         told = Validation.of(
             scenes.ranges, scenes.seed, how.validation, lambda fraction: bar.show("scenes to validate", fraction, {})
         )
+        if how.network != "start":
+            told = AlignedValidation(told.samples, network=how.network)
         try:
             training.run(told, lambda now: bar.show("training", now.step / how.steps, now.record))
         except KeyboardInterrupt:

@@ -10,6 +10,7 @@ from typing import Any
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
+from torch import Tensor
 
 from ..checks import InputError, require_regular
 from ..io.atomic import atomic_path
@@ -70,13 +71,7 @@ def read_weights(path: Path = SHIPPED) -> Trained:
             "no weights come with this version of holosplat; train a network (holosplat dataset, holosplat train) and "
             "name its file with --set weights=FILE."
         )
-    require_regular(path, "a file of weights")
-    try:
-        with safe_open(path, framework="pt") as file:
-            said = file.metadata() or {}
-            tensors = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 (it is no mapping)
-    except (SafetensorError, OSError) as error:
-        raise InputError(f"{path} must be a safetensors file, but it is damaged or another: {error}.") from None
+    tensors, said = tensors_of(path)
     if said.get("holosplat") != str(VERSION):
         raise InputError(
             f"{path} must hold weights of version {VERSION} of holosplat's network, but it holds "
@@ -89,3 +84,16 @@ def read_weights(path: Path = SHIPPED) -> Trained:
         raise InputError(f"{path} must hold the weights of the network that it says, but: {error}.") from None
     network.eval().requires_grad_(False)
     return Trained(network, Card(**json.loads(said["card"])))
+
+
+def tensors_of(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """The tensors of a safetensors file by name, in single precision, and what is written beside them; `InputError` for
+    a file that is none."""
+    require_regular(path, "a file of weights")
+    try:
+        with safe_open(path, framework="pt") as file:
+            said = file.metadata() or {}
+            tensors = {name: file.get_tensor(name).float() for name in file.keys()}  # noqa: SIM118 (it is no mapping)
+    except (SafetensorError, OSError) as error:
+        raise InputError(f"{path} must be a safetensors file, but it is damaged or another: {error}.") from None
+    return tensors, said

@@ -8,6 +8,7 @@ from .gaussians import Gaussians, gaussian_fit
 from .ground import ExtraTerm
 from .method import Method, Near, Stage, Task, begun, finished
 from .neural_field import NeuralFields, NeuralFit
+from .onix import AlignedFit, Onix, PixelNerf
 from .per_view import PerView
 from .pinn import Pinn, PinnFit
 from .solve import Settled, settled, solve
@@ -24,6 +25,8 @@ METHODS: dict[str, Method] = {
     "voxels": Voxels(),
     "volume": SmoothVolume(),
     "neural-field": NeuralFields(),
+    "onix": Onix(),
+    "pixelnerf": PixelNerf(),
     "holographic-tv": HolographicVoxels(),
     "tikhonov-tv": PerView("tikhonov", "tv"),
     "ctf-tv": PerView("ctf", "tv"),
@@ -38,6 +41,7 @@ OF_SERIES: dict[str, Method] = {"pinn": Pinn()}
 __all__ = [
     "METHODS",
     "OF_SERIES",
+    "AlignedFit",
     "Auto",
     "Determined",
     "ExtraTerm",
@@ -50,9 +54,11 @@ __all__ = [
     "Near",
     "NeuralFields",
     "NeuralFit",
+    "Onix",
     "PerView",
     "Pinn",
     "PinnFit",
+    "PixelNerf",
     "Settled",
     "SmoothVolume",
     "Stage",

@@ -96,6 +96,7 @@ NAMES = {
     "space-time-field": "Reconstruction as a field of space and time",
     "voxels": "Voxel reconstruction",
     "neural-field": "Reconstruction as a neural field",
+    "pixel-aligned-field": "Reconstruction as a pixel-aligned field",
 }
 """What a report is called, by the kind of object."""
 

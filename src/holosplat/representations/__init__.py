@@ -10,6 +10,7 @@ from torch import Tensor
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..volume import LineIntegrals, TrainableObject
+from .aligned_network import AlignedNetwork, PixelAligned
 from .encodings import Encoding
 from .flow import Flow, Lattice
 from .gaussians import GaussianCloud
@@ -20,6 +21,7 @@ from .moving_surfaces import MovingSurfaces
 from .neural_field import Network, NeuralField
 from .paths import TimeBasis
 from .photographed import AlphaCloud, RadianceField
+from .pixel_aligned import PixelAlignedField
 from .space_time import SpaceTime, SpaceTimeField
 from .surfaces import SurfaceMesh
 from .voxel_lines import VoxelLines
@@ -74,7 +76,7 @@ KINDS: dict[str, type[Stored]] = {
     kind.kind: kind
     for kind in (
         *(GaussianCloud, VoxelGrid, SurfaceMesh, MovingSurfaces, MovingGaussians, NeuralField),
-        *(SpaceTimeField, AlphaCloud, RadianceField),
+        *(SpaceTimeField, AlphaCloud, RadianceField, PixelAlignedField),
     )
 }
 """Every kind of Object that files hold, by name."""
@@ -84,6 +86,7 @@ MOVING = (MovingSurfaces, MovingGaussians, SpaceTimeField)
 __all__ = [
     "KINDS",
     "MOVING",
+    "AlignedNetwork",
     "AlphaCloud",
     "Encoding",
     "Flow",
@@ -93,6 +96,8 @@ __all__ = [
     "MovingSurfaces",
     "Network",
     "NeuralField",
+    "PixelAligned",
+    "PixelAlignedField",
     "RadianceField",
     "SpaceTime",
     "SpaceTimeField",

@@ -29,6 +29,10 @@ def soft_dice(guess: Tensor, truth: Tensor) -> Tensor:
 
 def dice(logits: Tensor, truth: Tensor) -> float:
     """The Dice coefficient of voxels of which more than half is matter; one where there are none in either."""
-    found, there = logits > 0, truth > 0.5
+    return share_of_overlap(logits > 0, truth > 0.5)
+
+
+def share_of_overlap(found: Tensor, there: Tensor) -> float:
+    """The Dice coefficient of two masks; one where both are empty."""
     total = int(found.sum() + there.sum())
     return 1.0 if total == 0 else 2 * int((found & there).sum()) / total

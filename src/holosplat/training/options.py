@@ -9,6 +9,7 @@ from typing import Literal
 from ..checks import at_least
 from ..learning.size import Size
 from ..ranges import Natural, Positive, Rate, Seed, Share, Weight, ranged
+from .aligned_options import FrameGoal
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,11 @@ class TrainOptions:
     """How scenes are shown."""
     goal: Goal = field(default_factory=Goal)
     """What is minimised."""
+    network: Literal["start", "onix", "pixelnerf"] = "start"
+    """What is trained: the network of `--start learned`, or those of the methods `onix` and `pixelnerf`, which learn
+    from frames alone; these are of one size."""
+    frames: FrameGoal = field(default_factory=FrameGoal)
+    """What is minimised where frames are all that is learnt from."""
 
     def __post_init__(self) -> None:
         at_least(self, 1, "steps")

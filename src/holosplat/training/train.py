@@ -9,21 +9,23 @@ from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 
 from ..checks import InputError, require
 from ..io.atomic import atomic_path
 from ..io.json import read_json, write_json
 from ..learning.network import Guess
-from ..learning.weights import write_weights
+from ..learning.weights import Card, write_weights
 from ..tables import to_table
 from .folder import Dataset
 from .objective import loss
 from .options import TrainOptions
+from .sample import Sample
 from .shown import lesson
 from .validate import Validation
 
@@ -45,10 +47,13 @@ def has_bfloat16() -> bool:
 class Training:
     """A training in its folder: what is learnt, the optimiser, and the step that comes next."""
 
+    columns: ClassVar[tuple[str, ...]] = COLUMNS
+    """Of the curves."""
+
     def __init__(self, data: Dataset, folder: Path, options: TrainOptions) -> None:
         self.data, self.folder, self.options = data, folder, options
         torch.manual_seed(options.seed)
-        self.network = Guess(options.size).to(options.device)
+        self.network = self._made().to(options.device)
         self.optimiser = torch.optim.AdamW(
             self.network.parameters(), lr=options.rate, weight_decay=options.decay, betas=BETAS
         )
@@ -77,10 +82,18 @@ class Training:
         training, checkpoint = cls(data, folder, options), folder / CHECKPOINT
         if checkpoint.is_file():
             kept = torch.load(checkpoint, weights_only=True, map_location=options.device)
-            training.network.load_state_dict(kept["network"])
-            training.optimiser.load_state_dict(kept["optimiser"])
+            for name, part in training.parts().items():
+                part.load_state_dict(kept[name])
             training.step, training.rows = kept["step"], [tuple(row) for row in kept["rows"]]
         return training
+
+    def _made(self) -> torch.nn.Module:
+        """The network as it begins."""
+        return Guess(self.options.size)
+
+    def parts(self) -> dict[str, Any]:
+        """What a checkpoint holds, by name: everything with a `state_dict`."""
+        return {"network": self.network, "optimiser": self.optimiser}
 
     def run(self, validation: Validation, on_step: Callable[[Training], None]) -> None:
         """All steps that are left; a checkpoint, curves and a validation every `keep_every` steps and at the end.
@@ -99,35 +112,45 @@ class Training:
         """One step: a scene as it is shown once. Its random numbers depend on the seed and the step alone."""
         options = self.options
         rng = np.random.default_rng([PURPOSE, options.seed, self.step])
-        shown = lesson(self.data.sample(int(rng.integers(self.data.count))), options.shown, rng)
+        sample = self.data.sample(int(rng.integers(self.data.count)))
         rate = options.rate_at(self.step)
         for group in self.optimiser.param_groups:
             group["lr"] = rate
-        with self._precision():
-            value, scores = loss(self.network, shown.on(options.device), options.goal)
+        value, scores = self._value(sample, rng)
         self.optimiser.zero_grad()
         value.backward()
         norm = float(clip_grad_norm_(self.network.parameters(), options.longest))
         if math.isfinite(norm):  # a step that is none, where sums overflowed
             self.optimiser.step()
         self.step += 1
-        self.rows.append((self.step, float(value.detach()), *scores.tolist(), rate))
+        self.rows.append((self.step, float(value.detach()), *scores, rate))
+
+    def _value(self, sample: Sample, rng: np.random.Generator) -> tuple[Tensor, list[float]]:
+        """What this step minimises, and the scores that the curves show beside it."""
+        assert isinstance(self.network, Guess)
+        shown = lesson(sample, self.options.shown, rng)
+        with self._precision():
+            value, scores = loss(self.network, shown.on(self.options.device), self.options.goal)
+        return value, scores.tolist()
 
     def keep(self, validation: Validation) -> None:
         """Write the checkpoint, the curves and the validation, each whole or not at all."""
-        state = {"network": self.network.state_dict(), "optimiser": self.optimiser.state_dict()}
+        state: dict[str, Any] = {name: part.state_dict() for name, part in self.parts().items()}
         with atomic_path(self.folder / CHECKPOINT) as temporary:
             torch.save(state | {"step": self.step, "rows": [list(row) for row in self.rows]}, temporary)
-        _write_rows(self.folder / CURVES, COLUMNS, self.rows)
+        _write_rows(self.folder / CURVES, self.columns, self.rows)
         validation.write(self.folder)
 
     def finish(self, validation: Validation, made_by: dict[str, str]) -> Path:
         """Write the weights with their card; their file."""
         card = validation.card(self.network, to_table(self.data.ranges) | {"seed": self.data.seed}, made_by)
-        card = replace(card, training=_settings(self.data, self.options)["options"])
         path = self.folder / WEIGHTS
-        write_weights(path, self.network, card)
+        self._write(path, replace(card, training=_settings(self.data, self.options)["options"]))
         return path
+
+    def _write(self, path: Path, card: Card) -> None:
+        assert isinstance(self.network, Guess)
+        write_weights(path, self.network, card)
 
     @property
     def record(self) -> dict[str, float]:

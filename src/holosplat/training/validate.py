@@ -6,10 +6,11 @@ import csv
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from torch import nn
 
 from ..io.atomic import atomic_path
 from ..learning.network import Guess
@@ -18,7 +19,7 @@ from ..learning.weights import Card
 from .objective import dice
 from .ranges import Ranges
 from .sample import Sample, sample_of
-from .shown import Lesson, whole
+from .shown import whole
 
 COUNTS = (2, 3, 4, 6)
 """Numbers of views."""
@@ -27,12 +28,16 @@ OTHER_SEED = 1
 MOST = 95
 """Per cent of the scenes that leave less unexplained than what counts as typical."""
 FILE = "validation.csv"
+COLUMNS = ("step", "views", "dice_guess", "dice")
 
 
 @dataclass
 class Validation:
     """Scenes of another seed, and what networks scored on them: rows of step, number of views, Dice of the guess and of
     the corrected one."""
+
+    columns: ClassVar[tuple[str, ...]] = COLUMNS
+    """Of the file."""
 
     samples: Sequence[Sample]
     rows: list[tuple[float, ...]] = field(default_factory=list)
@@ -46,10 +51,10 @@ class Validation:
             on_progress((index + 1) / count)
         return cls(samples)
 
-    def judge(self, network: Guess, step: int) -> None:
+    def judge(self, network: nn.Module, step: int) -> None:
         """A row for each number of views."""
         for count in self._counts():
-            scores = [_scores(network, each)[:2] for each in self._lessons(count)]
+            scores = [self._scores(network, sample, count)[:2] for sample in self.samples]
             self.rows.append((step, count, *np.mean(scores, axis=0)))
 
     def last(self) -> str:
@@ -61,14 +66,14 @@ class Validation:
         """Write all rows, whole or not at all."""
         with atomic_path(folder / FILE) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
-            writer.writerow(("step", "views", "dice_guess", "dice"))
+            writer.writerow(self.columns)
             writer.writerows([f"{value:.6g}" for value in row] for row in self.rows)
 
-    def card(self, network: Guess, trained_on: dict[str, Any], made_by: dict[str, str]) -> Card:
+    def card(self, network: nn.Module, trained_on: dict[str, Any], made_by: dict[str, str]) -> Card:
         """What `network` scores here, as a card."""
         scores, typical = {}, {}
         for count in self._counts():
-            found = np.array([_scores(network, each) for each in self._lessons(count)])
+            found = np.array([self._scores(network, sample, count) for sample in self.samples])
             scores[str(count)] = {"dice": float(found[:, 1].mean()), "scenes": float(len(found))}
             typical[str(count)] = float(np.percentile(found[:, 2], MOST))
         return Card(trained_on, {}, made_by, scores, typical)
@@ -77,15 +82,11 @@ class Validation:
         most = min(int((~sample.is_test).sum()) for sample in self.samples)
         return [count for count in COUNTS if count <= most]
 
-    def _lessons(self, count: int) -> Sequence[Lesson]:
-        return [whole(sample, count) for sample in self.samples]
-
-
-def _scores(network: Guess, shown: Lesson) -> tuple[float, float, float]:
-    """Dice of the guess and of the corrected one, and what that leaves unexplained."""
-    device = next(network.parameters()).device
-    shown = shown.on(str(device))
-    with torch.inference_mode():
-        first, second = network(shown.images, shown.taps)
-        left = unexplained(torch.sigmoid(second), shown.images, shown.taps)
-    return dice(first, shown.occupancy), dice(second, shown.occupancy), left
+    def _scores(self, network: nn.Module, sample: Sample, count: int) -> tuple[float, float, float]:
+        """Dice of the guess and of the corrected one from the first `count` views, and what that leaves unexplained."""
+        assert isinstance(network, Guess)
+        shown = whole(sample, count).on(str(next(network.parameters()).device))
+        with torch.inference_mode():
+            first, second = network(shown.images, shown.taps)
+            left = unexplained(torch.sigmoid(second), shown.images, shown.taps)
+        return dice(first, shown.occupancy), dice(second, shown.occupancy), left

@@ -1,0 +1,195 @@
+"""Pixel-aligned networks: `onix`, δ and β through the waves, and `pixelnerf`, line integrals of attenuation alone.
+
+A network that has seen many scenes by their frames alone (`holosplat train --network onix`), or none, says what is at
+a point by what all views show in front of it; then its weights are fitted to the frames of this scan. The field itself
+is `representations.PixelAlignedField`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import ClassVar
+
+import torch
+from torch import Tensor
+
+from ..checks import require
+from ..fit.loop import Fit, Plan
+from ..fit.optimiser import Adam
+from ..fit.problem import Problem, Term
+from ..fit.schedule import Schedule
+from ..fit.terms import Objective
+from ..fit.terms.aligned import AlignedFrames, AlignedLines
+from ..geometry import Grid
+from ..learning.aligned_weights import ONIX, PIXELNERF, read_aligned
+from ..learning.images import images, retrieved_thickness
+from ..materials import DeltaBeta
+from ..matter import Matter
+from ..optics.noise import noise_levels
+from ..ranges import Natural, Rate, Share, Weight, ranged
+from ..representations import AlignedNetwork, PixelAligned, PixelAlignedField, Stored
+from ..representations.neural_field import grown
+from ..scan import Scan
+from .assumed import assumed_material
+from .ground import ExtraTerm, ground
+from .method import Stage, Task
+from .neural_field import visual_hull
+from .volume import binning
+
+
+def _objective() -> Objective:
+    return Objective(l1=0.0, spectral=1.0, floor=0.1)
+
+
+def _schedule() -> Schedule:
+    return Schedule(steps=80, decay=0.1)
+
+
+@dataclass(frozen=True)
+@ranged
+class AlignedFit:
+    """Options of a pixel-aligned field and its fit."""
+
+    weights: str = ""
+    """File of weights that `holosplat train --network` wrote (default: none; all is learnt from the scan's frames)."""
+    network: AlignedNetwork = field(default_factory=AlignedNetwork)
+    """How large the network is where no weights are given."""
+    rate: Rate = 0.005
+    """Adam's first rate of all weights."""
+    weight: Weight = 0.01
+    """Weight of total variation, in voxel edges of thickness."""
+    noise_weight: Weight = 0.1
+    """What it grows by for every pixel of thickness that the noise of the frames amounts to."""
+    smoothing: float = 0.005
+    """Differences between voxels below which total variation is a square."""
+    hull: Share = 0.1
+    """Share of the largest thickness that counts as matter: the field lives where all views show some."""
+    margin: Natural = 2
+    """Pixels around that."""
+    max_voxels: Natural = 3_000_000
+    """Frames are binned for the field rather than having more voxels than this: 144 pixels across."""
+    objective: Objective = field(default_factory=_objective)
+    """How frames are compared."""
+    schedule: Schedule = field(default_factory=_schedule)
+    """Of the fit; no steps leave what the network guesses."""
+    terms: tuple[ExtraTerm, ...] = ()
+    """Further terms by name."""
+
+    def __post_init__(self) -> None:
+        require(self.rate > 0, f"rate must be positive, but it is {self.rate:g}.")
+        require(self.smoothing > 0, f"smoothing must be positive, but it is {self.smoothing:g}.")
+        require(
+            self.schedule.validation_views == 0,
+            "a pixel-aligned field sees all training frames, so that none validates: validation_views must be 0, but "
+            f"it is {self.schedule.validation_views}.",
+        )
+
+    def started(self, network: str, seed: int) -> tuple[AlignedNetwork, dict[str, Tensor]]:
+        """The size and the weights of `network`: of the file, or drawn by `seed`; errors: those of `read_aligned`."""
+        if self.weights:
+            found = read_aligned(Path(self.weights), network)
+            return found.size, found.weights
+        return self.network, dict(PixelAligned(self.network, seed).named_parameters())
+
+    def with_effort(self, effort: float) -> AlignedFit:
+        """The same with `effort` times the steps, at least one."""
+        return replace(self, schedule=replace(self.schedule, steps=max(1, round(effort * self.schedule.steps))))
+
+
+@dataclass(frozen=True)
+class Onix:
+    """ONIX (Zhang et al. 2023) with waves: a network of δ and β that is the same for all scenes, then fitted to one."""
+
+    kind: ClassVar[str] = "onix"
+
+    fit: AlignedFit = field(default_factory=AlignedFit)
+
+    def stages(self) -> Sequence[Stage]:
+        """The guess, and its fit."""
+        return (AlignedStage(self.fit, ONIX, "pixel-aligned field through the waves"),)
+
+    def with_effort(self, effort: float) -> Onix:
+        """The same method with `effort` times the steps, at least one."""
+        return replace(self, fit=self.fit.with_effort(effort))
+
+
+@dataclass(frozen=True)
+class PixelNerf:
+    """pixelNeRF (Yu et al. 2021) for line integrals of attenuation: as ONIX, but the fit knows no waves.
+
+    It is fitted to what absorption alone would show, which phase retrieval makes of each frame by itself; frames in
+    contact are that already.
+    """
+
+    kind: ClassVar[str] = "pixelnerf"
+
+    fit: AlignedFit = field(default_factory=AlignedFit)
+
+    def stages(self) -> Sequence[Stage]:
+        """The guess, and its fit."""
+        return (AlignedStage(self.fit, PIXELNERF, "pixel-aligned field of line integrals"),)
+
+    def with_effort(self, effort: float) -> PixelNerf:
+        """The same method with `effort` times the steps, at least one."""
+        return replace(self, fit=self.fit.with_effort(effort))
+
+
+@dataclass(frozen=True)
+class AlignedStage:
+    """What a network says of the scan, and its fit; network: `onix` or `pixelnerf`."""
+
+    options: AlignedFit
+    network: str
+    name: str
+
+    def start(self, task: Task, before: Stored | None) -> PixelAlignedField:
+        """The guess: of one material, or with δ and β free where waves may tell them apart and nothing is known."""
+        options, factor = self.options, binning(task.scan, self.options.max_voxels)
+        scan = task.scan.binned(factor)
+        material = assumed_material(scan, task.prior, task.on_progress)
+        matter = Matter.one(*material)
+        if self.network == ONIX and not task.prior.fixes_ratio:
+            matter = matter.freed()
+        seen, thickness = seen_of(scan, material)
+        grid = Grid.of_views(scan.views)
+        mask = grown(visual_hull(thickness, scan.views, grid, options.hull), options.margin)
+        size, weights = options.started(self.network, task.seed)
+        upper = task.bound(1.0) if matter.single else 0.0
+        return PixelAlignedField(weights, seen, scan.views, mask, grid, matter, network=size, upper=upper)
+
+    def fit(self, task: Task, start: Stored) -> Fit | None:
+        """The fit of the network's weights to the training frames; None for no steps."""
+        assert isinstance(start, PixelAlignedField)
+        return aligned_fit(task, start, self.options, self.network == ONIX) if self.options.schedule.steps else None
+
+
+def seen_of(scan: Scan, material: DeltaBeta) -> tuple[Tensor, Tensor]:
+    """The network's images [V, 3, H, W] of a scan, and the thickness of `material` [V, H, W] [pixels] in them."""
+    frames = torch.from_numpy(scan.frames)
+    thickness = (retrieved_thickness(frames, scan.exposures, material) / scan.views.finest).float()
+    return images(frames - 1, thickness, noise_levels(frames)), thickness
+
+
+def aligned_fit(task: Task, start: PixelAlignedField, options: AlignedFit, waves: bool) -> Fit:
+    """The fit of `start` to the training frames of `task`, through the waves or to retrieved line integrals."""
+    factor = max(1, round(start.grid.voxel_size[0] / task.scan.views.finest))
+    scan, light = task.scan.binned(factor), task.uneven and task.uneven.part(torch.arange(len(task.scan)), factor)
+    base = ground(scan, start, start.matter, options.objective, options.schedule, "cpu", light=light)
+    noise = 0.0 if base.frames.spectral is None else base.frames.spectral.noise
+    weight = (options.weight + options.noise_weight * noise) / len(base.train)
+    if waves:
+        term: Term = AlignedFrames(base.frames, weight, options.smoothing)
+    else:
+        thickness = seen_of(scan, start.matter.channels[0])[1]
+        term = AlignedLines(thickness, scan.views, weight, options.smoothing)
+    names = base.model.parameters()
+    plan = Plan(
+        Problem(base.model, (term, *base.extra(options.terms))),
+        options.schedule,
+        lambda leaves: Adam(leaves, "cpu"),
+        rates=lambda factor, step: dict.fromkeys(names, options.rate * factor),
+        capture=False,
+    )
+    return Fit(plan, task.seed)

@@ -1,0 +1,104 @@
+"""Pixel-aligned networks: what each view shows in front of a point, encoded by shared weights, and what that makes.
+
+Images are encoded one by one (a small U-Net), their features looked up where a point's shadow falls, and made into
+numbers by a perceptron that is shared by all views; mean, maximum and variance of these over the views decide what is
+at the point (pixelNeRF, Yu et al. 2021; ONIX, Zhang et al. 2023). So any number of views will do, in any order.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import grid_sample, interpolate, leaky_relu
+
+from ..checks import at_least, require
+from ..ranges import Natural, ranged
+
+INPUTS = 3
+"""Channels of an image: contrast, retrieved thickness, noise, as `learning.images` makes them."""
+SLOPE = 0.1
+"""Of the leaky rectifiers."""
+FIRST_LOGIT = -2.0
+"""What a network without training says everywhere, before it is bounded: little, so that frames ask for more."""
+
+
+@dataclass(frozen=True)
+@ranged
+class AlignedNetwork:
+    """How large a pixel-aligned network is."""
+
+    image: tuple[Natural, ...] = (16, 32, 32)
+    """Channels of the views' encoder, from whole pixels to its coarsest level."""
+    hidden: Natural = 32
+    """Units of each layer of the perceptrons, and features of a pixel."""
+    octaves: int = 4
+    """Waves that say how deep in a view a point lies (0: nothing does): their periods halve from the field's width."""
+
+    def __post_init__(self) -> None:
+        require(len(self.image) > 1, f"image must have two levels or more, but it has {len(self.image)}.")
+        at_least(self, 0, "octaves")
+
+
+class PixelAligned(nn.Module):
+    """The network: images and where points lie in them → `channels` numbers at every point."""
+
+    def __init__(self, size: AlignedNetwork = AlignedNetwork(), seed: int = 0, channels: int = 2) -> None:
+        super().__init__()
+        self.size, widths, hidden = size, size.image, size.hidden
+        self.first = nn.Conv2d(INPUTS, widths[0], 3, padding=1)
+        self.down = nn.ModuleList(nn.Conv2d(a, b, 3, stride=2, padding=1) for a, b in pairwise(widths))
+        self.up = nn.ModuleList(nn.Conv2d(a + b, a, 3, padding=1) for a, b in pairwise(widths))
+        self.features = nn.Conv2d(widths[0], hidden, 1)
+        self.depth = nn.Linear(max(1, 2 * size.octaves), hidden, bias=False)
+        self.each = nn.Linear(hidden, hidden)
+        self.all = nn.Linear(3 * hidden, hidden)
+        self.output = nn.Linear(hidden, channels)
+        self._start(torch.Generator().manual_seed(seed))
+
+    def _start(self, generator: torch.Generator) -> None:
+        """Weights after He et al. (2015), drawn from `generator`; an output that is small everywhere, whose second
+        channel, what β has beyond δ, begins with nothing."""
+        with torch.no_grad():
+            for name, weight in self.named_parameters():
+                fan_in = weight[0].numel()
+                drawn = torch.randn(weight.shape, generator=generator) * math.sqrt(2 / fan_in)
+                weight.copy_(drawn if name.endswith("weight") else torch.zeros_like(weight))
+            self.output.weight.mul_(0.1)
+            self.output.weight[1:].zero_()
+            self.output.bias[0] = FIRST_LOGIT
+
+    def encoded(self, images: Tensor) -> Tensor:
+        """Features [V, F, H, W] of images [V, 3, H, W]."""
+        levels = [leaky_relu(self.first(images), SLOPE)]
+        for down in self.down:
+            levels.append(leaky_relu(down(levels[-1]), SLOPE))
+        found = levels.pop()
+        for up in reversed(list(self.up)):
+            level = levels.pop()
+            larger = interpolate(found, level.shape[2:], mode="nearest")
+            found = leaky_relu(up(torch.cat([level, larger], 1)), SLOPE)
+        return self.features(found)
+
+    def forward(self, features: Tensor, places: Tensor) -> Tensor:
+        """Numbers [N, C] at N points.
+
+        features: [V, F, H, W] of `encoded`; places: [V, N, 3], column and row of each point's shadow, from -1 to 1
+        between the outer edges of the image, and its depth in half widths of the field.
+        """
+        seen = grid_sample(features, places[:, :, None, :2], align_corners=False)[..., 0].transpose(1, 2)
+        if self.size.octaves:
+            seen = seen + self.depth(self._waves(places[..., 2]))
+        of_views = leaky_relu(self.each(leaky_relu(seen, SLOPE)), SLOPE)
+        mean = of_views.mean(0)
+        pooled = torch.cat([mean, of_views.amax(0), (of_views - mean).square().mean(0)], 1)
+        return self.output(leaky_relu(self.all(pooled), SLOPE))
+
+    def _waves(self, depth: Tensor) -> Tensor:
+        """Sines and cosines [V, N, 2K] of depths [V, N]."""
+        rates = math.pi * 2.0 ** torch.arange(self.size.octaves, device=depth.device)
+        phase = depth[..., None] * rates.to(depth)
+        return torch.cat([phase.sin(), phase.cos()], -1)

@@ -1,0 +1,217 @@
+"""Matter as a pixel-aligned network sees it: a field that hangs on images of its views, on voxels to be projected."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.func import functional_call
+from torch.nn.functional import softplus
+
+from ..checks import positive, require
+from ..display import of_object
+from ..geometry import Grid, Poses, Views
+from ..matter import Matter
+from ..tables import from_table, to_table
+from ..volume import LineIntegrals, Volume
+from .aligned_network import INPUTS, AlignedNetwork, PixelAligned
+from .voxels import VoxelGrid
+
+DEFAULT = AlignedNetwork()
+CHUNK = 1 << 16
+"""Points evaluated at once where no gradient is needed."""
+
+
+class PixelAlignedField:
+    """Matter on the voxels of `grid` (cubes) inside `mask` [Z, Y, X], as a network says it from images of `views`.
+
+    images: [V, 3, H, W] of the views that are encoded (`learning.images`), on their pixels; weights: of
+    `PixelAligned`. A single material has the occupancy `upper · sigmoid` of the first number (upper 0: its softplus,
+    without a bound). Where δ and β are free, δ is the softplus of the first and β that of the sum of both. Between the
+    centres of voxels the field is as `VoxelGrid` has it, and so are its line integrals.
+    Errors: `InputError` where the arrays do not fit together.
+    """
+
+    kind: ClassVar[str] = "pixel-aligned-field"
+    """The name of this kind of Object in files."""
+    _repr_html_ = of_object
+
+    def __init__(
+        self,
+        weights: Mapping[str, Tensor],
+        images: Tensor,
+        views: Views,
+        mask: Tensor,
+        grid: Grid,
+        matter: Matter,
+        *,
+        network: AlignedNetwork = DEFAULT,
+        upper: float = 1.0,
+    ) -> None:
+        require(np.allclose(grid.voxel_size, grid.voxel_size[0]), "a pixel-aligned field needs a grid of cubic voxels.")
+        require(
+            len(matter.channels) == 1 or (not matter.single and matter.second is None),
+            "a pixel-aligned field is of one material, or has δ and β free, but there are two; choose another method.",
+        )
+        wanted = (len(views), INPUTS, *views.shape)
+        require(tuple(images.shape) == wanted, f"images must have the shape {wanted}, but it is {tuple(images.shape)}.")
+        shape = tuple(mask.shape)
+        require(shape == grid.shape, f"the mask must have the grid's shape {grid.shape}, but it has {shape}.")
+        require(upper >= 0, f"upper must not be negative, but it is {upper:g}.")
+        self._net = PixelAligned(network)
+        _require_shapes(weights, dict(self._net.named_parameters()))
+        self.weights = {name: weights[name].detach() for name, _ in self._net.named_parameters()}
+        self.images, self.views, self.mask, self.grid, self.matter = images, views, mask.bool(), grid, matter
+        self.network, self.upper, self.backend = network, float(upper), "cpu"
+        self._cells = self.mask.flatten().nonzero()[:, 0]
+        self._places = places_of(grid, views, self._cells).to(images.dtype)
+        self._still = VoxelGrid(images.new_zeros(len(matter), *grid.shape), grid, matter)
+
+    def parameters(self) -> dict[str, Tensor]:
+        """The weights of the network by name."""
+        return dict(self.weights)
+
+    def with_parameters(self, parameters: Mapping[str, Tensor]) -> PixelAlignedField:
+        """The same field with other weights; it shares the projectors that are ready."""
+        field = copy.copy(self)
+        field.weights = {name: parameters.get(name, mine) for name, mine in self.weights.items()}
+        return field
+
+    def values(self) -> Tensor:
+        """Values [C, Z, Y, X] at the centres of the voxels, zero outside the mask; differentiable in the weights."""
+        features = self._call("encoded", self.images)
+        step = CHUNK if not torch.is_grad_enabled() else max(1, len(self._cells))
+        raw = [self._call("forward", features, part) for part in self._places.split(step, dim=1)]
+        found = self._bounded(torch.cat(raw)) if raw else self.images.new_zeros(0, len(self.matter))
+        whole = found.new_zeros(self.mask.numel(), len(self.matter))
+        return whole.index_copy(0, self._cells, found).T.reshape(-1, *self.grid.shape)
+
+    def _call(self, name: str, *arguments: Tensor) -> Tensor:
+        weights = {f"net.{key}": weight for key, weight in self.weights.items()}
+        return functional_call(_Calling(self._net, name), weights, arguments)
+
+    def _bounded(self, raw: Tensor) -> Tensor:
+        """Values [N, C] of the network's numbers [N, 2]."""
+        if not self.matter.single:
+            return softplus(torch.stack([raw[:, 0], raw.sum(1)], 1))
+        return self.upper * torch.sigmoid(raw[:, :1]) if self.upper > 0 else softplus(raw[:, :1])
+
+    def at(self, time: float) -> VoxelGrid:
+        """The matter on voxels; it does not move."""
+        return self._still.with_parameters({"values": self.values()})
+
+    def project(self, views: Views | Poses) -> LineIntegrals:
+        """Line integrals (B, D), differentiable in the weights."""
+        return self.at(0.0).project(views)
+
+    def voxelise(self, grid: Grid) -> Volume:
+        """δ and β on `grid`."""
+        with torch.no_grad():
+            return self.at(0.0).voxelise(grid)
+
+    def on(self, backend: str) -> PixelAlignedField:
+        """The field for another backend (resolved); it runs on the CPU."""
+        field = self.with_parameters({name: weight.cpu() for name, weight in self.weights.items()})
+        field.backend = backend
+        return field
+
+    @property
+    def described(self) -> str:
+        """How large the field is, in words."""
+        weights = sum(weight.numel() for weight in self.weights.values())
+        return f"a field of {weights} weights on {len(self.images)} views"
+
+    @property
+    def stored_bytes(self) -> int:
+        """Size of the weights and images as float16, and of the mask in bits."""
+        weights = sum(weight.numel() for weight in self.weights.values())
+        return 2 * (weights + self.images.numel()) + self.mask.numel() // 8
+
+    def enclosing_grid(self, most_voxels: int) -> Grid:
+        """The grid of the field, whatever its size."""
+        return self.grid
+
+    def state(self) -> dict[str, Any]:
+        """Tensors and plain values that `from_state` makes the same field of."""
+        scales = self.views.relative
+        return {
+            "weights": dict(self.weights),
+            "images": self.images,
+            "mask": self.mask,
+            "rotations": torch.from_numpy(self.views.rotations),
+            "shifts": torch.from_numpy(self.views.shifts),
+            "scales": torch.from_numpy(scales),
+            "pitch": self.views.pitch,
+            "voxel_size": list(self.grid.voxel_size),
+            "origin": list(self.grid.origin),
+            "matter": self.matter.as_dict(),
+            "network": to_table(self.network),
+            "upper": self.upper,
+        }
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> PixelAlignedField:
+        """The field that `state` described; `InputError` where it does not fit together."""
+        images, mask = state["images"], state["mask"]
+        rotations, shifts, scales = (state[name].numpy() for name in ("rotations", "shifts", "scales"))
+        views = Views(
+            rotations,
+            shifts,
+            (int(images.shape[2]), int(images.shape[3])),
+            float(state["pitch"]),
+            None if (scales == 1).all() else scales,
+        )
+        size, origin = (tuple(float(v) for v in state[name]) for name in ("voxel_size", "origin"))
+        return cls(
+            state["weights"],
+            images,
+            views,
+            mask,
+            Grid(tuple(mask.shape), size, origin),  # type: ignore[arg-type]
+            Matter.from_dict(state["matter"]),
+            network=from_table(AlignedNetwork, state["network"], "network"),
+            upper=float(state["upper"]),
+        )
+
+
+class _Calling(torch.nn.Module):
+    """A network one of whose methods is called, so that `functional_call` can give it other weights."""
+
+    def __init__(self, net: PixelAligned, name: str) -> None:
+        super().__init__()
+        self.net, self._name = net, name
+
+    def forward(self, *arguments: Tensor) -> Tensor:
+        """What the method returns."""
+        return getattr(self.net, self._name)(*arguments)
+
+
+def places_of(grid: Grid, views: Views, cells: Tensor) -> Tensor:
+    """Where the centres of the voxels `cells` [N] (flat) of `grid` lie in each view: [V, N, 3], as `PixelAligned` takes
+    them; float64. Depths are those along the beam from the middle of the grid."""
+    z, y, x = (torch.from_numpy(np.ascontiguousarray(axis)) for axis in grid.axes()[::-1])
+    nz, ny, nx = grid.shape
+    points = torch.stack([x[cells % nx], y[cells // nx % ny], z[cells // (nx * ny)]], 1)
+    h, w = views.shape
+    middle = torch.as_tensor(np.asarray(grid.centre, dtype=np.float64))
+    half = 0.5 * positive("voxel size", grid.voxel_size[0], "metres") * max(nx, nz)
+    found = []
+    for rotation, shift, pixel in zip(views.rotations, views.shifts, views.pixel_sizes):
+        turn = torch.from_numpy(np.ascontiguousarray(rotation))
+        across = (points @ turn[:2].T - torch.from_numpy(shift.copy())) / (0.5 * float(pixel))
+        depth = (points - middle) @ turn[2] / half
+        found.append(torch.stack([across[:, 0] / w, across[:, 1] / h, depth], 1))
+    return torch.stack(found)
+
+
+def _require_shapes(given: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> None:
+    for name in {**wanted, **given}:
+        shapes = [tuple(table[name].shape) if name in table else None for table in (wanted, given)]
+        require(
+            shapes[0] == shapes[1],
+            f"weights/{name} of the network must have the shape {shapes[0]}, but it has {shapes[1]}.",
+        )
