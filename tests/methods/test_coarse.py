@@ -117,7 +117,7 @@ def test_fine_structure_tells_what_is_missing(scan):
 @pytest.fixture(scope="module")
 def near(scan):
     """What coarse pixels show, and the task then."""
-    return begun(Bodies(quick(), SurfaceOptions(), SmoothVolume(), 0.25).stages()[0], task_of(scan), None)
+    return begun(Bodies(quick(), SurfaceOptions(), SmoothVolume(), 0.12).stages()[0], task_of(scan), None)
 
 
 def test_surfaces_of_coarse_pixels_are_near_those_of_fine_ones(near):
@@ -129,7 +129,7 @@ def test_surfaces_of_coarse_pixels_are_near_those_of_fine_ones(near):
 
 
 def test_few_steps_on_fine_pixels_end_it(scan, near):
-    first, last, _ = Bodies(quick(), SurfaceOptions(), SmoothVolume(), 0.25).stages()
+    first, last, _ = Bodies(quick(), SurfaceOptions(), SmoothVolume(), 0.12).stages()
     assert first.fit(near[1], near[0]) is None
     start, task = begun(last, near[1], near[0])
     assert task.near

@@ -43,9 +43,9 @@ class Auto:
     """How it is decided whether matter has levels."""
     trials: CrossValidation = field(default_factory=CrossValidation)
     """How views are set aside for trials."""
-    unexplained: Share = 0.25
-    """Share of all matter that bodies may leave unexplained before a smooth volume is tried: right levels leave less
-    than a sixth even of crowded scenes in noise."""
+    unexplained: Share = 0.12
+    """Share of all matter that bodies may leave unexplained before a smooth volume is tried: right levels leave less,
+    but for crowded scenes in noise, where a volume leaves as much as they do."""
 
     def stages(self) -> Sequence[Stage]:
         """Those for matter with levels; `chosen` decides."""
