@@ -25,7 +25,7 @@ UNEVEN, SEEN = 6.0, 0.07
 """Light is uneven if the squares of its lowest modes in air exceed those of noise by so many of their deviations, and
 it is so large a part of the frames' contrast."""
 SURE, FAINT = 60.0, 0.03
-"""The same of light that is faint beside the contrast: far fringes, which pass for air, leave as much, but less sure."""
+"""The same of light that is faint beside the contrast: far fringes that pass for air leave as much, but less surely."""
 GRAINY, HALVED = 4, 0.5
 """Rounds, at most, in which light is divided out and the noise of the rest gives better light. Grain that falls below
 this part of what it was may still be steep light; true grain stays as it is, and there is one round."""
