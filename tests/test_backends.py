@@ -11,6 +11,7 @@ from holosplat import backends, native
 from holosplat.backends import DESCRIPTIONS, NAMES, SUPPORT, missing, resolve, support_table
 from holosplat.checks import InputError, MissingError
 from holosplat.cli import commands
+from holosplat.cli.commands import Asked
 from holosplat.cli.options import MethodOptions
 
 GONE = "a reason"
@@ -115,7 +116,7 @@ def test_the_command_line_lists_and_refuses(monkeypatch, capsys, tmp_path):
     assert all(name in shown for name in (*NAMES, *SUPPORT))
     lack(monkeypatch, "cuda")
     with pytest.raises(InputError, match=f"'cuda' cannot be used here. cuda: {GONE}"):
-        commands.reconstruct(tmp_path / "none.nxs", tmp_path / "run", how=MethodOptions(backend="cuda"))
+        commands.reconstruct(tmp_path / "none.nxs", tmp_path / "run", Asked(how=MethodOptions(backend="cuda")))
     assert not (tmp_path / "run").exists()
 
 

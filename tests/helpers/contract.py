@@ -33,7 +33,7 @@ PHOTOGRAPHS = {
 }
 """Methods without waves, in few and larger steps."""
 _ALIGNED = AlignedFit(network=AlignedNetwork((4, 6), 8, 2), rate=0.05)
-_ALIGNED = replace(_ALIGNED, schedule=replace(_ALIGNED.schedule, steps=20))
+_ALIGNED = replace(_ALIGNED, schedule=replace(_ALIGNED.schedule, steps=30))
 ALIGNED = {
     name: replace(METHODS[name], options=options)
     for name, options in {"onix": Onix(_ALIGNED), "pixelnerf": PixelNerf(_ALIGNED)}.items()

@@ -68,9 +68,8 @@ def test_wave_optics_explains_nothing_of_photographs(scan):
     """Photographs of a detector that is elsewhere ask for its shift alone, not for matter, distances or blurs."""
     seen, views = start(scan), scan.views
     moved = replace(views, shifts=views.shifts + np.array([0.3 * views.pitch, 0.0]))
-    found = residuals(
-        Prediction(seen, scan.exposures, 1), seen.photographs(moved).detach(), torch.tensor(1e-9).expand(6, 24, 16)
-    )
+    noise = torch.tensor(1e-9).expand(len(scan), views.shape[0], views.shape[1] // 2 + 1)
+    found = residuals(Prediction(seen, scan.exposures, 1), seen.photographs(moved).detach(), noise)
     cause = scores(found)
     assert [cause[name].gain for name in ("mass", "absorption", "distance", "blur")] == [0.0] * 4
     assert cause["shift_x"].value[0] == pytest.approx(0.3, rel=0.1)

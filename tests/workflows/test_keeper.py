@@ -71,14 +71,16 @@ def test_a_slightly_worse_share_may_be_noise(scan):
 
 
 def test_steps_of_a_method_and_other_kinds_are_no_rivals(scan):
-    """A worse state takes the place of a better one where it was not fitted, or is of the kind that was asked for."""
+    """A worse state takes the place of a better one where it was not fitted, or is of the kind that was asked for; one
+    that has lost the matter does not."""
     train = scan.train()
     good = solve(SMALL, Task(train, KNOWN), "levels")
-    bad = good.with_parameters({"raw_amplitudes": good.parameters()["raw_amplitudes"] - 3})
+    bad, worse = (good.with_parameters({"raw_amplitudes": good.parameters()["raw_amplitudes"] - s}) for s in (0.7, 3))
     voxels = VoxelGrid(0 * bad.density(Grid.of_views(train.views))[None, 0], Grid.of_views(train.views), good.matter)
     for mixed, found, fitted, kept in (
         (False, bad, True, "first"),
         (False, bad, False, "second"),
+        (False, worse, False, "first"),
         (False, voxels, True, "second"),
         (True, voxels, True, "first"),
     ):

@@ -99,7 +99,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "train": (
         "train",
-        "Train the network of `--start learned` on scenes of `holosplat dataset`: weights with a card, and curves.",
+        "Train a network on scenes of `holosplat dataset`: weights with a card, and curves.",
     ),
     "demo": ("commands", "Run the whole chain on generated red cells: simulate, reconstruct, evaluate, report."),
     "bench": (

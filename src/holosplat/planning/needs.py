@@ -20,7 +20,9 @@ from ..methods import (
     HolographicVoxels,
     Method,
     NeuralFields,
+    Onix,
     PerView,
+    PixelNerf,
     SmoothVolume,
     Surfaces,
     Voxels,
@@ -48,6 +50,10 @@ class Costs:
     """A voxel of a smooth volume: six pairs of L-BFGS, gradients and priors."""
     plain: float = 52.0
     """A voxel of a tomography by itself."""
+    aligned: float = 300.0
+    """A voxel of a pixel-aligned field, of which two in five show matter."""
+    feature: float = 460.0
+    """Such a voxel in a view: the features and the numbers that the network makes of them, with gradients."""
     waves: float = 150.0
     """A wave sample of all views in a fit, with its gradient."""
     gaussian: float = 700.0
@@ -163,6 +169,11 @@ def _parts(sizes: Sizes, method: Method) -> tuple[float, float, float] | None:
             return begun, 3 + 1.5e-6 * fine, fine
         fitted = Costs.waves * sizes.waves() + Costs.plain * sizes.voxels
         return max(begun, fitted), 20 + 3e-6 * fine, sizes.voxels
+    if isinstance(method, Onix | PixelNerf):
+        small, steps = sizes.joined(method.fit.max_voxels), method.fit.schedule.steps
+        seen = small.views * small.voxels
+        memory = Costs.aligned * small.voxels + Costs.feature * seen + Costs.waves * sizes.waves()
+        return memory, 5 + 0.9e-6 * steps * seen, small.voxels
     gaussians = method if isinstance(method, Gaussians) else getattr(method, "gaussians", None)
     return _bodies(sizes, gaussians, gaussians is not method) if isinstance(gaussians, Gaussians) else None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
@@ -70,6 +71,7 @@ class PixelAlignedField:
         self._cells = self.mask.flatten().nonzero()[:, 0]
         self._places = places_of(grid, views, self._cells).to(images.dtype)
         self._still = VoxelGrid(images.new_zeros(len(matter), *grid.shape), grid, matter)
+        self._last: tuple[bytes, VoxelGrid] | None = None
 
     def parameters(self) -> dict[str, Tensor]:
         """The weights of the network by name."""
@@ -79,6 +81,7 @@ class PixelAlignedField:
         """The same field with other weights; it shares the projectors that are ready."""
         field = copy.copy(self)
         field.weights = {name: parameters.get(name, mine) for name, mine in self.weights.items()}
+        field._last = None
         return field
 
     def values(self) -> Tensor:
@@ -101,8 +104,20 @@ class PixelAlignedField:
         return self.upper * torch.sigmoid(raw[:, :1]) if self.upper > 0 else softplus(raw[:, :1])
 
     def at(self, time: float) -> VoxelGrid:
-        """The matter on voxels; it does not move."""
-        return self._still.with_parameters({"values": self.values()})
+        """The matter on voxels; it does not move. Without gradients it is kept, for frames are judged one by one."""
+        if torch.is_grad_enabled():
+            return self._still.with_parameters({"values": self.values()})
+        known = self._fingerprint()
+        if self._last is None or self._last[0] != known:
+            self._last = known, self._still.with_parameters({"values": self.values()})
+        return self._last[1]
+
+    def _fingerprint(self) -> bytes:
+        """Of the weights, which fits change in place."""
+        found = hashlib.blake2b()
+        for weight in self.weights.values():
+            found.update(weight.detach().cpu().contiguous().numpy().tobytes())
+        return found.digest()
 
     def project(self, views: Views | Poses) -> LineIntegrals:
         """Line integrals (B, D), differentiable in the weights."""

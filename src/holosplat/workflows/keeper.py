@@ -14,6 +14,9 @@ from ..methods.cross_validation import MissingMatter
 from ..representations import KINDS, Stored
 from ..scan import Exposures, Scan
 
+LOST = 0.5
+"""What takes the place of all others must not leave more than this share of all matter unexplained, and twice what the
+best of them does: then it has lost the matter. Noise that a first volume follows changes the share less."""
 CLEARLY = 0.95
 """An earlier state is kept if it leaves less than this part of the matter that a later one leaves unexplained, and no
 more of the contrast: differences in fitted frames may also be noise."""
@@ -92,7 +95,8 @@ class Keeper:
             self.train, self._judge = train, None
 
     def look(self, name: str, found: Stored, oversample: int, fitted: bool = True, better: float = 0.0) -> None:
-        """Take in the latest state. What is not `fitted` is a step of the method, and takes the place of all others.
+        """Take in the latest state. What is not `fitted` is a step of the method, and takes the place of all others
+        unless it has lost the matter (`LOST`).
 
         better: how many times less than the best of the others it must leave unexplained to be taken (0: `CLEARLY`).
         """
@@ -100,15 +104,19 @@ class Keeper:
             self._judge = MissingMatter(self.train, _material(self.best.object if self.best else found))
         share, contrast = self._judge.shares(found, oversample)
         self.judged[name] = share
-        best = self.best
-        rivals = best is not None and fitted and (self.mixed or best.object.kind == found.kind)
-        wins = best is None or not rivals
-        if best is not None and better > 0:
-            wins = wins or better * share <= best.share
-        elif best is not None:
-            wins = wins or CLEARLY * share <= best.share or contrast < best.contrast
-        if wins:
+        if self._wins(found, share, contrast, fitted, better):
             self.best = State(name, found, oversample, share, contrast, self.train.exposures)
+
+    def _wins(self, found: Stored, share: float, contrast: float, fitted: bool, better: float) -> bool:
+        best = self.best
+        if best is None:
+            return True
+        same = best.object.kind == found.kind
+        if not (fitted and (self.mixed or same)):
+            return not (same and share > LOST and share > 2 * best.share)
+        if better > 0:
+            return better * share <= best.share
+        return CLEARLY * share <= best.share or contrast < best.contrast
 
     def state_dict(self) -> dict[str, Any] | None:
         """What `load` needs; None before the first state."""
