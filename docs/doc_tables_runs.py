@@ -347,3 +347,17 @@ def _learned() -> dict[tuple[str, int, int], dict[str, dict[str, str]]]:
     for row in read("learned.csv"):
         found.setdefault((row["case"], int(row["scene"]), int(row["views"])), {})[row["start"]] = row
     return {key: rows for key, rows in found.items() if len(rows) == 3}
+
+
+def random_scenes() -> str:
+    """Error of δ, Dice, total and verdict of the default method, a line a scene."""
+    lines = []
+    for r in sorted(read("random_scenes.csv"), key=lambda r: (int(r["seed"]), int(r["number"]))):
+        told = [r["kind"], r["prior"], r["views"], r["noise"], r["uneven"]]
+        if r["error"]:
+            good = {"True": "explained", "False": "warned"}.get(r["good"], "–")
+            lines.append([*told, f"{r['error']} / {r['dice']} / {r['total']}", r["kept"], good])
+        else:
+            lines.append([*told, "–", "–", r["result"]])
+    columns = ("matter", "known", "views", "noise", "uneven light", "error of δ / Dice / total", "result", "verdict")
+    return markdown(columns, lines)

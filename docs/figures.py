@@ -149,6 +149,12 @@ TABLES["ellipsoids"] = Table(
     "python benchmarks/ellipsoids.py --write",
     "hours",
 )
+TABLES["random_scenes"] = Table(
+    runs.random_scenes,
+    ("random_scenes.csv",),
+    "python benchmarks/random_scenes.py --write",
+    "half an hour",
+)
 TABLES["bed"] = Table(
     measured.bed, ("real_data.csv",), "python benchmarks/packed_bed.py --data FOLDER --work FOLDER", "an hour"
 )
