@@ -100,6 +100,7 @@ def test_a_smooth_volume_takes_over_where_no_bodies_of_that_level_explain_the_fr
     done = reconstruct(scan, known, method, matter="levels")
     assert (done.choice.kept == "smooth volume") is (denser < 1)
     assert ("smooth volume" in done.choice.judged) is (denser < 1)
+    assert any("bodies of one level explain these frames badly" in line for line in done.choice.lines()) is (denser < 1)
 
 
 def test_old_summaries_say_nothing():

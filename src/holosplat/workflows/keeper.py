@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..matter import DeltaBeta, MatterKind
+from ..methods.auto import VolumeWhereUnexplained
 from ..methods.cross_validation import MissingMatter
 from ..representations import KINDS, Stored
 from ..scan import Exposures, Scan
@@ -57,6 +58,8 @@ class Choice:
         if self.kept and len(self.judged) > 1:
             shares = ", ".join(f"{name} {100 * share:.2g} %" for name, share in self.judged.items())
             lines.append(f"kept: {self.kept} (matter that training frames leave unexplained: {shares})")
+        if self.matter == "levels" and self.kept == VolumeWhereUnexplained.name and "fit" in self.judged:
+            lines.append("bodies of one level explain these frames badly: there may be several levels, or none")
         return lines
 
 
