@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.geometry import Views
 from holosplat.matter import DeltaBeta, MaterialPrior
-from holosplat.methods import Task
+from holosplat.methods import SmoothVolume, Task, sharp_level
 from holosplat.methods.sharp_level import material_of_levels
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens import MeshScene
@@ -44,6 +45,16 @@ def test_noise_takes_nothing_off_the_level(noisy):
     assert found.ratio == pytest.approx(WATER.ratio)
     assert estimate_delta(noisy, WATER.ratio, task.on_progress) < 0.8 * WATER.delta
     assert "level of the matter" in said
+
+
+def test_a_level_is_never_below_that_of_tomography(noisy, monkeypatch):
+    """Where voxels are larger than thin shells, the likeliest volume dilutes them."""
+    task = Task(noisy, MaterialPrior.of_ratio(WATER.ratio))
+    tomography = estimate_delta(noisy, WATER.ratio, task.on_progress)
+    monkeypatch.setattr(sharp_level, "SmoothVolume", partial(SmoothVolume, coarser=(), iterations=1))
+    for level, delta in ((0.1, tomography), (3.0, 3 * tomography)):
+        monkeypatch.setattr(sharp_level, "level_of", lambda values, level=level: level)
+        assert material_of_levels(task).delta == pytest.approx(delta)
 
 
 def test_a_known_level_is_taken(noisy):

@@ -77,6 +77,15 @@ def test_light_is_found_in_air_and_where_matter_is(shape, kind):
     assert Light.of(frames, LightOptions("even")).background is None
 
 
+@pytest.mark.parametrize("shape", SHAPES)
+def test_light_that_is_faint_beside_the_contrast_is_uneven_where_air_is_sure(shape):
+    """Of a twentieth of the contrast: seen in little noise, and not in much."""
+    size = 0.05 * rms(measured(shape, np.ones(shape), 0.0) - 1)
+    for noise, seen in ((0.2 * size, True), (5 * size, False)):
+        found = Light.of(measured(shape, uneven(shape, "slopes", size), noise))
+        assert (found.background is not None) is seen
+
+
 @pytest.mark.parametrize("shape", [(6, 84, 92), (4, 61, 98)])
 @pytest.mark.parametrize("kind", ["slopes", "correlated"])
 def test_light_without_noise_does_not_run_away_where_there_is_no_air(shape, kind):
