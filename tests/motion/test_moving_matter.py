@@ -12,10 +12,10 @@ from holosplat.fit.carried_volume import CarriedProblem, likelier_flow, strain
 from holosplat.fit.smooth_volume import ContinuousPrior
 from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid, Views
-from holosplat.matter import DeltaBeta, MaterialPrior
+from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import SmoothVolume, Task
 from holosplat.motion.carried import CarriedOptions, Search, merged, of_degree, on_lattice, trendless
-from holosplat.representations import Flow, Lattice, TimeBasis
+from holosplat.representations import Flow, Lattice, TimeBasis, VoxelGrid
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.carried import CarriedScene
 from holosplat.specimens.continuous import Bump, ContinuousScene, ellipsoid
@@ -121,6 +121,24 @@ def test_a_drift_is_found_and_all_times_are_better_than_each_by_itself():
     assert np.mean(together) < 0.97 * np.mean(own)
     between = error(found.object.at(0.3).voxelise(grid), scene.at(0.3).voxelise(grid))
     assert between < 1.05 * np.mean(own)
+
+
+def test_where_one_time_shows_nothing_all_of_them_begin(drifting, monkeypatch):
+    _, scan = drifting
+    how, asked = search(scan), list[str]()
+    grid = Grid.of_views(scan.views)
+    shown = {"middle time": torch.zeros(1, *grid.shape), "mean of all times": torch.ones(1, *grid.shape)}
+
+    def by_itself(one, name):
+        asked.append(name)
+        return VoxelGrid(shown[name], grid, Matter.one(*MATTER))
+
+    monkeypatch.setattr(how, "by_itself", by_itself)
+    assert bool((how.first().values == 1).all())
+    assert asked == ["middle time", "mean of all times"]
+    assert "begun with the mean" in how.history[-1]
+    shown["middle time"] += 2
+    assert bool((how.first().values == 2).all())
 
 
 def test_a_drift_is_said_to_move(drifting):

@@ -44,8 +44,8 @@ class Auto:
     trials: CrossValidation = field(default_factory=CrossValidation)
     """How views are set aside for trials."""
     unexplained: Share = 0.12
-    """Share of all matter that bodies may leave unexplained before a smooth volume is tried: right levels leave less,
-    but for crowded scenes in noise, where a volume leaves as much as they do."""
+    """Share of all matter that bodies may leave unexplained before a smooth volume is tried. Where it is too low, a
+    volume is fitted in vain, for it must leave half of what they do to be taken."""
 
     def stages(self) -> Sequence[Stage]:
         """Those for matter with levels; `chosen` decides."""

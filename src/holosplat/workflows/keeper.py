@@ -17,7 +17,7 @@ from ..scan import Exposures, Scan
 
 LOST = 0.5
 """What takes the place of all others must not leave more than this share of all matter unexplained, and twice what the
-best of them does: then it has lost the matter. Noise that a first volume follows changes the share less."""
+best of them does: then a prior has wiped out matter that the frames show."""
 CLEARLY = 0.95
 """An earlier state is kept if it leaves less than this part of the matter that a later one leaves unexplained, and no
 more of the contrast: differences in fitted frames may also be noise."""
