@@ -150,17 +150,10 @@ def rows_of(name: str, experiment: Experiment, moments: list[str], commit: str) 
     rows = list[Row]()
     said: Row = {"case": name, "scene": Path(experiment.scene).stem, "seed": experiment.errors.seed}
     said |= {"machine": f"{platform.machine()}, one core of two", "commit": commit}
+    spent = {"seconds": f"{seconds:.0f}", "cpu_seconds": f"{worked:.0f}"}
     for moment in ("planned", "aligned"):
-        for views, index in (("training", ~scan.is_test), ("all", np.ones(len(scan), dtype=bool))):
-            chosen = np.flatnonzero(index)
-            errors = rms_errors(placed[moment][chosen], true[chosen])
-            names = ("shift_px", "across_deg", "roll_deg", "magnification")
-            values = {key: f"{e:.5f}" if key == "magnification" else f"{e:.4f}" for key, e in zip(names, errors)}
-            away = distance_errors(placed[moment][chosen], true[chosen])
-            values |= {key: f"{e:.4f}" for key, e in zip(("distance", "mean_distance"), away, strict=True)}
-            values |= {"seconds": f"{seconds:.0f}", "cpu_seconds": f"{worked:.0f}"}
-            rows.append(said | {"views": views, "moment": moment} | values)
-            print(rows[-1], flush=True)
+        rows += [said | {"moment": moment} | row | spent for row in pose_rows(placed[moment], true, scan.is_test)]
+        print(*rows[-2:], sep="\n", flush=True)
     for method in experiment.methods:
         for moment in moments:
             if moment == "refined":
@@ -169,6 +162,18 @@ def rows_of(name: str, experiment: Experiment, moments: list[str], commit: str) 
                 new = [{"views": "volume"} | volume_row(case, scan, placed[moment], true, method)]
             rows += [said | {"moment": moment} | row for row in new]
             print(*rows[-len(new) :], sep="\n", flush=True)
+    return rows
+
+
+def pose_rows(found: hs.Exposures, true: hs.Exposures, is_test: np.ndarray) -> list[Row]:
+    """Errors of the training views, and of all."""
+    rows = list[Row]()
+    for views, chosen in (("training", np.flatnonzero(~is_test)), ("all", np.arange(len(is_test)))):
+        shift, across, roll, magnification = rms_errors(found[chosen], true[chosen])
+        away, mean = distance_errors(found[chosen], true[chosen])
+        values = {"shift_px": shift, "across_deg": across, "roll_deg": roll, "distance": away, "mean_distance": mean}
+        row: Row = {"views": views, "magnification": f"{magnification:.5f}"}
+        rows.append(row | {key: f"{value:.4f}" for key, value in values.items()})
     return rows
 
 
@@ -190,12 +195,7 @@ def refined_rows(case: Case, scan: hs.Scan, true: hs.Exposures, experiment: Expe
     began = time.perf_counter()
     done = hs.reconstruct(scan, case.prior, METHODS[method], refine=PoseOptions(experiment.told()))
     said: Row = {"method": f"{method} ({done.object.kind})", "seconds": f"{time.perf_counter() - began:.0f}"}
-    found, rows = done.placed(scan).exposures, list[Row]()
-    for views, index in (("training", ~scan.is_test), ("all", np.ones(len(scan), dtype=bool))):
-        chosen = np.flatnonzero(index)
-        errors = (*rms_errors(found[chosen], true[chosen]), *distance_errors(found[chosen], true[chosen]))
-        keys = ("shift_px", "across_deg", "roll_deg", "distance", "mean_distance")
-        rows.append(said | {"views": views} | {key: f"{e:.4f}" for key, e in zip(keys, errors, strict=True)})
+    rows = [said | row for row in pose_rows(done.placed(scan).exposures, true, scan.is_test)]
     truth = case.truth()
     scores = volume_scores(done.object.voxelise(truth.grid), truth)
     numbers: Row = {"error_delta": f"{scores.relative_error_delta:.4f}", "dice": f"{scores.dice:.4f}"}

@@ -1,4 +1,4 @@
-"""The likeliest smooth volume: the prior against its plain form, the descent, and what modulations mend."""
+"""The likeliest smooth volume: the prior against its plain form, and the descent."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 
 from helpers.blobs import MATERIAL, SHAPE, blob_scan, blobs
 from holosplat.checks import InputError
-from holosplat.fit.smooth_volume import ContinuousPrior, Descent, VolumeProblem, descend, modulated, modulations
+from holosplat.fit.smooth_volume import ContinuousPrior, Descent, VolumeProblem, descend
 from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid
 from holosplat.optics.noise_model import NoiseModel
@@ -86,17 +86,6 @@ def test_an_empty_volume_is_a_trap_that_shorter_steps_avoid(kept, end):
         descent.step()
     assert descent.u.numpy() == pytest.approx(end, abs=1e-3)
     assert Descent.again(Trap(), descent.state_dict()).kept is kept
-
-
-def test_modulations_give_back_what_was_taken():
-    """A fifth of all matter, and more of one side, is found again in the frames."""
-    p = problem()
-    side = torch.linspace(0.7, 0.9, matter().shape[2])
-    less = matter() * side
-    mended = modulated(p, less)
-    assert float(less.sum() / matter().sum()) < 0.82
-    assert float(mended.sum() / matter().sum()) == pytest.approx(1.0, abs=0.05)
-    assert len(modulations(less, 1.0)) == 7
 
 
 def test_bad_options_are_refused():

@@ -15,11 +15,12 @@ from holosplat.baselines import HolographicTV
 from holosplat.baselines.material import plateau
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
-from holosplat.fit.smooth_volume import ContinuousPrior, VolumeProblem, descend, modulated
+from holosplat.fit.smooth_volume import ContinuousPrior, VolumeProblem, descend
 from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import HolographicVoxels, SmoothVolume, Task, smooth_fit, solve
+from holosplat.methods.modulation import modulated, unshrunk
 from holosplat.methods.smooth_fit import SmoothFit
 from holosplat.methods.volume import SmoothStage, binning
 from holosplat.optics.noise_model import NoiseModel
@@ -169,9 +170,11 @@ def plainly(scan: Scan, options: SmoothVolume) -> torch.Tensor:
         return WhitenedFrames(scan.binned(factor), first.matter.channels[0], task.noise.binned(factor))
 
     def rounds(seen: WhitenedFrames, prior: ContinuousPrior, u: torch.Tensor, loose: float = 0.0) -> torch.Tensor:
-        for factor in [loose] * (loose > 0) + [1.0] * options.rounds:
+        factors = [loose] * (loose > 0) + [1.0] * options.rounds
+        for i, factor in enumerate(factors):
             problem = VolumeProblem(seen, prior, factor * plateau(u))
-            u = modulated(problem, descend(problem, u, options.iterations)[0])
+            mended = modulated if loose or i < len(factors) - 1 else unshrunk
+            u = mended(problem, descend(problem, u, options.iterations)[0])
         return u
 
     grid = Grid.of_views(scan.binned(2).views)

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 
 import torch
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool3d, avg_pool3d, interpolate, pad
+from torch.nn.functional import pad
 
 from ..checks import require
 from ..geometry import Grid
@@ -26,10 +26,6 @@ REFRESH = 10
 """Iterations after which the preconditioner is made anew."""
 MATTER = 0.05
 """Share of the largest value above which a voxel counts as matter for the preconditioner."""
-SPREAD = 0.5
-"""Standard deviation expected of each of the shares by which a volume is modulated."""
-HALVINGS = 4
-"""How often a modulation is halved at most until it lowers the misfit."""
 
 
 @dataclass(frozen=True)
@@ -288,49 +284,3 @@ def _direction(
     for s, y, curved, share in reversed(used):
         result = result + (share - float((y * result).sum()) / curved) * s
     return -result if float((result * gradient).sum()) > 0 else -(inverse(gradient * free) * free)
-
-
-def modulations(u: Tensor, level: float) -> list[Tensor]:
-    """Changes [Z, Y, X] that noise hides and a prior distorts: of all matter, of a side of it, of dense against faint
-    matter, and of a halo about it."""
-    sides = [u]
-    for axis in range(3):
-        n = u.shape[axis]
-        wave = torch.cos(math.pi * (torch.arange(n) + 0.5) / n)
-        sides.append(u * wave.reshape([-1 if a == axis else 1 for a in range(3)]))
-    return [*sides, u * (u / level - 1), _halo(u, 8), _halo(u, 4)]
-
-
-def _halo(u: Tensor, parts: int) -> Tensor:
-    """u as a volume of about `parts` cells along its longest edge shows it."""
-    edge = max(1, max(u.shape) // parts)
-    z, y, x = (max(1, round(n / edge)) for n in u.shape)
-    coarse = adaptive_avg_pool3d(u[None, None], (z, y, x))
-    coarse = avg_pool3d(coarse, 3, stride=1, padding=1, count_include_pad=False) if min(z, y, x) > 2 else coarse
-    return interpolate(coarse, size=u.shape, mode="trilinear", align_corners=False)[0, 0]
-
-
-def shares_of(problem: VolumeProblem, u: Tensor, changes: list[Tensor]) -> tuple[Tensor, Tensor]:
-    """The shares [K] of K changes that the frames of a volume u ask for, and their covariance [K, K], float64."""
-    matrix, right = problem.frames.normal_equations(problem.lines(u), [problem.lines(change) for change in changes])
-    covariance = torch.linalg.inv(matrix + torch.eye(len(right), dtype=right.dtype) / SPREAD**2)
-    return covariance @ right, covariance
-
-
-def modulated(problem: VolumeProblem, u: Tensor) -> Tensor:
-    """u with the `modulations` that its frames ask for: least squares of their misfit, without the prior.
-
-    A prior takes a share of all matter, and from what is faint most; of these few numbers the frames know enough. Each
-    is expected to be within `SPREAD`. The change is halved until the misfit falls, or left out.
-    """
-    changes = modulations(u, problem.level)
-    lines = problem.lines(u)
-    shares, _ = shares_of(problem, u, changes)
-    change = torch.stack([float(s) * c for s, c in zip(shares, changes)]).sum(dim=0)
-    before = problem.frames(lines).value
-    for _ in range(HALVINGS):
-        moved = (u + change).clamp_min(0)
-        if problem.frames(problem.lines(moved)).value < before:
-            return moved
-        change = change / 2
-    return u

@@ -14,7 +14,7 @@ from ..baselines.material import plateau
 from ..fit.interrupt import interrupts_held
 from ..fit.loop import DivergedError
 from ..fit.running import Record
-from ..fit.smooth_volume import ContinuousPrior, Descent, VolumeProblem, modulated
+from ..fit.smooth_volume import ContinuousPrior, Descent, VolumeProblem
 from ..fit.whitened import WhitenedFrames
 from ..geometry import Grid
 from ..memory import memory_kept
@@ -23,6 +23,7 @@ from ..optics.noise_model import NoiseModel
 from ..optics.sampling import fringe_sampling
 from ..representations import VoxelGrid
 from ..scan import Scan
+from .modulation import modulated, unshrunk
 
 EXPLAINED = 0.95
 """χ² a pixel above which a volume does not explain its frames to within their noise; where prior and frames agree it is
@@ -58,11 +59,14 @@ class Leg:
 @dataclass(frozen=True)
 class SmoothPlan:
     """What a smooth volume is fitted to and how. scan: its frames; begun: the start, on voxels of a pixel; noise: of
-    the frames; the others are the options of `SmoothVolume`."""
+    the frames; ratio_known: whether δ/β is known, and not estimated; uneven: whether the light is; the others are the
+    options of `SmoothVolume`."""
 
     scan: Scan
     begun: VoxelGrid
     noise: NoiseModel
+    ratio_known: bool
+    uneven: bool
     prior: ContinuousPrior
     coarser: tuple[int, ...]
     rounds: int
@@ -223,7 +227,7 @@ class SmoothFit:
             u = empty if problem(empty)[0] <= descent.value else u
         unexplained = 2 * problem.frames(problem.lines(u)).value / problem.frames.count
         if leg.kind == "round" and bool((u > 0).any()):
-            u = modulated(problem, u)
+            u = self._mended(problem, u)
         elif leg.kind == "from coarse" and unexplained > 1:
             self._rival = (u, descent.value)
         elif leg.kind == "from start" and self._rival is not None:
@@ -232,6 +236,12 @@ class SmoothFit:
         found = self._volume.with_parameters({"values": u[None]})
         if not self._weakened(found, unexplained):
             self._volume, self._leg = found, self._leg + 1
+
+    def _mended(self, problem: VolumeProblem, u: Tensor) -> Tensor:
+        """u with what the prior has taken: the edges' way between rounds, the total's at the end. Low frequencies see
+        the total by its absorption, so where δ/β was estimated they are no better than the others."""
+        last = self._leg == len(self._legs) - 1
+        return unshrunk(problem, u, self.plan.uneven) if last and self.plan.ratio_known else modulated(problem, u)
 
     def _weakened(self, found: VoxelGrid, unexplained: float) -> bool:
         """Whether the fit goes elsewhere than on: back to its start with half the prior, or back to a stronger one."""

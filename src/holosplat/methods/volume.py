@@ -106,7 +106,8 @@ class SmoothStage:
         if rows_of(start.grid, scan.views):
             noise = noise.at_least(LEFT * contrast_level(torch.from_numpy(scan.frames)))
         how = (options.prior, options.coarser, options.rounds, options.iterations, options.loose, backend)
-        return SmoothFit(SmoothPlan(scan, start, noise, *how))
+        told = task.prior.fixes_ratio, task.uneven is not None
+        return SmoothFit(SmoothPlan(scan, start, noise, *told, *how))
 
 
 def _beside(task: Task, start: VoxelGrid) -> Scan:

@@ -1,0 +1,181 @@
+"""What a prior takes from a volume, given back: a few changes of all of it, by least squares of its frames."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool3d, avg_pool3d, interpolate
+
+from ..baselines.material import plateau
+from ..fit.smooth_volume import VolumeProblem
+
+SPREAD = 0.5
+"""Standard deviation expected of each of the shares by which a volume is modulated between two descents."""
+LOST = 1.0
+"""The same where a total is told by ranges of frequencies: a fit in noise may have lost most of its matter."""
+HALVINGS = 4
+"""How often a modulation is halved at most until it lowers the misfit."""
+WAVES = 4
+"""Periods along the longer side of a frame that the narrowest range of frequencies has at least."""
+UPDATES = 2
+"""Gauss–Newton steps in a range of frequencies, the last of which gives the total."""
+
+
+def modulations(u: Tensor, level: float) -> list[Tensor]:
+    """Changes [Z, Y, X] that noise hides and a prior distorts: of all matter, of a side of it, of dense against faint
+    matter, and of a halo about it."""
+    sides = [u]
+    for axis in range(3):
+        n = u.shape[axis]
+        wave = torch.cos(math.pi * (torch.arange(n) + 0.5) / n)
+        sides.append(u * wave.reshape([-1 if a == axis else 1 for a in range(3)]))
+    return [*sides, u * (u / level - 1), _halo(u, 8), _halo(u, 4)]
+
+
+def _halo(u: Tensor, parts: int) -> Tensor:
+    """u as a volume of about `parts` cells along its longest edge shows it."""
+    edge = max(1, max(u.shape) // parts)
+    z, y, x = (max(1, round(n / edge)) for n in u.shape)
+    coarse = adaptive_avg_pool3d(u[None, None], (z, y, x))
+    coarse = avg_pool3d(coarse, 3, stride=1, padding=1, count_include_pad=False) if min(z, y, x) > 2 else coarse
+    return interpolate(coarse, size=u.shape, mode="trilinear", align_corners=False)[0, 0]
+
+
+def shares_of(problem: VolumeProblem, u: Tensor, changes: list[Tensor]) -> tuple[Tensor, Tensor]:
+    """The shares [K] of K changes that the frames of a volume u ask for, and their covariance [K, K], float64."""
+    matrix, right = problem.frames.normal_equations(problem.lines(u), [problem.lines(change) for change in changes])
+    covariance = torch.linalg.inv(matrix + torch.eye(len(right), dtype=right.dtype) / SPREAD**2)
+    return covariance @ right, covariance
+
+
+def modulated(problem: VolumeProblem, u: Tensor) -> Tensor:
+    """u with the `modulations` that its frames ask for: least squares of their misfit, without the prior.
+
+    A prior takes a share of all matter, and from what is faint most; of these few numbers the frames know enough. Each
+    is expected to be within `SPREAD`. The change is halved until the misfit falls, or left out.
+    """
+    changes = modulations(u, problem.level)
+    lines = problem.lines(u)
+    shares, _ = shares_of(problem, u, changes)
+    change = torch.stack([float(s) * c for s, c in zip(shares, changes)]).sum(dim=0)
+    before = problem.frames(lines).value
+    for _ in range(HALVINGS):
+        moved = (u + change).clamp_min(0)
+        if problem.frames(problem.lines(moved)).value < before:
+            return moved
+        change = change / 2
+    return u
+
+
+class Told(NamedTuple):
+    """What a range of frequencies says. value, variance: of the total [voxels] in the field of view; moved: the volume
+    with what they ask for; limit: the highest frequency [cycles per pixel]."""
+
+    value: float
+    variance: float
+    moved: Tensor
+    limit: float
+
+
+class Ranges:
+    """Misfits of frames in ranges of spatial frequencies that widen by octaves.
+
+    High frequencies are many, and biased by shapes that noise or a prior has blurred; low ones are few, and see the
+    total alone.
+
+    predicted: frames [V, H, W] of the first volume by its own model; None where its voxels say the same.
+    limits: highest frequencies [cycles per pixel], the narrowest range first.
+    """
+
+    def __init__(self, problem: VolumeProblem, predicted: Tensor | None = None) -> None:
+        self.problem, self.frames = problem, problem.frames
+        self._predicted, self._offset = predicted, torch.zeros(())
+        (h, w), longest = self.frames.shape, max(self.frames.shape)
+        self.radius = torch.hypot(torch.fft.fftfreq(h)[:, None], torch.fft.rfftfreq(w))
+        octaves = max(0, int(math.log2(0.5 * longest / WAVES)))
+        self.limits = [*(0.5 / 2**k for k in range(octaves, 0, -1)), 1.0]
+        self._twice = torch.full((w // 2 + 1,), 2.0)
+        self._twice[0] = 1
+        if w % 2 == 0:
+            self._twice[-1] = 1
+
+    def by_range(self, u: Tensor, limits: list[float]) -> list[Told]:
+        """What each range says of a volume u, each from where the narrower one before it has led."""
+        found = list[Told]()
+        with torch.no_grad():
+            for limit in limits:
+                for _ in range(UPDATES - 1):
+                    moved = self.told(u, limit).moved
+                    u = moved if bool((moved > 0).any()) else u
+                found.append(self.told(u, limit))
+        return found
+
+    def told(self, u: Tensor, limit: float) -> Told:
+        """Least squares by frequencies up to `limit`."""
+        changes, problem = modulations(u, plateau(u)), self.problem
+        lines = problem.lines(u)
+        slopes = self.frames.slopes(lines, [problem.lines(change) for change in changes])
+        weight = self._weight(limit)
+        spectra = torch.fft.rfft2(torch.stack(slopes), norm="ortho")
+        left = torch.fft.rfft2(self._left(lines), norm="ortho")
+        weighted = (spectra * weight).flatten(1)
+        matrix = (weighted @ spectra.flatten(1).conj().T).real.double()
+        right = (weighted @ left.flatten().conj()).real.double()
+        covariance = torch.linalg.inv(matrix + torch.eye(len(right), dtype=right.dtype) / LOST**2)
+        shares = covariance @ right
+        count = float(((self.radius <= limit) * self._twice).sum()) * len(left)
+        chi2 = (float((weight * left.abs().square()).double().sum()) - float(right @ shares)) / count
+        masses = torch.stack([self._inside(change) for change in changes])
+        moved = u + torch.einsum("k,kzyx->zyx", shares.float(), torch.stack(changes))
+        value, variance = float(self._inside(u) + masses @ shares), float(masses @ covariance @ masses)
+        return Told(value, variance * max(1.0, chi2), moved.clamp_min(0), limit)
+
+    def misfit(self, u: Tensor, limit: float) -> float:
+        """χ² of u by frequencies up to `limit`."""
+        with torch.no_grad():
+            left = torch.fft.rfft2(self._left(self.problem.lines(u)), norm="ortho")
+        return float((self._weight(limit) * left.abs().square()).double().sum())
+
+    def _weight(self, limit: float) -> Tensor:
+        return (self.radius <= limit) * self._twice / self.frames.power
+
+    def _inside(self, u: Tensor) -> Tensor:
+        """The sum of a volume in the field of view."""
+        beyond = self.frames.beyond
+        return u[:, beyond : u.shape[1] - beyond].double().sum()
+
+    def _left(self, lines: Tensor) -> Tensor:
+        """What is left of measured amplitudes."""
+        now = self.frames.amplitudes(lines)
+        if self._predicted is not None:
+            self._offset, self._predicted = self._predicted.clamp_min(0).sqrt().to(now) - now, None
+        return self.frames.measured - now - self._offset
+
+
+def best(found: list[Told]) -> Told:
+    """The range with the least variance and squared bias of its total, which is how much it differs from narrower ones
+    beyond their errors (Goldenshluger & Lepski 2011); its variance has the squared bias in it."""
+
+    def doubt(i: int) -> float:
+        value, variance = found[i].value, found[i].variance
+        return variance + max([0.0, *((value - each.value) ** 2 - each.variance for each in found[:i])])
+
+    chosen = min(range(len(found)), key=doubt)
+    return found[chosen]._replace(variance=doubt(chosen))
+
+
+def unshrunk(problem: VolumeProblem, u: Tensor, uneven: bool = False) -> Tensor:
+    """u with the `modulations` that the frequencies ask for which know its total best (`best`).
+
+    A prior makes matter in noise too faint and its edges wrong. Least squares of all frequencies (`modulated`) then
+    answer to the edges, and miss the total. uneven: whether the light is; the narrowest range,
+    where light and matter look alike, is left out then. Where the change does not lower the misfit of its range, all
+    frequencies are taken.
+    """
+    ranges = Ranges(problem)
+    told = best(ranges.by_range(u, ranges.limits[1:] if uneven and len(ranges.limits) > 1 else ranges.limits))
+    lower = ranges.misfit(told.moved, told.limit) < ranges.misfit(u, told.limit)
+    return told.moved if lower and bool((told.moved > 0).any()) else modulated(problem, u)
