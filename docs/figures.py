@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import doc_tables as benchmark
+import doc_tables_alignment as alignment
 import doc_tables_measured as measured
 import doc_tables_runs as runs
 import doc_tables_thesis as thesis
@@ -129,6 +130,30 @@ TABLES |= {
         ("whole", measured.whole),
         ("tooth", measured.tooth),
         ("hair", measured.hair),
+    )
+}
+ALIGN = "python benchmarks/alignment.py"
+TABLES |= {
+    name: Table(make, (data,), command, takes)
+    for name, make, data, command, takes in (
+        ("align-errors", alignment.errors, "alignment.csv", ALIGN, "ten minutes"),
+        ("align-magnified", alignment.magnified, "alignment.csv", ALIGN, "ten minutes"),
+        (
+            "align-volumes",
+            alignment.volumes,
+            "alignment.csv",
+            f"{ALIGN} --moments planned aligned refined true",
+            "an hour",
+        ),
+        ("align-series", alignment.series, "alignment.csv", "python benchmarks/series_alignment.py", "half an hour"),
+        (
+            "align-series-volumes",
+            alignment.series_volumes,
+            "alignment.csv",
+            "python benchmarks/series_alignment.py",
+            "an hour",
+        ),
+        ("few-views", alignment.few_views, "few_views.csv", "python benchmarks/few_views.py", "ten minutes"),
     )
 }
 TABLES["pinn"] = Table(

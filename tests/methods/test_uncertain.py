@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from helpers.blobs import MATERIAL as BLOBS
 from helpers.blobs import SHAPE, blob_scan
@@ -16,7 +17,7 @@ from holosplat.baselines.beyond import rows_beyond
 from holosplat.checks import InputError
 from holosplat.matter import MaterialPrior
 from holosplat.methods import Task
-from holosplat.methods.profile import Profile, ProfileOptions
+from holosplat.methods.profile import Profile, ProfileOptions, without_specks
 from holosplat.methods.uncertain import Determined, Search, Uncertain, at_energy, determine, likeliest_ratio, told
 
 RATIO = MaterialPrior.of_ratio(MATERIAL.ratio)
@@ -165,3 +166,17 @@ def test_what_was_determined_is_read_from_its_table():
 
     found = Determined("distance", 0.1, 0.09, 0.11, (0.05, 0.2), True, "a remark")
     assert Determined.from_dict(to_table(found)) == found
+
+
+def test_specks_of_noise_are_no_support_but_small_matter_is():
+    volume = torch.zeros(12, 13, 15)
+    volume[3:7, 3:7, 3:7] = 1.0
+    volume[10, 10, 2], volume[9:11, 1, 12] = 0.2, 0.3
+    inside = (volume > 0.1).numpy()
+    kept = without_specks(volume, inside)
+    assert kept.sum() == 64
+    assert kept[3:7, 3:7, 3:7].all()
+    small = torch.zeros(12, 13, 15)
+    small[2::5, 2::5, 2::5] = 1.0
+    alone = (small > 0.1).numpy()
+    assert np.array_equal(without_specks(small, alone), alone)

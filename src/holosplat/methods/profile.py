@@ -9,10 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import cast
 
 import numpy as np
 import torch
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, label
 from torch import Tensor
 
 from ..baselines import HolographicTV, holographic_tv
@@ -33,6 +34,11 @@ from .method import Task, quiet
 
 UNIT_DELTA = 1e-6
 """δ of an occupancy of one; any value does, for occupancies have no bound."""
+
+SPECK = 27
+"""Voxels of which a connected piece of matter has at least, or it may be noise: a cube of three."""
+FEW_SPECKS = 0.1
+"""Share of all matter up to which such pieces are taken for noise; if they hold more, they are matter."""
 
 Constants = Mapping[str, float]
 """Values of what is uncertain, by name: `distance` [m], `energy_kev` [keV], `delta_beta`."""
@@ -69,6 +75,16 @@ class ProfileOptions:
         require(0 < self.faint < 1, f"faint must lie between 0 and 1, but it is {self.faint:g}.")
 
 
+def without_specks(volume: Tensor, inside: np.ndarray) -> np.ndarray:
+    """`inside` [Z, Y, X] bool of a volume [Z, Y, X] without what noise strews over it; no ray would pass beside that."""
+    pieces, _ = cast(tuple[np.ndarray, int], label(inside))
+    large = np.bincount(pieces.ravel()) >= SPECK
+    large[0] = False
+    kept = large[pieces]
+    lost = float(volume.numpy()[inside & ~kept].sum())
+    return kept if lost <= FEW_SPECKS * float(volume.numpy()[inside].sum()) else inside
+
+
 class Profile:
     """-log of the likelihood of the coarse frames of a task, as a function of constants; the volume is the likeliest.
 
@@ -99,7 +115,7 @@ class Profile:
             whole = self._volume(self.frames(nominal))
             self._beyond = rows_of(whole.grid, self._scan.views)
             first = self._placed(whole)
-        inside = (first > options.faint * plateau(first)).numpy()
+        inside = without_specks(first, (first > options.faint * plateau(first)).numpy())
         self.support = torch.from_numpy(np.asarray(binary_dilation(inside, iterations=max(1, options.dilated))))
         self._peak = plateau(first) / float((first * self.support).sum() / self.support.sum())
         """The level of matter over its mean in the support. The prior's unit must not vary by chance from fit to fit,
