@@ -76,7 +76,7 @@ class ProfileOptions:
 
 
 def without_specks(volume: Tensor, inside: np.ndarray) -> np.ndarray:
-    """`inside` [Z, Y, X] bool of a volume [Z, Y, X] without what noise strews over it; no ray would pass beside that."""
+    """`inside` [Z, Y, X] of a volume [Z, Y, X] without what noise strews over it; no ray would pass beside that."""
     pieces, _ = cast(tuple[np.ndarray, int], label(inside))
     large = np.bincount(pieces.ravel()) >= SPECK
     large[0] = False

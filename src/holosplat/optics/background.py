@@ -31,6 +31,10 @@ GRAINY, HALVED = 4, 0.5
 this part of what it was may still be steep light; true grain stays as it is, and there is one round."""
 FAINTEST = 1e-4
 """Noise [relative intensity] assumed at least: light is not known better."""
+STEADY = 0.93
+"""Part of the grain that is left at least where light is no part of it. The smooth modes that are divided out have then
+taken the lowest frequencies of the grain, so that its noise is that of the frames before: it was .98 to 1.03 in single
+frames of a grainy lamp, and .82 to .88 where light of two per cent counted as grain."""
 FINER = 0.15
 """Part of the light's unevenness in air that counts as noise at least: the modes do not describe the rest of it, and
 fitted to that as if it were known they run away where there is no air (measured by benchmarks/air_light.py)."""
@@ -91,6 +95,8 @@ class Light:
             even, grain = frames / background.factor(), noise.grain_level
             air = air if options.air else find_air(even) | air  # without steep light more of it is seen to be quiet
             noise = NoiseModel.of_frames(even, air)
+            if noise.grain_level > STEADY * grain > 0:  # it is grain, of which light has taken the lowest frequencies
+                noise = NoiseModel.of_frames(frames, air)
             background = Background.of_air(frames, air, noise)
             if noise.grain_level >= HALVED * grain:  # it is grain, and not steep light
                 break
