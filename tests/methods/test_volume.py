@@ -259,3 +259,17 @@ def test_noise_of_binned_frames_is_that_of_their_means():
     low = (slice(0, 3), slice(0, 3))
     np.testing.assert_allclose(found.power()[0][low].numpy(), power[low].numpy(), rtol=0.3)
     assert float(found.power().mean()) == pytest.approx(float(power.mean()), rel=0.15)
+
+
+@pytest.mark.parametrize(("known", "uneven"), [(True, False), (True, True), (False, False)])
+def test_the_last_round_goes_by_the_frequencies_that_know_the_total(quiet, monkeypatch, known, uneven):
+    """Once, and told of the light; where δ/β was estimated, by all frequencies as before."""
+    seen = list[bool]()
+    monkeypatch.setattr(smooth_fit, "unshrunk", lambda problem, u, light: seen.append(light) or u)
+    monkeypatch.setattr(smooth_fit, "EXPLAINED", math.inf)
+    options = SmoothVolume(QUICK, coarser=(2,), rounds=2, iterations=1)
+    task = Task(quiet[[0, 2, 4, 6]], RATIO)
+    fit = SmoothStage(options).fit(task, SmoothStage(options).start(task, None))
+    fit.plan = replace(fit.plan, ratio_known=known, uneven=uneven)
+    fit.run(lambda record: None)
+    assert seen == ([uneven] if known else [])

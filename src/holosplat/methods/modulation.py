@@ -174,9 +174,9 @@ def unshrunk(problem: VolumeProblem, u: Tensor, uneven: bool = False) -> Tensor:
     """u with the `modulations` that the frequencies ask for which know its total best (`best`).
 
     A prior makes matter in noise too faint and its edges wrong. Least squares of all frequencies (`modulated`) then
-    answer to the edges, and miss the total. uneven: whether the light is; the narrowest range,
-    where light and matter look alike, is left out then. Where the misfit of its range is more than `RISE` times what it
-    was, all frequencies are taken.
+    answer to the edges, and miss the total. uneven: whether the light is; the narrowest range, where light and matter
+    look alike, is left out then. Where the misfit of its range is more than `RISE` times what it was, all frequencies
+    are taken.
     """
     ranges = Ranges(problem)
     told = best(ranges.by_range(u, ranges.limits[1:] if uneven and len(ranges.limits) > 1 else ranges.limits))
