@@ -77,6 +77,20 @@ def test_matter_that_a_volume_lacks_in_all_frames_does_not_pass_for_light():
     assert float(wrong.mean()) > 0.3 * np.log(0.97)
 
 
+@pytest.mark.parametrize("explained", [1.0, 0.6])
+def test_faint_matter_that_passes_for_air_is_not_light(explained: float):
+    """A body around the axis that absorbs less than a frame's noise: many frames have it surely in common."""
+    y, x = np.mgrid[-15:16, -23.5:24]
+    thickness = 0.004 * np.sqrt(np.clip(1 - (x / 20) ** 2 - (y / 13) ** 2, 0, 1))
+    draw, shape = np.random.default_rng(5), (60, *SHAPE)
+    body = torch.from_numpy(np.broadcast_to(np.exp(-thickness), shape).copy())
+    measured = body * torch.from_numpy(1 + NOISE * draw.standard_normal(shape))
+    air, quiet = torch.ones(shape, dtype=torch.bool), noise(60)
+    assert shows_still_light(measured, air, quiet)
+    assert still_light(measured, body**explained, air, quiet) is None
+    assert still_light(measured, torch.ones(shape).double(), air, quiet) is not None  # with no matter it were light
+
+
 def test_smooth_mean_light_is_that_of_its_modes():
     rows = torch.cos(torch.pi * (torch.arange(SHAPE[0]).double() + 0.5) / SHAPE[0])
     light = (0.1 * rows).exp()[:, None].expand(SHAPE)

@@ -11,12 +11,14 @@ from torch.nn.functional import pad
 
 from ..matter import DeltaBeta
 from ..model import Instrument, LightField
+from ..optics.background import Light
 from ..optics.noise_model import NoiseModel
 from ..optics.retrieval.spectra import Raster, response, squared_frequency
 from ..optics.sampling import fringe_sampling
 from ..scan import Scan
 from ..units import wavelength, wavenumber
 from ..volume import LineIntegrals
+from .light_apart import LightApart
 
 DARKEST = 1e-3
 """Least intensity under a root, whose slope would have no bound."""
@@ -47,7 +49,8 @@ class WhitenedFrames:
 
     train: the frames; material: δ > 0 and β of an occupancy of one; noise: their noise; light: a factor of each frame,
     None for even light; oversample: wave samples a pixel (0: as the first fringe needs); beyond: rows above and
-    below the frames in which there may be matter.
+    below the frames in which there may be matter; doubt: uneven light that the frames were divided by, of which what is
+    not known is then an unknown of each frame (`LightApart`): P with it in the `noise` is only its mean.
     """
 
     def __init__(
@@ -59,6 +62,8 @@ class WhitenedFrames:
         backend: str = "cpu",
         oversample: int = 0,
         beyond: int = 0,
+        *,
+        doubt: Light | None = None,
     ) -> None:
         exposures = train.exposures
         self.train, self.material, self.beyond = train, material, beyond
@@ -73,6 +78,10 @@ class WhitenedFrames:
         error = model_error(frames, power)
         self.power = (0.25 * (power + error + FAINTEST)).float()
         """P [V, H, W//2 + 1], of amplitudes."""
+        self._own, self._apart = self.power, None
+        if doubt is not None and doubt.background is not None:
+            self._own = (0.25 * (doubt.noise.power() + error + FAINTEST)).float()
+            self._apart = LightApart(self._amplitudes, doubt.background.covariances, self._over_noise)
         self._sharp = self._sharpening()
 
     @property
@@ -130,8 +139,13 @@ class WhitenedFrames:
         return Misfit(0.5 * float((difference.detach().double() * weighted).sum()), gradient)
 
     def whitened(self, images: Tensor) -> Tensor:
-        """Images [V, H, W] with their spectra over P."""
-        return torch.fft.irfft2(torch.fft.rfft2(images) / self.power, s=self.shape)
+        """Images [V, H, W] over the covariance of the amplitudes' errors: their spectra over P, and with doubtful light
+        what it does not explain."""
+        weighted = self._over_noise(images)
+        return weighted if self._apart is None else self._apart(weighted)
+
+    def _over_noise(self, images: Tensor) -> Tensor:
+        return torch.fft.irfft2(torch.fft.rfft2(images) / self._own, s=self.shape)
 
     @property
     def measured(self) -> Tensor:

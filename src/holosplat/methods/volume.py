@@ -15,7 +15,7 @@ from ..fit.smooth_volume import ContinuousPrior
 from ..geometry import Grid
 from ..matter import Matter
 from ..optics.retrieval.spectra import contrast_level
-from ..ranges import ranged
+from ..ranges import Positive, ranged
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
 from .assumed import assumed_material
@@ -53,9 +53,12 @@ class SmoothVolume:
     """What is expected of continuous matter."""
     coarser: tuple[int, ...] = (4, 2)
     """Edges of the larger voxels [pixels] on which the fit is begun: low frequencies are found there soonest."""
+    faint: Positive = 0.3
+    """Level of the even matter with which the fit begins on the largest voxels, as a share of the start's. What a start
+    takes of noise and light for matter would stay (benchmarks/beginnings.py); of far less the prior leaves nothing."""
     loose: float = 10.0
-    """How many times too high the matter's level is taken in a first round, on the largest voxels. A start in noise has
-    too little matter, and a prior for so low a level wipes it out; on large voxels frames hardly need a prior."""
+    """How many times that is the level of the prior in the first round. One for matter so faint would wipe it out; on
+    large voxels frames hardly need a prior."""
     rounds: int = 3
     """How often a fit is followed by the modulations that undo what the prior takes."""
     iterations: int = 20
@@ -105,9 +108,9 @@ class SmoothStage:
         scan = _beside(task, start).binned(factor)
         if rows_of(start.grid, scan.views):
             noise = noise.at_least(LEFT * contrast_level(torch.from_numpy(scan.frames)))
-        how = (options.prior, options.coarser, options.rounds, options.iterations, options.loose, backend)
-        told = task.prior.fixes_ratio, task.uneven is not None
-        return SmoothFit(SmoothPlan(scan, start, noise, *told, *how))
+        light = task.uneven and task.uneven.part(torch.arange(len(scan)), factor)
+        how = (options.prior, options.coarser, options.rounds, options.iterations, options.faint, options.loose)
+        return SmoothFit(SmoothPlan(scan, start, noise, task.prior.fixes_ratio, light, *how, backend))
 
 
 def _beside(task: Task, start: VoxelGrid) -> Scan:

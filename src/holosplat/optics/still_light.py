@@ -17,6 +17,9 @@ DARKEST = 0.01
 """Relative intensity below which a pixel counts as so bright: its logarithm has no meaning."""
 SURE = 6.0
 """Standard errors by which frames must have something in common, in pixels in which they show air, or it is chance."""
+MATTER = 0.5
+"""Part of what air has in common that a volume may explain: light has it from no matter, whereas faint matter that
+single frames hide in their noise passes for air, and of many frames surely has something in common."""
 NOISELESS = 0.02
 """Frames count as having at least so much noise, as a share of their contrast: what less of it leaves is not light."""
 
@@ -59,14 +62,15 @@ def shows_still_light(frames: Tensor, air: Tensor, noise: NoiseModel) -> bool:
 def still_light(frames: Tensor, predicted: Tensor, air: Tensor, noise: NoiseModel) -> Tensor | None:
     """The factor [H, W], float64, that frames [V, H, W] have in common beside those `predicted`; None without one.
 
-    Where frames show air [V, H, W] bool they say it themselves, elsewhere what is left of the prediction does, trusted
-    by how little that is thereabouts. The light is expected to be as strong everywhere as air shows it (a Wiener filter
-    of single pixels): matter that the prediction lacks in all frames, in the same pixels, cannot pass for more.
+    There is none, either, where the prediction explains what air has in common (`MATTER`): that is matter. Where frames
+    show air [V, H, W] bool they say it themselves, elsewhere what is left of the prediction does, trusted by how little
+    that is thereabouts. The light is expected to be as strong everywhere as air shows it (a Wiener filter of single
+    pixels): matter that the prediction lacks in all frames, in the same pixels, cannot pass for more.
     """
     bright = (frames > DARKEST) & (predicted > DARKEST)
     left, seen = _logarithms(frames) - _logarithms(predicted), air & bright
     shown = Common.of(left, seen, noise)
-    if not _worth(shown, frames):
+    if not _worth(shown, frames) or shown.power < (1 - MATTER) * Common.of(_logarithms(frames), seen).power:
         return None
     beside = bright & ~air
     alone = max(shown.own, FAINTEST**2)
