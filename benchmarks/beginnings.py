@@ -29,6 +29,7 @@ from holosplat.bench.case import Case, load_case
 from holosplat.methods import smooth_fit
 from holosplat.methods.method import Task, begun, run_quietly
 from holosplat.methods.still import prepared
+from holosplat.methods.volume import SmoothStage
 
 SCENES: tuple[tuple[str, int, float | None], ...] = (
     ("soft12", 11, None),
@@ -62,7 +63,7 @@ def ended(case: Case, clearly: float) -> Ended:
     scan, truth = case.scan(), case.truth()
     method = hs.methods.SmoothVolume()
     task = prepared(Task(scan[np.flatnonzero(~scan.is_test)], case.prior, matter="continuous"), method)
-    (stage,) = method.stages()
+    stage = SmoothStage(method)
     start, task = begun(stage, task, None)
     fit = stage.fit(task, start)
     asked: list[float] = []
