@@ -137,6 +137,31 @@ def test_auto_takes_bodies_for_levels_and_a_volume_for_a_continuum(soft, sharp):
     assert settled(auto, Task(sharp, RATIO)).method.kind == "bodies"
 
 
+@pytest.mark.parametrize(
+    ("shares", "noise", "wanted"),
+    [
+        ((0.18, 0.18), 0.0, "continuous"),
+        ((0.179, 0.183), 0.0, "continuous"),
+        ((0.15, 0.18), 0.0, "levels"),
+        ((0.18, 0.1), 0.0, "continuous"),
+        ((0.15, 0.18), 0.2, "continuous"),
+        ((0.71, 0.738), 0.66, "levels"),
+    ],
+)
+def test_a_trial_decides_where_one_method_is_better_beyond_noise(soft, monkeypatch, shares, noise, wanted):
+    """Shares that Gaussians and a volume leave in views set aside; else what a known ratio leaves open stays so."""
+    auto, task = Auto(), Task(soft, RATIO)
+    module = import_module("holosplat.methods.auto")
+    monkeypatch.setattr(module, "solve_stages", lambda method, trial: trial.matter)
+    share = dict(zip(("levels", "continuous"), shares))
+    monkeypatch.setattr(MissingMatter, "share", lambda judge, matter: share[matter])
+    monkeypatch.setattr(MissingMatter, "of", lambda judge, images: noise**2 if images.dtype == torch.float64 else 1.0)
+    method, decision = auto.chosen(task, Decision("continuous", "open", sure=False))
+    assert decision.matter == wanted
+    assert (method is auto.volume) == (wanted == "continuous")
+    assert ("decides nothing" in decision.why) == (wanted == "continuous" and shares[0] <= shares[1])
+
+
 def test_occupancies_are_bounded_where_matter_has_levels_only(sharp):
     known = MaterialPrior.known(MATERIAL)
     levels, continuous = (Task(sharp, known, matter=matter) for matter in ("levels", "continuous"))

@@ -167,3 +167,12 @@ def test_boxes_are_joined():
     assert int(air.sum()) == 3 * (20 + 40)
     with pytest.raises(InputError, match="at least one"):
         air_in_boxes([], 1, (5, 5))
+
+
+def test_draws_have_the_power_of_the_noise():
+    shape, smooth = (9, 14), torch.linspace(1.0, 0.0, 8, dtype=torch.float64) ** 2
+    known = NoiseModel(torch.full((400,), 0.1, dtype=torch.float64), 0.04 * smooth.expand(400, 9, 8), 14)
+    spectra = torch.fft.rfft2(known.drawn(3), norm="ortho").abs().square().mean(dim=0)
+    np.testing.assert_allclose(spectra.mean(dim=0).numpy(), known.power()[0].mean(dim=0).numpy(), rtol=0.1)
+    assert known.drawn(3).shape == (400, *shape)
+    assert torch.equal(known.drawn(3), known.drawn(3))

@@ -23,6 +23,8 @@ from .surfaces import BodiesStage, SurfaceStage
 from .volume import SmoothStage, SmoothVolume
 
 TRIAL = "trial of methods"
+CLEARLY = 0.95
+"""Part of what one method leaves unexplained beyond noise that another must stay below, or a trial decides nothing."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,7 @@ class Auto:
     """Matter with levels: Gaussians, and closed surfaces where there are bodies. Continuous matter: a smooth volume.
 
     Where neither frames nor knowledge say which it is, both are tried on coarse frames without some of the views, and
-    what foretells these better is taken.
+    what clearly foretells these better, beyond their noise, is taken.
     """
 
     kind: ClassVar[str] = "auto"
@@ -79,9 +81,14 @@ class Auto:
             task.on_progress(f"{TRIAL}: {method.kind}", 0.0)
             trial = replace(task, scan=seen, lit=self.trials.light(task.scan, task.lit), matter=matter)
             shares[matter] = judge.share(solve_stages(method, trial))
-        best = min(shares, key=lambda matter: shares[matter])
+        noise = judge.of(self.trials.noise_aside(task.scan, task.noise).drawn(task.seed)) / max(judge.whole, 1e-60)
         left = " and ".join(f"{candidates[m].kind} leave {100 * share:.2g} %" for m, share in shares.items())
-        return Decision(best, f"{decision.why}; in a trial, {left} of the matter in views set aside unexplained")
+        said = f"{decision.why}; in a trial, {left} of the matter in views set aside unexplained"
+        beyond: dict[MatterKind, float] = {m: max(share**2 - noise, 0.0) for m, share in shares.items()}
+        best = min(beyond, key=lambda matter: beyond[matter])
+        if best != decision.matter and beyond[best] >= CLEARLY**2 * beyond[decision.matter]:
+            return replace(decision, why=f"{said}, noise {100 * noise**0.5:.2g} %, which decides nothing")
+        return Decision(best, said)
 
     def on_backend(self, backend: Backend) -> Auto:
         """The same method whose Gaussians are computed by `backend`."""

@@ -14,6 +14,7 @@ from ..checks import at_least
 from ..matter import DeltaBeta
 from ..model import Instrument, Model
 from ..optics.background import Light
+from ..optics.noise_model import NoiseModel
 from ..optics.sampling import fringe_sampling
 from ..ranges import ranged
 from ..scan import Exposures, Scan
@@ -46,6 +47,10 @@ class CrossValidation:
         """The light of the frames of `scan` that are left, by that of all."""
         left = torch.from_numpy(np.flatnonzero(~self._aside(len(scan))))
         return None if light is None else light.part(left, self._factor(scan))
+
+    def noise_aside(self, scan: Scan, noise: NoiseModel) -> NoiseModel:
+        """The noise of the binned frames of `scan` that are set aside, by that of all."""
+        return noise.binned(self._factor(scan))[np.flatnonzero(self._aside(len(scan)))]
 
     def _aside(self, count: int) -> np.ndarray:
         """Which of `count` frames are set aside, [V] bool."""

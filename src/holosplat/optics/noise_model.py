@@ -137,6 +137,13 @@ class NoiseModel:
         """Power [V, H, W//2 + 1] of all noise at the frequencies of `rfft2`, float64."""
         return self.white.square()[:, None, None] + self.grain
 
+    def drawn(self, seed: int) -> Tensor:
+        """One draw of the noise [V, H, W], float64."""
+        draw = torch.Generator().manual_seed(seed)
+        white = torch.randn(len(self), *self.shape, generator=draw, dtype=torch.float64)
+        spectra = torch.fft.rfft2(white, norm="ortho") * self.power().sqrt()
+        return torch.fft.irfft2(spectra, s=self.shape, norm="ortho")
+
     def power_on(self, shape: tuple[int, int], oversample: int = 1) -> Tensor:
         """The same [V, H', W'//2 + 1] at the frequencies of a raster of `shape` with pixels divided by `oversample`.
 
