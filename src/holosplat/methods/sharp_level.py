@@ -20,14 +20,15 @@ def material_of_levels(task: Task, backend: Backend = "cpu", options: MaterialEs
     Tomography takes noise off its volume, and with it a tenth to a third of the level in noise of a fifth of the
     contrast, and a third to a half in noise of half of it. The likeliest volume under noise and prior
     (`SmoothVolume`, of at most `EDGE`³ voxels) keeps it, for its prior hardly shrinks what is large
-    (docs/data/level.csv). Where that volume is empty, or its level lower, the material is that of tomography: larger
-    voxels than thin shells dilute them.
+    (docs/data/level.csv); begun with even matter, it would give small balls in noise as strong as the contrast half of
+    it. Where that volume is empty, or its level lower, the material is that of tomography: larger voxels than thin
+    shells dilute them.
     """
     material = assumed_material(task.scan, task.prior, task.on_progress, backend, options)
     if not (task.bounded and isinstance(task.prior, KnownRatio)):
         return material
     task.on_progress(STAGE, 0.0)
-    stage = SmoothStage(SmoothVolume(estimate=options, max_voxels=EDGE**3, rounds=1))
+    stage = SmoothStage(SmoothVolume(estimate=options, max_voxels=EDGE**3, rounds=1, faint=0.0))
     fit = stage.fit(task, stage.start(task, None))
     fit.run(lambda record: task.on_progress(STAGE, fit.share))
     found = fit.voxels

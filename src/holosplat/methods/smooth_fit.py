@@ -90,7 +90,8 @@ class SmoothPlan:
         factors = [factor for factor in self.coarser if min(self.scan.views.shape) >= LEAST_EDGE * factor]
         coarse = [Leg(factor, self.iterations) for factor in factors for _ in range(self.rounds)]
         if coarse:
-            coarse = [Leg(factors[0], self.iterations, "from even", self.loose), *coarse]
+            first = Leg(factors[0], self.iterations, "from even" if self.faint else "round", self.loose)
+            coarse = [first, *coarse]
         half = max(1, self.iterations // 2)
         trials = [Leg(1, half, "from coarse"), Leg(1, half, "from start")] if factors else []
         return (*coarse, *trials, *(Leg(1, self.iterations) for _ in range(self.rounds)))
@@ -242,7 +243,8 @@ class SmoothFit:
             self._rival = (u, descent.value)
         elif leg.kind == "from start" and self._rival is not None:
             other, value = self._rival
-            u, self._rival = (u if CLEARLY * descent.value < value else other), None
+            clearly = CLEARLY if self.plan.faint else 1.0
+            u, self._rival = (u if clearly * descent.value < value else other), None
         found = self._volume.with_parameters({"values": u[None]})
         if not self._weakened(found, unexplained):
             self._volume, self._leg = found, self._leg + 1

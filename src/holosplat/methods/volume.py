@@ -15,7 +15,7 @@ from ..fit.smooth_volume import ContinuousPrior
 from ..geometry import Grid
 from ..matter import Matter
 from ..optics.retrieval.spectra import contrast_level
-from ..ranges import Positive, ranged
+from ..ranges import Weight, ranged
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
 from .assumed import assumed_material
@@ -53,9 +53,10 @@ class SmoothVolume:
     """What is expected of continuous matter."""
     coarser: tuple[int, ...] = (4, 2)
     """Edges of the larger voxels [pixels] on which the fit is begun: low frequencies are found there soonest."""
-    faint: Positive = 0.3
-    """Level of the even matter with which the fit begins on the largest voxels, as a share of the start's. What a start
-    takes of noise and light for matter would stay (benchmarks/beginnings.py); of far less the prior leaves nothing."""
+    faint: Weight = 0.3
+    """Level of the even matter with which the fit begins on the largest voxels, as a share of the start's; 0: with the
+    start. What a start takes of noise and light for matter would stay (benchmarks/beginnings.py); of far less the prior
+    leaves nothing."""
     loose: float = 10.0
     """How many times that is the level of the prior in the first round. One for matter so faint would wipe it out; on
     large voxels frames hardly need a prior."""
