@@ -39,7 +39,7 @@ fault, and the volume before stands."""
 CLEARLY = 2.0
 """So many times likelier must the start be on voxels of a pixel to take the place of what began with even matter. A
 start follows noise and light, which the objective does not punish enough: in scenes in which it ends worse it is up to
-1.2 times likelier, in those in which it ends better 2 to 47 times (benchmarks/beginnings.py)."""
+1.2 times likelier, in those in which it ends better 4.7 to 56 times; at 2 both end alike (docs/data/beginnings.csv)."""
 LEAST_EDGE = 12
 """Pixels along a frame's shorter side that larger ones must leave, or the fit is not begun on them."""
 
