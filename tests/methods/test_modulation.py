@@ -87,6 +87,18 @@ def test_a_range_that_does_no_good_gives_way_to_all_frequencies(monkeypatch):
     assert torch.equal(unshrunk(p, less), modulated(p, less))
 
 
+def test_a_total_does_not_ruin_what_other_frequencies_say(monkeypatch):
+    """What its narrow range likes, and what is far from the frames at all others."""
+    p, less = noisy(0), 0.8 * matter()
+    ranges, row = Ranges(p), torch.arange(matter().shape[1])
+    ruined = matter() * (1 + 0.3 * (-1.0) ** row[:, None])
+    narrow = ranges.limits[0]
+    assert ranges.misfit(ruined, narrow) < ranges.misfit(less, narrow)
+    assert ranges.misfit(ruined, 1.0) > 3 * ranges.misfit(less, 1.0)
+    monkeypatch.setattr(Ranges, "by_range", lambda self, u, limits: [Told(1.0, 1.0, ruined, narrow)])
+    assert torch.equal(unshrunk(p, less), modulated(p, less))
+
+
 def test_ranges_widen_by_octaves_to_all_frequencies():
     ranges = Ranges(problem())
     assert ranges.limits[-1] == 1.0

@@ -40,6 +40,11 @@ CLEARLY = 2.0
 """So many times likelier must the start be on voxels of a pixel to take the place of what began with even matter. A
 start follows noise and light, which the objective does not punish enough: in scenes in which it ends worse it is up to
 1.2 times likelier, in those in which it ends better 4.7 to 56 times; at 2 both end alike (docs/data/beginnings.csv)."""
+GROWING, MOST = 1.1, 8
+"""The last round is done again while it finds more than so many times the matter before it, so often at most: a prior
+too strong for faint matter lets go of it from round to round."""
+NOTHING = 1e-3
+"""Share of the start's level below which a volume is taken for an empty one."""
 LEAST_EDGE = 12
 """Pixels along a frame's shorter side that larger ones must leave, or the fit is not begun on them."""
 
@@ -117,7 +122,7 @@ class SmoothFit:
         self._legs, self._leg = plan.legs(), 0
         self._volume = plan.begun
         self._rival: tuple[Tensor, float] | None = None
-        self._level = 0.0
+        self._level, self._more = 0.0, 0
         self._strength, self._settled, self._kept = 1.0, False, False
         self._stronger: tuple[VoxelGrid, float] | None = None
         self._descent: Descent | None = None
@@ -230,13 +235,15 @@ class SmoothFit:
         halved where an empty volume is likelier still, and where voxels of a pixel do not explain the frames to within
         their noise (Morozov's discrepancy principle, 1966), as long as that helps.
         """
-        problem, u = descent.problem, descent.u
+        problem, u = descent.problem, self._or_nothing(descent.u)
         assert isinstance(problem, VolumeProblem)
         self._descent = None
         if self._kept and self._leg == len(self._legs) - 1:
             empty = torch.zeros_like(u)
             u = empty if problem(empty)[0] <= descent.value else u
-        unexplained = 2 * problem.frames(problem.lines(u)).value / problem.frames.count
+        unexplained = _unexplained(problem, u)
+        if self._grown(problem, u):
+            return
         if leg.kind in ("round", "from even") and bool((u > 0).any()):
             u = self._mended(problem, u)
         elif leg.kind == "from coarse" and unexplained > 1:
@@ -246,8 +253,23 @@ class SmoothFit:
             clearly = CLEARLY if self.plan.faint else 1.0
             u, self._rival = (u if clearly * descent.value < value else other), None
         found = self._volume.with_parameters({"values": u[None]})
-        if not self._weakened(found, unexplained):
+        if not self._weakened(found, unexplained, problem):
             self._volume, self._leg = found, self._leg + 1
+
+    def _or_nothing(self, u: Tensor) -> Tensor:
+        """u, or an empty volume for one that is next to nothing beside the start."""
+        faint = bool((u > 0).any()) and plateau(u) < NOTHING * plateau(self.plan.begun.values[0])
+        return torch.zeros_like(u) if faint else u
+
+    def _grown(self, problem: VolumeProblem, u: Tensor) -> bool:
+        """Whether the last round has found so much more matter that it is done once more, from there."""
+        if self._leg < len(self._legs) - 1 or self._more == MOST or not bool((u > 0).any()):
+            return False
+        more = modulated(problem, u)
+        if float(more.sum()) <= GROWING * float(self._volume.values.sum()):
+            return False
+        self._volume, self._more = self._volume.with_parameters({"values": more[None]}), self._more + 1
+        return True
 
     def _mended(self, problem: VolumeProblem, u: Tensor) -> Tensor:
         """u with what the prior has taken: the edges' way between rounds, the total's at the end. Low frequencies see
@@ -256,8 +278,9 @@ class SmoothFit:
         told = last and self.plan.ratio_known
         return unshrunk(problem, u, self.plan.light is not None) if told else modulated(problem, u)
 
-    def _weakened(self, found: VoxelGrid, unexplained: float) -> bool:
-        """Whether the fit goes elsewhere than on: back to its start with half the prior, or back to a stronger one."""
+    def _weakened(self, found: VoxelGrid, unexplained: float, problem: VolumeProblem) -> bool:
+        """Whether the fit goes elsewhere than on: back to its start with half the prior, or back to a stronger one; not
+        to one that explained next to nothing, as a nearly empty volume does."""
         if not bool((found.values > 0).any()):
             if unexplained <= EMPTY or self._strength <= WEAKEST:
                 return False
@@ -273,7 +296,8 @@ class SmoothFit:
             return True
         self._settled = unexplained <= EXPLAINED or self._strength <= WEAKEST
         if not self._settled:
-            self._stronger = (found, unexplained)
+            empty = _unexplained(problem, torch.zeros_like(found.values[0]))
+            self._stronger = (found, unexplained) if unexplained - 1 < WORTH * (empty - 1) else None
             self._again(self._strength / 2)
         return not self._settled
 
@@ -303,6 +327,7 @@ class SmoothFit:
             "stronger": self._stronger and [self._stronger[0].state(), self._stronger[1]],
             "volume": self._volume.state(),
             "level": self._level,
+            "more": self._more,
             "rival": None if self._rival is None else list(self._rival),
             "descent": None if self._descent is None else self._descent.state_dict(),
         }
@@ -311,6 +336,7 @@ class SmoothFit:
         """Go back to a saved state."""
         self.step, self.seconds = int(state["step"]), float(state["seconds"])
         self._leg, self._level, self._strength = int(state["leg"]), float(state["level"]), float(state["strength"])
+        self._more = int(state["more"])
         self._settled, self._kept, before = bool(state["settled"]), bool(state["kept"]), state["stronger"]
         self._stronger = before and (VoxelGrid.from_state(before[0]), float(before[1]))
         self._volume = VoxelGrid.from_state(state["volume"])
@@ -319,3 +345,8 @@ class SmoothFit:
         if state["descent"] is not None:
             factor = self._legs[self._leg].factor
             self._descent = Descent.again(self._problem(self._frames_of(factor), factor), state["descent"])
+
+
+def _unexplained(problem: VolumeProblem, u: Tensor) -> float:
+    """χ² a pixel of a volume."""
+    return 2 * problem.frames(problem.lines(u)).value / problem.frames.count

@@ -107,9 +107,10 @@ class SmoothStage:
         options, factor = self.options, binning(task.scan, self.options.max_voxels)
         noise, backend = task.noise.binned(factor), options.volume.backend
         scan = _beside(task, start).binned(factor)
-        if rows_of(start.grid, scan.views):
-            noise = noise.at_least(LEFT * contrast_level(torch.from_numpy(scan.frames)))
         light = task.uneven and task.uneven.part(torch.arange(len(scan)), factor)
+        if rows_of(start.grid, scan.views):
+            least = LEFT * contrast_level(torch.from_numpy(scan.frames))
+            noise, light = noise.at_least(least), light and replace(light, noise=light.noise.at_least(least))
         how = (options.prior, options.coarser, options.rounds, options.iterations, options.faint, options.loose)
         return SmoothFit(SmoothPlan(scan, start, noise, task.prior.fixes_ratio, light, *how, backend))
 
