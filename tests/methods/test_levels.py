@@ -18,6 +18,7 @@ from holosplat.methods import Auto, Gaussians, Task, levels, settled
 from holosplat.methods.cross_validation import CrossValidation, MissingMatter
 from holosplat.methods.levels import Decision, LevelTest, decide_matter, flattened
 from holosplat.optics.background import Light, LightOptions
+from holosplat.optics.noise_model import NoiseModel
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
@@ -160,6 +161,19 @@ def test_a_trial_decides_where_one_method_is_better_beyond_noise(soft, monkeypat
     assert decision.matter == wanted
     assert (method is auto.volume) == (wanted == "continuous")
     assert ("decides nothing" in decision.why) == (wanted == "continuous" and shares[0] <= shares[1])
+
+
+def test_views_set_aside_are_judged_by_their_own_noise(soft):
+    """Binned as they are, of a scan in which each view has noise of its own."""
+    white = torch.arange(1.0, len(soft) + 1).double()
+    noise = NoiseModel(white, torch.zeros(len(soft), soft.views.shape[0], soft.views.shape[1] // 2 + 1).double())
+    halved = CrossValidation(width=max(soft.views.shape) // 2)
+    left, aside = halved.split(soft)
+    exposures = soft.exposures.views.rotations
+    of = [int(np.abs(exposures - turn).sum((1, 2)).argmin()) for turn in aside.views.rotations]
+    assert len(left) + len(of) == len(soft)
+    factor = soft.views.shape[0] // aside.views.shape[0]
+    np.testing.assert_allclose(halved.noise_aside(soft, noise).white, white[of] / factor)
 
 
 def test_occupancies_are_bounded_where_matter_has_levels_only(sharp):

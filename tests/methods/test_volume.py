@@ -321,6 +321,7 @@ def test_matter_beyond_the_frames_is_noise_in_uneven_light_too(quiet):
     begun = VoxelGrid(torch.ones(1, *taller.shape), taller, Matter.one(*MATERIAL))
     fit = SmoothStage(SmoothVolume()).fit(task, begun)
     assert fit.plan.light is not None
+    assert fit.plan.frames(1)._apart is not None  # what is not known of the light is an unknown of the fit
     least = 0.09 * float(frames.sub(1).double().square().mean().sqrt())
     assert float(fit.plan.light.noise.white.min()) > least
     assert float(fit.plan.noise.white.min()) > least
