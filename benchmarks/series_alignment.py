@@ -60,6 +60,8 @@ def errors(seed: int) -> Misalignment:
 CASES = {
     "series, 3 beams": Experiment("xmpi_3beam", errors(7), volumes=True),
     "series, 3 beams, other errors": Experiment("xmpi_3beam", errors(8), volumes=True),
+    "series, 3 beams, third errors": Experiment("xmpi_3beam", errors(9), volumes=True),
+    "series, 3 beams, fourth errors": Experiment("xmpi_3beam", errors(10), volumes=True),
     "series, 3 beams, 2000 photons": Experiment("xmpi_3beam", errors(7), 2000.0),
     "series, 3 beams, 2000 photons, other errors": Experiment("xmpi_3beam", errors(8), 2000.0),
     "series, 3 beams, cells pass the edges": Experiment("xmpi_3beam", errors(7), travel=36e-6),

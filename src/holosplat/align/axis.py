@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from ..checks import at_least, in_range, require
-from ..geometry import Views
+from ..geometry import Views, rotation_y
 from ..optics.background import LightOptions
 from ..progress import Advance
 from ..ranges import ranged
@@ -17,6 +17,7 @@ from ..scan import Exposures, Scan
 from .axis_search import Search
 from .combine import Estimate
 from .consistency import Sinograms
+from .half_turn import HalfTurn, ends_of, half_turn, may_be_half
 from .shadows import EVEN_OR_NOT, shadows
 
 STEP = 0.25
@@ -59,12 +60,14 @@ class Axis:
     offset: from where the scan said it is, at the middle of the object frame, along the columns [pixels]
     lean: of the axis in the image, columns a row; positive: further right further down; None: too few rows
     column: of the axis in the frames' middle row, 0 the middle of the first one; of the first view
+    turn: where a half turn ends, if not where the scan says
     """
 
     offset: Estimate
     lean: Estimate | None
     column: float
     rows: int
+    turn: HalfTurn | None = None
 
     @cached_property
     def leans(self) -> bool:
@@ -73,9 +76,13 @@ class Axis:
         return lean is not None and abs(lean.value) > max(SURE * lean.error, LEAST_LEAN_PX / self.rows)
 
     def applied(self, exposures: Exposures) -> Exposures:
-        """The exposures with the axis where it is: detector shifts, and a roll `ω_z = -atan(lean)` where it leans."""
+        """The exposures with the axis where it is: detector shifts, a roll `ω_z = -atan(lean)` where it leans, and the
+        angles of a half turn that ends elsewhere."""
         views, p = exposures.views, exposures.views.pixel_size
         rotations = views.rotations
+        if self.turn is not None:
+            angles = np.unwrap(_angles(views))
+            rotations = rotations @ rotation_y(np.rad2deg(self.turn.spread(angles) - angles))
         if self.leans and self.lean is not None:
             angle = -np.arctan(self.lean.value)
             c, s = np.cos(angle), np.sin(angle)
@@ -86,7 +93,8 @@ class Axis:
     def lines(self) -> list[str]:
         """What was found, in words."""
         moved = f"{self.offset.value:+.3f} from the scan's"
-        said = [f"axis at column {self.column:.3f} ± {self.offset.error:.3f} ({moved})"]
+        said = [] if self.turn is None else [self.turn.line()]
+        said.append(f"axis at column {self.column:.3f} ± {self.offset.error:.3f} ({moved})")
         if self.lean is None:
             said.append("lean of the axis: the frames have too few rows to tell")
         else:
@@ -114,6 +122,20 @@ def find_axis(
     `FEWEST_VIEWS`, and where no place within the field is better than those beside it.
     """
     sinograms = sinograms_of(scan, options, ratio, light)
+    found = _searched(scan, sinograms, options, on_progress)
+    angles = np.unwrap(_angles(scan.views))
+    if not may_be_half(angles):
+        return found
+    ends = _banded(scan[ends_of(len(scan))], options, ratio, light)
+    turn = half_turn(angles, ends, found.offset.value)
+    if turn is None:
+        return found
+    turned = replace(sinograms, angles=turn.spread(np.unwrap(sinograms.angles)))
+    return replace(_searched(scan, turned, options, on_progress), turn=turn)
+
+
+def _searched(scan: Scan, sinograms: Sinograms, options: AxisOptions, on_progress: Advance) -> Axis:
+    """The axis of sinograms of `scan`."""
     width, columns = scan.views.shape[1], sinograms.values.shape[-1]
     factor, pitch = max(1, columns // 64), scan.views.shape[1] / columns
     first = Search.of(
@@ -140,14 +162,20 @@ def sinograms_of(scan: Scan, options: AxisOptions, ratio: float | None, light: L
         len(chosen) >= FEWEST_VIEWS,
         f"an axis needs {FEWEST_VIEWS} views at least, but there are {len(chosen)}; align without --axis-only.",
     )
-    scan, (h, w), p = scan[chosen], views.shape, views.pixel_size
+    return _banded(scan[chosen], options, ratio, light)
+
+
+def _banded(scan: Scan, options: AxisOptions, ratio: float | None, light: LightOptions) -> Sinograms:
+    """Sinograms of all frames of `scan`."""
+    views = scan.views
+    (h, w), p = views.shape, views.pixel_size
     images = shadows(scan, ratio, light).numpy()
     edges = np.linspace(0, h, min(options.bands, h) + 1).round().astype(int)
     values = np.stack([images[:, a:b].mean(1) for a, b in pairwise(edges)], axis=1)
     heights = 0.5 * (edges[:-1] + edges[1:]) - h / 2 + views.shifts[0, 1] / p
-    sideways = scan.views.shifts[:, :1] / p
+    sideways = views.shifts[:, :1] / p
     positions = np.arange(w) + 0.5 - w / 2 + (sideways[:1] if np.ptp(sideways) < 1e-9 else sideways)
-    return Sinograms(values, _angles(scan.views), positions, heights).binned(max(1, -(-w // options.columns)))
+    return Sinograms(values, _angles(views), positions, heights).binned(max(1, -(-w // options.columns)))
 
 
 def _angles(views: Views) -> np.ndarray:
