@@ -24,6 +24,8 @@ MAGNIFIED = {
 SERIES = {
     "series, 3 beams": "3 beams (`xmpi_3beam`)",
     "series, 3 beams, other errors": "3 beams, other errors",
+    "series, 3 beams, third errors": "3 beams, third errors",
+    "series, 3 beams, fourth errors": "3 beams, fourth errors",
     "series, 3 beams, 2000 photons": "3 beams, 2000 photons a pixel",
     "series, 3 beams, 2000 photons, other errors": "3 beams, 2000 photons a pixel, other errors",
     "series, 3 beams, drift of 1 px": "3 beams, drifting by about 1 px (before the volumes)",
@@ -106,11 +108,15 @@ def series() -> str:
 
 def series_volumes() -> str:
     """Dice of volumes of three times of a series."""
-    cases = {"series, 3 beams": "3 beams", "series, 3 beams, other errors": "3 beams, other errors"}
-    lines = list[list[str]]()
-    for case, called in cases.items():
-        rows = _rows(case, "volume")
-        lines.append([called, *(f"{float(rows[moment]['dice']):.3f}" for moment in ("planned", "aligned", "true"))])
+    draws = {"3 beams": "", "other errors": ", other errors", "third errors": ", third errors"}
+    draws["fourth errors"] = ", fourth errors"
+    lines, moments = list[list[str]](), ("planned", "aligned", "true")
+    for called, more in draws.items():
+        rows = _rows(f"series, 3 beams{more}", "volume")
+        lines.append([called, *(f"{float(rows[m]['dice']):.3f}" if m in rows else "–" for m in moments)])
+    columns = list(zip(*(line[1:] for line in lines)))
+    means = (f"{sum(map(float, column)) / len(column):.3f}" if "–" not in column else "–" for column in columns)
+    lines.append(["mean", *means])
     return markdown(("Dice", "as planned", "`align`", "known geometry"), lines)
 
 
