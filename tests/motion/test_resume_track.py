@@ -42,7 +42,7 @@ class Kept:
 def frequent(monkeypatch):
     """Fits are kept after every step, and each time sees the true bodies at once."""
     monkeypatch.setattr(track, "CHECKPOINT_SECONDS", -1.0)
-    monkeypatch.setattr(track, "sightings", lambda frames, material, options: seen(float(frames.instants[0])))
+    monkeypatch.setattr(track, "sightings", lambda frames, material, options, network: seen(float(frames.instants[0])))
 
 
 def seen(time: float):

@@ -44,6 +44,9 @@ class MotionFlags:
     """Pieces of the paths' splines over the whole time (0: as many as predict held-out frames best)."""
     rounds: int = 4
     """How often bodies are looked for beside those that are known, at most."""
+    learned: bool = True
+    """Bodies of single times are found in what the package's network guesses, where frames do not contradict it and its
+    bodies explain clearly more: red cells in two or three beams."""
     least_volume: float = 30.0
     """Bodies of fewer voxels, of a pixel's edge, are not followed."""
     volume_kept: Weight = 0.006
@@ -71,4 +74,5 @@ class MotionFlags:
             name: replace(fit, objective=replace(fit.objective, bending=self.bending), **known)
             for name, fit in (("stiff", usual.stiff), ("soft", usual.soft), ("half", usual.half))
         }
+        usual = usual if self.learned else replace(usual, learned=None)
         return replace(usual, paths=paths, sightings=found, rounds=self.rounds, intervals=self.intervals, **fits)

@@ -6,16 +6,20 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ..baselines import HolographicTV, holographic_tv
 from ..checks import InputError, in_range
-from ..geometry import Views
+from ..geometry import Grid, Views
+from ..learning.network import Guess
+from ..learning.start import guessed
 from ..matter import DeltaBeta, Matter
 from ..mesh import TriangleMesh
 from ..progress import Progress
 from ..ranges import Pixels, Weight, ranged
 from ..representations import SurfaceMesh, isosurface
 from ..scan import Scan
+from .touching import parted
 
 
 @dataclass(frozen=True)
@@ -62,19 +66,36 @@ class SightingOptions:
 
 
 def sightings(
-    scan: Scan, material: DeltaBeta, options: SightingOptions = SightingOptions(), on_progress: Progress | None = None
+    scan: Scan,
+    material: DeltaBeta,
+    options: SightingOptions = SightingOptions(),
+    on_progress: Progress = lambda stage, part: None,
+    network: Guess | None = None,
 ) -> list[Sighting]:
-    """The bodies of `material` in the frames of `scan`, of one time, the largest first; none where nothing is seen."""
-    values, grid = holographic_tv(scan, material, options.volume, on_progress or (lambda stage, part: None))
+    """The bodies of `material` in the frames of `scan`, of one time, the largest first; none where nothing is seen.
+
+    network: guesses the volume, which is made by total variation without one.
+    """
+    values, grid = occupancy(scan, material, options, on_progress, network)
     pixel = scan.views.finest
     least = options.least_volume * (pixel / grid.voxel_size[0]) ** 3
     try:
-        mesh = isosurface(values.numpy(), grid, options.level, least, options.smoothing)
+        mesh = isosurface(parted(values.numpy(), options.level, least), grid, options.level, least, options.smoothing)
         unit = torch.from_numpy(mesh.vertices / pixel)
         bodies = SurfaceMesh(unit, torch.from_numpy(mesh.faces), pixel, Matter.one(*material)).bodies()
     except InputError:  # nothing reaches the level, or cavities alone do
         return []
     return [Sighting(body, is_cut(body, scan.views, options.edge)) for body in bodies]
+
+
+def occupancy(
+    scan: Scan, material: DeltaBeta, options: SightingOptions, on_progress: Progress, network: Guess | None
+) -> tuple[Tensor, Grid]:
+    """The volume [Z, Y, X] of one time, and its voxels; by `network`, if there is one."""
+    if network is None:
+        return holographic_tv(scan, material, options.volume, on_progress)
+    found = guessed(scan, material, network, on_progress)
+    return found.values, found.grid
 
 
 def is_cut(body: TriangleMesh, views: Views, edge: float = 1.0) -> bool:

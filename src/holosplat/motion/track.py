@@ -13,6 +13,8 @@ import torch
 from ..checks import InputError, as_written, require
 from ..fit.running import Record
 from ..fit.schedule import Schedule
+from ..learning.network import Guess
+from ..learning.start import LearnedStart
 from ..matter import DeltaBeta
 from ..mesh import TriangleMesh
 from ..optics.background import Light
@@ -22,6 +24,7 @@ from ..representations import MovingSurfaces, TimeBasis
 from ..scan import Scan
 from .elastic import Rest
 from .fit import MotionFit, motion_fit
+from .guesses import network_for
 from .halves import halves_of
 from .identities import LinkOptions
 from .journal import Journal, Nowhere, from_sightings, to_sightings
@@ -61,6 +64,9 @@ class TrackOptions:
     """What is known of the bodies' shape at rest, which makes two beams enough; None: nothing."""
     sightings: SightingOptions = field(default_factory=SightingOptions)
     """How bodies are found at single times."""
+    learned: LearnedStart | None = field(default_factory=LearnedStart)
+    """The network that may guess their volumes, where frames do not contradict it and its bodies explain clearly more;
+    None: none."""
     links: LinkOptions = field(default_factory=LinkOptions)
     """Which of them are one body."""
     paths: PathOptions = field(default_factory=PathOptions)
@@ -97,7 +103,8 @@ USUAL = TrackOptions()
 class Followed:
     """What `follow` found. bodies: on their paths; records: of the steps of all fits; oversample: wave samples a pixel
     in these; timing: seconds of each stage; found: how many bodies each time shows by itself; halves: the bodies by
-    halves of the frames, two and two, empty without intervals; rest: their shape at rest [m], if that is known."""
+    halves of the frames, two and two, empty without intervals; rest: their shape at rest [m], if that is known; begun:
+    what showed the bodies of single times, in words."""
 
     bodies: MovingSurfaces
     records: list[Record]
@@ -106,6 +113,7 @@ class Followed:
     found: tuple[int, ...]
     halves: tuple[MovingSurfaces, ...] = ()
     rest: TriangleMesh | None = None
+    begun: str = ""
 
 
 def follow(
@@ -132,7 +140,7 @@ def follow(
         run.advance()
     assert run.bodies is not None
     told = run.records, run.oversample, run.timing, tuple(run.counts), tuple(run.halves)
-    return Followed(run.bodies, *told, run.shape_at_rest())
+    return Followed(run.bodies, *told, run.shape_at_rest(), run.guess)
 
 
 @dataclass
@@ -158,6 +166,8 @@ class _Following:
     oversample: int = 1
     size: float = 1.0
     """Of all bodies of known rest shape, beside what was said."""
+    guess: str = ""
+    """Whether a network guesses the volumes of single times, and why."""
     _begun: Mapping[str, Any] | None = None
     """The state of the fit in which the run was cut off."""
     _search: KnownBodies | None = None
@@ -175,12 +185,12 @@ class _Following:
         self.seen, self.counts = to_sightings(saved["seen"]), list(saved["counts"])
         self.records, self.timing = list(saved["records"]), dict(saved["timing"])
         self.halves = [MovingSurfaces.from_state(one) for one in saved["halves"]]
-        self._begun, self.size = saved["fit"], float(saved["size"])
+        self._begun, self.size, self.guess = saved["fit"], float(saved["size"]), str(saved["guess"])
 
     def _save(self, fit: Mapping[str, Any] | None = None) -> None:
         """Write the journal; fit: the state of the one that runs, which starts at `bodies`."""
         state = {"next": self.stage, "round": self.round, "oversample": self.oversample, "counts": self.counts}
-        state["size"] = self.size
+        state |= {"size": self.size, "guess": self.guess}
         state |= {"bodies": None if self.bodies is None else self.bodies.state(), "fit": fit}
         state |= {"seen": from_sightings(self.seen), "records": self.records, "timing": self.timing}
         self.journal.save(state | {"halves": [one.state() for one in self.halves]})
@@ -188,7 +198,7 @@ class _Following:
     def advance(self) -> None:
         """Do the stage that is next."""
         if self.stage == "sightings":
-            self.seen = [] if self.options.body else self.look(self.train)
+            self.seen = [] if self.options.body else self.look(self.train, network=self.network())
             self.counts, self.stage = [len(one) for one in self.seen], "first paths"
         elif self.stage == "first paths":
             self.bodies, self.seen, self.stage = self.first(), [], "stiff"
@@ -233,14 +243,27 @@ class _Following:
         yield
         self.timing[name] = self.timing.get(name, 0.0) + time.perf_counter() - began
 
-    def look(self, frames: Scan, level: float = 1.0) -> list[list[Sighting]]:
-        """The bodies that each time of `frames` shows by itself; level: factor of the occupancy at the surface."""
+    def network(self) -> Guess | None:
+        """What guesses the volumes of single times: asked at the time in the middle."""
+        if self.options.learned is None:
+            return None
+        at = self.train.at_instant(len(self.train.instants) // 2)
+        how = (self.options.sightings, self.options.learned)
+        with self._timed("sightings"):
+            found, self.guess = network_for(at, self.material, *how, lambda stage, part: None)
+        return found
+
+    def look(self, frames: Scan, level: float = 1.0, network: Guess | None = None) -> list[list[Sighting]]:
+        """The bodies that each time of `frames` shows by itself.
+
+        level: factor of the occupancy at the surface; network: what guesses the volumes.
+        """
         how = replace(self.options.sightings, level=level * self.options.sightings.level)
         times, found = frames.instants, list[list[Sighting]]()
         with self._timed("sightings"):
             for t in range(len(times)):
                 self.on_progress("bodies at each time", t / len(times), {})
-                found.append(sightings(frames.at_instant(t), self.material, how))
+                found.append(sightings(frames.at_instant(t), self.material, how, network=network))
         return found
 
     def first(self) -> MovingSurfaces:
