@@ -99,8 +99,9 @@ def contradicted(found: Guessed, how: LearnedStart, card: Card) -> str:
     left, allowed = found.left(), how.doubt * card.typical(len(found.images))
     if left <= allowed:
         return ""
+    part = f"{100 * left:.0f} %" if left < 1 else "all"
     return (
-        f"it leaves {100 * left:.0f} % of the retrieved thickness unexplained, and of bodies that it knows at most "
+        f"it leaves {part} of the retrieved thickness unexplained, and of bodies that it knows at most "
         f"{100 * allowed:.0f} %"
     )
 
