@@ -36,7 +36,8 @@ def folder(tmp_path_factory) -> Path:
     write_voxels(folder / "truth.h5", truth().at(STEP * (TIMES - 1)), Grid.of_views(scan().views))
     how = (*KNOWN, "--effort", "0.2", "--pieces", "1", "--rounds", "0")
     with undrawn():
-        worked_by("track", folder / "scan.nxs", *how, "--out", folder / "run")
+        said = worked_by("track", folder / "scan.nxs", *how, "--out", folder / "run")
+    assert "start: bodies that tomography shows at single times" in said.out
     return folder
 
 
@@ -57,6 +58,7 @@ def test_a_run_has_its_bodies_and_tracks(folder):
     summary = json.loads((run / "summary.json").read_text())
     assert summary["times_s"] == pytest.approx(STEP * np.arange(TIMES))
     assert summary["kind"] == "moving-surfaces"
+    assert summary["decided"]["begun"].startswith("bodies that tomography shows")
     assert (run / "report.html").is_file()
 
 

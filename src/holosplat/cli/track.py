@@ -89,7 +89,7 @@ def track(
         write_json(folder.source, run_source(scan, reading))
         evaluation = score(result, measured, None)
         report = report_run(folder, result, measured, evaluation, None)
-    for line in evaluation.lines():
+    for line in (*evaluation.lines(), *result.choice.lines()):
         print(line)
     for line in result.verdict.lines("training frames") if result.verdict else ():
         print(line)

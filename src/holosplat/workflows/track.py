@@ -92,7 +92,7 @@ def track(
             found.oversample,
             found.timing,
             True,
-            Choice("levels", "closed bodies have a surface", {}, "soft fit"),
+            Choice("levels", "closed bodies have a surface", {}, "soft fit", found.begun),
             task.delta_told,
             judge(said, train, task.noise if task.uneven else None),
             light=found_in(task),
@@ -147,7 +147,7 @@ def _write(folder: RunFolder, done: Reconstruction, found: Followed, task: Task)
     if task.uneven is not None and task.uneven.background is not None:
         write_light(folder.light, task.uneven.background)
     told = {"steps": len(found.records), "times_s": task.scan.instants.tolist(), "bodies": found.bodies.count}
-    told |= {"bodies_at_each_time": list(found.found), "bodies_begun": found.begun, "light": task.light_in_words}
+    told |= {"bodies_at_each_time": list(found.found), "light": task.light_in_words}
     folder.write_summary(summary_of(done, None, task.scan) | told)
 
 
