@@ -45,12 +45,15 @@ ANGLES = {
     "flow4": (0.0, 45.0, 90.0, 135.0),
     "flow3": (0.0, 30.0, 48.0),
     "flow2": (0.0, 90.0),
+    "flow3-tomography": (0.0, 30.0, 48.0),
     "flow3-body": (0.0, 30.0, 48.0),
     "flow2-body": (0.0, 90.0),
     "flow2n-body": (0.0, 23.8),
 }
 BODY = "-body"
 """End of the names of cases in which the cells are known to be red cells."""
+UNLEARNED = "-tomography"
+"""End of the names of cases in which no network is asked."""
 SHAPE, PIXEL, PHOTONS = (128, 96), 0.5e-6, 1000.0
 MATERIAL = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
 TURN = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
@@ -201,6 +204,7 @@ def row_of(case: str, data: Path, first: int, times: int, every: int, seed: int,
     scan = imaged(cells, ANGLES[case], seed)
     began = time.perf_counter(), time.process_time()
     options = replace(options_without(without), body=KnownBody() if case.endswith(BODY) else None)
+    options = replace(options, learned=None) if case.endswith(UNLEARNED) else options
     result = follow(scan, MATERIAL, options, seed)
     found = result.bodies
     seconds = time.perf_counter() - began[0], time.process_time() - began[1]

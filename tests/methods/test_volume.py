@@ -92,11 +92,11 @@ def test_noise_wipes_nothing_out(seed):
     for found in (start, solve(SHORT, Task(scan, RATIO), "continuous")):
         totals.append(float(np.asarray(found.voxelise(grid).delta, dtype=np.float64).sum()) / true)
     assert totals[0] < 0.5
-    assert totals[1] == pytest.approx(1.0, abs=0.3)
+    assert totals[1] == pytest.approx(1.0, abs=0.25)
 
 
 def test_the_last_round_goes_on_while_it_finds_matter(quiet, monkeypatch):
-    """From a hundredth of it, by an iteration a round; and not where that is no growth."""
+    """From a hundredth of it, by an iteration a round; not where that is no growth; and after it was stopped, too."""
     task = Task(quiet, RATIO)
     stage = SmoothStage(SmoothVolume(QUICK, coarser=(), rounds=1, iterations=1))
     start = stage.start(task, None)
@@ -108,6 +108,12 @@ def test_the_last_round_goes_on_while_it_finds_matter(quiet, monkeypatch):
         fit = stage.fit(task, faint)
         fit.run(lambda record: None)
         more.append(fit.step)
+        again, rest = stage.fit(task, faint), stage.fit(task, faint)
+        again.run(lambda record: None, until=1)
+        rest.load(again.state_dict())
+        rest.run(lambda record: None)
+        assert (rest.step, rest._more) == (fit.step, fit._more)
+        assert torch.equal(rest.voxels.values, fit.voxels.values)
     assert 1 + smooth_fit.MOST >= more[0] > more[1] == 1
 
 

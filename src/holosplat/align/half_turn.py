@@ -61,14 +61,12 @@ def may_be_half(angles: np.ndarray) -> bool:
 
 
 def half_turn(angles: np.ndarray, ends: Sinograms, offset: float) -> HalfTurn | None:
-    """The half turn of the frames at `angles` [V] [rad], if it is clearly another one than these say; else None.
+    """The half turn of the frames at `angles` [V] [rad] that `may_be_half`, if it is clearly another one; else None.
 
     ends: the frames `ends_of` the scan; offset: of the axis [pixels]. Files often do not say whether 180° is the angle
     of the last frame or of one after it. How much frames differ that are k steps apart is seen at each end of the scan.
     Frames at one end and mirrored ones of the other differ by as much, and by a constant more, for light drifts.
     """
-    if not may_be_half(angles):
-        return None
     positions = np.broadcast_to(ends.positions, (len(ends.values), ends.positions.shape[-1]))
     first = ends.values[: PAIRS + 1]
     last = np.stack([_mirrored(*frame, offset) for frame in zip(ends.values, positions)])[:PAIRS:-1]

@@ -34,7 +34,7 @@ def network_for(
         return None, f"bodies that tomography shows at single times: the network knows others, for {against}"
     values, grid = occupancy(scan, material, options, on_progress, None)
     seen = VoxelGrid(values[None], grid, Matter.one(*material)).resampled(found.grid).values[0]
-    left, by_tomography = (_left(volume, found, options.level) for volume in (found.values, seen))
+    left, by_tomography = (left_by_bodies(volume, found, options.level) for volume in (found.values, seen))
     taken = left < CLEARLY * by_tomography
     return (trained.network if taken else None), (
         f"bodies that {'a network guesses' if taken else 'tomography shows'} at single times: those of the network "
@@ -42,6 +42,9 @@ def network_for(
     )
 
 
-def _left(values: Tensor, found: Guessed, level: float) -> float:
-    """What full bodies leave unexplained of the thickness that the network saw."""
+def left_by_bodies(values: Tensor, found: Guessed, level: float) -> float:
+    """What full bodies leave unexplained of the thickness that the network saw, as a share.
+
+    values: [Z, Y, X] on the voxels of `found`, of which what is above `level` is full
+    """
     return unexplained((values > level).to(torch.float32), found.images, found.taps)
