@@ -19,4 +19,5 @@ def in_one_go() -> Iterator[None]:
     """Within, smooth volumes take their frames for explained, and keep the prior that they have."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(smooth_fit, "EXPLAINED", math.inf)
+        patch.setattr(smooth_fit, "WEAKER", math.inf)
         yield

@@ -105,6 +105,7 @@ def test_the_last_round_goes_on_while_it_finds_matter(quiet, monkeypatch):
     for growing in (smooth_fit.GROWING, math.inf):
         monkeypatch.setattr(smooth_fit, "GROWING", growing)
         monkeypatch.setattr(smooth_fit, "EXPLAINED", math.inf)
+        monkeypatch.setattr(smooth_fit, "WEAKER", math.inf)
         fit = stage.fit(task, faint)
         fit.run(lambda record: None)
         more.append(fit.step)
@@ -115,6 +116,26 @@ def test_the_last_round_goes_on_while_it_finds_matter(quiet, monkeypatch):
         assert (rest.step, rest._more) == (fit.step, fit._more)
         assert torch.equal(rest.voxels.values, fit.voxels.values)
     assert 1 + smooth_fit.MOST >= more[0] > more[1] == 1
+
+
+def test_a_round_goes_on_while_it_explains_more(quiet, monkeypatch):
+    """Where frames are not explained yet; and after it was stopped, too."""
+    task = Task(quiet, RATIO)
+    stage = SmoothStage(SmoothVolume(QUICK, coarser=(), rounds=1, iterations=12))
+    start = stage.start(task, None)
+    monkeypatch.setattr(smooth_fit, "WEAKER", math.inf)
+    monkeypatch.setattr(smooth_fit, "GROWING", math.inf)
+    fits = [stage.fit(task, start) for _ in range(4)]
+    fits[0].run(lambda record: None)
+    fits[1].run(lambda record: None, until=15)
+    fits[2].load(fits[1].state_dict())
+    fits[2].run(lambda record: None)
+    monkeypatch.setattr(smooth_fit, "EXPLAINED", math.inf)
+    fits[3].run(lambda record: None)
+    assert fits[3].step == 12
+    assert 12 < fits[0].step <= 12 * smooth_fit.LONGEST
+    assert fits[2].step == fits[0].step
+    assert torch.equal(fits[2].voxels.values, fits[0].voxels.values)
 
 
 def test_next_to_nothing_is_nothing(quiet):
@@ -235,6 +256,7 @@ def plainly(scan: Scan, options: SmoothVolume) -> torch.Tensor:
 def test_a_fit_in_steps_is_one_descent_after_another(quiet, sigma, faint, monkeypatch):
     """Bit for bit, and so is one that goes on from a saved state, wherever it was stopped."""
     monkeypatch.setattr(smooth_fit, "EXPLAINED", math.inf)  # so short a fit explains nothing
+    monkeypatch.setattr(smooth_fit, "WEAKER", math.inf)
     monkeypatch.setattr(smooth_fit, "GROWING", math.inf)  # and would go on
     few = quiet[[0, 2, 4, 6]]
     scan = noisy(few, sigma, 1) if sigma else few
@@ -310,6 +332,7 @@ def test_the_last_round_goes_by_the_frequencies_that_know_the_total(quiet, monke
     seen = list[bool]()
     monkeypatch.setattr(smooth_fit, "unshrunk", lambda problem, u, light: seen.append(light) or u)
     monkeypatch.setattr(smooth_fit, "EXPLAINED", math.inf)
+    monkeypatch.setattr(smooth_fit, "WEAKER", math.inf)
     options = SmoothVolume(QUICK, coarser=(2,), rounds=2, iterations=1)
     task = Task(quiet[[0, 2, 4, 6]], RATIO)
     fit = SmoothStage(options).fit(task, SmoothStage(options).start(task, None))

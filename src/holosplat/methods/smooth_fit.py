@@ -26,9 +26,10 @@ from ..representations import VoxelGrid
 from ..scan import Scan
 from .modulation import modulated, unshrunk
 
-EXPLAINED = 0.95
-"""χ² a pixel above which a volume does not explain its frames to within their noise; where prior and frames agree it is
-below one, for the volume follows some of the noise."""
+EXPLAINED, WEAKER = 0.95, 0.98
+"""χ² a pixel above which a volume does not explain its frames to within their noise yet, and above which a prior may be
+too strong for that; where prior and frames agree it is below one, for the volume follows some of the noise: little of
+that of many views, of which a weaker prior made noise three times as wrong as its matter."""
 EMPTY = 1.2
 """χ² a pixel up to which an empty volume is taken for the truth, as the noise is known to some per cent only."""
 WEAKEST = 1 / 16
@@ -45,6 +46,9 @@ GROWING, MOST = 1.1, 8
 too strong for faint matter lets go of it from round to round."""
 NOTHING = 1e-3
 """Share of the start's level below which a volume is taken for an empty one."""
+FALLING, WINDOW, LONGEST = 0.005, 10, 4
+"""A round on voxels of a pixel that does not explain its frames goes on while so many iterations have lowered the
+objective by more than this part, up to so many times its iterations: many views of dense beads converge slowly."""
 LEAST_EDGE = 12
 """Pixels along a frame's shorter side that larger ones must leave, or the fit is not begun on them."""
 
@@ -126,6 +130,7 @@ class SmoothFit:
         self._strength, self._settled, self._kept = 1.0, False, False
         self._stronger: tuple[VoxelGrid, float] | None = None
         self._descent: Descent | None = None
+        self._values: list[float] = []
         self._frames: tuple[int, WhitenedFrames] | None = None
 
     @property
@@ -187,17 +192,30 @@ class SmoothFit:
             return None
         assert self._descent is not None
         descent, record = self._descent, None
-        if descent.done < leg.iterations:
+        if not self._done(leg, descent):
             before = descent.done
             descent.step()
             if descent.done > before:
                 self.step += 1
+                self._values = [*self._values[-WINDOW:], descent.value]
                 record = {"step": self.step, "loss": descent.value, "voxel_px": leg.factor}
                 if not torch.isfinite(torch.tensor(descent.value)):
                     raise DivergedError(self.step)
-        if descent.ended or descent.done >= leg.iterations:
+        if descent.ended or self._done(leg, descent):
             self._end(leg, descent)
         return record
+
+    def _done(self, leg: Leg, descent: Descent) -> bool:
+        """Whether a descent has had its iterations, and those that it needs beyond them."""
+        if descent.done < leg.iterations:
+            return False
+        over = leg.factor > 1 or leg.kind != "round" or descent.done >= LONGEST * leg.iterations
+        if over or len(self._values) <= WINDOW or (descent.done - leg.iterations) % WINDOW:
+            return over or len(self._values) <= WINDOW
+        if self._values[0] - descent.value <= FALLING * abs(descent.value):
+            return True
+        assert isinstance(descent.problem, VolumeProblem)
+        return _unexplained(descent.problem, descent.u) <= EXPLAINED
 
     def _begin(self, leg: Leg) -> bool:
         """Make the descent of a leg; False where there is nothing to be done."""
@@ -237,7 +255,7 @@ class SmoothFit:
         """
         problem, u = descent.problem, self._or_nothing(descent.u)
         assert isinstance(problem, VolumeProblem)
-        self._descent = None
+        self._descent, self._values = None, []
         if self._kept and self._leg == len(self._legs) - 1:
             empty = torch.zeros_like(u)
             u = empty if problem(empty)[0] <= descent.value else u
@@ -285,7 +303,7 @@ class SmoothFit:
             if unexplained <= EMPTY or self._strength <= WEAKEST:
                 return False
             self._again(self._strength / 2 if self._kept else self._strength)
-            self._kept = True
+            self._kept, self._settled = True, False
             return True
         late = self._leg >= len(self._legs) - max(1, self.plan.rounds - 1)  # a first round is often not at its end yet
         if not late or self._settled:
@@ -294,7 +312,7 @@ class SmoothFit:
             (self._volume, _), self._strength, self._settled = self._stronger, 2 * self._strength, True
             self._leg += 1
             return True
-        self._settled = unexplained <= EXPLAINED or self._strength <= WEAKEST
+        self._settled = unexplained <= WEAKER or self._strength <= WEAKEST
         if not self._settled:
             empty = _unexplained(problem, torch.zeros_like(found.values[0]))
             self._stronger = (found, unexplained) if unexplained - 1 < WORTH * (empty - 1) else None
@@ -328,6 +346,7 @@ class SmoothFit:
             "volume": self._volume.state(),
             "level": self._level,
             "more": self._more,
+            "values": self._values,
             "rival": None if self._rival is None else list(self._rival),
             "descent": None if self._descent is None else self._descent.state_dict(),
         }
@@ -336,7 +355,7 @@ class SmoothFit:
         """Go back to a saved state."""
         self.step, self.seconds = int(state["step"]), float(state["seconds"])
         self._leg, self._level, self._strength = int(state["leg"]), float(state["level"]), float(state["strength"])
-        self._more = int(state["more"])
+        self._more, self._values = int(state["more"]), [float(value) for value in state["values"]]
         self._settled, self._kept, before = bool(state["settled"]), bool(state["kept"]), state["stronger"]
         self._stronger = before and (VoxelGrid.from_state(before[0]), float(before[1]))
         self._volume = VoxelGrid.from_state(state["volume"])
