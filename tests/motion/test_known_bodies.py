@@ -19,7 +19,7 @@ from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
 from holosplat.motion.elastic import Elastic, RestShapeKept
-from holosplat.motion.known import best_size, drift
+from holosplat.motion.known import best_size, drift, poses_like
 from holosplat.motion.poses import Explained, Pose, exchanged, pursued
 from holosplat.motion.rest_shape import KnownBody, surface, thinned
 from holosplat.motion.shadows import Shadows
@@ -118,11 +118,43 @@ def test_the_term_is_the_mean_over_times_and_its_gradient_is_right():
 def test_two_beams_find_a_body_and_its_pose():
     """One cell that the frames cut at the end: centre, velocity and axis."""
     truth = pose(TURN, (3.0, 11.0, -2.5), 1.1)
-    (found,) = pursued(cell(), shadows([truth]), FLOW * np.array([0.9, 1.1])[:, None])
+    (found,), of_begun = pursued(cell(), shadows([truth]), FLOW * np.array([0.9, 1.1])[:, None])
+    assert not of_begun
     assert np.linalg.norm(found.centre - truth.centre) < 0.2
     assert np.linalg.norm(found.velocity - truth.velocity) < 0.2
     assert axis_error(found, TURN) < 5
     assert np.linalg.det(found.matrix) == pytest.approx(1)
+
+
+def test_a_search_begins_with_what_is_known_where_that_explains_more(monkeypatch):
+    """Cells that nothing but the start shows, for no place is tried; a start at ghosts is worth less than none."""
+    truth = [pose(TURN, (6.0, 0.0, -5.0)), pose(OTHER, (-6.0, 1.0, 5.0), 1.2)]
+    near = [replace(one, centre=one.centre + 0.8) for one in truth]
+    astray = pose(TURN, (0.0, -18.0, 0.0))
+    seen = shadows(truth)
+    assert not pursued(cell(), seen, FLOW[None], [astray])[1]
+    monkeypatch.setattr(Search, "tops", lambda *given: [])
+    found, of_begun = pursued(cell(), seen, FLOW[None], [*near, astray])
+    assert of_begun
+    assert len(found) == 2
+    for one, other in zip(found, truth):
+        assert np.linalg.norm(one.centre - other.centre) < 0.3
+
+
+def test_bodies_of_single_times_become_poses():
+    """A body that moves and is longer along one axis than at rest; lengths in pixels of 2 µm."""
+    longer = np.diag([1.5, 1.0, 1 / 1.5])
+    nodes = 2e-6 * (cell().vertices @ longer.T @ TURN.T)
+    paths = np.stack([nodes + 2e-6 * np.array([3.0, 1.0, 0.0]), 2e-6 * FLOW + 0 * nodes])
+    basis = TimeBasis(0.0, 4.0, 1)
+    when = np.linspace(0, 4, 8)
+    dense = np.array([paths[0] + (t / 2 - 1) * paths[1] for t in when])
+    matter = Matter.one(*HAEMOGLOBIN.delta_beta(20.0))
+    bodies = MovingSurfaces.of_bodies([basis.fitted(when, dense)], [cell().faces], basis, 2e-6, matter)
+    (found,) = poses_like(bodies, cell(), (0.0, 4.0), 2e-6)
+    np.testing.assert_allclose(found.centre, [3.0, 1.0, 0.0], atol=0.01)
+    np.testing.assert_allclose(found.velocity, FLOW, atol=0.01)
+    np.testing.assert_allclose(found.matrix @ found.matrix.T, TURN @ longer @ longer.T @ TURN.T, atol=0.02)
 
 
 def test_ghosts_are_exchanged_for_bodies():

@@ -18,7 +18,7 @@ from ..checks import require
 from ..mesh import TriangleMesh
 from ..specimens.membrane.model import Membrane
 from .forecast import areas, normals
-from .measures import area, moments
+from .measures import area, moments, stretched_like
 
 STIFFNESS = (1e-6, 3e-6, 1e-5, 3e-5, 1e-4, 1e-4, 1e-4)
 """Springs between the surfaces [N/m a node], one round after the other: at the last one, forces of the membrane, some
@@ -129,9 +129,4 @@ class _Springs:
 
 def _placed(mesh: TriangleMesh, rest: TriangleMesh) -> np.ndarray:
     """The nodes of `rest`, moved, turned and stretched such that its ellipsoid of second moments is that of `mesh`."""
-    (_, to, wanted), (_, origin, own) = (moments(one) for one in (mesh, rest))
-    (values, axes), (rests, frame) = np.linalg.eigh(wanted), np.linalg.eigh(own)
-    axes = axes * np.sign(np.linalg.det(axes) * np.linalg.det(frame)) ** np.array([1, 0, 0])
-    stretch = np.sqrt(np.maximum(values, 0) / rests)
-    stretch = stretch / stretch.prod() ** (1 / 3)
-    return ((rest.vertices - origin) @ frame * stretch) @ axes.T + to
+    return (rest.vertices - moments(rest)[1]) @ stretched_like(mesh, rest).T + moments(mesh)[1]

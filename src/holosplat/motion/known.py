@@ -15,6 +15,7 @@ from ..mesh import TriangleMesh
 from ..representations import MovingSurfaces, TimeBasis
 from ..scan import Scan
 from .elastic import Elastic, Rest
+from .measures import moments, stretched_like
 from .poses import Explained, Pose, pursued
 from .rest_shape import KnownBody
 from .shadows import Shadows
@@ -42,16 +43,21 @@ class KnownBodies:
         frames = train[np.flatnonzero(np.isin(train.exposures.time, chosen))]
         self.seen = Shadows.of(frames, material, self.first, self.last).binned(self.bin)
         self.velocities = drift(self.seen) * np.array(SPREAD)[:, None]
+        self.of_begun = False
 
-    def bodies(self, basis: TimeBasis, known: MovingSurfaces | None = None) -> MovingSurfaces | None:
+    def bodies(
+        self, basis: TimeBasis, known: MovingSurfaces | None = None, begun: MovingSurfaces | None = None
+    ) -> MovingSurfaces | None:
         """Bodies on paths of `basis` that explain what `known` ones leave of the frames; None where there are none.
 
-        The first search finds the size of all bodies.
+        begun: bodies of any shape with which the search may begin; `of_begun` says whether it did. The first search
+        finds the size of all bodies.
         """
         seen, mesh = self.seen, _sized(self.coarse, self.size / self.bin)
         if known is not None:
             seen = seen.without(self._shadows(known))
-        found = pursued(mesh, seen, self.velocities)
+        like = [] if begun is None else poses_like(begun, mesh, (self.first, self.last), self.pixel * self.bin)
+        found, self.of_begun = pursued(mesh, seen, self.velocities, like)
         if not found:
             return None
         if known is None and self.body.uncertain > 0:
@@ -73,6 +79,17 @@ class KnownBodies:
         paths = [self.pixel * basis.fitted(middle + half * when, one) for one in nodes]
         matter = Matter.one(*self.material)
         return MovingSurfaces.of_bodies(paths, [rest.faces] * len(paths), basis, self.pixel, matter)
+
+
+def poses_like(bodies: MovingSurfaces, rest: TriangleMesh, ends: tuple[float, float], unit: float) -> list[Pose]:
+    """Poses of `rest` like `bodies` between the times `ends` [s], lengths in `unit` [m]: as long along the same axes as
+    these are in the middle of the time, on the straight paths of their centres."""
+    first, middle, last = (bodies.bodies(time) for time in (ends[0], 0.5 * sum(ends), ends[1]))
+    centres = [np.array([moments(one)[1] / unit for one in meshes]) for meshes in (first, middle, last)]
+    return [
+        Pose(stretched_like(mesh, rest), centre, 0.5 * (end - start), np.zeros(3))
+        for mesh, start, centre, end in zip(middle, *centres)
+    ]
 
 
 def at_rest(body: KnownBody, pixel: float, size: float) -> Rest:

@@ -97,6 +97,14 @@ def moments(mesh: TriangleMesh) -> tuple[float, np.ndarray, np.ndarray]:
     return float(sums), origin + middle, second / 20 - sums * np.outer(middle, middle)
 
 
+def stretched_like(mesh: TriangleMesh, rest: TriangleMesh) -> np.ndarray:
+    """Matrix [3, 3] of determinant one by which the ellipsoid of second moments of `rest` becomes one like `mesh`'s."""
+    (values, axes), (rests, frame) = (np.linalg.eigh(moments(one)[2]) for one in (mesh, rest))
+    axes = axes * np.sign(np.linalg.det(axes) * np.linalg.det(frame)) ** np.array([1, 0, 0])
+    stretch = np.sqrt(np.maximum(values, 0) / rests)
+    return (axes * (stretch / stretch.prod() ** (1 / 3))) @ frame.T
+
+
 def volume_velocity(mesh: TriangleMesh, speed: np.ndarray) -> np.ndarray:
     """Velocity [3] [m/s] of the centre of the volume: (∫ (x - c) (v · n) dA) / V (Reynolds' transport theorem)."""
     volume, centre, _ = moments(mesh)

@@ -129,10 +129,26 @@ class Explained:
         return self.seen.project([nodes[t] for t in self.seen.times], faces)
 
 
-def pursued(mesh: TriangleMesh, seen: Shadows, velocities: np.ndarray) -> list[Pose]:
-    """Poses of all bodies of the rest shape `mesh` [pixels] that shadows show, on paths near `velocities` [K, 3]."""
+def pursued(
+    mesh: TriangleMesh, seen: Shadows, velocities: np.ndarray, begun: Sequence[Pose] = ()
+) -> tuple[list[Pose], bool]:
+    """Poses of all bodies of the rest shape `mesh` [pixels] that shadows show, on paths near `velocities` [K, 3].
+
+    begun: poses that are known about; the search is done with and without them. The other value: whether those explain
+    more that began with them.
+    """
     search, every = Search(Templates.of(mesh, seen), seen, velocities), Explained(mesh, seen)
-    found = _more(every, search, [])
+    found = _searched(every, search, [])
+    if not begun:
+        return found, False
+    other = _searched(every, search, every.improved(begun, LAST_STEPS))
+    costs = [float(every.cost(every.seen.thickness - every.images(poses))) for poses in (found, other)]
+    return (other, True) if costs[1] < costs[0] else (found, False)
+
+
+def _searched(every: Explained, search: Search, begun: list[Pose]) -> list[Pose]:
+    """`begun` and what is found beside them, without those that explain nothing."""
+    found = _more(every, search, [pose for k, pose in enumerate(begun) if _share(every, begun, k) >= LEAST])
     found = _second_look(every, search, exchanged(every, search, every.improved(found, LAST_STEPS)))
     return [pose for k, pose in enumerate(found) if _share(every, found, k) >= LEAST]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
@@ -198,7 +198,8 @@ class _Following:
     def advance(self) -> None:
         """Do the stage that is next."""
         if self.stage == "sightings":
-            self.seen = [] if self.options.body else self.look(self.train, network=self.network())
+            network = self.network()
+            self.seen = [] if self.options.body and not network else self.look(self.train, network=network)
             self.counts, self.stage = [len(one) for one in self.seen], "first paths"
         elif self.stage == "first paths":
             self.bodies, self.seen, self.stage = self.first(), [], "stiff"
@@ -271,16 +272,25 @@ class _Following:
         times, options = self.train.instants, self.options
         basis = TimeBasis(float(times[0]), float(times[-1]), options.paths.degree)
         if options.body is not None:
-            posed = self._posed(options.body, basis)
+            begun = None
+            with suppress(InputError):  # no track
+                begun = self._sighted(basis)
+            posed = self._posed(options.body, basis, begun=begun)
             if posed is None:
                 raise InputError(
                     f"no body of the shape {options.body.shape} was found in the frames; check its size, the material "
                     "and the pixel size, or leave --body."
                 )
             return posed
-        found = first_paths(self.seen, times, basis, self.train.views.finest, self.material, options.links)
+        found = self._sighted(basis)
+        assert found is not None
         sure = sure_ones(found, self.train.views, times)
         return found if options.rounds == 0 or len(sure) == found.count else only(found, sure)
+
+    def _sighted(self, basis: TimeBasis) -> MovingSurfaces | None:
+        """The bodies of single times on first paths; None where none were looked for."""
+        times, pixel = self.train.instants, self.train.views.finest
+        return first_paths(self.seen, times, basis, pixel, self.material, self.options.links) if self.seen else None
 
     @property
     def rest(self) -> Rest | None:
@@ -295,13 +305,23 @@ class _Following:
         mesh = rest.elastic.membrane.mesh
         return TriangleMesh(self.train.views.finest * mesh.vertices, mesh.faces, "rest")
 
-    def _posed(self, body: KnownBody, basis: TimeBasis, known: MovingSurfaces | None = None) -> MovingSurfaces | None:
-        """Bodies of known shape beside `known` ones, on first paths."""
+    def _posed(
+        self,
+        body: KnownBody,
+        basis: TimeBasis,
+        known: MovingSurfaces | None = None,
+        begun: MovingSurfaces | None = None,
+    ) -> MovingSurfaces | None:
+        """Bodies of known shape beside `known` ones, on first paths; a search may begin with `begun` ones."""
         self.on_progress("poses", 0.0, {})
         with self._timed("poses"):
             self._search = self._search or KnownBodies(self.train, self.material, body, self.size)
-            found = self._search.bodies(basis, known)
+            found = self._search.bodies(basis, known, begun)
             self.size = self._search.size
+        if begun is not None:
+            self.guess += (
+                f"; poses that begin with them explain {'more' if self._search.of_begun else 'less'} than others"
+            )
         return found
 
     def more(self, bodies: MovingSurfaces) -> MovingSurfaces | None:
