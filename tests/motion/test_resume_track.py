@@ -13,7 +13,7 @@ import torch
 from helpers.moving_ellipsoids import MATERIAL, PIXEL, TIMES, scan, true_paths
 from holosplat.fit.schedule import Schedule
 from holosplat.motion import track
-from holosplat.motion.halves import halves_of, standard_errors
+from holosplat.motion.halves import ASTRAY, astray, halves_of, standard_errors, tell_shapes
 from holosplat.motion.pieces import PathOptions
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import TimeBasis
@@ -47,6 +47,10 @@ def frequent(monkeypatch):
 
 def seen(time: float):
     return [track.Sighting(mesh, False) for mesh in true_paths().bodies(time)]
+
+
+def three_views():
+    return scan()[np.flatnonzero(np.arange(len(scan())) % 4 < 3)]
 
 
 @cache
@@ -106,9 +110,27 @@ def test_halves_share_no_frame():
         assert np.array_equal(np.unique(times[part], return_counts=True)[1], np.full(TIMES, 2))
         assert np.array_equal(scan().views.rotations[part][:2], scan().views.rotations[part][-2:])
     assert len(halves_of(scan(), TimeBasis(0.0, 1.0, 2))) == 1  # two times do not tell parabolas
-    three = scan()[np.flatnonzero(np.arange(len(scan())) % 4 < 3)]
+    three = three_views()
     assert len(halves_of(three, basis)) == 1
     assert halves_of(three, TimeBasis(0.0, 1.0, 2)) == []
+
+
+def test_halves_of_few_views_begin_apart():
+    """By a tenth of a body's radius to either side, at all times alike; those of four views begin with the result."""
+    bodies = true_paths()
+    one, other = (astray(bodies, 3, side).coefficients - bodies.coefficients for side in (1, -1))
+    torch.testing.assert_close(one, -other)
+    torch.testing.assert_close(one, one[:1].expand_as(one))
+    own, _ = bodies.body(1)
+    shape = bodies.coefficients[:, own].mean(0)
+    radius = float((shape - shape.mean(0)).square().sum(1).mean().sqrt())
+    assert 0.5 < float(one[0, own].square().sum(1).mean().sqrt()) / (ASTRAY * radius) < 3
+    assert tell_shapes(scan())
+    assert not tell_shapes(three_views())
+    result = follow(three_views(), MATERIAL, QUICK)
+    apart = result.halves[0].coefficients - result.halves[1].coefficients
+    middle = 0.5 * (result.halves[0].coefficients + result.halves[1].coefficients)
+    assert float(apart.square().mean()) > 100 * float((middle - result.bodies.coefficients).square().mean())
 
 
 def test_standard_errors_are_half_of_what_halves_disagree_by():

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
+import torch
 
 from ..representations import MovingSurfaces, TimeBasis
 from ..scan import Scan
@@ -18,6 +19,10 @@ FEWEST_VIEWS = 4
 """Views of a time from which on half of them still tell a shape."""
 NO_ERRORS = ("time_s", "body", "nx", "ny", "nz", "in_field")
 """Columns that have no standard error."""
+
+ASTRAY = 0.1
+"""Displacement by which halves of fewer views begin apart, in radii of a body, to either side: what few beams do not
+tell of a shape stays where it begins."""
 
 Pair = tuple[np.ndarray, np.ndarray]
 
@@ -35,6 +40,30 @@ def halves_of(train: Scan, basis: TimeBasis) -> list[Pair]:
     if np.bincount(number).min() >= FEWEST_VIEWS:
         found.append(order % 2)
     return [(np.flatnonzero(part == 0), np.flatnonzero(part == 1)) for part in found]
+
+
+def tell_shapes(train: Scan) -> bool:
+    """Whether frames are of so many views that shapes do not depend on where a fit begins."""
+    return bool(np.unique(train.exposures.time, return_counts=True)[1].min() >= FEWEST_VIEWS)
+
+
+def astray(bodies: MovingSurfaces, seed: int, side: int) -> MovingSurfaces:
+    """Each of `bodies` displaced by a random smooth field, of second order in the place; the other way for side -1.
+
+    About the middle of a body of radius r (root mean square), a place x is moved by r · ASTRAY · (A ξ + B ξ ξ) with
+    ξ = x/r, at all times alike; a number of A and B is drawn from a normal distribution, such that the mean square of
+    either term is one where ξ is of length one.
+    """
+    draws, moved = np.random.default_rng([seed, 1]), bodies.coefficients.detach().clone()
+    for number in range(bodies.count):
+        own, _ = bodies.body(number)
+        shape = moved[:, own].mean(0)
+        shape = shape - shape.mean(0)
+        radius = float(shape.square().sum(1).mean().sqrt())
+        first, second = (torch.from_numpy(draws.normal(size=size)) / 3**0.5 for size in ((3, 3), (3, 3, 3)))
+        xi = shape / radius
+        moved[:, own] += side * ASTRAY * radius * (xi @ first.T + torch.einsum("ijk,pj,pk->pi", second, xi, xi))
+    return bodies.with_parameters({"coefficients": moved})
 
 
 def standard_errors(bodies: MovingSurfaces, halves: Sequence[MovingSurfaces], scan: Scan) -> Mapping[str, np.ndarray]:

@@ -25,7 +25,7 @@ from ..scan import Scan
 from .elastic import Rest
 from .fit import MotionFit, motion_fit
 from .guesses import network_for
-from .halves import halves_of
+from .halves import astray, halves_of, tell_shapes
 from .identities import LinkOptions
 from .journal import Journal, Nowhere, from_sightings, to_sightings
 from .known import KnownBodies, at_rest
@@ -234,6 +234,8 @@ class _Following:
         if len(self.halves) < len(parts):
             part = parts[len(self.halves)]
             light = self.light and self.light.part(torch.from_numpy(part))
+            side = 1 - 2 * (len(self.halves) % 2)
+            bodies = bodies if tell_shapes(self.train) else astray(bodies, self.seed, side)
             self.halves.append(self.fitted("intervals", self.train[part], bodies, self.options.half, light))
         if len(self.halves) == len(parts):
             self.stage = "done"
