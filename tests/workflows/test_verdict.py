@@ -50,6 +50,18 @@ def on(scan: Scan, obj: VoxelGrid) -> Verdict:
     return judge(Prediction(obj, scan.exposures, 2), scan)
 
 
+def test_an_empty_object_is_said_to_be_empty():
+    """Of frames that are noise it explains everything; of frames with matter it does not, and that is said instead."""
+    scan = a_scan(soft(), 3000)
+    noise = np.random.default_rng(3).normal(1.0, 0.02, scan.frames.shape).astype(np.float32)
+    found = on(replace(scan, frames=noise), soft(0.0))
+    assert not found.good
+    assert found.words.startswith("No matter was found")
+    assert "--bin" in found.reasons[0]
+    assert "No matter" not in on(scan, soft(0.0)).words
+    assert not on(scan, soft(0.0)).good
+
+
 @pytest.mark.parametrize("photons", [None, 3000, 100_000])
 def test_the_truth_is_good(photons):
     found = on(a_scan(soft(), photons), soft())

@@ -101,6 +101,11 @@ LEAVES = (
     "What lies beyond is not known, so that matter is wrong near these rows and, of soft matter, far from them; take "
     "frames of more rows, to where the matter ends."
 )
+NOTHING = "No matter was found: the frames are noise to within what is known of it, or matter is fainter than that."
+"""What is said of an empty object that explains its frames: right where nothing was in the beam, and else wrong."""
+HELP = (
+    "If something was in the beam, take more photons, join pixels (--bin), or give more of what is known (--material)."
+)
 OUTER_ROWS, LEAVING, FEW_VIEWS = 2, 0.3, 4
 """Rows at the top and at the bottom, the part of the mean thickness from which on matter goes on there, and the views
 that are looked at."""
@@ -110,17 +115,25 @@ def judge(said: Prediction, frames: Scan, noise: NoiseModel | None = None) -> Ve
     """The verdict on what is said of `frames`, whose exposures the prediction has; noise: None to estimate it."""
     measured = torch.from_numpy(frames.frames)
     found = verdict(residuals(said, measured, (noise or _noise(measured)).power()))
-    if found.good or not _leaves_the_field(said):
+    absorbing, refracting = _matter(said)
+    if found.good and not bool(absorbing.any() or refracting.any()):
+        return replace(found, good=False, words=NOTHING, reasons=(HELP, *found.reasons))
+    if found.good or not _leaves_the_field(refracting):
         return found
     return replace(found, reasons=(LEAVES, *found.reasons))
 
 
-def _leaves_the_field(said: Prediction) -> bool:
-    """Whether the object has about as much matter in the outermost rows of the frames as in the others."""
+def _matter(said: Prediction) -> tuple[torch.Tensor, torch.Tensor]:
+    """Sizes of the integrals of β and δ through the object [v, H, W] in a few views."""
     views = said.exposures.views
     few = np.unique(np.linspace(0, len(views) - 1, min(len(views), FEW_VIEWS)).round().astype(int))
     with torch.no_grad():
-        matter = said.object.project(views[few])[1].abs().cpu()
+        beta, delta = said.object.project(views[few])
+    return beta.abs().cpu(), delta.abs().cpu()
+
+
+def _leaves_the_field(matter: torch.Tensor) -> bool:
+    """Whether about as much `matter` [v, H, W] is in the outermost rows of the frames as in the others."""
     outer = torch.cat([matter[:, :OUTER_ROWS], matter[:, -OUTER_ROWS:]], dim=1)
     return float(outer.mean()) > LEAVING * float(matter.mean())
 
