@@ -138,6 +138,18 @@ def test_a_round_goes_on_while_it_explains_more(quiet, monkeypatch):
     assert torch.equal(fits[2].voxels.values, fits[0].voxels.values)
 
 
+def test_a_fit_that_begins_again_from_nothing_may_be_weakened_again(quiet):
+    """Though a stronger prior had settled before."""
+    task = Task(quiet, RATIO)
+    stage = SmoothStage(SmoothVolume(QUICK))
+    fit = stage.fit(task, stage.start(task, None))
+    empty = fit.voxels.with_parameters({"values": torch.zeros_like(fit.voxels.values)})
+    problem = VolumeProblem(fit._frames_of(1), fit.plan.prior, 1.0)
+    fit._settled = True
+    assert fit._weakened(empty, 2 * smooth_fit.EMPTY, problem)
+    assert not fit._settled
+
+
 def test_next_to_nothing_is_nothing(quiet):
     """Or the prior, in units of its level, had no lower bound."""
     fit = SmoothStage(SmoothVolume()).fit(

@@ -207,15 +207,17 @@ class SmoothFit:
 
     def _done(self, leg: Leg, descent: Descent) -> bool:
         """Whether a descent has had its iterations, and those that it needs beyond them."""
-        if descent.done < leg.iterations:
+        more = descent.done - leg.iterations
+        if more < 0:
             return False
-        over = leg.factor > 1 or leg.kind != "round" or descent.done >= LONGEST * leg.iterations
-        if over or len(self._values) <= WINDOW or (descent.done - leg.iterations) % WINDOW:
-            return over or len(self._values) <= WINDOW
-        if self._values[0] - descent.value <= FALLING * abs(descent.value):
+        longer = leg.factor == 1 and leg.kind == "round" and len(self._values) > WINDOW
+        if not longer or descent.done >= LONGEST * leg.iterations:
             return True
+        if more % WINDOW:  # asked now and then, for it takes a projection
+            return False
+        falling = self._values[0] - descent.value > FALLING * abs(descent.value)
         assert isinstance(descent.problem, VolumeProblem)
-        return _unexplained(descent.problem, descent.u) <= EXPLAINED
+        return not falling or _unexplained(descent.problem, descent.u) <= EXPLAINED
 
     def _begin(self, leg: Leg) -> bool:
         """Make the descent of a leg; False where there is nothing to be done."""

@@ -15,7 +15,7 @@ from .sightings import SightingOptions, occupancy
 
 CLEARLY = 0.75
 """What bodies by the network may leave unexplained of the retrieved thickness, over what those by tomography leave.
-Of red cells that is 0.4 to 0.65 in two and three beams, and about one in four: then there is no reason to guess."""
+Of red cells that is 0.31 to 0.71 in two and three beams, and about one in four (docs/data/sightings.csv)."""
 
 
 def network_for(
