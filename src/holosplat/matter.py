@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 
@@ -131,12 +131,24 @@ class Matter:
 
 
 class MaterialPrior:
-    """What is known of the matter before a reconstruction: one of `Known`, `KnownTwo`, `KnownRatio` and `Unknown`."""
+    """What is known of the matter before a reconstruction: one of `Known`, `KnownTwo`, `KnownRatio` and `Unknown`.
+
+    Made by `known`, `of_ratio` or `unknown`. Errors: `InputError` where it is made without saying which.
+    """
 
     kind = ""
     """The name of this knowledge in files and tables."""
     materials: tuple[DeltaBeta, ...] = ()
     """The known materials, the denser first."""
+
+    def __new__(cls, *args: object, **named: object) -> Self:
+        """One of the four; of the base class alone nobody could say what is known."""
+        require(
+            cls is not MaterialPrior,
+            "what is known of the matter must be said by MaterialPrior.known(...), .of_ratio(...) or .unknown(), but "
+            "it is MaterialPrior(); take one of them.",
+        )
+        return super().__new__(cls)
 
     @staticmethod
     def known(material: DeltaBeta, second: DeltaBeta | None = None) -> MaterialPrior:
