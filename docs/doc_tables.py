@@ -35,7 +35,7 @@ OVERVIEW_METHODS = {
 OURS = ("gaussians", "surfaces")
 STANDING = {"ssim": 1, "frcm": 1, "dice": 1, "relative_error_delta": -1}
 """The scores in which methods are compared, and whether more of it is better."""
-CONTINUOUS = ("soft12", "soft12-5000", "light12-5000", "drift", "tissue16", "coated")
+CONTINUOUS = ("soft12", "soft12-unknown", "soft12-5000", "light12-5000", "drift", "tissue16", "coated")
 ABSORBERS = ("absorber12", "contact91")
 MEASURED = ("capsule-dome", "capsule", "tooth")
 PHOTOGRAPHED = ("cells12", "cells4")

@@ -27,7 +27,8 @@ NAMES = (
     ["main12", "main4", "thesis16", "thesis8", "cells4", "cells6", "cells8", "cells12", "xmpi4", "two_beam"]
     + ["plasma8-1e3", "plasma8-1e4", "plasma8-1e5", "noise12-500", "noise12-2000", "noise12-10000", "crowded12"]
     + ["sharp-even", "sharp-light", "sharp-drift", "misaligned12", "misaligned4"]
-    + ["two_materials8", "shells8", "foam12", "soft12", "soft12-5000", "light12-5000", "drift", "tissue16", "coated"]
+    + ["two_materials8", "shells8", "foam12", "soft12", "soft12-unknown", "soft12-5000"]
+    + ["light12-5000", "drift", "tissue16", "coated"]
     + ["absorber12", "contact91", "resolution"]
 )
 APART = {"contact91": 0.9}
