@@ -16,7 +16,8 @@ from ..representations import MovingSurfaces, TimeBasis
 from ..scan import Scan
 from .elastic import Elastic, Rest
 from .measures import moments, stretched_like
-from .poses import Explained, Pose, pursued
+from .poses import FREER, Explained, Pose
+from .replaced import Heard, pursued
 from .rest_shape import KnownBody
 from .shadows import Shadows
 
@@ -46,7 +47,12 @@ class KnownBodies:
         self.of_begun = False
 
     def bodies(
-        self, basis: TimeBasis, known: MovingSurfaces | None = None, begun: MovingSurfaces | None = None
+        self,
+        basis: TimeBasis,
+        known: MovingSurfaces | None = None,
+        begun: MovingSurfaces | None = None,
+        seed: int = 0,
+        on_progress: Heard = lambda share: None,
     ) -> MovingSurfaces | None:
         """Bodies on paths of `basis` that explain what `known` ones leave of the frames; None where there are none.
 
@@ -57,12 +63,12 @@ class KnownBodies:
         if known is not None:
             seen = seen.without(self._shadows(known))
         like = [] if begun is None else poses_like(begun, mesh, (self.first, self.last), self.pixel * self.bin)
-        found, self.of_begun = pursued(mesh, seen, self.velocities, like)
+        found, self.of_begun = pursued(mesh, seen, self.velocities, like, seed, on_progress)
         if not found:
             return None
         if known is None and self.body.uncertain > 0:
             self.size = best_size(mesh, seen, found, self.body.uncertain)
-            found = Explained(_sized(mesh, self.size), seen).improved(found, SIZE_STEPS)
+            found = Explained(_sized(mesh, self.size), seen, FREER).improved(found, SIZE_STEPS)
         return self._paths([pose.scaled(self.bin) for pose in found], basis)
 
     def _shadows(self, bodies: MovingSurfaces) -> np.ndarray:

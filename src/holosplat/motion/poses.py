@@ -1,5 +1,4 @@
-"""Pose search: bodies of known rest shape on straight paths that explain the shadows of several times, one after the
-other (matching pursuit: Mallat & Zhang 1993, IEEE Trans. Signal Process. 41, 3397), and then all together."""
+"""Poses of bodies of known rest shape on straight paths, and what they explain of the shadows of several times."""
 
 from __future__ import annotations
 
@@ -13,24 +12,17 @@ from torch import Tensor
 
 from ..mesh import TriangleMesh
 from .shadows import Shadows
-from .templates import Search, Templates
 
 ROUNDED = 3.0
 """Standard deviations from which on a misfit counts by its size, no longer by its square: shadows of other bodies."""
 MODEL_ERROR = 0.15
 """What the search expects affine bodies to miss of a shadow [radii of the ball of their volume], at least."""
-STRAIN = 0.02
-"""Cost of a squared strain of one, and of a turn by a radian, as a share of what the body casts."""
-LEAST, ALSO = 0.35, 0.8
-"""Share of what its shadow is worth by which a body must explain the frames; and share of the best one's from which on
-others are taken in the same round."""
-TRIED, FIRST_STEPS, STEPS, LAST_STEPS = 4, 8, 5, 15
-"""Places that are tried in a round, and steps of the search for better poses: of one, of all, of all in the end."""
-SURE, LOOKS = 0.8, 3
-"""Share below which a body may stand for others, and how often that is looked into."""
-SAME_HEIGHT = 1.0
-"""Radii within which bodies that two beams might exchange are at one height."""
-MOST_ROUNDS = 60
+STRAIN, FREER = 0.02, 0.001
+"""Cost of a squared strain of one, and of a turn by a radian, as a share of what the body casts: while bodies are
+looked for, when ghosts need larger strains than bodies do, and of those that are found, for cells in flow have large
+ones."""
+SHADOW = 0.2
+"""Part of a body's largest thickness from which on a pixel is in its shadow."""
 NUMBERS = 18
 """Unknowns of a pose: affine matrix, centre, velocity, turning."""
 
@@ -58,25 +50,34 @@ class Pose:
 
 
 class Explained:
-    """What bodies of one rest shape leave of shadows, and what they cost."""
+    """What bodies of one rest shape leave of shadows, and what they cost; strain: cost of a squared strain of one."""
 
-    def __init__(self, mesh: TriangleMesh, seen: Shadows) -> None:
+    def __init__(self, mesh: TriangleMesh, seen: Shadows, strain: float = STRAIN) -> None:
         radius = (3 * mesh.volume / (4 * np.pi)) ** (1 / 3)
         self.mesh, self.seen = mesh, seen
         self.noise = max(seen.noise, MODEL_ERROR * radius)
         self.target, self.rest = torch.from_numpy(seen.thickness), torch.from_numpy(mesh.vertices)
         self.radius = float(self.rest.norm(dim=1).mean())
         self.instants = np.unique(seen.times)
-        self.worth = STRAIN * mesh.volume ** (4 / 3) * len(seen) / self.noise**2
+        self.strain = strain
+        self.worth = strain * mesh.volume ** (4 / 3) * len(seen) / self.noise**2
 
     def beside(self, images: np.ndarray) -> Explained:
         """The same beside matter that casts `images` [N, H, W]."""
-        return Explained(self.mesh, self.seen.without(images))
+        return Explained(self.mesh, self.seen.without(images), self.strain)
+
+    def without(self, poses: Sequence[Pose]) -> Explained:
+        """The same beside bodies in `poses`."""
+        return self.beside(self.images(poses))
 
     def cost(self, left: Tensor | np.ndarray) -> Tensor:
         """Of shadows [N, H, W] that are left, in likelihoods: squares, but of large misfits their size."""
+        return self.cost_map(torch.as_tensor(left)).sum()
+
+    def cost_map(self, left: Tensor) -> Tensor:
+        """The same of each pixel of shadows [..., N, H, W]."""
         width = ROUNDED * self.noise
-        return ((torch.as_tensor(left).square() + width**2).sqrt() - width).sum() * width / self.noise**2
+        return ((left.square() + width**2).sqrt() - width) * width / self.noise**2
 
     def images(self, poses: Sequence[Pose]) -> np.ndarray:
         """Thickness [N, H, W] of bodies in `poses`."""
@@ -90,6 +91,36 @@ class Explained:
         images = self.images([pose])
         gain = self.cost(self.target) - self.cost(self.seen.thickness - images)
         return float(gain / self.cost(images).clamp_min(1.0))
+
+    def shares(self, poses: Sequence[Pose]) -> np.ndarray:
+        """[K]: what each body explains of that which the others leave, as `share`."""
+        return self._shares(self.each(poses))
+
+    def doubts(self, poses: Sequence[Pose]) -> np.ndarray:
+        """[K]: what is left unexplained where each body casts its shadow, over the cost of that, and what is lacking of
+        its share."""
+        each = self.each(poses)
+        left, own = self.cost_map(self.target - each.sum(0)), self.cost_map(each).sum((1, 2, 3)).clamp_min(1.0)
+        dark = each > SHADOW * each.amax((1, 2, 3), keepdim=True)
+        beside = ((left * dark).sum((1, 2, 3)) / own).numpy()
+        return beside + (1 - self._shares(each)).clip(0.0)
+
+    def _shares(self, each: Tensor) -> np.ndarray:
+        left = self.target - each.sum(0)
+        gains = [self.cost(left + one) - self.cost(left) for one in each]
+        return np.array([float(gain / self.cost(one).clamp_min(1.0)) for gain, one in zip(gains, each)])
+
+    def each(self, poses: Sequence[Pose]) -> Tensor:
+        """[K, N, H, W] thickness of each body."""
+        return torch.from_numpy(np.array([self.images([pose]) for pose in poses]).reshape(-1, *self.target.shape))
+
+    def value(self, poses: Sequence[Pose]) -> float:
+        """What is to be small: the cost of what `poses` leave, and of their strains and turns."""
+        return float(self.cost(self.seen.thickness - self.images(poses))) + self.strained(poses)
+
+    def strained(self, poses: Sequence[Pose]) -> float:
+        """The cost of strains and turns."""
+        return float(self._strained(_parts(poses))) if poses else 0.0
 
     def improved(self, poses: Sequence[Pose], steps: int) -> list[Pose]:
         """Poses that explain more, by so many steps of L-BFGS."""
@@ -109,15 +140,17 @@ class Explained:
         def value(flat: np.ndarray) -> tuple[float, np.ndarray]:
             u = torch.from_numpy(flat.reshape(-1, NUMBERS).copy()).requires_grad_()
             parts = moved(u)
-            strain = parts[0].mT @ parts[0] - torch.eye(3, dtype=u.dtype)
-            total = self.worth * (strain.square().sum() + parts[3].square().sum())
-            total = total + self.cost(self.target - self._project(parts))
+            total = self._strained(parts) + self.cost(self.target - self._project(parts))
             (gradient,) = torch.autograd.grad(total, u)
             return float(total.detach()), gradient.numpy().ravel()
 
         start = np.zeros(NUMBERS * len(poses))
         found = minimize(value, start, jac=True, method="L-BFGS-B", options={"maxiter": steps})
         return _poses(moved(torch.from_numpy(found.x.reshape(-1, NUMBERS))))
+
+    def _strained(self, parts: Parts) -> Tensor:
+        strain = parts[0].mT @ parts[0] - torch.eye(3, dtype=parts[0].dtype)
+        return self.worth * (strain.square().sum() + parts[3].square().sum())
 
     def _project(self, parts: Parts) -> Tensor:
         matrices, centres, velocity, turning = parts
@@ -127,112 +160,6 @@ class Explained:
         turned = torch.linalg.cross(turning[:, None].expand_as(away), away)
         nodes = {t: (away + t * turned + (centres + t * velocity)[:, None]).flatten(0, 1) for t in self.instants}
         return self.seen.project([nodes[t] for t in self.seen.times], faces)
-
-
-def pursued(
-    mesh: TriangleMesh, seen: Shadows, velocities: np.ndarray, begun: Sequence[Pose] = ()
-) -> tuple[list[Pose], bool]:
-    """Poses of all bodies of the rest shape `mesh` [pixels] that shadows show, on paths near `velocities` [K, 3].
-
-    begun: poses that are known about; the search is done with and without them. The other value: whether those explain
-    more that began with them.
-    """
-    search, every = Search(Templates.of(mesh, seen), seen, velocities), Explained(mesh, seen)
-    found = _searched(every, search, [])
-    if not begun:
-        return found, False
-    other = _searched(every, search, every.improved(begun, LAST_STEPS))
-    costs = [float(every.cost(every.seen.thickness - every.images(poses))) for poses in (found, other)]
-    return (other, True) if costs[1] < costs[0] else (found, False)
-
-
-def _searched(every: Explained, search: Search, begun: list[Pose]) -> list[Pose]:
-    """`begun` and what is found beside them, without those that explain nothing."""
-    found = _more(every, search, [pose for k, pose in enumerate(begun) if _share(every, begun, k) >= LEAST])
-    found = _second_look(every, search, exchanged(every, search, every.improved(found, LAST_STEPS)))
-    return [pose for k, pose in enumerate(found) if _share(every, found, k) >= LEAST]
-
-
-def _more(every: Explained, search: Search, found: list[Pose], without: Sequence[np.ndarray] = ()) -> list[Pose]:
-    """`found`, and those that explain what these leave, one round after the other; the first one not near `without`."""
-    left = every.beside(every.images(found))
-    for turn in range(MOST_ROUNDS):
-        tried = list[tuple[float, Pose]]()
-        for hit in search.tops(left.seen, TRIED, without if turn == 0 else ()):
-            start = Pose(hit.matrix, hit.centre, hit.velocity, np.zeros(3))
-            (pose,) = left.improved([start], FIRST_STEPS)
-            tried.append((left.share(pose), pose))
-        tried.sort(key=lambda pair: -pair[0])
-        if not tried or tried[0][0] < LEAST:
-            break
-        least = max(LEAST, ALSO * tried[0][0])
-        for _, pose in tried:
-            if left.share(pose) >= least:
-                found = [*found, pose]
-                left = left.beside(left.images([pose]))
-        found = every.improved(found, STEPS)
-        left = every.beside(every.images(found))
-    return found
-
-
-def _second_look(every: Explained, search: Search, found: list[Pose]) -> list[Pose]:
-    """The bodies without those that explain least, where others in their place explain more.
-
-    What was found first may have been taken for the shadows of several bodies, or for their crossing.
-    """
-    for _ in range(LOOKS):
-        shares = [_share(every, found, k) for k in range(len(found))]
-        if not shares or min(shares) >= SURE:
-            break
-        worst = int(np.argmin(shares))
-        others = [pose for k, pose in enumerate(found) if k != worst]
-        again = every.improved(_more(every, search, others, [found[worst].centre]), STEPS)
-        costs = [float(every.cost(every.seen.thickness - every.images(poses))) for poses in (found, again)]
-        if costs[1] >= costs[0]:
-            break
-        found = exchanged(every, search, again)
-    return found
-
-
-def exchanged(every: Explained, search: Search, found: list[Pose]) -> list[Pose]:
-    """The same bodies, pairs of which have exchanged what two beams show of them where that explains more.
-
-    Two beams see two bodies at one height as they would see two others, each in the shadow of the one in the first
-    beam and of the other in the second. Their shapes and motion tell which they are; pairs that explain enough (`SURE`)
-    are left as they are.
-    """
-    seen, directions = every.seen, np.unique(search.templates.directions, return_index=True)[1]
-    if len(directions) != 2 or len(found) < 2:
-        return found
-    first, second = (seen.rotations[int(n)].numpy() for n in directions)
-    height = np.cross(first[2], second[2]) / np.linalg.norm(np.cross(first[2], second[2]))
-    found, sure = list(found), [_share(every, found, k) >= SURE for k in range(len(found))]
-    for i in range(len(found)):
-        for j in range(i):
-            if (sure[i] and sure[j]) or abs((found[i].centre - found[j].centre) @ height) > SAME_HEIGHT * every.radius:
-                continue
-            left = every.beside(every.images([pose for k, pose in enumerate(found) if k not in (i, j)]))
-            pair = [found[i], found[j]]
-            others = []
-            for one, other in (pair, pair[::-1]):
-                both = np.concatenate([first[:2], second[:2]])
-                moved = [
-                    np.linalg.lstsq(both, np.concatenate([first[:2] @ a, second[:2] @ b]), rcond=1e-9)[0]
-                    for a, b in ((one.centre, other.centre), (one.velocity, other.velocity))
-                ]
-                hit = search.here(left.seen, moved[0], moved[1])
-                others.append(Pose(hit.matrix, hit.centre, hit.velocity, np.zeros(3)))
-            others = left.improved(others, 2 * FIRST_STEPS)
-            costs = [float(left.cost(left.seen.thickness - left.images(poses))) for poses in (pair, others)]
-            if costs[1] < costs[0]:
-                found[i], found[j] = others
-    return every.improved(found, STEPS)
-
-
-def _share(every: Explained, found: Sequence[Pose], number: int) -> float:
-    """What a body explains of that which the others leave."""
-    others = [pose for k, pose in enumerate(found) if k != number]
-    return every.beside(every.images(others)).share(found[number])
 
 
 def _unimodular(matrices: Tensor) -> Tensor:

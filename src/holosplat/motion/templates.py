@@ -120,7 +120,10 @@ class Search:
         self.grid = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 3)
 
     def tops(self, seen: Shadows, most: int, without: Sequence[np.ndarray] = ()) -> list[Hit]:
-        """The `most` best places, the best first, none near the places `without` [3]."""
+        """The `most` best places, the best first, none near the places `without` [3].
+
+        Gains may be negative: between the places and poses that are tried there may be one that explains what is left.
+        """
         gains, held = zip(*(self._frame(seen, n) for n in range(len(seen))))
         rows = list[tuple[float, int, int, int]]()
         for k, velocity in enumerate(self.velocities):
@@ -133,7 +136,7 @@ class Search:
         found = list[Hit]()
         for gain, which, place, k in sorted(rows, reverse=True):
             centre = self.grid[place]
-            if gain <= 0 or len(found) == most:
+            if len(found) == most:
                 break
             if all(np.linalg.norm(centre - other) > APART for other in (*without, *(hit.centre for hit in found))):
                 found.append(Hit(gain, self.templates.matrices[which], centre, self.velocities[k]))

@@ -315,10 +315,11 @@ class _Following:
         begun: MovingSurfaces | None = None,
     ) -> MovingSurfaces | None:
         """Bodies of known shape beside `known` ones, on first paths; a search may begin with `begun` ones."""
-        self.on_progress("poses", 0.0, {})
         with self._timed("poses"):
             self._search = self._search or KnownBodies(self.train, self.material, body, self.size)
-            found = self._search.bodies(basis, known, begun)
+            found = self._search.bodies(
+                basis, known, begun, self.seed, lambda share: self.on_progress("poses", share, {})
+            )
             self.size = self._search.size
         if begun is not None:
             self.guess += (

@@ -1,0 +1,157 @@
+"""The search for bodies of known rest shape: some are taken away, and others looked for in their place, as long as that
+explains more (large neighbourhood search: Shaw 1998, Lect. Notes Comput. Sci. 1520, 417)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ..mesh import TriangleMesh
+from .pool import Pool
+from .poses import FREER, Explained, Pose
+from .pursuit import LAST_STEPS, candidates, explaining, level_pairs, searched, swapped, two_beams
+from .shadows import Shadows
+from .templates import Search, Templates
+
+TRIES, MOST_ROUNDS, PATIENCE = 12, 20, 3
+"""Tries of a round, of which few bodies need fewer; rounds at most; and those in which nothing clearly better is found,
+after which the search ends."""
+CLEARLY, WORSE = 3e-3, 0.015
+"""Part of the cost by which something is clearly better than the best so far; and by which it may be worse for the
+search to go on from it."""
+LEAST_DOUBT = 0.05
+"""That of a body that explains all of its shadow."""
+LOOKED_AT, CHOICE = 6, 0.1
+"""Places that are looked at for a body in place of another, and the difference of shares that matters between them."""
+MOST_OTHERS = 3
+"""Bodies that are taken away beside the first."""
+EXCHANGES = 4
+"""Every so many-th try exchanges what two beams show of a pair."""
+FREE_STEPS = 80
+"""Steps to better poses in the end, when strains cost less."""
+
+Heard = Callable[[float], None]
+"""Takes the share of the search that is done, at most."""
+
+
+def pursued(
+    mesh: TriangleMesh,
+    seen: Shadows,
+    velocities: np.ndarray,
+    begun: Sequence[Pose] = (),
+    seed: int = 0,
+    on_progress: Heard = lambda share: None,
+) -> tuple[list[Pose], bool]:
+    """Poses of all bodies of the rest shape `mesh` [pixels] that shadows show, on paths near `velocities` [K, 3].
+
+    begun: poses that are known about; bodies are found with and without them, and what explains more is made better.
+    The other value: whether that began with them. seed: of the choices of what is taken away.
+    """
+    search, every = Search(Templates.of(mesh, seen), seen, velocities), Explained(mesh, seen)
+    found, of_begun = searched(every, search, []), False
+    if begun:
+        other = searched(every, search, every.improved(begun, LAST_STEPS))
+        of_begun = every.value(other) < every.value(found)
+        found = other if of_begun else found
+    found = Replaced(every, search, seed).better(found, on_progress)
+    return Explained(mesh, seen, FREER).improved(found, FREE_STEPS), of_begun
+
+
+@dataclass
+class Replaced:
+    """Takes some bodies away, looks for others in their place, and keeps what explains more.
+
+    A pursuit takes one body at a time: the first ones may stand for the shadows of several, or for their crossing, and
+    those that come later have what is left.
+    """
+
+    every: Explained
+    search: Search
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        self._draws, self._pool = np.random.default_rng(self.seed), Pool(self.every)
+        self._two = two_beams(self.search)
+
+    def better(self, found: list[Pose], on_progress: Heard = lambda share: None) -> list[Pose]:
+        """`found`, or what explains more; ends when `PATIENCE` rounds have found nothing clearly better.
+
+        What is little worse than the best is gone on from, too (record-to-record travel: Dueck 1993, J. Comput. Phys.
+        104, 86): of bodies that stand for each other's shadows all must change before anything is better. Each round
+        ends with the best choice among all bodies that were tried so far.
+        """
+        best, least, idle = found, self.every.value(found), 0
+        self._pool.add(found)
+        for turn in range(MOST_ROUNDS if found else 0):
+            before, now, tries = least, best, min(TRIES, 2 + len(best))
+            for number in range(tries):
+                part = number / tries
+                on_progress(max((turn + part) / MOST_ROUNDS, (idle + part) / PATIENCE))
+                other = self._combined() if number == tries - 1 else self._changed(now, number)
+                value = self.every.value(other)
+                now = other if other and value < (1 + WORSE) * least else now
+                if value < least:
+                    best, least = other, value
+            idle = 0 if least < (1 - CLEARLY) * before else idle + 1
+            if idle == PATIENCE:
+                break
+        return explaining(self.every, best)
+
+    def _changed(self, found: list[Pose], number: int) -> list[Pose]:
+        """Another choice, made better."""
+        other = self._exchanged(found) if self._two and number % EXCHANGES == 0 else self._replaced(found)
+        other = self.every.improved(other, LAST_STEPS)
+        self._pool.add(other)
+        return other
+
+    def _combined(self) -> list[Pose]:
+        """The best choice among all bodies that were tried, made better."""
+        other = explaining(self.every, self.every.improved(self._pool.chosen(self._draws), LAST_STEPS))
+        other = self.every.improved(other, LAST_STEPS)
+        self._pool.add(other)
+        return other
+
+    def _replaced(self, found: list[Pose]) -> list[Pose]:
+        """Others in the place of a body, the rather the more is unexplained about it, and of some that share its
+        shadows."""
+        gone = self._gone(found)
+        kept, new = [pose for k, pose in enumerate(found) if k not in gone], list[Pose]()
+        beside = left = self.every.without(kept)
+        for turn in range(len(gone) + 1):
+            tried = candidates(left, self.search, LOOKED_AT, [found[gone[0]].centre] if turn == 0 else ())
+            if not tried:
+                break
+            self._pool.add([pose for _, pose in tried])
+            new.append(self._chosen(tried))
+            left = left.without(new[-1:])
+        return [*kept, *beside.improved(new, LAST_STEPS)]
+
+    def _gone(self, found: list[Pose]) -> list[int]:
+        """Numbers of a body and of up to `MOST_OTHERS` others, the rather the more of a shadow they have in common."""
+        doubts = self.every.doubts(found) + LEAST_DOUBT
+        first = int(self._draws.choice(len(found), p=doubts**2 / (doubts**2).sum()))
+        each = self.every.each(found)
+        common = np.array([float(torch.minimum(one, each[first]).sum()) for one in each])
+        common[first] = 0.0
+        count = min(int(self._draws.integers(MOST_OTHERS + 1)), int((common > 0).sum()))
+        if count == 0:
+            return [first]
+        others = self._draws.choice(len(found), count, replace=False, p=common / common.sum())
+        return [first, *map(int, others)]
+
+    def _chosen(self, tried: list[tuple[float, Pose]]) -> Pose:
+        """One of those that were tried, the rather the more it explains."""
+        likely = np.exp([(share - tried[0][0]) / CHOICE for share, _ in tried])
+        return tried[int(self._draws.choice(len(tried), p=likely / likely.sum()))][1]
+
+    def _exchanged(self, found: list[Pose]) -> list[Pose]:
+        """The same bodies, two of one height, if there are such, as if each had the other's shadow in one beam."""
+        pairs = level_pairs(self.every, found)
+        if not pairs:
+            return found
+        i, j = pairs[int(self._draws.integers(len(pairs)))]
+        others = swapped(self.every, self.search, found, i, j)
+        return [*(pose for k, pose in enumerate(found) if k not in (i, j)), *others]
