@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 import holosplat as hs
+from helpers.motion_shadows import FLOW, OTHER, RADIUS, TURN, cell, pose, shadows
 from holosplat.checks import InputError
 from holosplat.cli.track import BodyFlags
-from holosplat.geometry import rotation_y
 from holosplat.io.vtk import write_mesh
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
+from holosplat.motion import replaced
 from holosplat.motion.elastic import Elastic, RestShapeKept
 from holosplat.motion.known import best_size, drift, poses_like
 from holosplat.motion.poses import Explained, Pose
 from holosplat.motion.pursuit import exchanged
 from holosplat.motion.replaced import pursued
 from holosplat.motion.rest_shape import KnownBody, surface, thinned
-from holosplat.motion.shadows import Shadows
 from holosplat.motion.sightings import centroid
 from holosplat.motion.strain import strain_energy
 from holosplat.motion.templates import Search, Templates
@@ -32,35 +30,6 @@ from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.mesh_series import MeshSeries
 from holosplat.specimens.red_cells import evans_fung_cell, icosphere
-
-SHAPE, STEPS = (47, 33), (-1.0, 0.0, 1.0)
-RADIUS = 4.5
-FLOW = np.array([0.0, 4.0, 0.0])
-TURN = Rotation.from_rotvec([0.9, 0.3, 0.4]).as_matrix()
-OTHER = Rotation.from_rotvec([-0.2, 0.5, 1.3]).as_matrix()
-
-
-@cache
-def cell() -> TriangleMesh:
-    """A red cell about its centre [pixels]."""
-    return KnownBody().mesh(3.91e-6 / RADIUS, coarse=True)
-
-
-def shadows(poses: list[Pose], angles: tuple[float, ...] = (0.0, 90.0), mesh: TriangleMesh | None = None) -> Shadows:
-    """What beams at `angles` [degrees] see of bodies at three times, with a little noise."""
-    count = len(angles) * len(STEPS)
-    times = np.repeat(STEPS, len(angles))
-    rotations = torch.from_numpy(np.tile(rotation_y(np.array(angles)), (len(STEPS), 1, 1)))
-    empty = Shadows(
-        np.zeros((count, *SHAPE)), rotations, torch.zeros(count, 2, dtype=torch.float64), times, 0.0,
-        np.full(count, 25.0), np.full(count, 3.0),
-    )  # fmt: skip
-    images = Explained(mesh or cell(), empty).images(poses)
-    return replace(empty, thickness=images + 0.1 * np.random.default_rng(0).normal(size=images.shape))
-
-
-def pose(turn: np.ndarray, centre: tuple[float, float, float], speed: float = 1.0) -> Pose:
-    return Pose(turn, np.array(centre), speed * FLOW, np.zeros(3))
 
 
 def axis_error(found: Pose, turn: np.ndarray) -> float:
@@ -134,6 +103,7 @@ def test_a_search_begins_with_what_is_known_where_that_explains_more(monkeypatch
     near = [replace(one, centre=one.centre + 0.8) for one in truth]
     astray = pose(TURN, (0.0, -18.0, 0.0))
     seen = shadows(truth)
+    monkeypatch.setattr(replaced, "PATIENCE", 1)
     assert not pursued(cell(), seen, FLOW[None], [astray])[1]
     monkeypatch.setattr(Search, "tops", lambda *given: [])
     found, of_begun = pursued(cell(), seen, FLOW[None], [*near, astray])

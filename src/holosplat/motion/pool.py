@@ -49,10 +49,10 @@ class Pool:
         images = csr_array(vstack(self._rows))
         products = (images @ images.T).toarray().astype(np.float64) / self.every.noise**2
         gains = images @ self.every.seen.thickness.ravel() / self.every.noise**2
-        return [self.poses[k] for k in np.flatnonzero(_annealed(products, gains - self._strains, draws))]
+        return [self.poses[k] for k in np.flatnonzero(annealed(products, gains - self._strains, draws))]
 
 
-def _annealed(products: np.ndarray, gains: np.ndarray, draws: np.random.Generator) -> np.ndarray:
+def annealed(products: np.ndarray, gains: np.ndarray, draws: np.random.Generator) -> np.ndarray:
     """[C] x, true or false, with the least ½ xᵀ G x - gᵀ x that was found, G the products [C, C], g the gains [C]."""
     count, own = len(gains), 0.5 * np.diag(products)
     x, slope, value = np.zeros(count, dtype=bool), -gains, 0.0
