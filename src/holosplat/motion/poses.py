@@ -19,8 +19,8 @@ MODEL_ERROR = 0.15
 """What the search expects affine bodies to miss of a shadow [radii of the ball of their volume], at least."""
 STRAIN, FREER = 0.02, 0.001
 """Cost of a squared strain of one, and of a turn by a radian, as a share of what the body casts: while bodies are
-looked for, when ghosts need larger strains than bodies do, and of those that are found, for cells in flow have large
-ones."""
+found one after the other, when those that stand for several need larger strains; and then, for cells in flow have large
+strains, and their shadows tell the wrong ones better where these cost little."""
 SHADOW = 0.2
 """Part of a body's largest thickness from which on a pixel is in its shadow."""
 NUMBERS = 18

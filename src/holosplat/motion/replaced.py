@@ -31,7 +31,7 @@ MOST_OTHERS = 3
 EXCHANGES = 4
 """Every so many-th try exchanges what two beams show of a pair."""
 FREE_STEPS = 80
-"""Steps to better poses in the end, when strains cost less."""
+"""Steps to better poses in the end."""
 
 Heard = Callable[[float], None]
 """Takes the share of the search that is done, at most."""
@@ -56,8 +56,9 @@ def pursued(
         other = searched(every, search, every.improved(begun, LAST_STEPS))
         of_begun = every.value(other) < every.value(found)
         found = other if of_begun else found
-    found = Replaced(every, search, seed).better(found, on_progress)
-    return Explained(mesh, seen, FREER).improved(found, FREE_STEPS), of_begun
+    free = Explained(mesh, seen, FREER)
+    found = Replaced(free, search, seed).better(free.improved(found, LAST_STEPS), on_progress)
+    return free.improved(found, FREE_STEPS), of_begun
 
 
 @dataclass
