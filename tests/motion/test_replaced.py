@@ -46,7 +46,7 @@ def test_a_body_that_stands_for_two_is_replaced_by_them(monkeypatch):
     search = Search(Templates.of(cell(), seen), seen, FLOW[None])
     begun = every.improved([pose(TURN, (0.0, 0.5, 0.0))], 15)
     heard: list[float] = []
-    found = Replaced(every, search, 1).better(begun, heard.append)
+    found = Replaced(every, search, 1).better(begun, on_progress=heard.append)
     assert len(found) == 2
     for one in truth:
         assert min(np.linalg.norm(other.centre - one.centre) for other in found) < 0.5

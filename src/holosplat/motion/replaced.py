@@ -51,14 +51,13 @@ def pursued(
     The other value: whether that began with them. seed: of the choices of what is taken away.
     """
     search, every = Search(Templates.of(mesh, seen), seen, velocities), Explained(mesh, seen)
-    found, of_begun = searched(every, search, []), False
-    if begun:
-        other = searched(every, search, every.improved(begun, LAST_STEPS))
-        of_begun = every.value(other) < every.value(found)
-        found = other if of_begun else found
     free = Explained(mesh, seen, FREER)
-    found = Replaced(free, search, seed).better(free.improved(found, LAST_STEPS), on_progress)
-    return free.improved(found, FREE_STEPS), of_begun
+    starts = [[], every.improved(begun, LAST_STEPS)] if begun else [[]]
+    found = [free.improved(searched(every, search, start), LAST_STEPS) for start in starts]
+    values = [free.value(poses) for poses in found]
+    best = int(np.argmin(values))
+    better = Replaced(free, search, seed).better(found[best], sum(found, []), on_progress)
+    return free.improved(better, FREE_STEPS), best > 0
 
 
 @dataclass
@@ -77,15 +76,19 @@ class Replaced:
         self._draws, self._pool = np.random.default_rng(self.seed), Pool(self.every)
         self._two = two_beams(self.search)
 
-    def better(self, found: list[Pose], on_progress: Heard = lambda share: None) -> list[Pose]:
+    def better(
+        self, found: list[Pose], tried: Sequence[Pose] = (), on_progress: Heard = lambda share: None
+    ) -> list[Pose]:
         """`found`, or what explains more; ends when `PATIENCE` rounds have found nothing clearly better.
+
+        tried: other bodies that may be among the best.
 
         What is little worse than the best is gone on from, too (record-to-record travel: Dueck 1993, J. Comput. Phys.
         104, 86): of bodies that stand for each other's shadows all must change before anything is better. Each round
         ends with the best choice among all bodies that were tried so far.
         """
         best, least, idle = found, self.every.value(found), 0
-        self._pool.add(found)
+        self._pool.add([*found, *tried])
         for turn in range(MOST_ROUNDS if found else 0):
             before, now, tries = least, best, min(TRIES, 2 + len(best))
             for number in range(tries):

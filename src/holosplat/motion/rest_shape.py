@@ -37,7 +37,7 @@ class KnownBody:
     """By which part all bodies may be larger or smaller than that, at most; frames tell (0: they are not)."""
     stiffness: Weight = 100.0
     """Minus the logarithm of the probability of strains of about one: frames decide what they see, this the rest."""
-    instants: int = 5
+    instants: int = 9
     """Times of the scan at which bodies are looked for together."""
 
     def __post_init__(self) -> None:
