@@ -54,9 +54,9 @@ def pursued(
     free = Explained(mesh, seen, FREER)
     starts = [[], every.improved(begun, LAST_STEPS)] if begun else [[]]
     found = [free.improved(searched(every, search, start), LAST_STEPS) for start in starts]
-    values = [free.value(poses) for poses in found]
-    best = int(np.argmin(values))
-    better = Replaced(free, search, seed).better(found[best], sum(found, []), on_progress)
+    best = int(np.argmin([free.value(poses) for poses in found]))
+    tried = [pose for poses in found for pose in poses]
+    better = Replaced(free, search, seed).better(found[best], tried, on_progress)
     return free.improved(better, FREE_STEPS), best > 0
 
 
