@@ -79,3 +79,11 @@ def test_strains_cost_less_in_the_end():
     assert strains[1] == pytest.approx(strains[0] / 20)
     left = Explained(cell(), seen)
     assert left.value(longer) == pytest.approx(strains[0] + float(left.cost(seen.thickness - left.images(longer))))
+
+
+def test_a_body_in_front_of_a_missing_one_is_doubtful():
+    """It explains its own shadow, and what is left lies there, too."""
+    truth = [pose(TURN, (1.0, 0.0, -7.0)), pose(OTHER, (-1.0, 1.0, 7.0), 1.1)]
+    every = Explained(cell(), shadows(truth))
+    assert every.shares(truth[:1])[0] > 0.95
+    assert every.doubts(truth[:1])[0] > 0.2 > 3 * every.doubts(truth)[0]
