@@ -30,14 +30,16 @@ from holosplat.metrics import image_scores, intensity_range, volume_scores
 from holosplat.metrics.distances import normal_distance
 from holosplat.motion.cell_model import ChannelFrame
 from holosplat.motion.dynamics import DynamicsForecast, carry
+from holosplat.motion.elastic import Rest
 from holosplat.motion.forecast import Forecast, Halves, PathForecast, extrapolate
 from holosplat.motion.half_sets import half_sets
+from holosplat.motion.rest_shape import KnownBody
 from holosplat.motion.sightings import centroid
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces
 from holosplat.specimens.mesh_series import MeshSeries
 from holosplat.workflows.evaluate import render_object
-from motion import ANGLES, MATERIAL, PIXEL, SHAPE, cells_in_flow, imaged
+from motion import ANGLES, BODY, MATERIAL, PIXEL, SHAPE, cells_in_flow, imaged
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "forecast.csv"
 AHEAD = (1, 5, 10, 15, 20, 25)
@@ -122,8 +124,12 @@ def tracked(scan: hs.Scan, seed: int, keep: Path | None, name: str) -> tuple[Mov
     if files and all(file.is_file() for file in files):
         whole, *halves = (read_object(file) for file in files)
         return whole, tuple(halves)  # pyright: ignore[reportReturnType]
-    whole = follow(scan, MATERIAL, TrackOptions(), seed).bodies
-    halves = half_sets(scan, whole, seed=seed)
+    body = KnownBody() if BODY in name else None
+    found = follow(scan, MATERIAL, TrackOptions(body=body), seed)
+    whole, rest = found.bodies, None
+    if body and found.rest:
+        rest = Rest.of(found.rest, body.stiffness, whole.unit_length)
+    halves = half_sets(scan, whole, seed=seed, rest=rest)
     for file, bodies in zip(files, (whole, *halves)):
         write_object(file, bodies)
     return whole, halves

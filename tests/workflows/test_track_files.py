@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
-from helpers.moving_ellipsoids import TIMES, scan, true_paths
+from helpers.moving_ellipsoids import PIXEL, TIMES, scan, true_paths
+from holosplat.checks import InputError
+from holosplat.motion.known import at_rest
+from holosplat.motion.rest_shape import KnownBody
+from holosplat.representations import MovingSurfaces, TimeBasis
+from holosplat.workflows.rest_file import read_rest, write_rest
 from holosplat.workflows.run_folder import RunFolder
 from holosplat.workflows.track import STRAIN, TRACKS, read_errors, write_tracks
 
@@ -27,3 +34,26 @@ def test_more_columns_stand_beside_those_of_every_run(tmp_path):
     assert read_errors(folder)["x_m"] == pytest.approx(errors, rel=1e-3, abs=0)
     write_tracks(folder, true_paths(), scan())  # again, over what is there
     assert read_errors(folder) == {}
+
+
+def test_a_shape_at_rest_is_read_as_it_was_written(tmp_path):
+    """With the stiffness that the run was told; of runs without it there is none, and other triangles are refused."""
+    folder, bodies = RunFolder(tmp_path / "run"), true_paths()
+    folder.begin({})
+    config = {"method": {"body": {"stiffness": 70.0}}}
+    assert read_rest(folder, bodies, config) is None
+    known = at_rest(KnownBody(), 0.5 * PIXEL, 1.03)
+    mesh = known.elastic.membrane.mesh
+    shape = replace(mesh, vertices=PIXEL * mesh.vertices)
+    places = [np.stack([shape.vertices + [0, k * 1e-5, 0]] * 2) for k in range(2)]
+    cells = MovingSurfaces.of_bodies(places, [shape.faces] * 2, TimeBasis(0.0, 1.0, 1), PIXEL, bodies.matter)
+    write_rest(folder, shape)
+    found = read_rest(folder, cells, config)
+    assert found is not None
+    assert found.stiffness == 70
+    nodes = torch.from_numpy(1.1 * mesh.vertices)
+    assert float(found.elastic(nodes)) == pytest.approx(float(known.elastic(nodes)), rel=1e-5)
+    with pytest.raises(InputError, match="has others"):
+        read_rest(folder, bodies, config)
+    with pytest.raises(InputError, match=r"config\.json"):
+        read_rest(folder, cells, {"method": {}})

@@ -59,6 +59,9 @@ class MotionFlags:
     """Weight of bent paths (0: as bent as splines can be)."""
     bending: float = 1.0
     """Weight of bent surfaces (0: free)."""
+    twins: bool = True
+    """Bodies in two beams are told from others of the same volume whose shadows have the same size and tilt, by short
+    fits."""
     intervals: bool = True
     """Standard errors from fits to halves of the frames, which take about as long as the last fit."""
     effort: float = 1.0
@@ -75,4 +78,6 @@ class MotionFlags:
             for name, fit in (("stiff", usual.stiff), ("soft", usual.soft), ("half", usual.half))
         }
         usual = usual if self.learned else replace(usual, learned=None)
-        return replace(usual, paths=paths, sightings=found, rounds=self.rounds, intervals=self.intervals, **fits)
+        return replace(
+            usual, paths=paths, sightings=found, rounds=self.rounds, twins=self.twins, intervals=self.intervals, **fits
+        )

@@ -57,6 +57,11 @@ class Rest:
     elastic: Elastic
     stiffness: float
 
+    @classmethod
+    def of(cls, shape: TriangleMesh, stiffness: float, unit: float) -> Rest:
+        """Of bodies whose shape at rest is the mesh `shape` [m], on paths in `unit` [m]."""
+        return cls(Elastic(TriangleMesh(shape.vertices / unit, shape.faces, shape.name)), stiffness)
+
 
 class _Energy(torch.autograd.Function):
     """The energy with the forces as its gradient, which cost a fifth of the automatic one."""

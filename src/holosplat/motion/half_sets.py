@@ -12,6 +12,7 @@ from ..fit.running import Record
 from ..optics.background import Light
 from ..representations import MovingSurfaces
 from ..scan import Scan
+from .elastic import Rest
 from .fit import MotionFit, motion_fit
 from .forecast import Halves
 
@@ -27,12 +28,15 @@ def half_sets(
     how: MotionFit = USUAL,
     seed: int = 0,
     light: Light | None = None,
+    *,
+    rest: Rest | None = None,
     on_record: Callable[[Record], None] = lambda record: None,
 ) -> Halves:
     """`bodies`, fitted to the frames `train` of all times, fitted on to those of every other time, both halves of them.
 
     A path is told by times before and after, so that each half tells it nearly as the whole does, with noise of its
-    own. light: of the frames, which were divided by it. Errors: `InputError` for fewer than 8 times.
+    own. light: of the frames, which were divided by it; rest: what is known of the bodies' shape at rest. Errors:
+    `InputError` for fewer than 8 times.
     """
     times = train.instants
     require(
@@ -44,7 +48,7 @@ def half_sets(
     for half in (0, 1):
         kept = np.flatnonzero(number % 2 == half)
         part = None if light is None else light.part(torch.from_numpy(kept))
-        fit = motion_fit(train[kept], bodies, how, seed, part)
+        fit = motion_fit(train[kept], bodies, how, seed, part, rest)
         fit.run(on_record)
         one = fit.result().object
         assert isinstance(one, MovingSurfaces)

@@ -6,94 +6,37 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
 
 from ..checks import InputError, as_written, require
 from ..fit.running import Record
-from ..fit.schedule import Schedule
 from ..learning.network import Guess
-from ..learning.start import LearnedStart
 from ..matter import DeltaBeta
 from ..mesh import TriangleMesh
 from ..optics.background import Light
 from ..progress import FitProgress
-from ..ranges import Share, ranged
 from ..representations import MovingSurfaces, TimeBasis
 from ..scan import Scan
 from .elastic import Rest
 from .fit import MotionFit, motion_fit
 from .guesses import network_for
 from .halves import astray, halves_of, tell_shapes
-from .identities import LinkOptions
 from .journal import Journal, Nowhere, from_sightings, to_sightings
 from .known import KnownBodies, at_rest
-from .pieces import PathOptions, chosen_paths
+from .pieces import chosen_paths
 from .remainder import apart, beside, joined, only, sure_ones, whole_ones
 from .rest_shape import KnownBody
-from .sightings import Sighting, SightingOptions, sightings
+from .sightings import Sighting, sightings
 from .start import first_paths
+from .track_options import TrackOptions
+from .twins import Trials, chosen_twins, trial_of
 
 CHECKPOINT_SECONDS = 20.0
 """A fit that runs is kept so often [s]."""
 NOWHERE = Nowhere()
 """No journal."""
-
-
-def _stiff() -> MotionFit:
-    return MotionFit(rate=0.4, stiffness=100.0, schedule=Schedule(steps=60, views_per_step=16))
-
-
-def _half() -> MotionFit:
-    return MotionFit(rate=0.1, schedule=Schedule(steps=40, views_per_step=16))
-
-
-def _soft() -> MotionFit:
-    return MotionFit(schedule=Schedule(steps=150, views_per_step=16))
-
-
-@dataclass(frozen=True)
-@ranged
-class TrackOptions:
-    """How bodies are followed through time."""
-
-    kind: ClassVar[str] = "track"
-
-    body: KnownBody | None = None
-    """What is known of the bodies' shape at rest, which makes two beams enough; None: nothing."""
-    sightings: SightingOptions = field(default_factory=SightingOptions)
-    """How bodies are found at single times."""
-    learned: LearnedStart | None = field(default_factory=LearnedStart)
-    """The network that may guess their volumes, where frames do not contradict it and its bodies explain clearly more;
-    None: none."""
-    links: LinkOptions = field(default_factory=LinkOptions)
-    """Which of them are one body."""
-    paths: PathOptions = field(default_factory=PathOptions)
-    """How the vertices move."""
-    rounds: int = 4
-    """How often bodies are looked for beside those that are known, at most."""
-    fainter: Share = 0.6
-    """Factor of the level there: few views smear a body, and beside what is known there is little to take it for."""
-    stiff: MotionFit = field(default_factory=_stiff)
-    """The first fit, in which bodies move and turn nearly as a whole."""
-    soft: MotionFit = field(default_factory=_soft)
-    """The second one, in which they deform."""
-
-    intervals: bool = True
-    """Whether halves of the frames are fitted, too, for standard errors: up to four fits of a quarter of the steps."""
-    half: MotionFit = field(default_factory=_half)
-    """The fit to a half, from the result: errors are hundredths of a pixel."""
-
-    def with_effort(self, effort: float) -> TrackOptions:
-        """The same with `effort` times the steps, at least one."""
-        parts = {name: getattr(self, name) for name in ("stiff", "soft", "half")}
-        changed = {
-            name: replace(part, schedule=replace(part.schedule, steps=max(1, round(effort * part.schedule.steps))))
-            for name, part in parts.items()
-        }
-        return replace(self, **changed)
-
 
 USUAL = TrackOptions()
 """What `follow` does unless it is told."""
@@ -213,11 +156,13 @@ class _Following:
         """The stages after the first paths."""
         if self.stage == "stiff":
             self.bodies = self.whole(self.fitted("stiff fit", self.train, bodies, self.options.stiff, self.light))
-            self.stage = "beside" if self.round < self.options.rounds else "paths"
+            self.stage = "beside" if self.round < self.options.rounds else "twins"
         elif self.stage == "beside":
             more = self.more(bodies)
             self.round += 1
-            self.bodies, self.stage = (bodies, "paths") if more is None else (more, "stiff")
+            self.bodies, self.stage = (bodies, "twins") if more is None else (more, "stiff")
+        elif self.stage == "twins":
+            self.bodies, self.stage = self.told_from_twins(bodies), "paths"
         elif self.stage == "paths":
             self.bodies, self.stage = self.on_chosen_paths(bodies), "soft"
         elif self.stage == "soft":
@@ -346,6 +291,14 @@ class _Following:
         """`bodies` without pieces of others."""
         kept = whole_ones(bodies, self.train.instants)
         return bodies if len(kept) == bodies.count else only(bodies, kept)
+
+    def told_from_twins(self, bodies: MovingSurfaces) -> MovingSurfaces:
+        """`bodies`, or their twins, where there are two beams."""
+        if not self.options.twins:
+            return bodies
+        how = (trial_of(self.options.stiff), trial_of(self.options.soft), self.seed, self.light, self.rest)
+        with self._timed("twins"):
+            return chosen_twins(bodies, Trials(self.train, *how), lambda share: self.on_progress("twins", share, {}))
 
     def on_chosen_paths(self, bodies: MovingSurfaces) -> MovingSurfaces:
         """`bodies` on paths of as many pieces as frames ask for."""

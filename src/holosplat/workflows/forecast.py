@@ -221,7 +221,7 @@ def _halves(
         done[0] += 1
         on_progress("half-sets", done[0] / total, record)
 
-    return half_sets(train, bodies, options.fit, seed, part, show)
+    return half_sets(train, bodies, options.fit, seed, part, rest=run.rest, on_record=show)
 
 
 def _judged(found: Forecast, run: Reconstruction, scan: Scan, known: Scan, slack: float) -> list[dict[str, float]]:

@@ -44,6 +44,7 @@ from .refine import (
     with_fitted,
     with_held_out,
 )
+from .rest_file import read_rest
 from .resume import goes_on
 from .run_folder import RunFolder, claimed
 from .run_light import found_in, read_light_options, still_in
@@ -135,7 +136,7 @@ def load_reconstruction(folder: RunFolder) -> Reconstruction:
         choice, geometry = Choice.read(summary), read_geometry(summary)
         with as_written(folder.config, "what reconstruct wrote"):
             light = read_light_options(config, summary)
-    told_of = (choice, told, said, total, constants, light, geometry, still)
+    told_of = (choice, told, said, total, constants, light, geometry, still, read_rest(folder, found, config))
     found = found.on("reference" if plain else "cpu")
     return Reconstruction(found, method, energy, oversample, timing, done, *told_of)
 

@@ -9,6 +9,7 @@ import numpy as np
 from ..align.geometry import Geometry
 from ..display import card, of_object
 from ..methods.uncertain import Determined, placed
+from ..motion.elastic import Rest
 from ..optics.background import LightOptions
 from ..representations import Stored
 from ..scan import Scan
@@ -36,6 +37,7 @@ class Reconstruction:
     light: what is assumed of the light of other frames of the scan: smooth if that of the training frames is uneven
     geometry: where the frames were found to be; None: they are taken to be where the scan says
     still: [H, W] the light that all frames of the scan have in common, by those for training; None: there is none
+    rest: what is known of the shape of moving bodies at rest; None: nothing
     """
 
     object: Stored
@@ -52,6 +54,7 @@ class Reconstruction:
     light: LightOptions = EVEN
     geometry: Geometry | None = None
     still: np.ndarray | None = None
+    rest: Rest | None = None
 
     def _repr_html_(self) -> str:
         """What Jupyter shows: what was decided and found, and the object."""

@@ -38,6 +38,7 @@ class RunFolder:
         self.object = self.path / "object.h5"
         self.light = self.path / "light.h5"
         self.guess = self.path / "guess.h5"
+        self.rest = self.path / "rest.vtp"
         self.summary = self.path / "summary.json"
         self.source = self.path / "source.json"
         self.report = self.path / "report.html"

@@ -23,6 +23,7 @@ from ..methods import Task
 from ..methods.assumed import assumed_material
 from ..methods.presets import SCHEMA
 from ..methods.uncertain import Uncertain
+from ..motion.elastic import Rest
 from ..motion.halves import standard_errors
 from ..motion.measures import columns, measured, row
 from ..motion.strain import strain_energy
@@ -35,6 +36,7 @@ from ..tables import to_table
 from .keeper import Choice
 from .provenance import environment, scan_hash
 from .reconstruction import Reconstruction
+from .rest_file import write_rest
 from .resume import goes_on
 from .run_folder import RunFolder, claimed
 from .run_light import found_in
@@ -96,11 +98,18 @@ def track(
             task.delta_told,
             judge(said, train, task.noise if task.uneven else None),
             light=found_in(task),
+            rest=_rest(found, options),
         )
         if folder is not None:
             _write(folder, done, found, task)
             write_tracks(folder, found.bodies, scan, _more(found, options, scan))
         return done
+
+
+def _rest(found: Followed, options: TrackOptions) -> Rest | None:
+    if found.rest is None or options.body is None:
+        return None
+    return Rest.of(found.rest, options.body.stiffness, found.bodies.unit_length)
 
 
 def _more(found: Followed, options: TrackOptions, scan: Scan) -> dict[str, np.ndarray]:
@@ -144,6 +153,8 @@ def _write(folder: RunFolder, done: Reconstruction, found: Followed, task: Task)
     folder.start_metrics(dict.fromkeys(name for record in found.records for name in record))
     folder.append_metrics(found.records)
     write_object(folder.object, found.bodies)
+    if found.rest is not None:
+        write_rest(folder, found.rest)
     if task.uneven is not None and task.uneven.background is not None:
         write_light(folder.light, task.uneven.background)
     told = {"steps": len(found.records), "times_s": task.scan.instants.tolist(), "bodies": found.bodies.count}

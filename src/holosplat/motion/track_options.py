@@ -1,0 +1,71 @@
+"""How bodies are followed through time: the options of `track`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import ClassVar
+
+from ..fit.schedule import Schedule
+from ..learning.start import LearnedStart
+from ..ranges import Share, ranged
+from .fit import MotionFit
+from .identities import LinkOptions
+from .pieces import PathOptions
+from .rest_shape import KnownBody
+from .sightings import SightingOptions
+
+
+def _stiff() -> MotionFit:
+    return MotionFit(rate=0.4, stiffness=100.0, schedule=Schedule(steps=60, views_per_step=16))
+
+
+def _half() -> MotionFit:
+    return MotionFit(rate=0.1, schedule=Schedule(steps=40, views_per_step=16))
+
+
+def _soft() -> MotionFit:
+    return MotionFit(schedule=Schedule(steps=150, views_per_step=16))
+
+
+@dataclass(frozen=True)
+@ranged
+class TrackOptions:
+    """How bodies are followed through time."""
+
+    kind: ClassVar[str] = "track"
+
+    body: KnownBody | None = None
+    """What is known of the bodies' shape at rest, which makes two beams enough; None: nothing."""
+    sightings: SightingOptions = field(default_factory=SightingOptions)
+    """How bodies are found at single times."""
+    learned: LearnedStart | None = field(default_factory=LearnedStart)
+    """The network that may guess their volumes, where frames do not contradict it and its bodies explain clearly more;
+    None: none."""
+    links: LinkOptions = field(default_factory=LinkOptions)
+    """Which of them are one body."""
+    paths: PathOptions = field(default_factory=PathOptions)
+    """How the vertices move."""
+    rounds: int = 4
+    """How often bodies are looked for beside those that are known, at most."""
+    fainter: Share = 0.6
+    """Factor of the level there: few views smear a body, and beside what is known there is little to take it for."""
+    stiff: MotionFit = field(default_factory=_stiff)
+    """The first fit, in which bodies move and turn nearly as a whole."""
+    soft: MotionFit = field(default_factory=_soft)
+    """The second one, in which they deform."""
+
+    twins: bool = True
+    """Whether bodies are told from others of the same volume whose shadows two beams do not tell from theirs."""
+    intervals: bool = True
+    """Whether halves of the frames are fitted, too, for standard errors: up to four fits of a quarter of the steps."""
+    half: MotionFit = field(default_factory=_half)
+    """The fit to a half, from the result: errors are hundredths of a pixel."""
+
+    def with_effort(self, effort: float) -> TrackOptions:
+        """The same with `effort` times the steps, at least one."""
+        parts = {name: getattr(self, name) for name in ("stiff", "soft", "half")}
+        changed = {
+            name: replace(part, schedule=replace(part.schedule, steps=max(1, round(effort * part.schedule.steps))))
+            for name, part in parts.items()
+        }
+        return replace(self, **changed)

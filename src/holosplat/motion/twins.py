@@ -1,0 +1,179 @@
+"""Twins: what two beams cannot tell of a body by its shadows' size and tilt, and which fits to the frames decide.
+
+Parallel beams along d₁ and d₂ tell the second moments Q of a body but for one number: with N = d₁ d₂ᵀ + d₂ d₁ᵀ, the
+shadows of Q + s N have the same moments for every s. Two of these have the same volume: s = 0, and
+s = 2 a₁₂/(a₁₁ a₂₂ - a₁₂²), a = dᵢᵀ Q⁻¹ dⱼ (det(1 + s Q⁻¹ N) = (1 + s a₁₂)² - s² a₁₁ a₂₂ is one there). A search that
+takes bodies for ellipsoids of a known volume finds the one or the other; finer details of the frames tell them apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import product
+
+import numpy as np
+import torch
+
+from ..fit.batch import Batch
+from ..fit.loop import Fit
+from ..geometry import Views
+from ..mesh import TriangleMesh
+from ..optics.background import Light
+from ..representations import MovingSurfaces
+from ..scan import Scan
+from .elastic import Rest
+from .fit import MotionFit, motion_fit
+from .measures import moments
+
+APART = 0.05
+"""Distance of a body and its twin, over its extent, from which on they are told apart."""
+ALIKE = 1e-4
+"""Largest component of the difference of two directions that are one."""
+TRIAL_STEPS, TRIAL_VIEWS = 45, 4
+"""Steps of each fit of a trial, and frames of a step: with fewer steps a body is not yet at home where its twin is."""
+Heard = Callable[[float], None]
+"""Takes the share that is done."""
+
+
+def trial_of(how: MotionFit) -> MotionFit:
+    """`how` in as many steps, of few frames, as tell twins apart; sizes over time and overlaps, which take half of the
+    time of such steps, are left to the fits that follow."""
+    schedule = replace(how.schedule, steps=min(TRIAL_STEPS, how.schedule.steps), views_per_step=TRIAL_VIEWS)
+    return replace(how, volume_kept=0.0, area_kept=0.0, apart=0.0, schedule=schedule)
+
+
+@dataclass(frozen=True)
+class Trials:
+    """The fits that decide: stiff, then soft."""
+
+    train: Scan
+    stiff: MotionFit
+    soft: MotionFit
+    seed: int = 0
+    light: Light | None = None
+    rest: Rest | None = None
+
+    def __call__(self, start: MovingSurfaces) -> tuple[float, MovingSurfaces]:
+        """The loss that is left of `start`, and its bodies then."""
+        loss = np.inf
+        for how in (self.stiff, self.soft):
+            fit = motion_fit(self.train, start, how, self.seed, self.light, self.rest)
+            fit.run(lambda record: None)
+            loss, start = _left(fit)
+        return loss, start
+
+
+def chosen_twins(bodies: MovingSurfaces, trials: Trials, on_progress: Heard = lambda share: None) -> MovingSurfaces:
+    """`bodies`, each or its twin, whichever leaves less; as they are where no twin does, and for other than two beams.
+
+    One after the other is put in its twin's place, those first that are farthest from it, and all are fitted again, by
+    the same steps from shapes without details: what was fitted before is fitted to what was there. Twins that are
+    taken stay for the next trials.
+    """
+    beams = two_beams(trials.train.views)
+    if beams is None:
+        return bodies
+    start = bodies if trials.rest is None else without_details(bodies, trials.rest)
+    away = np.array([distance(_second(start, number), beams) for number in range(start.count)])
+    asked = [int(k) for k in np.argsort(-away) if away[k] > APART]
+    if not asked:
+        return bodies
+    (least, _), kept = trials(start), bodies
+    for turn, number in enumerate(asked):
+        on_progress((1 + turn) / (1 + len(asked)))
+        other = twinned(start, number, beams)
+        left, found = trials(other)
+        if left < least:
+            start, least, kept = other, left, found
+    return kept
+
+
+def two_beams(views: Views) -> np.ndarray | None:
+    """[2, 3] the directions of the beams, of either sense; None unless there are two."""
+    found = list[np.ndarray]()
+    for direction in views.rotations[:, 2]:
+        if all(min(np.abs(direction - one).max(), np.abs(direction + one).max()) > ALIKE for one in found):
+            found.append(direction)
+    return np.array(found) if len(found) == 2 else None
+
+
+def twin_of(second: np.ndarray, beams: np.ndarray) -> np.ndarray:
+    """The second moments [3, 3] of the twin of a body of moments `second`, in their unit; beams: [2, 3]."""
+    (a, b), (_, c) = beams @ np.linalg.inv(second) @ beams.T
+    shear = np.outer(*beams)
+    return second + 2 * b / (a * c - b**2) * (shear + shear.T)
+
+
+def twin_map(second: np.ndarray, beams: np.ndarray) -> np.ndarray:
+    """The matrix T [3, 3] of determinant one that takes a body of second moments `second` [3, 3] to its twin.
+
+    Axes of the ellipsoid become those of the other one, in the order of their lengths, by the smallest turn.
+    """
+    (values, axes), (lengths, frame) = np.linalg.eigh(second), np.linalg.eigh(twin_of(second, beams))
+    signs = [np.array(one) for one in product((1.0, -1.0), repeat=3)]
+    turns = [(frame * sign) @ axes.T for sign in signs]
+    sign = signs[int(np.argmax([np.trace(turn) if np.linalg.det(turn) > 0 else -np.inf for turn in turns]))]
+    return (frame * sign * np.sqrt(lengths / values)) @ axes.T
+
+
+def distance(second: np.ndarray, beams: np.ndarray) -> float:
+    """How far a body of moments `second` [3, 3] is from its twin, over the root mean square of its extent.
+
+    The Wasserstein distance of normal distributions of these moments (Givens & Shortt 1984, Michigan Math. J. 31, 231).
+    """
+    other, (values, axes) = twin_of(second, beams), np.linalg.eigh(second)
+    root = (axes * np.sqrt(values)) @ axes.T
+    common = np.sqrt(np.maximum(np.linalg.eigvalsh(root @ other @ root), 0)).sum()
+    return float(np.sqrt(max(np.trace(second) + np.trace(other) - 2 * common, 0) / np.trace(second)))
+
+
+def twinned(bodies: MovingSurfaces, number: int, beams: np.ndarray) -> MovingSurfaces:
+    """`bodies` with the body `number` in the place of its twin, by one linear map about its middle at all times."""
+    own, middles, arms = _arms(bodies, number)
+    changed = bodies.coefficients.detach().clone()
+    changed[:, own] = middles + arms @ torch.from_numpy(twin_map(_second(bodies, number), beams)).T
+    return bodies.with_parameters({"coefficients": changed})
+
+
+def without_details(bodies: MovingSurfaces, rest: Rest) -> MovingSurfaces:
+    """Each of `bodies` as the nearest linear map of the shape at `rest`, of its own volume in mid-time."""
+    shape, changed = torch.from_numpy(rest.elastic.membrane.mesh.vertices), bodies.coefficients.detach().clone()
+    for number in range(bodies.count):
+        own, middles, arms = _arms(bodies, number)
+        changed[:, own] = middles + torch.stack([shape @ torch.linalg.lstsq(shape, one).solution for one in arms])
+    plain = bodies.with_parameters({"coefficients": changed})
+    for number in range(bodies.count):
+        own, middles, arms = _arms(plain, number)
+        share = _middle_mesh(bodies, number).volume / _middle_mesh(plain, number).volume
+        changed[:, own] = middles + share ** (1 / 3) * arms
+    return bodies.with_parameters({"coefficients": changed})
+
+
+def _arms(bodies: MovingSurfaces, number: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Which vertices a body has, the coefficients [K, 1, 3] of its middle, and those [K, Q, 3] about it."""
+    own, _ = bodies.body(number)
+    paths = bodies.coefficients.detach()[:, own]
+    middles = paths.mean(1, keepdim=True)
+    return own, middles, paths - middles
+
+
+def _middle_mesh(bodies: MovingSurfaces, number: int) -> TriangleMesh:
+    return bodies.bodies(0.5 * (bodies.basis.first + bodies.basis.last))[number]
+
+
+def _second(bodies: MovingSurfaces, number: int) -> np.ndarray:
+    """[3, 3] m², second moments over the volume."""
+    volume, _, second = moments(_middle_mesh(bodies, number))
+    return second / volume
+
+
+def _left(fit: Fit) -> tuple[float, MovingSurfaces]:
+    """The loss of all frames and priors after `fit`, and its bodies."""
+    model = fit.result()
+    whole = Batch(None, torch.zeros(3, dtype=torch.float64), torch.tensor(1.0), 0)
+    with torch.no_grad():
+        loss = float(fit.plan.problem.loss(model, whole)[0])
+    found = model.object
+    assert isinstance(found, MovingSurfaces)
+    return loss, found.with_parameters({"coefficients": found.coefficients.detach()})

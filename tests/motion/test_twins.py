@@ -1,0 +1,137 @@
+"""Twins of bodies in two beams: what they have in common, which of them frames show, on a raster of odd sides."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+import holosplat as hs
+from helpers.motion_shadows import OTHER, TURN, cell
+from holosplat.fit.schedule import Schedule
+from holosplat.geometry import rotation_y
+from holosplat.materials import HAEMOGLOBIN
+from holosplat.matter import Matter
+from holosplat.motion.elastic import Elastic, Rest
+from holosplat.motion.fit import MotionFit
+from holosplat.motion.measures import moments
+from holosplat.motion.twins import (
+    Trials,
+    chosen_twins,
+    distance,
+    twin_map,
+    twin_of,
+    twinned,
+    two_beams,
+    without_details,
+)
+from holosplat.representations import MovingSurfaces, TimeBasis
+
+PIXEL, SHAPE = 1e-6, (29, 35)
+ACROSS = rotation_y(np.array([0.0, 90.0]))[:, 2]
+TIMES = 1e-4 * np.arange(4)
+
+
+def cells(*turns: np.ndarray) -> MovingSurfaces:
+    """Red cells beside each other that flow by six pixels, turned so at all times."""
+    basis = TimeBasis(0.0, float(TIMES[-1]), 1)
+    places = [np.array([9.0 * k - 4.5 * (len(turns) - 1), -3.0, 6.0 * k]) for k in range(len(turns))]
+    ends = [[cell().vertices @ turn.T + place + [0, 6.0 * t, 0] for t in (0, 1)] for turn, place in zip(turns, places)]
+    paths = [PIXEL * basis.fitted(np.array([0.0, TIMES[-1]]), np.array(one)) for one in ends]
+    matter = Matter.one(*HAEMOGLOBIN.delta_beta(20.0))
+    return MovingSurfaces.of_bodies(paths, [cell().faces] * len(turns), basis, PIXEL, matter)
+
+
+@pytest.mark.parametrize("angle", [90.0, 23.8])
+def test_twins_have_the_same_shadows_moments_and_volume(angle):
+    beams = rotation_y(np.array([0.0, angle]))
+    draws = np.random.default_rng(3).normal(size=(5, 3, 3))
+    for second in draws @ draws.transpose(0, 2, 1):
+        matrix = twin_map(second, beams[:, 2])
+        other = matrix @ second @ matrix.T
+        assert np.linalg.det(matrix) == pytest.approx(1)
+        assert np.abs(other - second).max() > 1e-2
+        for view in beams[:, :2]:
+            np.testing.assert_allclose(view @ other @ view.T, view @ second @ view.T, atol=1e-9)
+        back = twin_map(other, beams[:, 2])
+        np.testing.assert_allclose(back @ other @ back.T, second, atol=1e-9)
+
+
+def test_what_is_alike_on_both_sides_of_a_beam_is_its_own_twin():
+    np.testing.assert_allclose(twin_map(np.diag([1.0, 2.0, 3.0]), ACROSS), np.eye(3), atol=1e-12)
+
+
+def test_two_beams_are_two_directions_of_either_sense():
+    def views(*angles: float) -> hs.Views:
+        return hs.Views.from_angles(np.array(angles), SHAPE, PIXEL)
+
+    assert two_beams(views(0.0, 30.0, 48.0)) is None
+    assert two_beams(views(0.0, 180.0)) is None
+    found = two_beams(views(0.0, 90.0, 180.0, 0.0, 270.0))
+    assert found is not None
+    np.testing.assert_allclose(np.abs(found), np.abs(ACROSS), atol=1e-12)
+
+
+def test_one_body_takes_its_twins_place():
+    """The others stay, and so do its middle, its volume and the moments of its shadows."""
+    bodies = cells(TURN, OTHER)
+    moved = twinned(bodies, 0, ACROSS)
+    own, _ = bodies.body(1)
+    assert torch.equal(moved.coefficients[:, own], bodies.coefficients[:, own])
+    for time in TIMES[[0, -1]]:
+        before, after = bodies.bodies(float(time))[0], moved.bodies(float(time))[0]
+        assert after.volume == pytest.approx(before.volume)
+        np.testing.assert_allclose(after.vertices.mean(0), before.vertices.mean(0), atol=1e-9)
+        for beam in rotation_y(np.array([0.0, 90.0]))[:, :2]:
+            seen = [beam @ moments(mesh)[2] @ beam.T / moments(mesh)[0] for mesh in (before, after)]
+            np.testing.assert_allclose(seen[1], seen[0], rtol=1e-6, atol=1e-20)
+
+
+def test_the_distance_of_twins():
+    """Of long rods along the diagonal of two beams: the twin lies along the other one, at √2 of the rod's extent."""
+    along, across = np.array([1.0, 0, 1]) / 2**0.5, np.array([1.0, 0, -1]) / 2**0.5
+    rod = 1e-4 * np.eye(3) + np.outer(along, along)
+    twin = twin_of(rod, ACROSS)
+    assert distance(rod, ACROSS) == pytest.approx(2**0.5, rel=0.02)
+    np.testing.assert_allclose(twin, 1e-4 * np.eye(3) + np.outer(across, across), atol=1e-9)
+    assert distance(np.eye(3), ACROSS) == pytest.approx(0, abs=1e-7)
+
+
+def test_details_go_and_size_place_and_linear_motion_stay():
+    rest = Rest(Elastic(cell()), 100.0)
+    bodies = cells(TURN)
+    stretch = torch.tensor([[1.1, 0.2, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1 / 1.1]], dtype=torch.float64)
+    arms = bodies.coefficients - bodies.coefficients.mean(1, keepdim=True)
+    middles = bodies.coefficients - arms
+    linear = bodies.with_parameters({"coefficients": middles + torch.stack([arms[0], arms[1] @ stretch.T])})
+    plain = without_details(linear, rest)
+    np.testing.assert_allclose(plain.coefficients, linear.coefficients, atol=0.02)
+    bumps = 0.3 * torch.sin(3 * arms[0]).flip(1)
+    rough = without_details(linear.with_parameters({"coefficients": linear.coefficients + bumps}), rest)
+    away = (rough.coefficients - linear.coefficients).square().mean().sqrt()
+    assert away < 0.5 * bumps.square().mean().sqrt()
+
+
+def test_frames_tell_a_body_from_its_twin():
+    """Of two cells the one that begins as its twin is taken back, the other stays; three beams ask nothing."""
+    truth = cells(TURN, OTHER)
+    views = hs.Views.from_angles(np.array([0.0, 90.0]), SHAPE, PIXEL)
+    exposures = hs.Exposures.of(views, 20.0, 0.05).repeated(TIMES)
+    frames = np.concatenate([hs.simulate(truth.at(t), exposures[exposures.time == t]).frames for t in TIMES])
+    noise = 1e-3 * np.random.default_rng(0).normal(size=frames.shape)
+    scan = hs.Scan((frames + noise).astype(np.float32), exposures, np.zeros(len(frames), dtype=bool))
+    stiff = MotionFit(rate=0.4, stiffness=100.0, schedule=Schedule(steps=10))
+    soft = MotionFit(schedule=Schedule(steps=10))
+    trials = Trials(scan, stiff, soft, rest=Rest(Elastic(cell()), 100.0))
+    heard = list[float]()
+    found = chosen_twins(twinned(truth, 0, ACROSS), trials, heard.append)
+    for number, turn in enumerate((TURN, OTHER)):
+        axes = np.linalg.eigh(moments(found.bodies(float(TIMES[1]))[number])[2])[1]
+        assert abs(axes[:, 0] @ turn[:, 2]) > 0.98
+    assert heard == sorted(heard)
+    assert 0 < heard[0] < heard[-1] < 1
+    assert chosen_twins(truth, trials) is truth
+    other = hs.Views.from_angles(np.array([0.0, 30.0, 48.0]), SHAPE, PIXEL)
+    three = hs.Exposures.of(other, 20.0, 0.05).repeated(TIMES[:2])
+    blank = hs.Scan(np.ones((6, *SHAPE), dtype=np.float32), three, np.zeros(6, dtype=bool))
+    assert chosen_twins(truth, Trials(blank, stiff, soft)) is truth
