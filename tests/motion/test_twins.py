@@ -19,12 +19,13 @@ from holosplat.motion.twins import (
     Trials,
     chosen_twins,
     distance,
+    in_question,
     twin_map,
     twin_of,
     twinned,
     two_beams,
     without_details,
-)
+)  # fmt: skip
 from holosplat.representations import MovingSurfaces, TimeBasis
 
 PIXEL, SHAPE = 1e-6, (29, 35)
@@ -110,6 +111,15 @@ def test_details_go_and_size_place_and_linear_motion_stay():
     rough = without_details(linear.with_parameters({"coefficients": linear.coefficients + bumps}), rest)
     away = (rough.coefficients - linear.coefficients).square().mean().sqrt()
     assert away < 0.5 * bumps.square().mean().sqrt()
+
+
+def test_twins_far_from_the_shape_at_rest_are_not_in_question():
+    """In beams across each other both are; at 24° twins would be several times as long."""
+    rest, bodies = Rest(Elastic(cell()), 100.0), cells(TURN, OTHER)
+    assert sorted(in_question(bodies, ACROSS, rest)) == [0, 1]
+    narrow = rotation_y(np.array([0.0, 23.8]))[:, 2]
+    assert in_question(bodies, narrow, rest) == []
+    assert sorted(in_question(bodies, narrow, None)) == [0, 1]
 
 
 def test_frames_tell_a_body_from_its_twin():

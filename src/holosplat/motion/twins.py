@@ -30,6 +30,11 @@ APART = 0.05
 """Distance of a body and its twin, over its extent, from which on they are told apart."""
 ALIKE = 1e-4
 """Largest component of the difference of two directions that are one."""
+STRAINED = 10.0
+"""Elastic energy by which a twin may exceed its body, in units of its area times the shear modulus; cells in flow have
+up to four, their twins in beams across each other one more, in beams at 24° thirty and more."""
+HOPELESS = 0.02
+"""Part by which the loss of a stiff fit may be larger than without the twin for the soft fit to be made."""
 TRIAL_STEPS, TRIAL_VIEWS = 45, 4
 """Steps of each fit of a trial, and frames of a step: with fewer steps a body is not yet at home where its twin is."""
 Heard = Callable[[float], None]
@@ -54,14 +59,17 @@ class Trials:
     light: Light | None = None
     rest: Rest | None = None
 
-    def __call__(self, start: MovingSurfaces) -> tuple[float, MovingSurfaces]:
-        """The loss that is left of `start`, and its bodies then."""
-        loss = np.inf
+    def __call__(self, start: MovingSurfaces, hopeless: float = np.inf) -> tuple[list[float], MovingSurfaces]:
+        """The losses that fits leave of `start`, and its bodies then; one fit where it leaves more than `hopeless`."""
+        losses = list[float]()
         for how in (self.stiff, self.soft):
             fit = motion_fit(self.train, start, how, self.seed, self.light, self.rest)
             fit.run(lambda record: None)
             loss, start = _left(fit)
-        return loss, start
+            losses.append(loss)
+            if loss > hopeless:
+                break
+        return losses, start
 
 
 def chosen_twins(bodies: MovingSurfaces, trials: Trials, on_progress: Heard = lambda share: None) -> MovingSurfaces:
@@ -75,18 +83,27 @@ def chosen_twins(bodies: MovingSurfaces, trials: Trials, on_progress: Heard = la
     if beams is None:
         return bodies
     start = bodies if trials.rest is None else without_details(bodies, trials.rest)
-    away = np.array([distance(_second(start, number), beams) for number in range(start.count)])
-    asked = [int(k) for k in np.argsort(-away) if away[k] > APART]
+    asked = in_question(start, beams, trials.rest)
     if not asked:
         return bodies
     (least, _), kept = trials(start), bodies
     for turn, number in enumerate(asked):
         on_progress((1 + turn) / (1 + len(asked)))
         other = twinned(start, number, beams)
-        left, found = trials(other)
-        if left < least:
+        left, found = trials(other, (1 + HOPELESS) * least[0])
+        if len(left) == len(least) and left[-1] < least[-1]:
             start, least, kept = other, left, found
     return kept
+
+
+def in_question(bodies: MovingSurfaces, beams: np.ndarray, rest: Rest | None) -> list[int]:
+    """Numbers of the bodies that are apart from their twins, those first that are farthest; without those whose twin is
+    too far from the shape at `rest`, if that is known."""
+    away = np.array([distance(_second(bodies, number), beams) for number in range(bodies.count)])
+    found = [int(number) for number in np.argsort(-away) if away[number] > APART]
+    if rest is None:
+        return found
+    return [k for k in found if _energy(twinned(bodies, k, beams), k, rest) < _energy(bodies, k, rest) + STRAINED]
 
 
 def two_beams(views: Views) -> np.ndarray | None:
@@ -160,6 +177,13 @@ def _arms(bodies: MovingSurfaces, number: int) -> tuple[torch.Tensor, torch.Tens
 
 def _middle_mesh(bodies: MovingSurfaces, number: int) -> TriangleMesh:
     return bodies.bodies(0.5 * (bodies.basis.first + bodies.basis.last))[number]
+
+
+def _energy(bodies: MovingSurfaces, number: int, rest: Rest) -> float:
+    own, _ = bodies.body(number)
+    weights = bodies.basis.weights(np.array([0.5 * (bodies.basis.first + bodies.basis.last)]))[0]
+    nodes = torch.einsum("k,kpx->px", torch.from_numpy(weights), bodies.coefficients.detach()[:, own])
+    return float(rest.elastic(nodes))
 
 
 def _second(bodies: MovingSurfaces, number: int) -> np.ndarray:
