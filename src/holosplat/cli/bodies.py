@@ -60,8 +60,7 @@ class MotionFlags:
     bending: float = 1.0
     """Weight of bent surfaces (0: free)."""
     twins: bool = True
-    """Bodies in two beams are told from others of the same volume whose shadows have the same size and tilt, by short
-    fits."""
+    """Bodies of known shape in two beams are told from others whose shadows have the same size and tilt, by fits."""
     intervals: bool = True
     """Standard errors from fits to halves of the frames, which take about as long as the last fit."""
     effort: float = 1.0

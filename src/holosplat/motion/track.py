@@ -293,12 +293,13 @@ class _Following:
         return bodies if len(kept) == bodies.count else only(bodies, kept)
 
     def told_from_twins(self, bodies: MovingSurfaces) -> MovingSurfaces:
-        """`bodies`, or their twins, where there are two beams."""
-        if not self.options.twins:
+        """`bodies` of known rest shape, or their twins, where there are two beams."""
+        if self.rest is None or not self.options.twins:
             return bodies
-        how = (trial_of(self.options.stiff), trial_of(self.options.soft), self.seed, self.light, self.rest)
+        how = (trial_of(self.options.stiff), trial_of(self.options.soft), self.seed, self.light)
+        trials = Trials(self.train, self.rest, *how)
         with self._timed("twins"):
-            return chosen_twins(bodies, Trials(self.train, *how), lambda share: self.on_progress("twins", share, {}))
+            return chosen_twins(bodies, trials, lambda share: self.on_progress("twins", share, {}))
 
     def on_chosen_paths(self, bodies: MovingSurfaces) -> MovingSurfaces:
         """`bodies` on paths of as many pieces as frames ask for."""

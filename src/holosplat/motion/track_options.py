@@ -55,7 +55,7 @@ class TrackOptions:
     """The second one, in which they deform."""
 
     twins: bool = True
-    """Whether bodies are told from others of the same volume whose shadows two beams do not tell from theirs."""
+    """Whether bodies of known shape are told from others whose shadows two beams do not tell from theirs."""
     intervals: bool = True
     """Whether halves of the frames are fitted, too, for standard errors: up to four fits of a quarter of the steps."""
     half: MotionFit = field(default_factory=_half)

@@ -53,11 +53,11 @@ class Trials:
     """The fits that decide: stiff, then soft."""
 
     train: Scan
+    rest: Rest
     stiff: MotionFit
     soft: MotionFit
     seed: int = 0
     light: Light | None = None
-    rest: Rest | None = None
 
     def __call__(self, start: MovingSurfaces, hopeless: float = np.inf) -> tuple[list[float], MovingSurfaces]:
         """The losses that fits leave of `start`, and its bodies then; one fit where it leaves more than `hopeless`."""
@@ -73,7 +73,7 @@ class Trials:
 
 
 def chosen_twins(bodies: MovingSurfaces, trials: Trials, on_progress: Heard = lambda share: None) -> MovingSurfaces:
-    """`bodies`, each or its twin, whichever leaves less; as they are where no twin does, and for other than two beams.
+    """`bodies` of known rest shape, each or its twin, whichever leaves less; as they are for other than two beams.
 
     One after the other is put in its twin's place, those first that are farthest from it, and all are fitted again, by
     the same steps from shapes without details: what was fitted before is fitted to what was there. Twins that are
@@ -82,7 +82,7 @@ def chosen_twins(bodies: MovingSurfaces, trials: Trials, on_progress: Heard = la
     beams = two_beams(trials.train.views)
     if beams is None:
         return bodies
-    start = bodies if trials.rest is None else without_details(bodies, trials.rest)
+    start = without_details(bodies, trials.rest)
     asked = in_question(start, beams, trials.rest)
     if not asked:
         return bodies
@@ -96,13 +96,11 @@ def chosen_twins(bodies: MovingSurfaces, trials: Trials, on_progress: Heard = la
     return kept
 
 
-def in_question(bodies: MovingSurfaces, beams: np.ndarray, rest: Rest | None) -> list[int]:
+def in_question(bodies: MovingSurfaces, beams: np.ndarray, rest: Rest) -> list[int]:
     """Numbers of the bodies that are apart from their twins, those first that are farthest; without those whose twin is
-    too far from the shape at `rest`, if that is known."""
+    too far from the shape at `rest`."""
     away = np.array([distance(_second(bodies, number), beams) for number in range(bodies.count)])
     found = [int(number) for number in np.argsort(-away) if away[number] > APART]
-    if rest is None:
-        return found
     return [k for k in found if _energy(twinned(bodies, k, beams), k, rest) < _energy(bodies, k, rest) + STRAINED]
 
 
