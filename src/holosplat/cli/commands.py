@@ -21,7 +21,9 @@ from .progress import INTERRUPTED, ProgressBar
 from .room import tell_reconstruction
 
 if TYPE_CHECKING:
+    from ..methods import Method
     from ..scan import Scan
+    from ..series.settings import Settings
     from ..workflows.evaluate import Evaluation
     from ..workflows.reconstruct import Reconstruction
     from ..workflows.run_folder import RunFolder
@@ -41,6 +43,16 @@ class Asked:
     how: MethodOptions = field(default_factory=MethodOptions)
     illumination: RunLightFlags = field(default_factory=RunLightFlags)
     geometry: RefineOptions = field(default_factory=RefineOptions)
+
+    def each_time(self, method: Method, reading: Reading, seed: int) -> Settings:
+        """What is done with each of several times; `InputError` for what one time alone can be asked."""
+        from ..series.settings import Settings
+
+        require(self.geometry.options() is None, "--refine is of one time; find the one geometry by holosplat align.")
+        ranges = [*self.matter.ranges(), *reading.told.ranges()]
+        require(not ranges, "--time-frame each needs one number for each constant; find it by reconstruct of one time.")
+        shared = {"light": self.illumination.options(), "seed": seed}
+        return Settings("reconstruct", method, self.how.kind_of_matter(), **shared)
 
     def ways(self, reading: Reading) -> dict[str, Any]:
         """What `workflows.reconstruct` takes by name; `InputError` for what does not go together."""
@@ -89,6 +101,13 @@ def reconstruct(
     from .motion import asks_for_motion, reconstruct_in_motion
 
     method = asked.how.chosen()
+    if reading.part.time_frame == "each":
+        from .each_time import reconstruct_each
+
+        require(not (live.view or strict), "--view and --strict are of one time; leave them, or choose a time.")
+        settings = asked.each_time(method, reading, seed)
+        reconstruct_each(scan, out, settings, asked.matter.prior, reading, resume)
+        return
     if takes_series(method) and reading.part.time_frame == "all":
         reading = replace(reading, part=replace(reading.part, time_frame=None))
     ways, folder = asked.ways(reading), RunFolder(out)

@@ -20,6 +20,7 @@ from .progress import INTERRUPTED
 
 if TYPE_CHECKING:
     from ..series.folder import SeriesFolder
+    from ..series.rows import Row
     from ..series.run import Counts
     from ..series.settings import Settings
 
@@ -181,12 +182,10 @@ def run(
     _end(series, counts)
 
 
-def _tell_row(row: object) -> None:
-    from ..series.rows import Row
+def _tell_row(row: Row) -> None:
+    from ..series.words import line_of
 
-    assert isinstance(row, Row)
-    said = f"{row.begun}, {row.size}, {row.seconds:.1f} s" if row.done else f"failed: {row.reason}"
-    _say(f"time {row.number}: {said}")
+    _say(line_of(row))
 
 
 def _end(series: SeriesFolder, counts: Counts) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from .folder import TaskState
+from .rows import Row
 
 LONGEST = 160
 """Characters of a reason in a table."""
@@ -51,3 +52,9 @@ def duration(seconds: float) -> str:
     if seconds < 100:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+
+
+def line_of(row: Row) -> str:
+    """How a time went, in a line."""
+    said = f"{row.begun}, {row.size}, {row.seconds:.1f} s" if row.done else f"failed: {row.reason}"
+    return f"time {row.number}: {said}"
