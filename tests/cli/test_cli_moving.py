@@ -12,7 +12,7 @@ from holosplat.cli import motion
 from holosplat.io.nxtomo import read_scan
 from holosplat.io.volumes import read_volume
 from holosplat.methods import SmoothVolume
-from holosplat.motion.carried import CarriedOptions
+from holosplat.motion.carried import CarriedOptions, Search
 from holosplat.representations import MovingGaussians, SpaceTimeField
 from holosplat.workflows.moving import reconstruct_moving
 from holosplat.workflows.reconstruct import load_reconstruction
@@ -64,6 +64,28 @@ def test_a_series_in_motion_is_one_object_that_all_commands_read(quick):
     assert len(read_scan(quick / "p.nxs")) == 9
     refused = holosplat("export", quick / "run", "--bodies", quick / "b")
     assert refused.code == 2
+
+
+def test_a_run_that_was_cut_off_goes_on(quick, monkeypatch):
+    """Ctrl-C after two steps; the same command with --resume ends it, one with another seed is refused."""
+    asked = ["reconstruct", quick / "s.nxs", "--material", "PMMA", "--time-frame", "all", "--out", quick / "run"]
+    keep, kept = Search.keep, list[int]()
+
+    def broken_off(search, state=None):
+        keep(search, state)
+        kept.append(1)
+        if len(kept) == 2:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Search, "keep", broken_off)
+        outcome = holosplat(*asked)
+    assert outcome.code == 130
+    assert "--resume" in outcome.err
+    assert holosplat(*asked, "--resume", "--seed", 3).code == 2
+    assert holosplat("evaluate", quick / "run").code == 2  # not finished
+    worked(holosplat(*asked, "--resume"))
+    assert isinstance(load_reconstruction(RunFolder(quick / "run")).object, MovingGaussians)
 
 
 FEW = ["volume.iterations=5", "volume.retrieval=5", "volume.corrections=0", "fit.flow_steps=3", "fit.schedule.steps=3"]

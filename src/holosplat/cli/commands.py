@@ -98,7 +98,7 @@ def reconstruct(
     from ..methods.uncertain import Uncertain
     from ..workflows.reconstruct import reconstruct as fit
     from ..workflows.run_folder import RunFolder, claimed
-    from .motion import asks_for_motion, reconstruct_in_motion
+    from .motion import asks_for_motion, may_go_on, reconstruct_in_motion
 
     method = asked.how.chosen()
     if reading.part.time_frame == "each":
@@ -116,11 +116,11 @@ def reconstruct(
     if not measured.is_series:
         tell_reconstruction(measured.exposures[~measured.is_test], out, method, prior, ways["matter"])
     measured = measured.in_memory()
-    plain = not resume and ways["refine"] is None and ways["uncertain"] == Uncertain()
+    plain = may_go_on(folder, resume) and ways["refine"] is None and ways["uncertain"] == Uncertain()
     if asks_for_motion(reading, method, ways["matter"], plain):
         require(not live.view, "--view shows fits of one time; choose it with --time-frame, or leave --view.")
         with claimed(folder):
-            if reconstruct_in_motion(scan, reading, prior, folder, seed, ways["light"]):
+            if reconstruct_in_motion(scan, reading, prior, folder, seed, ways["light"], resume=resume):
                 return
         _say("nothing moves, as far as the frames tell: they are taken as of one time")
     with claimed(folder):

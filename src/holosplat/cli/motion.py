@@ -17,10 +17,10 @@ from ..report.run import report_run
 from ..scan import Scan
 from ..workflows.evaluate import evaluate as score
 from ..workflows.moments import moment
-from ..workflows.moving import reconstruct_moving
+from ..workflows.moving import begun_in_motion, reconstruct_moving
 from ..workflows.reconstruction import Reconstruction
 from ..workflows.run_folder import RunFolder
-from .progress import ProgressBar
+from .progress import INTERRUPTED, ProgressBar
 
 FEWEST_TIMES = 3
 """Times from which on matter in motion can be found."""
@@ -32,16 +32,34 @@ def asks_for_motion(reading: Reading, method: Method, matter: MatterKind | None,
     return reading.part.time_frame == "all" and isinstance(method, Auto) and matter != "levels" and plain
 
 
+def may_go_on(folder: RunFolder, resume: bool) -> bool:
+    """Whether a run in motion may be in `folder`, or begin there; not where one of another kind is to go on."""
+    return not resume or not folder.config.is_file() or begun_in_motion(folder)
+
+
 def reconstruct_in_motion(
-    scan: Path, reading: Reading, prior: MaterialPrior, folder: RunFolder, seed: int, light: LightOptions
+    scan: Path,
+    reading: Reading,
+    prior: MaterialPrior,
+    folder: RunFolder,
+    seed: int,
+    light: LightOptions,
+    *,
+    resume: bool = False,
 ) -> bool:
     """Find matter in motion, write its run, its report and its scores; False where nothing moves, or times are few."""
     reading = replace(reading, part=replace(reading.part, time_frame=None))
     measured = read_as(scan, replace(reading, told=reading.told.at_middle())).in_memory()
     if isinstance(prior, KnownTwo) or len(measured.train().instants) < FEWEST_TIMES:
         return False
-    with ProgressBar() as bar:
-        found = reconstruct_moving(measured, prior, seed=seed, light=light, folder=folder, on_progress=bar.show)
+    try:
+        with ProgressBar() as bar:
+            told = {"light": light, "folder": folder, "resume": resume, "on_progress": bar.show}
+            found = reconstruct_moving(measured, prior, seed=seed, **told)
+    except KeyboardInterrupt:
+        begun = folder.checkpoint.is_file()
+        print(f"interrupted{f'; go on with --out {folder.path} --resume' if begun else ''}", file=sys.stderr)
+        raise SystemExit(INTERRUPTED) from None
     if found is None:
         return False
     result = found.reconstruction

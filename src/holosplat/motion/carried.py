@@ -12,26 +12,27 @@ from __future__ import annotations
 import time as clock
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from ..baselines.material import plateau
-from ..checks import at_least, positive, require
+from ..checks import as_written, at_least, positive, require
 from ..fit.carried_volume import CarriedProblem, likelier_flow
 from ..fit.smooth_volume import descend
-from ..fit.whitened import WhitenedFrames
 from ..geometry import Grid
 from ..matter import DeltaBeta, MaterialPrior, Matter
 from ..methods import Task
 from ..methods.smooth_fit import SmoothFit
 from ..methods.volume import SmoothStage, SmoothVolume
-from ..optics.noise_model import NoiseModel
 from ..ranges import Pixels, Weight, ranged
 from ..representations import Flow, Lattice, MovingGaussians, TimeBasis, VoxelGrid, approximate, cloud_from_volume
 from ..representations.initialise import FILLED
 from ..scan import Scan
+from .freer_flow import of_degree, on_lattice
+from .journal import Journal, Nowhere
+from .timed_frames import Frames, merged
 
 SURE, AGAIN = 4.0, 2.0
 """Standard deviations, and times what it explains of times in another order, by which a flow must explain frames before
@@ -40,6 +41,8 @@ BETTER = 2.0
 """Standard errors by which a freer flow must predict held-out frames better."""
 ORDERS = 200
 """Orders of the times that are tried for one without a trend."""
+NOWHERE = Nowhere()
+"""No journal."""
 FEWEST_PIXELS = 24
 """Pixels along a frame's shorter side from which on flows are found on voxels of two pixels."""
 
@@ -85,51 +88,6 @@ class CarriedOptions:
 
 
 @dataclass(frozen=True)
-class Frames:
-    """The frames of each time, ready: scans [T] (training frames), times [T] [s], the noise of each, one material."""
-
-    scans: Sequence[Scan]
-    times: np.ndarray
-    noise: Sequence[NoiseModel]
-    material: DeltaBeta
-
-    @classmethod
-    def of(cls, task: Task, material: DeltaBeta) -> Frames:
-        """Those of a task of several times, whose light has been evened."""
-        times = task.scan.instants
-        scans = [task.scan.at_instant(k) for k in range(len(times))]
-        parts = [Task(scan, task.prior, light=task.light) for scan in scans]
-        return cls(scans, times, [part.noise for part in parts], material)
-
-    def whitened(self, k: int, factor: int, keep: np.ndarray | None = None) -> WhitenedFrames:
-        """The frames of the time numbered k on pixels `factor` times larger; keep: [V] bool, which of them."""
-        scan, noise = self.scans[k], self.noise[k]
-        if keep is not None:
-            scan, noise = scan[np.flatnonzero(keep)], part_of(noise, np.flatnonzero(keep))
-        return WhitenedFrames(scan.binned(factor), self.material, noise.binned(factor))
-
-
-def part_of(noise: NoiseModel, index: np.ndarray) -> NoiseModel:
-    """The noise of some of the frames."""
-    return noise[torch.from_numpy(index)]
-
-
-def merged(scan: Scan) -> Scan:
-    """The mean of the frames of each exposure over the times, as a scan of one time, where all times have the same
-    exposures; else all frames, as if taken at one time."""
-    count, times = len(scan), scan.instants
-    each = [np.flatnonzero(scan.exposures.time == time) for time in times]
-    first = scan.exposures[each[0]]
-    same = all(
-        len(one) == len(each[0]) and scan.views[one].fingerprint() == first.views.fingerprint() for one in each[1:]
-    )
-    if not same or len(each[0]) * len(times) != count:
-        return scan.as_static()
-    frames = np.mean([scan.frames[one] for one in each], axis=0)
-    return replace(scan[each[0]], frames=frames).as_static()
-
-
-@dataclass(frozen=True)
 class Carried:
     """What was found. object: the matter in motion; volume: of the reference time, on voxels; misfit: [T] χ² a pixel at
     each time; history: what was tried, in words; timing: seconds by stage."""
@@ -151,15 +109,22 @@ class _State:
 
 
 class Search:
-    """The way from frames to matter in motion, step by step."""
+    """The way from frames to matter in motion, step by step; `journal` keeps the last of them."""
 
-    def __init__(self, task: Task, material: DeltaBeta, options: CarriedOptions = CarriedOptions()) -> None:
-        self.task, self.options = task, options
+    def __init__(
+        self,
+        task: Task,
+        material: DeltaBeta,
+        options: CarriedOptions = CarriedOptions(),
+        journal: Journal = NOWHERE,
+    ) -> None:
+        self.task, self.options, self.journal = task, options, journal
         self.frames = Frames.of(task, material)
         self.times, views = self.frames.times, task.scan.views
         self.middle = len(self.times) // 2
         self.factor = 2 if min(views.shape) >= FEWEST_PIXELS else 1
         self.prior, self.history, self.timing = options.volume.prior, list[str](), dict[str, float]()
+        self._strength, self._step, self._saved = 1.0, 0, dict[str, Any]()
         self._extents = (views.width / views.finest, views.height / views.finest, views.width / views.finest)
 
     def by_itself(self, scan: Scan, name: str) -> VoxelGrid:
@@ -171,7 +136,8 @@ class Search:
         start = stage.start(task, None)
         fit: SmoothFit = stage.fit(task, start)
         fit.run(lambda record: self.task.on_progress(name, fit.share))
-        self.prior = self.options.volume.prior.weakened(float(fit.state_dict()["strength"]))
+        self._strength = float(fit.state_dict()["strength"])
+        self.prior = self.options.volume.prior.weakened(self._strength)
         self.timing[name] = clock.perf_counter() - began
         found = fit.result().object
         assert isinstance(found, VoxelGrid)
@@ -242,18 +208,48 @@ class Search:
                 return found
             reach *= 2
 
+    def take_up(self) -> None:
+        """Go on where the journal ends."""
+        saved = self.journal.load()
+        if saved is None:
+            return
+        with as_written("checkpoint.pt", "a checkpoint of this run"):
+            self._saved, self.history = dict(saved), list(saved["history"])
+            self.timing, self._strength = dict(saved["timing"]), float(saved["strength"])
+            self.prior = self.options.volume.prior.weakened(self._strength)
+
+    def keep(self, state: _State | None = None) -> None:
+        """Write the journal: so many steps are done, and what the last of them found."""
+        found = {} if state is None else {"flow": state.flow.state(), "u": state.u}
+        told = {"history": list(self.history), "timing": dict(self.timing), "strength": self._strength}
+        self.journal.save({"steps": self._step, **found, **told})
+
     def run(self) -> Carried:
         """The whole way, from the middle time on."""
-        volume = self.first()
-        began = clock.perf_counter()
-        state = _State(self.steady(self.options.cells), self.on(volume, self.factor))
+        state = self._stepped("flow", self._begun)
         windows = self.windows()
         for n, window in enumerate(windows):
             self.task.on_progress("flow", n / (len(windows) + 3))
-            state = self.turns(self.problem(window, self.factor, state.flow, state.u), state)
-        state = self.freer(state)
-        self.timing["flow"] = clock.perf_counter() - began
-        return self.finished(state)
+            state = self._stepped("flow", lambda s=state, w=window: self.turns(self._whole(s, w), s))
+        return self.finished(self.freer(state))
+
+    def _stepped(self, name: str, make: Callable[[], _State]) -> _State:
+        """What `make` finds, in the time of stage `name`; of steps that are done already, what the last one found."""
+        done, self._step = int(self._saved.get("steps", 0)), self._step + 1
+        if self._step <= done:
+            return _State(Flow.from_state(self._saved["flow"]), self._saved["u"])
+        began, before = clock.perf_counter(), sum(self.timing.values())
+        found, others = make(), sum(self.timing.values()) - before
+        self.timing[name] = self.timing.get(name, 0.0) + clock.perf_counter() - began - others
+        self.keep(found)
+        return found
+
+    def _begun(self) -> _State:
+        return _State(self.steady(self.options.cells), self.on(self.first(), self.factor))
+
+    def _whole(self, state: _State, window: Sequence[int] | range) -> CarriedProblem:
+        """The frames of the times numbered `window`, with the matter of `state`."""
+        return self.problem(window, self.factor, state.flow, state.u)
 
     def first(self) -> VoxelGrid:
         """The volume of the middle time; of all times, as if nothing moved, where noise hides a single one."""
@@ -271,25 +267,27 @@ class Search:
         aside[np.random.default_rng(self.task.seed).permutation(count * views)[:number]] = True
         keep = ~aside.reshape(count, views)
         keep[~keep.any(1), 0] = True
-        for change in self._changes(state.flow):
-            wanted = change(state.flow)
-            if wanted is None:
-                continue
-            kept = self.problem(range(count), self.factor, state.flow, state.u, keep)
-            same = self.turns(kept, state)
-            kept.carry(wanted)
-            other = self.turns(kept, _State(wanted, state.u))
-            errors = [self.left_out(one, ~keep) for one in (same, other)]
-            gain = errors[0] - errors[1]
-            better = bool(gain.mean() > BETTER * gain.std(ddof=1) / np.sqrt(len(gain)))
-            size = f"degree {wanted.basis.degree}, {' × '.join(map(str, wanted.lattice.counts))} nodes"
-            self.history.append(f"{size}: {gain.mean():+.1f} of ½χ² a held-out frame{', taken' if better else ''}")
-            if better:
-                state = other
-        every = self.problem(range(count), self.factor, state.flow, state.u)
-        return self.turns(every, state)
+        for change in self._changes():
+            state = self._stepped("flow", lambda s=state, c=change: self._changed(s, c, keep))
+        return self._stepped("flow", lambda: self.turns(self._whole(state, range(count)), state))
 
-    def _changes(self, flow: Flow) -> list[Callable[[Flow], Flow | None]]:
+    def _changed(self, state: _State, change: Callable[[Flow], Flow | None], keep: np.ndarray) -> _State:
+        """The state with a freer flow, if that predicts the frames better that `keep` [T, V] leaves out."""
+        wanted, count = change(state.flow), len(self.times)
+        if wanted is None:
+            return state
+        kept = self.problem(range(count), self.factor, state.flow, state.u, keep)
+        same = self.turns(kept, state)
+        kept.carry(wanted)
+        other = self.turns(kept, _State(wanted, state.u))
+        errors = [self.left_out(one, ~keep) for one in (same, other)]
+        gain = errors[0] - errors[1]
+        better = bool(gain.mean() > BETTER * gain.std(ddof=1) / np.sqrt(len(gain)))
+        size = f"degree {wanted.basis.degree}, {' × '.join(map(str, wanted.lattice.counts))} nodes"
+        self.history.append(f"{size}: {gain.mean():+.1f} of ½χ² a held-out frame{', taken' if better else ''}")
+        return other if better else state
+
+    def _changes(self) -> list[Callable[[Flow], Flow | None]]:
         options = self.options
         most = min(options.most_degree, len(self.times) - 2)
         degrees = [lambda f, d=d: of_degree(f, d) if f.basis.degree == d - 1 else None for d in range(1, most + 1)]
@@ -312,21 +310,27 @@ class Search:
 
     def finished(self, state: _State) -> Carried:
         """The state on voxels of a pixel, and the Gaussians that stand for it."""
-        began, options = clock.perf_counter(), self.options
-        coarse = VoxelGrid(state.u[None], self._grid(self.factor), Matter.one(*self.frames.material))
-        flow, u = state.flow, self.on(coarse, 1)
+        state = self._stepped("volume", lambda: self._fine(state))
+        problem = self.problem(range(len(self.times)), 1, state.flow, state.u)
+        pixels = problem.count / len(self.times)
+        misfit = [2 * one / pixels for one in problem.misfit(state.u)]
+        volume = self._volume(state.u, 1)
+        return Carried(self.gaussians(volume, state.flow), volume, state.flow, misfit, tuple(self.history), self.timing)
+
+    def _volume(self, u: Tensor, factor: int) -> VoxelGrid:
+        return VoxelGrid(u[None], self._grid(factor), Matter.one(*self.frames.material))
+
+    def _fine(self, state: _State) -> _State:
+        """On voxels of a pixel: the volume, the flow by it, and once more the volume."""
+        how, flow, u = self.options, state.flow, self.on(self._volume(state.u, self.factor), 1)
         problem = self.problem(range(len(self.times)), 1, flow, u)
         for k in range(2):
             self.task.on_progress("volume", k / 2)
             if k:
-                flow, _ = likelier_flow(problem, u, flow, options.iterations // 2, options.strain, options.divergence)
+                flow, _ = likelier_flow(problem, u, flow, how.iterations // 2, how.strain, how.divergence)
                 problem.carry(flow)
-            u, _ = descend(problem, u, options.final)
-        pixels = problem.count / len(self.times)
-        misfit = [2 * one / pixels for one in problem.misfit(u)]
-        volume = VoxelGrid(u[None], self._grid(1), coarse.matter)
-        self.timing["volume"] = clock.perf_counter() - began
-        return Carried(self.gaussians(volume, flow), volume, flow, misfit, tuple(self.history), self.timing)
+            u, _ = descend(problem, u, how.final)
+        return _State(flow, u)
 
     def gaussians(self, volume: VoxelGrid, flow: Flow) -> MovingGaussians:
         """Gaussians that stand for a volume of the reference time, with its flow."""
@@ -348,37 +352,3 @@ def trendless(count: int) -> list[int]:
 
 def _known(material: DeltaBeta) -> MaterialPrior:
     return MaterialPrior.known(material)
-
-
-def of_degree(flow: Flow, degree: int) -> Flow:
-    """The same flow in a basis of time of a higher degree, which holds it."""
-    old = flow.basis
-    basis = TimeBasis(old.first, old.last, degree, old.pieces)
-    times = np.linspace(old.first, old.last, 4 * (basis.count + old.count))
-    weights = old.weights(times)
-
-    def raised(tensor: Tensor) -> Tensor:
-        values = np.einsum("tk,k...->t...", weights, tensor.numpy())
-        return torch.from_numpy(basis.fitted(times, values)).to(tensor)
-
-    found = {name: raised(tensor) for name, tensor in flow.parameters().items()}
-    return Flow(found["potential"], flow.lattice, basis, flow.reference, flow.steps, found.get("sources"))
-
-
-def on_lattice(flow: Flow, lattice: Lattice) -> Flow:
-    """About the same flow on another lattice: potentials agree in the mean square along each axis."""
-    matrices = []
-    for axis in range(3):
-        count, first, cell = lattice.counts[2 - axis], lattice.first[axis], lattice.cell
-        places = torch.linspace(first, first + cell * (count - 1), 8 * count, dtype=torch.float64)
-        points = torch.zeros(len(places), 3, dtype=torch.float64)
-        points[:, axis] = places
-        old, new = (one.weights(points, axis, 0)[0] for one in (flow.lattice, lattice))
-        matrices.append(torch.linalg.lstsq(new, old).solution)
-    x, y, z = matrices
-
-    def moved(tensor: Tensor) -> Tensor:
-        return torch.einsum("...zyx,cz,by,ax->...cba", tensor.double(), z, y, x).to(tensor)
-
-    found = {name: moved(tensor) for name, tensor in flow.parameters().items()}
-    return Flow(found["potential"], lattice, flow.basis, flow.reference, flow.steps, found.get("sources"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 from ..checks import require
 from ..fit.residuals import Prediction
@@ -12,7 +13,8 @@ from ..matter import KnownTwo, MaterialPrior
 from ..methods import Task
 from ..methods.assumed import assumed_material
 from ..methods.presets import SCHEMA
-from ..motion.carried import CarriedOptions, Search, merged
+from ..methods.uncertain import Uncertain
+from ..motion.carried import NOWHERE, CarriedOptions, Search, merged
 from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling
 from ..progress import FitProgress
@@ -22,7 +24,8 @@ from ..tables import to_table
 from .keeper import Choice
 from .provenance import environment, scan_hash
 from .reconstruction import Reconstruction
-from .run_folder import RunFolder
+from .resume import goes_on
+from .run_folder import Checkpoint, RunFolder
 from .run_light import found_in
 from .run_record import summary_of
 from .suitable import check_frames
@@ -53,6 +56,7 @@ def reconstruct_moving(
     light: LightOptions | None = None,
     ask: bool = True,
     folder: RunFolder | None = None,
+    resume: bool = False,
     on_progress: FitProgress = lambda stage, fraction, record: None,
 ) -> Motion | None:
     """Continuous matter that moves through the training frames of `scan`, of several times; None where nothing moves.
@@ -60,9 +64,9 @@ def reconstruct_moving(
     `reconstruction.object` of the result is a `MovingGaussians`. ask: whether the frames are asked first if anything
     moves; without, it does. light: what is assumed of it (default: even, unless air says otherwise). A material that is
     not known is estimated from the mean of all times. With a `folder`, everything is written there, unless nothing
-    moves.
-    Errors: `InputError` for a scan of one or two times, frames that are not relative to the flat field, two materials,
-    and folders that are there.
+    moves, and every step is kept; a later call with `resume=True` goes on from the last one, with the same result, bit
+    for bit, as if nothing had happened. Errors: `InputError` for a scan of one or two times, frames that are not
+    relative to the flat field, two materials, and folders that do not fit.
     """
     require(not isinstance(prior, KnownTwo), "a flow carries one material, but two are known; leave --second-material.")
     train = scan.train()
@@ -72,15 +76,20 @@ def reconstruct_moving(
         f"matter in motion needs training frames of three times or more, but theirs are of {count}; choose a time.",
     )
     check_frames(train)
-    if folder is not None:
-        folder.require_new()
     assumed = light or LightOptions()
+    config = _config(scan, prior, options, seed, assumed)
+    going = goes_on(folder, config, resume)
     task = Task(train, prior, seed, lambda stage, part: on_progress(stage, part, {}), assumed).evened()
     mean = merged(task.scan)
     material = assumed_material(mean, task.prior, task.on_progress)
-    search = Search(task, material, options)
-    if ask and not search.moves(search.by_itself(mean, "mean of all times")):
+    search = Search(task, material, options, NOWHERE if folder is None else Checkpoint(folder))
+    if going:
+        search.take_up()
+    elif ask and not search.moves(search.by_itself(mean, "mean of all times")):
         return None
+    if folder is not None and not going:
+        folder.begin(config | environment("cpu"))
+        search.keep()
     found = search.run()
     oversample = fringe_sampling(train.exposures)
     said = Prediction(found.object, task.scan.exposures, oversample)
@@ -97,9 +106,6 @@ def reconstruct_moving(
         light=found_in(task),
     )
     if folder is not None:
-        method = {"method": {"kind": KIND, **to_table(options)}, "matter": "continuous"}
-        told = {"seed": seed, "prior": prior.as_dict(), "scan_hash": scan_hash(scan), "light": to_table(assumed)}
-        folder.begin({"schema_version": SCHEMA, **method, **told} | environment("cpu"))
         folder.start_metrics([])
         write_object(folder.object, found.object)
         if task.uneven is not None and task.uneven.background is not None:
@@ -107,3 +113,25 @@ def reconstruct_moving(
         seen = {"times_s": task.scan.instants.tolist(), "misfit": found.misfit, "asked": list(found.history)}
         folder.write_summary(summary_of(done, None, task.scan) | seen | {"light": task.light_in_words})
     return Motion(done, found.volume, found.history)
+
+
+def begun_in_motion(folder: RunFolder) -> bool:
+    """Whether a folder holds a run of matter in motion, finished or not."""
+    return folder.config.is_file() and folder.read_config().get("method", {}).get("kind") == KIND
+
+
+def _config(
+    scan: Scan, prior: MaterialPrior, options: CarriedOptions, seed: int, light: LightOptions
+) -> dict[str, Any]:
+    """What config.json says the run is of."""
+    return {
+        "schema_version": SCHEMA,
+        "method": {"kind": KIND, **to_table(options)},
+        "matter": "continuous",
+        "seed": seed,
+        "prior": prior.as_dict(),
+        "scan_hash": scan_hash(scan),
+        "light": to_table(light),
+        "uncertain": to_table(Uncertain()),
+        "refine": None,
+    }

@@ -7,8 +7,9 @@ import io
 import os
 import secrets
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -174,6 +175,21 @@ class RunFolder:
             return state
         require(not damaged, f"{self.checkpoint} must be a checkpoint, but it is damaged; start anew without it.")
         return None
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Keeps what a run has come to as checkpoint.pt of its folder: a `motion.journal.Journal`."""
+
+    folder: RunFolder
+
+    def load(self) -> Mapping[str, Any] | None:
+        """What was saved last; None at the beginning."""
+        return self.folder.load_checkpoint()
+
+    def save(self, state: Mapping[str, Any]) -> None:
+        """Keep `state` in place of what was saved before."""
+        self.folder.save_checkpoint(dict(state))
 
 
 @contextmanager

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -38,7 +37,7 @@ from .provenance import environment, scan_hash
 from .reconstruction import Reconstruction
 from .rest_file import write_rest
 from .resume import goes_on
-from .run_folder import RunFolder, claimed
+from .run_folder import Checkpoint, RunFolder, claimed
 from .run_light import found_in
 from .run_record import summary_of
 from .suitable import check_frames
@@ -84,7 +83,7 @@ def track(
         task = Task(scan.train(), prior, seed, lambda stage, part: on_progress(stage, part, {}), assumed).evened()
         train = task.scan
         material = assumed_material(train.at_instant(0), task.prior, task.on_progress)
-        journal = NOWHERE if folder is None else _Checkpoint(folder)
+        journal = NOWHERE if folder is None else Checkpoint(folder)
         found = follow(train, material, options, seed, light=task.uneven, journal=journal, on_progress=on_progress)
         said = Prediction(found.bodies, train.exposures, found.oversample)
         done = Reconstruction(
@@ -118,19 +117,6 @@ def _more(found: Followed, options: TrackOptions, scan: Scan) -> dict[str, np.nd
     more = {STRAIN: strain_energy(found.bodies, scan.instants, found.rest)} if red_cells and found.rest else {}
     errors = standard_errors(found.bodies, found.halves, scan)
     return more | {f"{ERROR}{name}": values for name, values in errors.items()}
-
-
-@dataclass(frozen=True)
-class _Checkpoint:
-    """Keeps a run as checkpoint.pt of its folder."""
-
-    folder: RunFolder
-
-    def load(self) -> Mapping[str, Any] | None:
-        return self.folder.load_checkpoint()
-
-    def save(self, state: Mapping[str, Any]) -> None:
-        self.folder.save_checkpoint(dict(state))
 
 
 def _config(scan: Scan, prior: MaterialPrior, options: TrackOptions, seed: int, light: LightOptions) -> dict[str, Any]:

@@ -1,0 +1,43 @@
+"""The same flow in richer bases of time and space, which fits then make use of."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..representations import Flow, Lattice, TimeBasis
+
+
+def of_degree(flow: Flow, degree: int) -> Flow:
+    """The same flow in a basis of time of a higher degree, which holds it."""
+    old = flow.basis
+    basis = TimeBasis(old.first, old.last, degree, old.pieces)
+    times = np.linspace(old.first, old.last, 4 * (basis.count + old.count))
+    weights = old.weights(times)
+
+    def raised(tensor: Tensor) -> Tensor:
+        values = np.einsum("tk,k...->t...", weights, tensor.numpy())
+        return torch.from_numpy(basis.fitted(times, values)).to(tensor)
+
+    found = {name: raised(tensor) for name, tensor in flow.parameters().items()}
+    return Flow(found["potential"], flow.lattice, basis, flow.reference, flow.steps, found.get("sources"))
+
+
+def on_lattice(flow: Flow, lattice: Lattice) -> Flow:
+    """About the same flow on another lattice: potentials agree in the mean square along each axis."""
+    matrices = []
+    for axis in range(3):
+        count, first, cell = lattice.counts[2 - axis], lattice.first[axis], lattice.cell
+        places = torch.linspace(first, first + cell * (count - 1), 8 * count, dtype=torch.float64)
+        points = torch.zeros(len(places), 3, dtype=torch.float64)
+        points[:, axis] = places
+        old, new = (one.weights(points, axis, 0)[0] for one in (flow.lattice, lattice))
+        matrices.append(torch.linalg.lstsq(new, old).solution)
+    x, y, z = matrices
+
+    def moved(tensor: Tensor) -> Tensor:
+        return torch.einsum("...zyx,cz,by,ax->...cba", tensor.double(), z, y, x).to(tensor)
+
+    found = {name: moved(tensor) for name, tensor in flow.parameters().items()}
+    return Flow(found["potential"], lattice, flow.basis, flow.reference, flow.steps, found.get("sources"))

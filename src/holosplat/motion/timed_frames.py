@@ -1,0 +1,60 @@
+"""The frames of several times, ready to be compared with what a flow carries."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from ..fit.whitened import WhitenedFrames
+from ..matter import DeltaBeta
+from ..methods import Task
+from ..optics.noise_model import NoiseModel
+from ..scan import Scan
+
+
+@dataclass(frozen=True)
+class Frames:
+    """The frames of each time, ready: scans [T] (training frames), times [T] [s], the noise of each, one material."""
+
+    scans: Sequence[Scan]
+    times: np.ndarray
+    noise: Sequence[NoiseModel]
+    material: DeltaBeta
+
+    @classmethod
+    def of(cls, task: Task, material: DeltaBeta) -> Frames:
+        """Those of a task of several times, whose light has been evened."""
+        times = task.scan.instants
+        scans = [task.scan.at_instant(k) for k in range(len(times))]
+        parts = [Task(scan, task.prior, light=task.light) for scan in scans]
+        return cls(scans, times, [part.noise for part in parts], material)
+
+    def whitened(self, k: int, factor: int, keep: np.ndarray | None = None) -> WhitenedFrames:
+        """The frames of the time numbered k on pixels `factor` times larger; keep: [V] bool, which of them."""
+        scan, noise = self.scans[k], self.noise[k]
+        if keep is not None:
+            scan, noise = scan[np.flatnonzero(keep)], part_of(noise, np.flatnonzero(keep))
+        return WhitenedFrames(scan.binned(factor), self.material, noise.binned(factor))
+
+
+def part_of(noise: NoiseModel, index: np.ndarray) -> NoiseModel:
+    """The noise of some of the frames."""
+    return noise[torch.from_numpy(index)]
+
+
+def merged(scan: Scan) -> Scan:
+    """The mean of the frames of each exposure over the times, as a scan of one time, where all times have the same
+    exposures; else all frames, as if taken at one time."""
+    count, times = len(scan), scan.instants
+    each = [np.flatnonzero(scan.exposures.time == time) for time in times]
+    first = scan.exposures[each[0]]
+    same = all(
+        len(one) == len(each[0]) and scan.views[one].fingerprint() == first.views.fingerprint() for one in each[1:]
+    )
+    if not same or len(each[0]) * len(times) != count:
+        return scan.as_static()
+    frames = np.mean([scan.frames[one] for one in each], axis=0)
+    return replace(scan[each[0]], frames=frames).as_static()

@@ -1,0 +1,75 @@
+"""Matter in motion that is cut off after a step goes on as if nothing had happened."""
+
+from __future__ import annotations
+
+import copy
+
+import numpy as np
+import pytest
+import torch
+
+import holosplat as hs
+from holosplat.checks import InputError
+from holosplat.matter import DeltaBeta, MaterialPrior
+from holosplat.methods import SmoothVolume, Task
+from holosplat.motion.carried import Carried, CarriedOptions, Search
+from holosplat.scan import Exposures, Scan
+
+MATTER = DeltaBeta(8e-7, 8e-10)
+QUICK = CarriedOptions(
+    volume=SmoothVolume(coarser=(), rounds=1, iterations=3), cells=2, most_degree=1, most_cells=3, steps=2,
+    iterations=2, final=2, spacing_px=2.0, approximate_steps=3,
+)  # fmt: skip
+
+
+class Kept:
+    """Keeps every state, as a file would; breaks off after `most` of them."""
+
+    def __init__(self, states=(), most: int = 10**6) -> None:
+        self.states, self.most = list(states), most
+
+    def load(self):
+        return copy.deepcopy(self.states[-1]) if self.states else None
+
+    def save(self, state) -> None:
+        self.states.append(copy.deepcopy(dict(state)))
+        if len(self.states) >= self.most:
+            raise KeyboardInterrupt
+
+
+@pytest.fixture(scope="module")
+def scan() -> Scan:
+    scene = hs.specimens.stirred_blob(14e-6, MATTER, 1, turn=0.6)
+    views = hs.Views.from_angles(np.array([0.0, 60.0, 110.0]), (19, 23), 1e-6)
+    exposures = Exposures.of(views, 20.0, 0.1).repeated(np.linspace(0.0, 1.0, 4))
+    return hs.simulate(scene, exposures, photons_per_pixel=800.0, seed=1, is_test=np.zeros(len(exposures), dtype=bool))
+
+
+def found(scan: Scan, journal: Kept) -> Carried:
+    search = Search(Task(scan, MaterialPrior.known(MATTER), seed=2), MATTER, QUICK, journal)
+    search.take_up()
+    return search.run()
+
+
+def test_every_step_is_kept_and_gone_on_from(scan):
+    """Bit for bit, with the same history, from any of them; what is done is not done again."""
+    whole = Kept()
+    result = found(scan, whole)
+    names = [state["steps"] for state in whole.states]
+    assert names == list(range(1, len(names) + 1))
+    assert len(names) >= 6  # the start, two windows, a degree, cells, all times, fine voxels
+    for cut in (1, 2, len(names) - 2, len(names)):
+        with pytest.raises(KeyboardInterrupt):
+            found(scan, cut_off := Kept(most=cut))
+        again = found(scan, rest := Kept(cut_off.states))
+        assert len(rest.states) == len(names)
+        assert torch.equal(again.volume.values, result.volume.values)
+        for name, tensor in again.flow.parameters().items():
+            assert torch.equal(tensor, result.flow.parameters()[name])
+        assert again.history == result.history
+        assert again.misfit == result.misfit
+
+
+def test_a_damaged_state_is_named(scan):
+    with pytest.raises(InputError, match=r"checkpoint\.pt"):
+        found(scan, Kept([{"steps": 1}]))
