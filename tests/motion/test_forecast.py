@@ -18,6 +18,7 @@ from holosplat.metrics.distances import normal_distance
 from holosplat.motion.fit import MotionFit
 from holosplat.motion.forecast import PathForecast, across, extrapolate, normals
 from holosplat.motion.half_sets import half_sets
+from holosplat.motion.sightings import centroid
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.red_cells import icosphere
 
@@ -114,8 +115,25 @@ def test_half_sets_are_fits_to_half_of_the_times():
     )
     scan = hs.Scan(frames, exposures, np.zeros(16, dtype=bool))
     how = MotionFit(stiffness=100.0, schedule=Schedule(steps=25, views_per_step=0))
-    even, odd = (one.coefficients[..., 1].mean() for one in half_sets(scan, still, how))
+    even, odd = (1e6 * centroid(one.bodies(0.0)[0])[1] for one in half_sets(scan, still, how))
     assert even == pytest.approx(0, abs=0.1)
     assert odd == pytest.approx(1, abs=0.2)
     with pytest.raises(InputError, match="8 times"):
         half_sets(scan[:8], still, replace(how))
+
+
+@pytest.mark.parametrize(("angles", "apart"), [((0.0, 90.0), True), ((0.0, 45.0, 90.0, 135.0), False)])
+def test_halves_of_few_views_begin_with_other_shapes_at_the_same_middle(angles, apart):
+    """What two beams leave open of a shape is no agreement of halves that begin alike."""
+    times, views = 1e-5 * np.arange(8), hs.Views.from_angles(np.array(angles), (15, 22), 1e-6)
+    exposures = hs.Exposures.of(views, 20.0, 0.05).repeated(times)
+    paths = [np.stack([4e-6 * SPHERE] * 2)]
+    still = MovingSurfaces.of_bodies(paths, [FACES], TimeBasis(0.0, times[-1], 1), 1e-6, Matter.one(4e-7, 4e-10))
+    frames = np.concatenate([hs.simulate(still.at(0.0), exposures[: len(angles)]).frames] * 8)
+    scan = hs.Scan(frames, exposures, np.zeros(len(frames), dtype=bool))
+    how = MotionFit(rate=1e-6, schedule=Schedule(steps=1, views_per_step=0))
+    moves = [(half.coefficients - still.coefficients)[0] for half in half_sets(scan, still, how)]
+    extent = [float(move.square().mean().sqrt()) for move in moves]
+    assert [one > 0.1 for one in extent] == [apart] * 2
+    np.testing.assert_allclose(moves[0], -moves[1], atol=1e-4)
+    np.testing.assert_allclose(moves[0].mean(0), 0, atol=1e-4)

@@ -15,6 +15,7 @@ from ..scan import Scan
 from .elastic import Rest
 from .fit import MotionFit, motion_fit
 from .forecast import Halves
+from .halves import astray, tell_shapes
 
 LEAST = 8
 """Times from which on halves of them still tell the paths of the whole."""
@@ -35,8 +36,9 @@ def half_sets(
     """`bodies`, fitted to the frames `train` of all times, fitted on to those of every other time, both halves of them.
 
     A path is told by times before and after, so that each half tells it nearly as the whole does, with noise of its
-    own. light: of the frames, which were divided by it; rest: what is known of the bodies' shape at rest. Errors:
-    `InputError` for fewer than 8 times.
+    own. Of fewer views than tell shapes the halves begin with shapes that are astray, as those of standard errors do
+    (`halves.astray`), but at the same middles. light: of the frames, which were divided by it; rest: what is known of
+    the bodies' shape at rest. Errors: `InputError` for fewer than 8 times.
     """
     times = train.instants
     require(
@@ -48,9 +50,18 @@ def half_sets(
     for half in (0, 1):
         kept = np.flatnonzero(number % 2 == half)
         part = None if light is None else light.part(torch.from_numpy(kept))
-        fit = motion_fit(train[kept], bodies, how, seed, part, rest)
+        start = bodies if tell_shapes(train) else _shapes_astray(bodies, seed, 1 - 2 * half)
+        fit = motion_fit(train[kept], start, how, seed, part, rest)
         fit.run(on_record)
         one = fit.result().object
         assert isinstance(one, MovingSurfaces)
         found.append(one.with_parameters({"coefficients": one.coefficients.detach()}))
     return found[0], found[1]
+
+
+def _shapes_astray(bodies: MovingSurfaces, seed: int, side: int) -> MovingSurfaces:
+    moved = astray(bodies, seed, side).coefficients
+    for number in range(bodies.count):
+        own, _ = bodies.body(number)
+        moved[:, own] -= (moved[:, own] - bodies.coefficients.detach()[:, own]).mean(1, keepdim=True)
+    return bodies.with_parameters({"coefficients": moved})
