@@ -27,9 +27,14 @@ OVERVIEW_METHODS = {
     "holographic-tv": "holographic TV",
     "voxels-waves": "voxels through the waves",
     "neural-field": "neural field",
+    "alpha-3dgs": "opaque splats, as photographs",
+    "nerf": "NeRF, as photographs",
+    "pixelnerf": "`pixelnerf`, of this scan alone",
+    "onix": "`onix`, of this scan alone",
     "gaussians-random": "Gaussians, random start",
     "gaussians": "Gaussians",
     "surfaces": "surfaces, from Gaussians",
+    "learned": "`auto --start learned`",
 }
 """What docs/overview.md shows: cases, numbers, and methods as it calls them."""
 OURS = ("gaussians", "surfaces")
@@ -81,11 +86,12 @@ def means(rows: list[Row]) -> Means:
 
 def overview() -> str:
     """Methods on the cases `OVERVIEW_CASES`."""
-    found = means(read("benchmark.csv"))
+    found = means(read("families.csv")) | means(read("benchmark.csv"))
     lines = []
     for method, label in OVERVIEW_METHODS.items():
         chosen = [found.get((case, method), {}) for case in OVERVIEW_CASES]
-        lines.append([label, *(" / ".join(shown(numbers, name) for numbers in chosen) for name in OVERVIEW_NUMBERS)])
+        cells = [" / ".join(shown(numbers, name) for numbers in chosen) for name in OVERVIEW_NUMBERS]
+        lines.append([label, *cells] if any(chosen) else [label, "not run", *["–"] * (len(cells) - 1)])
     table = markdown(("method", "SSIM", "Dice", "error of δ", "time / s", "stored / MB"), lines)
     return f"*{' / '.join(OVERVIEW_CASES)}*\n\n{table}"
 

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import doc_tables as benchmark
 import doc_tables_alignment as alignment
+import doc_tables_learning as learning
 import doc_tables_measured as measured
 import doc_tables_runs as runs
 import doc_tables_thesis as thesis
@@ -42,7 +43,12 @@ class Table:
 BENCH = "holosplat bench run --out bench --snapshots DIR --seeds 101 102, then python docs/make_benchmark.py bench"
 TABLES = {
     "standing": Table(benchmark.standing, ("benchmark.csv",), BENCH, "a day"),
-    "overview": Table(benchmark.overview, ("benchmark.csv",), BENCH, "a day"),
+    "overview": Table(
+        benchmark.overview,
+        ("benchmark.csv", "families.csv"),
+        f"{BENCH}; and with --seeds 101 --methods pixelnerf onix learned, to docs/data/families.csv",
+        "a day",
+    ),
     "before-noise": Table(
         benchmark.before_noise,
         ("before_noise.csv", "benchmark.csv"),
@@ -160,16 +166,34 @@ TABLES["pinn"] = Table(
     runs.pinn, ("pinn.csv",), "python benchmarks/pinn.py --cases channel swirl --write", "half an hour"
 )
 TABLES["learned"] = Table(
-    runs.learned,
+    learning.learned,
     ("learned.csv",),
     "python benchmarks/learned.py DATA --write",
     "half an hour",
 )
 TABLES["learned_change"] = Table(
-    runs.learned_change, ("learned.csv",), "python benchmarks/learned.py DATA --write", "half an hour"
+    learning.learned_change, ("learned.csv",), "python benchmarks/learned.py DATA --write", "half an hour"
+)
+TABLES["aligned-inference"] = Table(
+    learning.aligned_inference,
+    ("aligned_inference.csv",),
+    "python benchmarks/aligned_inference.py --write",
+    "a minute",
+)
+TABLES["few-families"] = Table(
+    learning.few_families,
+    ("few_families.csv", "learned.csv", "photographs.csv", "families.csv", "benchmark.csv"),
+    "python benchmarks/few_families.py DATA --write, python benchmarks/learned.py DATA --write",
+    "half an hour",
+)
+TABLES["moving-families"] = Table(
+    learning.moving_families,
+    ("motion.csv", "pinn.csv", "moving_matter.csv"),
+    "python benchmarks/motion.py DATA --write, and pinn.py and moving_matter.py with --write",
+    "hours",
 )
 TABLES["ellipsoids"] = Table(
-    runs.ellipsoids,
+    learning.ellipsoids,
     ("ellipsoids.csv",),
     "python benchmarks/ellipsoids.py --write",
     "hours",

@@ -63,6 +63,23 @@ def test_a_guess_that_the_frames_contradict_is_not_begun_with_and_the_run_says_s
     assert guess.delta.shape == spread.shape
 
 
+@pytest.mark.parametrize(
+    ("content", "said"), [(None, "must be a file of weights, but there is no such file"), (b"?", "damaged or another")]
+)
+@pytest.mark.parametrize("method", ["auto", "gaussians", "surfaces", "onix"])
+def test_weights_that_cannot_be_read_are_refused_before_any_work(shop, tmp_path, monkeypatch, method, content, said):
+    monkeypatch.setattr("holosplat.workflows.reconstruct.prepared", lambda *_: pytest.fail("work has begun"))
+    path = tmp_path / "weights.safetensors"
+    if content is not None:
+        path.write_bytes(content)
+    start = () if method == "onix" else ("--start", "learned")
+    asked = ("reconstruct", shop.scan, "--out", tmp_path / "run", *MATTER[2:], "--method", method, *start)
+
+    refused(holosplat(*asked, "--set", f"weights={path}"), said)
+
+    assert not (tmp_path / "run").exists()
+
+
 @pytest.mark.parametrize("method", [None, "auto", "gaussians", "surfaces"])
 def test_every_method_with_gaussians_takes_the_start(method):
     chosen = MethodOptions(method, start="learned").chosen()

@@ -213,6 +213,19 @@ def test_every_variant_of_surfaces_changes_something(scripts):
     assert found["no smoothness"][0].objective.bending == 0
 
 
+def test_what_cases_of_learned_starts_are_told(scripts):
+    """The same scene with noise in the frames for training alone, or without its material."""
+    learned = scripts["learned"]
+    plain, noisy, untold = (learned.setting(f"cells{end}", None, 0, 2) for end in ("", "-noise", "-unknown"))
+    for other in (noisy, untold):
+        assert np.array_equal(other.scan.test().frames, plain.scan.test().frames)
+    assert np.array_equal(untold.scan.frames, plain.scan.frames)
+    deviation = (noisy.scan.train().frames - plain.scan.train().frames).std()
+    assert 0.2 < deviation / plain.scan.train().frames.std() < 0.6
+    assert [given.prior.kind for given in (plain, noisy, untold)] == ["known", "known", "free"]
+    assert set(learned.CASES) >= {"espresso", "foam-noise", "espresso-unknown", "soft-cells-noise"}
+
+
 def test_changed_options_must_exist(scripts):
     tune = scripts["tune_fields"]
     found = scripts["changes"].changed(tune.VoxelFit(), {"steps": 7, "floor": 0.3, "decay": 0.5})

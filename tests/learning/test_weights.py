@@ -36,10 +36,14 @@ def test_files_of_others_are_refused(tmp_path):
     write_weights(damaged, Guess(SMALL), Card())
     damaged.write_bytes(damaged.read_bytes()[:-100])
     other.write_bytes(save({"a": torch.zeros(2)}))
+    bare = tmp_path / "bare.safetensors"
+    bare.write_bytes(save({"a": torch.zeros(2)}, {"holosplat": "1"}))
 
     with pytest.raises(InputError, match="damaged or another"):
         read_weights(damaged)
     with pytest.raises(InputError, match="version 1 of holosplat's network, but it holds others"):
         read_weights(other)
+    with pytest.raises(InputError, match="what holosplat train wrote"):
+        read_weights(bare)
     with pytest.raises(InputError, match="a file of weights"):
         read_weights(tmp_path / "missing.safetensors")

@@ -72,6 +72,19 @@ def test_the_order_of_the_views_does_not_matter_and_their_number_may_be_any(view
     assert float(values.std()) > 1e-3
 
 
+@pytest.mark.parametrize("octaves", [0, 2])
+def test_what_is_told_without_gradients_is_the_same_but_for_rounding(octaves, monkeypatch):
+    """In float64 to the last digits, on points in and beyond the image, in more than one piece."""
+    monkeypatch.setattr("holosplat.representations.aligned_network.CHUNK", 64)
+    generator = torch.Generator().manual_seed(5)
+    network = PixelAligned(AlignedNetwork((3, 4), 5, octaves), 1).double()
+    features = torch.randn(3, 5, 9, 13, generator=generator, dtype=torch.float64)
+    places = 1.5 * (2 * torch.rand(3, 200, 3, generator=generator, dtype=torch.float64) - 1)
+    places[:, :4, :2] = torch.tensor([[-1.0, -1.0], [1.0, 1.0], [0.0, 1.0], [1 / 13, -1 / 9]])
+
+    torch.testing.assert_close(network.told(features, places), network(features, places), rtol=1e-12, atol=1e-13)
+
+
 def test_every_view_counts():
     views = directions(3)
     first = field(views)

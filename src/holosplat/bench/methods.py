@@ -136,6 +136,12 @@ def _through_waves(effort: float) -> list[Method]:
             "what suits the matter, with the best state kept: what reconstruct does by default",
             Auto().with_effort(effort),
         ),
+        (
+            "learned",
+            AUTO,
+            "the same, begun with a network's guess where that explains the frames better: --start learned",
+            replace(Auto(), gaussians=replace(Auto().gaussians, start="learned")).with_effort(effort),
+        ),
     ]
     return [Method(*row) for row in rows]
 

@@ -12,7 +12,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from ..checks import InputError, require_regular
+from ..checks import InputError, as_written, require_regular
 from ..io.atomic import atomic_path
 from ..tables import from_table
 from .network import Guess, Size
@@ -77,13 +77,15 @@ def read_weights(path: Path = SHIPPED) -> Trained:
             f"{path} must hold weights of version {VERSION} of holosplat's network, but it holds "
             f"{said.get('holosplat', 'others')}; train anew (holosplat train)."
         )
-    network = Guess(from_table(Size, json.loads(said["size"])))
+    with as_written(path, "what holosplat train wrote"):
+        network = Guess(from_table(Size, json.loads(said["size"])))
+        card = Card(**json.loads(said["card"]))
     try:
         network.load_state_dict(tensors)
     except RuntimeError as error:
         raise InputError(f"{path} must hold the weights of the network that it says, but: {error}.") from None
     network.eval().requires_grad_(False)
-    return Trained(network, Card(**json.loads(said["card"])))
+    return Trained(network, card)
 
 
 def tensors_of(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -61,6 +61,10 @@ class Auto:
             else Bodies(self.gaussians, self.surfaces, self.volume, self.unexplained)
         )
 
+    def require_files(self) -> None:
+        """Those of the Gaussians."""
+        self.gaussians.require_files()
+
     def chosen(self, task: Task, decision: Decision) -> tuple[Method, Decision]:
         """The method for `task`, of whose matter there is a `decision`; and that, if a trial has changed it."""
         if not decision.sure and task.prior.kind != "known":

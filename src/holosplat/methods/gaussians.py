@@ -47,6 +47,11 @@ class Gaussians(GaussianOptions):
         """One: the start, and the fit."""
         return (GaussianStage(self),)
 
+    def require_files(self) -> None:
+        """Read the network's weights where one is asked; errors: those of `LearnedStart.network`."""
+        if self.start == "learned":
+            _ = self.learned.network
+
     @property
     def wants_levels(self) -> bool:
         """Whether it matters to these options whether matter has levels."""

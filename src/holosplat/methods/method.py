@@ -157,6 +157,14 @@ def takes_series(method: Method) -> bool:
     return bool(getattr(method, "of_series", False))
 
 
+def require_files(method: Method) -> None:
+    """Read the files that `method` names in a `require_files` of its own, so that one that is missing or damaged is
+    refused before any work. Errors: those of reading."""
+    read = getattr(method, "require_files", None)
+    if read is not None:
+        read()
+
+
 @runtime_checkable
 class Method(Protocol):
     """Options of a method, as a frozen dataclass; `kind` is its name in tables, files and on the command line.

@@ -93,6 +93,11 @@ class AlignedFit:
             return found.size, found.weights
         return self.network, dict(PixelAligned(self.network, seed).named_parameters())
 
+    def require_weights(self, network: str) -> None:
+        """Read the weights of `network` where a file of them is named; errors: those of `read_aligned`."""
+        if self.weights:
+            read_aligned(Path(self.weights), network)
+
     def with_effort(self, effort: float) -> AlignedFit:
         """The same with `effort` times the steps, at least one."""
         return replace(self, schedule=replace(self.schedule, steps=max(1, round(effort * self.schedule.steps))))
@@ -109,6 +114,10 @@ class Onix:
     def stages(self) -> Sequence[Stage]:
         """The guess, and its fit."""
         return (AlignedStage(self.fit, ONIX, "pixel-aligned field through the waves"),)
+
+    def require_files(self) -> None:
+        """Read the weights, where a file of them is named; errors: those of `read_aligned`."""
+        self.fit.require_weights(ONIX)
 
     def with_effort(self, effort: float) -> Onix:
         """The same method with `effort` times the steps, at least one."""
@@ -130,6 +139,10 @@ class PixelNerf:
     def stages(self) -> Sequence[Stage]:
         """The guess, and its fit."""
         return (AlignedStage(self.fit, PIXELNERF, "pixel-aligned field of line integrals"),)
+
+    def require_files(self) -> None:
+        """Read the weights, where a file of them is named; errors: those of `read_aligned`."""
+        self.fit.require_weights(PIXELNERF)
 
     def with_effort(self, effort: float) -> PixelNerf:
         """The same method with `effort` times the steps, at least one."""

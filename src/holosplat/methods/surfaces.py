@@ -33,6 +33,10 @@ class Surfaces(SurfaceOptions):
         """Those of the Gaussians, and the surfaces."""
         return (BodiesStage(self.gaussians, surfaces=self), SurfaceStage(self, self.gaussians.coarse))
 
+    def require_files(self) -> None:
+        """Those of the Gaussians."""
+        self.gaussians.require_files()
+
     def on_backend(self, backend: Backend) -> Surfaces:
         """The same method whose Gaussians are computed by `backend`; surfaces are fitted on the CPU."""
         return replace(self, gaussians=self.gaussians.on_backend(backend))

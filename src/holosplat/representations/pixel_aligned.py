@@ -23,8 +23,6 @@ from .aligned_network import INPUTS, AlignedNetwork, PixelAligned
 from .voxels import VoxelGrid
 
 DEFAULT = AlignedNetwork()
-CHUNK = 1 << 16
-"""Points evaluated at once where no gradient is needed."""
 
 
 class PixelAlignedField:
@@ -87,9 +85,11 @@ class PixelAlignedField:
     def values(self) -> Tensor:
         """Values [C, Z, Y, X] at the centres of the voxels, zero outside the mask; differentiable in the weights."""
         features = self._call("encoded", self.images)
-        step = CHUNK if not torch.is_grad_enabled() else max(1, len(self._cells))
-        raw = [self._call("forward", features, part) for part in self._places.split(step, dim=1)]
-        found = self._bounded(torch.cat(raw)) if raw else self.images.new_zeros(0, len(self.matter))
+        if len(self._cells):
+            name = "forward" if torch.is_grad_enabled() else "told"
+            found = self._bounded(self._call(name, features, self._places))
+        else:
+            found = self.images.new_zeros(0, len(self.matter))
         whole = found.new_zeros(self.mask.numel(), len(self.matter))
         return whole.index_copy(0, self._cells, found).T.reshape(-1, *self.grid.shape)
 

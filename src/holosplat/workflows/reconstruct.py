@@ -21,7 +21,7 @@ from ..learning.start import GuessedMatter
 from ..matter import MaterialPrior, MatterKind
 from ..methods import Auto, Gaussians, Method, Settled, Stage, Task, begun, finished, settled
 from ..methods.beginning import Beginning
-from ..methods.method import takes_series
+from ..methods.method import require_files, takes_series
 from ..methods.still import prepared
 from ..methods.uncertain import Determined, Uncertain
 from ..optics.background import LightOptions
@@ -88,6 +88,8 @@ def reconstruct(
     if not takes_series(method):
         require_one_time(scan)
     check_frames(scan.train())
+    if not resume:  # a run that goes on may be past them
+        require_files(method)
     assumed, ranges, planned = light or LightOptions(), uncertain or Uncertain(), scan
     said = {"light": to_table(assumed), "uncertain": to_table(ranges), "refine": refine and to_table(refine)}
     config = config_of(scan, prior, method, seed, matter) | said
