@@ -74,7 +74,9 @@ def test_bodies_go_on_with_a_band(folder):
     assert isinstance(after, MovingSurfaces)
     for ours, theirs in zip(after.bodies(wanted[0] - STEP), before.bodies(wanted[0] - STEP)):
         assert ours.vertices == pytest.approx(theirs.vertices, abs=0.3e-6)  # of 3 to 5 µm, that move 2 µm a step
-    assert (later / "report.html").is_file()
+    page = (later / "report.html").read_text(encoding="utf-8")
+    assert "surface along its normals, root mean square over it" in page
+    assert "similarity of predicted frames with 1 that the run did not see" in page
 
 
 def test_frames_that_were_held_out_judge_it(folder):

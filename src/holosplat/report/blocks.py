@@ -22,6 +22,7 @@ from .figures import (
     scene_figure,
     slices_figure,
 )
+from .forecast_shown import forecast_block
 from .guess import guess_block
 from .light import light_figure
 from .motion_blocks import motion_blocks
@@ -47,6 +48,7 @@ def make_blocks(content: ReportContent) -> list[Block]:
     )
     blocks, number = [], 0
     first = [] if content.moving is None else motion_blocks(content.moving)
+    first += [] if content.forecast is None else [forecast_block(content.forecast)]
     drawn = [make(content) for make in makers]
     guessed = [] if content.guess is None else [guess_block(content.guess)]
     after = makers.index(_slices) + 1

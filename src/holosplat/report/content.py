@@ -16,6 +16,7 @@ from ..metrics import ImageScores, VolumeScores, require_same_grid, robust_mater
 from ..volume import Volume
 from ..workflows.totals import TotalMatter
 from ..workflows.verdict import Verdict
+from .forecast_shown import ForecastShown
 from .guess_shown import GuessShown
 from .moving import Moving
 from .view3d.view import View3D
@@ -111,6 +112,7 @@ class ReportContent:
     - moving: bodies in motion, whose volumes are those of one time; None: matter stands still
     - view: what can be turned; None: nothing
     - guess: what a network guessed before the fit; None: none was asked
+    - forecast: of a forecast, its errors and scores; None: it is none
     - geometry: where the frames were found to be; None: as the scan says
     - history: columns of metrics.csv, each [S]: step, seconds, loss, the loss' terms, count, val_ssim …
     - seconds: time of the reconstruction [s]
@@ -135,6 +137,7 @@ class ReportContent:
     moving: Moving | None = None
     view: View3D | None = None
     guess: GuessShown | None = None
+    forecast: ForecastShown | None = None
     history: Mapping[str, np.ndarray] = field(default_factory=dict)
     seconds: float | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)

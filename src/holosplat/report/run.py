@@ -12,6 +12,7 @@ import torch
 
 from ..geometry import Grid, Views
 from ..io.guess import read_guess
+from ..io.json import read_json
 from ..motion.measures import columns, measured
 from ..optics.background import Light
 from ..projectors.voxels import voxel_line_integrals
@@ -20,11 +21,13 @@ from ..scan import Scan
 from ..units import span
 from ..volume import Volume
 from ..workflows.evaluate import Evaluation, render
+from ..workflows.forecast import NUMBERS, read_band
 from ..workflows.reconstruct import Reconstruction
 from ..workflows.run_folder import RunFolder
 from ..workflows.track import read_errors
 from .content import HeldOutViews, LitViews, ProjectedMaps, ReportContent, view_labels
 from .figures import evenly_chosen
+from .forecast_shown import ForecastShown
 from .guess_shown import GuessShown
 from .moving import Moving
 from .page import write_report
@@ -76,6 +79,7 @@ def report_run(
         lit=_lit(reconstruction, scan, evaluation),
         moving=moving,
         guess=_guess(folder, reconstruction),
+        forecast=_forecast(folder),
         view=view_of(turned, volume, truth, scan),
         history=folder.history(),
         seconds=sum(reconstruction.timing.values()),
@@ -110,6 +114,14 @@ def _guess(folder: RunFolder, reconstruction: Reconstruction) -> GuessShown | No
     unit = reconstruction.object.matter.delta if reconstruction.object.matter.single else delta
     found = reconstruction.object.voxelise(volume.grid).delta / unit
     return GuessShown(volume.delta / unit, found, spread, volume.grid, reconstruction.choice.begun)
+
+
+def _forecast(folder: RunFolder) -> ForecastShown | None:
+    """The errors and scores of a forecast; None of another run."""
+    if not (folder.path / NUMBERS).is_file():
+        return None
+    times, band = read_band(folder)
+    return ForecastShown(times, band, read_json(folder.path / NUMBERS)["held_out"])
 
 
 def _title(config: Mapping[str, Any], reconstruction: Reconstruction) -> str:

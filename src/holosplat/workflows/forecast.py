@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from ..checks import InputError, positive, require
+from ..checks import InputError, as_written, positive, require
 from ..io.atomic import atomic_path
 from ..io.json import write_json
 from ..io.nxtomo import write_scan
@@ -181,6 +181,16 @@ def write_forecast(folder: RunFolder, run: Reconstruction, found: Forecasted, co
     )
     write_tracks(folder, said.bodies, found.predicted)
     return done
+
+
+def read_band(folder: RunFolder) -> tuple[np.ndarray, np.ndarray]:
+    """Times [N] s and standard errors [N, B] m, NaN where nothing tells them, of the forecast in `folder`."""
+    path = folder.path / TABLE
+    with as_written(path, "what forecast wrote"), path.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+        times = np.array(list(dict.fromkeys(float(row["time_s"]) for row in rows)))
+        band = np.array([float(row["standard_error_m"]) for row in rows]).reshape(len(times), -1)
+    return times, band
 
 
 def config_of(options: ForecastOptions, scan: Scan, run: dict[str, Any], seed: int) -> dict[str, Any]:
