@@ -20,7 +20,7 @@ from holosplat.representations import TimeBasis
 
 SHORT = {name: replace(getattr(TrackOptions(), name), schedule=Schedule(steps=3)) for name in ("stiff", "soft", "half")}
 QUICK = replace(TrackOptions(), rounds=1, paths=PathOptions(degree=1, pieces=1), **SHORT)
-STAGES = ("first paths", "stiff", "beside", "twins", "paths", "soft", "halves", "done")
+STAGES = ("first paths", "stiff", "beside", "paths", "soft", "twins", "halves", "done")
 
 
 class Kept:

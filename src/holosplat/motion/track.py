@@ -31,7 +31,7 @@ from .rest_shape import KnownBody
 from .sightings import Sighting, sightings
 from .start import first_paths
 from .track_options import TrackOptions
-from .twins import Trials, chosen_twins, trial_of
+from .twins import Trials, chosen_twins
 
 CHECKPOINT_SECONDS = 20.0
 """A fit that runs is kept so often [s]."""
@@ -156,16 +156,20 @@ class _Following:
         """The stages after the first paths."""
         if self.stage == "stiff":
             self.bodies = self.whole(self.fitted("stiff fit", self.train, bodies, self.options.stiff, self.light))
-            self.stage = "beside" if self.round < self.options.rounds else "twins"
+            self.stage = "beside" if self.round < self.options.rounds else "paths"
         elif self.stage == "beside":
             more = self.more(bodies)
             self.round += 1
-            self.bodies, self.stage = (bodies, "twins") if more is None else (more, "stiff")
-        elif self.stage == "twins":
-            self.bodies, self.stage = self.told_from_twins(bodies), "paths"
+            self.bodies, self.stage = (bodies, "paths") if more is None else (more, "stiff")
         elif self.stage == "paths":
             self.bodies, self.stage = self.on_chosen_paths(bodies), "soft"
         elif self.stage == "soft":
+            self.bodies = self.fitted("soft fit", self.train, bodies, self.options.soft, self.light)
+            self.stage = "twins"
+        elif self.stage == "twins":
+            self.bodies = self.told_from_twins(bodies)
+            self.stage = "halves" if self.bodies is bodies else "soft again"
+        elif self.stage == "soft again":
             self.bodies = self.fitted("soft fit", self.train, bodies, self.options.soft, self.light)
             self.stage = "halves"
         else:
@@ -296,7 +300,7 @@ class _Following:
         """`bodies` of known rest shape, or their twins, where there are two beams."""
         if self.rest is None or not self.options.twins:
             return bodies
-        how = (trial_of(self.options.stiff), trial_of(self.options.soft), self.seed, self.light)
+        how = (self.options.stiff, self.options.soft, self.oversample, self.seed, self.light)
         trials = Trials(self.train, self.rest, *how)
         with self._timed("twins"):
             return chosen_twins(bodies, trials, lambda share: self.on_progress("twins", share, {}))

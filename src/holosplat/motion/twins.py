@@ -25,6 +25,7 @@ from ..scan import Scan
 from .elastic import Rest
 from .fit import MotionFit, motion_fit
 from .measures import moments
+from .remainder import beside, only
 
 APART = 0.05
 """Distance of a body and its twin, over its extent, from which on they are told apart."""
@@ -35,35 +36,39 @@ STRAINED = 10.0
 up to four, their twins in beams across each other one more, in beams at 24° thirty and more."""
 HOPELESS = 0.02
 """Part by which the loss of a stiff fit may be larger than without the twin for the soft fit to be made."""
-TRIAL_STEPS, TRIAL_VIEWS = 45, 4
-"""Steps of each fit of a trial, and frames of a step: with fewer steps a body is not yet at home where its twin is."""
+STIFF_STEPS, SOFT_STEPS, TRIAL_VIEWS = 40, 80, 4
+"""Steps of the two fits of a trial, and frames of a step: with a third of these steps a body is not yet at home where
+its twin is."""
+SAMPLES = 4
+"""Times at which a body that turns is put in its twin's place, for each coefficient of its path."""
 Heard = Callable[[float], None]
 """Takes the share that is done."""
 
 
-def trial_of(how: MotionFit) -> MotionFit:
-    """`how` in as many steps, of few frames, as tell twins apart; sizes over time and overlaps, which take half of the
-    time of such steps, are left to the fits that follow."""
-    schedule = replace(how.schedule, steps=min(TRIAL_STEPS, how.schedule.steps), views_per_step=TRIAL_VIEWS)
+def trial_of(how: MotionFit, steps: int) -> MotionFit:
+    """`how` in so many steps at most, of few frames, for one body: what it has with others is left out."""
+    schedule = replace(how.schedule, steps=min(steps, how.schedule.steps), views_per_step=TRIAL_VIEWS)
     return replace(how, volume_kept=0.0, area_kept=0.0, apart=0.0, schedule=schedule)
 
 
 @dataclass(frozen=True)
 class Trials:
-    """The fits that decide: stiff, then soft."""
+    """What fits need that decide. oversample: wave samples a pixel where others are divided out."""
 
     train: Scan
     rest: Rest
     stiff: MotionFit
     soft: MotionFit
+    oversample: int
     seed: int = 0
     light: Light | None = None
 
-    def __call__(self, start: MovingSurfaces, hopeless: float = np.inf) -> tuple[list[float], MovingSurfaces]:
-        """The losses that fits leave of `start`, and its bodies then; one fit where it leaves more than `hopeless`."""
+    def left(self, frames: Scan, start: MovingSurfaces, hopeless: float = np.inf) -> tuple[list[float], MovingSurfaces]:
+        """The losses that a stiff fit and then a soft one leave of `frames`, and what `start` has become; the stiff one
+        alone where it leaves more than `hopeless`."""
         losses = list[float]()
-        for how in (self.stiff, self.soft):
-            fit = motion_fit(self.train, start, how, self.seed, self.light, self.rest)
+        for how, steps in ((self.stiff, STIFF_STEPS), (self.soft, SOFT_STEPS)):
+            fit = motion_fit(frames, start, trial_of(how, steps), self.seed, self.light, self.rest)
             fit.run(lambda record: None)
             loss, start = _left(fit)
             losses.append(loss)
@@ -75,31 +80,30 @@ class Trials:
 def chosen_twins(bodies: MovingSurfaces, trials: Trials, on_progress: Heard = lambda share: None) -> MovingSurfaces:
     """`bodies` of known rest shape, each or its twin, whichever leaves less; as they are for other than two beams.
 
-    One after the other is put in its twin's place, those first that are farthest from it, and all are fitted again, by
-    the same steps from shapes without details: what was fitted before is fitted to what was there. Twins that are
-    taken stay for the next trials.
+    Frames are divided by those that all others predict, and the body and its twin are fitted to them, from shapes
+    without details: those that were fitted before would speak for the body that was there.
     """
     beams = two_beams(trials.train.views)
     if beams is None:
         return bodies
-    start = without_details(bodies, trials.rest)
-    asked = in_question(start, beams, trials.rest)
-    if not asked:
-        return bodies
-    (least, _), kept = trials(start), bodies
+    plain = without_details(bodies, trials.rest)
+    asked, changed = in_question(plain, beams, trials.rest), bodies.coefficients.detach().clone()
     for turn, number in enumerate(asked):
-        on_progress((1 + turn) / (1 + len(asked)))
-        other = twinned(start, number, beams)
-        left, found = trials(other, (1 + HOPELESS) * least[0])
+        on_progress(turn / len(asked))
+        own, others = only(plain, [number]), [k for k in range(bodies.count) if k != number]
+        frames = beside(trials.train, only(bodies, others), trials.oversample) if others else trials.train
+        least, _ = trials.left(frames, own)
+        left, found = trials.left(frames, twinned(own, 0, beams), (1 + HOPELESS) * least[0])
         if len(left) == len(least) and left[-1] < least[-1]:
-            start, least, kept = other, left, found
-    return kept
+            changed[:, bodies.body(number)[0]] = found.coefficients
+    same = torch.equal(changed, bodies.coefficients.detach())
+    return bodies if same else bodies.with_parameters({"coefficients": changed})
 
 
 def in_question(bodies: MovingSurfaces, beams: np.ndarray, rest: Rest) -> list[int]:
     """Numbers of the bodies that are apart from their twins, those first that are farthest; without those whose twin is
     too far from the shape at `rest`."""
-    away = np.array([distance(_second(bodies, number), beams) for number in range(bodies.count)])
+    away = np.array([distance(_second(_middle_mesh(bodies, number)), beams) for number in range(bodies.count)])
     found = [int(number) for number in np.argsort(-away) if away[number] > APART]
     return [k for k in found if _energy(twinned(bodies, k, beams), k, rest) < _energy(bodies, k, rest) + STRAINED]
 
@@ -143,11 +147,38 @@ def distance(second: np.ndarray, beams: np.ndarray) -> float:
     return float(np.sqrt(max(np.trace(second) + np.trace(other) - 2 * common, 0) / np.trace(second)))
 
 
+def map_near(second: np.ndarray, beams: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Of all matrices [3, 3] that take a body of moments `second` to its twin, the one nearest to the matrix `near`.
+
+    They are Q'^½ R Q^-½ of any rotation R: that of the polar decomposition of Q'^-½ `near` Q^½.
+    """
+    (before, less), (after, more) = _roots(second), _roots(twin_of(second, beams))
+    left, _, right = np.linalg.svd(more @ near @ before)
+    turn = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    return after @ turn @ less
+
+
+def _roots(second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The symmetric square root of `second` [3, 3], and its inverse."""
+    values, axes = np.linalg.eigh(second)
+    return (axes * np.sqrt(values)) @ axes.T, (axes / np.sqrt(values)) @ axes.T
+
+
 def twinned(bodies: MovingSurfaces, number: int, beams: np.ndarray) -> MovingSurfaces:
-    """`bodies` with the body `number` in the place of its twin, by one linear map about its middle at all times."""
-    own, middles, arms = _arms(bodies, number)
+    """`bodies` with the body `number` in the place of its twin at all times, by linear maps about its middle.
+
+    A body that turns has another map at each time: the one nearest to that of the time in the middle.
+    """
+    basis, (own, _) = bodies.basis, bodies.body(number)
+    middle = twin_map(_second(_middle_mesh(bodies, number)), beams)
+    places, times = [], np.linspace(basis.first, basis.last, SAMPLES * basis.count)
+    for time in times:
+        mesh = _mesh(bodies, number, float(time))
+        centre = moments(mesh)[1]
+        matrix = map_near(_second(mesh), beams, middle)
+        places.append(((mesh.vertices - centre) @ matrix.T + centre) / bodies.unit_length)
     changed = bodies.coefficients.detach().clone()
-    changed[:, own] = middles + arms @ torch.from_numpy(twin_map(_second(bodies, number), beams)).T
+    changed[:, own] = torch.from_numpy(basis.fitted(times, np.array(places)))
     return bodies.with_parameters({"coefficients": changed})
 
 
@@ -173,8 +204,12 @@ def _arms(bodies: MovingSurfaces, number: int) -> tuple[torch.Tensor, torch.Tens
     return own, middles, paths - middles
 
 
+def _mesh(bodies: MovingSurfaces, number: int, time: float) -> TriangleMesh:
+    return bodies.bodies(time)[number]
+
+
 def _middle_mesh(bodies: MovingSurfaces, number: int) -> TriangleMesh:
-    return bodies.bodies(0.5 * (bodies.basis.first + bodies.basis.last))[number]
+    return _mesh(bodies, number, 0.5 * (bodies.basis.first + bodies.basis.last))
 
 
 def _energy(bodies: MovingSurfaces, number: int, rest: Rest) -> float:
@@ -184,9 +219,9 @@ def _energy(bodies: MovingSurfaces, number: int, rest: Rest) -> float:
     return float(rest.elastic(nodes))
 
 
-def _second(bodies: MovingSurfaces, number: int) -> np.ndarray:
+def _second(mesh: TriangleMesh) -> np.ndarray:
     """[3, 3] m², second moments over the volume."""
-    volume, _, second = moments(_middle_mesh(bodies, number))
+    volume, _, second = moments(mesh)
     return second / volume
 
 
