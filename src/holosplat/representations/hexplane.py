@@ -30,7 +30,7 @@ class HexPlanes:
     """Options of the field."""
 
     features: int = 16
-    """Features of each plane: twice as many took twice the time and gained nothing on the tuning snapshots."""
+    """Features of each plane (24 to 48 as published, for scenes of many colours)."""
     hidden: int = 16
     """Units of the decoder's one layer."""
     cell_px: Pixels = 1.0

@@ -33,13 +33,13 @@ class HexPlane:
 
     planes: HexPlanes = field(default_factory=HexPlanes)
     """The planes and the decoder."""
-    rate: Rate = 0.02
-    """Adam's first rate of the planes (0.02 as published)."""
-    decoder_rate: Rate = 0.005
-    """The same of the decoder (0.001 as published, for ten times the steps and more)."""
-    roughness: Weight = 0.001
+    rate: Rate = 0.1
+    """Adam's first rate of the planes (0.02 as published, for a hundred times the steps)."""
+    decoder_rate: Rate = 0.02
+    """The same of the decoder (0.001 as published)."""
+    roughness: Weight = 1e-4
     """Weight of squared differences of features between nodes of a plane in space, their mean times the voxels."""
-    jerkiness: Weight = 0.001
+    jerkiness: Weight = 1e-4
     """The same of squared second differences in time (K-Planes: Fridovich-Keil et al. 2023, eq. 5)."""
     fit: TimesFit = field(default_factory=TimesFit)
     """The fit through the waves."""

@@ -29,9 +29,9 @@ class LowRank:
     """The start: each time by itself, of which the nearest matter of low rank is taken."""
     rank: int = 8
     """Volumes (at most as many as times)."""
-    rate: Rate = 0.01
+    rate: Rate = 0.003
     """Adam's first rate of the volumes, whose courses have a mean square of one."""
-    course_rate: Rate = 0.005
+    course_rate: Rate = 0.002
     """The same of the courses."""
     fit: TimesFit = field(default_factory=TimesFit)
     """The fit through the waves."""

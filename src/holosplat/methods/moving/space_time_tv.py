@@ -33,8 +33,9 @@ class SpaceTimeFit:
     """Weight of total variation, in voxel edges of thickness, as voxels of one time have it."""
     noise_weight: Weight = 0.03
     """What it grows by for every pixel of thickness that the noise of the frames amounts to."""
-    pace: Weight = 0.3
-    """What a change from one time to the next counts beside one from a voxel to the next (0: times are apart)."""
+    pace: Weight = 2.0
+    """What a change from one time to the next counts beside one from a voxel to the next (0: times are apart); 0 to 1
+    left more noise on the tuning snapshots."""
     smoothing: float = 0.005
     """Changes below which total variation is a square."""
     objective: Objective = field(default_factory=spectral_objective)
