@@ -13,11 +13,13 @@ import holosplat as hs
 from helpers.unjudged import unjudged
 from holosplat.baselines import HolographicTV
 from holosplat.checks import InputError
+from holosplat.fit.schedule import Schedule
 from holosplat.fit.terms.times import DrawnTimes
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.mesh import TriangleMesh
 from holosplat.methods import HolographicVoxels, Method, Pinn, Task, VoxelFit, Voxels, solve
+from holosplat.methods.ground import ground
 from holosplat.methods.moving import (
     Deformed,
     EachTime,
@@ -28,6 +30,7 @@ from holosplat.methods.moving import (
     TimesFit,
     each_time,
 )
+from holosplat.methods.moving.through_waves import spectral_objective, weight_of
 from holosplat.representations import Deformation, HexPlanes, OnVoxels, VoxelGrid
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.mesh_series import MeshSeries
@@ -142,6 +145,15 @@ def test_continuous_matter_has_no_bound(scan):
     found = solve(SpaceTimeTV(VOLUME, SpaceTimeFit(steps=1)), Task(scan, KNOWN), "continuous")
     assert isinstance(found, OnVoxels)
     assert found.upper == 0.0
+
+
+def test_the_weight_of_variation_goes_with_noise_up_for_levels_and_down_for_other_matter(scan):
+    volumes = solve(METHODS["each-time"], Task(scan, KNOWN), "levels")
+    base = ground(scan, volumes, volumes.matter, spectral_objective(), Schedule(), "cpu")
+    assert base.frames.spectral is not None
+    noise, floor = base.frames.spectral.noise, base.frames.spectral.floor
+    assert weight_of(base, 0.05, 0.03, True) == pytest.approx(0.05 + 0.03 * noise)
+    assert weight_of(base, 0.05, 0.03, False) == pytest.approx(0.05 / (1 + floor**2))
 
 
 @pytest.mark.parametrize("name", METHODS)

@@ -32,7 +32,8 @@ class SpaceTimeFit:
     weight: Weight = 0.05
     """Weight of total variation, in voxel edges of thickness, as voxels of one time have it."""
     noise_weight: Weight = 0.03
-    """What it grows by for every pixel of thickness that the noise of the frames amounts to."""
+    """What it grows by for every pixel of thickness that the noise of the frames amounts to, for matter with levels;
+    for other matter it falls with noise (`weight_of`)."""
     pace: Weight = 2.0
     """What a change from one time to the next counts beside one from a voxel to the next (0: times are apart); 0 to 1
     left more noise on the tuning snapshots."""
@@ -81,7 +82,7 @@ class SpaceTimeStage:
         assert isinstance(start, VoxelSeries)
         options, schedule = self.options, replace(Schedule(), steps=self.options.steps)
         base = ground(task.scan, start, start.matter, options.objective, schedule, "cpu", light=task.uneven)
-        weight = weight_of(base, options.weight, options.noise_weight) / frames_of_a_time(base)
+        weight = weight_of(base, options.weight, options.noise_weight, start.upper > 0) / frames_of_a_time(base)
         variation = SpaceTimeVariation4D(weight, options.pace, options.smoothing)
         problem, upper = Problem(base.model, (AllTimes(base.frames, base.train), variation)), start.upper
         plan = Plan(problem, schedule, lambda leaves: ProjectedGradient(leaves, upper or float("inf")))

@@ -39,7 +39,8 @@ class TimesFit:
     weight: Weight = 0.05
     """Weight of total variation in space, in voxel edges of thickness, as voxels of one time have it."""
     noise_weight: Weight = 0.03
-    """What it grows by for every pixel of thickness that the noise of the frames amounts to."""
+    """What it grows by for every pixel of thickness that the noise of the frames amounts to, for matter with levels;
+    for other matter it falls with noise (`weight_of`)."""
     smoothing: float = 0.005
     """Differences between voxels below which total variation is a square."""
     objective: Objective = field(default_factory=spectral_objective)
@@ -51,10 +52,17 @@ class TimesFit:
         require(0 < self.decay <= 1, f"decay must lie in (0, 1], but it is {self.decay:g}.")
 
 
-def weight_of(base: Ground, weight: float, noise_weight: float) -> float:
-    """The weight of total variation beside frames as noisy as those of `base`."""
+def weight_of(base: Ground, weight: float, noise_weight: float, bounded: bool) -> float:
+    """The weight of total variation beside frames as noisy as those of `base`.
+
+    bounded: whether the occupancy has an upper bound, as matter with levels has. Without one the weight falls with
+    noise as those of the frames do at high frequencies, by 1 / (1 + f²), f the floor of `SpectralMisfit`, for nothing
+    but the frames holds faint matter against total variation.
+    """
     spectral = base.frames.spectral
-    return weight + noise_weight * (0.0 if spectral is None else spectral.noise)
+    if spectral is None:
+        return weight
+    return weight + noise_weight * spectral.noise if bounded else weight / (1 + spectral.floor**2)
 
 
 def frames_of_a_time(base: Ground) -> float:
@@ -78,7 +86,8 @@ def times_fit(
     schedule = Schedule(steps=options.steps, decay=options.decay)
     base = ground(task.scan, start, start.matter, options.objective, schedule, "cpu", light=task.uneven)
     views, generator = frames_of_a_time(base), torch.Generator().manual_seed(task.seed)
-    variation = Variation(weight_of(base, options.weight, options.noise_weight) / views, options.smoothing)
+    weight = weight_of(base, options.weight, options.noise_weight, task.bound(1.0) > 0)
+    variation = Variation(weight / views, options.smoothing)
     term = SomeTimes(base.frames, base.train, options.drawn, (variation, *costs(views)), generator)
     problem = Problem(base.model, (term,))
     first = {name: rates(name.removeprefix("object.")) for name in problem.model.parameters()}
