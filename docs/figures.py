@@ -21,6 +21,7 @@ import doc_tables as benchmark
 import doc_tables_alignment as alignment
 import doc_tables_learning as learning
 import doc_tables_measured as measured
+import doc_tables_moving as moving
 import doc_tables_runs as runs
 import doc_tables_thesis as thesis
 
@@ -164,6 +165,12 @@ TABLES |= {
 }
 TABLES["pinn"] = Table(
     runs.pinn, ("pinn.csv",), "python benchmarks/pinn.py --cases channel swirl --write", "half an hour"
+)
+TABLES["moving_methods"] = Table(
+    moving.moving_methods,
+    ("moving_methods.csv", "motion.csv", "moving_matter.csv"),
+    "python benchmarks/moving_methods.py DATA --cases flow4 flow3 flow2 stir4 burst4 --write",
+    "an hour",
 )
 TABLES["learned"] = Table(
     learning.learned,

@@ -24,10 +24,15 @@ from holosplat.representations import (
     KINDS,
     AlignedNetwork,
     AlphaCloud,
+    Deformation,
+    DeformedVoxels,
     Encoding,
     Flow,
     GaussianCloud,
+    HexPlaneField,
+    HexPlanes,
     Lattice,
+    LowRankVoxels,
     MovingGaussians,
     MovingSurfaces,
     Network,
@@ -41,6 +46,7 @@ from holosplat.representations import (
     SurfaceMesh,
     TimeBasis,
     VoxelGrid,
+    VoxelSeries,
 )
 from holosplat.specimens.red_cells import icosphere
 
@@ -87,6 +93,21 @@ def objects() -> dict[str, Stored]:
         "space-time-field": SpaceTimeField.still(
             torch.rand(3, *GRID.shape), GRID, np.array([0, 1e-5, 3e-5]), CELL, SpaceTime(pieces=1), 5, 0.9
         ),
+        **on_voxels(),
+    }
+
+
+def on_voxels() -> dict[str, Stored]:
+    """Those whose matter at any time is voxels of one grid."""
+    times, planes, deformation = [0.0, 1e-5, 3e-5], HexPlanes(features=3, hidden=4), Deformation(2, 5, 1, 1, 3.0, 2.0)
+    volumes, wanted = torch.rand(3, *GRID.shape), planes.shapes(GRID, 3)
+    return {
+        "voxel-series": VoxelSeries(volumes, GRID, times, CELL, 0.8),
+        "low-rank-voxels": LowRankVoxels((volumes[:2], torch.rand(2, 3)), GRID, times, CELL),
+        "hexplane-field": HexPlaneField(
+            {name: torch.rand(shape) for name, shape in wanted.items()}, GRID, times, CELL, 0.9, planes
+        ),
+        "deformed-voxels": DeformedVoxels.still(volumes[0], GRID, times, CELL, 0.9, deformation, 3),
     }
 
 

@@ -99,6 +99,10 @@ NAMES = {
     "moving-gaussians": "Reconstruction as Gaussians that a flow carries",
     "space-time-field": "Reconstruction as a field of space and time",
     "voxels": "Voxel reconstruction",
+    "voxel-series": "Reconstruction as voxels at several times",
+    "low-rank-voxels": "Reconstruction as voxels of low rank in time",
+    "hexplane-field": "Reconstruction as a field of six planes of space and time",
+    "deformed-voxels": "Reconstruction as voxels that a network displaces",
     "neural-field": "Reconstruction as a neural field",
     "pixel-aligned-field": "Reconstruction as a pixel-aligned field",
 }

@@ -11,13 +11,16 @@ from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..volume import LineIntegrals, TrainableObject
 from .aligned_network import AlignedNetwork, PixelAligned
+from .deformed_voxels import Deformation, DeformedVoxels
 from .encodings import Encoding
 from .flow import Flow, Lattice
 from .gaussians import GaussianCloud
+from .hexplane import HexPlaneField, HexPlanes
 from .initialise import approximate, at_pitch, cloud_from_two, cloud_from_volume, freed, random_cloud
 from .isosurface import isosurface
 from .moving_gaussians import MovingGaussians
 from .moving_surfaces import MovingSurfaces
+from .moving_voxels import LowRankVoxels, OnVoxels, VoxelSeries
 from .neural_field import Network, NeuralField
 from .paths import TimeBasis
 from .photographed import AlphaCloud, RadianceField
@@ -77,10 +80,11 @@ KINDS: dict[str, type[Stored]] = {
     for kind in (
         *(GaussianCloud, VoxelGrid, SurfaceMesh, MovingSurfaces, MovingGaussians, NeuralField),
         *(SpaceTimeField, AlphaCloud, RadianceField, PixelAlignedField),
+        *(VoxelSeries, LowRankVoxels, HexPlaneField, DeformedVoxels),
     )
 }
 """Every kind of Object that files hold, by name."""
-MOVING = (MovingSurfaces, MovingGaussians, SpaceTimeField)
+MOVING = (MovingSurfaces, MovingGaussians, SpaceTimeField, VoxelSeries, LowRankVoxels, HexPlaneField, DeformedVoxels)
 """Those that are of several times."""
 
 __all__ = [
@@ -88,14 +92,20 @@ __all__ = [
     "MOVING",
     "AlignedNetwork",
     "AlphaCloud",
+    "Deformation",
+    "DeformedVoxels",
     "Encoding",
     "Flow",
     "GaussianCloud",
+    "HexPlaneField",
+    "HexPlanes",
     "Lattice",
+    "LowRankVoxels",
     "MovingGaussians",
     "MovingSurfaces",
     "Network",
     "NeuralField",
+    "OnVoxels",
     "PixelAligned",
     "PixelAlignedField",
     "RadianceField",
@@ -106,6 +116,7 @@ __all__ = [
     "TimeBasis",
     "VoxelGrid",
     "VoxelLines",
+    "VoxelSeries",
     "approximate",
     "at_pitch",
     "cloud_from_two",

@@ -1,0 +1,53 @@
+"""The table of other ways to reconstruct all times, from docs/data alone; `docs/figures.py` puts it into its page."""
+
+from __future__ import annotations
+
+from doc_tables import Row, markdown, read, rounded
+
+WAYS = {
+    "each-tv": "each time by itself, total variation",
+    "each-voxels": "each time by itself, voxels through the waves",
+    "each-surfaces": "each time by itself, surfaces",
+    "each-volume": "each time by itself, smooth volume",
+    "warm-voxels": "warm start, voxels",
+    "warm-surfaces": "warm start, surfaces",
+    "warm-volume": "warm start, smooth volume",
+    "space-time-tv": "total variation in space and time",
+    "low-rank": "low rank",
+    "hexplane": "six planes",
+    "deformed": "deformation network",
+    "ours": "**ours**",
+}
+"""What the table calls the methods, in order."""
+CASES = ("flow4", "flow3", "flow2", "stir4", "burst4")
+
+
+def moving_methods() -> str:
+    """Each way beside ours, whose rows are those of docs/data/motion.csv and docs/data/moving_matter.csv."""
+    rows = [r for r in read("moving_methods.csv") if (r["seed"], r["first"]) in (("1", "0"), ("1", "5"))]
+    found = {(r["case"], r["method"]): r for r in [*rows, *_ours()]}
+    lines = []
+    for case in CASES:
+        if not any(key[0] == case for key in found if key[1] != "ours"):
+            continue
+        for method, called in WAYS.items():
+            if (case, method) in found:
+                r = found[case, method]
+                dice = f"{rounded(r['dice'], 3)} ({rounded(r['least_dice'], 3)})" if case.startswith("flow") else ""
+                worst = f" ({rounded(r['worst'], 3)})" if r["worst"] else ""
+                memory = f"{float(r['memory_mb']) / 1000:.1f} GB"
+                error, spent = f"{rounded(r['error'], 3)}{worst}", f"{float(r['cpu_seconds']):.0f} s"
+                lines.append([f"`{case}`", called, dice, error, spent, memory])
+    columns = ("case", "way", "Dice, mean (worst time)", "error of δ, mean (worst time)", "processor time", "memory")
+    return markdown(columns, lines)
+
+
+def _ours() -> list[Row]:
+    """`track` for bodies, `reconstruct --time-frame all` for other matter."""
+    bodies = [
+        r | {"method": "ours", "worst": ""}
+        for r in read("motion.csv")
+        if (r["first"], r["every"], r["seed"], r["without"]) == ("0", "1", "1", "none")
+    ]
+    matter = [r | {"method": "ours"} for r in read("moving_matter.csv") if r["method"] == "all times in one"]
+    return [*bodies, *matter]

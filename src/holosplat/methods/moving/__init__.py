@@ -1,0 +1,22 @@
+"""Other ways to reconstruct all times of a scan, beside which ours are measured: docs/motion.md describes them."""
+
+from __future__ import annotations
+
+from .deformed import Deformed
+from .each_time import EachTime, Snapshots, each_time
+from .hexplane import HexPlane
+from .low_rank import LowRank
+from .space_time_tv import SpaceTimeFit, SpaceTimeTV
+from .through_waves import TimesFit
+
+__all__ = [
+    "Deformed",
+    "EachTime",
+    "HexPlane",
+    "LowRank",
+    "Snapshots",
+    "SpaceTimeFit",
+    "SpaceTimeTV",
+    "TimesFit",
+    "each_time",
+]
