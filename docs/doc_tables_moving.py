@@ -51,3 +51,15 @@ def _ours() -> list[Row]:
     ]
     matter = [r | {"method": "ours"} for r in read("moving_matter.csv") if r["method"] == "all times in one"]
     return [*bodies, *matter]
+
+
+def assimilation() -> str:
+    """4D-Var on manufactured holograms: what each assumption finds, and where its cells then are."""
+    lines = []
+    for r in read("assimilation.csv"):
+        told = [f"{float(r[name]):.2f}" if r[name] else "" for name in ("peak_told", "shear_told")]
+        found = f"{float(r['peak_m_s']):.4f} m/s", f"{1e6 * float(r['shear_n_m']):.1f} µN/m"
+        states = [f"{float(r[name]):.3f} µm" for name in ("before_um", "state_um", "later_um")]
+        lines.append([r["case"], *(f"{one} ({share})" if share else one for one, share in zip(found, told)), *states])
+    columns = ("assumed", "peak", "modulus", "first state, before", "after", "120 µs later")
+    return markdown(columns, lines)

@@ -166,6 +166,9 @@ TABLES |= {
 TABLES["pinn"] = Table(
     runs.pinn, ("pinn.csv",), "python benchmarks/pinn.py --cases channel swirl --write", "half an hour"
 )
+TABLES["assimilation"] = Table(
+    moving.assimilation, ("assimilation.csv",), "python benchmarks/assimilation.py --write", "five minutes"
+)
 TABLES["moving_methods"] = Table(
     moving.moving_methods,
     ("moving_methods.csv", "motion.csv", "moving_matter.csv"),
