@@ -6,6 +6,7 @@ VENV := .venv
 STAMP := $(VENV)/.installed
 DOCS := $(VENV)/.docs-installed
 GALLERY := build/gallery
+NOTEBOOKS := build/notebooks
 NATIVE := $(wildcard native/*.cpp native/*.hpp native/*.cmake native/CMakeLists.txt)
 SOURCES := $(shell find src -name '*.py')
 TOOLS := build/tools
@@ -41,7 +42,7 @@ check: setup ## lint, formatting and types
 	$(VENV)/bin/ruff format --check .
 	$(VENV)/bin/pyright
 
-docs: $(GALLERY)/.built ## run the examples and build the documentation site, into build/site; warnings are errors
+docs: $(GALLERY)/.built $(NOTEBOOKS)/.built ## run examples and notebooks, and build the documentation site, into build/site; warnings are errors
 	NO_MKDOCS_2_WARNING=1 $(VENV)/bin/python -m mkdocs build --strict
 
 figures: setup ## make the tables of the docs from docs/data, and list what their figures need
@@ -51,6 +52,11 @@ figures: setup ## make the tables of the docs from docs/data, and list what thei
 $(GALLERY)/.built: $(DOCS) docs/site/gallery.py $(wildcard examples/*.py) $(SOURCES)
 	rm -rf $(GALLERY)
 	$(VENV)/bin/python docs/site/gallery.py $(GALLERY)
+	touch $@
+
+$(NOTEBOOKS)/.built: $(DOCS) docs/site/notebooks.py $(wildcard docs/notebooks/*.ipynb) $(SOURCES)
+	rm -rf $(NOTEBOOKS)
+	$(VENV)/bin/python docs/site/notebooks.py $(NOTEBOOKS)
 	touch $@
 
 $(DOCS): $(STAMP)

@@ -21,6 +21,7 @@ import doc_tables as benchmark
 import doc_tables_alignment as alignment
 import doc_tables_learning as learning
 import doc_tables_measured as measured
+import doc_tables_motion as motion
 import doc_tables_moving as moving
 import doc_tables_runs as runs
 import doc_tables_thesis as thesis
@@ -217,6 +218,27 @@ TABLES["random_scenes"] = Table(
 TABLES["bed"] = Table(
     measured.bed, ("real_data.csv",), "python benchmarks/packed_bed.py --data FOLDER --work FOLDER", "an hour"
 )
+TRACKED = "python benchmarks/motion.py DATA --write"
+FORECAST = "python benchmarks/forecast.py DATA --write"
+TABLES |= {
+    name: Table(make, data, command, takes)
+    for name, make, data, command, takes in (
+        ("tracked", motion.tracked, ("motion.csv",), f"{TRACKED} --cases flow4 flow3 …", "an hour"),
+        ("tracked-windows", motion.windows, ("motion.csv", "motion_ablation.csv"), TRACKED, "half an hour"),
+        ("tracked-known", motion.known, ("motion.csv",), f"{TRACKED} --cases flow2-body --first 8", "an hour"),
+        ("tracked-ablation", motion.ablation, ("motion_ablation.csv",), f"{TRACKED} --ablation", "an hour"),
+        ("forecast", motion.forecast, ("forecast.csv",), FORECAST, "an hour"),
+        ("forecast-mechanics", motion.mechanics, ("forecast.csv",), FORECAST, "an hour"),
+        (
+            "moving-matter",
+            motion.moving_matter,
+            ("moving_matter.csv",),
+            "python benchmarks/moving_matter.py --write",
+            "ten minutes",
+        ),
+        ("espresso", motion.espresso, ("espresso_flow.csv",), "python benchmarks/espresso_flow.py DATA", "minutes"),
+    )
+}
 
 
 THESIS = "python benchmarks/thesis_runs.py run RUNS --snapshots DIR, then collect RUNS"

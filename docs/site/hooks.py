@@ -12,7 +12,8 @@ from mkdocs.structure.files import File
 
 def on_config(config: Any) -> Any:
     """Puts the pages of whole sections into the navigation."""
-    sections = {"Gallery": pages.gallery_pages(), "API": pages.api_pages(), "Design": pages.design_pages()}
+    sections = {"Notebooks": pages.notebook_pages(), "Gallery": pages.gallery_pages(), "API": pages.api_pages()}
+    sections["Design"] = pages.design_pages()
     for title, made in sections.items():
         entry = next(entry for entry in config.nav if title in entry)
         first = entry[title]
@@ -21,18 +22,19 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """Adds the pages that are made, and the gallery's pictures."""
-    for path, text in {**pages.root_pages(), **pages.gallery_pages(), **pages.api_pages()}.items():
+    """Adds the pages that are made, and the pictures of gallery and notebooks."""
+    made = {**pages.root_pages(), **pages.notebook_pages(), **pages.gallery_pages(), **pages.api_pages()}
+    for path, text in made.items():
         files.append(File.generated(config, path, content=text))
-    for picture in pages.gallery_pictures():
-        path = "gallery/" + picture.relative_to(pages.GALLERY).as_posix()
+    for picture in (*pages.gallery_pictures(), *pages.notebook_pictures()):
+        path = picture.relative_to(pages.GALLERY.parent).as_posix()
         files.append(File.generated(config, path, abs_src_path=str(picture)))
     return files
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Turns the repository's links into the site's."""
-    made = page.file.src_uri.startswith(("gallery/", "api/"))
+    made = page.file.src_uri.startswith(("gallery/", "notebooks/", "api/"))
     return markdown if made else pages.linked(markdown, page.file.src_uri)
 
 

@@ -1,4 +1,4 @@
-"""The pages that the site has beside docs/: of the repository's root, the API reference, the gallery; and all links.
+"""The pages that the site has beside docs/: of the root, the API reference, gallery and notebooks; and all links.
 
 Links in Markdown files are written for the repository. Here they are turned into links of the site: `docs/method.md` in
 README.md becomes `method.md`, `examples/01_….py` becomes the example's page in the gallery.
@@ -15,6 +15,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 SOURCE = ROOT / "src" / "holosplat"
 GALLERY = ROOT / "build" / "gallery"
+NOTEBOOKS = ROOT / "build" / "notebooks"
 FROM_ROOT = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
 """Pages that lie in the repository's root, and where the site has them."""
 
@@ -33,6 +34,8 @@ def site_path(path: str) -> str | None:
     """Where the site has a file of the repository (`docs/method.md` → `method.md`), or None if it has not."""
     if path in FROM_ROOT:
         return FROM_ROOT[path]
+    if path.startswith("docs/notebooks/"):
+        return f"notebooks/{Path(path).stem}.md"
     if path.startswith("docs/"):
         return path.removeprefix("docs/")
     if path.startswith("examples/") and path.endswith(".py"):
@@ -129,25 +132,43 @@ def _top_level() -> Iterator[str]:
         yield f"[`{name}`][{module}.{own}]: {first}"
 
 
-# --- the gallery --------------------------------------------------------------------------------------------
+# --- the gallery and the notebooks --------------------------------------------------------------------------
 
 
 def gallery_pages(folder: Path = GALLERY) -> Pages:
     """The pages that docs/site/gallery.py wrote, and the list of them."""
-    found = sorted(folder.glob("*.md"))
-    if not found:
-        raise FileNotFoundError(f"{folder} holds no pages: run `python docs/site/gallery.py {folder}` first.")
-    pages = {f"gallery/{path.name}": path.read_text(encoding="utf-8") for path in found}
-    rows = ["# Gallery", "", "The files in `examples/`, run when the site was built.", ""]
-    for name, text in pages.items():
-        title, rest = text.removeprefix("# ").split("\n", 1)
-        first = rest.strip().split("\n\n")[0].replace("\n", " ")
-        rows += [f"## [{title}]({posixpath.basename(name)})", "", *([first] if "```" not in first else []), ""]
-        picture = re.search(r"!\[.*", text)
-        rows += [picture[0], ""] if picture else []
-    return {"gallery/index.md": "\n".join(rows), **pages}
+    return _listed("gallery", folder, "# Gallery", "The files in `examples/`, run when the site was built.")
 
 
 def gallery_pictures(folder: Path = GALLERY) -> Iterator[Path]:
     """The pictures of all examples."""
     return (path for path in sorted(folder.glob("*/out/*.png")))
+
+
+def notebook_pages(folder: Path = NOTEBOOKS) -> Pages:
+    """The pages that docs/site/notebooks.py wrote, and the list of them."""
+    said = (
+        "Jupyter notebooks, run when the site was built. Each page leads to its notebook, which needs no other files."
+    )
+    return _listed("notebooks", folder, "# Notebooks", said)
+
+
+def notebook_pictures(folder: Path = NOTEBOOKS) -> Iterator[Path]:
+    """The pictures of all notebooks."""
+    return (path for path in sorted(folder.glob("*_files/*.png")))
+
+
+def _listed(section: str, folder: Path, title: str, said: str) -> Pages:
+    """The pages in `folder` and the list of them, each with its first paragraph and its first picture."""
+    found = sorted(folder.glob("*.md"))
+    if not found:
+        raise FileNotFoundError(f"{folder} holds no pages: run `python docs/site/{section}.py {folder}` first.")
+    pages = {f"{section}/{path.name}": path.read_text(encoding="utf-8") for path in found}
+    rows = [title, "", said, ""]
+    for name, text in pages.items():
+        heading, rest = text.removeprefix("# ").split("\n", 1)
+        first = rest.strip().split("\n\n")[0].replace("\n", " ")
+        rows += [f"## [{heading}]({posixpath.basename(name)})", "", *([first] if "```" not in first else []), ""]
+        picture = re.search(r"!\[.*", text)
+        rows += [picture[0], ""] if picture else []
+    return {f"{section}/index.md": "\n".join(rows), **pages}

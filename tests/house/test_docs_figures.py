@@ -25,6 +25,30 @@ def test_tables_are_as_their_data(figures):
     assert [str(path.relative_to(ROOT)) for path in figures.changed()] == []
 
 
+def test_new_rows_of_motion_appear_by_rule(figures, monkeypatch):
+    """Of cases that the tables know, at the times that a table is of; each case of a forecast has its own table."""
+    motion = importlib.import_module("doc_tables_motion")
+    rows = {name: motion.read(f"{name}.csv") for name in ("motion", "motion_ablation", "forecast")}
+    monkeypatch.setattr(motion, "read", lambda name: rows[name.removesuffix(".csv")])
+    like = next(row for row in rows["motion"] if (row["case"], row["first"]) == ("flow2-body", "0"))
+    like |= {"least_dice": "0.891", "error": "0.351", "centre_um": "0.0291", "volume_spread": "0.0036"}
+    like |= {"cpu_seconds": "258.2"}
+    rows["forecast"] = [row for row in rows["forecast"] if row["case"] == "flow4"]
+    rows["motion"] = [like | {"dice": "0.5"}, like | {"first": "99", "dice": "0.6"}, like | {"times": "24"}]
+    assert motion.tracked().splitlines()[2:] == [
+        "| 2 at 0°, 90°, `--body red-cell` | 0.500 (0.891) | 0.35 | 14 of 14 | 16 of 16 | 0.029 µm | ± 0.36 % | 258 s |"
+    ]
+    rows["motion"] = [like | {"case": "flow4", "first": "7", "every": "3"}]
+    assert [line.split(" | ")[0] for line in motion.windows().splitlines()[2:]] == ["| 20 … 35", "| 7, 10 … 52"]
+    before = motion.forecast()
+    kept = [row for row in rows["forecast"] if row["model"] in ("paths", "auto")]
+    rows["forecast"] = [row | {"case": "flow2-body"} for row in kept[1:]] + rows["forecast"]
+    first, _, rest = motion.forecast().partition("\n\n")
+    assert first == before
+    assert rest.startswith("*2 at 0°, 90°, `--body red-cell`*\n\n| times ahead | paths | auto | SSIM of paths, auto |")
+    assert re.fullmatch(r"\| 1 \| 0\.048 / 0\.0\d\d \| – \| 0\.998, – \|", rest.splitlines()[4])
+
+
 def test_a_number_that_drifts_is_seen(figures):
     page = (DOCS / "verdict.md").read_text(encoding="utf-8")
     assert figures.filled(page) == page

@@ -5,33 +5,20 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
-import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
 import holosplat
+from helpers.docs_site import loaded
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 
 
-def module(name: str) -> ModuleType:
-    """A file of docs/site, which is no package."""
-    spec = importlib.util.spec_from_file_location(f"docs_site_{name}", ROOT / "docs" / "site" / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
-    loaded = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = loaded
-    spec.loader.exec_module(loaded)
-    return loaded
-
-
-site = module("pages")
-gallery = module("gallery")
+site = loaded("pages")
+gallery = loaded("gallery")
 
 
 # --- links --------------------------------------------------------------------------------------------------
@@ -130,6 +117,7 @@ def test_unknown_names_are_seen():
         ("index.md", "docs/images/hero.png", "images/hero.png"),
         ("index.md", "CONTRIBUTING.md", "contributing.md"),
         ("index.md", "examples/01_a.py", "gallery/01_a.md"),
+        ("viewing.md", "notebooks/01_a.ipynb", "notebooks/01_a.md"),
         ("simulation.md", "../README.md", "index.md"),
         ("simulation.md", "conventions.md", "conventions.md"),
         ("design/architecture.md", "../conventions.md", "../conventions.md"),
@@ -174,7 +162,7 @@ def test_what_a_page_loads_from_elsewhere_is_seen(html, addresses):
 def test_docstrings_become_markdown():
     pytest.importorskip("griffe", reason="the extra `docs` is not installed")
     text = "Weights [N] [m], *not* a*b, `[x]`.\n\nfirst, second [px]: one;\n    goes on.\nthird: `a_b` a_b.\n\nEnd."
-    assert module("docstrings").markdown(text) == (
+    assert loaded("docstrings").markdown(text) == (
         "Weights \\[N\\] \\[m\\], *not* a\\*b, `[x]`.\n\n\n"
         "- **first, second \\[px\\]**: one;\n    goes on.\n- **third**: `a_b` a\\_b.\n\nEnd."
     )

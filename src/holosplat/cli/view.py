@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,15 +15,16 @@ from .live import Port, say_where
 if TYPE_CHECKING:
     from ..representations import Stored
     from ..show.server import LiveView
+    from ..workflows.run_folder import RunFolder
 
-CUTS = 50
-"""Steps of the slider that cuts matter away."""
-BOX = 1000
-"""Voxels of the grid that only says where the object lies."""
+INTERVAL_S = 1.0
+"""Seconds from one look at a run that another process fits to the next."""
 
 
 def view(what: Positional[Path], port: Port = 8080) -> None:
     """Show a run or an object file in the browser, as Gaussians or surfaces, with sliders (Ctrl-C ends).
+
+    A run that another process fits is followed: its last checkpoint is shown, and each new one when it is there.
 
     The page is on this machine's own address only, and opens with the token in the address that is printed. On another
     machine, forward the port: ssh -L 8080:127.0.0.1:8080 THERE.
@@ -32,17 +34,41 @@ def view(what: Positional[Path], port: Port = 8080) -> None:
         port: Port; the next free one is taken.
     """
     from ..show.server import LiveView
+    from ..workflows.latest import fitted_by
+    from ..workflows.run_folder import RunFolder
 
-    objects, words = _objects(what)
-    page = LiveView(what.name or "holosplat", port)
+    folder = RunFolder(what)
+    followed = what.is_dir() and fitted_by(folder) is not None
+    objects, words = ({}, []) if followed else _objects(what)
+    page = LiveView(what.resolve().name or "holosplat", port)
     try:
-        _shown(page, objects, words)
-        say_where(page)
+        if followed:
+            _follow(page, folder)
+        else:
+            from ..show.scene import Scene
+
+            Scene(page).put(objects, words)
+            say_where(page)
         _until_interrupted()
     except KeyboardInterrupt:
         pass
     finally:
         page.close()
+
+
+def _follow(page: LiveView, folder: RunFolder) -> None:
+    """Show what another process fits, until that ends."""
+    from ..show.follow import Follow
+
+    run = Follow(page, folder)
+    say_where(page)
+    while run.look():
+        _pause()
+
+
+def _pause() -> None:
+    """Wait for the next look."""
+    time.sleep(INTERVAL_S)
 
 
 def _until_interrupted() -> None:
@@ -56,6 +82,7 @@ def _objects(what: Path) -> tuple[dict[str, Stored], list[str]]:
     from ..io.hdf5 import open_hdf5
     from ..io.objects import read_object
     from ..io.series import read_series
+    from ..show.follow import steps_of
     from ..show.parts import at_times
     from ..workflows.moments import instants_of
     from ..workflows.run_folder import RunFolder
@@ -65,9 +92,7 @@ def _objects(what: Path) -> tuple[dict[str, Stored], list[str]]:
         folder = RunFolder(what)
         folder.require_run()
         obj = read_object(folder.result())
-        losses = folder.history().get("loss")
-        said = [] if losses is None or len(losses) == 0 else [f"step {len(losses)}, loss {losses[-1]:.4g}"]
-        return at_times(obj, instants_of(folder)), [obj.described, *said]
+        return at_times(obj, instants_of(folder)), [obj.described, *steps_of(folder)]
     with open_hdf5(what) as file:
         several = file.attrs.get("format", "") == SERIES
     if several:
@@ -75,25 +100,3 @@ def _objects(what: Path) -> tuple[dict[str, Stored], list[str]]:
         return series, [f"{len(series)} objects"]
     obj = read_object(what)
     return at_times(obj, ()), [obj.described]
-
-
-def _shown(page: LiveView, objects: dict[str, Stored], words: list[str]) -> None:
-    """The first object, and the sliders."""
-    from ..show.parts import Frame, cut, shown
-
-    labels, parts = list(objects), dict[int, object]()
-    page.frame = Frame.around(next(iter(objects.values())).enclosing_grid(BOX))
-    now = {"time": 0, "cut": 0}
-
-    def draw(**changed: int) -> None:
-        now.update(changed)
-        number = now["time"]
-        if number not in parts:
-            parts[number] = shown(objects[labels[number]])
-        page.show(cut(parts[number], 2, now["cut"] / CUTS))  # pyright: ignore[reportArgumentType]
-        page.tell(*words, labels[number])
-
-    draw()
-    if len(labels) > 1:
-        page.slider("time", len(labels), lambda k: draw(time=k))
-    page.slider("cut along z", CUTS, lambda k: draw(cut=k))
