@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import copy
-
 import numpy as np
 import pytest
 import torch
 
 import holosplat as hs
+from helpers.kept import Kept
 from holosplat.checks import InputError
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import SmoothVolume, Task
@@ -20,21 +19,6 @@ QUICK = CarriedOptions(
     volume=SmoothVolume(coarser=(), rounds=1, iterations=3), cells=2, most_degree=1, most_cells=3, steps=2,
     iterations=2, final=2, spacing_px=2.0, approximate_steps=3,
 )  # fmt: skip
-
-
-class Kept:
-    """Keeps every state, as a file would; breaks off after `most` of them."""
-
-    def __init__(self, states=(), most: int = 10**6) -> None:
-        self.states, self.most = list(states), most
-
-    def load(self):
-        return copy.deepcopy(self.states[-1]) if self.states else None
-
-    def save(self, state) -> None:
-        self.states.append(copy.deepcopy(dict(state)))
-        if len(self.states) >= self.most:
-            raise KeyboardInterrupt
 
 
 @pytest.fixture(scope="module")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import replace
 from functools import cache
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.kept import Kept
 from helpers.moving_ellipsoids import MATERIAL, PIXEL, TIMES, scan, true_paths
 from holosplat.fit.schedule import Schedule
 from holosplat.motion import track
@@ -21,21 +21,6 @@ from holosplat.representations import TimeBasis
 SHORT = {name: replace(getattr(TrackOptions(), name), schedule=Schedule(steps=3)) for name in ("stiff", "soft", "half")}
 QUICK = replace(TrackOptions(), rounds=1, paths=PathOptions(degree=1, pieces=1), **SHORT)
 STAGES = ("first paths", "stiff", "beside", "paths", "soft", "twins", "halves", "done")
-
-
-class Kept:
-    """Keeps every state, as a file would; breaks off after `most` of them."""
-
-    def __init__(self, states=(), most: int = 10**6) -> None:
-        self.states, self.most = list(states), most
-
-    def load(self):
-        return copy.deepcopy(self.states[-1]) if self.states else None
-
-    def save(self, state) -> None:
-        self.states.append(copy.deepcopy(dict(state)))
-        if len(self.states) >= self.most:
-            raise KeyboardInterrupt
 
 
 @pytest.fixture(autouse=True)

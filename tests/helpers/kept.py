@@ -1,0 +1,20 @@
+"""A journal that keeps every state in memory."""
+
+from __future__ import annotations
+
+import copy
+
+
+class Kept:
+    """Keeps every state, as a file would; breaks off after `most` of them."""
+
+    def __init__(self, states=(), most: int = 10**6) -> None:
+        self.states, self.most = list(states), most
+
+    def load(self):
+        return copy.deepcopy(self.states[-1]) if self.states else None
+
+    def save(self, state) -> None:
+        self.states.append(copy.deepcopy(dict(state)))
+        if len(self.states) >= self.most:
+            raise KeyboardInterrupt
