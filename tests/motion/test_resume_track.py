@@ -68,6 +68,22 @@ def test_a_run_that_was_cut_off_goes_on_as_if_nothing_had_happened(cut):
     assert again.found == result.found == (3,) * TIMES
 
 
+def test_the_fit_after_twins_goes_on_too(monkeypatch):
+    """Where twins are taken, all bodies are fitted softly again, from these."""
+
+    def moved(run, bodies):
+        return bodies.with_parameters({"coefficients": bodies.coefficients + 0.3})
+
+    monkeypatch.setattr(track._Following, "told_from_twins", moved)
+    result = follow(scan(), MATERIAL, QUICK, journal=(kept := Kept()))
+    named = [state["next"] for state in kept.states]
+    assert named.index("twins") < named.index("soft again") < named.index("halves")
+    assert not torch.equal(result.bodies.coefficients, whole()[1].bodies.coefficients)
+    number = next(k for k, one in enumerate(kept.states) if one["next"] == "soft again" and one["fit"] is not None)
+    again = follow(scan(), MATERIAL, QUICK, journal=Kept(kept.states[: number + 1]))
+    assert torch.equal(again.bodies.coefficients, result.bodies.coefficients)
+
+
 def test_ctrl_c_in_a_fit_loses_no_step(monkeypatch):
     """It is passed on, after the state is kept."""
     monkeypatch.setattr(track, "CHECKPOINT_SECONDS", 1e9)

@@ -32,8 +32,8 @@ APART = 0.05
 ALIKE = 1e-4
 """Largest component of the difference of two directions that are one."""
 STRAINED = 10.0
-"""Elastic energy by which a twin may exceed its body, in units of its area times the shear modulus; cells in flow have
-up to four, their twins in beams across each other one more, in beams at 24° thirty and more."""
+"""Elastic energy by which a twin may exceed its body, in units of its area times the shear modulus: in trials cells in
+flow had up to four, their twins in beams across each other half a unit more, in beams at 24° 28 and more."""
 HOPELESS = 0.02
 """Part by which the loss of a stiff fit may be larger than without the twin for the soft fit to be made."""
 STIFF_STEPS, SOFT_STEPS, TRIAL_VIEWS = 40, 80, 4
