@@ -6,10 +6,10 @@
 
 DIR holds the snapshots of an ESPResSo run, as for espresso_flow.py. A run is one configuration on one thread, a
 subprocess `holosplat bench thesis`; RUNS gets a folder of a study for each schedule, case, physics and seed. What is
-finished is skipped and what was cut off goes on from its checkpoint, so that the same command can be given again.
-`list` says what is left, with its command. `collect` writes runs.csv (a row a run: schedule, case, physics, seed, hash
-of the scan, commit, scores at the end and at the best held-out FRCM), the curves of each run, and for the pictures the
-maps of the studies of seed 0.
+finished, there or by its row in runs.csv, is skipped, and what was cut off goes on from its checkpoint, so that the
+same command can be given again. `list` says what is left, with its command. `collect` adds to runs.csv (a row a run:
+schedule, case, physics, seed, hash of the scan, commit, scores at the end and at the best held-out FRCM), writes the
+curves of each run, and for the pictures the maps of the studies of seed 0.
 """
 
 from __future__ import annotations
@@ -80,8 +80,21 @@ def tasks() -> list[Task]:
 
 
 def finished(runs: Path, task: Task) -> bool:
-    """Whether it is done."""
+    """Whether it is done in `runs`."""
     return StudyFolder(runs / task.study).finished(task.name)
+
+
+def collected() -> dict[tuple[str, ...], dict[str, str]]:
+    """The rows of runs.csv, by what names their runs."""
+    if not (DATA / "runs.csv").exists():
+        return {}
+    with (DATA / "runs.csv").open(newline="") as file:
+        return {tuple(row[key] for key in IDENTITY): row for row in csv.DictReader(file)}
+
+
+def known(task: Task) -> tuple[str, ...]:
+    """What names its row in runs.csv."""
+    return tuple(str(getattr(task, key)) for key in IDENTITY)
 
 
 class Queue:
@@ -89,7 +102,9 @@ class Queue:
 
     def __init__(self, runs: Path, until: float) -> None:
         self._runs, self._until = runs, until
-        self._lock, self._busy, self._tried = threading.Lock(), set[str](), set[Task]()
+        had = collected()
+        self._lock, self._busy = threading.Lock(), set[str]()
+        self._tried = {task for task in tasks() if known(task) in had}
 
     def next(self) -> Task | None:
         """The next task; None when there is none, or time is over."""
@@ -132,9 +147,12 @@ def run(runs: Path, snapshots: Path, jobs: int, minutes: float) -> None:
 
 
 def rows(runs: Path) -> Iterator[dict[str, object]]:
-    """A row of runs.csv for each task that is done."""
+    """A row of runs.csv for each task that is done, here or by its row there."""
+    had = collected()
     for task in tasks():
         if not finished(runs, task):
+            if known(task) in had:
+                yield dict(had[known(task)])
             continue
         folder = StudyFolder(runs / task.study)
         about, row = json.loads(folder.about.read_text()), folder.row(task.name)
@@ -171,6 +189,9 @@ def collect_maps(study: Path, out: Path) -> None:
         found[f"{name}/slice"] = maps["slice"]
         if name == MAIN:
             found |= {f"{name}/{key}": maps[key] for key in ("true_slice", "steps", "lines", "true_lines")}
+    if out.exists():
+        with np.load(out) as had:
+            found = dict(had) | found
     with atomic_path(out) as path, path.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **found)
 
@@ -189,8 +210,10 @@ def main() -> None:
     elif given.act == "collect":
         collect(given.runs)
     else:
+        had = collected()
         for task in tasks():
-            print("done" if finished(given.runs, task) else "left", *task.command(given.runs, "DIR"))
+            done = known(task) in had or finished(given.runs, task)
+            print("done" if done else "left", *task.command(given.runs, "DIR"))
 
 
 if __name__ == "__main__":
