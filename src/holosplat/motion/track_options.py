@@ -8,7 +8,7 @@ from typing import ClassVar
 from ..fit.schedule import Schedule
 from ..learning.start import LearnedStart
 from ..ranges import Share, ranged
-from .fit import MotionFit
+from .fit import MotionFit, converged
 from .identities import LinkOptions
 from .pieces import PathOptions
 from .rest_shape import KnownBody
@@ -21,10 +21,6 @@ def _stiff() -> MotionFit:
 
 def _half() -> MotionFit:
     return MotionFit(rate=0.1, schedule=Schedule(steps=40, views_per_step=16))
-
-
-def _soft() -> MotionFit:
-    return MotionFit(schedule=Schedule(steps=150, views_per_step=16))
 
 
 @dataclass(frozen=True)
@@ -51,7 +47,7 @@ class TrackOptions:
     """Factor of the level there: few views smear a body, and beside what is known there is little to take it for."""
     stiff: MotionFit = field(default_factory=_stiff)
     """The first fit, in which bodies move and turn nearly as a whole."""
-    soft: MotionFit = field(default_factory=_soft)
+    soft: MotionFit = field(default_factory=converged)
     """The second one, in which they deform."""
 
     twins: bool = True
