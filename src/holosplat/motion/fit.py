@@ -87,8 +87,7 @@ def motion_fit(
     rest: what is known of the bodies' shape at rest.
 
     Steps are Adam's, of one length for all vertices, or those of L-BFGS, in coordinates in which neighbours move
-    together (Nicolet et al. 2021) and in which times count alike: the paths' Gram matrix over the times of the frames is
-    one.
+    together (Nicolet et al. 2021) and in which times count alike: the paths' Gram matrix over the times is one.
     """
     train, schedule = scan.train(), options.schedule
     if options.pairs or 0 < len(train) <= schedule.views_per_step:

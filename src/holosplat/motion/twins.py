@@ -36,9 +36,11 @@ STRAINED = 10.0
 flow had up to four, their twins in beams across each other half a unit more, in beams at 24° 28 and more."""
 HOPELESS = 0.02
 """Part by which the loss of a stiff fit may be larger than without the twin for the soft fit to be made."""
-STIFF_STEPS, SOFT_STEPS, TRIAL_VIEWS = 40, 80, 4
-"""Steps of the two fits of a trial, and frames of a step: with a third of these steps a body is not yet at home where
-its twin is."""
+STIFF_STEPS, SOFT_STEPS, TRIAL_VIEWS = 40, 60, 4
+"""Steps of the two fits of a trial, and frames of a step of Adam's: with a third of these steps a body is not yet at
+home where its twin is."""
+TRIAL_WORTH = 1.0
+"""What a step of L-BFGS must gain there [nats]: bodies and their twins differ by ten at times."""
 SAMPLES = 4
 """Times at which a body that turns is put in its twin's place, for each coefficient of its path."""
 Heard = Callable[[float], None]
@@ -47,8 +49,9 @@ Heard = Callable[[float], None]
 
 def trial_of(how: MotionFit, steps: int) -> MotionFit:
     """`how` in so many steps at most, of few frames, for one body: what it has with others is left out."""
-    schedule = replace(how.schedule, steps=min(steps, how.schedule.steps), views_per_step=TRIAL_VIEWS)
-    return replace(how, volume_kept=0.0, area_kept=0.0, apart=0.0, schedule=schedule)
+    views = how.schedule.views_per_step if how.pairs else TRIAL_VIEWS
+    schedule = replace(how.schedule, steps=min(steps, how.schedule.steps), views_per_step=views)
+    return replace(how, volume_kept=0.0, area_kept=0.0, apart=0.0, worth=TRIAL_WORTH, schedule=schedule)
 
 
 @dataclass(frozen=True)
