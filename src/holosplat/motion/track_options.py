@@ -20,7 +20,8 @@ def _stiff() -> MotionFit:
 
 
 def _half() -> MotionFit:
-    return MotionFit(rate=0.1, schedule=Schedule(steps=40, views_per_step=16))
+    fit = converged()
+    return replace(fit, rate=0.1, schedule=replace(fit.schedule, steps=40))
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ class TrackOptions:
     twins: bool = True
     """Whether bodies of known shape are told from others whose shadows two beams do not tell from theirs."""
     intervals: bool = True
-    """Whether halves of the frames are fitted, too, for standard errors: up to four fits of a quarter of the steps."""
+    """Whether halves of the frames are fitted, too, for standard errors: up to four fits of a third of the steps."""
     half: MotionFit = field(default_factory=_half)
     """The fit to a half, from the result: errors are hundredths of a pixel."""
 
