@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -35,6 +38,16 @@ class Batches:
             torch.tensor(share).to(on, non_blocking=True),
             volume,
         )
+
+    def parts(self, batch: Batch) -> Iterator[tuple[Batch, float]]:
+        """`batch` in parts of few enough frames, and which share of its frames each has."""
+        most, count = self._schedule.views_at_once, self._count if batch.index is None else len(batch.index)
+        if most <= 0 or count <= most:
+            yield batch, 1.0
+            return
+        every = torch.arange(count, device=self._device) if batch.index is None else batch.index
+        for part in every.split(most):
+            yield replace(batch, index=part), len(part) / count
 
     def _views(self) -> np.ndarray:
         """The frames of this step: all, or the next ones of a shuffled order without replacement."""

@@ -239,6 +239,7 @@ class Fit:
             if moved and self._capture is not None:
                 self._capture.forget()
         self.step += 1
+        self.stopped_early = self.trainable.optimiser.settled
         record: Record = {"step": self.step}
         for event in self.plan.events:
             record |= event.columns(self.model)
@@ -248,14 +249,22 @@ class Fit:
 
     def _work(self, batch: Batch) -> Tensor:
         """One step on the device: gradients, what events want of them, the optimiser. Waits for nothing."""
-        loss, values, self._names[batch.volume] = self.plan.problem.loss(self.model, batch)
-        loss.backward()
+        values = self._gradients(batch)
         for event in self.plan.events:
             event.on_gradients(self.trainable.leaves)
-        self.trainable.optimiser.apply(loss.detach())
+        self.trainable.optimiser.apply(values[0])
         sums = [leaf.detach().sum() for leaf in self.trainable.leaves.values()]
         sound = torch.stack([s.to(values.dtype) for s in sums]).sum()[None]
         return torch.cat([values, sound])
+
+    def _gradients(self, batch: Batch) -> Tensor:
+        """Of the loss, and the values [1 + K] of it and its parts: means over parts of the batch by their frames."""
+        sums = list[Tensor]()
+        for part, share in self._batches.parts(batch):
+            loss, values, self._names[batch.volume] = self.plan.problem.loss(self.model, part)
+            (loss if share == 1 else share * loss).backward()
+            sums.append(values if share == 1 else share * values)
+        return sum(sums[1:], start=sums[0])
 
     def _validate(self, judge: Judge) -> Record:
         """Look at the validation frames; keeps the best state, and stops the fit when patience is over."""
@@ -263,7 +272,7 @@ class Fit:
         if score < self._best.score:
             self._best = _Best(self.trainable.snapshot(), score, self.step)
         overdue = self.step - self._best.step >= self.schedule.patience * self.schedule.validate_every
-        self.stopped_early = self.schedule.patience > 0 and overdue
+        self.stopped_early |= self.schedule.patience > 0 and overdue
         return columns
 
     def state_dict(self) -> dict[str, Any]:

@@ -30,6 +30,11 @@ class Optimiser(Protocol):
         """The part that runs on the device: moves the leaves in place by their `grad`, and clears it."""
         ...
 
+    @property
+    def settled(self) -> bool:
+        """Whether further steps are not worth it, where the optimiser knows; the fit then ends."""
+        ...
+
     def best(self) -> Leaves | None:
         """The best parameters so far, where the optimiser keeps them; None where the last ones count."""
         ...
@@ -99,6 +104,11 @@ class Apart:
         """See `Optimiser`."""
         for part in self._parts:
             part.apply(loss)
+
+    @property
+    def settled(self) -> bool:
+        """See `Optimiser`."""
+        return all(part.settled for part in self._parts)
 
     def best(self) -> Leaves | None:
         """See `Optimiser`."""
@@ -182,6 +192,11 @@ class Adam:
         self._second[name].mul_(slower).add_(square, alpha=1 - slower)
         first, second = self._first[name] / short, self._second[name] / shorter
         leaf.mul_(1 - rate * group.decay).sub_(rate * first / (second.sqrt() + group.epsilon))
+
+    @property
+    def settled(self) -> bool:
+        """Never: it has rates that end."""
+        return False
 
     def best(self) -> None:
         """None: the last parameters count."""

@@ -72,6 +72,11 @@ class ProjectedGradient:
         if value < self._least:
             self._best, self._least = self._point, value
 
+    @property
+    def settled(self) -> bool:
+        """Never: its steps are counted."""
+        return False
+
     def best(self) -> Leaves:
         """The point with the least value; `InputError` if no value was finite."""
         if not self._least < float("inf"):

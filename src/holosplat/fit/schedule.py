@@ -17,6 +17,8 @@ class Schedule:
     """Gradient steps: 200 leave sharp edges unfinished, 400 gain nothing on the cases of the benchmark."""
     views_per_step: int = 0
     """Frames drawn for each step (0: all training frames, which few views afford)."""
+    views_at_once: int = 0
+    """Of these, frames whose waves are in memory at a time (0: all)."""
     decay: float = 0.1
     """Share of the rates that is left at the last step (exponential in between)."""
     warmup_steps: int = 0

@@ -15,6 +15,7 @@ from ..checks import require
 from ..geometry import Grid
 from ..projectors.voxels import projector_for
 from ..ranges import Weight, ranged
+from .quasi_newton import direction
 from .whitened import WhitenedFrames
 
 MEMORY = 6
@@ -200,11 +201,11 @@ class Descent:
             self._conditioned(self.u)
         u, gradient = self.u, self._gradient
         free = ((u > 0) | (gradient < 0)).to(u)
-        direction = _direction(gradient, free, self._pairs, self._inverse)
-        found = self._searched(direction)
+        way = direction(gradient, self._pairs, self._inverse, free)
+        found = self._searched(way)
         if found is None and self._pairs:
             self._pairs = []
-            found = self._searched(_direction(gradient, free, self._pairs, self._inverse))
+            found = self._searched(direction(gradient, self._pairs, self._inverse, free))
         if found is None:
             self.ended = True
             return
@@ -215,11 +216,11 @@ class Descent:
         self.u, self._gradient, self.value = moved, slope, value
         self.done += 1
 
-    def _searched(self, direction: Tensor) -> tuple[Tensor, float, Tensor] | None:
-        """The first point of a shrinking series along the projected `direction` that lowers the objective enough."""
+    def _searched(self, way: Tensor) -> tuple[Tensor, float, Tensor] | None:
+        """The first point of a shrinking series along the projected `way` that lowers the objective enough."""
         length, u, gradient = 1.0, self.u, self._gradient
         for _ in range(TRIALS):
-            moved = (u + length * direction).clamp_min(0)
+            moved = (u + length * way).clamp_min(0)
             length *= SHRINK
             if self.kept and not bool((moved > 0).any()):
                 continue
@@ -263,24 +264,3 @@ def descend(problem: Penalised, start: Tensor, iterations: int) -> tuple[Tensor,
             break
         values.append(descent.value)
     return descent.u, values
-
-
-def _direction(
-    gradient: Tensor, free: Tensor, pairs: list[tuple[Tensor, Tensor]], inverse: Callable[[Tensor], Tensor]
-) -> Tensor:
-    """Minus the inverse second derivative, as L-BFGS knows it, times the gradient, among the free voxels."""
-    left, used = gradient * free, list[tuple[Tensor, Tensor, float, float]]()
-    for step, change in reversed(pairs):
-        s, y = step * free, change * free
-        curved = float((s * y).sum())
-        if curved > 1e-10 * float(s.norm() * y.norm()):
-            share = float((s * left).sum()) / curved
-            left = left - share * y
-            used.append((s, y, curved, share))
-    result = inverse(left) * free
-    if used:
-        _, y, curved, _ = used[0]
-        result *= curved / float((y * inverse(y)).sum())
-    for s, y, curved, share in reversed(used):
-        result = result + (share - float((y * result).sum()) / curved) * s
-    return -result if float((result * gradient).sum()) > 0 else -(inverse(gradient * free) * free)

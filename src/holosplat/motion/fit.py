@@ -13,8 +13,9 @@ from torch import Tensor
 
 from ..checks import positive, require
 from ..fit.loop import Fit, Plan
-from ..fit.optimiser import Adam, Group
+from ..fit.optimiser import Adam, Group, Leaves, Optimiser
 from ..fit.problem import Problem, Term
+from ..fit.quasi_newton import QuasiNewton
 from ..fit.schedule import Schedule
 from ..fit.terms import Objective
 from ..methods.ground import Ground, ground
@@ -44,7 +45,11 @@ class MotionFit:
     """Options of a fit of moving surfaces."""
 
     rate: Rate = 0.2
-    """Length of the first steps [pixels], the same for all vertices."""
+    """Length of the first steps [pixels], the same for all vertices; a tenth of the longest one of L-BFGS."""
+    pairs: int = 0
+    """Pairs of steps that L-BFGS remembers, whose steps look at all frames (0: steps are Adam's)."""
+    worth: Weight = 5.0
+    """Log-likelihood that a step of L-BFGS must gain for the fit to go on [nats], in the mean over ten."""
     stiffness: Weight = 10.0
     """How far a vertex draws its neighbours along, λ of Nicolet et al. (2021)."""
     acceleration: float = 1e-6
@@ -58,10 +63,15 @@ class MotionFit:
     objective: Objective = field(default_factory=_objective)
     """How frames are compared, and what bending costs."""
     schedule: Schedule = field(default_factory=lambda: Schedule(steps=100, views_per_step=16))
-    """The loop; memory is that of the frames of one step."""
+    """The loop; memory is that of the frames of one step, of which L-BFGS takes several for one of its own."""
 
     def __post_init__(self) -> None:
         positive("rate", self.rate, "pixels")
+
+
+def converged() -> MotionFit:
+    """A fit by L-BFGS, which ends when it gains nothing more."""
+    return MotionFit(pairs=20, schedule=Schedule(steps=120, views_per_step=16, decay=1.0))
 
 
 def motion_fit(
@@ -76,20 +86,27 @@ def motion_fit(
 
     rest: what is known of the bodies' shape at rest.
 
-    Steps are Adam's, of one length for all vertices, in coordinates in which neighbours move together (Nicolet et al.
-    2021) and in which times count alike: the paths' Gram matrix over the times of the frames is one.
+    Steps are Adam's, of one length for all vertices, or those of L-BFGS, in coordinates in which neighbours move
+    together (Nicolet et al. 2021) and in which times count alike: the paths' Gram matrix over the times is one.
     """
     train, schedule = scan.train(), options.schedule
-    if 0 < len(train) <= schedule.views_per_step:
-        schedule = replace(schedule, views_per_step=0)
+    if options.pairs or 0 < len(train) <= schedule.views_per_step:
+        schedule = replace(schedule, views_per_step=0, views_at_once=schedule.views_per_step)
     finer = oversampling(train) if not schedule.oversample else 0
     base = ground(scan, start, start.matter, options.objective, schedule, "cpu", finer=finer, light=light)
     times = base.train.exposures.time
-    group = Group(BETAS, EPSILON, solve=_smooth_directions(start, options.stiffness, times), together=True)
+    smooth, worth = _smooth_directions(start, options.stiffness, times), options.worth * _of_likelihood(base)
+    group = Group(BETAS, EPSILON, solve=smooth, together=True)
+
+    def optimiser(leaves: Leaves) -> Optimiser:
+        if options.pairs:
+            return QuasiNewton(leaves, smooth, options.pairs, worth)
+        return Adam(leaves, "cpu", {COEFFICIENTS: group})
+
     plan = Plan(
         problem=Problem(base.model, (base.frames, *_terms(base, start, options), *_at_rest(base, start, rest))),
         schedule=schedule,
-        optimiser=lambda leaves: Adam(leaves, "cpu", {COEFFICIENTS: group}),
+        optimiser=optimiser,
         rates=lambda factor, step: {COEFFICIENTS: options.rate * factor},
         judge=base.judge,
     )

@@ -35,6 +35,8 @@ from .twins import Trials, chosen_twins
 
 CHECKPOINT_SECONDS = 20.0
 """A fit that runs is kept so often [s]."""
+AFTER_SOFT = {"soft": "twins", "soft again": "halves"}
+"""The stages of soft fits, and what comes after each."""
 NOWHERE = Nowhere()
 """No journal."""
 
@@ -163,15 +165,12 @@ class _Following:
             self.bodies, self.stage = (bodies, "paths") if more is None else (more, "stiff")
         elif self.stage == "paths":
             self.bodies, self.stage = self.on_chosen_paths(bodies), "soft"
-        elif self.stage == "soft":
-            self.bodies = self.fitted("soft fit", self.train, bodies, self.options.soft, self.light)
-            self.stage = "twins"
         elif self.stage == "twins":
             self.bodies = self.told_from_twins(bodies)
             self.stage = "halves" if self.bodies is bodies else "soft again"
-        elif self.stage == "soft again":
+        elif self.stage in AFTER_SOFT:
             self.bodies = self.fitted("soft fit", self.train, bodies, self.options.soft, self.light)
-            self.stage = "halves"
+            self.stage = AFTER_SOFT[self.stage]
         else:
             self._half(bodies)
 

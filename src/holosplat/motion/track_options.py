@@ -8,7 +8,7 @@ from typing import ClassVar
 from ..fit.schedule import Schedule
 from ..learning.start import LearnedStart
 from ..ranges import Share, ranged
-from .fit import MotionFit
+from .fit import MotionFit, converged
 from .identities import LinkOptions
 from .pieces import PathOptions
 from .rest_shape import KnownBody
@@ -20,11 +20,8 @@ def _stiff() -> MotionFit:
 
 
 def _half() -> MotionFit:
-    return MotionFit(rate=0.1, schedule=Schedule(steps=40, views_per_step=16))
-
-
-def _soft() -> MotionFit:
-    return MotionFit(schedule=Schedule(steps=150, views_per_step=16))
+    fit = converged()
+    return replace(fit, rate=0.1, schedule=replace(fit.schedule, steps=40))
 
 
 @dataclass(frozen=True)
@@ -51,13 +48,13 @@ class TrackOptions:
     """Factor of the level there: few views smear a body, and beside what is known there is little to take it for."""
     stiff: MotionFit = field(default_factory=_stiff)
     """The first fit, in which bodies move and turn nearly as a whole."""
-    soft: MotionFit = field(default_factory=_soft)
+    soft: MotionFit = field(default_factory=converged)
     """The second one, in which they deform."""
 
     twins: bool = True
     """Whether bodies of known shape are told from others whose shadows two beams do not tell from theirs."""
     intervals: bool = True
-    """Whether halves of the frames are fitted, too, for standard errors: up to four fits of a quarter of the steps."""
+    """Whether halves of the frames are fitted, too, for standard errors: up to four fits of a third of the steps."""
     half: MotionFit = field(default_factory=_half)
     """The fit to a half, from the result: errors are hundredths of a pixel."""
 

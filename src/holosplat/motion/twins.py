@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -36,9 +37,15 @@ STRAINED = 10.0
 flow had up to four, their twins in beams across each other half a unit more, in beams at 24° 28 and more."""
 HOPELESS = 0.02
 """Part by which the loss of a stiff fit may be larger than without the twin for the soft fit to be made."""
-STIFF_STEPS, SOFT_STEPS, TRIAL_VIEWS = 40, 80, 4
-"""Steps of the two fits of a trial, and frames of a step: with a third of these steps a body is not yet at home where
-its twin is."""
+STIFF_STEPS, SOFT_STEPS, TRIAL_VIEWS = 40, 40, 4
+"""Steps of the two fits of a trial, and frames of a step of Adam's: with a third of these steps a body is not yet at
+home where its twin is."""
+CLOSE = 5e-4
+"""Part of the loss by which a body and its twin must differ to be told after these steps: so much they gain later."""
+FIRST_LOOK = 0.7
+"""About the share of the work before the closer ones are looked at again."""
+TRIAL_WORTH = 1.0
+"""What a step of L-BFGS must gain there [nats]: bodies and their twins differ by ten at times."""
 SAMPLES = 4
 """Times at which a body that turns is put in its twin's place, for each coefficient of its path."""
 Heard = Callable[[float], None]
@@ -47,8 +54,9 @@ Heard = Callable[[float], None]
 
 def trial_of(how: MotionFit, steps: int) -> MotionFit:
     """`how` in so many steps at most, of few frames, for one body: what it has with others is left out."""
-    schedule = replace(how.schedule, steps=min(steps, how.schedule.steps), views_per_step=TRIAL_VIEWS)
-    return replace(how, volume_kept=0.0, area_kept=0.0, apart=0.0, schedule=schedule)
+    views = how.schedule.views_per_step if how.pairs else TRIAL_VIEWS
+    schedule = replace(how.schedule, steps=min(steps, how.schedule.steps), views_per_step=views)
+    return replace(how, volume_kept=0.0, area_kept=0.0, apart=0.0, worth=TRIAL_WORTH, schedule=schedule)
 
 
 @dataclass(frozen=True)
@@ -63,41 +71,72 @@ class Trials:
     seed: int = 0
     light: Light | None = None
 
-    def left(self, frames: Scan, start: MovingSurfaces, hopeless: float = np.inf) -> tuple[list[float], MovingSurfaces]:
-        """The losses that a stiff fit and then a soft one leave of `frames`, and what `start` has become; the stiff one
-        alone where it leaves more than `hopeless`."""
-        losses = list[float]()
-        for how, steps in ((self.stiff, STIFF_STEPS), (self.soft, SOFT_STEPS)):
-            fit = motion_fit(frames, start, trial_of(how, steps), self.seed, self.light, self.rest)
-            fit.run(lambda record: None)
-            loss, start = _left(fit)
-            losses.append(loss)
-            if loss > hopeless:
-                break
-        return losses, start
+    def begun(self, frames: Scan, start: MovingSurfaces) -> Tried:
+        """A stiff fit of `start` to `frames`."""
+        return self._fitted(frames, start, trial_of(self.stiff, STIFF_STEPS))
+
+    def gone_on(self, frames: Scan, tried: Tried) -> Tried:
+        """A soft fit to `frames` from there."""
+        return self._fitted(frames, tried.bodies, trial_of(self.soft, SOFT_STEPS))
+
+    def _fitted(self, frames: Scan, start: MovingSurfaces, how: MotionFit) -> Tried:
+        fit = motion_fit(frames, start, how, self.seed, self.light, self.rest)
+        fit.run(lambda record: None)
+        return _left(fit)
+
+    def beside(self, bodies: MovingSurfaces, number: int) -> Scan:
+        """The frames, divided by those of all `bodies` but one."""
+        others = [k for k in range(bodies.count) if k != number]
+        return beside(self.train, only(bodies, others), self.oversample) if others else self.train
+
+
+class Tried(NamedTuple):
+    """What a fit leaves of frames, and its bodies."""
+
+    loss: float
+    bodies: MovingSurfaces
 
 
 def chosen_twins(bodies: MovingSurfaces, trials: Trials, on_progress: Heard = lambda share: None) -> MovingSurfaces:
     """`bodies` of known rest shape, each or its twin, whichever leaves less; as they are for other than two beams.
 
     Frames are divided by those that all others predict, and the body and its twin are fitted to them, from shapes
-    without details: those that were fitted before would speak for the body that was there.
+    without details: those that were fitted before would speak for the body that was there. Where the two leave nearly
+    the same, both fits go on when all others have been looked at.
     """
     beams = two_beams(trials.train.views)
     if beams is None:
         return bodies
-    plain = without_details(bodies, trials.rest)
-    asked, changed = in_question(plain, beams, trials.rest), bodies.coefficients.detach().clone()
+    plain, now = without_details(bodies, trials.rest), bodies
+    asked, rivals = in_question(plain, beams, trials.rest), dict[int, tuple[Tried, Tried]]()
     for turn, number in enumerate(asked):
-        on_progress(turn / len(asked))
-        own, others = only(plain, [number]), [k for k in range(bodies.count) if k != number]
-        frames = beside(trials.train, only(bodies, others), trials.oversample) if others else trials.train
-        least, _ = trials.left(frames, own)
-        left, found = trials.left(frames, twinned(own, 0, beams), (1 + HOPELESS) * least[0])
-        if len(left) == len(least) and left[-1] < least[-1]:
-            changed[:, bodies.body(number)[0]] = found.coefficients
-    same = torch.equal(changed, bodies.coefficients.detach())
-    return bodies if same else bodies.with_parameters({"coefficients": changed})
+        on_progress(FIRST_LOOK * turn / len(asked))
+        frames, own = trials.beside(now, number), only(plain, [number])
+        first, other = (trials.begun(frames, start) for start in (own, twinned(own, 0, beams)))
+        first = trials.gone_on(frames, first)
+        if other.loss > (1 + HOPELESS) * first.loss:
+            continue
+        rivals[number] = first, trials.gone_on(frames, other)
+        now = _better(now, number, bodies, rivals[number])
+    close = [k for k, (first, other) in rivals.items() if abs(other.loss - first.loss) < CLOSE * first.loss]
+    for turn, number in enumerate(close):
+        on_progress(FIRST_LOOK + (1 - FIRST_LOOK) * turn / len(close))
+        frames = trials.beside(now, number)
+        first, other = (trials.gone_on(frames, tried) for tried in rivals[number])
+        now = _better(now, number, bodies, (first, other))
+    return now
+
+
+def _better(now: MovingSurfaces, number: int, before: MovingSurfaces, rivals: tuple[Tried, Tried]) -> MovingSurfaces:
+    """`now` with its body `number` as it was `before`, or as its twin, if that leaves less."""
+    first, other = rivals
+    own, _ = now.body(number)
+    place = other.bodies.coefficients if other.loss < first.loss else before.coefficients.detach()[:, own]
+    if torch.equal(place, now.coefficients.detach()[:, own]):
+        return now
+    changed = now.coefficients.detach().clone()
+    changed[:, own] = place
+    return now.with_parameters({"coefficients": changed})
 
 
 def in_question(bodies: MovingSurfaces, beams: np.ndarray, rest: Rest) -> list[int]:
@@ -225,7 +264,7 @@ def _second(mesh: TriangleMesh) -> np.ndarray:
     return second / volume
 
 
-def _left(fit: Fit) -> tuple[float, MovingSurfaces]:
+def _left(fit: Fit) -> Tried:
     """The loss of all frames and priors after `fit`, and its bodies."""
     model = fit.result()
     whole = Batch(None, torch.zeros(3, dtype=torch.float64), torch.tensor(1.0), 0)
@@ -233,4 +272,4 @@ def _left(fit: Fit) -> tuple[float, MovingSurfaces]:
         loss = float(fit.plan.problem.loss(model, whole)[0])
     found = model.object
     assert isinstance(found, MovingSurfaces)
-    return loss, found.with_parameters({"coefficients": found.coefficients.detach()})
+    return Tried(loss, found.with_parameters({"coefficients": found.coefficients.detach()}))
