@@ -13,6 +13,7 @@ from ..ranges import Share, ranged
 from ..representations import GaussianCloud, Stored, SurfaceMesh, VoxelGrid
 from .assumed import assumed_material
 from .cross_validation import CrossValidation, MissingMatter
+from .evidence import Evidence
 from .gaussian_options import Backend
 from .gaussians import Gaussians
 from .levels import Decision, LevelTest
@@ -37,6 +38,8 @@ class Auto:
     """
 
     kind: ClassVar[str] = "auto"
+    mixes_kinds: ClassVar[bool] = True
+    """A volume may take the place of bodies."""
 
     gaussians: Gaussians = field(default_factory=Gaussians)
     surfaces: SurfaceOptions = field(default_factory=SurfaceOptions)
@@ -46,8 +49,8 @@ class Auto:
     trials: CrossValidation = field(default_factory=CrossValidation)
     """How views are set aside for trials."""
     unexplained: Share = 0.12
-    """Share of all matter that bodies may leave unexplained before a smooth volume is tried. Where it is too low, a
-    volume is fitted in vain, for it must leave half of what they do to be taken."""
+    """Share of all matter that bodies may leave unexplained, beyond noise, before a smooth volume is tried. Where it is
+    too low, a volume is fitted in vain, for it must leave half of what they do to be taken."""
 
     def stages(self) -> Sequence[Stage]:
         """Those for matter with levels; `chosen` decides."""
@@ -117,6 +120,7 @@ class Bodies:
     """Gaussians, surfaces where these enclose bodies of one material; a smooth volume where neither explains much."""
 
     kind: ClassVar[str] = "bodies"
+    mixes_kinds: ClassVar[bool] = True
 
     gaussians: Gaussians
     surfaces: SurfaceOptions
@@ -155,7 +159,7 @@ class SurfacesWhereClosed(SurfaceStage):
 class VolumeWhereUnexplained:
     """A smooth volume, where matter with levels explains the frames badly: then there are no such levels.
 
-    most: share of all matter that what came before may leave unexplained
+    most: share of all matter that what came before may leave unexplained, beyond noise
     """
 
     options: SmoothVolume
@@ -163,6 +167,8 @@ class VolumeWhereUnexplained:
     name: str = "smooth volume"
     better: ClassVar[float] = 2.0
     """So many times less must it leave unexplained than bodies do: it is freer, and follows the frames' errors, too."""
+    of_best: ClassVar[bool] = True
+    """It is the best of the states before it that must explain the frames, not the latest."""
 
     def start(self, task: Task, before: Stored | None) -> Stored:
         """A first volume; what came before, where that explains the frames or has two materials."""
@@ -171,7 +177,8 @@ class VolumeWhereUnexplained:
         if not matter.single or task.scan.is_series:
             return before
         judge = MissingMatter(task.scan, DeltaBeta(matter.delta, matter.beta))
-        return before if judge.share(before) <= self.most else SmoothStage(self.options).start(_continuous(task), None)
+        left = Evidence(judge, task.noise).share(judge.predicted(before))
+        return before if left <= self.most else SmoothStage(self.options).start(_continuous(task), None)
 
     def fit(self, task: Task, start: Stored) -> SmoothFit | None:
         """The fit of the volume; None for what came before."""
