@@ -16,6 +16,7 @@ from holosplat.io.json import read_json
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import Auto, GaussianRates, SmoothVolume, solve
 from holosplat.methods.auto import VolumeWhereUnexplained
+from holosplat.methods.cross_validation import CrossValidation
 from holosplat.methods.keeper import Keeper
 from holosplat.methods.method import Task
 from holosplat.methods.volume import SmoothStage
@@ -61,7 +62,7 @@ def test_a_stage_may_go_on_from_the_best_state(scan):
     good = solve(SMALL, Task(train, KNOWN), "levels")
     assert isinstance(good, GaussianCloud)
     bad = good.with_parameters({"raw_amplitudes": good.parameters()["raw_amplitudes"] - 0.7})
-    keeper, volume = Keeper(train, mixed=True), VolumeWhereUnexplained(SmoothVolume(), 0.12)
+    keeper, volume = Keeper(train, mixed=True), VolumeWhereUnexplained(SmoothVolume(), 0.12, SMALL, CrossValidation())
     assert keeper.handed(volume, None, placed=False) is None
     keeper.look("surfaces", good, 2)
     keeper.look("other", bad, 2)
