@@ -88,6 +88,26 @@ def aligned_inference() -> str:
     return markdown(columns, lines)
 
 
+SEEN = ("nothing", "frames", "frames, adversary 0.1")
+"""What weights of `onix` were learnt from, in the order of the table."""
+
+
+def onix_scenes() -> str:
+    """Scores of `onix` on scenes that it has not seen, each scene, by what it learnt from and number of views."""
+    rows = read("onix_scenes.csv")
+    lines = []
+    for views in sorted({r["views"] for r in rows}):
+        for weights in SEEN:
+            for fitted in sorted({r["fitted"] for r in rows}, key=int):
+                own = [r for r in rows if (r["views"], r["weights"], r["fitted"]) == (views, weights, fitted)]
+                own.sort(key=lambda r: (int(r["scene"]), int(r["seed"])))
+                if own:
+                    scores = (", ".join(rounded(r[n], 3) for r in own) for n in ("dice", "error", "ssim", "frcm"))
+                    lines.append([views, weights, fitted, *scores])
+    columns = ("views", "learnt from", "steps on the scan", "Dice", "error of δ", "SSIM", "FRCM")
+    return markdown(columns, lines)
+
+
 FEW = {
     "paganin-fbp": "Paganin, FBP",
     "paganin-tv": "Paganin, TV in the box",

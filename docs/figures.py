@@ -165,7 +165,10 @@ TABLES |= {
     )
 }
 TABLES["pinn"] = Table(
-    runs.pinn, ("pinn.csv",), "python benchmarks/pinn.py --cases channel swirl --write", "half an hour"
+    runs.pinn,
+    ("pinn.csv",),
+    "python benchmarks/pinn.py --cases channel swirl --write (and espresso with --data)",
+    "half an hour",
 )
 TABLES["assimilation"] = Table(
     moving.assimilation, ("assimilation.csv",), "python benchmarks/assimilation.py --write", "five minutes"
@@ -184,6 +187,12 @@ TABLES["learned"] = Table(
 )
 TABLES["learned_change"] = Table(
     learning.learned_change, ("learned.csv",), "python benchmarks/learned.py DATA --write", "half an hour"
+)
+TABLES["onix-scenes"] = Table(
+    learning.onix_scenes,
+    ("onix_scenes.csv",),
+    "python benchmarks/onix_scenes.py FOLDER --write",
+    "an hour",
 )
 TABLES["aligned-inference"] = Table(
     learning.aligned_inference,

@@ -16,9 +16,13 @@ from holosplat.learning.start import LearnedStart
 from holosplat.learning.weights import Card, Trained
 from holosplat.methods import Gaussians, Task
 from holosplat.methods.beginning import Beginning
+from holosplat.methods.cross_validation import MissingMatter
+from holosplat.methods.evidence import Evidence
 from holosplat.methods.gaussians import GaussianStage
+from holosplat.methods.learned import _Trial
 from holosplat.methods.method import solve_stages
 from holosplat.methods.start import starting_cloud
+from holosplat.optics.noise_model import NoiseModel
 from holosplat.specimens import Ball
 
 MATERIAL = hs.DeltaBeta(2e-7, 2e-10)
@@ -29,7 +33,7 @@ OPTIONS = Gaussians(
     start="learned",
     approximate_steps=10,
     volume=HolographicTV(retrieval=10, iterations=20, corrections=1, inner=5),
-    learned=LearnedStart(trial_steps=4, trial_surfaces=3),
+    learned=LearnedStart(trial_steps=4, trial_surfaces=3, last_steps=6, last_surfaces=4),
 )
 
 
@@ -92,6 +96,52 @@ def test_a_guess_that_frames_contradict_goes_on_with_phase_retrieval(scan, monke
     assert told.why.startswith("The frames contradict the network's guess (it leaves ")
     assert told.why.endswith("at most 15 %): the run began with phase retrieval.")
     assert torch.equal(found, ordinary)
+
+
+@pytest.mark.parametrize("after", [0.05, 0.19], ids=["better", "no better"])
+def test_a_guess_that_seems_better_is_taken_if_it_still_is_after_a_whole_fit(scan, monkeypatch, after):
+    frames = torch.from_numpy(scan.frames)
+    near = torch.cat([frames[:1], frames[1:] + 0.1])
+    left = iter([0.4, 0.1, 0.2, after])  # of phase retrieval and of the guess, in both rounds
+    steps = []
+
+    def of(task, cloud, evidence, how, fitted):
+        steps.append(how)
+        share = next(left)
+        return _Trial(share, near if len(steps) % 2 else frames, closed=True)
+
+    monkeypatch.setattr(_Trial, "of", of)
+    _, _, told = begun(scan, monkeypatch, 0.0, 1.0)
+
+    assert steps == [(4, 3), (4, 3), (6, 4), (6, 4)]
+    assert told.taken == ("learned" if after == 0.05 else "phase")
+    assert f"; fitted to the end, it leaves {100 * after:.2g} % of the frames unexplained, and phase" in told.why
+
+
+def test_a_guess_that_is_better_by_no_more_than_noise_is_not_taken(scan, monkeypatch):
+    contrast = float((torch.from_numpy(scan.frames) - 1).square().mean().sqrt())
+    noise = NoiseModel.white_only(torch.full((2,), 0.2 * contrast), scan.views.shape)
+    evidence = Evidence(MissingMatter(scan, MATERIAL), noise)
+    frames, closer = torch.from_numpy(scan.frames), LearnedStart()
+    plain, guess = _Trial(0.2, 1 + 0.99 * (frames - 1), closed=True), _Trial(0.1, frames, closed=True)
+    far = replace(plain, predicted=1 + 0.1 * (frames - 1))
+
+    assert not guess.clearly_better(plain, evidence, closer)
+    assert guess.clearly_better(far, evidence, closer)
+    assert not replace(guess, closed=False).clearly_better(far, evidence, closer)
+    assert not replace(guess, left=0.19).clearly_better(far, evidence, closer)
+
+
+def test_frames_that_validate_are_left_out_with_their_light(scan):
+    three = hs.Scan(
+        np.concatenate([scan.frames, scan.frames[:1]]), scan.exposures[np.array([0, 1, 0])], np.zeros(3, dtype=bool)
+    )
+    fit = replace(OPTIONS.fit, schedule=replace(OPTIONS.fit.schedule, validation_views=1))
+    task = Task(three, KNOWN).evened()
+    seen = GaussianStage(replace(OPTIONS, fit=fit))._without_validation(task)
+
+    assert len(seen.scan) == len(seen.noise) == 2
+    assert GaussianStage(OPTIONS)._without_validation(task) is task
 
 
 def test_a_network_of_one_material_is_not_asked_for_two(scan, monkeypatch):

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from helpers.runs import CELL, KNOWN, SMALL
 from helpers.soft import two_cells
@@ -14,9 +15,13 @@ from holosplat.geometry import Grid
 from holosplat.io.json import read_json
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import Auto, GaussianRates, SmoothVolume, solve
+from holosplat.methods.auto import VolumeWhereUnexplained
+from holosplat.methods.cross_validation import CrossValidation
+from holosplat.methods.keeper import Keeper
 from holosplat.methods.method import Task
-from holosplat.representations import VoxelGrid
-from holosplat.workflows.keeper import Choice, Keeper
+from holosplat.methods.volume import SmoothStage
+from holosplat.representations import GaussianCloud, VoxelGrid
+from holosplat.workflows.choice import Choice
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
 
@@ -38,6 +43,32 @@ def test_a_fit_that_goes_astray_ends_with_its_start(scan, tmp_path):
     assert loaded.choice == done.choice
     assert np.array_equal(loaded.object.parameters()["centres"], done.object.parameters()["centres"])
     assert any("kept: start" in line for line in done.choice.lines())
+
+
+def test_stages_in_memory_keep_the_best_state_too(scan):
+    task = Task(scan.train(), KNOWN)
+    found = solve(RUINOUS, task, "levels")
+    done = reconstruct(scan, KNOWN, RUINOUS, matter="levels")
+    kept = done.object
+    assert isinstance(found, GaussianCloud)
+    assert isinstance(kept, GaussianCloud)
+    assert torch.equal(found.centres, kept.centres)
+    assert torch.equal(found.raw_amplitudes, kept.raw_amplitudes)
+
+
+def test_a_stage_may_go_on_from_the_best_state(scan):
+    """The latest of them is worse; where fits find where frames are, the best one may be of other places."""
+    train = scan.train()
+    good = solve(SMALL, Task(train, KNOWN), "levels")
+    assert isinstance(good, GaussianCloud)
+    bad = good.with_parameters({"raw_amplitudes": good.parameters()["raw_amplitudes"] - 0.7})
+    keeper, volume = Keeper(train, mixed=True), VolumeWhereUnexplained(SmoothVolume(), 0.12, SMALL, CrossValidation())
+    assert keeper.handed(volume, None, placed=False) is None
+    keeper.look("surfaces", good, 2)
+    keeper.look("other", bad, 2)
+    assert keeper.handed(volume, bad, placed=False) is good
+    assert keeper.handed(volume, bad, placed=True) is bad
+    assert keeper.handed(SmoothStage(SmoothVolume()), bad, placed=False) is bad
 
 
 def test_a_fit_that_does_well_is_kept(scan):
@@ -75,6 +106,7 @@ def test_steps_of_a_method_and_other_kinds_are_no_rivals(scan):
     that has lost the matter does not."""
     train = scan.train()
     good = solve(SMALL, Task(train, KNOWN), "levels")
+    assert isinstance(good, GaussianCloud)
     bad, worse = (good.with_parameters({"raw_amplitudes": good.parameters()["raw_amplitudes"] - s}) for s in (0.7, 3))
     voxels = VoxelGrid(0 * bad.density(Grid.of_views(train.views))[None, 0], Grid.of_views(train.views), good.matter)
     for mixed, found, fitted, kept in (

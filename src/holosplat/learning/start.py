@@ -47,9 +47,15 @@ class LearnedStart:
     """Steps of the fit of Gaussians from either start, before they are compared."""
     trial_surfaces: Natural = 60
     """Steps of the fit of surfaces that follow, where matter has one known level."""
+    last_steps: Natural = 300
+    """The same for a guess that then seems better: those of a whole fit."""
+    last_surfaces: Natural = 100
+    """The same of surfaces."""
     clearly: Share = 0.9
-    """What the guess may leave unexplained after them, of what phase retrieval leaves: where it leaves more, the run is
-    the same as without the network."""
+    """What the guess may leave unexplained after either, beyond noise, of what phase retrieval leaves: where it leaves
+    more, the run is the same as without the network."""
+    sure: Weight = 3.0
+    """Standard deviations of the noise by which the frames must speak for it."""
 
     @property
     def network(self) -> Trained:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
@@ -13,6 +13,7 @@ from ..ranges import Share, ranged
 from ..representations import GaussianCloud, Stored, SurfaceMesh, VoxelGrid
 from .assumed import assumed_material
 from .cross_validation import CrossValidation, MissingMatter
+from .evidence import Evidence
 from .gaussian_options import Backend
 from .gaussians import Gaussians
 from .levels import Decision, LevelTest
@@ -27,6 +28,11 @@ CLEARLY = 0.95
 """Part of what one method leaves unexplained beyond noise that another must stay below, or a trial decides nothing."""
 
 
+OTHER: Mapping[MatterKind, MatterKind] = {"levels": "continuous", "continuous": "levels"}
+KINDS: Mapping[MatterKind, str] = {"levels": Gaussians.kind, "continuous": SmoothVolume.kind}
+"""What stands for either kind of matter in a trial."""
+
+
 @dataclass(frozen=True)
 @ranged
 class Auto:
@@ -37,6 +43,8 @@ class Auto:
     """
 
     kind: ClassVar[str] = "auto"
+    mixes_kinds: ClassVar[bool] = True
+    """A volume may take the place of bodies."""
 
     gaussians: Gaussians = field(default_factory=Gaussians)
     surfaces: SurfaceOptions = field(default_factory=SurfaceOptions)
@@ -46,8 +54,8 @@ class Auto:
     trials: CrossValidation = field(default_factory=CrossValidation)
     """How views are set aside for trials."""
     unexplained: Share = 0.12
-    """Share of all matter that bodies may leave unexplained before a smooth volume is tried. Where it is too low, a
-    volume is fitted in vain, for it must leave half of what they do to be taken."""
+    """Share of all matter that bodies may leave unexplained, beyond noise, before a smooth volume is tried. Where it is
+    too low, a volume is fitted in vain, for it must leave half of what they do to be taken."""
 
     def stages(self) -> Sequence[Stage]:
         """Those for matter with levels; `chosen` decides."""
@@ -58,7 +66,7 @@ class Auto:
         return (
             self.volume
             if matter == "continuous"
-            else Bodies(self.gaussians, self.surfaces, self.volume, self.unexplained)
+            else Bodies(self.gaussians, self.surfaces, self.volume, self.unexplained, self.trials)
         )
 
     def require_files(self) -> None:
@@ -73,25 +81,12 @@ class Auto:
 
     def _tried(self, task: Task, decision: Decision) -> Decision:
         """The decision by a trial; as it was where there are too few views for one."""
-        split = self.trials.split(task.scan)
-        if split is None:
+        tried = Trial.of(task, self.gaussians, self.volume, self.trials)
+        if tried is None:
             return decision
-        seen, aside = split
-        judge = MissingMatter(aside, assumed_material(seen, task.prior, task.on_progress))
-        shares = dict[MatterKind, float]()
-        plain = replace(self.gaussians, start="phase") if self.gaussians.start == "learned" else self.gaussians
-        candidates: dict[MatterKind, Method] = {"levels": plain, "continuous": self.volume}
-        for matter, method in candidates.items():
-            task.on_progress(f"{TRIAL}: {method.kind}", 0.0)
-            trial = replace(task, scan=seen, lit=self.trials.light(task.scan, task.lit), matter=matter)
-            shares[matter] = judge.share(solve_stages(method, trial))
-        noise = judge.of(self.trials.noise_aside(task.scan, task.noise).drawn(task.seed)) / max(judge.whole, 1e-60)
-        left = " and ".join(f"{candidates[m].kind} leave {100 * share:.2g} %" for m, share in shares.items())
-        said = f"{decision.why}; in a trial, {left} of the matter in views set aside unexplained"
-        beyond: dict[MatterKind, float] = {m: max(share**2 - noise, 0.0) for m, share in shares.items()}
-        best = min(beyond, key=lambda matter: beyond[matter])
-        if best != decision.matter and beyond[best] >= CLEARLY**2 * beyond[decision.matter]:
-            return replace(decision, why=f"{said}, noise {100 * noise**0.5:.2g} %, which decides nothing")
+        said, best = f"{decision.why}; {tried.in_words}", min(tried.beyond, key=lambda matter: tried.beyond[matter])
+        if best != decision.matter and not tried.clearly(best):
+            return replace(decision, why=f"{said}, noise {100 * tried.noise**0.5:.2g} %, which decides nothing")
         return Decision(best, said)
 
     def on_backend(self, backend: Backend) -> Auto:
@@ -113,20 +108,67 @@ class Auto:
 
 
 @dataclass(frozen=True)
+class Trial:
+    """How Gaussians and a smooth volume foretell views that are set aside, on coarse frames.
+
+    shares: of all matter in these that either leaves unexplained; noise: square of the share that is noise
+    """
+
+    shares: Mapping[MatterKind, float]
+    noise: float
+
+    @classmethod
+    def of(cls, task: Task, gaussians: Gaussians, volume: SmoothVolume, how: CrossValidation) -> Trial | None:
+        """That of `task`; None where there are too few views to set some aside."""
+        split = how.split(task.scan)
+        if split is None:
+            return None
+        seen, aside = split
+        judge = MissingMatter(aside, assumed_material(seen, task.prior, task.on_progress))
+        shares = dict[MatterKind, float]()
+        plain = replace(gaussians, start="phase") if gaussians.start == "learned" else gaussians
+        candidates: dict[MatterKind, Method] = {"levels": plain, "continuous": volume}
+        for matter, method in candidates.items():
+            task.on_progress(f"{TRIAL}: {method.kind}", 0.0)
+            trial = replace(task, scan=seen, lit=how.light(task.scan, task.lit), matter=matter)
+            shares[matter] = judge.share(solve_stages(method, trial))
+        noise = judge.of(how.noise_aside(task.scan, task.noise).drawn(task.seed)) / max(judge.whole, 1e-60)
+        return cls(shares, noise)
+
+    @property
+    def beyond(self) -> Mapping[MatterKind, float]:
+        """Squares of the shares, without that of the noise."""
+        return {matter: max(share**2 - self.noise, 0.0) for matter, share in self.shares.items()}
+
+    def clearly(self, matter: MatterKind) -> bool:
+        """Whether one kind foretells the views clearly better than the other."""
+        beyond = self.beyond
+        return beyond[matter] < CLEARLY**2 * beyond[OTHER[matter]]
+
+    @property
+    def in_words(self) -> str:
+        """What either leaves."""
+        said = (f"{KINDS[matter]} leave {100 * share:.2g} %" for matter, share in self.shares.items())
+        return f"in a trial, {' and '.join(said)} of the matter in views set aside unexplained"
+
+
+@dataclass(frozen=True)
 class Bodies:
     """Gaussians, surfaces where these enclose bodies of one material; a smooth volume where neither explains much."""
 
     kind: ClassVar[str] = "bodies"
+    mixes_kinds: ClassVar[bool] = True
 
     gaussians: Gaussians
     surfaces: SurfaceOptions
     volume: SmoothVolume
     unexplained: float
+    trials: CrossValidation
 
     def stages(self) -> Sequence[Stage]:
         """Those of the Gaussians, the surfaces, and the volume."""
         closed = SurfacesWhereClosed(self.surfaces, self.gaussians.coarse)
-        last = VolumeWhereUnexplained(self.volume, self.unexplained)
+        last = VolumeWhereUnexplained(self.volume, self.unexplained, self.gaussians, self.trials)
         return (BodiesStage(self.gaussians, surfaces=self.surfaces), closed, last)
 
 
@@ -153,16 +195,24 @@ class SurfacesWhereClosed(SurfaceStage):
 
 @dataclass(frozen=True)
 class VolumeWhereUnexplained:
-    """A smooth volume, where matter with levels explains the frames badly: then there are no such levels.
+    """A smooth volume, where matter with levels explains the frames badly, and foretells others clearly worse: then
+    there are no such levels.
 
-    most: share of all matter that what came before may leave unexplained
+    In few views a volume explains any frames, and says the less of views between them: so it is tried on views that are
+    set aside, and not taken where there are too few for that.
+
+    most: share of all matter that what came before may leave unexplained, beyond noise; gaussians, trials: of the trial
     """
 
     options: SmoothVolume
     most: float
+    gaussians: Gaussians
+    trials: CrossValidation
     name: str = "smooth volume"
     better: ClassVar[float] = 2.0
     """So many times less must it leave unexplained than bodies do: it is freer, and follows the frames' errors, too."""
+    of_best: ClassVar[bool] = True
+    """It is the best of the states before it that must explain the frames, not the latest."""
 
     def start(self, task: Task, before: Stored | None) -> Stored:
         """A first volume; what came before, where that explains the frames or has two materials."""
@@ -171,7 +221,14 @@ class VolumeWhereUnexplained:
         if not matter.single or task.scan.is_series:
             return before
         judge = MissingMatter(task.scan, DeltaBeta(matter.delta, matter.beta))
-        return before if judge.share(before) <= self.most else SmoothStage(self.options).start(_continuous(task), None)
+        left = Evidence(judge, task.noise).share(judge.predicted(before))
+        if left <= self.most or not self._foretells(task):
+            return before
+        return SmoothStage(self.options).start(_continuous(task), None)
+
+    def _foretells(self, task: Task) -> bool:
+        tried = Trial.of(task, self.gaussians, self.options, self.trials)
+        return tried is not None and tried.clearly("continuous")
 
     def fit(self, task: Task, start: Stored) -> SmoothFit | None:
         """The fit of the volume; None for what came before."""

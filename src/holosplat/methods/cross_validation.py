@@ -85,6 +85,8 @@ class MissingMatter:
         self._correction = Correction(scan, material)
         self.whole = self.of(self.measured - 1)
         """Mean square of all matter in the frames [m²]."""
+        self.contrast = max(float((self.measured - 1).double().square().mean()), np.finfo(float).tiny)
+        """Mean square of their contrast."""
 
     def predicted(self, obj: Object, oversample: int = 0) -> Tensor:
         """Frames [V, H, W] of `obj`, view by view to bound memory.
@@ -95,7 +97,11 @@ class MissingMatter:
 
     def of(self, residual: Tensor) -> float:
         """Mean square [m²] of the thickness that explains residuals [V, H, W] of intensity."""
-        return float(self._correction(residual).double().square().mean())
+        return float(self.matter(residual).square().mean())
+
+    def matter(self, residual: Tensor) -> Tensor:
+        """The thickness [V, H, W] [m] itself, float64; linear in the residuals."""
+        return self._correction(residual).double()
 
     def share(self, obj: Object) -> float:
         """Root of the part of all matter that `obj` leaves unexplained: 0 for a perfect object, about 1 for none."""
@@ -103,7 +109,10 @@ class MissingMatter:
 
     def shares(self, obj: Object, oversample: int = 0) -> tuple[float, float]:
         """The same of matter, and of the contrast of the frames. oversample: as for `predicted`."""
-        left, least = self.measured - self.predicted(obj, oversample), np.finfo(float).tiny
-        contrast = float((self.measured - 1).double().square().mean())
-        intensity = float(left.double().square().mean()) / max(contrast, least)
-        return math.sqrt(self.of(left) / max(self.whole, least)), math.sqrt(intensity)
+        matter, contrast = self.squares(self.measured - self.predicted(obj, oversample))
+        return math.sqrt(matter), math.sqrt(contrast)
+
+    def squares(self, residual: Tensor) -> tuple[float, float]:
+        """Squares of the parts of all matter, and of the contrast, that residuals [V, H, W] of intensity stand for."""
+        intensity = float(residual.double().square().mean())
+        return self.of(residual) / max(self.whole, np.finfo(float).tiny), intensity / self.contrast

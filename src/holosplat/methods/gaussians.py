@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
+import numpy as np
 import torch
 
 from ..backends import resolve
@@ -16,7 +17,7 @@ from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Adam
 from ..fit.problem import Problem, Term
 from ..fit.terms import Anisotropy, VolumeTerm
-from ..fit.validation import split_validation
+from ..fit.validation import set_aside, split_validation
 from ..geometry import Grid
 from ..matter import Matter
 from ..optics.background import Light
@@ -89,11 +90,19 @@ class GaussianStage:
         """The starting cloud on the pixels of `task`."""
         if resolve(self.options.fit.backend) == "cuda":
             resolve("cpu")  # the start and the judging run there
-        train, _ = split_validation(task.scan, self.options.fit.schedule.validation_views)
-        seen = replace(task, scan=train)
+        seen = self._without_validation(task)
         if self.options.start == "learned":
             return learned_cloud(seen, self.options, self._fitted)
         return starting_cloud(seen, self.options)
+
+    def _without_validation(self, task: Task) -> Task:
+        """`task` without the frames that validate its fit."""
+        count = self.options.fit.schedule.validation_views
+        if count == 0:
+            return task
+        train, _ = split_validation(task.scan, count)
+        left = torch.from_numpy(np.flatnonzero(~set_aside(len(task.scan), count)))
+        return replace(task, scan=train, lit=None if task.lit is None else task.lit.part(left))
 
     def _fitted(self, task: Task, cloud: GaussianCloud, steps: int) -> GaussianCloud:
         """`cloud` after so many steps, on the frames of `task` alone."""
@@ -117,8 +126,7 @@ class GaussianStage:
         how, options = self.options.coarse, self.options
         if how.factor(task.scan) == 1 or options.start == "random" or not task.bounded:
             return None
-        train, _ = split_validation(task.scan, options.fit.schedule.validation_views)
-        return coarse_surfaces(replace(task, scan=train), self.solved, surfaces, how)
+        return coarse_surfaces(self._without_validation(task), self.solved, surfaces, how)
 
     def solved(self, task: Task) -> GaussianCloud:
         """The cloud fitted to the frames of `task`."""

@@ -3,21 +3,24 @@ with.
 
 The network knows the bodies that it was trained on. Of others its guess is wrong in a way that it does not see itself,
 and what the fit makes of it may be worse than what it makes of the ordinary start. So the guess has to leave clearly
-less of the matter in the frames unexplained than that; where it does not, the run is the same as without a network.
+less of the frames unexplained than that, beyond their noise, and more surely than noise could; where it does not, the
+run is the same as without a network.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+
+from torch import Tensor
 
 from ..checks import InputError
 from ..learning.start import GuessedMatter, LearnedStart, contradicted, guessed
 from ..matter import DeltaBeta
 from ..representations import GaussianCloud, SurfaceMesh
 from .beginning import Beginning
-from .cross_validation import MissingMatter
+from .cross_validation import MissingMatter, predicted_frames
+from .evidence import Evidence
 from .gaussian_options import GaussianOptions
 from .method import Task, run_quietly
 from .sharp_level import material_of_levels
@@ -48,13 +51,31 @@ def learned_cloud(task: Task, options: GaussianOptions, fitted: Fitted) -> Gauss
         why = f"The frames contradict the network's guess ({refused}): the run began with phase retrieval."
         return _begun(task, Beginning("phase", why, guess), starting_cloud(task, ordinary))
     clouds = starting_cloud(task, ordinary), cloud_of(found.values, found.grid, material, task, options)
-    plain, learned = (_Trial.of(task, cloud, material, how, fitted) for cloud in clouds)
-    told = f"leaves {100 * learned.left:.2g} % of the frames unexplained, and phase retrieval {100 * plain.left:.2g} %"
-    if learned.clearly_better(plain, how):
-        why = f"The run began with the network's guess: fitted for a while, it {told}."
-        return _begun(task, Beginning("learned", why, guess), clouds[1])
-    why = f"The run began with phase retrieval: fitted for a while, the network's guess {told}."
-    return _begun(task, Beginning("phase", why, guess), clouds[0])
+    won, why = _compared(task, clouds, material, how, fitted)
+    return _begun(task, Beginning("learned" if won else "phase", why, guess), clouds[won])
+
+
+def _compared(
+    task: Task, clouds: tuple[GaussianCloud, GaussianCloud], material: DeltaBeta, how: LearnedStart, fitted: Fitted
+) -> tuple[bool, str]:
+    """Whether the second cloud, of the guess, is begun with, and why.
+
+    A short fit of both says whether the guess may be better. It is taken if it still is after the steps of a whole one:
+    in noise the ordinary start takes longest to find edges.
+    """
+    evidence, told = Evidence(MissingMatter(task.scan, material), task.noise), list[str]()
+    rounds = {"for a while": (how.trial_steps, how.trial_surfaces), "to the end": (how.last_steps, how.last_surfaces)}
+    for said, steps in rounds.items():
+        plain, learned = (_Trial.of(task, cloud, evidence, steps, fitted) for cloud in clouds)
+        told.append(
+            f"fitted {said}, {{}} leaves {100 * learned.left:.2g} % of the frames unexplained, "
+            f"and phase retrieval {100 * plain.left:.2g} %"
+        )
+        if not learned.clearly_better(plain, evidence, how):
+            first, *others = told
+            why = "; ".join((first.format("the network's guess"), *(each.format("it") for each in others)))
+            return False, f"The run began with phase retrieval: {why}."
+    return True, f"The run began with the network's guess: {'; '.join(each.format('it') for each in told)}."
 
 
 def _begun(task: Task, beginning: Beginning, cloud: GaussianCloud) -> GaussianCloud:
@@ -64,34 +85,28 @@ def _begun(task: Task, beginning: Beginning, cloud: GaussianCloud) -> GaussianCl
 
 @dataclass(frozen=True)
 class _Trial:
-    """share: of all matter that a start leaves unexplained in the frames after a short fit; contrast: the same of their
-    contrast; closed: whether that was a fit of surfaces."""
+    """left: what a start leaves unexplained of the frames after a fit, beyond their noise; predicted: frames [V, H, W]
+    of what it became; closed: whether these are surfaces."""
 
-    share: float
-    contrast: float
+    left: float
+    predicted: Tensor
     closed: bool
 
-    @property
-    def left(self) -> float:
-        """Their geometric mean: the one does not see fringes that are out of place, the other hardly sees how much
-        matter there is."""
-        return math.sqrt(self.share * self.contrast)
-
     @classmethod
-    def of(cls, task: Task, cloud: GaussianCloud, material: DeltaBeta, how: LearnedStart, fitted: Fitted) -> _Trial:
+    def of(cls, task: Task, cloud: GaussianCloud, evidence: Evidence, steps: tuple[int, int], fitted: Fitted) -> _Trial:
         """That of `cloud`, as Gaussians, and then as surfaces where it has some: they hold edges, and cannot explain by
-        half a density what is in the wrong place."""
-        judge = MissingMatter(task.scan, material)
+        half a density what is in the wrong place. steps: of both."""
         quiet = replace(task, on_progress=lambda stage, fraction: task.on_progress(STAGE, fraction))
-        found = fitted(quiet, cloud, how.trial_steps)
-        surfaces = _surfaces(quiet, found, how.trial_surfaces) if task.bounded else None
-        if surfaces is None:
-            return cls(*judge.shares(found), closed=False)
-        return cls(*judge.shares(surfaces, oversampling(task.scan)), closed=True)
+        found = fitted(quiet, cloud, steps[0])
+        surfaces = _surfaces(quiet, found, steps[1]) if task.bounded else None
+        samples = 0 if surfaces is None else oversampling(task.scan)
+        predicted = predicted_frames(task.scan.exposures, found if surfaces is None else surfaces, samples)
+        return cls(evidence.left(predicted), predicted, surfaces is not None)
 
-    def clearly_better(self, other: _Trial, how: LearnedStart) -> bool:
-        """Whether it explains the frames clearly better than another one, of the same kind."""
-        return self.closed == other.closed and self.left < how.clearly * other.left
+    def clearly_better(self, other: _Trial, evidence: Evidence, how: LearnedStart) -> bool:
+        """Whether it explains the frames clearly, and surely, better than another one, of the same kind."""
+        clearly = self.closed == other.closed and self.left < how.clearly * other.left
+        return clearly and evidence.sureness(self.predicted, other.predicted) > how.sure
 
 
 def _surfaces(task: Task, cloud: GaussianCloud, steps: int) -> SurfaceMesh | None:

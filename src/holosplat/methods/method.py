@@ -20,6 +20,7 @@ from ..progress import Advance, Progress
 from ..representations import KINDS, Stored
 from ..scan import Scan
 from .beginning import Beginning
+from .keeper import Keeper
 
 
 def quiet(stage: str, fraction: float) -> None:
@@ -157,6 +158,11 @@ def takes_series(method: Method) -> bool:
     return bool(getattr(method, "of_series", False))
 
 
+def mixes_kinds(method: Method) -> bool:
+    """Whether states of different kinds of Objects compete for the result of `method`."""
+    return bool(getattr(method, "mixes_kinds", False))
+
+
 def require_files(method: Method) -> None:
     """Read the files that `method` names in a `require_files` of its own, so that one that is missing or damaged is
     refused before any work. Errors: those of reading."""
@@ -201,13 +207,22 @@ def run_quietly(fit: Running, report: Advance) -> Stored:
 
 
 def solve_stages(method: Method, task: Task) -> Stored:
-    """Run all stages of `method` in memory, without a folder; Ctrl-C is passed on."""
+    """Run all stages of `method` in memory, without a folder; the best of their states (`Keeper`), as in a run folder.
+
+    Ctrl-C is passed on.
+    """
     task, found = task.evened(), None
-    for stage in method.stages():
-        found, task = begun(stage, task, found)
+    keeper = Keeper(task.scan, mixes_kinds(method))
+    for number, stage in enumerate(method.stages()):
+        before = keeper.handed(stage, found, task.freedom is not None)
+        found, task = begun(stage, task, before)
         fit = stage.fit(task, found)
+        if found is not before and (number == 0 or fit is None):
+            keeper.look(stage.name if number else "start", found, fit.oversample if fit else 0, fitted=False)
         if fit is not None:
             found = run_quietly(fit, task.report(stage.name))
             task = replace(task.moved(fit.result()), near=False)
-    assert found is not None
-    return found
+            keeper.moved(task.scan)
+            keeper.look_after(stage, stage.name, found, fit.oversample)
+    assert keeper.best is not None
+    return keeper.best.object

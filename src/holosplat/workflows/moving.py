@@ -21,7 +21,7 @@ from ..progress import FitProgress
 from ..representations import VoxelGrid
 from ..scan import Scan
 from ..tables import to_table
-from .keeper import Choice
+from .choice import Choice
 from .provenance import environment, scan_hash
 from .reconstruction import Reconstruction
 from .resume import goes_on

@@ -21,7 +21,8 @@ from ..learning.start import GuessedMatter
 from ..matter import MaterialPrior, MatterKind
 from ..methods import Auto, Gaussians, Method, Settled, Stage, Task, begun, finished, settled
 from ..methods.beginning import Beginning
-from ..methods.method import require_files, takes_series
+from ..methods.keeper import Keeper, placed_at, where
+from ..methods.method import mixes_kinds, require_files, takes_series
 from ..methods.still import prepared
 from ..methods.uncertain import Determined, Uncertain
 from ..optics.background import LightOptions
@@ -31,7 +32,7 @@ from ..ranges import require_plausible
 from ..representations import KINDS, Stored
 from ..scan import Scan
 from ..tables import to_table
-from .keeper import Choice, Keeper, placed_at, where
+from .choice import Choice
 from .provenance import environment, scan_hash
 from .reconstruction import Reconstruction
 from .refine import (
@@ -166,7 +167,7 @@ class _Run:
         """Look at the folder, and at what of the run is there already; writes nothing."""
         self._config, self.asked = config, self.method.kind
         self.task = replace(self.task, on_beginning=self._told_beginning)
-        self._keeper = Keeper(self.task.scan, mixed=isinstance(self.method, Auto))
+        self._keeper = Keeper(self.task.scan, mixed=mixes_kinds(self.method))
         if self.folder is None or not goes_on(self.folder, config, resume):
             return
         self._saved = self.folder.load_checkpoint()
@@ -205,10 +206,11 @@ class _Run:
         last: Running | None = None
         for number in range(first, len(stages)):
             stage, saved = stages[number], self._saved if number == first else None
-            start = self._start_again(saved) if saved else self._started(stage, found)
+            before = self._keeper.handed(stage, found, self.task.freedom is not None)
+            start = self._start_again(saved) if saved else self._started(stage, before)
             fit = stage.fit(self.task, start)
             oversample = fit.oversample if fit else 0
-            if saved is None and start is not found and (number == 0 or fit is None):
+            if saved is None and start is not before and (number == 0 or fit is None):
                 self._keeper.look(stage.name if number else "start", start, oversample, fitted=False)
             if fit is None:
                 found = start
@@ -222,8 +224,7 @@ class _Run:
             self._keeper.moved(self.task.scan)
             if not complete:
                 return self._result(found, fit, False)
-            fitted, better = not getattr(stage, "likelier", False), float(getattr(stage, "better", 0.0))
-            self._keeper.look(stage.name, found, oversample, fitted, better)
+            self._keeper.look_after(stage, stage.name, found, oversample)
         assert self._keeper.best is not None
         self.task = replace(self.task, scan=replace(self.task.scan, exposures=self._keeper.best.exposures))
         return self._result(self._keeper.best.object, last, True)

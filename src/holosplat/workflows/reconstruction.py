@@ -13,7 +13,7 @@ from ..motion.elastic import Rest
 from ..optics.background import LightOptions
 from ..representations import Stored
 from ..scan import Scan
-from .keeper import Choice
+from .choice import Choice
 from .run_light import EVEN
 from .totals import TotalMatter
 from .verdict import Verdict

@@ -19,11 +19,11 @@ from ..checks import as_written, require
 from ..fit.freedom import Freedom
 from ..io.json import read_json, write_json
 from ..matter import MaterialPrior
+from ..methods.keeper import where
 from ..methods.uncertain import Uncertain
 from ..optics.background import LightOptions
 from ..progress import Progress
 from ..scan import Scan
-from .keeper import where
 from .provenance import scan_hash
 from .reconstruction import Reconstruction
 from .run_folder import RunFolder

@@ -32,7 +32,7 @@ from ..progress import FitProgress
 from ..representations import MovingSurfaces
 from ..scan import Scan
 from ..tables import to_table
-from .keeper import Choice
+from .choice import Choice
 from .provenance import environment, scan_hash
 from .reconstruction import Reconstruction
 from .rest_file import write_rest

@@ -9,11 +9,10 @@ from typing import Any, cast
 import torch
 from torch import Tensor
 
-from ..matter import DeltaBeta, MatterKind
-from ..methods.auto import VolumeWhereUnexplained
-from ..methods.cross_validation import MissingMatter
+from ..matter import DeltaBeta
 from ..representations import KINDS, Stored
 from ..scan import Exposures, Scan
+from .cross_validation import MissingMatter
 
 LOST = 0.5
 """What takes the place of all others must not leave more than this share of all matter unexplained, and twice what the
@@ -21,46 +20,6 @@ best of them does: then a prior has wiped out matter that the frames show."""
 CLEARLY = 0.95
 """An earlier state is kept if it leaves less than this part of the matter that a later one leaves unexplained, and no
 more of the contrast: differences in fitted frames may also be noise."""
-
-
-@dataclass(frozen=True)
-class Choice:
-    """What was decided in a run.
-
-    matter: of which kind it was taken to be; why: in words; judged: share of all matter that each state leaves
-    unexplained in the training frames, by its name; kept: the name of the state that is the result, empty where the run
-    was interrupted; begun: what it began with and why, in a sentence, where a network was asked
-    """
-
-    matter: MatterKind = "levels"
-    why: str = ""
-    judged: Mapping[str, float] = field(default_factory=dict)
-    kept: str = ""
-    begun: str = ""
-
-    def as_dict(self) -> dict[str, Any]:
-        """Entries of summary.json; `read` reads them."""
-        decided = {"matter": self.matter, "why": self.why} | ({"begun": self.begun} if self.begun else {})
-        return {"decided": decided, "kept": self.kept, "unexplained": dict(self.judged)}
-
-    @classmethod
-    def read(cls, summary: Mapping[str, Any]) -> Choice:
-        """What a summary.json says of it; that of older versions says nothing."""
-        decided = summary.get("decided", {})
-        matter: MatterKind = "continuous" if decided.get("matter") == "continuous" else "levels"
-        why, begun = (str(decided.get(name, "")) for name in ("why", "begun"))
-        return cls(matter, why, summary.get("unexplained", {}), str(summary.get("kept", "")), begun)
-
-    def lines(self) -> list[str]:
-        """The same as a few lines of text."""
-        lines = [f"matter: {self.matter} ({self.why})"] if self.why else []
-        lines += [f"start: {self.begun}"] if self.begun else []
-        if self.kept and len(self.judged) > 1:
-            shares = ", ".join(f"{name} {100 * share:.2g} %" for name, share in self.judged.items())
-            lines.append(f"kept: {self.kept} (matter that training frames leave unexplained: {shares})")
-        if self.matter == "levels" and self.kept == VolumeWhereUnexplained.name and "fit" in self.judged:
-            lines.append("bodies of one level explain these frames badly: there may be several levels, or none")
-        return lines
 
 
 @dataclass(frozen=True)
@@ -83,6 +42,9 @@ class Keeper:
 
     mixed: whether states of different kinds of Objects compete; else those of another kind than the latest are out, for
     who asks for surfaces wants surfaces
+
+    Shares are compared with the noise that is in them. Beyond it nothing could be compared: what is freer follows the
+    noise of the frames that it is fitted to, and a smooth volume leaves less than that of cells that it does not show.
     """
 
     train: Scan
@@ -96,6 +58,17 @@ class Keeper:
         """The training frames are elsewhere from now on."""
         if train.exposures is not self.train.exposures:
             self.train, self._judge = train, None
+
+    def handed(self, stage: object, latest: Stored | None, placed: bool) -> Stored | None:
+        """What a stage goes on from: the latest state; or the best one, for a stage that says so by `of_best`, unless
+        the frames are not where they were then. placed: whether fits find where they are."""
+        best = self.best
+        return best.object if best is not None and getattr(stage, "of_best", False) and not placed else latest
+
+    def look_after(self, stage: object, name: str, found: Stored, oversample: int) -> None:
+        """Take in what the fit of a stage ended with; it may say `likelier` and `better` (see `look`)."""
+        fitted, better = not getattr(stage, "likelier", False), float(getattr(stage, "better", 0.0))
+        self.look(name, found, oversample, fitted, better)
 
     def look(self, name: str, found: Stored, oversample: int, fitted: bool = True, better: float = 0.0) -> None:
         """Take in the latest state. What is not `fitted` is a step of the method, and takes the place of all others
