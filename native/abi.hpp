@@ -131,6 +131,10 @@ HOLO_EXPORT int64_t holosplat_lattice_poses(const HoloLattice*, const HoloViews*
 // over `lines` lines of it.
 HOLO_EXPORT int64_t holosplat_surface(const HoloSurface*, const HoloRaster*, int64_t lines, double* image,
                                       int64_t threads);
+// What each corner of each triangle gets of `image_gradient` [V, H, W], linear between pixels: shares [F, 3] <- sum over
+// views of weights[v] times the sum, over three points of equal weight, of the image times the corner's hat.
+HOLO_EXPORT int64_t holosplat_surface_shares(const HoloSurface*, const HoloRaster*, const double* image_gradient,
+                                             const double* weights, double* shares, int64_t threads);
 // Derivatives of the scalar whose derivative by the image is `image_gradient` [V, H, W], linear between pixels: by each
 // view's rotation, rotations [V, 3, 3], and by its shift, shifts [V, 2]; vertices [P, 3] in the object frame.
 HOLO_EXPORT int64_t holosplat_surface_poses(const HoloSurface*, const HoloRaster*, const double* vertices,
