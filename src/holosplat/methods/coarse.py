@@ -44,7 +44,7 @@ class CoarseToFine:
     """Mean chord of the bodies [coarse pixels] below which these do not show their shapes, and finer ones are tried."""
     missing: Share = 0.25
     """Part of the fine structure of the frames, by its power, that surfaces of coarse pixels may leave unexplained."""
-    coarse_steps: int = 60
+    coarse_steps: int = 40
     """Steps of the coarse surfaces."""
     finer_steps: int = 40
     """Steps of the surfaces on each finer pixel but the frames' own."""
