@@ -48,7 +48,7 @@ class CoarseToFine:
     """Steps of the coarse surfaces."""
     finer_steps: int = 40
     """Steps of the surfaces on each finer pixel but the frames' own."""
-    last_steps: int = 25
+    last_steps: int = 30
     """Steps on these, which cost most."""
     near_rate: Weight = 0.1
     """Length of their first steps [pixels]: half of what surfaces cut out of Gaussians need."""
