@@ -111,6 +111,9 @@ def coarse_surfaces(
         found = _fitted(binned(task, factor), found, surfaces, how)
         factor //= 2
     found = on_pixels(found, task.scan.views.finest, how.last_edge)
+    if unexplained(found, task.scan, surfaces) <= how.missing:
+        return found
+    found = _run(replace(task, freedom=None), found, how.nearby(surfaces.fit))  # edges may be off by more
     return found if unexplained(found, task.scan, surfaces) <= how.missing else None
 
 
