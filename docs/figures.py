@@ -127,7 +127,7 @@ TABLES["rerun"] = Table(
 TABLES["sizes"] = Table(
     runs.sizes,
     ("sizes.csv",),
-    "python benchmarks/sizes.py --pixels 512 --method auto --csv docs/data/sizes.csv",
+    "python benchmarks/sizes.py --pixels 128 256 512 1024 --method auto --csv docs/data/sizes.csv",
     "minutes",
 )
 REAL = "python benchmarks/real_data.py --data FOLDER"

@@ -80,6 +80,13 @@ struct HoloSurface {  // triangles seen in V views
   const int64_t* corners;   // [F, 3] vertices, counter-clockwise seen from outside
 };
 
+struct HoloSlices {  // a sparse matrix that all slices share: what each voxel of a slice adds to its rays
+  int64_t voxels, rays, slices;
+  const int64_t* starts;  // [voxels + 1] of each voxel's entries
+  const int64_t* places;  // [entries] the ray of each
+  const float* weights;   // [entries]
+};
+
 struct HoloOptions {
   double cutoff;    // half-width of a Gaussian's box in standard deviations
   double variance;  // added to the covariance: what a pixel or voxel does
@@ -127,10 +134,19 @@ HOLO_EXPORT int64_t holosplat_lattice_poses(const HoloLattice*, const HoloViews*
                                             const float* image_gradient, double* rotations, double* shifts,
                                             int64_t threads);
 
+// lines [rays, slices] from volume [voxels, slices], and the exact adjoint.
+HOLO_EXPORT int64_t holosplat_slices_project(const HoloSlices*, const float* volume, float* lines, int64_t threads);
+HOLO_EXPORT int64_t holosplat_slices_backproject(const HoloSlices*, const float* lines, float* volume,
+                                                 int64_t threads);
+
 // Thickness of what closed surfaces enclose, image [V, H, W]: along rows the mean over each pixel, across them the mean
 // over `lines` lines of it.
 HOLO_EXPORT int64_t holosplat_surface(const HoloSurface*, const HoloRaster*, int64_t lines, double* image,
                                       int64_t threads);
+// What each corner of each triangle gets of `image_gradient` [V, H, W], linear between pixels: shares [F, 3] <- sum over
+// views of weights[v] times the sum, over three points of equal weight, of the image times the corner's hat.
+HOLO_EXPORT int64_t holosplat_surface_shares(const HoloSurface*, const HoloRaster*, const double* image_gradient,
+                                             const double* weights, double* shares, int64_t threads);
 // Derivatives of the scalar whose derivative by the image is `image_gradient` [V, H, W], linear between pixels: by each
 // view's rotation, rotations [V, 3, 3], and by its shift, shifts [V, 2]; vertices [P, 3] in the object frame.
 HOLO_EXPORT int64_t holosplat_surface_poses(const HoloSurface*, const HoloRaster*, const double* vertices,

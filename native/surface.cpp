@@ -15,25 +15,39 @@
 
 namespace {
 
+constexpr int64_t kRunFaces = 8192;
+
 struct Point {
   double column, row, depth;
 };
 
-// Where the edge from `low` up to `high` meets the line at `row`; the same numbers for both triangles of an edge.
-Point crossing(const Point& low, const Point& high, double row) {
-  const double share = (row - low.row) / (high.row - low.row);
-  return {low.column + share * (high.column - low.column), row, low.depth + share * (high.depth - low.depth)};
-}
+// An edge from its lower to its upper end, and where it meets the line at `row`: the same numbers for both of its
+// triangles.
+struct Edge {
+  double column, row, depth, columns, depths;  // of the lower end; per row
+
+  Edge(const Point& low, const Point& high) : column(low.column), row(low.row), depth(low.depth) {
+    const double per_row = 1 / (high.row - low.row);  // of a level edge, which no line meets, no number
+    columns = (high.column - low.column) * per_row, depths = (high.depth - low.depth) * per_row;
+  }
+  Point at(double line) const { return {column + (line - row) * columns, line, depth + (line - row) * depths}; }
+};
 
 // Adds the integrals of the depth over the pixels of one image row, times `weight`.
-void integrate(Point a, Point b, double weight, double* row, int64_t width) {
-  if (a.column > b.column) std::swap(a, b);
+void integrate(const Point& one, const Point& other, double weight, double* row, int64_t width) {
+  const bool ordered = one.column <= other.column;
+  const Point &a = ordered ? one : other, &b = ordered ? other : one;
   const double length = b.column - a.column;
   if (!(length > 0)) return;
-  const double slope = (b.depth - a.depth) / length;
-  const double last = std::min(b.column, width - 0.5);
   double left = std::max(a.column, -0.5);
-  for (int64_t j = static_cast<int64_t>(std::floor(left + 0.5)); left < last; ++j) {
+  const double last = std::min(b.column, width - 0.5);
+  int64_t j = static_cast<int64_t>(left + 0.5);  // left + 0.5 is not negative
+  if (left == a.column && b.column <= j + 0.5 && j < width) {  // most segments: in one pixel
+    row[j] += weight * length * (0.5 * (a.depth + b.depth));
+    return;
+  }
+  const double slope = (b.depth - a.depth) / length;
+  for (; left < last; ++j) {
     const double right = std::min(last, j + 0.5);
     if (j < width) row[j] += weight * (right - left) * (a.depth + slope * (0.5 * (left + right) - a.column));
     left = right;
@@ -52,14 +66,19 @@ void draw(const Point& a, const Point& b, const Point& c, int64_t lines, double*
   const auto line = [&](double row) {
     return static_cast<int64_t>(std::clamp(std::ceil((row + 0.5) * lines - 0.5), 0.0, double(height * lines)));
   };
-  const double weight = (area > 0 ? 1.0 : -1.0) / lines;
+  const double apart = 1.0 / lines, weight = area > 0 ? apart : -apart;
   const int64_t last = std::min(line(high->row) + 1, height * lines);  // `line` may be off by its rounding
-  for (int64_t s = std::max<int64_t>(line(low->row) - 1, 0); s < last; ++s) {
-    const double row = (s + 0.5) / lines - 0.5;
-    if (row < low->row || row >= high->row) continue;
-    const Point one = crossing(*low, *high, row);
-    const Point other = row < middle->row ? crossing(*low, *middle, row) : crossing(*middle, *high, row);
-    integrate(one, other, weight, image + (s / lines) * width, width);
+  const Edge whole(*low, *high), lower(*low, *middle), upper(*middle, *high);
+  const int64_t first = std::max<int64_t>(line(low->row) - 1, 0);
+  int64_t left = lines - first % lines;  // lines of this row of pixels that are still to come
+  double* pixels = image + first / lines * width;
+  for (int64_t s = first; s < last; ++s) {
+    const double row = (s + 0.5) * apart - 0.5;
+    if (row >= low->row && row < high->row) {
+      const Point other = row < middle->row ? lower.at(row) : upper.at(row);
+      integrate(whole.at(row), other, weight, pixels, width);
+    }
+    if (--left == 0) left = lines, pixels += width;
   }
 }
 
@@ -77,6 +96,18 @@ double interpolated(const double* image, int64_t height, int64_t width, double c
   return (1 - b) * ((1 - a) * at(i, j) + a * at(i, j + 1)) + b * ((1 - a) * at(i + 1, j) + a * at(i + 1, j + 1));
 }
 
+// shares[k] += weight Σ_q image(q) λ_k(q), λ_k the hat of corner k, q the triangle's three points of equal weight.
+void add_shares(const Point* const corner[3], const double* image, int64_t height, int64_t width, double weight,
+                double* shares) {
+  for (int q = 0; q < 3; ++q) {
+    const Point &near = *corner[q], &one = *corner[(q + 1) % 3], &other = *corner[(q + 2) % 3];
+    const double column = (4 * near.column + one.column + other.column) / 6;
+    const double row = (4 * near.row + one.row + other.row) / 6;
+    const double value = weight * interpolated(image, height, width, column, row) / 6;
+    for (int k = 0; k < 3; ++k) shares[k] += k == q ? 4 * value : value;
+  }
+}
+
 struct PoseGradient {
   double rotation[3][3], position[3];  // by the rotation, and by a common motion in the lab frame
 };
@@ -89,13 +120,7 @@ void add_triangle(const Point* const corner[3], const double* const vertex[3], c
   const double v[3] = {c.column - a.column, c.row - a.row, c.depth - a.depth};
   const double normal[3] = {u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]};
   double share[3] = {};  // of the corners
-  for (int q = 0; q < 3; ++q) {
-    const Point &near = *corner[q], &one = *corner[(q + 1) % 3], &other = *corner[(q + 2) % 3];
-    const double column = (4 * near.column + one.column + other.column) / 6;
-    const double row = (4 * near.row + one.row + other.row) / 6;
-    const double value = interpolated(image, height, width, column, row) / 36;
-    for (int k = 0; k < 3; ++k) share[k] += k == q ? 4 * value : value;
-  }
+  add_shares(corner, image, height, width, 1.0 / 6, share);
   for (int i = 0; i < 3; ++i)
     for (int k = 0; k < 3; ++k) {
       out.position[i] += share[k] * normal[i];
@@ -116,6 +141,25 @@ int64_t holosplat_surface(const HoloSurface* surface, const HoloRaster* raster, 
       for (int64_t f = 0; f < surface->faces; ++f) {
         const int64_t* corner = surface->corners + 3 * f;
         draw(points[corner[0]], points[corner[1]], points[corner[2]], lines, out, raster->height, raster->width);
+      }
+    });
+  });
+}
+
+int64_t holosplat_surface_shares(const HoloSurface* surface, const HoloRaster* raster, const double* image_gradient,
+                                 const double* weights, double* shares, int64_t threads) {
+  return holo::guarded([&] {
+    const int64_t h = raster->height, w = raster->width;
+    const auto* points = reinterpret_cast<const Point*>(surface->points);
+    holo::parallel_runs(surface->faces, kRunFaces, threads, [&](int64_t begin, int64_t end) {
+      std::fill(shares + 3 * begin, shares + 3 * end, 0.0);
+      for (int64_t view = 0; view < raster->count; ++view) {  // one image at a time stays in the cache
+        const Point* seen = points + view * surface->vertices;
+        for (int64_t f = begin; f < end; ++f) {
+          const int64_t* at = surface->corners + 3 * f;
+          const Point* const corner[3] = {seen + at[0], seen + at[1], seen + at[2]};
+          add_shares(corner, image_gradient + view * h * w, h, w, weights[view], shares + 3 * f);
+        }
       }
     });
   });

@@ -10,8 +10,8 @@ from functools import cache
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_MMAP_MAX = -1, -3, -4
 """Parameters of glibc's `mallopt`."""
-INSIDE = {M_MMAP_MAX: 0, M_TRIM_THRESHOLD: 1 << 30}
-"""No array is mapped on its own, and up to 1 GB of free memory is kept."""
+INSIDE = {M_MMAP_MAX: 0, M_TRIM_THRESHOLD: -1}
+"""No array is mapped on its own, and all free memory is kept: a step on frames of 1024² pixels frees gigabytes."""
 OUTSIDE = {M_MMAP_MAX: 65536, M_MMAP_THRESHOLD: 1 << 25, M_TRIM_THRESHOLD: 1 << 26}
 """The size to which glibc's thresholds grow by themselves where large arrays come and go."""
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from .checks import MissingError
 
-ABI = 6
+ABI = 7
 ISAS = ("sse2", "avx2", "avx512")
 """Builds for x86-64, slowest first. Other processors have one build, `generic`."""
 
@@ -121,6 +121,16 @@ class Surface(ctypes.Structure):
     _fields_ = [("vertices", c_int64), ("faces", c_int64), ("points", c_void_p), ("corners", c_void_p)]
 
 
+class Slices(ctypes.Structure):
+    """A sparse matrix that all slices share: counts of voxels, rays and slices; pointers to int64 starts of the voxels'
+    entries, int64 rays and float32 weights of these."""
+
+    _fields_ = [
+        *((name, c_int64) for name in ("voxels", "rays", "slices")),
+        *((name, c_void_p) for name in ("starts", "places", "weights")),
+    ]
+
+
 class Options(ctypes.Structure):
     """Cutoff in standard deviations, variance added [px²], number of threads."""
 
@@ -146,7 +156,10 @@ _FUNCTIONS = {
     "holosplat_lattice_project": (POINTER(Lattice), POINTER(Views), c_void_p, c_void_p, c_int64),
     "holosplat_lattice_backproject": (POINTER(Lattice), POINTER(Views), c_void_p, c_void_p, c_int64),
     "holosplat_lattice_poses": (POINTER(Lattice), POINTER(Views), *(c_void_p,) * 4, c_int64),
+    "holosplat_slices_project": (POINTER(Slices), *(c_void_p,) * 2, c_int64),
+    "holosplat_slices_backproject": (POINTER(Slices), *(c_void_p,) * 2, c_int64),
     "holosplat_surface": (POINTER(Surface), POINTER(Raster), c_int64, c_void_p, c_int64),
+    "holosplat_surface_shares": (POINTER(Surface), POINTER(Raster), *(c_void_p,) * 3, c_int64),
     "holosplat_surface_poses": (POINTER(Surface), POINTER(Raster), *(c_void_p,) * 4, c_int64),
     "holosplat_exit_wave": (POINTER(Raster), *(c_void_p,) * 3, c_int64),
     "holosplat_exit_wave_backward": (POINTER(Raster), *(c_void_p,) * 4, c_int64),

@@ -22,6 +22,7 @@ from holosplat.projectors.voxels import (
     voxel_line_integrals,
 )
 from holosplat.projectors.voxels.lattice import lattice_reference
+from holosplat.projectors.voxels.slices import slice_matrix
 
 UNEVEN = Grid((11, 7, 9), (1.1, 0.8, 0.9), (-4.0, -2.9, -3.7))
 CUBES = Grid((11, 7, 9), (1.0, 1.0, 1.0), (-4.0, -3.0, -4.7))
@@ -78,6 +79,25 @@ def test_the_lattice_equals_its_float64_twin(views, threads):
     torch.set_num_threads(1)
     for image in lines:
         assert float((image.double() - truth).abs().max() / truth.abs().max()) < 1e-5
+
+
+@pytest.mark.parametrize("rows", [1, 7, 16, 37])
+def test_slices_equal_their_float64_twin_for_any_number_of_threads(rows):
+    """Fewer slices than a kernel takes at a time, as many, and more; with empty voxels, which are passed over."""
+    grid, views = Grid((11, rows, 9), (1.1, 1.0, 0.9), (-4.0, 0.5 - 0.5 * rows, -4.7)), around(5, (rows, 12))
+    matrix = torch.from_numpy(slice_matrix(grid, views).toarray()).double()
+    volume, lines = randoms(11, 9, rows), randoms(5, 12, rows)
+    volume[3:, 2:] = 0
+    wanted = (matrix @ volume.reshape(99, rows), matrix.T @ lines.reshape(60, rows))
+    for backend in ("cpu", "reference"):
+        projector, found = SliceProjector(grid, views, backend), []
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            found.append((projector.project(volume.float()), projector.backproject(lines.float())))
+        torch.set_num_threads(1)
+        for array, truth in zip(found[0], wanted):
+            assert float((array.double().reshape(truth.shape) - truth).abs().max() / truth.abs().max()) < 1e-6
+        assert all(torch.equal(a, b) for other in found[1:] for a, b in zip(found[0], other))
 
 
 @pytest.mark.parametrize("projector", [kind(CUBES, around(3, (7, 12))) for kind in (SliceProjector, LatticeProjector)])

@@ -47,6 +47,24 @@ def volume_gradient(vertices: Tensor, faces: Tensor) -> Tensor:
 # --- the projector ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("edges", [None, (1.0, 1.3, 0.8, 1.0)])
+@pytest.mark.parametrize("shape", [(31, 44), (1, 44), (31, 1)])
+def test_the_compiled_gradient_is_the_plain_one(shape, edges):
+    vertices, faces = tensors(bumpy(4, 12.0, (20.0, -9.0, 40.0)))  # partly outside of the raster
+    at = Poses.of(poses(4, shape))
+    pixels = None if edges is None else torch.tensor(edges, dtype=torch.float64)
+    upstream = torch.from_numpy(np.random.default_rng(0).normal(size=(4, *shape)))
+    both = []
+    for backend in ("cpu", "reference"):
+        leaf = vertices.clone().requires_grad_()
+        image = surface_thickness(leaf, faces, at.rotations, at.shifts, shape, 2, backend, pixels=pixels)
+        image.backward(upstream)
+        assert leaf.grad is not None
+        both.append(leaf.grad)
+    assert both[0].abs().max() > 0.1
+    assert torch.allclose(*both, rtol=0, atol=1e-12)
+
+
 @pytest.mark.parametrize("lines", [1, 2, 3])
 def test_the_compiled_kernel_is_the_plain_one(lines):
     vertices, faces = tensors(bumpy(2, 12.0, (20.0, -9.0, 40.0)))  # partly outside of the raster

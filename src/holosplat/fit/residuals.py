@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..checks import finite, require
+from ..memory import memory_kept
 from ..model import Alignment, Instrument, LightField, Model, smooth_modes
 from ..ranges import Weight, ranged
 from ..scan import Exposures
@@ -193,7 +194,7 @@ def residuals(said: Prediction, measured: Tensor, noise: Tensor, allowance: Allo
     spectra, sampling, changes = list[Tensor](), list[Tensor](), list[Tensor]()
     for i in range(count):
         one = said.view(i)
-        with torch.no_grad():
+        with torch.no_grad(), memory_kept():
             predicted = one.frames().double().cpu()
             finite("predicted frames", predicted.numpy())
             if i in probed:

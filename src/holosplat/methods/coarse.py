@@ -15,15 +15,15 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from ..checks import InputError, at_least
+from ..checks import at_least
 from ..optics.noise import noise_levels
 from ..ranges import Pixels, Share, Weight, ranged
-from ..representations import GaussianCloud, SurfaceMesh
+from ..representations import SurfaceMesh
 from ..representations.subdivision import edge_lengths, subdivided
 from ..scan import Scan
 from .cross_validation import predicted_frames
 from .method import Task, run_quietly
-from .surface_fit import SurfaceFit, SurfaceOptions, extract_surfaces, oversampling, surface_fit
+from .surface_fit import SurfaceFit, SurfaceOptions, oversampling, surface_fit
 
 STAGE = "coarse pixels"
 FEWEST_ROWS = 32
@@ -44,11 +44,11 @@ class CoarseToFine:
     """Mean chord of the bodies [coarse pixels] below which these do not show their shapes, and finer ones are tried."""
     missing: Share = 0.25
     """Part of the fine structure of the frames, by its power, that surfaces of coarse pixels may leave unexplained."""
-    coarse_steps: int = 60
+    coarse_steps: int = 40
     """Steps of the coarse surfaces."""
     finer_steps: int = 40
     """Steps of the surfaces on each finer pixel but the frames' own."""
-    last_steps: int = 25
+    last_steps: int = 30
     """Steps on these, which cost most."""
     near_rate: Weight = 0.1
     """Length of their first steps [pixels]: half of what surfaces cut out of Gaussians need."""
@@ -93,16 +93,17 @@ class CoarseToFine:
 
 
 def coarse_surfaces(
-    task: Task, cloud_of: Callable[[Task], GaussianCloud], surfaces: SurfaceOptions, how: CoarseToFine
+    task: Task, first: Callable[[Task], SurfaceMesh | None], surfaces: SurfaceOptions, how: CoarseToFine
 ) -> SurfaceMesh | None:
     """Surfaces near to those of the frames of `task`, by frames on coarser pixels; None where these do not show them.
 
-    cloud_of: Gaussians fitted to the frames of a task. The frames are not small (`how.factor`), and the matter is one
-    of a known level.
+    first: surfaces to begin with, of the frames of a task; None where there are none. Small frames (`how.factor`) are
+    their own coarse ones. The matter is one of a known level.
     """
     factor, found = how.factor(task.scan), None
-    while factor > 1 and found is None:
-        found = _first(binned(task, factor), cloud_of, surfaces, how)
+    finest = 1 if factor == 1 else 2
+    while factor >= finest and found is None:
+        found = _first(binned(task, factor), first, surfaces, how)
         factor //= 2
     if found is None:
         return None
@@ -110,11 +111,16 @@ def coarse_surfaces(
         found = _fitted(binned(task, factor), found, surfaces, how)
         factor //= 2
     found = on_pixels(found, task.scan.views.finest, how.last_edge)
+    if unexplained(found, task.scan, surfaces) <= how.missing:
+        return found
+    found = _run(replace(task, freedom=None), found, how.nearby(surfaces.fit))  # edges may be off by more
     return found if unexplained(found, task.scan, surfaces) <= how.missing else None
 
 
 def binned(task: Task, factor: int) -> Task:
     """`task` on pixels `factor` times larger; frames are where it says."""
+    if factor == 1:
+        return replace(task, freedom=None)
     task.on_progress(f"{STAGE}: {factor} × {factor}", 0.0)
     every = torch.arange(len(task.scan))
     light = None if task.lit is None else task.lit.part(every, factor)
@@ -122,19 +128,14 @@ def binned(task: Task, factor: int) -> Task:
 
 
 def _first(
-    task: Task, cloud_of: Callable[[Task], GaussianCloud], surfaces: SurfaceOptions, how: CoarseToFine
+    task: Task, first: Callable[[Task], SurfaceMesh | None], surfaces: SurfaceOptions, how: CoarseToFine
 ) -> SurfaceMesh | None:
-    """The first surfaces; None where there are none, or their bodies are too thin for the pixels."""
-    try:
-        cloud = cloud_of(task)
-        if not cloud.matter.single:
-            return None
-        start = extract_surfaces(cloud, task.scan, surfaces.extraction)
-    except InputError:  # there is no matter, or no surface
+    """The first surfaces, fitted; None where there are none, or their bodies are too thin for the pixels."""
+    start = first(task)
+    if start is None or mean_chord(start) < how.chord * task.scan.views.finest:
         return None
     schedule = replace(surfaces.fit.schedule, steps=how.coarse_steps)
-    found = _run(task, start, replace(surfaces.fit, schedule=schedule))
-    return found if mean_chord(found) >= how.chord * task.scan.views.finest else None
+    return _run(task, start, replace(surfaces.fit, schedule=schedule))
 
 
 def _fitted(task: Task, found: SurfaceMesh, surfaces: SurfaceOptions, how: CoarseToFine) -> SurfaceMesh:

@@ -12,6 +12,7 @@ from torch import Tensor
 from ..baselines.holographic_tv import Correction
 from ..checks import at_least
 from ..matter import DeltaBeta
+from ..memory import memory_kept
 from ..model import Instrument, Model
 from ..optics.background import Light
 from ..optics.noise_model import NoiseModel
@@ -67,7 +68,7 @@ def predicted_frames(exposures: Exposures, obj: Object, oversample: int = 0) -> 
     needs)."""
     samples, backend = oversample or fringe_sampling(exposures), getattr(obj, "backend", "cpu")
     one = (Instrument(exposures[[i]], samples, backend=backend) for i in range(len(exposures)))
-    with torch.no_grad():
+    with torch.no_grad(), memory_kept():
         return torch.cat([Model(obj, instrument).frames().cpu() for instrument in one])
 
 

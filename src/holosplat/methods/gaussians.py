@@ -29,6 +29,7 @@ from .coarse import STAGE as COARSE
 from .coarse import coarse_surfaces
 from .coarse_cloud import cloud_of_surfaces
 from .field import field_of
+from .first_surfaces import first_surfaces
 from .gaussian_options import Backend, FitOptions, GaussianOptions
 from .ground import Ground, ground
 from .learned import learned_cloud
@@ -123,10 +124,18 @@ class GaussianStage:
 
     def coarse_surfaces(self, task: Task, surfaces: SurfaceOptions) -> SurfaceMesh | None:
         """Surfaces near to those of the frames, where these are large and coarse pixels show the bodies."""
+        return None if self.options.coarse.factor(task.scan) == 1 else self.near_surfaces(task, surfaces)
+
+    def near_surfaces(self, task: Task, surfaces: SurfaceOptions) -> SurfaceMesh | None:
+        """The same of frames of any size."""
         how, options = self.options.coarse, self.options
-        if how.factor(task.scan) == 1 or options.start == "random" or not task.bounded:
+        if how.columns == 0 or options.start == "random" or not task.bounded:
             return None
-        return coarse_surfaces(self._without_validation(task), self.solved, surfaces, how)
+
+        def first(coarse: Task) -> SurfaceMesh | None:
+            return first_surfaces(coarse, options, surfaces.extraction, self.solved)
+
+        return coarse_surfaces(self._without_validation(task), first, surfaces, how)
 
     def solved(self, task: Task) -> GaussianCloud:
         """The cloud fitted to the frames of `task`."""

@@ -19,6 +19,7 @@ from ..fit.schedule import Schedule
 from ..fit.terms import Objective
 from ..fit.terms.object import Bending
 from ..geometry import Grid
+from ..matter import Matter
 from ..optics.background import Light
 from ..optics.noise import noise_share
 from ..optics.sampling import fringe_sampling
@@ -103,10 +104,20 @@ def extract_surfaces(cloud: GaussianCloud, scan: Scan, options: Extraction = Ext
     )
     grid = Grid.of_views(field_of(cloud, scan.views), 1 / options.spacing)
     with torch.no_grad():
-        density = cloud.density(grid)[0].cpu().numpy()
-    mesh = isosurface(density, grid, options.level, options.least_volume, options.smoothing)
-    vertices = torch.from_numpy(mesh.vertices / cloud.unit_length)
-    return SurfaceMesh(vertices, torch.from_numpy(mesh.faces), cloud.unit_length, cloud.matter)
+        density = cloud.density(grid)[0].cpu()
+    return cut_surfaces(density, grid, cloud.unit_length, cloud.matter, options)
+
+
+def cut_surfaces(
+    occupancy: Tensor, grid: Grid, unit_length: float, matter: Matter, options: Extraction = Extraction()
+) -> SurfaceMesh:
+    """The surfaces [`unit_length`] where occupancy [Z, Y, X] on `grid` crosses the level, filled with `matter`.
+
+    Errors: `InputError` if there is no such surface.
+    """
+    mesh = isosurface(occupancy.numpy(), grid, options.level, options.least_volume, options.smoothing)
+    vertices = torch.from_numpy(mesh.vertices / unit_length)
+    return SurfaceMesh(vertices, torch.from_numpy(mesh.faces), unit_length, matter)
 
 
 def surface_fit(

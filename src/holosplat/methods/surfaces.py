@@ -13,6 +13,7 @@ from ..progress import Progress
 from ..representations import GaussianCloud, Stored, SurfaceMesh
 from ..scan import Scan
 from .coarse import CoarseToFine
+from .first_surfaces import is_noisy
 from .gaussian_options import Backend
 from .gaussians import Gaussians, GaussianStage
 from .method import Near, Stage, Task, quiet, run_quietly
@@ -49,8 +50,7 @@ class Surfaces(SurfaceOptions):
 
 @dataclass(frozen=True)
 class BodiesStage(GaussianStage):
-    """What surfaces begin with: those of coarse pixels where frames are large and these show the bodies, and Gaussians
-    elsewhere."""
+    """What surfaces begin with: those of coarse pixels where these show the bodies, and Gaussians elsewhere."""
 
     surfaces: SurfaceOptions = field(default_factory=SurfaceOptions)
 
@@ -58,6 +58,12 @@ class BodiesStage(GaussianStage):
         """Surfaces near to the frames', or the starting cloud."""
         found = self.coarse_surfaces(task, self.surfaces)
         return self.own_start(task) if found is None else Near(found)
+
+    def coarse_surfaces(self, task: Task, surfaces: SurfaceOptions) -> SurfaceMesh | None:
+        """Those of coarse pixels, which small frames have themselves; small noisy ones are for Gaussians."""
+        small = self.options.coarse.factor(task.scan) == 1
+        straight = self.options.start == "phase" and task.freedom is None and not is_noisy(task, self.options)
+        return self.near_surfaces(task, surfaces) if straight or not small else None
 
     def fit(self, task: Task, start: Stored) -> Fit | None:  # type: ignore[override]
         """The fit of the cloud; none of surfaces, for the next stage has it."""

@@ -57,6 +57,8 @@ class Costs:
     """Such a voxel in a view: the features and the numbers that the network makes of them, with gradients."""
     waves: float = 150.0
     """A wave sample of all views in a fit, with its gradient."""
+    edges: float = 105.0
+    """The same in a fit of surfaces."""
     gaussian: float = 700.0
     """A Gaussian with gradients, Adam's moments and its tiles."""
     simulated: float = 85.0
@@ -183,11 +185,14 @@ def _bodies(sizes: Sizes, how: Gaussians, edges: bool) -> tuple[float, float, fl
     """The same of Gaussians, and of surfaces cut out of them where there are `edges`."""
     batch = how.fit.schedule.views_per_step
     fitted = replace(sizes, views=min(batch, sizes.views) if batch else sizes.views).waves()
-    waves = Costs.waves * max(fitted, sizes.waves(1) if edges else 0)
+    waves = max(Costs.waves * fitted, Costs.edges * sizes.waves(1) if edges else 0.0)
     begun = 0.0 if how.start == "random" else _start(sizes, how.volume)
     count = how.random_count if how.start == "random" else min(how.max_start, how.start_per_pixel * sizes.pixels)
     fine = _fine(sizes, how.volume)[0]
-    return max(begun, waves + Costs.gaussian * count), (30 if edges else 12) + 2.3e-6 * fine, 14 * count
+    memory, numbers = max(begun, waves + Costs.gaussian * count), 14 * count
+    if edges and how.start == "phase" and how.coarse.columns:  # surfaces from coarse pixels on, where they show bodies
+        return memory, 10 + 5.6e-6 * sizes.waves(1), numbers
+    return memory, (30 if edges else 12) + 2.3e-6 * fine, numbers
 
 
 def _fine(sizes: Sizes, how: HolographicTV) -> tuple[int, int]:

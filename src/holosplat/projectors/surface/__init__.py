@@ -11,7 +11,7 @@ edge-on, and the derivative of T is not. G is linear between pixels, so it is th
 averaged under a hat of one pixel's reach: both agree to second order in the pixel. A pose moves the surface in the lab
 frame, `p = R v - s`: its gradient is the same integral, over the motion that the pose gives each vertex.
 
-Backends: `cpu` (C++) and `reference` (plain torch), both in float64; the gradient of the vertices is torch's in both.
+Backends: `cpu` (C++) and `reference` (plain torch), both in float64.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from torch.autograd.function import once_differentiable
 
 from ...backends import implementation
 from ...checks import require
-from .reference import QUADRATURE, occupancy, sampled
+from .reference import occupancy
 
 __all__ = ["surface_occupancy", "surface_thickness"]
 
@@ -116,20 +116,19 @@ class _Thickness(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         vertices, faces, points, edges = ctx.saved_tensors
         gradient = gradient.to(vertices)
-        of_vertices = _of_vertices(vertices, faces, points, edges, gradient) if ctx.needs_input_grad[0] else None
+        kernels, of_vertices = implementation(__name__, ctx.backend), None
+        if ctx.needs_input_grad[0]:  # a view of pixels s sees volumes s³ smaller
+            weights = torch.ones(len(points)).to(points) if edges is None else edges**-3
+            of_vertices = _of_vertices(vertices, faces, kernels.corner_shares(points, faces, gradient, weights))
         poses: tuple[Tensor | None, Tensor | None] = (None, None)
         if any(ctx.needs_input_grad[1:3]):
-            poses = implementation(__name__, ctx.backend).pose_gradients(points, vertices, faces, gradient)
+            poses = kernels.pose_gradients(points, vertices, faces, gradient)
         return of_vertices, *poses, None, None, None, None, None
 
 
-def _of_vertices(vertices: Tensor, faces: Tensor, points: Tensor, edges: Tensor | None, gradient: Tensor) -> Tensor:
-    """The gradient [P, 3] of the vertices, of the image's [V, H, W]; a view of pixels s sees volumes s³ smaller."""
-    found = sampled(points, faces, gradient)
-    if edges is not None:
-        found = found * (edges**-3)[:, None, None]
-    weights = torch.tensor(QUADRATURE, dtype=vertices.dtype)
+def _of_vertices(vertices: Tensor, faces: Tensor, shares: Tensor) -> Tensor:
+    """The gradient [P, 3] of the vertices, of what the corners of the faces get [F, 3]."""
     a, b, c = vertices[faces].unbind(1)
     normals = torch.linalg.cross(b - a, c - a) / 6  # vector area, shared by the three points
-    shares = (found.sum(0) @ weights)[..., None] * normals[:, None]
-    return torch.zeros_like(vertices).index_add_(0, faces.reshape(-1), shares.reshape(-1, 3))
+    pulls = shares[..., None] * normals[:, None]
+    return torch.zeros_like(vertices).index_add_(0, faces.reshape(-1), pulls.reshape(-1, 3))

@@ -1,4 +1,4 @@
-"""Thickness of closed surfaces, and its gradient of the poses, on the CPU: the compiled kernels, in float64.
+"""Thickness of closed surfaces, and its gradients, on the CPU: the compiled kernels, in float64.
 
 Bitwise the same for every number of threads (torch's: `torch.set_num_threads`) and in every run.
 """
@@ -20,6 +20,16 @@ def thickness(points: Tensor, faces: Tensor, shape: tuple[int, int], lines: int)
     surface, raster = _surface(points, faces), native.Raster(len(points), 1, *shape)
     native.call("holosplat_surface", surface, raster, lines, c_void_p(image.data_ptr()), torch.get_num_threads())
     return image
+
+
+def corner_shares(points: Tensor, faces: Tensor, gradient: Tensor, weights: Tensor) -> Tensor:
+    """What each corner of each face gets of the image's gradient [V, H, W], views weighed by `weights` [V]: [F, 3]."""
+    points, faces, gradient, weights = (a.contiguous() for a in (points, faces, gradient, weights))
+    shares = points.new_empty(len(faces), 3)
+    surface, raster = _surface(points, faces), native.Raster(len(points), 1, *gradient.shape[1:])
+    arrays = [c_void_p(a.data_ptr()) for a in (gradient, weights, shares)]
+    native.call("holosplat_surface_shares", surface, raster, *arrays, torch.get_num_threads())
+    return shares
 
 
 def pose_gradients(points: Tensor, vertices: Tensor, faces: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:

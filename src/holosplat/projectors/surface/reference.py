@@ -25,6 +25,12 @@ def thickness(points: Tensor, faces: Tensor, shape: tuple[int, int], lines: int)
     return torch.stack(images) if images else points.new_zeros(0, h, w)
 
 
+def corner_shares(points: Tensor, faces: Tensor, gradient: Tensor, weights: Tensor) -> Tensor:
+    """What each corner of each face gets of the image's gradient [V, H, W], views weighed by `weights` [V]: [F, 3]."""
+    found = torch.einsum("v,vfq->fq", weights, sampled(points, faces, gradient))
+    return found @ torch.tensor(QUADRATURE, dtype=points.dtype)
+
+
 def pose_gradients(points: Tensor, vertices: Tensor, faces: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
     """Gradients of rotations [V, 3, 3] and shifts [V, 2], of the image's [V, H, W]; float64, lengths in pixels.
 

@@ -11,8 +11,8 @@ __all__ = ["LatticeProjector", "SliceProjector", "projector_for", "voxel_line_in
 def projector_for(grid: Grid, views: Views, backend: str = "cpu") -> SliceProjector | LatticeProjector:
     """The fastest linear projector that fits: slice matrices for views about y with matching rows, else the lattice.
 
-    backend: `cpu` or `reference`, for the lattice; slice matrices are torch's.
+    backend: `cpu` or `reference`.
     """
     if views.shares_axis and rows_match(grid, views):
-        return SliceProjector(grid, views)
+        return SliceProjector(grid, views, backend)
     return LatticeProjector(grid, views, backend)

@@ -10,12 +10,13 @@ import scipy.sparse
 import torch
 from torch import Tensor
 
+from ... import native
 from ...checks import require
 from ...geometry import Grid, Views
 from ..sparse import torch_csr
 
 SMALL = 1 << 16
-"""Voxels of a slice times views, at most, of matrices that are kept: about 4 MB each, with its transpose."""
+"""Voxels of a slice times views, at most, of matrices that are kept: about 2 MB each."""
 KEPT = 16
 """Small matrices that are kept: a run asks for the same ones for its start, its cross-validation and its verdict."""
 
@@ -23,29 +24,47 @@ KEPT = 16
 class SliceProjector:
     """Parallel-beam projector for views that share the y axis; forward and exact adjoint, float32.
 
+    Backends: `cpu` (compiled) and `reference` (torch's sparse products, of any float type).
+
     Its arrays are ordered for speed: volumes [Z, X, Y] and line integrals [V, W, H], so that all slices are the
     columns of one product with a sparse matrix; `volume_in`, `volume_out` and `lines_in`, `lines_out` convert.
     The grid's rows along y must be the detector's rows. A voxel's shadow across the axis is the exact trapezoid
     of a rotated square, integrated over each pixel (Kak & Slaney 1988, section 7.1, strip model).
     """
 
-    def __init__(self, grid: Grid, views: Views) -> None:
+    def __init__(self, grid: Grid, views: Views, backend: str = "cpu") -> None:
         require(views.shares_axis, "slice matrices need views that turn about the y axis only.")
         require(rows_match(grid, views), "slice matrices need voxel rows that are the detector's rows.")
-        self.grid, self.views = grid, views
+        self.grid, self.views, self.backend = grid, views, backend
         nz, ny, nx = grid.shape
         self.array_shape = (nz, nx, ny)
-        asked = _Asked(grid, views.fingerprint(), views)
-        self._forward, self._adjoint = (_kept if nz * nx * len(views) <= SMALL else _made)(asked)
+        made = _kept if nz * nx * len(views) <= SMALL else _made
+        self._adjoint = made(_Asked(grid, views.fingerprint(), True, views))
+        if backend == "reference":
+            self._forward = made(_Asked(grid, views.fingerprint(), False, views))
 
     def project(self, array: Tensor) -> Tensor:
         """Line integrals [V, W, H] in metres × value of a volume in the order [Z, X, Y]."""
-        lines = self._forward @ array.reshape(-1, array.shape[2])
-        return lines.reshape(len(self.views), self.views.shape[1], -1)
+        rays = (len(self.views), self.views.shape[1])
+        if self.backend == "reference":
+            return (self._forward @ array.reshape(-1, array.shape[2])).reshape(*rays, -1)
+        return self._call("holosplat_slices_project", array, (*rays, array.shape[2]))
 
     def backproject(self, lines: Tensor) -> Tensor:
         """The adjoint of `project`: [V, W, H] → [Z, X, Y]."""
-        return (self._adjoint @ lines.reshape(-1, lines.shape[2])).reshape(self.array_shape)
+        shape = (*self.array_shape[:2], lines.shape[2])
+        if self.backend == "reference":
+            return (self._adjoint @ lines.reshape(-1, lines.shape[2])).reshape(shape)
+        return self._call("holosplat_slices_backproject", lines, shape)
+
+    def _call(self, function: str, source: Tensor, shape: tuple[int, int, int]) -> Tensor:
+        """What a compiled kernel makes of `source`: float32 of `shape`, whose last axis both have."""
+        source, found = source.detach().float().contiguous(), torch.empty(shape)
+        entries = (self._adjoint.crow_indices(), self._adjoint.col_indices(), self._adjoint.values())
+        slices = native.Slices(*self._adjoint.shape, shape[2], *(array.data_ptr() for array in entries))
+        pointers = [native.c_void_p(array.data_ptr()) for array in (source, found)]
+        native.call(function, slices, *pointers, torch.get_num_threads())
+        return found
 
     def volume_in(self, volume: Tensor) -> Tensor:
         """[Z, Y, X] → [Z, X, Y]."""
@@ -62,17 +81,18 @@ class SliceProjector:
 
 @dataclass(frozen=True)
 class _Asked:
-    """Grid and views of a projector; equal to those of the same views."""
+    """Grid and views of a projector, and whether its matrix is transposed; equal to those of the same views."""
 
     grid: Grid
     mark: bytes
+    transposed: bool
     views: Views = field(compare=False)
 
 
-def _made(asked: _Asked) -> tuple[Tensor, Tensor]:
-    """The matrix [V·W, Z·X] of a projector and its transpose, CSR, float32; nobody writes to them."""
+def _made(asked: _Asked) -> Tensor:
+    """The matrix [V·W, Z·X] of a projector, or its transpose, CSR, float32; nobody writes to it."""
     matrix = slice_matrix(asked.grid, asked.views)
-    return torch_csr(matrix, torch.float32), torch_csr(matrix.T.tocsr(), torch.float32)
+    return torch_csr(matrix.T.tocsr() if asked.transposed else matrix, torch.float32)
 
 
 _kept = lru_cache(maxsize=KEPT)(_made)
