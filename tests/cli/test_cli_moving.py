@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -35,8 +36,8 @@ QUICK = CarriedOptions(
 def quick(monkeypatch, tmp_path):
     """A series of three times, fitted in few steps, without the report's drawing."""
 
-    def few(scan, prior, **options):
-        return reconstruct_moving(scan, prior, QUICK, ask=False, **options)
+    def few(scan, prior, options, *rest, **others):
+        return reconstruct_moving(scan, prior, replace(QUICK, fading=options.fading), *rest, ask=False, **others)
 
     monkeypatch.setattr(motion, "reconstruct_moving", few)
     monkeypatch.setattr(motion, "report_run", lambda *what: tmp_path / "run/report.html")
@@ -86,6 +87,20 @@ def test_a_run_that_was_cut_off_goes_on(quick, monkeypatch):
     assert holosplat("evaluate", quick / "run").code == 2  # not finished
     worked(holosplat(*asked, "--resume"))
     assert isinstance(load_reconstruction(RunFolder(quick / "run")).object, MovingGaussians)
+
+
+def test_matter_may_fade(quick):
+    """The option comes to the fit and into config.json; of one time it is refused."""
+    asked = ["reconstruct", quick / "s.nxs", "--material", "PMMA", "--fading", 0.3, "--out", quick / "run"]
+    refused = holosplat(*asked, "--time-frame", 1)
+    assert refused.code == 2
+    assert "--fading is of matter in motion" in refused.err
+    worked(holosplat(*asked, "--time-frame", "all"))
+    found = load_reconstruction(RunFolder(quick / "run")).object
+    assert isinstance(found, MovingGaussians)
+    assert found.fading is not None
+    assert float(found.fading.abs().max()) > 1e-4
+    assert json.loads((quick / "run/config.json").read_text())["method"]["fading"] == 0.3
 
 
 FEW = ["volume.iterations=5", "volume.retrieval=5", "volume.corrections=0", "fit.flow_steps=3", "fit.schedule.steps=3"]

@@ -12,6 +12,7 @@ from ..io.reading import Reading
 from ..io.run_scan import run_source
 from ..matter import KnownTwo, MaterialPrior, MatterKind
 from ..methods import Auto, Method
+from ..motion.carried import CarriedOptions
 from ..optics.background import LightOptions
 from ..report.run import report_run
 from ..scan import Scan
@@ -42,12 +43,15 @@ def reconstruct_in_motion(
     reading: Reading,
     prior: MaterialPrior,
     folder: RunFolder,
-    seed: int,
-    light: LightOptions,
+    how: tuple[int, LightOptions, CarriedOptions],
     *,
     resume: bool = False,
 ) -> bool:
-    """Find matter in motion, write its run, its report and its scores; False where nothing moves, or times are few."""
+    """Find matter in motion, write its run, its report and its scores; False where nothing moves, or times are few.
+
+    how: the seed, what is assumed of the light, and how matter moves.
+    """
+    seed, light, options = how
     reading = replace(reading, part=replace(reading.part, time_frame=None))
     measured = read_as(scan, replace(reading, told=reading.told.at_middle())).in_memory()
     if isinstance(prior, KnownTwo) or len(measured.train().instants) < FEWEST_TIMES:
@@ -55,7 +59,7 @@ def reconstruct_in_motion(
     try:
         with ProgressBar() as bar:
             told = {"light": light, "folder": folder, "resume": resume, "on_progress": bar.show}
-            found = reconstruct_moving(measured, prior, seed=seed, **told)
+            found = reconstruct_moving(measured, prior, options, seed, **told)
     except KeyboardInterrupt:
         begun = folder.checkpoint.is_file()
         print(f"interrupted{f'; go on with --out {folder.path} --resume' if begun else ''}", file=sys.stderr)
