@@ -11,9 +11,12 @@ import pytest
 from helpers.cli import holosplat, worked
 from holosplat.cli import motion
 from holosplat.io.nxtomo import read_scan
+from holosplat.io.reading import Reading
 from holosplat.io.volumes import read_volume
+from holosplat.matter import DeltaBeta, KnownTwo
 from holosplat.methods import SmoothVolume
 from holosplat.motion.carried import CarriedOptions, Search
+from holosplat.optics.background import LightOptions
 from holosplat.representations import MovingGaussians, SpaceTimeField
 from holosplat.workflows.moving import reconstruct_moving
 from holosplat.workflows.reconstruct import load_reconstruction
@@ -101,6 +104,21 @@ def test_matter_may_fade(quick):
     assert found.fading is not None
     assert float(found.fading.abs().max()) > 1e-4
     assert json.loads((quick / "run/config.json").read_text())["method"]["fading"] == 0.3
+
+
+def test_two_materials_in_motion_are_refused_or_said_to_be_left(quick, capsys):
+    """Bodies are refused in one sentence; continuous matter is taken as of one time, and not said to stand still."""
+    two = ["--material", "PMMA", "--second-material", "alumina"]
+    refused = holosplat("track", quick / "s.nxs", *two, "--out", quick / "none")
+    assert refused.code == 2
+    assert "bodies are of one material, but two are known; leave --second-material." in refused.err
+    prior = KnownTwo(DeltaBeta(8e-7, 8e-10), DeltaBeta(4e-7, 3e-10))
+    how = (0, LightOptions(), QUICK)
+    assert not motion.reconstruct_in_motion(quick / "s.nxs", Reading(), prior, RunFolder(quick / "none"), how)
+    said = capsys.readouterr().err
+    assert "a flow carries one material, but two are known" in said
+    assert "nothing moves" not in said
+    assert not (quick / "none").exists()
 
 
 FEW = ["volume.iterations=5", "volume.retrieval=5", "volume.corrections=0", "fit.flow_steps=3", "fit.schedule.steps=3"]

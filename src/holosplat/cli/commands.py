@@ -126,7 +126,6 @@ def reconstruct(
             told = (seed, ways["light"], asked.motion.options())
             if reconstruct_in_motion(scan, reading, prior, folder, told, resume=resume):
                 return
-        _say("nothing moves, as far as the frames tell: they are taken as of one time")
     with claimed(folder):
         with ProgressBar() as bar, watched(live, out.name, bar.show) as follow:
             told = {"on_progress": follow.on_progress, "on_state": follow.on_state}
