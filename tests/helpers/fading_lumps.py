@@ -37,7 +37,7 @@ def drifting(way: tuple[float, float, float] = (4e-6, -2e-6, 3e-6), fades: Fades
     """Three soft lumps."""
     places = [(-3e-6, -1e-6, 1e-6), (1e-6, 2e-6, -2e-6), (-1e-6, -2e-6, -3e-6)]
     parts = tuple(ellipsoid(c, (3e-6, 2.4e-6, 2.7e-6), Bump(2), MATTER) for c in places)
-    return CarriedScene(ContinuousScene(parts), Drift(way), 10e-6, 4e-7, fades=fades or Fades())
+    return CarriedScene(ContinuousScene(parts), Drift(way), 10e-6, 4e-7, fades=fades or Fades(0.0))
 
 
 def series(scene: CarriedScene, photons: float = 800.0) -> tuple[CarriedScene, Scan]:

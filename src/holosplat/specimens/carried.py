@@ -165,7 +165,7 @@ class Fades:
     """How δ and β of matter change with time, whatever its place: linearly, by `lost` of them a `duration` [s]; at a
     time at which none would be left, there is none. Errors: `InputError` for numbers out of range."""
 
-    lost: float = 0.0
+    lost: float
     duration: float = 1.0
 
     def __post_init__(self) -> None:
@@ -192,7 +192,7 @@ class CarriedScene:
     reach: float
     step: float
     moment: float = 0.0
-    fades: Fades = Fades()
+    fades: Fades = Fades(0.0)
 
     def __post_init__(self) -> None:
         in_range("reach", self.reach, 1e-9, 1.0, unit="metres")
