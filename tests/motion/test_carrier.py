@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from helpers.moving_ellipsoids import MATERIAL, PIXEL, scan, true_paths
+from holosplat.cli.bodies import MotionFlags
 from holosplat.fit.schedule import Schedule
 from holosplat.matter import Matter
 from holosplat.motion.carrier import FAMILIES, Carried, Carrier, Expected, middles_of
@@ -196,6 +197,13 @@ def test_a_body_that_is_seen_once_moves_as_the_others_say():
     ]
     assert np.linalg.norm(ends[1]) > 10
     assert ends[0] == pytest.approx(ends[1], abs=0.5)
+
+
+def test_the_option_comes_to_every_fit():
+    """Off unless it is asked for."""
+    for weight, flags in ((0.0, MotionFlags()), (0.5, MotionFlags(carrier=0.5))):
+        options = flags.options()
+        assert [one.carrier for one in (options.stiff, options.soft, options.half)] == [weight] * 3
 
 
 def test_middles_are_those_of_surfaces():
