@@ -1,10 +1,11 @@
 """How well matter in motion that is no body is reconstructed: rows of docs/data/moving_matter.csv.
 
-    python benchmarks/moving_matter.py [--cases stir4 foam4 burst4] [--times 8] [--write]
+    python benchmarks/moving_matter.py [--cases stir4 foam4 burst4 fade4] [--times 8] [--write]
 
 Four views evenly over 180°, 64 × 64 pixels of 0.5 µm, 20 keV, 10 cm, known material (δ = 6e-7, δ/β = 1000).
 stir4: a stirred soft blob whose middle turns by 60°, 1000 photons a pixel. foam4: a collapsing foam that loses half of
 its gas, likewise. burst4: the blob as it turns by 6°, at 16 times of 200 photons, beside one time of 3200 photons.
+fade4: the stirred blob as it loses half of its δ, with and without `CarriedOptions.fading`.
 Errors of δ are those of the whole volume at every time (‖δ - δ₀‖ / ‖δ₀‖), their mean and the largest. Opponents: each
 time by itself, by the method of continuous matter, and the mean of all times. The simulation moves matter by maps in
 closed form, and shares no numerics with the fit. With --write, rows stand in the file in place of earlier ones of the
@@ -14,25 +15,21 @@ same case, method, times and seed.
 from __future__ import annotations
 
 import argparse
-import csv
-import platform
-import time
 from collections.abc import Callable
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import torch
-from machine import commit, memory_megabytes
+import rows
+from machine import commit
 
 import holosplat as hs
 from holosplat.geometry import Grid
-from holosplat.io.atomic import atomic_path
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import SmoothVolume
 from holosplat.motion.carried import CarriedOptions, merged
 from holosplat.scan import Exposures, Scan
-from holosplat.specimens.carried import CarriedScene
+from holosplat.specimens.carried import CarriedScene, Fades
 from holosplat.workflows.moving import reconstruct_moving
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "moving_matter.csv"
@@ -44,7 +41,12 @@ SCENES: dict[str, Callable[[int], CarriedScene]] = {
     "stir4": lambda seed: hs.specimens.stirred_blob(SIZE, MATERIAL, seed, turn=np.radians(60)),
     "foam4": lambda seed: hs.specimens.collapsing_foam(SIZE, MATERIAL, seed),
     "burst4": lambda seed: hs.specimens.stirred_blob(SIZE, MATERIAL, seed, turn=np.radians(6)),
+    "fade4": lambda seed: replace(
+        hs.specimens.stirred_blob(SIZE, MATERIAL, seed, turn=np.radians(60)), fades=Fades(0.5)
+    ),
 }
+FADING = 0.3
+"""Of fade4: standard deviation expected of the logarithm's change."""
 BURST_TIMES, BURST_PHOTONS, PHOTONS = 16, 200.0, 1000.0
 
 
@@ -102,12 +104,10 @@ class Case:
 
     def row(self, method: str, make: Callable[[], tuple[Callable[[float], hs.Object], str]], times: np.ndarray) -> Row:
         """What `make` gives, scored at `times`."""
-        began = time.perf_counter(), time.process_time()
-        found, said = make()
-        spent = time.perf_counter() - began[0], time.process_time() - began[1]
+        with rows.spent() as spent:
+            found, said = make()
         wrong = errors(found, self.scene, self.scan, times)
-        machine = f"{platform.machine()}, {torch.get_num_threads()} of 2 cores, shared"
-        told = (float(wrong.mean()), float(wrong.max()), *spent, memory_megabytes("VmHWM"), machine, commit(), said)
+        told = (float(wrong.mean()), float(wrong.max()), *spent.told(), rows.machine(), commit(), said)
         return Row(self.name, method, len(self.times), self.seed, *told)
 
     def together(self, options: CarriedOptions) -> tuple[Callable[[float], hs.Object], str]:
@@ -140,36 +140,28 @@ def rows_of(case: Case) -> list[Row]:
     middle = case.times[[len(case.times) // 2]]
     usual = CarriedOptions(sources=case.name == "foam4")
     found = [case.row("all times in one", lambda: case.together(usual), case.times)]
+    if case.name == "fade4":
+        fading = CarriedOptions(fading=FADING)
+        found.append(case.row("all times in one, fading", lambda: case.together(fading), case.times))
     if case.name == "burst4":
         return [*found, case.row("one time of all photons", case.bright, middle)]
     return [*found, case.row("each time by itself", case.each, case.times), case.row("mean", case.mean, case.times)]
-
-
-def write(rows: list[Row]) -> None:
-    """Put `rows` in place of those of the same case, method, times and seed."""
-    names = [field.name for field in fields(Row)]
-    old = list(csv.reader(PAGE.read_text(encoding="utf-8").splitlines()))[1:] if PAGE.is_file() else []
-    new = [[f"{v:.4g}" if isinstance(v, float) else str(v) for v in astuple(row)] for row in rows]
-    kept = [row for row in old if row[:4] not in [one[:4] for one in new]]
-    with atomic_path(PAGE) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerows([names, *sorted([*kept, *new])])
 
 
 def main() -> None:
     """Run, print, write."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cases", nargs="+", choices=SCENES, default=list(SCENES))
-    parser.add_argument("--times", type=int, default=8, help="times of stir4 and foam4")
+    parser.add_argument("--times", type=int, default=8, help="times of all but burst4")
     parser.add_argument("--seed", type=int, default=1, help="of the photons")
     parser.add_argument("--scene", type=int, default=5, help="seed of the specimen")
     parser.add_argument("--write", action="store_true")
     asked = parser.parse_args()
     for name in asked.cases:
         for row in rows_of(Case(name, asked.times, asked.seed, asked.scene)):
-            print(*(f"{field.name} {getattr(row, field.name)}" for field in fields(Row)), sep="; ", flush=True)
+            rows.shown(row)
             if asked.write:
-                write([row])
+                rows.replaced(PAGE, row, key=4)
 
 
 if __name__ == "__main__":

@@ -18,24 +18,20 @@ times, first snapshot and seed.
 from __future__ import annotations
 
 import argparse
-import csv
-import platform
-import time
 from collections.abc import Callable
-from contextlib import suppress
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import moving_matter
 import numpy as np
+import rows
 import torch
-from machine import commit, memory_megabytes
+from machine import commit
 
 import holosplat as hs
 import motion
 from holosplat.baselines import HolographicTV
 from holosplat.geometry import Grid
-from holosplat.io.atomic import atomic_path
 from holosplat.matter import MatterKind
 from holosplat.methods import HolographicVoxels, Method, SmoothVolume, Surfaces, VoxelFit, Voxels
 from holosplat.methods.moving import Deformed, HexPlane, LowRank, Snapshots, SpaceTimeTV, each_time
@@ -116,30 +112,17 @@ class Case:
 
     def row(self, method: str) -> Row:
         """Its scores, and what it took."""
-        with suppress(OSError):  # the most that is counted begins anew
-            Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
-        began = time.perf_counter(), time.process_time()
-        found = self.found(method)
-        spent = time.perf_counter() - began[0], time.process_time() - began[1]
-        memory, grid = memory_megabytes("VmHWM"), Grid.of_views(self.scan.views)
+        with rows.spent() as spent:
+            found = self.found(method)
+        grid = Grid.of_views(self.scan.views)
         with torch.no_grad():
             scores = [volume_scores(found(t).voxelise(grid), self.truth.at(t).voxelise(grid)) for t in self.times]
         dice = np.array([one.dice for one in scores]) if self.bodies else np.array([np.nan])
         wrong = np.array([one.relative_error_delta for one in scores])
         told = (float(dice.mean()), float(dice.min()), float(wrong.mean()), float(wrong.max()))
-        machine = f"{platform.machine()}, {torch.get_num_threads()} of 2 cores, shared"
-        return Row(self.name, method, len(self.times), self.first, self.seed, *told, *spent, memory, machine, commit())
-
-
-def write(row: Row) -> None:
-    """Put `row` in place of that of the same case, method, times, first snapshot and seed."""
-    names = [field.name for field in fields(Row)]
-    old = list(csv.reader(PAGE.read_text(encoding="utf-8").splitlines()))[1:] if PAGE.is_file() else []
-    new = [f"{v:.4g}" if isinstance(v, float) else str(v) for v in astuple(row)]
-    kept = [one for one in old if one[:5] != new[:5]]
-    with atomic_path(PAGE) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerows([names, *sorted([*kept, new])])
+        return Row(
+            self.name, method, len(self.times), self.first, self.seed, *told, *spent.told(), rows.machine(), commit()
+        )
 
 
 def main() -> None:
@@ -157,9 +140,9 @@ def main() -> None:
         case, usual = Case(name, asked.data, asked.first, asked.scene, asked.seed), BODIES if name in FLOWS else MATTER
         for method in [one for one in asked.methods or usual if one in usual]:
             row = case.row(method)
-            print(*(f"{field.name} {getattr(row, field.name)}" for field in fields(Row)), sep="; ", flush=True)
+            rows.shown(row)
             if asked.write:
-                write(row)
+                rows.replaced(PAGE, row, key=5)
 
 
 if __name__ == "__main__":

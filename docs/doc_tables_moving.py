@@ -53,6 +53,22 @@ def _ours() -> list[Row]:
     return [*bodies, *matter]
 
 
+def carrier() -> str:
+    """Runs with and without a velocity field that bodies share; cells that are seen briefly, of those there are."""
+    lines = []
+    for r in sorted(
+        read("carrier.csv"), key=lambda r: (r["case"] != "flow4", r["case"], r["first"], float(r["weight"]))
+    ):
+        last = int(r["first"]) + int(r["times"]) - 1
+        scores = f"{rounded(r['dice'], 4)} ({rounded(r['least_dice'], 4)})", rounded(r["error"], 4)
+        away = [f"{rounded(r[name], 2)} µm" if r[name] != "nan" else "" for name in ("inside_um", "beyond_um")]
+        kept, with_it = f"{r['kept']} of {r['brief']}", "yes" if float(r["weight"]) > 0 else "no"
+        centre = f"{rounded(r['centre_um'], 4)} µm"
+        lines.append([f"`{r['case']}`, {r['first']} … {last}", with_it, *scores, centre, kept, *away])
+    columns = ("case, snapshots", "shared field", "Dice, mean (worst time)", "error of occupancy", "centres, median")
+    return markdown((*columns, "seen briefly and followed", "their middles in the field", "and beyond"), lines)
+
+
 def assimilation() -> str:
     """4D-Var on manufactured holograms: what each assumption finds, and where its cells then are."""
     lines = []

@@ -173,6 +173,9 @@ TABLES["pinn"] = Table(
 TABLES["assimilation"] = Table(
     moving.assimilation, ("assimilation.csv",), "python benchmarks/assimilation.py --write", "five minutes"
 )
+TABLES["tracked-carrier"] = Table(
+    moving.carrier, ("carrier.csv",), "python benchmarks/carrier.py DATA --cases flow4 --write", "ten minutes"
+)
 TABLES["moving_methods"] = Table(
     moving.moving_methods,
     ("moving_methods.csv", "motion.csv", "moving_matter.csv"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,9 +11,12 @@ import pytest
 from helpers.cli import holosplat, worked
 from holosplat.cli import motion
 from holosplat.io.nxtomo import read_scan
+from holosplat.io.reading import Reading
 from holosplat.io.volumes import read_volume
+from holosplat.matter import DeltaBeta, KnownTwo
 from holosplat.methods import SmoothVolume
 from holosplat.motion.carried import CarriedOptions, Search
+from holosplat.optics.background import LightOptions
 from holosplat.representations import MovingGaussians, SpaceTimeField
 from holosplat.workflows.moving import reconstruct_moving
 from holosplat.workflows.reconstruct import load_reconstruction
@@ -35,8 +39,8 @@ QUICK = CarriedOptions(
 def quick(monkeypatch, tmp_path):
     """A series of three times, fitted in few steps, without the report's drawing."""
 
-    def few(scan, prior, **options):
-        return reconstruct_moving(scan, prior, QUICK, ask=False, **options)
+    def few(scan, prior, options, *rest, **others):
+        return reconstruct_moving(scan, prior, replace(QUICK, fading=options.fading), *rest, ask=False, **others)
 
     monkeypatch.setattr(motion, "reconstruct_moving", few)
     monkeypatch.setattr(motion, "report_run", lambda *what: tmp_path / "run/report.html")
@@ -86,6 +90,35 @@ def test_a_run_that_was_cut_off_goes_on(quick, monkeypatch):
     assert holosplat("evaluate", quick / "run").code == 2  # not finished
     worked(holosplat(*asked, "--resume"))
     assert isinstance(load_reconstruction(RunFolder(quick / "run")).object, MovingGaussians)
+
+
+def test_matter_may_fade(quick):
+    """The option comes to the fit and into config.json; of one time it is refused."""
+    asked = ["reconstruct", quick / "s.nxs", "--material", "PMMA", "--fading", 0.3, "--out", quick / "run"]
+    refused = holosplat(*asked, "--time-frame", 1)
+    assert refused.code == 2
+    assert "--fading is of matter in motion" in refused.err
+    worked(holosplat(*asked, "--time-frame", "all"))
+    found = load_reconstruction(RunFolder(quick / "run")).object
+    assert isinstance(found, MovingGaussians)
+    assert found.fading is not None
+    assert float(found.fading.abs().max()) > 1e-4
+    assert json.loads((quick / "run/config.json").read_text())["method"]["fading"] == 0.3
+
+
+def test_two_materials_in_motion_are_refused_or_said_to_be_left(quick, capsys):
+    """Bodies are refused in one sentence; continuous matter is taken as of one time, and not said to stand still."""
+    two = ["--material", "PMMA", "--second-material", "alumina"]
+    refused = holosplat("track", quick / "s.nxs", *two, "--out", quick / "none")
+    assert refused.code == 2
+    assert "bodies are of one material, but two are known; leave --second-material." in refused.err
+    prior = KnownTwo(DeltaBeta(8e-7, 8e-10), DeltaBeta(4e-7, 3e-10))
+    how = (0, LightOptions(), QUICK)
+    assert not motion.reconstruct_in_motion(quick / "s.nxs", Reading(), prior, RunFolder(quick / "none"), how)
+    said = capsys.readouterr().err
+    assert "a flow carries one material, but two are known" in said
+    assert "nothing moves" not in said
+    assert not (quick / "none").exists()
 
 
 FEW = ["volume.iterations=5", "volume.retrieval=5", "volume.corrections=0", "fit.flow_steps=3", "fit.schedule.steps=3"]

@@ -14,6 +14,7 @@ from ..checks import InputError, require
 from ..io.reading import Reading
 from ..ranges import Seed
 from .align import RefineOptions
+from .carried import CarriedFlags
 from .light import RunLightFlags
 from .live import LiveFlags, watched
 from .options import BeamlineOptions, MethodOptions, PriorOptions, TruthOptions
@@ -36,13 +37,14 @@ UNEXPLAINED = 3
 
 @dataclass(frozen=True)
 class Asked:
-    """What is asked of a reconstruction: what is known of the matter, how it is found, in which light, and from where
-    it was seen."""
+    """What is asked of a reconstruction: what is known of the matter, how it is found, in which light, from where it
+    was seen, and what it may do in time."""
 
     matter: PriorOptions = field(default_factory=PriorOptions)
     how: MethodOptions = field(default_factory=MethodOptions)
     illumination: RunLightFlags = field(default_factory=RunLightFlags)
     geometry: RefineOptions = field(default_factory=RefineOptions)
+    motion: CarriedFlags = field(default_factory=CarriedFlags)
 
     def each_time(self, method: Method, reading: Reading, seed: int) -> Settings:
         """What is done with each of several times; `InputError` for what one time alone can be asked."""
@@ -101,6 +103,7 @@ def reconstruct(
     from .motion import asks_for_motion, may_go_on, reconstruct_in_motion
 
     method = asked.how.chosen()
+    asked.motion.require_all(reading)
     if reading.part.time_frame == "each":
         from .each_time import reconstruct_each
 
@@ -120,9 +123,9 @@ def reconstruct(
     if asks_for_motion(reading, method, ways["matter"], plain):
         require(not live.view, "--view shows fits of one time; choose it with --time-frame, or leave --view.")
         with claimed(folder):
-            if reconstruct_in_motion(scan, reading, prior, folder, seed, ways["light"], resume=resume):
+            told = (seed, ways["light"], asked.motion.options())
+            if reconstruct_in_motion(scan, reading, prior, folder, told, resume=resume):
                 return
-        _say("nothing moves, as far as the frames tell: they are taken as of one time")
     with claimed(folder):
         with ProgressBar() as bar, watched(live, out.name, bar.show) as follow:
             told = {"on_progress": follow.on_progress, "on_state": follow.on_state}

@@ -43,9 +43,10 @@ class ForecastFlags:
     """Times ahead."""
     step: Seconds | None = None
     """Between them [s] (default: the median step of the run)."""
-    model: Literal["auto", "paths", "rigid", "dynamics"] = "auto"
+    model: Literal["auto", "paths", "rigid", "dynamics", "assimilate"] = "auto"
     """Paths go on, each part of the motion as far as frames tell it; rigid: shapes stay; dynamics: red cells in the
-    flow of --channel; auto: the mean of paths and dynamics by their errors, or paths without a channel."""
+    flow of --channel, which their paths over the last times tell; assimilate: the same, fitted to the frames of these
+    times (4D-Var); auto: the mean of paths and dynamics by their errors, or paths without a channel."""
     degree: int = 2
     """Powers of time that are believed, at most."""
     window: int = 0
@@ -57,6 +58,8 @@ class ForecastFlags:
     effort: float = 1.0
     """Factor of the numbers of steps of these fits."""
 
+    back: Natural = 8
+    """Last times over which the flow is fitted, at most a third of the run's."""
     channel: tuple[Small, Small] | None = None
     """Extents [m] of a rectangular channel across the flow, along the other two axes in the order x, y, z."""
     flow_axis: Literal["x", "y", "z"] = "y"
@@ -81,15 +84,16 @@ class ForecastFlags:
 
     def _dynamics(self) -> DynamicsForecast | None:
         require(
-            self.model != "dynamics" or self.channel is not None,
-            "--model dynamics needs the channel that cells flow through; say --channel WIDTH HEIGHT [m].",
+            self.model not in ("dynamics", "assimilate") or self.channel is not None,
+            f"--model {self.model} needs the channel that cells flow through; say --channel WIDTH HEIGHT [m].",
         )
         if self.channel is None or self.model in ("paths", "rigid"):
             return None
         frame = ChannelFrame(self.channel, self.flow_axis, self.channel_centre)
         peak = (0.0, 0.0) if self.peak is None else _number_or_range("peak", self.peak)
         shear = _number_or_range("shear_modulus", self.shear_modulus)
-        return DynamicsForecast(frame, peak, shear, self.viscosity, mixed=self.model == "auto")
+        how = {"back": self.back, "mixed": self.model == "auto", "frames": self.model == "assimilate"}
+        return DynamicsForecast(frame, peak, shear, self.viscosity, **how)
 
 
 def _number_or_range(name: str, text: str) -> tuple[float, float]:

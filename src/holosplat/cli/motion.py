@@ -12,6 +12,7 @@ from ..io.reading import Reading
 from ..io.run_scan import run_source
 from ..matter import KnownTwo, MaterialPrior, MatterKind
 from ..methods import Auto, Method
+from ..motion.carried import CarriedOptions
 from ..optics.background import LightOptions
 from ..report.run import report_run
 from ..scan import Scan
@@ -42,26 +43,32 @@ def reconstruct_in_motion(
     reading: Reading,
     prior: MaterialPrior,
     folder: RunFolder,
-    seed: int,
-    light: LightOptions,
+    how: tuple[int, LightOptions, CarriedOptions],
     *,
     resume: bool = False,
 ) -> bool:
-    """Find matter in motion, write its run, its report and its scores; False where nothing moves, or times are few."""
+    """Find matter in motion, write its run, its report and its scores; False where nothing moves, or times are few.
+
+    how: the seed, what is assumed of the light, and how matter moves.
+    """
+    seed, light, options = how
     reading = replace(reading, part=replace(reading.part, time_frame=None))
     measured = read_as(scan, replace(reading, told=reading.told.at_middle())).in_memory()
-    if isinstance(prior, KnownTwo) or len(measured.train().instants) < FEWEST_TIMES:
-        return False
+    count = len(measured.train().instants)
+    if isinstance(prior, KnownTwo):
+        return _still("a flow carries one material, but two are known, and motion is not asked of the frames")
+    if count < FEWEST_TIMES:
+        return _still(f"motion is asked of frames of {FEWEST_TIMES} times or more, but there are {count}")
     try:
         with ProgressBar() as bar:
             told = {"light": light, "folder": folder, "resume": resume, "on_progress": bar.show}
-            found = reconstruct_moving(measured, prior, seed=seed, **told)
+            found = reconstruct_moving(measured, prior, options, seed, **told)
     except KeyboardInterrupt:
         begun = folder.checkpoint.is_file()
         print(f"interrupted{f'; go on with --out {folder.path} --resume' if begun else ''}", file=sys.stderr)
         raise SystemExit(INTERRUPTED) from None
     if found is None:
-        return False
+        return _still("nothing moves, as far as the frames tell")
     result = found.reconstruction
     write_json(folder.source, run_source(scan, reading))
     evaluation, report = score(result, measured, None), report_of_middle(folder, result, measured)
@@ -72,6 +79,11 @@ def reconstruct_in_motion(
         print(line, file=sys.stderr)
     print(f"{seconds:.1f} s, {result.object.described}; report: {report}", file=sys.stderr)
     return True
+
+
+def _still(why: str) -> bool:
+    print(f"{why}: they are taken as of one time", file=sys.stderr)
+    return False
 
 
 def report_of_middle(folder: RunFolder, result: Reconstruction, measured: Scan) -> Path:

@@ -1,5 +1,7 @@
 """The likeliest volume of continuous matter that a flow carries, by the frames of all times, and the likeliest flow.
 
+On its way matter may become more or less, by a smooth field of the volume's places (`Fading`).
+
 The volume is that of the flow's reference time. At the time t, a voxel has what the flow brought there: the value where
 it came from, linear between voxels. Times are looked at one after another, so that memory does not grow with their
 number.
@@ -13,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
+from ..representations.fading import Fading, faded
 from ..representations.flow import Flow
 from .smooth_volume import ContinuousPrior, VolumeProblem
 from .whitened import WhitenedFrames
@@ -37,10 +40,11 @@ class CarriedProblem:
         flow: Flow,
         unit: float,
     ) -> None:
-        self.level, self._unit, self._times = level, unit, list(times)
+        self.level, self._unit, self.times = level, unit, list(times)
         self._still = [VolumeProblem(one, prior, level) for one in frames]
         self.grid = self._still[0].grid
         self._points, self._coarse = _sparse_points(self._still[0], unit)
+        self._fading: list[Tensor | None] = [None] * len(self.times)
         self.carry(flow)
 
     @property
@@ -51,12 +55,21 @@ class CarriedProblem:
     def carry(self, flow: Flow) -> None:
         """Take another flow."""
         with torch.no_grad():
-            self._sources = [self._came_from(flow, time) for time in self._times]
+            self._sources = [self._came_from(flow, time) for time in self.times]
+
+    def fade(self, fading: Fading | None, flow: Flow) -> None:
+        """Take another change of amplitudes, from the reference of `flow` on."""
+        with torch.no_grad():
+            self._fading = [None if fading is None else self._factor(fading, flow, time) for time in self.times]
+
+    def _factor(self, fading: Fading, flow: Flow, time: float) -> Tensor:
+        """What matter has become at `time` [Z, Y, X], as a share of what it was at the reference of `flow`."""
+        values = fading.on([self._unit * torch.from_numpy(places) for places in self.grid.axes()])
+        return faded(values, (time - flow.reference) / (flow.basis.last - flow.basis.first))
 
     def at(self, u: Tensor, k: int) -> Tensor:
         """The volume [Z, Y, X] of the time numbered k."""
-        source = self._sources[k]
-        return u if source is None else _sampled(u, source)
+        return _carried(u, self._sources[k], self._fading[k])
 
     def __call__(self, u: Tensor) -> tuple[float, Tensor]:
         """The objective and its gradient [Z, Y, X]."""
@@ -81,13 +94,17 @@ class CarriedProblem:
     def flow_misfit(self, u: Tensor, flow: Flow) -> float:
         """½ χ² of `u` carried by `flow`; its gradient is added to those of the flow's parameters, time by time."""
         value = 0.0
-        for time, still in zip(self._times, self._still):
+        for time, still, factor in zip(self.times, self._still, self._fading):
             source = self._came_from(flow, time)
-            now = u if source is None else _sampled(u, source)
-            misfit = still.frames(still.lines(now.detach()))
-            value += misfit.value
-            if source is not None and now.requires_grad:
-                now.backward(still.backprojection(misfit.gradient))
+            value += _pulled(still, _carried(u, source, factor))
+        return value
+
+    def fading_misfit(self, u: Tensor, fading: Fading, flow: Flow) -> float:
+        """½ χ² of `u` carried by the flow that was taken, with other amplitudes; the gradient is added to that of the
+        fading's coefficients. flow: whose times count."""
+        value = 0.0
+        for time, still, source in zip(self.times, self._still, self._sources):
+            value += _pulled(still, _carried(u, source, self._factor(fading, flow, time)))
         return value
 
     def _came_from(self, flow: Flow, time: float) -> Tensor | None:
@@ -101,6 +118,19 @@ class CarriedProblem:
         origin, size = (torch.tensor(v, dtype=fine.dtype) for v in (self.grid.origin, self.grid.voxel_size))
         counts = torch.tensor(self.grid.shape[::-1], dtype=fine.dtype)
         return 2 * (fine - origin) / (size * (counts - 1).clamp_min(1)) - 1
+
+
+def _pulled(still: VolumeProblem, now: Tensor) -> float:
+    """½ χ² of the volume `now`, whose gradient goes on to what it was made of."""
+    misfit = still.frames(still.lines(now.detach()))
+    if now.requires_grad:
+        now.backward(still.backprojection(misfit.gradient))
+    return misfit.value
+
+
+def _carried(u: Tensor, source: Tensor | None, factor: Tensor | None) -> Tensor:
+    now = u if factor is None else u * factor
+    return now if source is None else _sampled(now, source)
 
 
 def _sparse_points(still: VolumeProblem, unit: float) -> tuple[Tensor, tuple[int, int, int]]:
@@ -130,6 +160,41 @@ def strain(flow: Flow, times: Sequence[float]) -> Tensor:
     return (0.5 * (gradients + gradients.mT)).square().sum() / len(times)
 
 
+def _minimised(tensors: list[Tensor], iterations: int) -> torch.optim.LBFGS:
+    return torch.optim.LBFGS(
+        tensors,
+        lr=1.0,
+        max_iter=iterations,
+        history_size=12,
+        line_search_fn="strong_wolfe",
+        tolerance_change=1e-7,
+        tolerance_grad=1e-9,
+    )
+
+
+def likelier_fading(
+    problem: CarriedProblem, u: Tensor, fading: Fading, flow: Flow, iterations: int, spread: float
+) -> tuple[Fading, list[float]]:
+    """`fading` after some iterations of L-BFGS towards the likeliest one of `u`, which the problem's flow carries; and
+    the objective's values.
+
+    spread: standard deviation expected of what logarithms of amplitudes change by over all times, at each node.
+    """
+    leaf = fading.coefficients.detach().clone().requires_grad_()
+    optimiser, values = _minimised([leaf], iterations), list[float]()
+
+    def closure() -> float:
+        optimiser.zero_grad()
+        value = problem.fading_misfit(u, fading.with_coefficients(leaf), flow)
+        prior = 0.5 * leaf.square().sum() / spread**2
+        prior.backward()
+        values.append(value + float(prior.detach()))
+        return values[-1]
+
+    optimiser.step(closure)
+    return fading.with_coefficients(leaf.detach()), values
+
+
 def likelier_flow(
     problem: CarriedProblem,
     u: Tensor,
@@ -145,15 +210,7 @@ def likelier_flow(
     leaves = {name: tensor.detach().clone().requires_grad_() for name, tensor in flow.parameters().items()}
     times = torch.linspace(flow.basis.first, flow.basis.last, flow.basis.count).tolist()
     scale = float(flow.lattice.cell)
-    optimiser = torch.optim.LBFGS(
-        list(leaves.values()),
-        lr=1.0,
-        max_iter=iterations,
-        history_size=12,
-        line_search_fn="strong_wolfe",
-        tolerance_change=1e-7,
-        tolerance_grad=1e-9,
-    )
+    optimiser = _minimised(list(leaves.values()), iterations)
     values: list[float] = []
 
     def closure() -> float:

@@ -63,6 +63,10 @@ class Assimilation:
                 0 < low <= high, f"{name} must be a range LOW:HIGH above 0, but it is {low:g}:{high:g}; correct it."
             )
 
+    def unknowns(self, cells: int) -> int:
+        """How many there are of so many cells."""
+        return sum(low < high for low, high in (self.peak, self.shear)) + AFFINE * cells
+
 
 @dataclass(frozen=True)
 class Assimilated:

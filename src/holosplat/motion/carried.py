@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ..baselines.material import plateau
 from ..checks import as_written, at_least, positive, require
-from ..fit.carried_volume import CarriedProblem, likelier_flow
+from ..fit.carried_volume import CarriedProblem, likelier_fading, likelier_flow
 from ..fit.smooth_volume import descend
 from ..geometry import Grid
 from ..matter import DeltaBeta, MaterialPrior, Matter
@@ -27,7 +27,16 @@ from ..methods import Task
 from ..methods.smooth_fit import SmoothFit
 from ..methods.volume import SmoothStage, SmoothVolume
 from ..ranges import Pixels, Weight, ranged
-from ..representations import Flow, Lattice, MovingGaussians, TimeBasis, VoxelGrid, approximate, cloud_from_volume
+from ..representations import (
+    Fading,
+    Flow,
+    Lattice,
+    MovingGaussians,
+    TimeBasis,
+    VoxelGrid,
+    approximate,
+    cloud_from_volume,
+)
 from ..representations.initialise import FILLED
 from ..scan import Scan
 from .freer_flow import of_degree, on_lattice
@@ -68,6 +77,8 @@ class CarriedOptions:
     """Standard deviation expected of what is not rigid of the motion, over all times (as-rigid-as-possible)."""
     divergence: Weight = 0.3
     """Standard deviation expected of the divergence of sources, over all times."""
+    fading: Weight = 0.0
+    """Standard deviation expected of what the logarithm of δ changes by, over all times (0: matter stays as much)."""
     iterations: int = 12
     """Iterations for the flow and for the volume, each time that the two take turns."""
     final: int = 20
@@ -102,10 +113,11 @@ class Carried:
 
 @dataclass(frozen=True)
 class _State:
-    """A flow and the volume [Z, Y, X] that it carries."""
+    """A flow, the volume [Z, Y, X] that it carries, and how that fades, if it may."""
 
     flow: Flow
     u: Tensor
+    fading: Fading | None = None
 
 
 class Search:
@@ -152,25 +164,35 @@ class Search:
     def moves(self, still: VoxelGrid) -> bool:
         """Whether a steady flow explains frames that matter which stands `still` does not."""
         began = clock.perf_counter()
-        flow, u = self.steady(self.options.cells), self.on(still, self.factor)
-        count = len(self.times)
-        gain, chance = (self._gain(order, flow, u) for order in (list(range(count)), trendless(count)))
-        self.history.append(f"a steady flow takes {gain:.0f} from ½χ², of times in another order {chance:.0f}")
+        state, count = self._still(self.on(still, self.factor)), len(self.times)
+        gain, chance = (self._gain(order, state) for order in (list(range(count)), trendless(count)))
+        what = "a steady flow takes" if state.fading is None else "a steady flow and a change of δ take"
+        self.history.append(f"{what} {gain:.0f} from ½χ², of times in another order {chance:.0f}")
         self.timing["does it move"] = clock.perf_counter() - began
         return gain > SURE**2 + AGAIN * chance
 
-    def _gain(self, order: list[int], flow: Flow, u: Tensor) -> float:
-        """What a steady flow takes from ½χ² of u where the times come in `order`."""
-        problem = self.problem(order, self.factor, flow, u, times=self.times)
-        _, values = likelier_flow(problem, u, flow, self.options.iterations, self.options.strain)
-        return values[0] - min(values)
+    def _still(self, u: Tensor) -> _State:
+        """Nothing moves, nothing fades."""
+        flow = self.steady(self.options.cells)
+        return _State(flow, u, Fading.none(flow.lattice) if self.options.fading > 0 else None)
+
+    def _gain(self, order: list[int], state: _State) -> float:
+        """What a steady flow, and a change of amplitudes where that may be, takes from ½χ² where the times come in
+        `order`."""
+        problem, steps = self.problem(order, self.factor, state, times=self.times), self.options.iterations
+        flow, values = likelier_flow(problem, state.u, state.flow, steps, self.options.strain)
+        gain = values[0] - min(values)
+        if state.fading is None:
+            return gain
+        problem.carry(flow)
+        _, values = likelier_fading(problem, state.u, state.fading, flow, steps, self.options.fading)
+        return gain + values[0] - min(values)
 
     def problem(
         self,
         which: Sequence[int] | range,
         factor: int,
-        flow: Flow,
-        u: Tensor,
+        state: _State,
         keep: np.ndarray | None = None,
         times: np.ndarray | None = None,
     ) -> CarriedProblem:
@@ -178,7 +200,9 @@ class Search:
         frames = [self.frames.whitened(k, factor, None if keep is None else keep[k]) for k in which]
         prior = self.prior if factor == 1 else self.prior.on_larger_voxels(factor)
         taken = self.times[list(which)] if times is None else times
-        return CarriedProblem(frames, taken.tolist(), prior, plateau(u), flow, factor)
+        problem = CarriedProblem(frames, taken.tolist(), prior, plateau(state.u), state.flow, factor)
+        problem.fade(state.fading, state.flow)
+        return problem
 
     def on(self, volume: VoxelGrid, factor: int) -> Tensor:
         """The values [Z, Y, X] of a volume on voxels of `factor` pixels."""
@@ -188,15 +212,23 @@ class Search:
         return Grid.of_views(self.frames.scans[0].binned(factor).views)
 
     def turns(self, problem: CarriedProblem, state: _State, rounds: int = 1) -> _State:
-        """Flow and volume in turns, each by `iterations`."""
-        flow, u = state.flow, state.u
+        """Flow, fading and volume in turns, each by `iterations`."""
         for _ in range(rounds):
-            flow, _ = likelier_flow(
-                problem, u, flow, self.options.iterations, self.options.strain, self.options.divergence
-            )
-            problem.carry(flow)
-            u, _ = descend(problem, u, self.options.iterations)
-        return _State(flow, u)
+            state = self._moved(problem, state, self.options.iterations)
+            u, _ = descend(problem, state.u, self.options.iterations)
+            state = replace(state, u=u)
+        return state
+
+    def _moved(self, problem: CarriedProblem, state: _State, steps: int) -> _State:
+        """`state` with a likelier flow, and then, where the problem is of all times, a likelier fading, which it takes,
+        too: in a few times what moves may pass for what fades."""
+        how, u, fading = self.options, state.u, state.fading
+        flow, _ = likelier_flow(problem, u, state.flow, steps, how.strain, how.divergence)
+        problem.carry(flow)
+        if fading is not None and len(problem.times) == len(self.times):
+            fading, _ = likelier_fading(problem, u, fading, flow, steps, how.fading)
+            problem.fade(fading, flow)
+        return _State(flow, u, fading)
 
     def windows(self) -> list[list[int]]:
         """Times about the middle: those next to it, then twice as many, to all."""
@@ -221,6 +253,8 @@ class Search:
     def keep(self, state: _State | None = None) -> None:
         """Write the journal: so many steps are done, and what the last of them found."""
         found = {} if state is None else {"flow": state.flow.state(), "u": state.u}
+        if state is not None and state.fading is not None:
+            found["fading"] = state.fading.coefficients
         told = {"history": list(self.history), "timing": dict(self.timing), "strength": self._strength}
         self.journal.save({"steps": self._step, **found, **told})
 
@@ -237,19 +271,24 @@ class Search:
         """What `make` finds, in the time of stage `name`; of steps that are done already, what the last one found."""
         done, self._step = int(self._saved.get("steps", 0)), self._step + 1
         if self._step <= done:
-            return _State(Flow.from_state(self._saved["flow"]), self._saved["u"])
+            return self._saved_state()
         began, before = clock.perf_counter(), sum(self.timing.values())
         found, others = make(), sum(self.timing.values()) - before
         self.timing[name] = self.timing.get(name, 0.0) + clock.perf_counter() - began - others
         self.keep(found)
         return found
 
+    def _saved_state(self) -> _State:
+        flow, fading = Flow.from_state(self._saved["flow"]), self._saved.get("fading")
+        lattice = self.steady(self.options.cells).lattice
+        return _State(flow, self._saved["u"], None if fading is None else Fading(fading, lattice))
+
     def _begun(self) -> _State:
-        return _State(self.steady(self.options.cells), self.on(self.first(), self.factor))
+        return self._still(self.on(self.first(), self.factor))
 
     def _whole(self, state: _State, window: Sequence[int] | range) -> CarriedProblem:
         """The frames of the times numbered `window`, with the matter of `state`."""
-        return self.problem(window, self.factor, state.flow, state.u)
+        return self.problem(window, self.factor, state)
 
     def first(self) -> VoxelGrid:
         """The volume of the middle time; of all times, as if nothing moved, where noise hides a single one."""
@@ -276,10 +315,11 @@ class Search:
         wanted, count = change(state.flow), len(self.times)
         if wanted is None:
             return state
-        kept = self.problem(range(count), self.factor, state.flow, state.u, keep)
+        kept = self.problem(range(count), self.factor, state, keep)
         same = self.turns(kept, state)
         kept.carry(wanted)
-        other = self.turns(kept, _State(wanted, state.u))
+        kept.fade(state.fading, wanted)
+        other = self.turns(kept, replace(state, flow=wanted))
         errors = [self.left_out(one, ~keep) for one in (same, other)]
         gain = errors[0] - errors[1]
         better = bool(gain.mean() > BETTER * gain.std(ddof=1) / np.sqrt(len(gain)))
@@ -304,43 +344,49 @@ class Search:
             for v in np.flatnonzero(left[k]):
                 one = np.zeros(left.shape, dtype=bool)
                 one[k, v] = True
-                problem = self.problem([int(k)], self.factor, state.flow, state.u, one)
+                problem = self.problem([int(k)], self.factor, state, one)
                 found.append(problem.misfit(state.u)[0])
         return np.array(found)
 
     def finished(self, state: _State) -> Carried:
         """The state on voxels of a pixel, and the Gaussians that stand for it."""
         state = self._stepped("volume", lambda: self._fine(state))
-        problem = self.problem(range(len(self.times)), 1, state.flow, state.u)
+        problem = self.problem(range(len(self.times)), 1, state)
         pixels = problem.count / len(self.times)
         misfit = [2 * one / pixels for one in problem.misfit(state.u)]
         volume = self._volume(state.u, 1)
-        return Carried(self.gaussians(volume, state.flow), volume, state.flow, misfit, tuple(self.history), self.timing)
+        found = self.gaussians(volume, state)
+        return Carried(found, volume, state.flow, misfit, tuple(self.history), self.timing)
 
     def _volume(self, u: Tensor, factor: int) -> VoxelGrid:
         return VoxelGrid(u[None], self._grid(factor), Matter.one(*self.frames.material))
 
     def _fine(self, state: _State) -> _State:
         """On voxels of a pixel: the volume, the flow by it, and once more the volume."""
-        how, flow, u = self.options, state.flow, self.on(self._volume(state.u, self.factor), 1)
-        problem = self.problem(range(len(self.times)), 1, flow, u)
+        how, state = self.options, replace(state, u=self.on(self._volume(state.u, self.factor), 1))
+        problem = self.problem(range(len(self.times)), 1, state)
         for k in range(2):
             self.task.on_progress("volume", k / 2)
             if k:
-                flow, _ = likelier_flow(problem, u, flow, how.iterations // 2, how.strain, how.divergence)
-                problem.carry(flow)
-            u, _ = descend(problem, u, how.final)
-        return _State(flow, u)
+                state = self._moved(problem, state, how.iterations // 2)
+            state = replace(state, u=descend(problem, state.u, how.final)[0])
+        return state
 
-    def gaussians(self, volume: VoxelGrid, flow: Flow) -> MovingGaussians:
-        """Gaussians that stand for a volume of the reference time, with its flow."""
+    def gaussians(self, volume: VoxelGrid, state: _State) -> MovingGaussians:
+        """Gaussians that stand for a volume of the reference time, with its flow and its fading."""
         began, unit = clock.perf_counter(), self.task.scan.views.finest
         spacing, u = self.options.spacing_px * unit, volume.values[0]
         filled = FILLED * plateau(u)
         first = cloud_from_volume(u, volume.grid, self.frames.material, spacing, unit, filled=filled)
         found = approximate(first, u, volume.grid, self.options.approximate_steps, self.task.on_progress)
         self.timing["gaussians"] = clock.perf_counter() - began
-        return MovingGaussians(found.detached(), flow)
+        cloud, flow, change = found.detached(), state.flow, None
+        if state.fading is not None:
+            ends = [
+                (t - flow.reference) / (flow.basis.last - flow.basis.first) for t in (self.times[0], self.times[-1])
+            ]
+            change = state.fading.of_raw(cloud.centres, cloud.raw_amplitudes[:, 0], (ends[0], ends[1]))
+        return MovingGaussians(cloud, flow, change)
 
 
 def trendless(count: int) -> list[int]:

@@ -53,6 +53,8 @@ class DynamicsForecast:
     """Whether what is wrong with the flow about each cell is put down to a linear flow of its own."""
     mixed: bool = False
     """Whether paths that go on count, too, by the inverse squares of both bands."""
+    frames: bool = False
+    """Whether the model is fitted to the window's frames, and not to the paths that were fitted to them (4D-Var)."""
 
     def __post_init__(self) -> None:
         in_range("viscosity", self.viscosity, 1e-6, 1e3, unit="pascal seconds")
@@ -60,6 +62,43 @@ class DynamicsForecast:
         for name, (low, high) in (("peak", self.peak), ("shear", self.shear)):
             require(0 <= low <= high, f"{name} must be a range LOW:HIGH, but it is {low:g}:{high:g}; correct it.")
         positive("shear", self.shear[0], "newtons a metre")
+
+
+@dataclass(frozen=True)
+class Window:
+    """What mechanics begin with. bodies: fitted to the frames; past: last times [P] s; every: the last one and those
+    ahead [N + 1] s; seen: places of each body [P, Q, 3] [m]; spread: [P, B] m, of these; base: as paths go on; cells:
+    numbers of the bodies that are whole cells in the channel; model: of these; peak: its range [m/s]."""
+
+    bodies: MovingSurfaces
+    options: DynamicsForecast
+    past: np.ndarray
+    every: np.ndarray
+    seen: list[np.ndarray]
+    spread: np.ndarray
+    base: Forecast
+    cells: list[int]
+    model: CellModel
+    peak: Range
+
+    def meshes(self, time: int) -> list[TriangleMesh]:
+        """The cells at the time numbered so of the past."""
+        return [TriangleMesh(self.seen[k][time], self.bodies.body(k)[1].numpy()) for k in self.cells]
+
+    def gone_on(self, later: list[np.ndarray], left: np.ndarray) -> Forecast:
+        """Cells go on at `later` [N + 1, Q, 3] [m] of each, all others as paths do.
+
+        left: [C] m, what the model misses of the cells over the past, which grows with time.
+        """
+        places, band = places_of(self.base.bodies, self.every), self.base.band.copy()
+        growth = (self.every - self.every[0]) / (self.past[-1] - self.past[0])
+        for k, own, missed in zip(self.cells, later, left):
+            error = np.hypot(self.spread[-1, k], growth * missed)
+            weight = _weights(error[1:], self.base.band[:, k], self.options.mixed)
+            places[k] = own + np.r_[0.0, 1 - weight][:, None, None] * (places[k] - own)
+            mixed = np.sqrt((weight * error[1:]) ** 2 + ((1 - weight) * self.base.band[:, k]) ** 2)
+            band[:, k] = mixed if self.options.mixed else error[1:]
+        return Forecast(on_paths(self.bodies, self.every, places), self.every[1:], band)
 
 
 def carry(
@@ -76,11 +115,29 @@ def carry(
     as `extrapolate` says. The band has the state's part, and what the model left of the window, growing with time.
     Errors: `InputError` where no body is a whole cell within the channel.
     """
-    window, every = paths.times(times), np.r_[times[-1], ahead]
-    past = window[-1 - min(options.back, max(1, len(window) // 3)) :]
-    seen, spread = smoothed(bodies, window, past, paths, halves)
+    window = window_of(bodies, times, ahead, options, paths, halves)
+    ranges = {"peak": window.peak, "shear": options.shear}
+    tracked = [window.seen[k] for k in window.cells]
+    fitted = window.model.fitted(window.meshes(0), tracked, window.past, ranges, options.free)
+    later = window.model.run(window.meshes(-1), window.every, fitted.unknowns, fitted.wrong)
+    for own, seen in zip(later, tracked):
+        own += seen[-1] - own[0]  # what the coarse membrane does not follow
+    return window.gone_on(later, fitted.left), fitted.as_dict()
+
+
+def window_of(
+    bodies: MovingSurfaces,
+    times: np.ndarray,
+    ahead: np.ndarray,
+    options: DynamicsForecast,
+    paths: PathForecast = GOING_ON,
+    halves: Halves | None = None,
+) -> Window:
+    """What mechanics begin with, as of `carry`."""
+    known = paths.times(times)
+    past = known[-1 - min(options.back, max(1, len(known) // 3)) :]
+    seen, spread = smoothed(bodies, known, past, paths, halves)
     base = extrapolate(bodies, times, ahead, paths, halves)
-    places, band = places_of(base.bodies, every), base.band.copy()
     faces = [bodies.body(k)[1].numpy() for k in range(bodies.count)]
     cells = whole_cells([TriangleMesh(one[-1], f) for one, f in zip(seen, faces)], options.frame)
     require(
@@ -88,20 +145,10 @@ def carry(
         "dynamics need cells that are whole and within the channel at the last time, but there are none; check "
         "--channel, --flow-axis and --channel-centre.",
     )
-    first, last = ([TriangleMesh(seen[k][t], faces[k]) for k in cells] for t in (0, -1))
+    last = [TriangleMesh(seen[k][-1], faces[k]) for k in cells]
     model = CellModel(options.frame, last, float(np.sqrt(np.prod(options.shear))), options.viscosity)
-    ranges = {"peak": _peak(model, bodies, cells, window, options), "shear": options.shear}
-    fitted = model.fitted(first, [seen[k] for k in cells], past, ranges, options.free)
-    later = model.run(last, every, fitted.unknowns, fitted.wrong)
-    growth = (every - times[-1]) / (past[-1] - past[0])
-    for k, own, left in zip(cells, later, fitted.left):
-        own += seen[k][-1] - own[0]  # what the coarse membrane does not follow
-        error = np.hypot(spread[-1, k], growth * left)
-        weight = _weights(error[1:], base.band[:, k], options.mixed)
-        places[k] = own + np.r_[0.0, 1 - weight][:, None, None] * (places[k] - own)
-        mixed = np.sqrt((weight * error[1:]) ** 2 + ((1 - weight) * base.band[:, k]) ** 2)
-        band[:, k] = mixed if options.mixed else error[1:]
-    return Forecast(on_paths(bodies, every, places), ahead, band), fitted.as_dict()
+    peak = _peak(model, bodies, cells, known, options)
+    return Window(bodies, options, past, np.r_[times[-1], ahead], seen, spread, base, cells, model, peak)
 
 
 def whole_cells(meshes: list[TriangleMesh], frame: ChannelFrame) -> list[int]:

@@ -21,6 +21,7 @@ class ForecastShown:
     """A forecast, as data.
 
     - times: [N] s; band: [N, B] m, standard error of each body's surface along its normals, NaN where nothing tells it
+    - flow: what mechanics found of the flow, and what they cannot tell, in words
     - held_out: scores of frames that the run did not see, a row a time: time_s, ssim, and ssim_still, of bodies that
       stay where they were
     """
@@ -28,6 +29,7 @@ class ForecastShown:
     times: np.ndarray
     band: np.ndarray
     held_out: Sequence[Mapping[str, float]] = ()
+    flow: str = ""
 
 
 def forecast_block(shown: ForecastShown) -> Block:
@@ -48,6 +50,7 @@ def forecast_block(shown: ForecastShown) -> Block:
         if shown.held_out
         else "b, the scan has no frames of these times."
     )
+    text += f" Mechanics found of the {shown.flow}." if shown.flow else ""
     return drawn_block(heading, text.strip(), "The forecast's error and scores.", forecast_figure(shown), "svg")
 
 

@@ -21,7 +21,7 @@ from ..scan import Scan
 from ..units import span
 from ..volume import Volume
 from ..workflows.evaluate import Evaluation, render
-from ..workflows.forecast import NUMBERS, read_band
+from ..workflows.forecast import NUMBERS, flow_in_words, read_band
 from ..workflows.reconstruct import Reconstruction
 from ..workflows.run_folder import RunFolder
 from ..workflows.track import read_errors
@@ -125,7 +125,8 @@ def _forecast(folder: RunFolder) -> ForecastShown | None:
     if not (folder.path / NUMBERS).is_file():
         return None
     times, band = read_band(folder)
-    return ForecastShown(times, band, read_json(folder.path / NUMBERS)["held_out"])
+    said = read_json(folder.path / NUMBERS)
+    return ForecastShown(times, band, said["held_out"], flow_in_words(said["flow"]) if said.get("flow") else "")
 
 
 def _title(config: Mapping[str, Any], reconstruction: Reconstruction) -> str:

@@ -13,6 +13,7 @@ from ..volume import LineIntegrals, TrainableObject
 from .aligned_network import AlignedNetwork, PixelAligned
 from .deformed_voxels import Deformation, DeformedVoxels
 from .encodings import Encoding
+from .fading import Fading
 from .flow import Flow, Lattice
 from .gaussians import GaussianCloud
 from .hexplane import HexPlaneField, HexPlanes
@@ -95,6 +96,7 @@ __all__ = [
     "Deformation",
     "DeformedVoxels",
     "Encoding",
+    "Fading",
     "Flow",
     "GaussianCloud",
     "HexPlaneField",

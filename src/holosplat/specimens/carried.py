@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from ..checks import finite, in_range
+from ..checks import finite, in_range, require
 from ..geometry import Grid, Views
 from ..volume import LineIntegrals, Volume
 from .continuous import ContinuousScene, Element
@@ -161,11 +161,29 @@ class Sinks:
 
 
 @dataclass(frozen=True)
+class Fades:
+    """How δ and β of matter change with time, whatever its place: linearly, by `lost` of them a `duration` [s]; at a
+    time at which none would be left, there is none. Errors: `InputError` for numbers out of range."""
+
+    lost: float
+    duration: float = 1.0
+
+    def __post_init__(self) -> None:
+        require(self.lost <= 1, f"lost must be 1 at most, all matter, but it is {self.lost:g}.")
+        in_range("duration", self.duration, 1e-12, 1e9, unit="seconds")
+
+    def left(self, time: float) -> float:
+        """The share that is left at `time` [s]."""
+        return max(1 - self.lost * time / self.duration, 0.0)
+
+
+@dataclass(frozen=True)
 class CarriedScene:
     """A continuous scene that a motion carries along; as it stands, that of time 0.
 
     scene: at time 0; motion: how it goes on; reach: radius [m] of the ball about the origin that matter never leaves;
-    step: from point to point along a ray [m], a sixth of the narrowest edge; moment: [s] the time that is looked at.
+    step: from point to point along a ray [m], a sixth of the narrowest edge; moment: [s] the time that is looked at;
+    fades: what is left of all matter with time.
     Errors: `InputError` for lengths out of range.
     """
 
@@ -174,6 +192,7 @@ class CarriedScene:
     reach: float
     step: float
     moment: float = 0.0
+    fades: Fades = Fades(0.0)
 
     def __post_init__(self) -> None:
         in_range("reach", self.reach, 1e-9, 1.0, unit="metres")
@@ -182,7 +201,7 @@ class CarriedScene:
 
     def at(self, time: float) -> CarriedScene:
         """The scene as it is at `time` [s]."""
-        return CarriedScene(self.scene, self.motion, self.reach, self.step, float(time))
+        return replace(self, moment=float(time))
 
     def missing_field(self, views: Views) -> float:
         """How far [m] the ball that holds the scene reaches beyond the detector in the worst view."""
@@ -196,7 +215,7 @@ class CarriedScene:
             before = self.motion.back(points[:, part], self.moment)
             for element in self.scene.elements:
                 _add(found[:, part], element, before)
-        return found
+        return found * self.fades.left(self.moment)
 
     def project(self, views: Views) -> LineIntegrals:
         """Line integrals of each of the scene's `kinds`, float64: sums of points `step` apart on the pixels' rays."""

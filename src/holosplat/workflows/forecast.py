@@ -16,10 +16,12 @@ from ..io.nxtomo import write_scan
 from ..io.objects import write_object
 from ..methods.presets import SCHEMA
 from ..metrics import image_scores, intensity_range
-from ..motion.dynamics import DynamicsForecast, carry
+from ..motion.by_frames import carry_by_frames
+from ..motion.dynamics import DynamicsForecast, carry, window_of
 from ..motion.fit import MotionFit
 from ..motion.forecast import Forecast, Halves, PathForecast, extrapolate
 from ..motion.half_sets import LEAST, half_sets
+from ..optics.background import Light
 from ..progress import FitProgress
 from ..ranges import Seconds, ranged
 from ..representations import MovingSurfaces
@@ -134,6 +136,9 @@ def forecast(
     flow = dict[str, float]()
     if options.dynamics is None:
         found = extrapolate(bodies, times, ahead, options.model, halves)
+    elif options.dynamics.frames:
+        window = window_of(bodies, times, ahead, options.dynamics, options.model, halves)
+        found, flow = carry_by_frames(window, _evened(run, known)[0], run.oversample)
     else:
         found, flow = carry(bodies, times, ahead, options.dynamics, options.model, halves)
     exposures = scan.exposures[last].repeated(ahead)
@@ -150,9 +155,13 @@ def flow_in_words(flow: dict[str, float]) -> str:
     for name, word in (("peak", "the peak"), ("shear", "the shear modulus")):
         told = flow.get(f"{name}_told", np.nan)
         if np.isnan(told):
-            said += f"; {word} was given"
+            said += "" if "unasked" in flow else f"; {word} was given"
         elif told > UNTOLD:
             said += f"; the window does not tell {word} (standard error {told:.2f} of the range's)"
+        else:
+            said += f"; {word} to {told:.2f} of the range's standard deviation"
+    if "unasked" in flow:
+        said += f"; how well the window tells them is not asked where {flow['unasked']:.0f} numbers are unknown"
     return said + "; of the membrane's viscosity it says nothing"
 
 
@@ -215,15 +224,9 @@ def _halves(
     on_progress: FitProgress,
 ) -> Halves | None:
     """Fits to halves of the training frames; None for too few times."""
-    kept = np.flatnonzero(~known.is_test)
-    train = known[kept]
+    train, part = _evened(run, known)
     if len(train.instants) < LEAST:
         return None
-    lit = light_of(known, run.light, run.still)
-    part = None
-    if lit is not None:
-        part = lit.part(torch.from_numpy(kept))
-        train = replace(train, frames=part.evened(torch.from_numpy(train.frames)).numpy())
     total = 2 * options.fit.schedule.steps
     done = [0]
 
@@ -232,6 +235,16 @@ def _halves(
         on_progress("half-sets", done[0] / total, record)
 
     return half_sets(train, bodies, options.fit, seed, part, rest=run.rest, on_record=show)
+
+
+def _evened(run: Reconstruction, known: Scan) -> tuple[Scan, Light | None]:
+    """The training frames over the light that the run found, and that light, where it is uneven."""
+    kept = np.flatnonzero(~known.is_test)
+    train, lit = known[kept], light_of(known, run.light, run.still)
+    if lit is None:
+        return train, None
+    part = lit.part(torch.from_numpy(kept))
+    return replace(train, frames=part.evened(torch.from_numpy(train.frames)).numpy()), part
 
 
 def _judged(found: Forecast, run: Reconstruction, scan: Scan, known: Scan, slack: float) -> list[dict[str, float]]:
