@@ -113,10 +113,9 @@ def chosen_twins(bodies: MovingSurfaces, trials: Trials, on_progress: Heard = la
         on_progress(FIRST_LOOK * turn / len(asked))
         frames, own = trials.beside(now, number), only(plain, [number])
         first, other = (trials.begun(frames, start) for start in (own, twinned(own, 0, beams)))
-        first = trials.gone_on(frames, first)
         if other.loss > (1 + HOPELESS) * first.loss:
             continue
-        rivals[number] = first, trials.gone_on(frames, other)
+        rivals[number] = trials.gone_on(frames, first), trials.gone_on(frames, other)
         now = _better(now, number, bodies, rivals[number])
     close = [k for k, (first, other) in rivals.items() if abs(other.loss - first.loss) < CLOSE * first.loss]
     for turn, number in enumerate(close):
