@@ -35,7 +35,7 @@ ALIKE = 1e-4
 STRAINED = 10.0
 """Elastic energy by which a twin may exceed its body, in units of its area times the shear modulus: in trials cells in
 flow had up to four, their twins in beams across each other half a unit more, in beams at 24° 28 and more."""
-HOPELESS = 0.02
+HOPELESS = 0.05
 """Part by which the loss of a stiff fit may be larger than without the twin for the soft fit to be made."""
 STIFF_STEPS, SOFT_STEPS, TRIAL_VIEWS = 40, 40, 4
 """Steps of the two fits of a trial, and frames of a step of Adam's: with a third of these steps a body is not yet at
