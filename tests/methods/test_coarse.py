@@ -19,6 +19,7 @@ from holosplat.methods import Gaussians, Near, SmoothVolume, SurfaceOptions, Sur
 from holosplat.methods.auto import Bodies
 from holosplat.methods.coarse import CoarseToFine, mean_chord, on_pixels, unexplained
 from holosplat.methods.coarse_cloud import occupancy_of
+from holosplat.methods.cross_validation import CrossValidation
 from holosplat.methods.gaussians import GaussianStage
 from holosplat.methods.method import run_quietly
 from holosplat.model import measure
@@ -29,7 +30,7 @@ from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
 
 PITCH = 0.5e-6
-QUICK = CoarseToFine(columns=32, coarse_steps=15, last_steps=10, volume_steps=8, fit_steps=3)
+QUICK = CoarseToFine(columns=32, coarse_steps=15, last_steps=10, views=1, volume_steps=8, fit_steps=3)
 MATTER = HAEMOGLOBIN.delta_beta(20.0)
 
 
@@ -117,7 +118,9 @@ def test_fine_structure_tells_what_is_missing(scan):
 @pytest.fixture(scope="module")
 def near(scan):
     """What coarse pixels show, and the task then."""
-    return begun(Bodies(quick(), SurfaceOptions(), SmoothVolume(), 0.12).stages()[0], task_of(scan), None)
+    return begun(
+        Bodies(quick(), SurfaceOptions(), SmoothVolume(), 0.12, CrossValidation()).stages()[0], task_of(scan), None
+    )
 
 
 def test_surfaces_of_coarse_pixels_are_near_those_of_fine_ones(near):
@@ -129,7 +132,7 @@ def test_surfaces_of_coarse_pixels_are_near_those_of_fine_ones(near):
 
 
 def test_few_steps_on_fine_pixels_end_it(scan, near):
-    first, last, _ = Bodies(quick(), SurfaceOptions(), SmoothVolume(), 0.12).stages()
+    first, last, _ = Bodies(quick(), SurfaceOptions(), SmoothVolume(), 0.12, CrossValidation()).stages()
     assert first.fit(near[1], near[0]) is None
     start, task = begun(last, near[1], near[0])
     assert task.near
@@ -230,3 +233,11 @@ def test_a_near_start_says_so(scan):
     assert task.near
     _, task = begun(Stage(), task, surfaces(body(3.0)))
     assert not replace(task, near=False).near
+
+
+def test_fewer_frames_take_more_steps():
+    how = CoarseToFine(coarse_steps=40, finer_steps=20, last_steps=30, views=12)
+    few, many = how.of_views(4), how.of_views(24)
+    assert (few.coarse_steps, few.finer_steps, few.last_steps) == (120, 60, 90)
+    assert many == how
+    assert (few.volume_steps, few.fit_steps) == (how.volume_steps, how.fit_steps)

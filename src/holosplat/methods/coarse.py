@@ -50,6 +50,8 @@ class CoarseToFine:
     """Steps of the surfaces on each finer pixel but the frames' own."""
     last_steps: int = 30
     """Steps on these, which cost most."""
+    views: int = 12
+    """Frames for which these steps are enough: of fewer, each tells less and costs less, and there are more steps."""
     near_rate: Weight = 0.1
     """Length of their first steps [pixels]: half of what surfaces cut out of Gaussians need."""
     edge: Pixels = 1.5
@@ -65,7 +67,7 @@ class CoarseToFine:
 
     def __post_init__(self) -> None:
         at_least(self, 0, "columns")
-        at_least(self, 1, "coarse_steps", "finer_steps", "last_steps", "sizes")
+        at_least(self, 1, "coarse_steps", "finer_steps", "last_steps", "views", "sizes")
         at_least(self, 1, "volume_steps", "fit_steps")
 
     def factor(self, scan: Scan) -> int:
@@ -86,6 +88,12 @@ class CoarseToFine:
     def _short(self, fit: SurfaceFit, steps: int) -> SurfaceFit:
         return replace(fit, schedule=replace(fit.schedule, steps=steps), rate=self.near_rate)
 
+    def of_views(self, count: int) -> CoarseToFine:
+        """The same with steps for so many frames: as many looks at them in all as for `views`."""
+        more = max(1.0, self.views / max(1, count))
+        names = ("coarse_steps", "finer_steps", "last_steps")
+        return replace(self, **{name: round(more * getattr(self, name)) for name in names})
+
     def with_effort(self, effort: float) -> CoarseToFine:
         """The same with `effort` times the steps, at least one."""
         names = ("coarse_steps", "finer_steps", "last_steps", "volume_steps", "fit_steps")
@@ -100,7 +108,7 @@ def coarse_surfaces(
     first: surfaces to begin with, of the frames of a task; None where there are none. Small frames (`how.factor`) are
     their own coarse ones. The matter is one of a known level.
     """
-    factor, found = how.factor(task.scan), None
+    how, factor, found = how.of_views(len(task.scan.train())), how.factor(task.scan), None
     finest = 1 if factor == 1 else 2
     while factor >= finest and found is None:
         found = _first(binned(task, factor), first, surfaces, how)
