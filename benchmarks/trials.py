@@ -72,6 +72,11 @@ class Averaging:
             for name, leaf in self._leaves.items():
                 self._sums[name] += leaf.detach()
 
+    @property
+    def settled(self) -> bool:
+        """See `Optimiser`."""
+        return self._inner.settled
+
     def best(self) -> Leaves | None:
         """The mean."""
         added = self._count - self._skipped

@@ -87,7 +87,8 @@ class VolumeProblem:
         views = frames.field
         pixels = views.in_units_of(views.finest)
         self.grid = Grid.of_views(pixels)
-        self._projector = projector_for(self.grid, pixels, backend)
+        # torch's products: decisions on priors, and so the results, are those of earlier versions to the last bit
+        self._projector = projector_for(self.grid, pixels, backend, slices="reference")
         self._symbol = self._data_symbol()
         frequencies = [torch.fft.fftfreq(n) for n in self.grid.shape[:2]] + [torch.fft.rfftfreq(self.grid.shape[2])]
         z, y, x = (4 * torch.sin(math.pi * f).square() for f in frequencies)

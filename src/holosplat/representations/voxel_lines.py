@@ -69,7 +69,8 @@ class _AboutAxis:
         (dx, _, dz), (x, _, z) = grid.voxel_size, grid.origin
         shifts = np.stack([views.shifts[:, 0], np.full(len(views), top + 0.5 * (high - low - 1) * pitch)], axis=1)
         part = Views(views.rotations, shifts, (high - low, views.shape[1]), pitch)
-        self._projector = SliceProjector(Grid((nz, high - low, nx), (dx, pitch, dz), (x, top, z)), part)
+        # torch's products, for voxels are fitted without kernels, too
+        self._projector = SliceProjector(Grid((nz, high - low, nx), (dx, pitch, dz), (x, top, z)), part, "reference")
 
     def __call__(self, values: Tensor) -> Tensor:
         array = values.transpose(1, 2)
