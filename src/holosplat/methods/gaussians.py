@@ -133,7 +133,7 @@ class GaussianStage:
             return None
 
         def first(coarse: Task) -> SurfaceMesh | None:
-            return first_surfaces(coarse, options, surfaces.extraction, self.solved)
+            return first_surfaces(coarse, options, surfaces, self.solved)
 
         return coarse_surfaces(self._without_validation(task), first, surfaces, how)
 
