@@ -21,8 +21,7 @@ struct Point {
   double column, row, depth;
 };
 
-// An edge from its lower to its upper end, and where it meets the line at `row`: the same numbers for both of its
-// triangles.
+// An edge from its lower to its upper end: the same numbers for both of its triangles.
 struct Edge {
   double column, row, depth, columns, depths;  // of the lower end; per row
 
@@ -30,27 +29,39 @@ struct Edge {
     const double per_row = 1 / (high.row - low.row);  // of a level edge, which no line meets, no number
     columns = (high.column - low.column) * per_row, depths = (high.depth - low.depth) * per_row;
   }
-  Point at(double line) const { return {column + (line - row) * columns, line, depth + (line - row) * depths}; }
 };
 
-// Adds the integrals of the depth over the pixels of one image row, times `weight`.
-void integrate(const Point& one, const Point& other, double weight, double* row, int64_t width) {
-  const bool ordered = one.column <= other.column;
-  const Point &a = ordered ? one : other, &b = ordered ? other : one;
-  const double length = b.column - a.column;
+// Adds the integrals of the depth, which is `from` at the column `left` and `to` at `right`, over the pixels of one
+// image row, times `weight`.
+inline void integrate(double left, double from, double right, double to, double weight, double* row, int64_t width) {
+  const double length = right - left;
   if (!(length > 0)) return;
-  double left = std::max(a.column, -0.5);
-  const double last = std::min(b.column, width - 0.5);
-  int64_t j = static_cast<int64_t>(left + 0.5);  // left + 0.5 is not negative
-  if (left == a.column && b.column <= j + 0.5 && j < width) {  // most segments: in one pixel
-    row[j] += weight * length * (0.5 * (a.depth + b.depth));
+  double begin = std::max(left, -0.5);
+  const double last = std::min(right, width - 0.5);
+  int64_t j = static_cast<int64_t>(begin + 0.5);  // begin + 0.5 is not negative
+  if (left == begin && right <= j + 0.5 && j < width) {  // within one pixel
+    row[j] += weight * length * (0.5 * (from + to));
     return;
   }
-  const double slope = (b.depth - a.depth) / length;
-  for (; left < last; ++j) {
-    const double right = std::min(last, j + 0.5);
-    if (j < width) row[j] += weight * (right - left) * (a.depth + slope * (0.5 * (left + right) - a.column));
-    left = right;
+  const double slope = (to - from) / length;
+  for (; begin < last; ++j) {
+    const double end = std::min(last, j + 0.5);
+    if (j < width) row[j] += weight * (end - begin) * (from + slope * (0.5 * (begin + end) - left));
+    begin = end;
+  }
+}
+
+// Adds a triangle's lines first … last - 1, each from the edge `left` to the edge `right`.
+inline void draw_lines(int64_t first, int64_t last, const Edge& left, const Edge& right, double weight, int64_t lines,
+                       double* image, int64_t width) {
+  const double apart = 1.0 / lines;
+  int64_t more = lines - first % lines;  // lines of this row of pixels that are still to come
+  double* pixels = image + first / lines * width;
+  for (int64_t s = first; s < last; ++s) {
+    const double row = (s + 0.5) * apart - 0.5, up = row - left.row, on = row - right.row;
+    integrate(left.column + up * left.columns, left.depth + up * left.depths, right.column + on * right.columns,
+              right.depth + on * right.depths, weight, pixels, width);
+    if (--more == 0) more = lines, pixels += width;
   }
 }
 
@@ -59,27 +70,25 @@ void draw(const Point& a, const Point& b, const Point& c, int64_t lines, double*
   const double area = (b.column - a.column) * (c.row - a.row) - (b.row - a.row) * (c.column - a.column);
   if (area == 0) return;
   const Point *low = &a, *middle = &b, *high = &c;
-  if (middle->row < low->row) std::swap(low, middle);
-  if (high->row < middle->row) std::swap(middle, high);
-  if (middle->row < low->row) std::swap(low, middle);
-  // Line s lies at row (s + 1/2) / lines - 1/2; a line through a vertex counts with what is above it (half-open).
+  bool rightwards = area > 0;  // whether the middle corner is to the right of the edge from low to high
+  const auto sort = [&](const Point*& lower, const Point*& upper) {
+    if (upper->row < lower->row) std::swap(lower, upper), rightwards = !rightwards;
+  };
+  sort(low, middle), sort(middle, high), sort(low, middle);
+  // Line s lies at row (s + 1/2) / lines - 1/2. The first one at a corner or above it is the same for all triangles of
+  // the corner, which so share out the lines between them.
   const auto line = [&](double row) {
     return static_cast<int64_t>(std::clamp(std::ceil((row + 0.5) * lines - 0.5), 0.0, double(height * lines)));
   };
-  const double apart = 1.0 / lines, weight = area > 0 ? apart : -apart;
-  const int64_t last = std::min(line(high->row) + 1, height * lines);  // `line` may be off by its rounding
-  const Edge whole(*low, *high), lower(*low, *middle), upper(*middle, *high);
-  const int64_t first = std::max<int64_t>(line(low->row) - 1, 0);
-  int64_t left = lines - first % lines;  // lines of this row of pixels that are still to come
-  double* pixels = image + first / lines * width;
-  for (int64_t s = first; s < last; ++s) {
-    const double row = (s + 0.5) * apart - 0.5;
-    if (row >= low->row && row < high->row) {
-      const Point other = row < middle->row ? lower.at(row) : upper.at(row);
-      integrate(whole.at(row), other, weight, pixels, width);
-    }
-    if (--left == 0) left = lines, pixels += width;
-  }
+  const int64_t first = line(low->row), turn = line(middle->row), last = line(high->row);
+  if (first == last) return;
+  const double weight = (area > 0 ? 1.0 : -1.0) / lines;
+  const Edge whole(*low, *high);
+  const auto between = [&](int64_t begin, int64_t end, const Edge& part) {
+    draw_lines(begin, end, rightwards ? whole : part, rightwards ? part : whole, weight, lines, image, width);
+  };
+  if (first < turn) between(first, turn, Edge(*low, *middle));
+  if (turn < last) between(turn, last, Edge(*middle, *high));
 }
 
 // The image at (column, row), linear between the pixels' centres and zero beyond them. A single row or column stands
