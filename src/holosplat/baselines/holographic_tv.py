@@ -8,6 +8,7 @@ frequencies that only consistency between views can mend.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal
@@ -35,6 +36,13 @@ from .primal_dual import PrimalDual
 from .rays import photons_left, rays_of
 from .tomography import TotalVariation, tv_solver
 from .wave_frames import frames_of, refined
+
+Wanted = Callable[[Tensor, Grid], bool]
+"""Whether the volume [Z, Y, X] that tomography has found, and its grid, are to be made to agree with the holograms."""
+
+
+def _always(volume: Tensor, grid: Grid) -> bool:
+    return True
 
 
 @dataclass(frozen=True)
@@ -86,19 +94,30 @@ class HolographicTV:
 
 
 def holographic_tv(
-    scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress, light: Light | None = None
+    scan: Scan,
+    material: DeltaBeta,
+    options: HolographicTV,
+    on_progress: Progress,
+    light: Light | None = None,
+    wanted: Wanted = _always,
 ) -> tuple[Tensor, Grid]:
     """Occupancy [Z, Y, X] of `material` (δ > 0, β of any sign) from the frames of `scan`, and its grid.
 
     `on_progress(stage, fraction)` is called between pieces of work. light: uneven light that the frames were divided
-    by; what is left of it is found anew in each round of agreement, beside what the volume predicts.
+    by; what is left of it is found anew in each round of agreement, beside what the volume predicts. wanted: asked
+    before the rounds, unless there are none.
     """
     with memory_kept():
-        return _holographic_tv(scan, material, options, on_progress, light)
+        return _holographic_tv(scan, material, options, on_progress, light, wanted)
 
 
 def _holographic_tv(
-    scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress, light: Light | None
+    scan: Scan,
+    material: DeltaBeta,
+    options: HolographicTV,
+    on_progress: Progress,
+    light: Light | None,
+    wanted: Wanted,
 ) -> tuple[Tensor, Grid]:
     noise = noise_share(torch.from_numpy(scan.frames))
     scan, refine, factor = _working_resolution(scan, options)
@@ -108,8 +127,10 @@ def _holographic_tv(
     else:
         scan, light, solver = _settled(scan, material, options, on_progress, light)
     alone = absorption_alone(scan.exposures, material.beta / material.delta)  # then retrieval left nothing to correct
-    if options.corrections == 0 or options.still_light or noise > options.noisy or alone.all():
-        return solver.volume, Grid.of_views(_field(scan, solver))
+    volume, grid = solver.volume, Grid.of_views(_field(scan, solver))
+    none = options.corrections == 0 or options.still_light or noise > options.noisy or alone.all()
+    if none or not wanted(volume, grid):
+        return volume, grid
     return _agree(scan, material, solver, options, refine, on_progress, light)
 
 

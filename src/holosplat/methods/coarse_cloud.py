@@ -14,6 +14,8 @@ from .method import Task
 
 MOST_VOXELS = 1 << 25
 """Voxels that are looked at together: an array of them is 134 MB."""
+EDGE = 64
+"""Voxels along an edge of the blocks of the volume that Gaussians learn; empty ones are left out."""
 MOST_GAUSSIANS = 2_000_000
 """Gaussians at most; beyond, all are twice as large."""
 
@@ -27,7 +29,7 @@ def cloud_of_surfaces(mesh: SurfaceMesh, task: Task, how: CoarseToFine) -> Gauss
     while len(found) > MOST_GAUSSIANS:
         edge *= 2
         found = cloud_in_octree(occupancy, grid, channel, mesh.unit_length, how.sizes, edge)
-    return approximate(found, occupancy, grid, how.volume_steps, task.on_progress, most_voxels=MOST_VOXELS)
+    return approximate(found, occupancy, grid, how.volume_steps, task.on_progress, edge=EDGE)
 
 
 def occupancy_of(mesh: SurfaceMesh, grid: Grid) -> Tensor:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import torch
+from torch import Tensor
 
 from ..baselines import holographic_tv
 from ..checks import InputError
-from ..matter import DeltaBeta, Matter
+from ..geometry import Grid
+from ..matter import Matter
 from ..optics.noise import noise_share
 from ..representations import GaussianCloud, SurfaceMesh
 from .coarse import unexplained
@@ -36,23 +37,27 @@ def first_surfaces(
         if options.start == "learned" or is_noisy(task, options):
             cloud = fitted(task)
             return extract_surfaces(cloud, task.scan, surfaces.extraction) if cloud.matter.single else None
-        cut = partial(_cut, task, options, surfaces, material_of_levels(task, options.volume.backend, options.estimate))
-        first = cut(rounds=0)
-        if (left := unexplained(first, task.scan, surfaces)) <= options.coarse.missing:
-            return first
-        agreed = cut(rounds=options.volume.corrections)
-        return agreed if unexplained(agreed, task.scan, surfaces) < left else first
+        return _of_volume(task, options, surfaces)
     except InputError:  # there is no matter, or no surface
         return None
 
 
-def _cut(
-    task: Task, options: GaussianOptions, surfaces: SurfaceOptions, material: DeltaBeta, rounds: int
-) -> SurfaceMesh:
-    """The surfaces of a volume of `material` after so many rounds of agreement."""
-    how = replace(options.volume, corrections=rounds, refine=1)
-    volume, grid = holographic_tv(task.scan, material, how, task.on_progress, task.uneven)
-    return cut_surfaces(volume, grid, task.scan.views.finest, Matter.one(*material), surfaces.extraction)
+def _of_volume(task: Task, options: GaussianOptions, surfaces: SurfaceOptions) -> SurfaceMesh:
+    """Those of a volume, before or after its rounds of agreement."""
+    tried = list[tuple[float, SurfaceMesh]]()
+    matter = material_of_levels(task, options.volume.backend, options.estimate)
+
+    def poor(volume: Tensor, grid: Grid) -> bool:
+        """Whether the surfaces of a volume, which join those that were tried, explain the frames badly."""
+        cut = cut_surfaces(volume, grid, task.scan.views.finest, Matter.one(*matter), surfaces.extraction)
+        tried.append((unexplained(cut, task.scan, surfaces), cut))
+        return tried[-1][0] > options.coarse.missing
+
+    how = replace(options.volume, refine=1)
+    last = holographic_tv(task.scan, matter, how, task.on_progress, task.uneven, poor)
+    if not tried or tried[0][0] > options.coarse.missing:
+        poor(*last)
+    return min(tried, key=lambda one: one[0])[1]
 
 
 def is_noisy(task: Task, options: GaussianOptions) -> bool:
