@@ -6,7 +6,6 @@ pixel `(i, j)` has its centre at `x = (j + ½ - W/2) p + sx`, `y = (i + ½ - H/2
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -377,13 +376,6 @@ class Grid:
         """The part of `shape` voxels whose first one is voxel `start` (z, y, x) of this grid."""
         origin = [o + d * i for o, d, i in zip(self.origin, self.voxel_size, start[::-1])]
         return Grid(shape, self.voxel_size, (origin[0], origin[1], origin[2]))
-
-    def slabs(self, most_voxels: int) -> Iterator[tuple[int, Grid]]:
-        """The first slice and the grid of parts along z, of at most so many voxels each, or of one slice (0: all)."""
-        count, rows, columns = self.shape
-        depth = max(1, most_voxels // (rows * columns)) if most_voxels else count
-        for first in range(0, count, depth):
-            yield first, self.block((first, 0, 0), (min(depth, count - first), rows, columns))
 
     def divided(self, factors: tuple[int, int, int]) -> Grid:
         """The same extent with each voxel divided by `factors` `(fx, fy, fz)`; the grid itself where all are 1.

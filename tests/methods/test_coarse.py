@@ -20,9 +20,11 @@ from holosplat.methods.auto import Bodies
 from holosplat.methods.coarse import CoarseToFine, mean_chord, on_pixels, unexplained
 from holosplat.methods.coarse_cloud import occupancy_of
 from holosplat.methods.cross_validation import CrossValidation
+from holosplat.methods.first_surfaces import first_surfaces
 from holosplat.methods.gaussians import GaussianStage
 from holosplat.methods.method import run_quietly
 from holosplat.model import measure
+from holosplat.projectors.surface import surface_occupancy
 from holosplat.representations import GaussianCloud, SurfaceMesh
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.scene import MeshScene
@@ -112,6 +114,21 @@ def test_fine_structure_tells_what_is_missing(scan):
     assert unexplained(true, flat, options) == 0.0
 
 
+@pytest.mark.parametrize(("missing", "rounds"), [(1.0, False), (0.0, True)])
+def test_rounds_of_agreement_come_first_where_a_volume_explains_badly(scan, missing, rounds):
+    """Of both volumes, the one whose surfaces leave less is taken."""
+    stages, left = set[str](), dict[float, float]()
+    task = replace(task_of(scan), on_progress=lambda stage, share: stages.add(stage))
+    for most in (1.0, missing):
+        volume = HolographicTV(retrieval=10, iterations=30, corrections=3)
+        options = replace(quick(replace(QUICK, missing=most)), volume=volume)
+        found = first_surfaces(task, options, SurfaceOptions(), lambda task: pytest.fail("no Gaussians are wanted"))
+        assert found is not None
+        left[most] = unexplained(found, scan, SurfaceOptions())
+    assert ("agreement with the holograms" in stages) == rounds
+    assert left[missing] <= left[1.0]
+
+
 # --- from coarse to fine ------------------------------------------------------------------------------------
 
 
@@ -195,26 +212,21 @@ def test_a_run_goes_on_from_a_near_start_with_as_few_steps(scan, near, tmp_path,
     assert isinstance(load_reconstruction(folder).object, SurfaceMesh)
 
 
-def test_occupancy_slab_by_slab(monkeypatch):
-    mesh = surfaces(body(5.0), unit=PITCH)
+def test_occupancy_some_rows_at_a_time(monkeypatch):
+    mesh, heights = surfaces(body(5.0), unit=PITCH), list[int]()
     grid = Grid.centred((15, 17, 13), PITCH)
     whole = mesh.voxelise(grid).delta / DELTA
     assert np.abs(occupancy_of(mesh, grid).numpy() - whole).max() < 1e-6
-    monkeypatch.setattr(coarse_cloud, "MOST_VOXELS", 4 * 4 * 17 * 13)
-    assert [first for first, _ in grid.slabs(coarse_cloud.MOST_VOXELS // 4)] == [0, 4, 8, 12]
+
+    def few(vertices, faces, shape):
+        heights.append(shape[1])
+        assert len(faces) < len(mesh.faces)
+        return surface_occupancy(vertices, faces, shape)
+
+    monkeypatch.setattr(coarse_cloud, "MOST_VOXELS", 8 * 3 * 15 * 13)
+    monkeypatch.setattr(coarse_cloud, "surface_occupancy", few)
     assert np.abs(occupancy_of(mesh, grid).numpy() - whole).max() < 1e-6
-
-
-def test_slabs_of_a_grid():
-    def cut(shape: tuple[int, int, int], most: int) -> list[tuple[int, int]]:
-        return [(first, slab.shape[0]) for first, slab in Grid.centred(shape, PITCH).slabs(most)]
-
-    assert cut((10, 4, 5), 60) == [(0, 3), (3, 3), (6, 3), (9, 1)]
-    assert cut((2, 40, 50), 60) == [(0, 1), (1, 1)]
-    assert cut((10, 4, 5), 0) == [(0, 10)]
-    grid = Grid.centred((10, 4, 5), PITCH)
-    last = list(grid.slabs(60))[-1][1]
-    assert last.axes()[2][-1] == pytest.approx(grid.axes()[2][-1], rel=1e-12)
+    assert heights == [3, 3, 3, 3, 3]  # rows 0 to 14; nothing is in the last two
 
 
 def test_a_near_start_says_so(scan):

@@ -14,7 +14,7 @@ from .method import Task
 
 MOST_VOXELS = 1 << 25
 """Voxels that are looked at together: an array of them is 134 MB."""
-EDGE = 64
+EDGE = 32
 """Voxels along an edge of the blocks of the volume that Gaussians learn; empty ones are left out."""
 MOST_GAUSSIANS = 2_000_000
 """Gaussians at most; beyond, all are twice as large."""
@@ -33,11 +33,18 @@ def cloud_of_surfaces(mesh: SurfaceMesh, task: Task, how: CoarseToFine) -> Gauss
 
 
 def occupancy_of(mesh: SurfaceMesh, grid: Grid) -> Tensor:
-    """The part of each voxel of `grid` that is inside, float32 [Z, Y, X], slab by slab: its own arrays are float64."""
+    """The part of each voxel of `grid` that is inside, float32 [Z, Y, X], some rows at a time: its own arrays are
+    float64, and of the triangles only those count that reach into the rows."""
     voxel, origin = (torch.tensor(values, dtype=torch.float64) for values in (grid.voxel_size, grid.origin))
     vertices = (mesh.vertices.detach() * mesh.unit_length - origin) / voxel
-    found = torch.zeros(grid.shape)
-    for first, slab in grid.slabs(MOST_VOXELS // 4):
-        moved = vertices - torch.tensor([0.0, 0.0, first], dtype=torch.float64)
-        found[first : first + slab.shape[0]] = surface_occupancy(moved, mesh.faces, slab.shape)
+    heights = vertices[:, 1][mesh.faces]
+    low, high = heights.amin(dim=1), heights.amax(dim=1)
+    found, (depth, height, width) = torch.zeros(grid.shape), grid.shape
+    rows = max(1, MOST_VOXELS // (8 * depth * width))
+    for first in range(0, height, rows):
+        count = min(rows, height - first)
+        faces = mesh.faces[(high >= first - 1) & (low <= first + count)]
+        if len(faces):
+            moved = vertices - torch.tensor([0.0, first, 0.0], dtype=torch.float64)
+            found[:, first : first + count] = surface_occupancy(moved, faces, (depth, count, width))
     return found
