@@ -175,10 +175,10 @@ def sizes() -> str:
         scores = [row["ssim"], row["frcm"], row["dice"], row["relative_error_delta"]]
         scores = [rounded(score, 3) for score in scores]
         times = [f"{float(row[name]):.0f}" for name in ("seconds", "cpu_seconds")]
-        of = [row["pixels"], row["pitch_um"], row["method"], row["seed"]]
+        of = [row["pixels"], row["pitch_um"], f"{row['bodies']} of {row['diameter_um']}", row["method"], row["seed"]]
         lines.append([*of, *scores, row["result"], *times, f"{float(row['peak_gib']):.1f}", row["load"], row["commit"]])
-    head = ("pixels", "pitch / µm", "method", "seed", "SSIM", "FRCM", "Dice", "error of δ", "result", "time / s")
-    return markdown((*head, "of processors / s", "peak / GiB", "load", "commit"), lines)
+    head = ("pixels", "pitch / µm", "bodies, µm", "method", "seed", "SSIM", "FRCM", "Dice", "error of δ", "result")
+    return markdown((*head, "time / s", "of processors / s", "peak / GiB", "load", "commit"), lines)
 
 
 def worst(method: str) -> dict[str, str]:

@@ -90,7 +90,7 @@ def _on_raster(vertices: Tensor, rotations: Tensor, shifts: Tensor, shape: tuple
     h, w = shape
     offset = torch.zeros(len(shifts), 1, 3).to(vertices)
     offset[:, 0, :2] = 0.5 * torch.tensor([w - 1, h - 1]).to(vertices) - shifts
-    return vertices @ rotations.mT + offset
+    return torch.baddbmm(offset, vertices.expand(len(shifts), -1, -1), rotations.mT)  # one pass over the points
 
 
 class _Thickness(torch.autograd.Function):
