@@ -30,10 +30,12 @@ def cloud_in_octree(
     isotropic Gaussian of its mass with half its edge as standard deviation, as in `cloud_from_volume`. filled: share of
     matter from which on a block is taken. unit_length [m]: the cloud's unit. Errors: `InputError` where all is empty.
     """
-    volume = occupancy.float().clamp_min(0)
     whole = edge * 2 ** (sizes - 1)
-    missing = [(-n) % whole for n in volume.shape]
-    levels = _levels(pad(volume, (0, missing[2], 0, missing[1], 0, missing[0])), sizes, edge)
+    missing = [(-n) % whole for n in occupancy.shape]
+    volume = occupancy.float()
+    if any(missing):  # a large volume is not copied in vain
+        volume = pad(volume, (0, missing[2], 0, missing[1], 0, missing[0]))
+    levels = _levels(volume.clamp_min(0) if float(volume.min()) < 0 else volume, sizes, edge)
     mass, corner, size = (torch.cat(parts) for parts in zip(*_chosen(levels, filled, edge)))
     require(len(mass) > 0, "there is no matter in the volume to make Gaussians of.")
     voxel = grid.voxel_size[0]
