@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
 import pytest
 import torch
 
@@ -12,8 +11,6 @@ from helpers.bumpy import area, bumpy
 from holosplat.checks import InputError
 from holosplat.geometry import Grid
 from holosplat.mesh import TriangleMesh
-from holosplat.representations import approximate
-from holosplat.representations.blocks import MARGIN, filled_blocks
 from holosplat.representations.octree import cloud_in_octree
 from holosplat.representations.subdivision import edge_lengths, subdivided
 
@@ -78,14 +75,6 @@ def ball(grid: Grid, radius: float) -> torch.Tensor:
     return ((radius - distance) / grid.voxel_size[0] + 0.5).clamp(0, 1).float()
 
 
-def lopsided(grid: Grid) -> torch.Tensor:
-    """Occupancy of a body without symmetry, 10 × 7 × 9 voxels."""
-    x, y, z = (torch.from_numpy(axis) for axis in grid.axes())
-    y, z = y[:, None], z[:, None, None]
-    r = (((x - 0.37 - 0.1 * y) / 5.1) ** 2 + ((y + 0.21) / 3.3) ** 2 + ((z - 0.43 + 0.07 * x) / 4.3) ** 2).sqrt()
-    return (4 * (1 - r) + 0.5).clamp(0, 1).float()
-
-
 def test_the_cloud_of_an_octree_keeps_mass_and_is_flat_inside():
     grid = Grid.centred((41, 39, 46), 0.5e-6)
     occupancy = ball(grid, 8.5e-6)
@@ -120,50 +109,3 @@ def test_larger_blocks_touch_nothing_that_changes():
 def test_an_empty_volume_is_refused():
     with pytest.raises(InputError, match="there is no matter"):
         cloud_in_octree(torch.zeros(4, 5, 6), Grid.centred((4, 5, 6), 1.0), (1e-6, 1e-9), 1.0, 2)
-
-
-def test_a_cloud_learns_a_volume_block_by_block_as_at_once():
-    grid = Grid.centred((13, 11, 15), 1.0)
-    occupancy = lopsided(grid)  # by symmetry, gradients of a ball are next to nothing, and Adam's steps are chance
-    start = cloud_in_octree(occupancy, grid, (1e-6, 1e-9), 1.0, 1)
-
-    def learnt(edge: int) -> np.ndarray:
-        found = approximate(start, occupancy, grid, 6, lambda stage, part: None, edge=edge)
-        return found.density(grid)[0].detach().numpy()
-
-    whole = learnt(0)
-    assert np.abs(learnt(4) - whole).max() < 1e-4
-    left = (float(np.square(d - occupancy.numpy()).sum()) for d in (start.density(grid)[0].detach().numpy(), whole))
-    assert next(left) > 1.5 * next(left)
-
-
-def test_only_blocks_near_matter_are_looked_at():
-    """Every voxel within the margin of matter is in one block, and no block is far from matter."""
-    grid, edge = Grid.centred((45, 31, 70), 0.5), 12
-    occupancy = torch.zeros(grid.shape)
-    occupancy[20:24, 3:6, 40:47] = 0.3
-    seen, near = torch.zeros(grid.shape), torch.zeros(grid.shape)
-    near[20 - MARGIN : 24 + MARGIN, : 6 + MARGIN, 40 - MARGIN : 47 + MARGIN] = 1
-    for block in filled_blocks(occupancy, grid, edge):
-        x, y, z = (round((a - b) / 0.5) for a, b in zip(block.grid.origin, grid.origin))
-        depth, height, width = block.grid.shape
-        part = (slice(z, z + depth), slice(y, y + height), slice(x, x + width))
-        seen[part] += 1
-        assert torch.equal(block.values, occupancy[part])
-        assert near[part].any()
-    assert torch.equal(seen[near > 0], torch.ones(int(near.sum())))
-    assert seen.max() == 1
-    assert seen.mean() < 0.5
-
-
-def test_a_block_knows_the_gaussians_that_reach_it():
-    grid = Grid.centred((24, 20, 28), 1.0)
-    cloud = cloud_in_octree(lopsided(grid), grid, (1e-6, 1e-9), 1.0, 2)
-    whole = cloud.density(grid)[0]
-    for block in filled_blocks(lopsided(grid), grid, 7):
-        index = block.near(cloud)
-        few = cloud.replaced(p[index] for p in cloud.parameters().values()).density(block.grid)[0]
-        x, y, z = (round(a - b) for a, b in zip(block.grid.origin, grid.origin))
-        depth, height, width = block.grid.shape
-        assert torch.allclose(few, whole[z : z + depth, y : y + height, x : x + width], atol=1e-6)
-    assert len(index) < len(cloud)

@@ -62,17 +62,19 @@ class CoarseToFine:
     """Mean length of triangles' edges [pixels] from which on they are divided on pixels between."""
     last_edge: Pixels = 2.5
     """The same on the frames' own pixels."""
-    sizes: int = 3
-    """Sizes of Gaussians that fill the surfaces, from one pixel on, each twice the last."""
-    volume_steps: int = 40
-    """Steps in which these Gaussians learn the surfaces' volume."""
+    sizes: int = 1
+    """Sizes of Gaussians that fill the surfaces, from one pixel on, each twice the last. Where sizes meet, their sum is
+    not flat, which costs more than the tenth of the Gaussians that larger ones save."""
     fit_steps: int = 40
     """Steps of the fit of Gaussians from there."""
+    fit_rate: Weight = 0.1
+    """Adam's rates in these steps, as a share of those of a fit that begins far away: its first ones are as long for
+    every parameter, and would blur what is sharp."""
 
     def __post_init__(self) -> None:
         at_least(self, 0, "columns")
         at_least(self, 1, "coarse_steps", "finer_steps", "last_steps", "views", "sizes")
-        at_least(self, 1, "volume_steps", "fit_steps")
+        at_least(self, 1, "fit_steps")
 
     def factor(self, scan: Scan) -> int:
         """Pixels of `scan` along an edge of the coarsest: a power of two, 1 where its frames are small."""
@@ -100,7 +102,7 @@ class CoarseToFine:
 
     def with_effort(self, effort: float) -> CoarseToFine:
         """The same with `effort` times the steps, at least one."""
-        names = ("coarse_steps", "finer_steps", "last_steps", "volume_steps", "fit_steps")
+        names = ("coarse_steps", "finer_steps", "last_steps", "fit_steps")
         return replace(self, **{name: max(1, round(effort * getattr(self, name))) for name in names})
 
 
@@ -128,6 +130,11 @@ def coarse_surfaces(
         return found
     found = _run(replace(task, freedom=None), found, how.nearby(surfaces.fit))  # edges may be off by more
     return found if unexplained(found, task.scan, surfaces) <= most else None
+
+
+def last_steps(task: Task, found: SurfaceMesh, surfaces: SurfaceOptions, how: CoarseToFine) -> SurfaceMesh:
+    """The surfaces that `coarse_surfaces` has `found`, fitted to the frames of `task` themselves."""
+    return _run(replace(task, freedom=None), found, how.of_views(len(task.scan.train())).nearby(surfaces.fit))
 
 
 def binned(task: Task, factor: int) -> Task:

@@ -7,21 +7,19 @@ from torch import Tensor
 
 from ..geometry import Grid
 from ..projectors.surface import surface_occupancy
-from ..representations import GaussianCloud, SurfaceMesh, approximate
+from ..representations import GaussianCloud, SurfaceMesh
 from ..representations.octree import cloud_in_octree
 from .coarse import CoarseToFine
 from .method import Task
 
 MOST_VOXELS = 1 << 25
 """Voxels that are looked at together: an array of them is 134 MB."""
-EDGE = 32
-"""Voxels along an edge of the blocks of the volume that Gaussians learn; empty ones are left out."""
-MOST_GAUSSIANS = 2_000_000
+MOST_GAUSSIANS = 3_000_000
 """Gaussians at most; beyond, all are twice as large."""
 
 
 def cloud_of_surfaces(mesh: SurfaceMesh, task: Task, how: CoarseToFine) -> GaussianCloud:
-    """Gaussians that approximate the volume of `mesh` on voxels of a pixel of the frames of `task`."""
+    """Gaussians that fill the volume of `mesh` on voxels of a pixel of the frames of `task`."""
     grid = Grid.of_views(task.scan.views)
     occupancy = occupancy_of(mesh, grid)
     edge, channel = 1, mesh.matter.channels[0]
@@ -29,7 +27,7 @@ def cloud_of_surfaces(mesh: SurfaceMesh, task: Task, how: CoarseToFine) -> Gauss
     while len(found) > MOST_GAUSSIANS:
         edge *= 2
         found = cloud_in_octree(occupancy, grid, channel, mesh.unit_length, how.sizes, edge)
-    return approximate(found, occupancy, grid, how.volume_steps, task.on_progress, edge=EDGE)
+    return found
 
 
 def occupancy_of(mesh: SurfaceMesh, grid: Grid) -> Tensor:
@@ -47,4 +45,4 @@ def occupancy_of(mesh: SurfaceMesh, grid: Grid) -> Tensor:
         if len(faces):
             moved = vertices - torch.tensor([0.0, first, 0.0], dtype=torch.float64)
             found[:, first : first + count] = surface_occupancy(moved, faces, (depth, count, width))
-    return found
+    return found.clamp_(min=0)  # of rounding

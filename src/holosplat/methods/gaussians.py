@@ -26,11 +26,11 @@ from ..ranges import ranged
 from ..representations import GaussianCloud, Stored, SurfaceMesh
 from ..scan import Scan
 from .coarse import STAGE as COARSE
-from .coarse import coarse_surfaces
+from .coarse import CoarseToFine, coarse_surfaces, last_steps
 from .coarse_cloud import cloud_of_surfaces
 from .field import field_of
 from .first_surfaces import first_surfaces
-from .gaussian_options import Backend, FitOptions, GaussianOptions
+from .gaussian_options import Backend, FitOptions, GaussianOptions, GaussianRates
 from .ground import Ground, ground
 from .learned import learned_cloud
 from .method import Near, Stage, Task, run_quietly
@@ -85,6 +85,7 @@ class GaussianStage:
         surfaces = self.coarse_surfaces(task, SurfaceOptions())
         if surfaces is None:
             return self.own_start(task)
+        surfaces = last_steps(self._without_validation(task), surfaces, SurfaceOptions(), self.options.coarse)
         return Near(cloud_of_surfaces(surfaces, task, self.options.coarse).on(self.options.volume.backend))
 
     def own_start(self, task: Task) -> GaussianCloud:
@@ -119,7 +120,7 @@ class GaussianStage:
         assert isinstance(start, GaussianCloud)
         options = resolved(self.options.fit, task, start.matter)
         if task.near:
-            options = replace(options, schedule=replace(options.schedule, steps=self.options.coarse.fit_steps))
+            options = nearby(options, self.options.coarse)
         return gaussian_fit(task.scan, start, options, task.seed, task.uneven, task.freedom)
 
     def coarse_surfaces(self, task: Task, surfaces: SurfaceOptions) -> SurfaceMesh | None:
@@ -149,6 +150,12 @@ def resolved(options: FitOptions, task: Task, matter: Matter) -> FitOptions:
     if task.bounded or (task.matter == "levels" and matter.second is not None):
         return options
     return replace(options, objective=replace(options.objective, overfull=0.0, two_levels=0.0))
+
+
+def nearby(options: FitOptions, how: CoarseToFine) -> FitOptions:
+    """The options of a fit that begins near to where it ends: fewer and shorter steps."""
+    rates = GaussianRates(**{name: how.fit_rate * rate for name, rate in vars(options.rates).items()})
+    return replace(options, rates=rates, schedule=replace(options.schedule, steps=how.fit_steps))
 
 
 def gaussian_fit(

@@ -14,7 +14,6 @@ from ..checks import require
 from ..geometry import Grid, Views
 from ..matter import Matter
 from ..memory import memory_kept
-from .blocks import Block, filled_blocks
 from .gaussians import GaussianCloud, raw_of
 
 SMALLEST = 1e-3
@@ -28,8 +27,6 @@ FILLED = 0.05
 """Share of matter from which on a block becomes a Gaussian, unless the caller says otherwise."""
 CALM = 0.2
 """Change of a block's occupancy towards its neighbours, as a share of it, below which nothing changes there."""
-LOOKED_UP = 8
-"""Steps after which it is looked up anew which Gaussians are near which block."""
 RATES = (0.02, 0.02, 0.02, 0.05)
 """Adam's first rates of centres, log-scales, quaternions and amplitudes while a cloud learns a volume, likewise."""
 
@@ -117,55 +114,26 @@ def approximate(
     steps: int,
     on_progress: Callable[[str, float], None],
     rates: Sequence[float] = RATES,
-    *,
-    edge: int = 0,
 ) -> GaussianCloud:
     """The cloud after `steps` of Adam towards `occupancy` on `grid`, by mean squared difference.
 
     occupancy: [Z, Y, X], or [C, Z, Y, X] of each of the cloud's channels. It starts a hologram fit where the classical
     reconstruction ended. `on_progress(stage, fraction)`. rates: first ones of centres, log-scales, quaternions and
-    amplitudes. edge: of blocks [voxels], of which only those near matter are looked at, one after another in each step
-    (0: the whole volume at once).
+    amplitudes.
     """
-    leaves = [p.detach().clone() for p in cloud.parameters().values()]
+    leaves = [p.detach().clone().requires_grad_() for p in cloud.parameters().values()]
     cloud = cloud.replaced(leaves)
     states = [[torch.zeros_like(leaf), torch.zeros_like(leaf), torch.zeros((), device=leaf.device)] for leaf in leaves]
     power = float(occupancy.square().sum())
-    blocks = list(filled_blocks(occupancy, grid, edge)) if edge else [Block(grid, occupancy)]
-    near: list[Tensor | None] = [None] * len(blocks)
     with memory_kept():
         for step in range(steps):
             on_progress("Gaussians for the volume", step / steps)
-            if edge and step % LOOKED_UP == 0:
-                near = [block.near(cloud) for block in blocks]
-            for leaf in leaves:
-                leaf.grad = torch.zeros_like(leaf)
-            for block, index in zip(blocks, near):
-                _add_gradients(leaves, cloud, block, index, power)
+            density = cloud.density(grid)
+            # The gradient of Σ (density - occupancy)² / power, without the arrays that autograd would keep.
+            density.backward((density.detach() - occupancy).mul_(2 / power))
             for leaf, rate, state in zip(leaves, rates, states):
                 _adam_step(leaf, rate * 0.1 ** (step / steps), state)
     return cloud.detached()
-
-
-def _add_gradients(
-    leaves: Sequence[Tensor], cloud: GaussianCloud, block: Block, index: Tensor | None, power: float
-) -> None:
-    """Add the gradients of Σ (density - occupancy)² / power over a block; index: of the Gaussians near it (None: all).
-
-    Without the arrays that autograd would keep.
-    """
-    parts = [(leaf if index is None else leaf[index]).detach().requires_grad_() for leaf in leaves]
-    if index is not None and not len(index):
-        return
-    density = cloud.replaced(parts).density(block.grid)
-    density.backward((density.detach() - block.values).mul_(2 / power))
-    for leaf, part in zip(leaves, parts):
-        assert leaf.grad is not None
-        assert part.grad is not None
-        if index is None:
-            leaf.grad.add_(part.grad)
-        else:
-            leaf.grad.index_add_(0, index, part.grad)
 
 
 def _adam_step(leaf: Tensor, rate: float, state: Sequence[Tensor]) -> None:
