@@ -17,7 +17,6 @@ from torch.nn.functional import avg_pool2d
 
 from ..checks import at_least
 from ..optics.noise import noise_levels
-from ..optics.sampling import fringe_sampling
 from ..ranges import Pixels, Share, Weight, ranged
 from ..representations import SurfaceMesh
 from ..representations.subdivision import edge_lengths, subdivided
@@ -155,19 +154,13 @@ def _first(
     if start is None or mean_chord(start) < how.chord * task.scan.views.finest:
         return None
     schedule = replace(surfaces.fit.schedule, steps=how.coarse_steps)
-    return _run(task, start, _rough(replace(surfaces.fit, schedule=schedule), task.scan))
+    return _run(task, start, replace(surfaces.fit, schedule=schedule))
 
 
 def _fitted(task: Task, found: SurfaceMesh, surfaces: SurfaceOptions, how: CoarseToFine) -> SurfaceMesh:
     """The surfaces on the pixels of `task`."""
     start = on_pixels(found, task.scan.views.finest, how.edge)
-    return _run(task, start, _rough(how.between(surfaces.fit), task.scan))
-
-
-def _rough(fit: SurfaceFit, scan: Scan) -> SurfaceFit:
-    """The fit with waves sampled as the first fringe needs: sharp edges want finer ones where surfaces end."""
-    samples = fit.schedule.oversample or fringe_sampling(scan.exposures)
-    return replace(fit, schedule=replace(fit.schedule, oversample=samples))
+    return _run(task, start, how.between(surfaces.fit))
 
 
 def _run(task: Task, start: SurfaceMesh, options: SurfaceFit) -> SurfaceMesh:
