@@ -25,6 +25,7 @@ from .guesses import network_for
 from .halves import astray, halves_of, tell_shapes
 from .journal import Journal, Nowhere, from_sightings, to_sightings
 from .known import KnownBodies, at_rest
+from .mergers import without_merger
 from .pieces import chosen_paths
 from .remainder import apart, beside, joined, only, sure_ones, whole_ones
 from .rest_shape import KnownBody
@@ -157,8 +158,10 @@ class _Following:
     def _go_on(self, bodies: MovingSurfaces) -> None:
         """The stages after the first paths."""
         if self.stage == "stiff":
-            self.bodies = self.whole(self.fitted("stiff fit", self.train, bodies, self.options.stiff, self.light))
-            self.stage = "beside" if self.round < self.options.rounds else "paths"
+            whole = self.whole(self.fitted("stiff fit", self.train, bodies, self.options.stiff, self.light))
+            self.bodies = without_merger(whole, self.train.instants)
+            after = "beside" if self.round < self.options.rounds else "paths"
+            self.stage = after if self.bodies is whole else "stiff"
         elif self.stage == "beside":
             more = self.more(bodies)
             self.round += 1
