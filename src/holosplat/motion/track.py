@@ -186,8 +186,10 @@ class _Following:
             part = parts[len(self.halves)]
             light = self.light and self.light.part(torch.from_numpy(part))
             side = 1 - 2 * (len(self.halves) % 2)
-            bodies = bodies if tell_shapes(self.train) else astray(bodies, self.seed, side)
-            self.halves.append(self.fitted("intervals", self.train[part], bodies, self.options.half, light))
+            told = tell_shapes(self.train)
+            bodies = bodies if told else astray(bodies, self.seed, side)
+            how = self.options.half if told or self.options.body else self.options.soft
+            self.halves.append(self.fitted("intervals", self.train[part], bodies, how, light))
         if len(self.halves) == len(parts):
             self.stage = "done"
 
