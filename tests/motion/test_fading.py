@@ -63,7 +63,8 @@ def search(scan, spread: float) -> Search:
         most_degree=0,
         steps=2,
         iterations=12,
-        final=16,
+        final=32,
+        most_final=32,
         spacing_px=1.0,
         fading=spread,
     )

@@ -14,7 +14,9 @@ from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import SmoothVolume, Task
-from holosplat.motion.carried import CarriedOptions, Search, merged, of_degree, on_lattice, trendless
+from holosplat.motion.carried import CarriedOptions, Search
+from holosplat.motion.freer_flow import of_degree, on_lattice
+from holosplat.motion.timed_frames import merged, trendless
 from holosplat.representations import Flow, Lattice, TimeBasis, VoxelGrid
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.carried import CarriedScene
@@ -59,7 +61,7 @@ def drifting() -> tuple[CarriedScene, Scan]:
 
 
 def search(scan: Scan, **options: object) -> Search:
-    usual = {"cells": 2, "most_degree": 0, "most_cells": 2, "steps": 2, "iterations": 6, "final": 8}
+    usual = {"cells": 2, "most_degree": 0, "most_cells": 2, "steps": 2, "iterations": 6, "final": 16, "most_final": 24}
     how = CarriedOptions(**{**usual, "volume": QUICK, "spacing_px": 1.0, **options})  # pyright: ignore[reportArgumentType]
     return Search(Task(scan, MaterialPrior.known(MATTER)), MATTER, how)
 
@@ -111,7 +113,7 @@ def test_steps_never_make_it_less_likely(drifting):
 def test_a_drift_is_found_and_all_times_are_better_than_each_by_itself():
     """In so few photons that single times hardly show the matter."""
     scene, scan = series((4e-6, -2e-6, 3e-6), 250.0)
-    how = search(scan, iterations=10, final=12)
+    how = search(scan, iterations=10, final=24)
     found, grid = how.run(), Grid.of_views(scan.views)
     own = [
         error(how.by_itself(scan.at_instant(k), "one").voxelise(grid), scene.at(TIMES[k]).voxelise(grid))

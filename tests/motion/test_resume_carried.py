@@ -17,7 +17,7 @@ from holosplat.scan import Exposures, Scan
 MATTER = DeltaBeta(8e-7, 8e-10)
 QUICK = CarriedOptions(
     volume=SmoothVolume(coarser=(), rounds=1, iterations=3), cells=2, most_degree=1, most_cells=3, steps=2,
-    iterations=2, final=2, spacing_px=2.0, approximate_steps=3,
+    iterations=2, final=2, most_final=4, spacing_px=2.0, approximate_steps=3,
 )  # fmt: skip
 
 

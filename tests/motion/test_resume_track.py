@@ -116,7 +116,7 @@ def test_halves_share_no_frame():
     assert halves_of(three, TimeBasis(0.0, 1.0, 2)) == []
 
 
-def test_halves_of_few_views_begin_apart():
+def test_halves_of_few_views_begin_apart(monkeypatch):
     """By a tenth of a body's radius to either side, at all times alike; those of four views begin with the result."""
     bodies = true_paths()
     one, other = (astray(bodies, 3, side).coefficients - bodies.coefficients for side in (1, -1))
@@ -128,10 +128,27 @@ def test_halves_of_few_views_begin_apart():
     assert 0.5 < float(one[0, own].square().sum(1).mean().sqrt()) / (ASTRAY * radius) < 3
     assert tell_shapes(scan())
     assert not tell_shapes(three_views())
+    monkeypatch.setattr(track._Following, "fitted", lambda run, name, frames, start, how, light: start)
     result = follow(three_views(), MATERIAL, QUICK)
     apart = result.halves[0].coefficients - result.halves[1].coefficients
     middle = 0.5 * (result.halves[0].coefficients + result.halves[1].coefficients)
     assert float(apart.square().mean()) > 100 * float((middle - result.bodies.coefficients).square().mean())
+
+
+def test_halves_that_begin_apart_are_fitted_to_the_end_where_no_shape_is_known(monkeypatch):
+    steps: list[tuple[str, int]] = []
+
+    def fitted(run, name, frames, start, how, light):
+        steps.append((name, how.schedule.steps))
+        return start
+
+    monkeypatch.setattr(track._Following, "fitted", fitted)
+    monkeypatch.setattr(track._Following, "on_chosen_paths", lambda run, bodies: bodies)
+    long = replace(QUICK, soft=replace(QUICK.soft, schedule=Schedule(steps=7)))
+    for frames, wanted in ((three_views(), [7, 7]), (scan(), [3, 3, 3, 3])):
+        steps.clear()
+        follow(frames, MATERIAL, long)
+        assert [count for name, count in steps if name == "intervals"] == wanted
 
 
 def test_standard_errors_are_half_of_what_halves_disagree_by():

@@ -17,6 +17,7 @@ from holosplat.matter import Matter
 from holosplat.metrics import volume_scores
 from holosplat.motion import track
 from holosplat.motion.fit import MotionFit, motion_fit
+from holosplat.motion.mergers import shared, without_merger
 from holosplat.motion.pieces import PathOptions, chosen_paths, refined
 from holosplat.motion.remainder import apart, beside, joined, only, sure_ones, whole_ones
 from holosplat.motion.sightings import centroid, sightings
@@ -120,6 +121,29 @@ def test_pieces_of_bodies_are_none():
         times = truth().times[2:3]
         assert whole_ones(joined(every, still), times) == wanted
         assert apart(still, every, times) == [0][: len(wanted) - 3]
+
+
+def test_a_merger_of_two_is_left_out_once_both_are_found():
+    """Balls of 4 pixels, and one of 5 between two of them; overlaps by the volume of a lens."""
+    sphere, faces = icosphere(3)
+    still, times = TimeBasis(0.0, 1.0, 0), np.linspace(0, 1, 5)
+
+    def balls(*placed: tuple[float, float]) -> MovingSurfaces:
+        paths = [PIXEL * (radius * sphere + np.array([column, 0, 0]))[None] for radius, column in placed]
+        return MovingSurfaces.of_bodies(paths, [faces] * len(placed), still, PIXEL, Matter.one(*MATERIAL))
+
+    r, big, d = 4.0, 5.0, 4.0
+    lens = np.pi * (r + big - d) ** 2 * (d * d + 2 * d * (r + big) - 3 * (r - big) ** 2) / (12 * d)
+    shares = shared(balls((r, -d), (big, 0.0), (r, 30.0)), 0.5)
+    assert shares[1, 0] == pytest.approx(lens / (4 / 3 * np.pi * big**3), abs=0.015)
+    assert shares[0, 1] == pytest.approx(lens / (4 / 3 * np.pi * r**3), abs=0.015)
+    assert not shares[2].any()
+    three = balls((r, -d), (big, 0.0), (r, d), (r, 30.0))
+    kept = without_merger(three, times)
+    assert kept.count == 3
+    assert [round(mesh.vertices.mean(0)[0] / PIXEL, 1) for mesh in kept.bodies(0.0)] == [-d, d, 30.0]
+    for others in (balls((r, -d), (big, 0.0), (r, 30.0)), balls((r, -8.5), (big, 0.0), (r, 8.5))):
+        assert without_merger(others, times) is others  # half a merger stays, and so do bodies that touch
 
 
 def test_small_bodies_wait_for_the_others_but_not_at_the_edge():

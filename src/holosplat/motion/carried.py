@@ -39,17 +39,16 @@ from ..representations import (
 )
 from ..representations.initialise import FILLED
 from ..scan import Scan
-from .freer_flow import of_degree, on_lattice
+from .freer_flow import Change, freer_flows
+from .held_out import iterations_that_predict, kept_frames
 from .journal import Journal, Nowhere
-from .timed_frames import Frames, merged
+from .timed_frames import Frames, merged, trendless
 
 SURE, AGAIN = 4.0, 2.0
 """Standard deviations, and times what it explains of times in another order, by which a flow must explain frames before
 anything is said to move."""
 BETTER = 2.0
 """Standard errors by which a freer flow must predict held-out frames better."""
-ORDERS = 200
-"""Orders of the times that are tried for one without a trend."""
 NOWHERE = Nowhere()
 """No journal."""
 FEWEST_PIXELS = 24
@@ -81,8 +80,10 @@ class CarriedOptions:
     """Standard deviation expected of what the logarithm of δ changes by, over all times (0: matter stays as much)."""
     iterations: int = 12
     """Iterations for the flow and for the volume, each time that the two take turns."""
-    final: int = 20
-    """Iterations of the volume on voxels of a pixel, twice."""
+    final: int = 40
+    """Iterations of the volume on voxels of a pixel, at least."""
+    most_final: int = 160
+    """At most, where held-out frames are predicted better after more."""
     held_out: int = 5
     """One frame in so many is held out to ask how free the flow is."""
     spacing_px: Pixels = 2.0
@@ -91,7 +92,7 @@ class CarriedOptions:
     """Steps in which they learn it."""
 
     def __post_init__(self) -> None:
-        at_least(self, 1, "cells", "most_cells", "steps", "iterations", "final", "approximate_steps")
+        at_least(self, 1, "cells", "most_cells", "steps", "iterations", "final", "most_final", "approximate_steps")
         at_least(self, 2, "held_out")
         for name in ("strain", "divergence"):
             require(getattr(self, name) > 0, f"{name} must be above zero, but it is {getattr(self, name):g}.")
@@ -143,7 +144,7 @@ class Search:
         """The volume of frames of one time; its prior is taken on."""
         began = clock.perf_counter()
         task = replace(self.task, scan=scan, lit=None, matter="continuous").evened()
-        task = replace(task, prior=_known(self.frames.material))
+        task = replace(task, prior=MaterialPrior.known(self.frames.material))
         stage = SmoothStage(self.options.volume)
         start = stage.start(task, None)
         fit: SmoothFit = stage.fit(task, start)
@@ -300,17 +301,16 @@ class Search:
 
     def freer(self, state: _State) -> _State:
         """The state with the flow as free in time and space as held-out frames ask for."""
-        count, views = len(self.times), len(self.frames.scans[0])
-        aside = np.zeros(count * views, dtype=bool)
-        number = count * views // self.options.held_out
-        aside[np.random.default_rng(self.task.seed).permutation(count * views)[:number]] = True
-        keep = ~aside.reshape(count, views)
-        keep[~keep.any(1), 0] = True
-        for change in self._changes():
+        count, keep, how = len(self.times), self._kept(), self.options
+        for change in freer_flows(self._extents, (how.cells, how.most_cells), min(how.most_degree, count - 2)):
             state = self._stepped("flow", lambda s=state, c=change: self._changed(s, c, keep))
         return self._stepped("flow", lambda: self.turns(self._whole(state, range(count)), state))
 
-    def _changed(self, state: _State, change: Callable[[Flow], Flow | None], keep: np.ndarray) -> _State:
+    def _kept(self) -> np.ndarray:
+        """[T, V] bool: the frames that are not held out."""
+        return kept_frames(len(self.times), len(self.frames.scans[0]), self.options.held_out, self.task.seed)
+
+    def _changed(self, state: _State, change: Change, keep: np.ndarray) -> _State:
         """The state with a freer flow, if that predicts the frames better that `keep` [T, V] leaves out."""
         wanted, count = change(state.flow), len(self.times)
         if wanted is None:
@@ -326,16 +326,6 @@ class Search:
         size = f"degree {wanted.basis.degree}, {' × '.join(map(str, wanted.lattice.counts))} nodes"
         self.history.append(f"{size}: {gain.mean():+.1f} of ½χ² a held-out frame{', taken' if better else ''}")
         return other if better else state
-
-    def _changes(self) -> list[Callable[[Flow], Flow | None]]:
-        options = self.options
-        most = min(options.most_degree, len(self.times) - 2)
-        degrees = [lambda f, d=d: of_degree(f, d) if f.basis.degree == d - 1 else None for d in range(1, most + 1)]
-        finer = (3 * options.cells // 2, 2 * options.cells)
-        cells = [
-            lambda f, c=c: on_lattice(f, Lattice.around(self._extents, c)) for c in finer if c <= options.most_cells
-        ]
-        return [*degrees, *cells]
 
     def left_out(self, state: _State, left: np.ndarray) -> np.ndarray:
         """½χ² of each of the frames `left` [T, V] bool."""
@@ -363,14 +353,36 @@ class Search:
 
     def _fine(self, state: _State) -> _State:
         """On voxels of a pixel: the volume, the flow by it, and once more the volume."""
-        how, state = self.options, replace(state, u=self.on(self._volume(state.u, self.factor), 1))
+        self.task.on_progress("volume", 0.0)
+        wanted = self._long_enough(state)
+        state = self._finer(state)
         problem = self.problem(range(len(self.times)), 1, state)
-        for k in range(2):
-            self.task.on_progress("volume", k / 2)
+        for k, iterations in enumerate((wanted - wanted // 2, wanted // 2)):
+            self.task.on_progress("volume", (k + 1) / 3)
             if k:
-                state = self._moved(problem, state, how.iterations // 2)
-            state = replace(state, u=descend(problem, state.u, how.final)[0])
+                state = self._moved(problem, state, self.options.iterations // 2)
+            state = replace(state, u=descend(problem, state.u, iterations)[0])
         return state
+
+    def _finer(self, state: _State) -> _State:
+        return replace(state, u=self.on(self._volume(state.u, self.factor), 1))
+
+    def _long_enough(self, state: _State) -> int:
+        """Iterations of the volume on voxels of a pixel: as many as predict frames best that are held out, which the
+        volume that they begin with is made to forget."""
+        keep, how = self._kept(), self.options
+        left = [int(k) for k in np.flatnonzero((~keep).any(1))]
+        if not left or how.most_final <= how.final:
+            return how.final
+        large = self.problem(range(len(keep)), self.factor, state, keep)
+        state = self._finer(replace(state, u=descend(large, state.u, how.iterations)[0]))
+        kept, aside = self.problem(range(len(keep)), 1, state, keep), self.problem(left, 1, state, ~keep)
+        best, gain = iterations_that_predict(kept, aside, state.u, how.most_final)
+        wanted = max(best, how.final)
+        self.history.append(
+            f"{wanted} iterations on voxels of a pixel; {best} take {gain:.0f} from ½χ² of held-out frames"
+        )
+        return wanted
 
     def gaussians(self, volume: VoxelGrid, state: _State) -> MovingGaussians:
         """Gaussians that stand for a volume of the reference time, with its flow and its fading."""
@@ -382,19 +394,6 @@ class Search:
         self.timing["gaussians"] = clock.perf_counter() - began
         cloud, flow, change = found.detached(), state.flow, None
         if state.fading is not None:
-            ends = [
-                (t - flow.reference) / (flow.basis.last - flow.basis.first) for t in (self.times[0], self.times[-1])
-            ]
-            change = state.fading.of_raw(cloud.centres, cloud.raw_amplitudes[:, 0], (ends[0], ends[1]))
+            one, two = (self.times[[0, -1]] - flow.reference) / (flow.basis.last - flow.basis.first)
+            change = state.fading.of_raw(cloud.centres, cloud.raw_amplitudes[:, 0], (float(one), float(two)))
         return MovingGaussians(cloud, flow, change)
-
-
-def trendless(count: int) -> list[int]:
-    """Numbers below `count` in the order, of some hundred random ones, that goes least with them."""
-    rng, numbers = np.random.default_rng(0), np.arange(count) - 0.5 * (count - 1)
-    orders = [rng.permutation(count) for _ in range(ORDERS)]
-    return min(orders, key=lambda order: abs(float(numbers @ order))).tolist()
-
-
-def _known(material: DeltaBeta) -> MaterialPrior:
-    return MaterialPrior.known(material)

@@ -2,11 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..representations import Flow, Lattice, TimeBasis
+
+Change = Callable[[Flow], Flow | None]
+"""A flow in a richer basis; None for one that it does not suit."""
+
+
+def freer_flows(extents: tuple[float, float, float], cells: tuple[int, int], most_degree: int) -> list[Change]:
+    """Changes that are tried in turn: a higher degree in time each, then more cells in space.
+
+    extents: of the field `(x, y, z)`; cells: along its longest edge, at first and at most.
+    """
+    degrees = [lambda f, d=d: of_degree(f, d) if f.basis.degree == d - 1 else None for d in range(1, most_degree + 1)]
+    finer = [count for count in (3 * cells[0] // 2, 2 * cells[0]) if count <= cells[1]]
+    return [*degrees, *(lambda f, c=c: on_lattice(f, Lattice.around(extents, c)) for c in finer)]
 
 
 def of_degree(flow: Flow, degree: int) -> Flow:

@@ -14,6 +14,9 @@ from ..methods import Task
 from ..optics.noise_model import NoiseModel
 from ..scan import Scan
 
+ORDERS = 200
+"""Orders of the times that are tried for one without a trend."""
+
 
 @dataclass(frozen=True)
 class Frames:
@@ -58,3 +61,10 @@ def merged(scan: Scan) -> Scan:
         return scan.as_static()
     frames = np.mean([scan.frames[one] for one in each], axis=0)
     return replace(scan[each[0]], frames=frames).as_static()
+
+
+def trendless(count: int) -> list[int]:
+    """Numbers below `count` in the order, of some hundred random ones, that goes least with them."""
+    rng, numbers = np.random.default_rng(0), np.arange(count) - 0.5 * (count - 1)
+    orders = [rng.permutation(count) for _ in range(ORDERS)]
+    return min(orders, key=lambda order: abs(float(numbers @ order))).tolist()

@@ -25,6 +25,7 @@ from .guesses import network_for
 from .halves import astray, halves_of, tell_shapes
 from .journal import Journal, Nowhere, from_sightings, to_sightings
 from .known import KnownBodies, at_rest
+from .mergers import without_merger
 from .pieces import chosen_paths
 from .remainder import apart, beside, joined, only, sure_ones, whole_ones
 from .rest_shape import KnownBody
@@ -157,8 +158,10 @@ class _Following:
     def _go_on(self, bodies: MovingSurfaces) -> None:
         """The stages after the first paths."""
         if self.stage == "stiff":
-            self.bodies = self.whole(self.fitted("stiff fit", self.train, bodies, self.options.stiff, self.light))
-            self.stage = "beside" if self.round < self.options.rounds else "paths"
+            whole = self.whole(self.fitted("stiff fit", self.train, bodies, self.options.stiff, self.light))
+            self.bodies = without_merger(whole, self.train.instants)
+            after = "beside" if self.round < self.options.rounds else "paths"
+            self.stage = after if self.bodies is whole else "stiff"
         elif self.stage == "beside":
             more = self.more(bodies)
             self.round += 1
@@ -183,8 +186,10 @@ class _Following:
             part = parts[len(self.halves)]
             light = self.light and self.light.part(torch.from_numpy(part))
             side = 1 - 2 * (len(self.halves) % 2)
-            bodies = bodies if tell_shapes(self.train) else astray(bodies, self.seed, side)
-            self.halves.append(self.fitted("intervals", self.train[part], bodies, self.options.half, light))
+            told = tell_shapes(self.train)
+            bodies = bodies if told else astray(bodies, self.seed, side)
+            how = self.options.half if told or self.options.body else self.options.soft
+            self.halves.append(self.fitted("intervals", self.train[part], bodies, how, light))
         if len(self.halves) == len(parts):
             self.stage = "done"
 
