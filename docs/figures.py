@@ -23,6 +23,7 @@ import doc_tables_learning as learning
 import doc_tables_measured as measured
 import doc_tables_motion as motion
 import doc_tables_moving as moving
+import doc_tables_printed as printed
 import doc_tables_runs as runs
 import doc_tables_thesis as thesis
 
@@ -162,6 +163,14 @@ TABLES |= {
             "an hour",
         ),
         ("few-views", alignment.few_views, "few_views.csv", "python benchmarks/few_views.py", "ten minutes"),
+        ("calibration", alignment.calibration, "calibration.csv", "python benchmarks/calibration.py", "minutes"),
+        (
+            "compact-series",
+            measured.compact_series,
+            "compact_series.csv",
+            "python benchmarks/compact_series.py NAME RUNS --write",
+            "minutes",
+        ),
     )
 }
 TABLES["pinn"] = Table(
@@ -263,6 +272,9 @@ TABLES |= {
         ("others", thesis.others),
         ("findings", thesis.verdicts),
     )
+}
+TABLES |= {
+    name: Table(make, (printed.file_of(name),), *printed.PRINTED[name]) for name, make in printed.makers().items()
 }
 
 
