@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -178,7 +179,9 @@ def _export_volume(
     from ..io.ome_zarr import ZARR_SUFFIX, require_zarr, write_ome_zarr
     from ..io.volume_files import TIFF_SUFFIXES, write_ome_tiff
     from ..io.volumes import write_voxels
+    from ..planning.acts import of_export
     from ..scan import PIXEL_RANGE_M
+    from .room import tell
 
     if volume.suffix.lower() == ZARR_SUFFIX:
         require_zarr()
@@ -194,6 +197,8 @@ def _export_volume(
     grid = Grid.centred(shape or (columns, rows, columns), edge, (x, y, z))
     count = math.prod(grid.shape)
     require(count <= MOST_VOXELS, f"shape must have at most {MOST_VOXELS:.0e} voxels, but it has {count:.0e}.")
+    slabs = ((f"an HDF5 file{how}", of_export(shape, False)) for how, shape in _smaller(grid.shape))
+    tell("the volume", of_export(grid.shape, volume.suffix.lower() in TIFF_SUFFIXES), volume, slabs)
     if volume.suffix.lower() in TIFF_SUFFIXES:
         write_ome_tiff(volume, result.object.voxelise(grid))
     elif volume.suffix.lower() == ZARR_SUFFIX:
@@ -201,6 +206,14 @@ def _export_volume(
     else:
         write_voxels(volume, result.object, grid)
     _say(f"wrote {volume}: {' × '.join(map(str, grid.shape))} voxels of {1e6 * grid.voxel_size[0]:.4g} µm")
+
+
+def _smaller(shape: tuple[int, int, int]) -> Iterator[tuple[str, tuple[int, int, int]]]:
+    """A shape, and halves of it, with the words for these."""
+    yield "", shape
+    while max(shape) > 1:
+        z, y, x = shape = tuple(max(1, n // 2) for n in shape)
+        yield f" with --shape {z} {y} {x} of larger voxels", shape
 
 
 def _say(text: str) -> None:
