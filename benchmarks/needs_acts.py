@@ -28,6 +28,7 @@ from holosplat.bench.methods import METHODS as BENCH_METHODS
 from holosplat.cli.dataset import _needs
 from holosplat.geometry import Views
 from holosplat.io.vtk import write_mesh
+from holosplat.learning.size import Size
 from holosplat.mesh import TriangleMesh
 from holosplat.methods import METHODS, Gaussians, Pinn, SurfaceOptions
 from holosplat.motion.carried import CarriedOptions
@@ -239,7 +240,7 @@ def said_of_dataset(sizes: Sizes) -> Needs:
 
 def said_of_training(network: str) -> Callable[[Sizes], Needs]:
     """Of a network."""
-    return lambda sizes: acts.of_training((sizes["rows"], sizes["columns"]), sizes["views"], network, 6)
+    return lambda sizes: acts.of_training((sizes["rows"], sizes["columns"]), sizes["views"], network, Size(), 6)
 
 
 def said_of_start(sizes: Sizes) -> Needs:

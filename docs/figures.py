@@ -262,6 +262,9 @@ TABLES |= {
 }
 
 
+TABLES["faults"] = Table(
+    runs.faults, ("faults.csv",), "python benchmarks/faults.py --trials 200 --csv docs/data/faults.csv", "an hour"
+)
 THESIS = "python benchmarks/thesis_runs.py run RUNS --snapshots DIR, then collect RUNS"
 TABLES |= {
     f"thesis-{name}": Table(make, ("thesis_study/runs.csv",), THESIS, "a day")
@@ -271,6 +274,7 @@ TABLES |= {
         ("full", lambda: thesis.configurations("full")),
         ("others", thesis.others),
         ("findings", thesis.verdicts),
+        ("left", thesis.left),
     )
 }
 TABLES |= {
@@ -355,7 +359,7 @@ ELSEWHERE = {
 
 def pages() -> list[Path]:
     """All pages that may hold tables."""
-    return [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+    return [ROOT / "README.md", ROOT / "SECURITY.md", *sorted(DOCS.rglob("*.md"))]
 
 
 def filled(text: str) -> str:

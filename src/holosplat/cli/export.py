@@ -97,7 +97,7 @@ def _ending(path: Path, ending: str) -> Path:
 def _export_compact(folder: RunFolder, out: Path, step_px: float, together: tuple[Path, ...]) -> None:
     from ..io.atomic import require_writable
     from ..io.compact import steps_of
-    from ..io.objects import read_object, write_compact
+    from ..io.objects import write_compact
     from ..io.series import names_of, write_series
     from ..workflows.run_folder import RunFolder
 
@@ -107,9 +107,9 @@ def _export_compact(folder: RunFolder, out: Path, step_px: float, together: tupl
         each.require_run()
     if together:
         names = names_of([each.path for each in folders])
-        write_series(out, {name: read_object(each.result()) for name, each in zip(names, folders)}, steps)
+        write_series(out, {name: each.read_result() for name, each in zip(names, folders)}, steps)
     else:
-        write_compact(out, read_object(folder.result()), steps)
+        write_compact(out, folder.read_result(), steps)
     before, after = sum(each.result().stat().st_size for each in folders), out.stat().st_size
     of = f"{len(folders)} runs" if together else folder.result().name
     _say(f"wrote {out}: {after / 1e6:.3g} MB, {before / after:.1f} times smaller than {of}")

@@ -40,7 +40,7 @@ def train(
     scenes.require_whole()
     frames, views = (scenes.ranges.rows, scenes.ranges.columns), max(how.shown.views)
     views = min(views, scenes.ranges.views)
-    tell("the training", of_training(frames, views, how.network, how.steps), out)
+    tell("the training", of_training(frames, views, how.network, how.size, how.steps), out)
     kind = Training if how.network == "start" else AlignedTraining
     training = (kind.resumed if resume else kind.begun)(scenes, out, how)
     who = made_by(how.device)  # before files change under a night's work

@@ -13,6 +13,8 @@ import numpy as np
 
 from ..align import PoseOptions
 from ..io.volumes import SLAB_VOXELS
+from ..learning.network import FINE
+from ..learning.size import Size
 from ..matter import MatterKind
 from ..methods import Method, Pinn
 from ..methods.surface_fit import SurfaceOptions
@@ -27,6 +29,8 @@ class Parts:
 
     plain_program: float = 0.35e9
     """The program without what fits need."""
+    trainer: float = 0.55e9
+    """The program while it trains, with its optimiser and what PyTorch compiles."""
     poses: float = 120.0
     """A voxel of the finest pixels on which poses are looked for."""
     pose_waves: float = 400.0
@@ -39,9 +43,13 @@ class Parts:
     """A voxel of a field of space and time that a step looks at, with gradients."""
     every_time: float = 12.0
     """The same voxel at each time, of the volumes that the field begins with."""
-    lattice: float = 2500.0
-    """A voxel of the lattice of a network in training."""
-    lattice_view: float = 500.0
+    channel: float = 30.0
+    """A channel of a voxel of the lattice of a network in training."""
+    lifted: float = 40.0
+    """A channel that is lifted from a view into such a voxel."""
+    aligned: float = 300.0
+    """A voxel of a pixel-aligned field in training."""
+    aligned_view: float = 150.0
     """The same in each view."""
     node_pairs: float = 100.0
     """A pair of nodes of two cells in flow, whose block is computed at once."""
@@ -173,12 +181,20 @@ def of_dataset(simulated: Needs, shape: tuple[int, int], views: int, scenes: int
     return Needs(jobs * memory + (jobs > 1) * Costs.program, disk, 1.5e-4 * scenes * pixels / jobs)
 
 
-def of_training(shape: tuple[int, int], views: int, network: str, steps: int) -> Needs:
-    """What `train` takes for scenes of so many pixels, of which so many views are shown."""
+def of_training(shape: tuple[int, int], views: int, network: str, size: Size, steps: int) -> Needs:
+    """What `train` takes for scenes of so many pixels, of which so many views are shown.
+
+    size: of the network of `--start learned`; those of the others are of one size.
+    """
     rows, columns = shape
-    voxels = rows * columns**2 / (8 if network == "start" else 1)
-    memory = (Parts.lattice + Parts.lattice_view * views) * voxels
-    return Needs(Costs.program + memory, 1e8, steps * (0.2 + 2e-5 * views * voxels))
+    voxels = rows * columns**2
+    if network == "start":
+        voxels /= FINE**3
+        channels = sum(width / 8**level for level, width in enumerate(size.volume)) + 3 * size.features
+        memory = (Parts.channel * channels + Parts.lifted * size.features * views) * voxels
+    else:
+        memory = (Parts.aligned + Parts.aligned_view * views) * voxels
+    return Needs(Parts.trainer + memory, 1e8, steps * (0.2 + 2e-5 * views * voxels))
 
 
 def of_methods(exposures: Exposures, is_test: np.ndarray, samples: int, methods: Sequence[Method]) -> Needs:

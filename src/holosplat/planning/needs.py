@@ -250,7 +250,7 @@ def require_room(needs: Needs, path: Path, others: Iterable[tuple[str, Needs]] =
     way = next((f"{how} takes {_size(one.memory)} and {_size(one.disk)}" for how, one in others if one.fit(path)), "")
     raise InputError(
         f"the job {needs.line()}, but {_size(memory)} of memory and {_size(disk)} of disk are free; "
-        f"{way or 'take a part of the frames (--crop, --views), or a larger machine'}."
+        f"{way or 'take a part of it (of frames by --crop, --views), or a larger machine'}."
     )
 
 
