@@ -47,14 +47,21 @@ def test_what_was_written_is_read(scan):
 
 
 def test_a_flipped_bit_is_noticed_wherever_it_is(scan):
-    """But in the seal's name, without which a file has no seal, and is what it was."""
+    """In the seal, too."""
     draws, size = random.Random(1), scan.stat().st_size
-    for _ in range(60):
-        at = draws.randrange(size - len(MAGIC))
+    for at in [*(draws.randrange(size) for _ in range(60)), size - 3, size - 40]:
         assert check(flipped(scan, at, draws.randrange(8)))[1], at
-    path = flipped(scan, size - 3, 0)
-    assert check(path) == (1, [])
-    assert np.array_equal(read_scan(path).frames, read_scan(scan).frames)
+
+
+def test_a_file_cut_off_within_its_seal_is_noticed(scan):
+    content = scan.read_bytes()
+    (length, *_) = ENDING.unpack(content[-ENDING.size :])
+    for kept in (length + 1, length + len(MAGIC) + 3, len(content) - 1):
+        scan.write_bytes(content[:kept])
+        with pytest.raises(InputError, match="truncated or damaged"):
+            read_scan(scan)
+    scan.write_bytes(content[:length])  # as a program leaves it that writes
+    assert len(read_scan(scan)) == 6
 
 
 def test_a_number_that_stands_for_itself_does_not_change_unnoticed(scan):
@@ -63,7 +70,7 @@ def test_a_number_that_stands_for_itself_does_not_change_unnoticed(scan):
     at = content.find(np.float64(PIXEL).tobytes())
     assert at > 0
     for byte in range(8):
-        with pytest.raises(InputError, match="must be as it was written, but it is damaged"):
+        with pytest.raises(InputError, match="must be as it was written, but it is truncated or damaged"):
             read_scan(flipped(scan, at + byte, 3))
 
 

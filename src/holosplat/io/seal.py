@@ -22,8 +22,12 @@ import numpy as np
 from ..checks import require
 
 MAGIC = b"holosplat sealed"
+"""With which a seal begins and ends."""
 ENDING = struct.Struct(f"<QQ32s{len(MAGIC)}s")
 """Length of the HDF5 file, length of the packed ranges, SHA-256, and the seal's name."""
+START = struct.Struct("<8sB31xQ")
+"""The first bytes of an HDF5 file: its signature, the version 0 of what follows, and where it ends."""
+SIGNATURE = b"\x89HDF\r\n\x1a\n"
 BLOCK = 1 << 20
 MOST = 1 << 30
 """Bytes of ranges, at most."""
@@ -47,27 +51,42 @@ def seal(raw: IO[bytes], ranges: np.ndarray) -> None:
     length, packed = raw.seek(0, io.SEEK_END), zlib.compress(ranges.tobytes())
     digest = _digest(raw, length, ranges)
     raw.seek(0, io.SEEK_END)
-    rest = memoryview(packed + ENDING.pack(length, len(packed), digest, MAGIC))
+    rest = memoryview(MAGIC + packed + ENDING.pack(length, len(packed), digest, MAGIC))
     while rest:  # a file without a buffer may take a part
         rest = rest[raw.write(rest) :]
 
 
 def require_sealed(path: Path) -> None:
-    """`InputError` for a file that is not as its seal says; files without one pass."""
+    """`InputError` for a file that is not as its seal says, or has a part of one; files without one pass."""
     with path.open("rb") as raw:
-        size = raw.seek(0, io.SEEK_END)
-        if size < ENDING.size:
-            return
-        raw.seek(size - ENDING.size)
-        length, packed, digest, name = ENDING.unpack(raw.read(ENDING.size))
-        if name != MAGIC:
-            return
-        good = length + packed + ENDING.size == size and packed <= MOST
-        if good:
-            raw.seek(length)
-            ranges = _unpacked(raw.read(packed))
-            good = ranges is not None and _digest(raw, length, ranges) == digest
-    require(good, f"{path} must be as it was written, but it is damaged; bring back the whole file.")
+        good = _is_as_sealed(raw, raw.seek(0, io.SEEK_END))
+    require(good, f"{path} must be as it was written, but it is truncated or damaged; bring back the whole file.")
+
+
+def _is_as_sealed(raw: IO[bytes], size: int) -> bool:
+    """Whether a file of so many bytes is as its seal says, or has none."""
+    if size < START.size + ENDING.size:
+        return True
+    raw.seek(size - ENDING.size)
+    length, packed, digest, name = ENDING.unpack(raw.read(ENDING.size))
+    if name != MAGIC:
+        return not _has_begun(raw)
+    if length + len(MAGIC) + packed + ENDING.size != size or packed > MOST:
+        return False
+    raw.seek(length + len(MAGIC))
+    ranges = _unpacked(raw.read(packed))
+    return ranges is not None and _digest(raw, length, ranges) == digest
+
+
+def _has_begun(raw: IO[bytes]) -> bool:
+    """Whether a seal begins where the HDF5 file ends, however little is left of it."""
+    raw.seek(0)
+    signature, version, end = START.unpack(raw.read(START.size))
+    if signature != SIGNATURE or version != 0 or end >= 1 << 63:
+        return False
+    raw.seek(end)
+    begun = raw.read(len(MAGIC))
+    return bool(begun) and MAGIC.startswith(begun)
 
 
 def _unpacked(packed: bytes) -> np.ndarray | None:
