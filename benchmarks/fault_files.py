@@ -163,8 +163,8 @@ VALUES = ("nan", "inf", "-inf", "-1", "1e30", "-1e30", str(2**70), str(10**12), 
 
 MEANT = {("seed", str(10**12)), ("photons-per-pixel", str(10**12)), ("axis-column", str(10**12))}
 MEANT |= {(flag, "1e-300") for flag in ("psf-sigma-px", "misalign-shift", "uncertain-shift", "axis-column")}
-"""What is no odd value: seeds are as large as they like, so many photons are as good as none lost, and so small a length
-is none; --axis-column may say that the axis is anywhere."""
+"""What is no odd value: seeds are as large as they like, so many photons give no noise, so small a length is none, and
+--axis-column may say that the axis is anywhere."""
 
 
 def odd(shop: Shop, rng: random.Random, folder: Path) -> str:

@@ -31,10 +31,12 @@ class Parts:
     """The program without what fits need."""
     trainer: float = 0.55e9
     """The program while it trains, with its optimiser and what PyTorch compiles."""
-    poses: float = 120.0
+    forecast: float = 0.62e9
+    """All of it while a forecast is drawn."""
+    search: float = 0.54e9
+    """The program while it looks for poses."""
+    poses: float = 110.0
     """A voxel of the finest pixels on which poses are looked for."""
-    pose_waves: float = 400.0
-    """A wave sample of a view there, with derivatives by its pose."""
     carried: float = 255.0
     """A voxel of matter in motion: L-BFGS, gradients and priors."""
     sources: float = 14.0
@@ -86,33 +88,35 @@ def times_of(exposures: Exposures) -> int:
 
 def of_track(exposures: Exposures, how: TrackOptions) -> Needs:
     """What `track` takes for training frames of several times: bodies of each by itself, then some frames a step."""
-    begun = of_start(Sizes.of(one_time(exposures)), how.sightings.volume)
-    return _of_paths(exposures, how.soft.schedule.views_per_step, begun)
+    paths = _of_paths(exposures, how.soft.schedule.views_per_step)
+    begun = Costs.program + of_start(Sizes.of(one_time(exposures)), how.sightings.volume)
+    every = replace(Sizes.of(one_time(exposures)), views=len(exposures))
+    return replace(paths, memory=with_report(every, max(begun, paths.memory)))
 
 
 def of_forecast(exposures: Exposures, views_per_step: int) -> Needs:
-    """What `forecast` takes for the training frames of its run."""
-    return _of_paths(exposures, views_per_step, 0.0)
+    """What `forecast` takes for the training frames of its run; its report is of one time."""
+    paths = _of_paths(exposures, views_per_step)
+    return replace(paths, memory=max(paths.memory, Parts.forecast + Costs.frames * Sizes.of(exposures).pixels))
 
 
-def _of_paths(exposures: Exposures, views_per_step: int, begun: float) -> Needs:
-    """Paths of bodies, `begun` with so many bytes."""
+def _of_paths(exposures: Exposures, views_per_step: int) -> Needs:
+    """What a fit of paths takes."""
     one, times = Sizes.of(one_time(exposures)), times_of(exposures)
     step = replace(one, views=min(len(exposures), views_per_step or len(exposures)))
     every = replace(one, views=len(exposures))
-    memory = Costs.program + Costs.frames * every.pixels + max(begun, Costs.edges * step.waves(1))
+    memory = Costs.program + Costs.frames * every.pixels + Costs.edges * step.waves(1)
     disk = Costs.page + Costs.written * every.pixels + Room.node * Room.nodes * one.rows * one.columns * times
-    return Needs(with_report(every, memory), disk, 20 + 3e-5 * every.waves(1))
+    return Needs(memory, disk, 20 + 3e-5 * every.waves(1))
 
 
 def of_alignment(exposures: Exposures, how: PoseOptions) -> Needs:
     """What `align` takes: all frames on the finest pixels on which poses are looked for, and a volume of theirs."""
     finest = min(level.pixels for level in how.levels(exposures.views.shape, len(exposures)))
     sizes = Sizes.of(exposures, finest)
-    memory = Parts.poses * sizes.voxels + Parts.pose_waves * sizes.waves() / sizes.views
     pixels = len(exposures) * math.prod(exposures.views.shape)
-    seconds = 10 + 2e-5 * sizes.views * sizes.voxels
-    return Needs(Costs.program + Costs.frames * pixels + memory, Costs.written * pixels + 1e6, seconds)
+    memory = Parts.search + Costs.frames * pixels + Parts.poses * sizes.voxels
+    return Needs(memory, Costs.written * pixels + 1e6, 10 + 2e-5 * sizes.views * sizes.voxels)
 
 
 def of_motion(exposures: Exposures, how: CarriedOptions) -> Needs:
