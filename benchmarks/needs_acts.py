@@ -299,7 +299,7 @@ JOBS = (
     ("align", {"rows": 64, "columns": 72, "views": 6}),
     ("align", {"rows": 128, "columns": 128, "views": 4}),
     ("matter in motion", {"rows": 32, "columns": 36, "views": 4, "times": 4}),
-    ("matter in motion", {"rows": 56, "columns": 64, "views": 4, "times": 6}),
+    ("matter in motion", {"rows": 40, "columns": 48, "views": 3, "times": 6}),
     ("pinn", {"rows": 40, "columns": 48, "views": 4, "times": 4}),
     ("pinn", {"rows": 72, "columns": 80, "views": 4, "times": 8}),
     ("each time", {"rows": 48, "columns": 56, "views": 4, "times": 3}),
