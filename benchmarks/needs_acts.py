@@ -18,6 +18,7 @@ from pathlib import Path
 
 import machine
 import numpy as np
+from forked import run as run_here
 from needs import START, peak
 from rows import read, write
 
@@ -53,6 +54,13 @@ SHORT_TRACK = ["--effort", 0.05, "--pieces", 1, "--rounds", 0]
 Sizes = dict[str, int]
 
 
+def made(command: list[object]) -> None:
+    """Run what a measured command needs."""
+    ended = run_here(command, limit=3600)
+    if ended.code != 0:
+        raise SystemExit(ended.said)
+
+
 def scan(folder: Path, sizes: Sizes) -> Path:
     """Frames of four cells, which move half a pixel from one time to the next, and what else `sizes` says."""
     rows, columns, times = sizes["rows"], sizes["columns"], sizes.get("times", 1)
@@ -66,7 +74,7 @@ def scan(folder: Path, sizes: Sizes) -> Path:
     beam = ["--detector", rows, columns, "--pixel-size", PIXEL, "--views", sizes["views"], "--test-every", 0]
     when = ["--snapshot-interval", STEP, "--frame-rate", 1 / STEP] if times > 1 else []
     out = folder / "scan.nxs"
-    peak(["simulate", *files, "--length-unit", "um", *KNOWN, *beam, *when, "--out", out])
+    made(["simulate", *files, "--length-unit", "um", *KNOWN, *beam, *when, "--out", out])
     return out
 
 
@@ -74,14 +82,14 @@ def run(folder: Path, sizes: Sizes) -> tuple[Path, Path]:
     """A run of Gaussians, and its scan."""
     seen, out = scan(folder, sizes), folder / "run"
     few = [*FEW, *ONE_STEP]
-    peak(["reconstruct", seen, "--out", out, *KNOWN, "--matter", "levels", "--method", "gaussians", *few])
+    made(["reconstruct", seen, "--out", out, *KNOWN, "--matter", "levels", "--method", "gaussians", *few])
     return out, seen
 
 
 def tracked(folder: Path, sizes: Sizes) -> Path:
     """A run of track."""
     out = folder / "run"
-    peak(["track", scan(folder, sizes), "--out", out, *KNOWN, *SHORT_TRACK, "--no-intervals"])
+    made(["track", scan(folder, sizes), "--out", out, *KNOWN, *SHORT_TRACK, "--no-intervals"])
     return out
 
 
@@ -155,7 +163,7 @@ def train(network: str) -> Callable[[Path, Sizes], list[object]]:
 
     def command(folder: Path, sizes: Sizes) -> list[object]:
         scenes = ["--rows", sizes["rows"], "--columns", sizes["columns"], "--views", sizes["views"]]
-        peak(["dataset", "--out", folder / "scenes", "--count", SCENES, *scenes])
+        made(["dataset", "--out", folder / "scenes", "--count", SCENES, *scenes])
         few = ["--steps", 6, "--validation", 1, "--views", sizes["views"], "--rows", sizes["rows"]]
         return ["train", folder / "scenes", "--out", folder / "out", "--network", network, *few]
 
@@ -268,7 +276,7 @@ def said_of_growth(sizes: Sizes) -> Needs:
 
 def said_of_export(whole: bool) -> Callable[[Sizes], Needs]:
     """Of a volume."""
-    return lambda sizes: acts.of_export((sizes["edge"],) * 3, whole)
+    return lambda sizes: acts.of_export((sizes["edge"], sizes["edge"], sizes["edge"]), whole)
 
 
 ACTS: dict[str, tuple[Callable[[Path, Sizes], list[object]], Callable[[Sizes], Needs]]] = {

@@ -15,6 +15,7 @@ import pytest
 
 from holosplat.align import PoseOptions
 from holosplat.geometry import Views
+from holosplat.learning.network import FINE
 from holosplat.learning.size import Size
 from holosplat.methods import METHODS, Pinn, SurfaceOptions
 from holosplat.motion.carried import CarriedOptions
@@ -112,6 +113,7 @@ def test_scenes_take_as_many_times_the_memory_as_there_are_processes():
 
 
 def test_a_wider_network_and_more_views_take_more():
+    assert acts.LATTICE == FINE**3
     sizes = ((64, 81), 3)
     plain = acts.of_training(*sizes, "start", Size(), 100)
     wide = acts.of_training(*sizes, "start", Size(volume=(32, 80, 160)), 100)

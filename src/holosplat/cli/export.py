@@ -212,7 +212,8 @@ def _smaller(shape: tuple[int, int, int]) -> Iterator[tuple[str, tuple[int, int,
     """A shape, and halves of it, with the words for these."""
     yield "", shape
     while max(shape) > 1:
-        z, y, x = shape = tuple(max(1, n // 2) for n in shape)
+        z, y, x = (max(1, n // 2) for n in shape)
+        shape = z, y, x
         yield f" with --shape {z} {y} {x} of larger voxels", shape
 
 

@@ -8,26 +8,31 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..align import PoseOptions
 from ..io.volumes import SLAB_VOXELS
-from ..learning.network import FINE
-from ..learning.size import Size
-from ..matter import MatterKind
-from ..methods import Method, Pinn
-from ..methods.surface_fit import SurfaceOptions
-from ..motion.carried import CarriedOptions
-from ..motion.track_options import TrackOptions
-from ..scan import Exposures
 from .needs import KEPT, Costs, Needs, Sizes, of_fit, of_simulation, of_start, with_report
+
+if TYPE_CHECKING:
+    from ..align import PoseOptions
+    from ..learning.size import Size
+    from ..matter import MatterKind
+    from ..methods import Method, Pinn
+    from ..methods.surface_fit import SurfaceOptions
+    from ..motion.carried import CarriedOptions
+    from ..motion.track_options import TrackOptions
+    from ..scan import Exposures
+
+LATTICE = 8
+"""Voxels for one of the lattice of the network of `--start learned`."""
 
 
 class Parts:
     """Bytes of memory and seconds that the parts of these commands take, beside those of `Costs`."""
 
-    plain_program: float = 0.35e9
+    plain_program: float = 0.38e9
     """The program without what fits need."""
     trainer: float = 0.55e9
     """The program while it trains, with its optimiser and what PyTorch compiles."""
@@ -193,7 +198,7 @@ def of_training(shape: tuple[int, int], views: int, network: str, size: Size, st
     rows, columns = shape
     voxels = rows * columns**2
     if network == "start":
-        voxels /= FINE**3
+        voxels /= LATTICE
         channels = sum(width / 8**level for level, width in enumerate(size.volume)) + 3 * size.features
         memory = (Parts.channel * channels + Parts.lifted * size.features * views) * voxels
     else:
