@@ -54,7 +54,7 @@ SHORT_TRACK = ["--effort", 0.05, "--pieces", 1, "--rounds", 0]
 Sizes = dict[str, int]
 
 
-def made(command: list[object]) -> None:
+def prepare(command: list[object]) -> None:
     """Run what a measured command needs."""
     ended = run_here(command, limit=3600)
     if ended.code != 0:
@@ -74,7 +74,7 @@ def scan(folder: Path, sizes: Sizes) -> Path:
     beam = ["--detector", rows, columns, "--pixel-size", PIXEL, "--views", sizes["views"], "--test-every", 0]
     when = ["--snapshot-interval", STEP, "--frame-rate", 1 / STEP] if times > 1 else []
     out = folder / "scan.nxs"
-    made(["simulate", *files, "--length-unit", "um", *KNOWN, *beam, *when, "--out", out])
+    prepare(["simulate", *files, "--length-unit", "um", *KNOWN, *beam, *when, "--out", out])
     return out
 
 
@@ -82,14 +82,14 @@ def run(folder: Path, sizes: Sizes) -> tuple[Path, Path]:
     """A run of Gaussians, and its scan."""
     seen, out = scan(folder, sizes), folder / "run"
     few = [*FEW, *ONE_STEP]
-    made(["reconstruct", seen, "--out", out, *KNOWN, "--matter", "levels", "--method", "gaussians", *few])
+    prepare(["reconstruct", seen, "--out", out, *KNOWN, "--matter", "levels", "--method", "gaussians", *few])
     return out, seen
 
 
 def tracked(folder: Path, sizes: Sizes) -> Path:
     """A run of track."""
     out = folder / "run"
-    made(["track", scan(folder, sizes), "--out", out, *KNOWN, *SHORT_TRACK, "--no-intervals"])
+    prepare(["track", scan(folder, sizes), "--out", out, *KNOWN, *SHORT_TRACK, "--no-intervals"])
     return out
 
 
@@ -163,7 +163,7 @@ def train(network: str) -> Callable[[Path, Sizes], list[object]]:
 
     def command(folder: Path, sizes: Sizes) -> list[object]:
         scenes = ["--rows", sizes["rows"], "--columns", sizes["columns"], "--views", sizes["views"]]
-        made(["dataset", "--out", folder / "scenes", "--count", SCENES, *scenes])
+        prepare(["dataset", "--out", folder / "scenes", "--count", SCENES, *scenes])
         few = ["--steps", 6, "--validation", 1, "--views", sizes["views"], "--rows", sizes["rows"]]
         return ["train", folder / "scenes", "--out", folder / "out", "--network", network, *few]
 
@@ -274,9 +274,9 @@ def said_of_growth(sizes: Sizes) -> Needs:
     return acts.of_growth(sizes["cells"], nodes_of(sizes["frequency"]), sizes["snapshots"], 5e-9)
 
 
-def said_of_export(whole: bool) -> Callable[[Sizes], Needs]:
+def said_of_export(suffix: str) -> Callable[[Sizes], Needs]:
     """Of a volume."""
-    return lambda sizes: acts.of_export((sizes["edge"], sizes["edge"], sizes["edge"]), whole)
+    return lambda sizes: acts.of_export((sizes["edge"], sizes["edge"], sizes["edge"]), suffix)
 
 
 ACTS: dict[str, tuple[Callable[[Path, Sizes], list[object]], Callable[[Sizes], Needs]]] = {
@@ -287,9 +287,9 @@ ACTS: dict[str, tuple[Callable[[Path, Sizes], list[object]], Callable[[Sizes], N
     "pinn": (pinn, lambda sizes: acts.of_space_time(frames(sizes), Pinn())),
     "each time": (each, said_of_method("gaussians")),
     "surface": (surface, lambda sizes: acts.of_surfaces(frames(sizes), SurfaceOptions())),
-    "export .h5": (export(".h5"), said_of_export(False)),
-    "export .ome.tif": (export(".ome.tif"), said_of_export(True)),
-    "export .ome.zarr": (export(".ome.zarr"), said_of_export(False)),
+    "export .h5": (export(".h5"), said_of_export(".h5")),
+    "export .ome.tif": (export(".ome.tif"), said_of_export(".tif")),
+    "export .ome.zarr": (export(".ome.zarr"), said_of_export(".zarr")),
     "grow": (grow, said_of_growth),
     "dataset": (dataset, said_of_dataset),
     "train start": (train("start"), said_of_training("start")),

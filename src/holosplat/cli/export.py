@@ -197,8 +197,8 @@ def _export_volume(
     grid = Grid.centred(shape or (columns, rows, columns), edge, (x, y, z))
     count = math.prod(grid.shape)
     require(count <= MOST_VOXELS, f"shape must have at most {MOST_VOXELS:.0e} voxels, but it has {count:.0e}.")
-    slabs = ((f"an HDF5 file{how}", of_export(shape, False)) for how, shape in _smaller(grid.shape))
-    tell("the volume", of_export(grid.shape, volume.suffix.lower() in TIFF_SUFFIXES), volume, slabs)
+    slabs = ((f"an HDF5 file{how}", of_export(shape, ".h5")) for how, shape in _smaller(grid.shape))
+    tell("the volume", of_export(grid.shape, volume.suffix.lower()), volume, slabs)
     if volume.suffix.lower() in TIFF_SUFFIXES:
         write_ome_tiff(volume, result.object.voxelise(grid))
     elif volume.suffix.lower() == ZARR_SUFFIX:

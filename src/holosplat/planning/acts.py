@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..io.ome_zarr import CHUNK, ZARR_SUFFIX
+from ..io.volume_files import TIFF_SUFFIXES
 from ..io.volumes import SLAB_VOXELS
 from .needs import KEPT, Costs, Needs, Sizes, of_fit, of_simulation, of_start, with_report
 
@@ -32,12 +34,12 @@ LATTICE = 8
 class Parts:
     """Bytes of memory and seconds that the parts of these commands take, beside those of `Costs`."""
 
-    plain_program: float = 0.38e9
+    plain_program: float = 0.37e9
     """The program without what fits need."""
-    trainer: float = 0.55e9
+    trainer: float = 0.61e9
     """The program while it trains, with its optimiser and what PyTorch compiles."""
-    forecast: float = 0.62e9
-    """All of it while a forecast is drawn."""
+    drawn: float = 0.63e9
+    """All of it while a report is drawn of one of several times."""
     search: float = 0.54e9
     """The program while it looks for poses."""
     poses: float = 110.0
@@ -50,20 +52,24 @@ class Parts:
     """A voxel of a field of space and time that a step looks at, with gradients."""
     every_time: float = 12.0
     """The same voxel at each time, of the volumes that the field begins with."""
-    channel: float = 30.0
+    channel: float = 37.0
     """A channel of a voxel of the lattice of a network in training."""
-    lifted: float = 40.0
+    lifted: float = 49.0
     """A channel that is lifted from a view into such a voxel."""
     aligned: float = 300.0
     """A voxel of a pixel-aligned field in training."""
     aligned_view: float = 150.0
     """The same in each view."""
-    node_pairs: float = 100.0
+    node_pairs: float = 10.0
     """A pair of nodes of two cells in flow, whose block is computed at once."""
-    exported: float = 30.0
+    exported: float = 25.0
     """A voxel of a volume that is written whole."""
-    slab: float = 30.0
+    slab: float = 18.0
     """A voxel of a slab of one."""
+    halved: float = 14.0
+    """A voxel of chunks of which larger voxels are made."""
+    scene: float = 8.0
+    """A voxel of a scene for learning, of which a file's are held."""
     judged: float = 60.0
     """A voxel of a case of the benchmark, whose truth and result are compared."""
 
@@ -102,7 +108,7 @@ def of_track(exposures: Exposures, how: TrackOptions) -> Needs:
 def of_forecast(exposures: Exposures, views_per_step: int) -> Needs:
     """What `forecast` takes for the training frames of its run; its report is of one time."""
     paths = _of_paths(exposures, views_per_step)
-    return replace(paths, memory=max(paths.memory, Parts.forecast + Costs.frames * Sizes.of(exposures).pixels))
+    return replace(paths, memory=max(paths.memory, Parts.drawn + Costs.frames * Sizes.of(exposures).pixels))
 
 
 def _of_paths(exposures: Exposures, views_per_step: int) -> Needs:
@@ -145,8 +151,8 @@ def of_space_time(exposures: Exposures, how: Pinn) -> Needs:
     fitted = (Parts.space_time * looked + Parts.every_time * times) * one.voxels + Costs.waves * step.waves()
     disk = Costs.page + Costs.written * (KEPT * one.voxels * times / 4 + every.pixels)
     seconds = 20 + 2e-7 * how.fit.schedule.steps * looked * one.voxels + 2e-4 * times * one.voxels
-    memory = Costs.program + Costs.frames * every.pixels + max(fitted, of_start(one, how.volume))
-    return Needs(with_report(every, memory), disk, seconds)
+    fitted = Costs.program + max(fitted, of_start(one, how.volume))
+    return Needs(Costs.frames * every.pixels + max(Parts.drawn, fitted), disk, seconds)
 
 
 def of_each_time(exposures: Exposures, method: Method, matter: MatterKind | None) -> Needs | None:
@@ -163,11 +169,16 @@ def of_surfaces(exposures: Exposures, how: SurfaceOptions) -> Needs:
     return Needs(memory, Room.node * Room.nodes * sizes.rows * sizes.columns + 1e6, 5 + 5.6e-6 * waves)
 
 
-def of_export(shape: tuple[int, int, int], whole: bool) -> Needs:
-    """What `export --volume` takes for δ and β on so many voxels, which are written `whole` or slab by slab."""
+def of_export(shape: tuple[int, int, int], suffix: str) -> Needs:
+    """What `export --volume` takes for δ and β on so many voxels, in a file or folder of this suffix: TIFF is written
+    whole, others slab by slab, and OME-Zarr at lower resolutions, too, by rows of chunks."""
     voxels = math.prod(shape)
-    held = Parts.exported * voxels if whole else Parts.slab * min(voxels, max(SLAB_VOXELS, shape[0] * shape[2]))
-    return Needs(Costs.program + held, 2 * Costs.written * voxels, 1 + 2e-7 * voxels)
+    slab, chunks = (
+        min(voxels, max(rows, shape[0] * shape[2])) for rows in (SLAB_VOXELS, 2 * CHUNK * shape[0] * shape[2])
+    )
+    held = Parts.exported * voxels if suffix in TIFF_SUFFIXES else Parts.slab * slab
+    held += Parts.halved * chunks if suffix == ZARR_SUFFIX else 0.0
+    return Needs(Parts.plain_program + held, 2 * Costs.written * voxels, 1 + 2e-7 * voxels)
 
 
 def of_growth(cells: int, nodes: int, snapshots: int, travel: float) -> Needs:
@@ -178,14 +189,14 @@ def of_growth(cells: int, nodes: int, snapshots: int, travel: float) -> Needs:
     steps = 2.4 * snapshots * travel / 1e-6
     seconds = 2 + 2.5e-8 * steps * (cells * nodes) ** 2
     disk = Room.node * nodes * cells * snapshots + 1e5
-    return Needs(Parts.plain_program + Parts.node_pairs * nodes**2, disk, seconds)
+    return Needs(Costs.program + Parts.node_pairs * nodes**2, disk, seconds)
 
 
 def of_dataset(simulated: Needs, shape: tuple[int, int], views: int, scenes: int, jobs: int) -> Needs:
     """What `dataset` takes in so many processes for scenes of so many views, each `simulated` at what it takes most."""
     rows, columns = shape
     pixels, voxels = views * rows * columns, rows * columns**2
-    memory = simulated.memory + Parts.judged * voxels
+    memory = simulated.memory + Parts.plain_program - Costs.program + Parts.scene * voxels
     disk = scenes * (Room.scene_pixel * pixels + Room.scene_voxel * voxels) + 1e5
     return Needs(jobs * memory + (jobs > 1) * Costs.program, disk, 1.5e-4 * scenes * pixels / jobs)
 
