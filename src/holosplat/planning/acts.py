@@ -1,6 +1,7 @@
 """What other commands than `reconstruct` and `simulate` of one time take, told before they start.
 
-`benchmarks/needs_acts.py` measures what the constants below stand for, and writes docs/data/needs_acts.csv.
+`benchmarks/needs_acts.py` measures the memory that the constants below stand for, and writes docs/data/needs_acts.csv.
+Seconds and bytes on the disk are rough: they were looked at once or twice, on a machine that others used.
 """
 
 from __future__ import annotations
