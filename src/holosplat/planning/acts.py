@@ -57,9 +57,11 @@ class Parts:
     """A channel of a voxel of the lattice of a network in training."""
     lifted: float = 49.0
     """A channel that is lifted from a view into such a voxel."""
-    aligned: float = 300.0
+    aligned_trainer: float = 0.57e9
+    """The same of a pixel-aligned network."""
+    aligned: float = 154.0
     """A voxel of a pixel-aligned field in training."""
-    aligned_view: float = 150.0
+    aligned_view: float = 77.0
     """The same in each view."""
     node_pairs: float = 10.0
     """A pair of nodes of two cells in flow, whose block is computed at once."""
@@ -212,10 +214,10 @@ def of_training(shape: tuple[int, int], views: int, network: str, size: Size, st
     if network == "start":
         voxels /= LATTICE
         channels = sum(width / 8**level for level, width in enumerate(size.volume)) + 3 * size.features
-        memory = (Parts.channel * channels + Parts.lifted * size.features * views) * voxels
+        memory = Parts.trainer + (Parts.channel * channels + Parts.lifted * size.features * views) * voxels
     else:
-        memory = (Parts.aligned + Parts.aligned_view * views) * voxels
-    return Needs(Parts.trainer + memory, 1e8, steps * (0.2 + 2e-5 * views * voxels))
+        memory = Parts.aligned_trainer + (Parts.aligned + Parts.aligned_view * views) * voxels
+    return Needs(memory, 1e8, steps * (0.2 + 2e-5 * views * voxels))
 
 
 def of_methods(exposures: Exposures, is_test: np.ndarray, samples: int, methods: Sequence[Method]) -> Needs:
