@@ -114,32 +114,6 @@ def statistics(nodes: np.ndarray, membrane: Membrane, times: np.ndarray) -> dict
     }
 
 
-def summary(theirs: dict[str, np.ndarray], here: dict[str, np.ndarray]) -> list[str]:
-    """Markdown, side by side."""
-    rows = {
-        "drift speed, mean over cells / mm/s": lambda s: f"{1e3 * s['drift'].mean():.2f}",
-        "drift speed, slowest and fastest cell / mm/s": lambda s: (
-            f"{1e3 * s['drift'].min():.1f}, {1e3 * s['drift'].max():.1f}"
-        ),
-        "shape change since the start at the end, mean over cells / µm": lambda s: (
-            f"{1e6 * s['change'][-1].mean():.2f}"
-        ),
-        "shape change, mean over cells and time / µm": lambda s: f"{1e6 * s['change'].mean():.2f}",
-        "shape change, greatest / µm": lambda s: f"{1e6 * s['change'].max():.2f}",
-        "elongation, mean over cells and time": lambda s: f"{s['elongation'].mean():.3f}",
-        "elongation, greatest": lambda s: f"{s['elongation'].max():.3f}",
-        "volume against rest, least and greatest": lambda s: (
-            f"{100 * s['volume'].min():+.2f} %, {100 * s['volume'].max():+.2f} %"
-        ),
-        "area against rest, least and greatest": lambda s: (
-            f"{100 * s['area'].min():+.2f} %, {100 * s['area'].max():+.2f} %"
-        ),
-    }
-    return ["| | ESPResSo | here |", "| --- | --- | --- |"] + [
-        f"| {name} | {show(theirs)} | {show(here)} |" for name, show in rows.items()
-    ]
-
-
 def write_rows(run: Run, fluid: np.ndarray, theirs: dict[str, np.ndarray], here: dict[str, np.ndarray]) -> None:
     """A row a cell as docs/data/espresso_flow.csv."""
     columns = {"fluid_m_s": fluid}
@@ -147,11 +121,17 @@ def write_rows(run: Run, fluid: np.ndarray, theirs: dict[str, np.ndarray], here:
         columns[f"{whose}_drift_m_s"] = found["drift"]
         columns[f"{whose}_shape_change_m"] = found["change"][-1]
         columns[f"{whose}_elongation"] = found["elongation"].mean(0)
+        columns[f"{whose}_mean_shape_change_m"] = found["change"].mean(0)
+        columns[f"{whose}_greatest_shape_change_m"] = found["change"].max(0)
+        columns[f"{whose}_greatest_elongation"] = found["elongation"].max(0)
+        for name in ("volume", "area"):  # against rest
+            columns[f"{whose}_least_{name}"] = found[name].min(0)
+            columns[f"{whose}_greatest_{name}"] = found[name].max(0)
     with atomic_path(DOCS / "data" / "espresso_flow.csv") as temporary, temporary.open("w", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["cell", *columns])
+        writer.writerow(["cell", *columns, "commit"])
         for cell in range(run.nodes.shape[1]):
-            writer.writerow([cell, *(f"{values[cell]:.5g}" for values in columns.values())])
+            writer.writerow([cell, *(f"{values[cell]:.5g}" for values in columns.values()), commit()])
 
 
 def draw(run: Run, nodes: np.ndarray, theirs: dict[str, np.ndarray], here: dict[str, np.ndarray]) -> None:
@@ -195,8 +175,7 @@ def main() -> None:
     start = torch.from_numpy(run.nodes[0].mean(1)) - torch.tensor([0.0, WALL, WALL], dtype=torch.float64)
     fluid = suspension.channel.speed(start).numpy()
     print(f"commit {commit()}; {state.taken} steps, {state.refused} refused, {seconds[0]:.0f} s of processor time, "
-          f"{seconds[1]:.0f} s by the clock\n")  # fmt: skip
-    print(*summary(theirs, here), sep="\n")
+          f"{seconds[1]:.0f} s by the clock")  # fmt: skip
     path = (nodes[-1] - run.nodes[-1]).mean(1)
     shape = shape_change(nodes[-1], run.nodes[-1])
     print(f"\ndrift speed, rms difference {1e3 * np.sqrt(((here['drift'] - theirs['drift']) ** 2).mean()):.2f} mm/s, "

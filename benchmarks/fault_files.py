@@ -161,6 +161,11 @@ FLAGS = {
 }
 VALUES = ("nan", "inf", "-inf", "-1", "1e30", "-1e30", str(2**70), str(10**12), "", "x", "1e-300", "\udc80")
 
+MEANT = {("seed", str(10**12)), ("photons-per-pixel", str(10**12)), ("axis-column", str(10**12))}
+MEANT |= {(flag, "1e-300") for flag in ("psf-sigma-px", "misalign-shift", "uncertain-shift", "axis-column")}
+"""What is no odd value: seeds are as large as they like, so many photons give no noise, so small a length is none, and
+--axis-column may say that the axis is anywhere."""
+
 
 def odd(shop: Shop, rng: random.Random, folder: Path) -> str:
     """A value that no experiment has: one sentence."""
@@ -168,8 +173,9 @@ def odd(shop: Shop, rng: random.Random, folder: Path) -> str:
     flag = f"--{rng.choice(FLAGS[name].split())}"
     command = {"grow": ["grow", "--out", folder / "out"], "simulate": shop.simulate(folder / "out.nxs")}
     command |= {"record": shop.record(folder / "out.nxs"), "reconstruct": shop.reconstruct(folder / "out")}
-    ended = run([*command[name], flag, rng.choice(VALUES)])
-    silent = ended.code == 0 and flag not in ("--axis-column",)
+    value = rng.choice(VALUES)
+    ended = run([*command[name], flag, value])
+    silent = ended.code == 0 and (flag.removeprefix("--"), value) not in MEANT
     return sentence(ended) or ("silent" if silent else "")
 
 

@@ -11,7 +11,6 @@ from the seed, and repeat with it but for moments of a kill.
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import platform
 import random
@@ -28,6 +27,7 @@ from fault_files import flipped, hostile, odd, tampered, two
 from fault_kills import full, killed
 from fault_shop import WRITERS, Shop, Writer
 from forked import loaded, run, size_of
+from rows import read, write
 
 OUTCOMES = ("traceback", "hang", "crash", "silent", "lost")
 DISTURBED = ("kill -9", "full disk")
@@ -72,6 +72,12 @@ def trials(
     return found
 
 
+def replaced(rows: list[dict[str, object]], row: dict[str, object]) -> list[dict[str, object]]:
+    """The rows with a new one in place of that of its kind, or behind them."""
+    kinds = [each["kind"] for each in rows]
+    return [row if each["kind"] == row["kind"] else each for each in rows] + [row] * (row["kind"] not in kinds)
+
+
 def main() -> None:
     """All kinds, and a table of them."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -84,18 +90,16 @@ def main() -> None:
     warnings.simplefilter("ignore")
     loaded()
     with tempfile.TemporaryDirectory() as name:
-        shop, rows = Shop.made(Path(name)), []
+        shop, rows = Shop.made(Path(name)), read(given.csv) if given.csv else []
         for kind in given.kinds:
             found = trials(shop, kind, given.trials, random.Random(f"{given.seed} {kind}"), seconds=given.seconds)
             row = {"kind": kind, "trials": found["trials"], **{name: found[name] for name in OUTCOMES}}
-            rows.append(row | {"machine": f"{os.cpu_count()} × {platform.machine()}", "seed": given.seed})
-            rows[-1]["commit"] = machine.commit()
-            print(rows[-1], flush=True)
+            row |= {"machine": f"{os.cpu_count()} × {platform.machine()}", "seed": given.seed}
+            row["commit"] = machine.commit()
+            print(row, flush=True)
+            rows = replaced(rows, row)
             if given.csv:
-                with given.csv.open("w", newline="") as file:
-                    writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-                    writer.writeheader()
-                    writer.writerows(rows)
+                write(rows, given.csv)
 
 
 if __name__ == "__main__":

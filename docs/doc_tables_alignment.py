@@ -131,3 +131,15 @@ def few_views() -> str:
         kept = ", ".join(row["as_planned"].split())
         lines.append([row["case"], *numbers, kept])
     return markdown(("frames", "shifts (px)", "turns across the beam (°)", "roll (°)", "as planned"), lines)
+
+
+def calibration() -> str:
+    """What a known body leaves of the errors of a plan."""
+    lines = list[list[str]]()
+    for row in read("calibration.csv"):
+        if row["moment"] == "calibrated":
+            angles = (f"{float(row[key]):.3f}°" for key in ("across_deg", "roll_deg"))
+            lines.append([row["case"], f"{float(row['shift_px']):.4f}", *angles, f"{float(row['distance']):.2%}"])
+    for line in lines:
+        line[-1] = line[-1].replace("%", " %")
+    return markdown(("body", "shifts (px)", "turns across the beam", "roll", "distance"), lines)

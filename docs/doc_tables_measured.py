@@ -87,3 +87,12 @@ def bed() -> str:
     lines.append([quoted, "0.848", "0.813", "0.767"])
     head = "Dice at half, of the segmentation as published (moved to where frames show it)"
     return markdown((head, "8 views", "4 views", "2 views"), lines)
+
+
+def compact_series() -> str:
+    """Objects of several times, in files of their own and in one."""
+    lines = list[list[str]]()
+    for row in read("compact_series.csv"):
+        sizes = (f"{float(row[key]) / 1e3:.0f} kB" for key in ("plain_bytes", "alone_bytes", "series_bytes"))
+        lines.append([row["name"], *sizes])
+    return markdown(("objects", "as runs hold them", "compact, each by itself", "in one file"), lines)

@@ -217,24 +217,29 @@ def _error(row: Row | None) -> str:
 
 
 def espresso() -> str:
-    """Sixteen cells beside ESPResSo's: drift, shape change at the end, and elongation, which the file has over time."""
+    """Sixteen cells beside ESPResSo's: drift, shape, elongation, volume and area."""
     rows = read("espresso_flow.csv")
 
-    def cells(name: str, said: Callable[[list[float]], str], factor: float) -> list[str]:
-        return [said([factor * float(row[f"{who}_{name}"]) for row in rows]) for who in ("espresso", "here")]
+    def line(said: str, names: str, shown: Callable[[list[float]], str], factor: float = 1.0) -> list[str]:
+        """Both programs' values of columns `names`, cell by cell, times `factor`."""
+        found = []
+        for who in ("espresso", "here"):
+            found.append(shown([factor * float(row[f"{who}_{name}"]) for name in names.split() for row in rows]))
+        return [said, *found]
 
+    share = lambda v: f"{min(v):+.2f} %, {max(v):+.2f} %"  # noqa: E731
+    mean = lambda digits: lambda v: f"{sum(v) / len(v):.{digits}f}"  # noqa: E731
+    most = lambda digits: lambda v: f"{max(v):.{digits}f}"  # noqa: E731
     lines = [
-        ["drift speed, mean over cells / mm/s", *cells("drift_m_s", lambda v: f"{sum(v) / len(v):.2f}", 1e3)],
-        [
-            "drift speed, slowest and fastest cell / mm/s",
-            *cells("drift_m_s", lambda v: f"{min(v):.1f}, {max(v):.1f}", 1e3),
-        ],
-        [
-            "shape change since the start at the end, mean over cells / µm",
-            *cells("shape_change_m", lambda v: f"{sum(v) / len(v):.2f}", 1e6),
-        ],
-        ["shape change at the end, greatest / µm", *cells("shape_change_m", lambda v: f"{max(v):.2f}", 1e6)],
-        ["elongation, mean over cells and time", *cells("elongation", lambda v: f"{sum(v) / len(v):.3f}", 1)],
+        line("drift speed, mean over cells / mm/s", "drift_m_s", mean(2), 1e3),
+        line("drift speed, slowest and fastest cell / mm/s", "drift_m_s", lambda v: f"{min(v):.1f}, {max(v):.1f}", 1e3),
+        line("shape change since the start at the end, mean over cells / µm", "shape_change_m", mean(2), 1e6),
+        line("shape change, mean over cells and time / µm", "mean_shape_change_m", mean(2), 1e6),
+        line("shape change, greatest / µm", "greatest_shape_change_m", most(2), 1e6),
+        line("elongation, mean over cells and time", "elongation", mean(3)),
+        line("elongation, greatest", "greatest_elongation", most(3)),
+        line("volume against rest, least and greatest", "least_volume greatest_volume", share, 100),
+        line("area against rest, least and greatest", "least_area greatest_area", share, 100),
     ]
     return _tight(markdown(("", "ESPResSo", "here"), lines))
 

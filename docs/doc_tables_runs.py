@@ -290,3 +290,9 @@ def random_scenes() -> str:
             lines.append([*told, "–", "–", r["result"]])
     columns = ("matter", "known", "views", "noise", "uneven light", "error of δ / Dice / total", "result", "verdict")
     return markdown(columns, lines)
+
+
+def faults() -> str:
+    """What commands did when they were disturbed, kind by kind."""
+    head = ("kind", "trials", "traceback", "hang", "crash", "silent", "lost")
+    return markdown(head, [[row[name] for name in head] for row in read("faults.csv")])

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from doc_tables_runs import script
 
 from holosplat.report.style import scientific
 from holosplat.thesis.configurations import EVERY, PACES, THESIS_TABLE
@@ -159,3 +160,20 @@ def studies(rows: Sequence[Row]) -> dict[str, Study]:
         for seed in sorted({int(row["seed"]) for row in plain}):
             found[f"{SCHEDULES[schedule]}, {seed}"] = study_of([row for row in plain if int(row["seed"]) == seed])
     return found
+
+
+def left() -> str:
+    """What was not run, with a command for each study."""
+    runs = script("thesis_runs")
+    had = {tuple(row[key] for key in runs.IDENTITY) for row in read_rows()}
+    missing = [task for task in runs.tasks() if runs.known(task) not in had]
+    studies_left: dict[str, list[Any]] = {}
+    for task in missing:
+        studies_left.setdefault(task.study, []).append(task)
+    lines = []
+    for tasks in studies_left.values():
+        first = tasks[0].command(Path("RUNS"), "DIR")
+        at = first.index(tasks[0].name)
+        command = " ".join([*first[:at], *(task.name for task in tasks), *first[at + 1 :]])
+        lines.append((SCHEDULES[tasks[0].schedule], str(len(tasks)), f"`{command}`"))
+    return "\n".join(markdown_table((f"{len(missing)} runs are left: steps", "runs", "command"), lines))

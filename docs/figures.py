@@ -23,6 +23,7 @@ import doc_tables_learning as learning
 import doc_tables_measured as measured
 import doc_tables_motion as motion
 import doc_tables_moving as moving
+import doc_tables_printed as printed
 import doc_tables_runs as runs
 import doc_tables_thesis as thesis
 
@@ -162,6 +163,14 @@ TABLES |= {
             "an hour",
         ),
         ("few-views", alignment.few_views, "few_views.csv", "python benchmarks/few_views.py", "ten minutes"),
+        ("calibration", alignment.calibration, "calibration.csv", "python benchmarks/calibration.py", "minutes"),
+        (
+            "compact-series",
+            measured.compact_series,
+            "compact_series.csv",
+            "python benchmarks/compact_series.py NAME RUNS --write",
+            "minutes",
+        ),
     )
 }
 TABLES["pinn"] = Table(
@@ -253,6 +262,9 @@ TABLES |= {
 }
 
 
+TABLES["faults"] = Table(
+    runs.faults, ("faults.csv",), "python benchmarks/faults.py --trials 200 --csv docs/data/faults.csv", "an hour"
+)
 THESIS = "python benchmarks/thesis_runs.py run RUNS --snapshots DIR, then collect RUNS"
 TABLES |= {
     f"thesis-{name}": Table(make, ("thesis_study/runs.csv",), THESIS, "a day")
@@ -262,7 +274,11 @@ TABLES |= {
         ("full", lambda: thesis.configurations("full")),
         ("others", thesis.others),
         ("findings", thesis.verdicts),
+        ("left", thesis.left),
     )
+}
+TABLES |= {
+    name: Table(make, (printed.file_of(name),), *printed.PRINTED[name]) for name, make in printed.makers().items()
 }
 
 
@@ -343,7 +359,7 @@ ELSEWHERE = {
 
 def pages() -> list[Path]:
     """All pages that may hold tables."""
-    return [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
+    return [ROOT / "README.md", ROOT / "SECURITY.md", *sorted(DOCS.rglob("*.md"))]
 
 
 def filled(text: str) -> str:

@@ -132,6 +132,7 @@ def test_a_run_of_an_estimated_material_is_taken(shop, tmp_path):
 def test_a_run_with_delta_and_beta_apart_is_refused(shop, tmp_path):
     apart = RunFolder(shutil.copytree(shop / "run", tmp_path / "apart"))
     write_object(apart.object, freed(load_reconstruction(apart).object))
+    apart.write_summary(apart.read_summary())  # which names the object
     out = tmp_path / "bodies"
     command = holosplat("surface", apart.path, "--scan", shop / "scan.nxs", "--out", out)
     refused(command, "surfaces need one material", "δ and β apart", "--material")

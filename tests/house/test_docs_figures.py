@@ -64,6 +64,28 @@ def test_an_empty_table_takes_nothing_with_it(figures):
     assert len(parts) == 3
 
 
+TABLE = re.compile(r"^\|.*\n\| ---.*\n((?:\|.*\n)+)", re.MULTILINE)
+DECLARED = {"docs/simulation.md": "| option | views |", "docs/thesis_study.md": "| the thesis | here |"}
+"""Tables of settings, which nobody measured."""
+WHOLE = "docs/benchmark_tables.md"
+"""The page that make_benchmark.py writes from docs/data as a whole."""
+
+
+def test_numbers_that_were_measured_stand_in_tables_that_a_script_makes(figures):
+    """Tables of which a quarter of the cells have decimals or units, outside of marks."""
+    assert "benchmark_tables.md" in (DOCS / "make_benchmark.py").read_text("utf-8")
+    found = []
+    for page in figures.pages():
+        name = page.relative_to(ROOT).as_posix()
+        for table in TABLE.finditer(figures.MARKED.sub("", page.read_text("utf-8"))):
+            cells = [cell for line in table[1].splitlines() for cell in line.strip("|").split("|")[1:]]
+            numbers = [cell for cell in cells if re.search(r"\d\.\d|\d (%|s|ms|kB|MB|GB)\b", cell)]
+            declared = table[0].startswith(DECLARED.get(name, "none"))
+            if len(numbers) > len(cells) / 4 and name != WHOLE and not declared:
+                found.append(f"{name}: {table[0].splitlines()[0]}")
+    assert found == []
+
+
 def test_every_table_stands_in_a_page_and_has_its_data(figures):
     found = [name for page in figures.pages() for _, name, _ in figures.MARKED.findall(page.read_text("utf-8"))]
     assert sorted(found) == sorted(figures.TABLES)

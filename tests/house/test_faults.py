@@ -94,3 +94,9 @@ def test_what_an_altered_run_may_say(faults, tmp_path, monkeypatch, noticed, fra
     monkeypatch.setattr(files, "_predicted", lambda shop, found: next(said))
     monkeypatch.setattr(files, "check", lambda path: (2, ["altered"] if noticed else []))
     assert faults.SINGLE["tampered runs"](None, random.Random(2), tmp_path) == verdict
+
+
+def test_a_kind_that_is_tried_again_takes_its_row(faults):
+    rows = [{"kind": "a", "trials": 1}, {"kind": "b", "trials": 2}]
+    assert faults.replaced(rows, {"kind": "a", "trials": 5}) == [{"kind": "a", "trials": 5}, rows[1]]
+    assert faults.replaced(rows, {"kind": "c", "trials": 5}) == [*rows, {"kind": "c", "trials": 5}]

@@ -122,6 +122,13 @@ def load_case(name: str | Path, seed: int = 0, snapshots: Path | None = None) ->
         raise InputError(f"{path}, case {called}: {error}") from None
 
 
+def planned_frames(name: str | Path, snapshots: Path | None = None) -> tuple[Exposures, np.ndarray]:
+    """The exposures of a case, without its scene, and which of them are held out; arguments and errors as those of
+    `load_case`."""
+    path, called = _found(str(name))
+    return read_declaration(path, called, snapshots is not None).exposures()
+
+
 def case_of(declared: Declaration, name: str, seed: int, snapshots: Path | None = None) -> Case:
     """The case that is `declared`, with the scene and the noise of `seed`; errors as those of `load_case`."""
     scene, text, balls = declared.scene(seed, snapshots)

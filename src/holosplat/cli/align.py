@@ -17,6 +17,7 @@ from .light import LightFlags
 from .options import PriorOptions
 from .progress import ProgressBar
 from .quantities import Degrees, Pixels, Share
+from .room import tell_frames
 
 if TYPE_CHECKING:
     import numpy as np
@@ -118,6 +119,7 @@ def align(
     from ..io.atomic import require_apart, require_writable
     from ..io.formats import read_as
     from ..io.nxtomo import write_scan
+    from ..planning.acts import of_alignment
     from ..scan import Scan
 
     for path in (out, *([table] if table else []), *([geometry_out] if geometry_out else [])):
@@ -125,13 +127,16 @@ def align(
         require_apart(path, scan)
     require(table is None or not axis_only, "--table is of single views; leave it, or --axis-only.")
     require(geometry_out is None or reading.part.views is None, "--geometry-out is of all frames; leave --views.")
-    measured = read_as(scan, reading).in_memory()
+    measured, how = read_as(scan, reading), unknown.options()
+    if not axis_only:
+        tell_frames("align", measured.exposures, out, lambda seen: of_alignment(seen, how))
+    measured = measured.in_memory()
     prior = matter.prior(measured.exposures.reference_energy)
     errors, frames, lasting = None, measured.source, np.arange(len(measured))
     if axis_only:
         lines, exposures = _axis(measured, prior, illumination.options())
     else:
-        found = _views(measured, prior, unknown.options(), illumination.options())
+        found = _views(measured, prior, how, illumination.options())
         lines, exposures, errors = found.lines(), found.exposures, found.errors
         if isinstance(found, AlignedBeams):
             frames = found.upright(measured.frames) if any(found.sides) else frames

@@ -14,11 +14,13 @@ from tyro.conf import Positional, arg, subcommand
 from ..checks import require
 from ..ranges import Seed, with_checked_numbers
 from .progress import INTERRUPTED, ProgressBar
+from .room import tell
 from .thesis import thesis
 
 if TYPE_CHECKING:
     from ..bench.method import Method
     from ..bench.rows import Row
+    from ..bench.run import Suite
 
 FIRST_SEED = 101
 """Options were tuned on scenes of seeds below 100."""
@@ -83,6 +85,7 @@ def run(
     suite = Suite(list(sources), sorted(set(seeds)), wanted, REFERENCES, load)
     folder = BenchFolder(out)
     folder.require_usable()
+    _tell({name: source for name, source in sources.items() if name not in MEASURED}, suite, folders, out)
     try:
         with sole_writer(out), _Screen() as screen:
             run_suite(suite, folder, retry=retry, on_progress=screen.show, on_row=screen.tell)
@@ -162,6 +165,24 @@ def _at_hand(sources: dict[str, str], data: Path | None) -> dict[str, str]:
     for name, why in missing.items():
         _say(f"{name} is skipped, for its data are not at hand (--data FOLDER): {why}")
     return {name: source for name, source in sources.items() if name not in missing}
+
+
+def _tell(sources: Mapping[str, str], suite: Suite, folders: Folders, out: Path) -> None:
+    """Say what the cases that are simulated take; `InputError` where there is less, with those that fit."""
+    from ..beamline.simulate import Simulation
+    from ..bench.case import planned_frames
+    from ..planning.acts import of_benchmark, of_methods
+
+    methods, each = [method.options for method in suite.methods.values()], {}
+    for name, source in sources.items():
+        exposures, is_test = planned_frames(source, folders.snapshots)
+        samples = Simulation().samples(exposures)
+        each[name] = of_methods(exposures, is_test, samples, methods).times(len(suite.seeds))
+    if each:
+        smallest = sorted(each, key=lambda name: each[name].memory)
+        fewer = (smallest[:count] for count in range(len(smallest) - 1, 0, -1))
+        others = ((f"--cases {' '.join(kept)}", of_benchmark([each[name] for name in kept])) for kept in fewer)
+        tell("the benchmark", of_benchmark(list(each.values())), out, others)
 
 
 def _list(cases: list[str], methods: Mapping[str, Method]) -> None:

@@ -19,7 +19,7 @@ from .light import RunLightFlags
 from .live import LiveFlags, watched
 from .options import BeamlineOptions, MethodOptions, PriorOptions, TruthOptions
 from .progress import INTERRUPTED, ProgressBar
-from .room import tell_reconstruction
+from .room import tell_frames, tell_reconstruction
 
 if TYPE_CHECKING:
     from ..methods import Method
@@ -96,8 +96,10 @@ def reconstruct(
         strict: Exit with 3 where the frames are not explained to within their noise; without it, that is a warning.
     """
     from ..io.formats import read_as
+    from ..methods import Pinn
     from ..methods.method import takes_series
     from ..methods.uncertain import Uncertain
+    from ..planning.acts import of_space_time
     from ..workflows.reconstruct import reconstruct as fit
     from ..workflows.run_folder import RunFolder, claimed
     from .motion import asks_for_motion, may_go_on, reconstruct_in_motion
@@ -116,8 +118,11 @@ def reconstruct(
     ways, folder = asked.ways(reading), RunFolder(out)
     measured = read_as(scan, replace(reading, told=reading.told.at_middle()))
     prior = asked.matter.without_ranges().prior(measured.exposures.reference_energy)
-    if not measured.is_series:
-        tell_reconstruction(measured.exposures[~measured.is_test], out, method, prior, ways["matter"])
+    seen = measured.exposures[~measured.is_test]
+    if isinstance(method, Pinn):
+        tell_frames(method.kind, seen, out, lambda frames: of_space_time(frames, method))
+    elif not measured.is_series:
+        tell_reconstruction(seen, out, method, prior, ways["matter"])
     measured = measured.in_memory()
     plain = may_go_on(folder, resume) and ways["refine"] is None and ways["uncertain"] == Uncertain()
     if asks_for_motion(reading, method, ways["matter"], plain):

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, arg
 
 from ..ranges import Natural, Seed
 from ..training.ranges import Ranges
 from .progress import INTERRUPTED, ProgressBar
+from .room import tell
+
+if TYPE_CHECKING:
+    from ..planning.needs import Needs
 
 Layout = Literal["nerf-synthetic", "r2-gaussian", "onix"]
 """Those of `training.export`, which loads torch."""
@@ -42,6 +46,9 @@ def dataset(
     from ..training.make import make
 
     wanted = Dataset(out, drawn, seed, count)
+    left = sum(map(len, wanted.missing()))
+    fewer = ((f"--jobs {n}", _needs(drawn, left, n)) for n in range(jobs - 1, 0, -1))
+    tell("the dataset", _needs(drawn, left, jobs), out, fewer)
     with ProgressBar() as bar:
         try:
             made = make(wanted, jobs, lambda fraction: bar.show("scenes", fraction, {}))
@@ -56,3 +63,14 @@ def dataset(
     for each in done:
         left_out = f"; left out, for their views have no common axis: {len(each.left_out)}" if each.left_out else ""
         print(f"wrote {each.count} scene{'s' * (each.count > 1)} into {each.folder}{left_out}")
+
+
+def _needs(drawn: Ranges, scenes: int, jobs: int) -> Needs:
+    """What so many scenes take."""
+    from ..beamline.simulate import Simulation
+    from ..planning.acts import of_dataset
+    from ..planning.needs import of_simulation
+
+    views = drawn.views + drawn.held_out
+    ends = (of_simulation(each, Simulation().samples(each), views) for each in drawn.extremes())
+    return of_dataset(max(ends, key=lambda needs: needs.memory), (drawn.rows, drawn.columns), views, scenes, jobs)

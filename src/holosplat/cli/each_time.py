@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..checks import require
+from ..io.formats import read_as
 from ..io.reading import Reading
 from ..matter import MaterialPrior
 from ..series.asked import Cut
@@ -18,6 +19,7 @@ from ..series.run import run_left
 from ..series.settings import Settings
 from ..series.words import line_of
 from .progress import INTERRUPTED
+from .room import tell_each_time
 from .series import UNFINISHED
 
 
@@ -37,6 +39,8 @@ def reconstruct_each(
     reading = replace(reading, part=replace(reading.part, time_frame=None))
     every = plan_series([scan], settings, prior, reading, Cut())
     planned = replace(every, cut=Cut(window=len(every.moments())))
+    seen, method, matter = read_as(scan, reading), settings.method, settings.matter
+    tell_each_time(seen.exposures[~seen.is_test], out, method, matter)
     folder = SeriesFolder(out)
     if resume and out.exists():
         require(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -96,7 +97,7 @@ def _ending(path: Path, ending: str) -> Path:
 def _export_compact(folder: RunFolder, out: Path, step_px: float, together: tuple[Path, ...]) -> None:
     from ..io.atomic import require_writable
     from ..io.compact import steps_of
-    from ..io.objects import read_object, write_compact
+    from ..io.objects import write_compact
     from ..io.series import names_of, write_series
     from ..workflows.run_folder import RunFolder
 
@@ -106,9 +107,9 @@ def _export_compact(folder: RunFolder, out: Path, step_px: float, together: tupl
         each.require_run()
     if together:
         names = names_of([each.path for each in folders])
-        write_series(out, {name: read_object(each.result()) for name, each in zip(names, folders)}, steps)
+        write_series(out, {name: each.read_result() for name, each in zip(names, folders)}, steps)
     else:
-        write_compact(out, read_object(folder.result()), steps)
+        write_compact(out, folder.read_result(), steps)
     before, after = sum(each.result().stat().st_size for each in folders), out.stat().st_size
     of = f"{len(folders)} runs" if together else folder.result().name
     _say(f"wrote {out}: {after / 1e6:.3g} MB, {before / after:.1f} times smaller than {of}")
@@ -178,7 +179,9 @@ def _export_volume(
     from ..io.ome_zarr import ZARR_SUFFIX, require_zarr, write_ome_zarr
     from ..io.volume_files import TIFF_SUFFIXES, write_ome_tiff
     from ..io.volumes import write_voxels
+    from ..planning.acts import of_export
     from ..scan import PIXEL_RANGE_M
+    from .room import tell
 
     if volume.suffix.lower() == ZARR_SUFFIX:
         require_zarr()
@@ -194,6 +197,8 @@ def _export_volume(
     grid = Grid.centred(shape or (columns, rows, columns), edge, (x, y, z))
     count = math.prod(grid.shape)
     require(count <= MOST_VOXELS, f"shape must have at most {MOST_VOXELS:.0e} voxels, but it has {count:.0e}.")
+    slabs = ((f"an HDF5 file{how}", of_export(shape, ".h5")) for how, shape in _smaller(grid.shape))
+    tell("the volume", of_export(grid.shape, volume.suffix.lower()), volume, slabs)
     if volume.suffix.lower() in TIFF_SUFFIXES:
         write_ome_tiff(volume, result.object.voxelise(grid))
     elif volume.suffix.lower() == ZARR_SUFFIX:
@@ -201,6 +206,15 @@ def _export_volume(
     else:
         write_voxels(volume, result.object, grid)
     _say(f"wrote {volume}: {' × '.join(map(str, grid.shape))} voxels of {1e6 * grid.voxel_size[0]:.4g} µm")
+
+
+def _smaller(shape: tuple[int, int, int]) -> Iterator[tuple[str, tuple[int, int, int]]]:
+    """A shape, and halves of it, with the words for these."""
+    yield "", shape
+    while max(shape) > 1:
+        z, y, x = (max(1, n // 2) for n in shape)
+        shape = z, y, x
+        yield f" with --shape {z} {y} {x} of larger voxels", shape
 
 
 def _say(text: str) -> None:

@@ -19,6 +19,7 @@ from ..motion.cell_model import ChannelFrame
 from ..motion.dynamics import DynamicsForecast
 from ..motion.fit import MotionFit
 from ..motion.forecast import PathForecast
+from ..planning.acts import of_forecast
 from ..ranges import Natural, Positive, Seconds, Seed, Signed, Small, ranged
 from ..report.run import report_run
 from ..scan import Scan
@@ -32,6 +33,7 @@ from ..workflows.refine import where_found
 from ..workflows.run_folder import RunFolder, claimed
 from ..workflows.track import COLLECTION, TRACKS
 from .progress import ProgressBar
+from .room import tell
 
 
 @dataclass(frozen=True)
@@ -122,6 +124,8 @@ def forecast(run: Positional[Path], out: Path, how: ForecastFlags = ForecastFlag
     tracked_bodies(tracked)
     times = np.array(instants_of(folder))
     scan = _whole_scan(folder)
+    known = scan.exposures[scan.exposures.time <= times[-1]]
+    tell("the forecast", of_forecast(known, options.fit.schedule.views_per_step), out)
     with ProgressBar() as bar:
         found = carry_on(tracked, scan, times, options, seed, on_progress=bar.show)
     with claimed(new):

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from ..beamline.grow import Growth, SeriesFolder
 from ..beamline.grow import grow as run
 from ..io.lock import sole_writer
+from ..planning.acts import of_growth
+from ..planning.needs import Needs
+from ..specimens.membrane.resting import nodes_of
 from .progress import INTERRUPTED, ProgressBar
+from .room import tell
 
 
 def grow(out: Path, what: Growth, resume: bool = False) -> None:
@@ -18,6 +23,9 @@ def grow(out: Path, what: Growth, resume: bool = False) -> None:
         out: Folder to make: rbcCC_TTT.vtp for cell CC at snapshot TTT, and cells.pvd, which ParaView opens.
         resume: Go on with an interrupted run, or to more snapshots.
     """
+    what.check()
+    coarser = ((f"--frequency {f}", _needs(replace(what, frequency=f))) for f in range(what.frequency - 1, 2, -1))
+    tell("grow", _needs(what), out, coarser)
     try:
         with sole_writer(out), ProgressBar() as bar:
             grown = run(what, out, resume, lambda fraction: bar.show("cells in flow", fraction, {}))
@@ -30,6 +38,10 @@ def grow(out: Path, what: Growth, resume: bool = False) -> None:
         f"{what.period:.4g} s apart; {grown.state.taken} steps, {grown.state.refused} refused; "
         f"volume within {100 * grown.volume:.2g} %, area within {100 * grown.area:.2g} %"
     )
+
+
+def _needs(what: Growth) -> Needs:
+    return of_growth(what.cells, nodes_of(what.frequency), what.snapshots, what.flow * what.period)
 
 
 def _say(text: str) -> None:

@@ -6,6 +6,8 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
 from ..io.formats import read_as
 from ..io.json import write_json
 from ..io.reading import Reading
@@ -14,6 +16,7 @@ from ..matter import KnownTwo, MaterialPrior, MatterKind
 from ..methods import Auto, Method
 from ..motion.carried import CarriedOptions
 from ..optics.background import LightOptions
+from ..planning.acts import of_motion
 from ..report.run import report_run
 from ..scan import Scan
 from ..workflows.evaluate import evaluate as score
@@ -22,6 +25,7 @@ from ..workflows.moving import begun_in_motion, reconstruct_moving
 from ..workflows.reconstruction import Reconstruction
 from ..workflows.run_folder import RunFolder
 from .progress import INTERRUPTED, ProgressBar
+from .room import tell_frames
 
 FEWEST_TIMES = 3
 """Times from which on matter in motion can be found."""
@@ -53,12 +57,15 @@ def reconstruct_in_motion(
     """
     seed, light, options = how
     reading = replace(reading, part=replace(reading.part, time_frame=None))
-    measured = read_as(scan, replace(reading, told=reading.told.at_middle())).in_memory()
-    count = len(measured.train().instants)
+    planned = read_as(scan, replace(reading, told=reading.told.at_middle()))
+    train = planned.exposures[~planned.is_test]
+    count = len(np.unique(train.time))
     if isinstance(prior, KnownTwo):
         return _still("a flow carries one material, but two are known, and motion is not asked of the frames")
     if count < FEWEST_TIMES:
         return _still(f"motion is asked of frames of {FEWEST_TIMES} times or more, but there are {count}")
+    tell_frames("matter in motion", train, folder.path, lambda seen: of_motion(seen, options))
+    measured = planned.in_memory()
     try:
         with ProgressBar() as bar:
             told = {"light": light, "folder": folder, "resume": resume, "on_progress": bar.show}

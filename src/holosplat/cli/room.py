@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ..matter import MaterialPrior, MatterKind
     from ..methods import Method
+    from ..planning.needs import Needs
     from ..scan import Exposures
 
 
@@ -18,21 +20,47 @@ def tell_reconstruction(
     """Say what the reconstruction of training frames takes; `InputError` where there is less. Of a known material
     frames nearly always say that it has levels."""
     from ..matter import Known
-    from ..planning.needs import Sizes, of_reconstruction, require_room, smaller
+    from ..planning.needs import Sizes, of_reconstruction, smaller
 
     if len(exposures) == 0:
         return  # there is nothing to fit, as the fit will say
     kind = matter or ("levels" if isinstance(prior, Known) else None)
     needs = of_reconstruction(Sizes.of(exposures), method, kind)
     if needs is not None:
-        require_room(needs, out, smaller(exposures, method, kind))
-        print(f"{method.kind} {needs.line()}", file=sys.stderr)
+        tell(method.kind, needs, out, smaller(exposures, method, kind))
+
+
+def tell_each_time(exposures: Exposures, out: Path, method: Method, matter: MatterKind | None) -> None:
+    """The same where each time is reconstructed by itself."""
+    from ..planning.acts import of_each_time, one_time, times_of
+    from ..planning.needs import smaller
+
+    if len(exposures) == 0:
+        return
+    needs = of_each_time(exposures, method, matter)
+    if needs is not None:
+        others = smaller(one_time(exposures), method, matter)
+        tell(f"{times_of(exposures)} times", needs, out, ((how, one.times(times_of(exposures))) for how, one in others))
 
 
 def tell_simulation(exposures: Exposures, out: Path, samples: int, frames: int) -> None:
     """The same for a simulation of `frames`, with so many wave samples along a pixel."""
-    from ..planning.needs import of_simulation, require_room
+    from ..planning.needs import of_simulation
 
-    needs = of_simulation(exposures, samples, frames)
-    require_room(needs, out)
-    print(f"the simulation {needs.line()}", file=sys.stderr)
+    tell("the simulation", of_simulation(exposures, samples, frames), out)
+
+
+def tell(what: str, needs: Needs, out: Path, others: Iterable[tuple[str, Needs]] = ()) -> None:
+    """Say what a job takes; `InputError` where there is less, with the first of the `others` that fits."""
+    from ..planning.needs import require_room
+
+    require_room(needs, out, others)
+    print(f"{what} {needs.line()}", file=sys.stderr)
+
+
+def tell_frames(what: str, exposures: Exposures, out: Path, of: Callable[[Exposures], Needs]) -> None:
+    """The same of a job of which `of` says what it takes for such frames; larger pixels may fit."""
+    from ..planning.needs import coarser
+
+    if len(exposures):  # without any there is nothing to do, as the job will say
+        tell(what, of(exposures), out, coarser(exposures, of))

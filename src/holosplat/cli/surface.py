@@ -21,6 +21,7 @@ from ..matter import Matter
 from ..mesh import TriangleMesh
 from ..methods.surface_fit import SurfaceOptions, oversampling
 from ..methods.surfaces import refine_surfaces
+from ..planning.acts import of_surfaces
 from ..representations import MovingSurfaces
 from ..workflows.evaluate import evaluate as score
 from ..workflows.evaluate import score_object
@@ -29,6 +30,7 @@ from ..workflows.provenance import scan_hash
 from ..workflows.reconstruct import load_reconstruction
 from ..workflows.run_folder import RunFolder
 from .progress import ProgressBar
+from .room import tell_frames
 from .scans import run_and_scan
 
 LENGTH_UNIT = "um"
@@ -66,6 +68,8 @@ def surface(
         _say("this is not the scan that was reconstructed: its held-out frames may have been fitted")
     if folder.read_config().get("prior", {}).get("kind") == "free":
         _say("nothing was known of the matter: δ and β of the surfaces are what the run estimated")
+    train = measured.exposures[~measured.is_test]
+    tell_frames("surface", train, out, lambda seen: of_surfaces(seen, how))
     before = score(result, measured, volume)
     began = time.perf_counter()
     with ProgressBar() as bar:

@@ -14,6 +14,7 @@ from ..io.json import write_json
 from ..io.reading import Reading
 from ..io.run_scan import run_source
 from ..motion.known import beam_directions
+from ..planning.acts import of_track
 from ..ranges import Seed
 from ..report.run import report_run
 from ..workflows.evaluate import evaluate as score
@@ -24,6 +25,7 @@ from .bodies import BodyFlags, MotionFlags
 from .light import LightFlags
 from .options import PriorOptions
 from .progress import INTERRUPTED, ProgressBar
+from .room import tell_frames
 
 USUAL = MotionFlags()
 """As the method has it."""
@@ -61,7 +63,9 @@ def track(
     options, folder = replace(how.options(), body=known.known()), RunFolder(out)
     if not resume:
         folder.require_new(advise_resume=True)
-    measured = read_as(scan, reading).in_memory()
+    measured = read_as(scan, reading)
+    tell_frames("track", measured.exposures[~measured.is_test], out, lambda seen: of_track(seen, options))
+    measured = measured.in_memory()
     if options.body is None and len(beam_directions(measured.train().views)) == 2:
         print(
             "note: two beams leave the shapes of bodies open; where their shape at rest is known, --body red-cell or "

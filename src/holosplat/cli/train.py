@@ -10,6 +10,7 @@ from tyro.conf import OmitArgPrefixes, Positional
 
 from ..training.options import TrainOptions
 from .progress import INTERRUPTED, ProgressBar
+from .room import tell
 
 A_NIGHT = TrainOptions()
 """What the shipped weights were made with."""
@@ -27,6 +28,7 @@ def train(
         out: Folder to make.
         resume: Go on with an interrupted training.
     """
+    from ..planning.acts import of_training
     from ..report.learning import training_curves
     from ..training.aligned import AlignedTraining, AlignedValidation
     from ..training.folder import Dataset
@@ -36,6 +38,9 @@ def train(
 
     scenes = Dataset.read(data)
     scenes.require_whole()
+    frames, views = (scenes.ranges.rows, scenes.ranges.columns), max(how.shown.views)
+    views = min(views, scenes.ranges.views)
+    tell("the training", of_training(frames, views, how.network, how.size, how.steps), out)
     kind = Training if how.network == "start" else AlignedTraining
     training = (kind.resumed if resume else kind.begun)(scenes, out, how)
     who = made_by(how.device)  # before files change under a night's work

@@ -91,7 +91,7 @@ def _objects(what: Path) -> tuple[dict[str, Stored], list[str]]:
     if what.is_dir():
         folder = RunFolder(what)
         folder.require_run()
-        obj = read_object(folder.result())
+        obj = folder.read_result()
         return at_times(obj, instants_of(folder)), [obj.described, *steps_of(folder)]
     with open_hdf5(what) as file:
         several = file.attrs.get("format", "") == SERIES

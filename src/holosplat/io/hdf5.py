@@ -15,6 +15,7 @@ from ..checks import InputError, require_regular, shaped
 from ..units import unit_factor
 from .guard import require_memory
 from .hdf5_guard import require_own
+from .seal import require_sealed
 
 
 @contextmanager
@@ -23,6 +24,7 @@ def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
     file = Path(path)
     require_regular(file, "an HDF5 file")
     try:
+        require_sealed(file)
         if not h5py.is_hdf5(file):
             raise InputError(f"{path} must be an HDF5 file, but it does not start like one.")
         with h5py.File(file, "r") as opened:

@@ -17,6 +17,7 @@ from ..checks import InputError, require
 from .guard import DEEPEST, require_declared
 from .hdf5_chunks import require_chunks
 from .hdf5_sources import linked, require_external, virtual_sources
+from .seal import require_sealed
 
 MOST = 200_000
 """Links in a file, at most: larger ones are no scans, and take minutes to look through."""
@@ -55,6 +56,7 @@ def require_own(file: h5py.File, path: Path) -> None:
             continue
         seen.add(other.resolve())
         require(len(seen) <= MOST_FILES, f"{path} must bring values of at most {MOST_FILES} files, but has more.")
+        require_sealed(other)
         try:
             with h5py.File(other, "r") as opened:
                 later += _others(opened, other, allowed)

@@ -1,4 +1,4 @@
-"""New HDF5 files: whole or not at all, with checksums of their values, on disks that may be full."""
+"""New HDF5 files: whole or not at all, with checksums of their values and a seal, on disks that may be full."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ import numpy as np
 
 from ..checks import require
 from .atomic import atomic_path
+from .seal import seal, summed
 
 LARGE = 1 << 20
 """Bytes of a chunk, about: checksums are of chunks, and are read with them."""
@@ -35,7 +36,9 @@ def new_hdf5(path: str | Path, size: int = 0) -> Iterator[h5py.File]:
             sink = _Sink(raw)
             with h5py.File(sink, "w") as file:
                 yield file
+                ranges = summed(file)
             sink.settle()
+            seal(raw, ranges)
 
 
 def put(group: h5py.Group, name: str, values: Any) -> h5py.Dataset:

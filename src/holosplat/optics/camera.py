@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.fft import dctn, idctn
 
-from ..checks import positive, require
+from ..checks import in_range, positive, require
 from ..ranges import Pixels, Positive, Weight, ranged
 
 BITS = (10, 16)
@@ -15,6 +15,10 @@ FLAT_LEVEL = 0.4
 """Part of the camera's range that a mean flat frame fills where no gain is given."""
 HOT_LEVELS = (0.5, 1.2)
 """Range of the levels of hot pixels without light, as parts of the camera's range; pixels above 1 are saturated."""
+
+
+GAINS = 1e-6, 1e6
+"""Counts that a photon may give."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +50,7 @@ class Camera:
         whole = isinstance(self.bits, int) and low <= self.bits <= high
         require(whole, f"bits must be a whole number from {low} to {high}, but it is {self.bits}.")
         if self.gain is not None:
-            positive("gain", self.gain, "counts a photon")
+            in_range("gain", self.gain, *GAINS, unit="counts a photon")
         require(
             self.offset < self.most, f"offset must be below the range of {self.most} counts, but it is {self.offset}."
         )

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -90,11 +90,7 @@ class Sizes:
     @classmethod
     def of(cls, exposures: Exposures, binning: int = 1) -> Sizes:
         """Those of exposures, on pixels `binning` times larger."""
-        if binning > 1:
-            views = exposures.views
-            shape = (max(1, views.shape[0] // binning), max(1, views.shape[1] // binning))
-            views = replace(views, shape=shape, pitch=views.pitch * binning)
-            exposures = replace(exposures, views=views, psf_sigma_px=exposures.psf_sigma_px / binning)
+        exposures = on_larger_pixels(exposures, binning)
         samples = fringe_sampling(exposures)
         return cls(len(exposures), *exposures.views.shape, samples, padding(exposures, samples))
 
@@ -121,6 +117,16 @@ class Sizes:
         return replace(self, rows=self.rows // factor, columns=self.columns // factor)
 
 
+def on_larger_pixels(exposures: Exposures, binning: int) -> Exposures:
+    """The same field on pixels `binning` times larger."""
+    if binning == 1:
+        return exposures
+    views = exposures.views
+    shape = (max(1, views.shape[0] // binning), max(1, views.shape[1] // binning))
+    views = replace(views, shape=shape, pitch=views.pitch * binning)
+    return replace(exposures, views=views, psf_sigma_px=exposures.psf_sigma_px / binning)
+
+
 @dataclass(frozen=True)
 class Needs:
     """What a job takes at its peak: memory and disk [bytes], time [s], the last to a factor of three."""
@@ -134,6 +140,10 @@ class Needs:
         time = f", and about {_time(self.seconds)}" if self.seconds else ""
         return f"takes about {_size(self.memory)} of memory, {_size(self.disk)} on the disk{time}"
 
+    def times(self, count: int) -> Needs:
+        """What so many of the same take, one after the other."""
+        return Needs(self.memory, count * self.disk, count * self.seconds)
+
     def fit(self, path: Path) -> bool:
         """Whether there is so much memory, and disk at `path`."""
         return SAFETY * self.memory <= free_memory() + Costs.program and self.disk <= free_disk(path)
@@ -144,17 +154,27 @@ def of_reconstruction(sizes: Sizes, method: Method, matter: MatterKind | None = 
 
     matter: its kind, where that is settled.
     """
+    fit = of_fit(sizes, method, matter)
+    return fit and replace(fit, memory=with_report(sizes, fit.memory))
+
+
+def of_fit(sizes: Sizes, method: Method, matter: MatterKind | None = None) -> Needs | None:
+    """The same without the report, which takes memory of its own."""
     if isinstance(method, Auto):
         kinds: tuple[MatterKind, ...] = (matter,) if matter else ("levels", "continuous")
-        each = [of_reconstruction(sizes, method.suited(kind)) for kind in kinds]
+        each = [of_fit(sizes, method.suited(kind)) for kind in kinds]
         return max((one for one in each if one is not None), key=lambda one: one.memory)
     parts = _parts(sizes, method)
     if parts is None:
         return None
     memory, seconds, numbers = parts
-    report = Costs.report + 0.5 * Costs.waves * sizes.waves()
     disk = Costs.written * (KEPT * numbers + sizes.pixels) + Costs.page
-    return Needs(Costs.frames * sizes.pixels + max(Costs.program + memory, report), disk, seconds)
+    return Needs(Costs.program + Costs.frames * sizes.pixels + memory, disk, seconds)
+
+
+def with_report(sizes: Sizes, memory: float) -> float:
+    """Bytes at the peak of a job that takes `memory`, and whose result is judged and drawn then."""
+    return max(memory, Costs.frames * sizes.pixels + Costs.report + 0.5 * Costs.waves * sizes.waves())
 
 
 def _parts(sizes: Sizes, method: Method) -> tuple[float, float, float] | None:
@@ -164,10 +184,10 @@ def _parts(sizes: Sizes, method: Method) -> tuple[float, float, float] | None:
         return memory, 1 + 0.35e-6 * sizes.views * sizes.voxels, sizes.voxels
     if isinstance(method, SmoothVolume):
         small = sizes.joined(method.max_voxels)
-        memory = max(Costs.smooth * small.voxels, _start(small, method.volume))
+        memory = max(Costs.smooth * small.voxels, of_start(small, method.volume))
         return memory, 10 + 4.5e-6 * sizes.views * small.voxels, small.voxels
     if isinstance(method, HolographicVoxels | Voxels | NeuralFields):
-        begun, fine = _start(sizes, method.volume), _fine(sizes, method.volume)[0]
+        begun, fine = of_start(sizes, method.volume), _fine(sizes, method.volume)[0]
         if isinstance(method, HolographicVoxels):
             return begun, 3 + 1.5e-6 * fine, fine
         fitted = Costs.waves * sizes.waves() + Costs.plain * sizes.voxels
@@ -186,7 +206,7 @@ def _bodies(sizes: Sizes, how: Gaussians, edges: bool) -> tuple[float, float, fl
     batch = how.fit.schedule.views_per_step
     fitted = replace(sizes, views=min(batch, sizes.views) if batch else sizes.views).waves()
     waves = max(Costs.waves * fitted, Costs.edges * sizes.waves(1) if edges else 0.0)
-    begun = 0.0 if how.start == "random" else _start(sizes, how.volume)
+    begun = 0.0 if how.start == "random" else of_start(sizes, how.volume)
     count = how.random_count if how.start == "random" else min(how.max_start, how.start_per_pixel * sizes.pixels)
     fine = _fine(sizes, how.volume)[0]
     memory, numbers = max(begun, waves + Costs.gaussian * count), 14 * count
@@ -203,8 +223,8 @@ def _fine(sizes: Sizes, how: HolographicTV) -> tuple[int, int]:
     return sizes.joined(how.max_voxels).voxels * refine**3, refine
 
 
-def _start(sizes: Sizes, how: HolographicTV) -> float:
-    """Bytes of the start."""
+def of_start(sizes: Sizes, how: HolographicTV) -> float:
+    """Bytes of a start by phase retrieval and total variation."""
     fine, refine = _fine(sizes, how)
     small = sizes.joined(how.max_voxels)
     alone = Costs.plain * small.voxels + Costs.rays * small.views * small.columns**2
@@ -230,7 +250,7 @@ def require_room(needs: Needs, path: Path, others: Iterable[tuple[str, Needs]] =
     way = next((f"{how} takes {_size(one.memory)} and {_size(one.disk)}" for how, one in others if one.fit(path)), "")
     raise InputError(
         f"the job {needs.line()}, but {_size(memory)} of memory and {_size(disk)} of disk are free; "
-        f"{way or 'take a part of the frames (--crop, --views), or a larger machine'}."
+        f"{way or 'take a part of it (of frames by --crop, --views), or a larger machine'}."
     )
 
 
@@ -245,6 +265,14 @@ def smaller(exposures: Exposures, method: Method, matter: MatterKind | None) -> 
             needs = of_reconstruction(sizes, tried, matter)
             if needs is not None and how:
                 yield how, needs
+
+
+def coarser(exposures: Exposures, of: Callable[[Exposures], Needs]) -> Iterator[tuple[str, Needs]]:
+    """What `of` says of the same frames on larger pixels; how, and what it takes then."""
+    for factor in BINNINGS:
+        if exposures.views.shape[1] // factor < FEWEST_COLUMNS:
+            return
+        yield f"--bin {factor}", of(on_larger_pixels(exposures, factor))
 
 
 def _one_voxel_a_pixel(method: Method) -> tuple[str, Method]:

@@ -9,13 +9,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 
 from ..checks import InputError
 from ..geometry import Grid
 from ..io.compact import FORMAT as COMPACT
 from ..io.gaussians import FORMAT as GAUSSIANS
+from ..io.hdf5 import open_hdf5
 from ..io.objects import FORMAT, read_object
 from ..io.volumes import NAMES, read_volume
 from ..representations import MOVING, Stored, SurfaceMesh
@@ -42,10 +42,10 @@ def get_reader(path: str | Sequence[str]) -> Callable[[str], list[Layer]] | None
     if found.suffix.lower() not in (".h5", ".hdf5"):
         return None
     try:
-        with h5py.File(found) as file:
+        with open_hdf5(found) as file:
             form = str(file.attrs.get("format", ""))
             return layers if form in (FORMAT, COMPACT, GAUSSIANS) or all(name in file for name in NAMES) else None
-    except OSError:
+    except InputError:
         return None
 
 
@@ -60,9 +60,9 @@ def layers(path: str) -> list[Layer]:
     if found.is_dir():
         folder = RunFolder(found)
         folder.require_run()
-        obj, times = read_object(folder.result()), instants_of(folder)
+        obj, times = folder.read_result(), instants_of(folder)
     else:
-        with h5py.File(found) as file:
+        with open_hdf5(found) as file:
             volume = all(name in file for name in NAMES)
         if volume:
             return _images(found.stem, [read_volume(found)], {})

@@ -6,7 +6,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ..checks import at_least, require
+from ..geometry import Views
 from ..ranges import Angle, Natural, Pixels, Positive, Share, SomeShare, Weight, ranged
+from ..scan import Exposures
+from ..units import wavelength
 
 Kind = Literal["red-cells", "crowd", "ellipsoids", "capsules", "filled-capsules", "foam", "soft-cells"]
 """What a scene may be made of."""
@@ -75,3 +78,9 @@ class Ranges:
         for name, pair in vars(self).items():
             if name != "kinds" and isinstance(pair, tuple):
                 require(pair[0] <= pair[1], f"{name} must be (least, most), but it is {pair}; exchange them.")
+
+    def extremes(self) -> list[Exposures]:
+        """Frames of both ends of the Fresnel numbers, between which those of all scenes lie."""
+        pixel, energy = 1e-6, 20.0  # on which nothing depends beside the Fresnel number
+        views = Views.evenly_spaced(self.views + self.held_out, (self.rows, self.columns), pixel)
+        return [Exposures.of(views, energy, pixel**2 / (wavelength(energy) * number)) for number in self.fresnel]

@@ -16,7 +16,7 @@ from ..fit.running import Record, Running
 from ..io.guess import write_guess
 from ..io.json import write_json
 from ..io.light import read_still_light, write_light
-from ..io.objects import read_object, write_object
+from ..io.objects import write_object
 from ..learning.start import GuessedMatter
 from ..matter import MaterialPrior, MatterKind
 from ..methods import Auto, Gaussians, Method, Settled, Stage, Task, begun, finished, settled
@@ -124,7 +124,7 @@ def load_reconstruction(folder: RunFolder) -> Reconstruction:
     """What a run folder holds; `InputError` if it holds no reconstruction."""
     folder.require_run()
     summary, config = folder.read_summary(), folder.read_config()
-    found = read_object(folder.result())
+    found = folder.read_result()
     still = read_still_light(folder.light) if folder.light.is_file() else None
     with as_written(folder.summary, "what reconstruct wrote"):
         require_plausible(summary)

@@ -24,7 +24,11 @@ from ..io.json import read_json, write_json
 from ..io.lock import sole_writer
 from ..io.objects import read_object
 from ..ranges import require_plausible
-from .manifest import write_manifest
+from ..representations import Stored
+from .manifest import sha256, write_manifest
+
+OBJECT_SUM = "object_sha256"
+"""The entry of summary.json that says what the object's file was."""
 
 
 class RunFolder:
@@ -76,8 +80,19 @@ class RunFolder:
         write_json(self.config, {"run": secrets.token_hex(8), **config})
 
     def write_summary(self, values: dict[str, Any]) -> None:
-        """Replace summary.json, with the name of the run."""
-        write_json(self.summary, values | {"run": self.name()})
+        """Replace summary.json, with the name of the run and the SHA-256 of its object, which is written before."""
+        summed = {OBJECT_SUM: sha256(self.object)} if self.object.is_file() else {}
+        write_json(self.summary, values | {"run": self.name()} | summed)
+
+    def read_result(self) -> Stored:
+        """The object; `InputError` if it is not that of summary.json, which is written after it."""
+        found, said = read_object(self.result()), self.read_summary().get(OBJECT_SUM)
+        require(
+            said is None or not self.object.is_file() or said == sha256(self.object),
+            f"{self.object} must be what {self.summary.name} says was written, but it is another file; bring back the "
+            "whole folder, or go on with --resume.",
+        )
+        return found
 
     def read_summary(self) -> dict[str, Any]:
         """What summary.json holds; `InputError` if it is of another run than config.json."""

@@ -28,12 +28,18 @@ def resting_cell(frequency: int = 6, diameter: float = DIAMETER) -> TriangleMesh
 
     diameter [m] scales the whole cell. The nodes lie on the smooth surface. `InputError` for f outside 3 … 20.
     """
-    low, high = FREQUENCIES
-    whole = isinstance(frequency, (int, np.integer)) and low <= frequency <= high
-    require(whole, f"frequency must be a whole number from {low} to {high}, but it is {frequency!r}.")
+    nodes_of(frequency)
     in_range("cell diameter", diameter, 1e-9, 1.0, unit="metres")
     sphere, faces = _even_sphere(int(frequency))
     return TriangleMesh(RedCell(diameter).surface(sphere), faces, f"red cell of {len(sphere)} nodes")
+
+
+def nodes_of(frequency: int) -> int:
+    """How many nodes the mesh of a cell has; `InputError` for f outside 3 … 20."""
+    low, high = FREQUENCIES
+    whole = isinstance(frequency, (int, np.integer)) and low <= frequency <= high
+    require(whole, f"frequency must be a whole number from {low} to {high}, but it is {frequency!r}.")
+    return 10 * int(frequency) ** 2 + 2
 
 
 def geodesic_sphere(frequency: int) -> tuple[np.ndarray, np.ndarray]:

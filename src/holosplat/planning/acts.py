@@ -1,0 +1,236 @@
+"""What other commands than `reconstruct` and `simulate` of one time take, told before they start.
+
+`benchmarks/needs_acts.py` measures the memory that the constants below stand for, and writes docs/data/needs_acts.csv.
+Seconds and bytes on the disk are rough: they were looked at once or twice, on a machine that others used.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..io.ome_zarr import CHUNK, ZARR_SUFFIX
+from ..io.volume_files import TIFF_SUFFIXES
+from ..io.volumes import SLAB_VOXELS
+from .needs import KEPT, Costs, Needs, Sizes, of_fit, of_simulation, of_start, with_report
+
+if TYPE_CHECKING:
+    from ..align import PoseOptions
+    from ..learning.size import Size
+    from ..matter import MatterKind
+    from ..methods import Method, Pinn
+    from ..methods.surface_fit import SurfaceOptions
+    from ..motion.carried import CarriedOptions
+    from ..motion.track_options import TrackOptions
+    from ..scan import Exposures
+
+LATTICE = 8
+"""Voxels for one of the lattice of the network of `--start learned`."""
+
+
+class Parts:
+    """Bytes of memory and seconds that the parts of these commands take, beside those of `Costs`."""
+
+    plain_program: float = 0.37e9
+    """The program without what fits need."""
+    trainer: float = 0.61e9
+    """The program while it trains, with its optimiser and what PyTorch compiles."""
+    drawn: float = 0.63e9
+    """All of it while a report is drawn of one of several times."""
+    search: float = 0.54e9
+    """The program while it looks for poses."""
+    poses: float = 110.0
+    """A voxel of the finest pixels on which poses are looked for."""
+    carried: float = 255.0
+    """A voxel of matter in motion: L-BFGS, gradients and priors."""
+    sources: float = 14.0
+    """The same voxel at each time: where the flow brought it from."""
+    space_time: float = 60.0
+    """A voxel of a field of space and time that a step looks at, with gradients."""
+    every_time: float = 12.0
+    """The same voxel at each time, of the volumes that the field begins with."""
+    channel: float = 37.0
+    """A channel of a voxel of the lattice of a network in training."""
+    lifted: float = 49.0
+    """A channel that is lifted from a view into such a voxel."""
+    aligned_trainer: float = 0.57e9
+    """The same of a pixel-aligned network."""
+    aligned: float = 154.0
+    """A voxel of a pixel-aligned field in training."""
+    aligned_view: float = 77.0
+    """The same in each view."""
+    node_pairs: float = 10.0
+    """A pair of nodes of two cells in flow, whose block is computed at once."""
+    exported: float = 25.0
+    """A voxel of a volume that is written whole."""
+    slab: float = 18.0
+    """A voxel of a slab of one."""
+    halved: float = 14.0
+    """A voxel of chunks of which larger voxels are made."""
+    scene: float = 8.0
+    """A voxel of a scene for learning, of which a file's are held."""
+    judged: float = 60.0
+    """A voxel of a case of the benchmark, whose truth and result are compared."""
+
+
+class Room:
+    """Bytes on the disk."""
+
+    node: float = 58.0
+    """A node of a mesh file, with its triangles."""
+    nodes: float = 4.0
+    """Nodes of all surfaces, for each pixel of a frame, by and large."""
+    scene_pixel: float = 4.0
+    """A pixel of a frame of a scene for learning."""
+    scene_voxel: float = 0.05
+    """A voxel of its occupancy."""
+
+
+def one_time(exposures: Exposures) -> Exposures:
+    """Those of the first time."""
+    return exposures[np.flatnonzero(exposures.time == exposures.time.min())]
+
+
+def times_of(exposures: Exposures) -> int:
+    """How many times there are."""
+    return len(np.unique(exposures.time))
+
+
+def of_track(exposures: Exposures, how: TrackOptions) -> Needs:
+    """What `track` takes for training frames of several times: bodies of each by itself, then some frames a step."""
+    paths = _of_paths(exposures, how.soft.schedule.views_per_step)
+    begun = Costs.program + of_start(Sizes.of(one_time(exposures)), how.sightings.volume)
+    every = replace(Sizes.of(one_time(exposures)), views=len(exposures))
+    return replace(paths, memory=with_report(every, max(begun, paths.memory)))
+
+
+def of_forecast(exposures: Exposures, views_per_step: int) -> Needs:
+    """What `forecast` takes for the training frames of its run; its report is of one time."""
+    paths = _of_paths(exposures, views_per_step)
+    return replace(paths, memory=max(paths.memory, Parts.drawn + Costs.frames * Sizes.of(exposures).pixels))
+
+
+def _of_paths(exposures: Exposures, views_per_step: int) -> Needs:
+    """What a fit of paths takes."""
+    one, times = Sizes.of(one_time(exposures)), times_of(exposures)
+    step = replace(one, views=min(len(exposures), views_per_step or len(exposures)))
+    every = replace(one, views=len(exposures))
+    memory = Costs.program + Costs.frames * every.pixels + Costs.edges * step.waves(1)
+    disk = Costs.page + Costs.written * every.pixels + Room.node * Room.nodes * one.rows * one.columns * times
+    return Needs(memory, disk, 20 + 3e-5 * every.waves(1))
+
+
+def of_alignment(exposures: Exposures, how: PoseOptions) -> Needs:
+    """What `align` takes: all frames on the finest pixels on which poses are looked for, and a volume of theirs."""
+    finest = min(level.pixels for level in how.levels(exposures.views.shape, len(exposures)))
+    sizes = Sizes.of(exposures, finest)
+    pixels = len(exposures) * math.prod(exposures.views.shape)
+    memory = Parts.search + Costs.frames * pixels + Parts.poses * sizes.voxels
+    return Needs(memory, Costs.written * pixels + 1e6, 10 + 2e-5 * sizes.views * sizes.voxels)
+
+
+def of_motion(exposures: Exposures, how: CarriedOptions) -> Needs:
+    """What `reconstruct --time-frame all` takes where something moves: a volume that a flow carries to every time."""
+    one, times = Sizes.of(one_time(exposures)), times_of(exposures)
+    alone = of_fit(one, how.volume)
+    assert alone is not None
+    every = replace(one, views=len(exposures))
+    moved = Costs.program + Costs.frames * every.pixels + (Parts.carried + Parts.sources * times) * one.voxels
+    memory = with_report(every, max(alone.memory, moved))
+    disk = Costs.page + Costs.written * (KEPT * one.voxels + every.pixels)
+    return Needs(memory, disk, 20 + 1.5e-4 * times * one.voxels)
+
+
+def of_space_time(exposures: Exposures, how: Pinn) -> Needs:
+    """What `reconstruct --method pinn` takes: volumes of all times, and those that a step looks at."""
+    one, times = Sizes.of(one_time(exposures)), times_of(exposures)
+    views = how.fit.schedule.views_per_step or len(exposures)
+    every, step = replace(one, views=len(exposures)), replace(one, views=min(views, len(exposures)))
+    looked = min(step.views, times)
+    fitted = (Parts.space_time * looked + Parts.every_time * times) * one.voxels + Costs.waves * step.waves()
+    disk = Costs.page + Costs.written * (KEPT * one.voxels * times / 4 + every.pixels)
+    seconds = 20 + 2e-7 * how.fit.schedule.steps * looked * one.voxels + 2e-4 * times * one.voxels
+    fitted = Costs.program + max(fitted, of_start(one, how.volume))
+    return Needs(Costs.frames * every.pixels + max(Parts.drawn, fitted), disk, seconds)
+
+
+def of_each_time(exposures: Exposures, method: Method, matter: MatterKind | None) -> Needs | None:
+    """What each time by itself takes, one after the other; None for a method of which nothing is known."""
+    one = of_fit(Sizes.of(one_time(exposures)), method, matter)
+    return one and one.times(times_of(exposures))
+
+
+def of_surfaces(exposures: Exposures, how: SurfaceOptions) -> Needs:
+    """What `surface` takes: the fit of what is cut out of a run."""
+    sizes, samples = Sizes.of(exposures), how.fit.schedule.oversample
+    waves = replace(sizes, samples=samples).waves() if samples else sizes.waves(1)
+    memory = Costs.program + Costs.frames * sizes.pixels + Costs.edges * waves
+    return Needs(memory, Room.node * Room.nodes * sizes.rows * sizes.columns + 1e6, 5 + 5.6e-6 * waves)
+
+
+def of_export(shape: tuple[int, int, int], suffix: str) -> Needs:
+    """What `export --volume` takes for δ and β on so many voxels, in a file or folder of this suffix: TIFF is written
+    whole, others slab by slab, and OME-Zarr at lower resolutions, too, by rows of chunks."""
+    voxels = math.prod(shape)
+    slab, chunks = (
+        min(voxels, max(rows, shape[0] * shape[2])) for rows in (SLAB_VOXELS, 2 * CHUNK * shape[0] * shape[2])
+    )
+    held = Parts.exported * voxels if suffix in TIFF_SUFFIXES else Parts.slab * slab
+    held += Parts.halved * chunks if suffix == ZARR_SUFFIX else 0.0
+    return Needs(Parts.plain_program + held, 2 * Costs.written * voxels, 1 + 2e-7 * voxels)
+
+
+def of_growth(cells: int, nodes: int, snapshots: int, travel: float) -> Needs:
+    """What `grow` takes: the flow that all nodes give each other, two cells at a time, and a mesh for each snapshot.
+
+    nodes: of a cell; travel: how far the fastest fluid goes from one snapshot to the next [m].
+    """
+    steps = 2.4 * snapshots * travel / 1e-6
+    seconds = 2 + 2.5e-8 * steps * (cells * nodes) ** 2
+    disk = Room.node * nodes * cells * snapshots + 1e5
+    return Needs(Costs.program + Parts.node_pairs * nodes**2, disk, seconds)
+
+
+def of_dataset(simulated: Needs, shape: tuple[int, int], views: int, scenes: int, jobs: int) -> Needs:
+    """What `dataset` takes in so many processes for scenes of so many views, each `simulated` at what it takes most."""
+    rows, columns = shape
+    pixels, voxels = views * rows * columns, rows * columns**2
+    memory = simulated.memory + Parts.plain_program - Costs.program + Parts.scene * voxels
+    disk = scenes * (Room.scene_pixel * pixels + Room.scene_voxel * voxels) + 1e5
+    return Needs(jobs * memory + (jobs > 1) * Costs.program, disk, 1.5e-4 * scenes * pixels / jobs)
+
+
+def of_training(shape: tuple[int, int], views: int, network: str, size: Size, steps: int) -> Needs:
+    """What `train` takes for scenes of so many pixels, of which so many views are shown.
+
+    size: of the network of `--start learned`; those of the others are of one size.
+    """
+    rows, columns = shape
+    voxels = rows * columns**2
+    if network == "start":
+        voxels /= LATTICE
+        channels = sum(width / 8**level for level, width in enumerate(size.volume)) + 3 * size.features
+        memory = Parts.trainer + (Parts.channel * channels + Parts.lifted * size.features * views) * voxels
+    else:
+        memory = Parts.aligned_trainer + (Parts.aligned + Parts.aligned_view * views) * voxels
+    return Needs(memory, 1e8, steps * (0.2 + 2e-5 * views * voxels))
+
+
+def of_methods(exposures: Exposures, is_test: np.ndarray, samples: int, methods: Sequence[Method]) -> Needs:
+    """What a case of the benchmark takes, with such frames, of which some are held out, and so many wave samples along
+    a pixel of its simulation."""
+    sizes, voxels = Sizes.of(exposures[~is_test]), Sizes.of(exposures).voxels
+    each = [needs for method in methods if (needs := of_fit(sizes, method)) is not None]
+    made = of_simulation(exposures, samples, len(exposures))
+    memory = max([made.memory, *(needs.memory for needs in each)]) + Parts.judged * voxels
+    disk = made.disk + 2 * Costs.written * voxels + 1e6 * len(each)
+    return Needs(memory, disk, 10 + sum(needs.seconds for needs in each))
+
+
+def of_benchmark(cases: Sequence[Needs]) -> Needs:
+    """What several cases take, one after the other."""
+    return Needs(max(one.memory for one in cases), sum(one.disk for one in cases), sum(one.seconds for one in cases))
