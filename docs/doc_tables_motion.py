@@ -74,15 +74,17 @@ def windows() -> str:
     return _tight(markdown(("snapshots", *COLUMNS, "centres", "volumes"), lines))
 
 
-def known() -> str:
-    """Bodies of known shape at other times; the last columns are errors over standard errors."""
-    rows = [row for row in read("motion.csv") if row["case"].endswith(KNOWN) and row["first"] != "0"]
+def others() -> str:
+    """Fewer than four beams at other times; the last columns are errors over standard errors."""
+    cases = [case + end for end in ("", KNOWN) for case in BEAMS if case != "flow4"]
+    rows = [row for row in read("motion.csv") if row["case"] in cases and row["first"] != "0"]
     lines = []
-    for row in sorted(rows, key=lambda row: (list(BEAMS).index(row["case"].removesuffix(KNOWN)), int(row["first"]))):
+    for row in sorted(rows, key=lambda row: (cases.index(row["case"]), int(row["first"]))):
         first, _ = _window(row)
         errors = [_or_nothing(row[f"{name}_over_error"], 2) for name in ("centre", "volume")]
         beams, last = BEAMS[row["case"].removesuffix(KNOWN)], first + int(row["times"]) - 1
-        lines.append([beams, f"{first} … {last}", *_scores(row, of=False), *errors])
+        shape = ", `--body`" if row["case"].endswith(KNOWN) else ""
+        lines.append([beams + shape, f"{first} … {last}", *_scores(row, of=False), *errors])
     return markdown(("beams", "snapshots", *COLUMNS, "centres", "volumes"), lines)
 
 

@@ -246,7 +246,7 @@ TABLES |= {
     for name, make, data, command, takes in (
         ("tracked", motion.tracked, ("motion.csv",), f"{TRACKED} --cases flow4 flow3 …", "an hour"),
         ("tracked-windows", motion.windows, ("motion.csv", "motion_ablation.csv"), TRACKED, "half an hour"),
-        ("tracked-known", motion.known, ("motion.csv",), f"{TRACKED} --cases flow2-body --first 8", "an hour"),
+        ("tracked-others", motion.others, ("motion.csv",), f"{TRACKED} --cases flow2-body --first 8", "an hour"),
         ("tracked-ablation", motion.ablation, ("motion_ablation.csv",), f"{TRACKED} --ablation", "an hour"),
         ("forecast", motion.forecast, ("forecast.csv",), FORECAST, "an hour"),
         ("forecast-mechanics", motion.mechanics, ("forecast.csv",), FORECAST, "an hour"),
