@@ -82,7 +82,12 @@ def shop(recorder, monkeypatch) -> Recorder:
     def load(name, seed, snapshots):
         return replace(make_case("round", seed), name="mine") if name.endswith(".toml") else make_case(name, seed)
 
+    def planned(source, snapshots):
+        case = load(source, 0, snapshots)
+        return case.exposures, case.is_test
+
     monkeypatch.setattr("holosplat.bench.case.load_case", load)
+    monkeypatch.setattr("holosplat.bench.case.planned_frames", planned)
     return recorder
 
 
