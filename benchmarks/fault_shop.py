@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 from forked import run
+from own_case import two_cells
 
 from holosplat.checks import InputError
 from holosplat.io.formats import read
@@ -28,28 +29,6 @@ QUICK = {
     "volume": {"retrieval": 8, "iterations": 10, "corrections": 1, "inner": 4, "refine": 1},
     "fit": {"objective": {"tv_volume": 0.05}, "schedule": {"steps": 12}},
 }
-CASE = f"""summary = "Two cells of a benchmark of one's own"
-prior = "known"
-[specimen]
-kind = "red cells"
-count = 2
-diameter = 24e-6
-box = [{COLUMNS * PIXEL}, {ROWS * PIXEL}, {COLUMNS * PIXEL}]
-[matter]
-material = "haemoglobin"
-[beam]
-energy_kev = 20.0
-distance = 0.1
-[detector]
-rows = {ROWS}
-columns = {COLUMNS}
-pixel_size = {PIXEL}
-psf_sigma_px = 0.05
-[views]
-kind = "between"
-train = 5
-test = 2
-"""
 METHODS = ("paganin-sirt", "paganin-tv")
 TIMES, STEP = 3, 1e-4
 """Moments of the scan in which the cells move, and seconds between two."""
@@ -101,7 +80,7 @@ class Shop:
             write_mesh(file, cell, "um")
         shop = cls(path, files)
         shop.quick.write_text(json.dumps(QUICK))
-        shop.case.write_text(CASE)
+        shop.case.write_text(two_cells(ROWS, COLUMNS, PIXEL, 24e-6, 5))
         for command in (
             shop.simulate(shop.scan),
             shop.record(shop.raw),

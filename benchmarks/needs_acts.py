@@ -20,6 +20,7 @@ import machine
 import numpy as np
 from forked import run as run_here
 from needs import START, peak
+from own_case import two_cells
 from rows import read, write
 
 from holosplat.align import PoseOptions
@@ -170,36 +171,11 @@ def train(network: str) -> Callable[[Path, Sizes], list[object]]:
     return command
 
 
-CASE = """summary = "Two cells"
-prior = "known"
-[specimen]
-kind = "red cells"
-count = 2
-diameter = {across}
-box = [{width}, {height}, {width}]
-[matter]
-material = "haemoglobin"
-[beam]
-energy_kev = 20.0
-distance = 0.1
-[detector]
-rows = {rows}
-columns = {columns}
-pixel_size = {pixel}
-psf_sigma_px = 0.05
-[views]
-kind = "between"
-train = {views}
-test = 2
-"""
-
-
 def case(folder: Path, sizes: Sizes) -> Path:
     """A case of the benchmark."""
     rows, columns = sizes["rows"], sizes["columns"]
-    told = {"width": columns * PIXEL, "height": rows * PIXEL, "across": min(rows, columns) * PIXEL / 3}
     path = folder / "own.toml"
-    path.write_text(CASE.format(rows=rows, columns=columns, pixel=PIXEL, views=sizes["views"], **told))
+    path.write_text(two_cells(rows, columns, PIXEL, min(rows, columns) * PIXEL / 3, sizes["views"]))
     return path
 
 
