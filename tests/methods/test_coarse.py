@@ -11,6 +11,7 @@ import torch
 from helpers.bumpy import DELTA, bumpy, poses, surfaces
 from holosplat.baselines import HolographicTV
 from holosplat.beamline.simulate import simulate
+from holosplat.fit.loop import Fit
 from holosplat.geometry import Grid
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import MaterialPrior
@@ -21,7 +22,8 @@ from holosplat.methods.coarse import CoarseToFine, mean_chord, on_pixels, unexpl
 from holosplat.methods.coarse_cloud import occupancy_of
 from holosplat.methods.cross_validation import CrossValidation
 from holosplat.methods.first_surfaces import first_surfaces
-from holosplat.methods.gaussians import GaussianStage
+from holosplat.methods.gaussian_options import FitOptions
+from holosplat.methods.gaussians import GaussianStage, nearby
 from holosplat.methods.method import run_quietly
 from holosplat.model import measure
 from holosplat.projectors.surface import surface_occupancy
@@ -129,6 +131,35 @@ def test_rounds_of_agreement_come_first_where_a_volume_explains_badly(scan, miss
     assert left[missing] <= left[1.0]
 
 
+@pytest.mark.parametrize("order", [(20.0, 16.0), (16.0, 20.0)], ids=["before the rounds", "after them"])
+def test_of_the_volumes_before_and_after_rounds_the_better_is_cut(scan, order, monkeypatch):
+    grid = Grid.of_views(scan.views)
+    middle = 0.5 * (np.array(grid.shape[::-1]) - 1)
+    before, after = (
+        surface_occupancy(torch.from_numpy(mesh.vertices + middle), torch.tensor(mesh.faces), grid.shape)
+        for mesh in (body(radius) for radius in order)
+    )
+
+    def volumes(scan, material, how, on_progress, light, wanted):
+        assert wanted(before, grid)
+        return after, grid
+
+    monkeypatch.setattr("holosplat.methods.first_surfaces.holographic_tv", volumes)
+    options = quick(replace(QUICK, missing=0.0))
+    found = first_surfaces(
+        task_of(scan), options, SurfaceOptions(), lambda task: pytest.fail("no Gaussians are wanted")
+    )
+    assert found is not None
+    assert dice(found, body()) > 0.9  # 0.68 of the smaller one
+
+
+def test_a_fit_near_its_end_takes_fewer_and_shorter_steps():
+    usual = FitOptions()
+    short = nearby(usual, CoarseToFine(fit_steps=7, fit_rate=0.25))
+    assert short.schedule == replace(usual.schedule, steps=7)
+    assert vars(short.rates) == pytest.approx({name: 0.25 * rate for name, rate in vars(usual.rates).items()})
+
+
 # --- from coarse to fine ------------------------------------------------------------------------------------
 
 
@@ -169,10 +200,10 @@ def test_gaussians_of_large_frames_fill_the_coarse_surfaces(scan):
     assert task.near
     assert dice(start, body()) > 0.97
     fit = stage.fit(task, start)
-    assert fit is not None
+    assert isinstance(fit, Fit)
     assert fit.schedule.steps == QUICK.fit_steps
     far = stage.fit(replace(task, near=False), start)
-    assert far is not None
+    assert isinstance(far, Fit)
     assert far.schedule.steps == 10
 
 
