@@ -16,10 +16,9 @@ from holosplat.geometry import Grid
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import MaterialPrior
 from holosplat.mesh import TriangleMesh
-from holosplat.methods import Gaussians, Near, SmoothVolume, SurfaceOptions, Surfaces, Task, begun, coarse_cloud
+from holosplat.methods import Gaussians, Near, SmoothVolume, SurfaceOptions, Surfaces, Task, begun
 from holosplat.methods.auto import Bodies
 from holosplat.methods.coarse import CoarseToFine, mean_chord, on_pixels, unexplained
-from holosplat.methods.coarse_cloud import occupancy_of
 from holosplat.methods.cross_validation import CrossValidation
 from holosplat.methods.first_surfaces import first_surfaces
 from holosplat.methods.gaussian_options import FitOptions
@@ -154,9 +153,11 @@ def test_of_the_volumes_before_and_after_rounds_the_better_is_cut(scan, order, m
 
 
 def test_a_fit_near_its_end_takes_fewer_and_shorter_steps():
-    usual = FitOptions()
-    short = nearby(usual, CoarseToFine(fit_steps=7, fit_rate=0.25))
-    assert short.schedule == replace(usual.schedule, steps=7)
+    usual, how = FitOptions(), CoarseToFine(fit_steps=7, fit_rate=0.25)
+    short = nearby(usual, how, 3)
+    assert short.schedule == replace(usual.schedule, steps=7, oversample=3)
+    asked = replace(usual, schedule=replace(usual.schedule, oversample=2))
+    assert nearby(asked, how, 3).schedule.oversample == 2
     assert vars(short.rates) == pytest.approx({name: 0.25 * rate for name, rate in vars(usual.rates).items()})
 
 
@@ -241,23 +242,6 @@ def test_a_run_goes_on_from_a_near_start_with_as_few_steps(scan, near, tmp_path,
     rows = folder.metrics.read_text(encoding="utf-8").strip().splitlines()
     assert len(rows) == 1 + QUICK.last_steps
     assert isinstance(load_reconstruction(folder).object, SurfaceMesh)
-
-
-def test_occupancy_some_rows_at_a_time(monkeypatch):
-    mesh, heights = surfaces(body(5.0), unit=PITCH), list[int]()
-    grid = Grid.centred((15, 17, 13), PITCH)
-    whole = mesh.voxelise(grid).delta / DELTA
-    assert np.abs(occupancy_of(mesh, grid).numpy() - whole).max() < 1e-6
-
-    def few(vertices, faces, shape):
-        heights.append(shape[1])
-        assert len(faces) < len(mesh.faces)
-        return surface_occupancy(vertices, faces, shape)
-
-    monkeypatch.setattr(coarse_cloud, "MOST_VOXELS", 8 * 3 * 15 * 13)
-    monkeypatch.setattr(coarse_cloud, "surface_occupancy", few)
-    assert np.abs(occupancy_of(mesh, grid).numpy() - whole).max() < 1e-6
-    assert heights == [3, 3, 3, 3, 3]  # rows 0 to 14; nothing is in the last two
 
 
 def test_a_near_start_says_so(scan):

@@ -1,4 +1,4 @@
-"""Finer triangles, and Gaussians of several sizes."""
+"""Finer triangles."""
 
 from __future__ import annotations
 
@@ -8,10 +8,7 @@ import pytest
 import torch
 
 from helpers.bumpy import area, bumpy
-from holosplat.checks import InputError
-from holosplat.geometry import Grid
 from holosplat.mesh import TriangleMesh
-from holosplat.representations.octree import cloud_in_octree
 from holosplat.representations.subdivision import edge_lengths, subdivided
 
 TETRAHEDRON = (
@@ -63,49 +60,3 @@ def test_facets_become_round():
     assert 0.998 < isoperimetric <= 1
     before = 36 * math.pi * start.volume**2 / area(start) ** 3
     assert isoperimetric > before
-
-
-# --- Gaussians of several sizes -------------------------------------------------------------------------------------
-
-
-def ball(grid: Grid, radius: float) -> torch.Tensor:
-    """Occupancy of a ball with an edge of one voxel."""
-    x, y, z = (torch.from_numpy(axis) for axis in grid.axes())
-    distance = (z[:, None, None] ** 2 + y[:, None] ** 2 + x**2).sqrt()
-    return ((radius - distance) / grid.voxel_size[0] + 0.5).clamp(0, 1).float()
-
-
-def test_the_cloud_of_an_octree_keeps_mass_and_is_flat_inside():
-    grid = Grid.centred((41, 39, 46), 0.5e-6)
-    occupancy = ball(grid, 8.5e-6)
-    cloud = cloud_in_octree(occupancy, grid, (1e-6, 1e-9), 0.5e-6, 3)
-    single = cloud_in_octree(occupancy, grid, (1e-6, 1e-9), 0.5e-6, 1)
-    sizes = torch.exp(cloud.log_scales[:, 0]) / 0.5
-    assert sorted(set(sizes.round().int().tolist())) == [1, 2, 4]
-    assert len(cloud) < 0.75 * len(single)
-    density = cloud.density(grid)[0].detach()
-    assert float(density.sum() / occupancy.sum()) == pytest.approx(1.0, abs=0.01)
-    inside = ball(grid, 7e-6) == 1
-    ripple = (density - occupancy)[inside]  # the edge of a large Gaussian is wider than that of those beside it
-    assert float(ripple.abs().max()) < 0.35
-    assert float(ripple.square().mean().sqrt()) < 0.12
-    assert abs(float(ripple.mean())) < 0.03
-    for found in (cloud, single):
-        assert torch.allclose((found.masses()[:, 0:1] * found.centres).sum(0), torch.zeros(3), atol=0.5)
-
-
-def test_larger_blocks_touch_nothing_that_changes():
-    grid = Grid.centred((32, 24, 40), 1.0)
-    occupancy = torch.zeros(grid.shape)
-    occupancy[8:24, 4:20, 8:32] = 1.0
-    cloud = cloud_in_octree(occupancy, grid, (1e-6, 1e-9), 1.0, 2)
-    large = torch.exp(cloud.log_scales[:, 0]) > 0.75
-    offset = cloud.centres[large] - torch.tensor(grid.centre, dtype=torch.float32)
-    assert len(offset) > 0
-    limit = torch.tensor([12.0, 8.0, 8.0]) - 2.9  # half the box, less a block around and half a block
-    assert bool((offset.abs() <= limit + 0.01).all())
-
-
-def test_an_empty_volume_is_refused():
-    with pytest.raises(InputError, match="there is no matter"):
-        cloud_in_octree(torch.zeros(4, 5, 6), Grid.centred((4, 5, 6), 1.0), (1e-6, 1e-9), 1.0, 2)

@@ -35,7 +35,7 @@ from .ground import Ground, ground
 from .learned import learned_cloud
 from .method import Near, Stage, Task, run_quietly
 from .start import starting_cloud
-from .surface_fit import SurfaceOptions
+from .surface_fit import SurfaceOptions, oversampling
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class GaussianStage:
         if surfaces is None:
             return self.own_start(task)
         surfaces = last_steps(self._without_validation(task), surfaces, SurfaceOptions(), self.options.coarse)
-        return Near(cloud_of_surfaces(surfaces, task, self.options.coarse).on(self.options.volume.backend))
+        return Near(cloud_of_surfaces(surfaces, task).on(self.options.volume.backend))
 
     def own_start(self, task: Task) -> GaussianCloud:
         """The starting cloud on the pixels of `task`."""
@@ -120,7 +120,7 @@ class GaussianStage:
         assert isinstance(start, GaussianCloud)
         options = resolved(self.options.fit, task, start.matter)
         if task.near:
-            options = nearby(options, self.options.coarse)
+            options = nearby(options, self.options.coarse, oversampling(task.scan))
         return gaussian_fit(task.scan, start, options, task.seed, task.uneven, task.freedom)
 
     def coarse_surfaces(self, task: Task, surfaces: SurfaceOptions) -> SurfaceMesh | None:
@@ -152,10 +152,12 @@ def resolved(options: FitOptions, task: Task, matter: Matter) -> FitOptions:
     return replace(options, objective=replace(options.objective, overfull=0.0, two_levels=0.0))
 
 
-def nearby(options: FitOptions, how: CoarseToFine) -> FitOptions:
-    """The options of a fit that begins near to where it ends: fewer and shorter steps."""
+def nearby(options: FitOptions, how: CoarseToFine, samples: int) -> FitOptions:
+    """The options of a fit that begins near to where it ends, with edges as sharp as those of surfaces: fewer and
+    shorter steps, and waves of so many samples a pixel, if the options do not say how many."""
     rates = GaussianRates(**{name: how.fit_rate * rate for name, rate in vars(options.rates).items()})
-    return replace(options, rates=rates, schedule=replace(options.schedule, steps=how.fit_steps))
+    schedule = replace(options.schedule, steps=how.fit_steps, oversample=options.schedule.oversample or samples)
+    return replace(options, rates=rates, schedule=schedule)
 
 
 def gaussian_fit(
