@@ -24,6 +24,7 @@ from holosplat.motion.pursuit import exchanged
 from holosplat.motion.replaced import pursued
 from holosplat.motion.rest_shape import KnownBody, surface, thinned
 from holosplat.motion.sightings import centroid
+from holosplat.motion.steps import Steps
 from holosplat.motion.strain import strain_energy
 from holosplat.motion.templates import Search, Templates
 from holosplat.motion.track import TrackOptions, follow
@@ -86,11 +87,17 @@ def test_the_term_is_the_mean_over_times_and_its_gradient_is_right():
         RestShapeKept(1.0, Elastic(TriangleMesh(*icosphere(1))), bodies)
 
 
-def test_two_beams_find_a_body_and_its_pose():
-    """One cell that the frames cut at the end: centre, velocity and axis."""
+def test_two_beams_find_a_body_and_its_pose(monkeypatch):
+    """One cell that the frames cut at the end: centre, velocity and axis; the steps of another run give the same."""
     truth = pose(TURN, (3.0, 11.0, -2.5), 1.1)
-    (found,), of_begun = pursued(cell(), shadows([truth]), FLOW * np.array([0.9, 1.1])[:, None])
+    flow, steps = FLOW * np.array([0.9, 1.1])[:, None], Steps()
+    (found,), of_begun = pursued(cell(), shadows([truth]), flow, steps=steps)
     assert not of_begun
+    with monkeypatch.context() as none:
+        none.setattr(Explained, "_better", lambda *given: pytest.fail("these poses were made better before"))
+        ((again,), _) = pursued(cell(), shadows([truth]), flow, steps=Steps(steps.done))
+    for name in ("matrix", "centre", "velocity", "turning"):
+        assert np.array_equal(getattr(again, name), getattr(found, name))
     assert np.linalg.norm(found.centre - truth.centre) < 0.2
     assert np.linalg.norm(found.velocity - truth.velocity) < 0.2
     assert axis_error(found, TURN) < 5

@@ -12,7 +12,8 @@ import torch
 from helpers.kept import Kept
 from helpers.moving_ellipsoids import MATERIAL, PIXEL, TIMES, scan, true_paths
 from holosplat.fit.schedule import Schedule
-from holosplat.motion import track
+from holosplat.motion import pieces, track
+from holosplat.motion.fit import motion_fit
 from holosplat.motion.halves import ASTRAY, astray, halves_of, standard_errors, tell_shapes
 from holosplat.motion.pieces import PathOptions
 from holosplat.motion.track import TrackOptions, follow
@@ -20,7 +21,7 @@ from holosplat.representations import TimeBasis
 
 SHORT = {name: replace(getattr(TrackOptions(), name), schedule=Schedule(steps=3)) for name in ("stiff", "soft", "half")}
 QUICK = replace(TrackOptions(), rounds=1, paths=PathOptions(degree=1, pieces=1), **SHORT)
-STAGES = ("first paths", "stiff", "beside", "paths", "soft", "twins", "halves", "done")
+STAGES = ("sightings", "first paths", "stiff", "beside", "paths", "soft", "twins", "halves", "done")
 
 
 @pytest.fixture(autouse=True)
@@ -50,7 +51,7 @@ def test_every_stage_is_kept():
     assert sum(state["fit"] is not None for state in whole()[0].states) == 3 * (1 + 1 + 4)
 
 
-@pytest.mark.parametrize("cut", ["first paths", "in stiff", "beside", "in soft", "in halves", "done"])
+@pytest.mark.parametrize("cut", ["sightings", "first paths", "in stiff", "beside", "in soft", "in halves", "done"])
 def test_a_run_that_was_cut_off_goes_on_as_if_nothing_had_happened(cut):
     """From every stage, and from the middle of fits: bodies, halves and records are the same bit for bit."""
     states, result = whole()
@@ -99,6 +100,46 @@ def test_ctrl_c_in_a_fit_loses_no_step(monkeypatch):
     assert kept.states[-1]["fit"]["step"] == 2
     again = follow(scan(), MATERIAL, QUICK, journal=kept)
     assert torch.equal(again.bodies.coefficients, whole()[1].bodies.coefficients)
+
+
+def test_times_that_were_looked_at_are_not_looked_at_again(monkeypatch):
+    """Cut off by Ctrl-C at the third time, of which nothing is kept."""
+    monkeypatch.setattr(track, "CHECKPOINT_SECONDS", 1e9)
+    looked = list[float]()
+
+    def look(frames, *given, network):
+        looked.append(float(frames.instants[0]))
+        if len(looked) == 3:
+            raise KeyboardInterrupt
+        return seen(looked[-1])
+
+    monkeypatch.setattr(track, "sightings", look)
+    with pytest.raises(KeyboardInterrupt):
+        follow(scan(), MATERIAL, QUICK, journal=(kept := Kept()))
+    assert [(one["next"], len(one["steps"])) for one in kept.states] == [("sightings", 2)]
+    again = follow(scan(), MATERIAL, QUICK, journal=kept)
+    assert len(looked) == TIMES + 1 + TIMES  # the third twice; and all beside the bodies
+    assert torch.equal(again.bodies.coefficients, whole()[1].bodies.coefficients)
+
+
+def test_fits_of_the_choice_of_paths_are_not_made_again(monkeypatch):
+    monkeypatch.setattr(track, "CHECKPOINT_SECONDS", 1e9)
+    free, fits = replace(QUICK, paths=PathOptions(degree=1)), list[int]()
+    result = follow(scan(), MATERIAL, free, journal=(every := Kept()))
+    at = next(k for k, one in enumerate(every.states) if one["next"] == "paths")
+
+    def fitted(frames, start, *given):
+        fits.append(start.basis.pieces)
+        if len(fits) == 2:
+            raise KeyboardInterrupt
+        return motion_fit(frames, start, *given)
+
+    monkeypatch.setattr(pieces, "motion_fit", fitted)
+    with pytest.raises(KeyboardInterrupt):
+        follow(scan(), MATERIAL, free, journal=(kept := Kept(every.states[: at + 1])))
+    again = follow(scan(), MATERIAL, free, journal=kept)
+    assert torch.equal(again.bodies.coefficients, result.bodies.coefficients)
+    assert fits[:4] == [1, 1, 1, 2]  # the first, the second cut off, that again, and the one with finer paths
 
 
 def test_halves_share_no_frame():

@@ -15,9 +15,11 @@ from holosplat.fit.schedule import Schedule
 from holosplat.geometry import rotation_y
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import Matter
+from holosplat.motion import twins
 from holosplat.motion.elastic import Elastic, Rest
 from holosplat.motion.fit import MotionFit
 from holosplat.motion.measures import moments
+from holosplat.motion.steps import Steps
 from holosplat.motion.twins import (
     Trials,
     chosen_twins,
@@ -139,8 +141,9 @@ def test_twins_far_from_the_shape_at_rest_are_not_in_question():
     assert in_question(bodies, narrow, rest) == []
 
 
-def test_frames_tell_a_body_from_its_twin():
-    """Of two cells the one that begins as its twin is taken back, the other stays; three beams ask nothing."""
+def test_frames_tell_a_body_from_its_twin(monkeypatch):
+    """Of two cells the one that begins as its twin is taken back, the other stays; three beams ask nothing. What was
+    tried is not tried again."""
     truth = cells(TURN, OTHER)
     views = hs.Views.from_angles(np.array([0.0, 90.0]), SHAPE, PIXEL)
     exposures = hs.Exposures.of(views, 20.0, 0.05).repeated(TIMES)
@@ -157,7 +160,13 @@ def test_frames_tell_a_body_from_its_twin():
         assert abs(axes[:, 0] @ turn[:, 2]) > 0.98
     assert heard == sorted(heard)
     assert 0 == heard[0] < heard[-1] < 1
-    assert chosen_twins(truth, trials) is truth
+    told = [*trials.steps.done]
+    assert len(told) >= 4  # a stiff and a soft fit of a body and of its twin
+    with monkeypatch.context() as none:
+        none.setattr(twins, "motion_fit", lambda *given: pytest.fail("this fit was made before"))
+        again = chosen_twins(twinned(truth, 0, ACROSS), replace(trials, steps=Steps(told)))
+    assert torch.equal(again.coefficients, found.coefficients)
+    assert chosen_twins(truth, replace(trials, steps=Steps())) is truth
     other = hs.Views.from_angles(np.array([0.0, 30.0, 48.0]), SHAPE, PIXEL)
     three = hs.Exposures.of(other, 20.0, 0.05).repeated(TIMES[:2])
     blank = hs.Scan(np.ones((6, *SHAPE), dtype=np.float32), three, np.zeros(6, dtype=bool))

@@ -20,6 +20,7 @@ from .poses import FREER, Explained, Pose
 from .replaced import Heard, pursued
 from .rest_shape import KnownBody
 from .shadows import Shadows
+from .steps import Steps
 
 SEARCH_RADIUS = 2.8
 """Radius of the ball of a body's volume in pixels of the search, whose frames are binned to about that."""
@@ -53,22 +54,24 @@ class KnownBodies:
         begun: MovingSurfaces | None = None,
         seed: int = 0,
         on_progress: Heard = lambda share: None,
+        steps: Steps | None = None,
     ) -> MovingSurfaces | None:
         """Bodies on paths of `basis` that explain what `known` ones leave of the frames; None where there are none.
 
         begun: bodies of any shape with which the search may begin; `of_begun` says whether it did. The first search
-        finds the size of all bodies.
+        finds the size of all bodies. steps: in which it is done.
         """
+        steps = steps or Steps()
         seen, mesh = self.seen, _sized(self.coarse, self.size / self.bin)
         if known is not None:
             seen = seen.without(self._shadows(known))
         like = [] if begun is None else poses_like(begun, mesh, (self.first, self.last), self.pixel * self.bin)
-        found, self.of_begun = pursued(mesh, seen, self.velocities, like, seed, on_progress)
+        found, self.of_begun = pursued(mesh, seen, self.velocities, like, seed, on_progress, steps)
         if not found:
             return None
         if known is None and self.body.uncertain > 0:
             self.size = best_size(mesh, seen, found, self.body.uncertain)
-            found = Explained(_sized(mesh, self.size), seen, FREER).improved(found, SIZE_STEPS)
+            found = Explained(_sized(mesh, self.size), seen, FREER, steps).improved(found, SIZE_STEPS)
         return self._paths([pose.scaled(self.bin) for pose in found], basis)
 
     def _shadows(self, bodies: MovingSurfaces) -> np.ndarray:

@@ -15,6 +15,7 @@ from ..representations import MovingSurfaces
 from ..scan import Scan
 from .elastic import Rest
 from .fit import MotionFit, motion_fit
+from .steps import Steps
 
 SURE = 2.0
 """Standard errors by which more pieces must be better."""
@@ -48,12 +49,14 @@ def chosen_paths(
     seed: int = 0,
     light: Light | None = None,
     rest: Rest | None = None,
+    *,
+    steps: Steps | None = None,
 ) -> MovingSurfaces:
     """`start` on paths of the asked number of pieces, or of the number that predicts held-out frames best.
 
     Numbers are doubled as long as a fit goes on better so than with as many pieces as before: half the steps of `how`,
     on all but the held-out frames, which it then predicts better by more than chance. There are never more coefficients
-    than times.
+    than times. steps: in which it is done, one for each fit.
     """
     if options.pieces > 0:
         return refined(start, options.pieces)
@@ -66,12 +69,18 @@ def chosen_paths(
     short = replace(how, schedule=replace(how.schedule, steps=max(1, how.schedule.steps // 2)))
     kept, left = train.with_split(aside), train[np.flatnonzero(aside)]
 
-    def fitted(bodies: MovingSurfaces) -> tuple[MovingSurfaces, np.ndarray]:
+    steps = steps or Steps()
+
+    def run(bodies: MovingSurfaces) -> tuple[torch.Tensor, torch.Tensor]:
         fit = motion_fit(kept, bodies, short, seed, _part(light, ~aside), rest)
         fit.run(lambda record: None)
         found = fit.result().object
         assert isinstance(found, MovingSurfaces)
-        return found, _errors(left, found, fit.oversample)
+        return found.coefficients.detach(), _errors(left, found, fit.oversample)
+
+    def fitted(bodies: MovingSurfaces) -> tuple[MovingSurfaces, np.ndarray]:
+        coefficients, errors = steps.of(lambda: run(bodies))
+        return bodies.with_parameters({"coefficients": coefficients}), errors.numpy()
 
     best, begun = start.basis.pieces, fitted(start)[0]
     for pieces in candidates[1:]:
@@ -94,11 +103,12 @@ def refined(start: MovingSurfaces, pieces: int) -> MovingSurfaces:
     return MovingSurfaces(paths, start.faces, start.of_body, basis, start.unit_length, start.matter, start.lines)
 
 
-def _errors(held_out: Scan, found: MovingSurfaces, oversample: int) -> np.ndarray:
+def _errors(held_out: Scan, found: MovingSurfaces, oversample: int) -> torch.Tensor:
     """Mean square [V] of what is left of each held-out frame."""
     said, measured = Prediction(found, held_out.exposures, oversample), torch.from_numpy(held_out.frames)
     with torch.no_grad():
-        return np.array([float((said.view(v).frames()[0] - one).square().mean()) for v, one in enumerate(measured)])
+        left = [float((said.view(v).frames()[0] - one).square().mean()) for v, one in enumerate(measured)]
+        return torch.tensor(left, dtype=torch.float64)
 
 
 def _better(before: np.ndarray, after: np.ndarray) -> bool:

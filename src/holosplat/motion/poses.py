@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ..mesh import TriangleMesh
 from .shadows import Shadows
+from .steps import Steps
 
 ROUNDED = 3.0
 """Standard deviations from which on a misfit counts by its size, no longer by its square: shadows of other bodies."""
@@ -50,11 +51,14 @@ class Pose:
 
 
 class Explained:
-    """What bodies of one rest shape leave of shadows, and what they cost; strain: cost of a squared strain of one."""
+    """What bodies of one rest shape leave of shadows, and what they cost.
 
-    def __init__(self, mesh: TriangleMesh, seen: Shadows, strain: float = STRAIN) -> None:
+    strain: cost of a squared strain of one; steps: of the calculation, one for each time that poses are `improved`.
+    """
+
+    def __init__(self, mesh: TriangleMesh, seen: Shadows, strain: float = STRAIN, steps: Steps | None = None) -> None:
         radius = (3 * mesh.volume / (4 * np.pi)) ** (1 / 3)
-        self.mesh, self.seen = mesh, seen
+        self.mesh, self.seen, self.steps = mesh, seen, steps or Steps()
         self.noise = max(seen.noise, MODEL_ERROR * radius)
         self.target, self.rest = torch.from_numpy(seen.thickness), torch.from_numpy(mesh.vertices)
         self.radius = float(self.rest.norm(dim=1).mean())
@@ -64,7 +68,7 @@ class Explained:
 
     def beside(self, images: np.ndarray) -> Explained:
         """The same beside matter that casts `images` [N, H, W]."""
-        return Explained(self.mesh, self.seen.without(images), self.strain)
+        return Explained(self.mesh, self.seen.without(images), self.strain, self.steps)
 
     def without(self, poses: Sequence[Pose]) -> Explained:
         """The same beside bodies in `poses`."""
@@ -124,9 +128,10 @@ class Explained:
 
     def improved(self, poses: Sequence[Pose], steps: int) -> list[Pose]:
         """Poses that explain more, by so many steps of L-BFGS."""
-        if not poses:
-            return []
-        first = _parts(poses)
+        return _poses(_unpacked(self.steps.of(lambda: self._better(_parts(poses), steps)))) if poses else []
+
+    def _better(self, first: Parts, steps: int) -> Tensor:
+        """The same of the parts of poses, packed."""
 
         def moved(u: Tensor) -> Parts:
             matrices = first[0] @ (torch.eye(3, dtype=u.dtype) + u[:, :9].reshape(-1, 3, 3) / self.radius)
@@ -144,9 +149,9 @@ class Explained:
             (gradient,) = torch.autograd.grad(total, u)
             return float(total.detach()), gradient.numpy().ravel()
 
-        start = np.zeros(NUMBERS * len(poses))
+        start = np.zeros(NUMBERS * len(first[0]))
         found = minimize(value, start, jac=True, method="L-BFGS-B", options={"maxiter": steps})
-        return _poses(moved(torch.from_numpy(found.x.reshape(-1, NUMBERS))))
+        return _packed(moved(torch.from_numpy(found.x.reshape(-1, NUMBERS))))
 
     def _strained(self, parts: Parts) -> Tensor:
         strain = parts[0].mT @ parts[0] - torch.eye(3, dtype=parts[0].dtype)
@@ -170,6 +175,16 @@ def _parts(poses: Sequence[Pose]) -> Parts:
     names = ("matrix", "centre", "velocity", "turning")
     first, second, third, fourth = (torch.from_numpy(np.array([getattr(p, name) for p in poses])) for name in names)
     return first, second, third, fourth
+
+
+def _packed(parts: Parts) -> Tensor:
+    """[B, NUMBERS]."""
+    return torch.cat([part.detach().flatten(1) for part in parts], dim=1)
+
+
+def _unpacked(numbers: Tensor) -> Parts:
+    matrices, centres, velocity, turning = numbers.split((9, 3, 3, 3), dim=1)
+    return matrices.reshape(-1, 3, 3), centres, velocity, turning
 
 
 def _poses(parts: Parts) -> list[Pose]:

@@ -14,6 +14,7 @@ from .pool import Pool
 from .poses import FREER, Explained, Pose
 from .pursuit import LAST_STEPS, candidates, explaining, level_pairs, searched, swapped, two_beams
 from .shadows import Shadows
+from .steps import Steps
 from .templates import Search, Templates
 
 TRIES, MOST_ROUNDS, PATIENCE = 12, 20, 3
@@ -44,14 +45,17 @@ def pursued(
     begun: Sequence[Pose] = (),
     seed: int = 0,
     on_progress: Heard = lambda share: None,
+    steps: Steps | None = None,
 ) -> tuple[list[Pose], bool]:
     """Poses of all bodies of the rest shape `mesh` [pixels] that shadows show, on paths near `velocities` [K, 3].
 
     begun: poses that are known about; bodies are found with and without them, and what explains more is made better.
-    The other value: whether that began with them. seed: of the choices of what is taken away.
+    The other value: whether that began with them. seed: of the choices of what is taken away. steps: in which it is
+    done.
     """
-    search, every = Search(Templates.of(mesh, seen), seen, velocities), Explained(mesh, seen)
-    free = Explained(mesh, seen, FREER)
+    steps = steps or Steps()
+    search, every = Search(Templates.of(mesh, seen), seen, velocities), Explained(mesh, seen, steps=steps)
+    free = Explained(mesh, seen, FREER, steps)
     starts = [[], every.improved(begun, LAST_STEPS)] if begun else [[]]
     found = [free.improved(searched(every, search, start), LAST_STEPS) for start in starts]
     best = int(np.argmin([free.value(poses) for poses in found]))

@@ -29,13 +29,14 @@ from .mergers import without_merger
 from .pieces import chosen_paths
 from .remainder import apart, beside, joined, only, sure_ones, whole_ones
 from .rest_shape import KnownBody
-from .sightings import Sighting, sightings
+from .sightings import Sighting, SightingOptions, sightings
 from .start import first_paths
+from .steps import Steps
 from .track_options import TrackOptions
 from .twins import Trials, chosen_twins
 
 CHECKPOINT_SECONDS = 20.0
-"""A fit that runs is kept so often [s]."""
+"""What a stage has come to is kept so often [s]."""
 AFTER_SOFT = {"soft": "twins", "soft again": "halves"}
 """The stages of soft fits, and what comes after each."""
 NOWHERE = Nowhere()
@@ -117,6 +118,11 @@ class _Following:
     _begun: Mapping[str, Any] | None = None
     """The state of the fit in which the run was cut off."""
     _search: KnownBodies | None = None
+    _kept: float = field(default_factory=time.perf_counter)
+    """When the journal was written."""
+
+    def __post_init__(self) -> None:
+        self._steps = Steps(on_step=self._save_now_and_then)
 
     def take_up(self) -> None:
         """Go on where the journal ends."""
@@ -132,6 +138,7 @@ class _Following:
         self.records, self.timing = list(saved["records"]), dict(saved["timing"])
         self.halves = [MovingSurfaces.from_state(one) for one in saved["halves"]]
         self._begun, self.size, self.guess = saved["fit"], float(saved["size"]), str(saved["guess"])
+        self._steps = Steps(saved.get("steps", ()), self._save_now_and_then)
 
     def _save(self, fit: Mapping[str, Any] | None = None) -> None:
         """Write the journal; fit: the state of the one that runs, which starts at `bodies`."""
@@ -139,7 +146,13 @@ class _Following:
         state |= {"size": self.size, "guess": self.guess}
         state |= {"bodies": None if self.bodies is None else self.bodies.state(), "fit": fit}
         state |= {"seen": from_sightings(self.seen), "records": self.records, "timing": self.timing}
-        self.journal.save(state | {"halves": [one.state() for one in self.halves]})
+        self.journal.save(state | {"halves": [one.state() for one in self.halves], "steps": self._steps.done})
+        self._kept = time.perf_counter()
+
+    def _save_now_and_then(self) -> None:
+        """Write the journal in the midst of a stage of several steps, where it is time."""
+        if time.perf_counter() - self._kept > CHECKPOINT_SECONDS:
+            self._save()
 
     def advance(self) -> None:
         """Do the stage that is next."""
@@ -153,6 +166,7 @@ class _Following:
                 self.counts = [self.bodies.count] * len(self.train.instants)
         elif self.bodies is not None:
             self._go_on(self.bodies)
+        self._steps = Steps(on_step=self._save_now_and_then)
         self._save()
 
     def _go_on(self, bodies: MovingSurfaces) -> None:
@@ -195,8 +209,13 @@ class _Following:
 
     @contextmanager
     def _timed(self, name: str) -> Iterator[None]:
+        """Of what is done in steps; they are kept where Ctrl-C comes between."""
         began = time.perf_counter()
-        yield
+        try:
+            yield
+        except KeyboardInterrupt:
+            self._save()
+            raise
         self.timing[name] = self.timing.get(name, 0.0) + time.perf_counter() - began
 
     def network(self) -> Guess | None:
@@ -219,8 +238,12 @@ class _Following:
         with self._timed("sightings"):
             for t in range(len(times)):
                 self.on_progress("bodies at each time", t / len(times), {})
-                found.append(sightings(frames.at_instant(t), self.material, how, network=network))
+                found += to_sightings([self._steps.of(lambda t=t: self._look_at(frames.at_instant(t), how, network))])
         return found
+
+    def _look_at(self, frames: Scan, how: SightingOptions, network: Guess | None) -> list[dict[str, Any]]:
+        """The bodies of one time, as the journal has them."""
+        return from_sightings([sightings(frames, self.material, how, network=network)])[0]
 
     def first(self) -> MovingSurfaces:
         """Bodies on first paths; the doubtful ones are left to be found beside the others."""
@@ -271,7 +294,7 @@ class _Following:
         with self._timed("poses"):
             self._search = self._search or KnownBodies(self.train, self.material, body, self.size)
             found = self._search.bodies(
-                basis, known, begun, self.seed, lambda share: self.on_progress("poses", share, {})
+                basis, known, begun, self.seed, lambda share: self.on_progress("poses", share, {}), self._steps
             )
             self.size = self._search.size
         if begun is not None:
@@ -304,7 +327,7 @@ class _Following:
         """`bodies` of known rest shape, or their twins, where there are two beams."""
         if self.rest is None or not self.options.twins:
             return bodies
-        how = (self.options.stiff, self.options.soft, self.oversample, self.seed, self.light)
+        how = (self.options.stiff, self.options.soft, self.oversample, self.seed, self.light, self._steps)
         trials = Trials(self.train, self.rest, *how)
         with self._timed("twins"):
             return chosen_twins(bodies, trials, lambda share: self.on_progress("twins", share, {}))
@@ -314,7 +337,7 @@ class _Following:
         how = (self.options.paths, self.options.stiff, self.seed, self.light, self.rest)
         self.on_progress("paths", 0.0, {})
         with self._timed("paths"):
-            return chosen_paths(self.train, bodies, *how)
+            return chosen_paths(self.train, bodies, *how, steps=self._steps)
 
     def fitted(
         self, name: str, frames: Scan, start: MovingSurfaces, how: MotionFit, light: Light | None
@@ -324,15 +347,13 @@ class _Following:
         if self._begun is not None:
             fit.load(dict(self._begun))
             self._begun = None
-        before, saved = len(self.records) - fit.step, time.perf_counter()
+        before = len(self.records) - fit.step
 
         def keep(record: Record) -> None:
-            nonlocal saved
             self.records.append(record | {"step": before + record["step"]})
             self.on_progress(name, fit.share, record)
-            if time.perf_counter() - saved > CHECKPOINT_SECONDS:
+            if time.perf_counter() - self._kept > CHECKPOINT_SECONDS:
                 self._save(fit.state_dict())
-                saved = time.perf_counter()
 
         try:
             fit.run(keep)

@@ -9,7 +9,7 @@ takes bodies for ellipsoids of a known volume finds the one or the other; finer 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import NamedTuple
 
@@ -27,6 +27,7 @@ from .elastic import Rest
 from .fit import MotionFit, motion_fit
 from .measures import moments
 from .remainder import beside, only
+from .steps import Steps
 
 APART = 0.05
 """Distance of a body and its twin, over its extent, from which on they are told apart."""
@@ -61,7 +62,8 @@ def trial_of(how: MotionFit, steps: int) -> MotionFit:
 
 @dataclass(frozen=True)
 class Trials:
-    """What fits need that decide. oversample: wave samples a pixel where others are divided out."""
+    """What fits need that decide. oversample: wave samples a pixel where others are divided out; steps: of the
+    calculation, one for each fit."""
 
     train: Scan
     rest: Rest
@@ -70,6 +72,7 @@ class Trials:
     oversample: int
     seed: int = 0
     light: Light | None = None
+    steps: Steps = field(default_factory=Steps)
 
     def begun(self, frames: Scan, start: MovingSurfaces) -> Tried:
         """A stiff fit of `start` to `frames`."""
@@ -80,9 +83,13 @@ class Trials:
         return self._fitted(frames, tried.bodies, trial_of(self.soft, SOFT_STEPS))
 
     def _fitted(self, frames: Scan, start: MovingSurfaces, how: MotionFit) -> Tried:
-        fit = motion_fit(frames, start, how, self.seed, self.light, self.rest)
-        fit.run(lambda record: None)
-        return _left(fit)
+        def run() -> tuple[float, torch.Tensor]:
+            fit = motion_fit(frames, start, how, self.seed, self.light, self.rest)
+            fit.run(lambda record: None)
+            return _left(fit)
+
+        loss, coefficients = self.steps.of(run)
+        return Tried(loss, start.with_parameters({"coefficients": coefficients}))
 
     def beside(self, bodies: MovingSurfaces, number: int) -> Scan:
         """The frames, divided by those of all `bodies` but one."""
@@ -263,12 +270,12 @@ def _second(mesh: TriangleMesh) -> np.ndarray:
     return second / volume
 
 
-def _left(fit: Fit) -> Tried:
-    """The loss of all frames and priors after `fit`, and its bodies."""
+def _left(fit: Fit) -> tuple[float, torch.Tensor]:
+    """The loss of all frames and priors after `fit`, and the coefficients of its bodies' paths."""
     model = fit.result()
     whole = Batch(None, torch.zeros(3, dtype=torch.float64), torch.tensor(1.0), 0)
     with torch.no_grad():
         loss = float(fit.plan.problem.loss(model, whole)[0])
     found = model.object
     assert isinstance(found, MovingSurfaces)
-    return Tried(loss, found.with_parameters({"coefficients": found.coefficients.detach()}))
+    return loss, found.coefficients.detach()
