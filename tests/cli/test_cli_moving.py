@@ -43,7 +43,12 @@ def quick(monkeypatch, tmp_path):
         return reconstruct_moving(scan, prior, replace(QUICK, fading=options.fading), *rest, ask=False, **others)
 
     monkeypatch.setattr(motion, "reconstruct_moving", few)
-    monkeypatch.setattr(motion, "report_run", lambda *what: tmp_path / "run/report.html")
+
+    def report(*what):
+        (tmp_path / "remark").write_text(what[-1], encoding="utf-8")
+        return tmp_path / "run/report.html"
+
+    monkeypatch.setattr(motion, "report_run", report)
     blob = ["--specimen", "stirred-blob", "--material", "PMMA", "--specimen-motion", 40, "--frame-rate", 1e3]
     field = ["--frames", 3, "--detector", 15, 19, "--pixel-size", "1e-6", "--distance", 0.1, "--views", 3]
     truth = ["--photons-per-pixel", 2000, "--test-every", 0, "--truth", tmp_path / "t.h5", "--truth-frames", 0, 2]
@@ -57,6 +62,7 @@ def test_a_series_in_motion_is_one_object_that_all_commands_read(quick):
     assert "carried by a flow" in said.err
     found = load_reconstruction(RunFolder(quick / "run"))
     assert isinstance(found.object, MovingGaussians)
+    assert "time 1000 µs, of 9 frames of 3 times" in (quick / "remark").read_text(encoding="utf-8")
     summary = json.loads((quick / "run/summary.json").read_text())
     assert summary["times_s"] == pytest.approx([0, 1e-3, 2e-3], abs=0)
     worked(holosplat("export", quick / "run", "--volume", quick / "v.h5", "--time-frame", "all"))

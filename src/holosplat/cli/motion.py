@@ -99,4 +99,5 @@ def report_of_middle(folder: RunFolder, result: Reconstruction, measured: Scan) 
     middle = len(times) // 2
     shown = measured[(measured.exposures.time == times[middle]).nonzero()[0]].as_static()
     now = moment(result, times, middle)
-    return report_run(folder, now, shown, score(now, shown, None), None)
+    whole = f"This is the time {1e6 * times[middle]:.4g} µs, of {len(measured)} frames of {len(times)} times in all."
+    return report_run(folder, now, shown, score(now, shown, None), None, whole)

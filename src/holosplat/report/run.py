@@ -47,8 +47,12 @@ def report_run(
     scan: Scan,
     evaluation: Evaluation,
     truth: Volume | None,
+    remark: str = "",
 ) -> Path:
-    """Write `report.html` of a run, of one in motion with the volume at the time in the middle; returns its path."""
+    """Write `report.html` of a run, of bodies in motion with the volume at the time in the middle; returns its path.
+
+    remark: a sentence on what `scan` is a part of, which follows the summary of it.
+    """
     config, moving = folder.read_config(), None
     turned = found = reconstruction.object
     if isinstance(found, MovingSurfaces):
@@ -64,7 +68,7 @@ def report_run(
     volume = found.voxelise(grid)
     content = ReportContent(
         title=_title(config, reconstruction),
-        summary=_summary(reconstruction, scan, moving),
+        summary=" ".join(filter(None, (_summary(reconstruction, scan, moving), remark))),
         reconstruction=volume,
         truth=truth,
         energy_kev=scan.exposures.reference_energy,
