@@ -15,7 +15,7 @@ from holosplat.checks import InputError
 from holosplat.geometry import Views
 from holosplat.methods import METHODS, Auto, Gaussians
 from holosplat.planning import needs
-from holosplat.planning.needs import Needs, Sizes, of_reconstruction, of_simulation, require_room, smaller
+from holosplat.planning.needs import Costs, Needs, Sizes, of_reconstruction, of_simulation, require_room, smaller
 from holosplat.scan import Exposures
 
 TABLE = Path(__file__).resolve().parents[2] / "docs/data/needs.csv"
@@ -66,6 +66,17 @@ def test_fewer_views_a_step_and_a_random_start_take_less():
     batched = replace(plain, fit=replace(plain.fit, schedule=replace(plain.fit.schedule, views_per_step=2)))
     of = [of_reconstruction(sizes, method).memory for method in (plain, batched, replace(batched, start="random"))]
     assert of[0] >= of[1] > of[2]
+
+
+def test_gaussians_that_fill_surfaces_of_large_frames_have_finer_waves():
+    """512 × 512 pixels: as measured on cells in a fiftieth of the field (docs/data/sizes.csv), within a half."""
+    sizes, method = Sizes.of(exposures((512, 512), 12, 0.8e-6)), METHODS["gaussians"]
+    assert isinstance(method, Gaussians)
+    said = of_reconstruction(sizes, method)
+    assert said.memory > Costs.waves * sizes.waves(1)
+    assert 0.8 < said.memory / 2.8e9 < 1.5
+    own = of_reconstruction(sizes, replace(method, coarse=replace(method.coarse, columns=0)))
+    assert own.disk < said.disk / 3
 
 
 def test_auto_takes_what_the_larger_of_its_methods_takes():

@@ -72,9 +72,9 @@ class CoarseToFine:
         at_least(self, 0, "columns")
         at_least(self, 1, "coarse_steps", "finer_steps", "last_steps", "views", "fit_steps")
 
-    def factor(self, scan: Scan) -> int:
-        """Pixels of `scan` along an edge of the coarsest: a power of two, 1 where its frames are small."""
-        (h, w), factor = scan.views.shape, 1
+    def factor(self, shape: tuple[int, int]) -> int:
+        """Pixels of frames [H, W] along an edge of the coarsest: a power of two, 1 where these are small."""
+        (h, w), factor = shape, 1
         while self.columns and h * w >= (2 * factor * self.columns) ** 2 and min(h, w) >= 2 * factor * FEWEST_ROWS:
             factor *= 2
         return factor
@@ -110,7 +110,7 @@ def coarse_surfaces(
     first: surfaces to begin with, of the frames of a task; None where there are none. Small frames (`how.factor`) are
     their own coarse ones. The matter is one of a known level.
     """
-    how, factor, found = how.of_views(len(task.scan.train())), how.factor(task.scan), None
+    how, factor, found = how.of_views(len(task.scan.train())), how.factor(task.scan.views.shape), None
     most = how.missing_small if factor == 1 else how.missing
     finest = 1 if factor == 1 else 2
     while factor >= finest and found is None:

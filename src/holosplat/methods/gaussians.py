@@ -125,7 +125,8 @@ class GaussianStage:
 
     def coarse_surfaces(self, task: Task, surfaces: SurfaceOptions) -> SurfaceMesh | None:
         """Surfaces near to those of the frames, where these are large and coarse pixels show the bodies."""
-        return None if self.options.coarse.factor(task.scan) == 1 else self.near_surfaces(task, surfaces)
+        small = self.options.coarse.factor(task.scan.views.shape) == 1
+        return None if small else self.near_surfaces(task, surfaces)
 
     def near_surfaces(self, task: Task, surfaces: SurfaceOptions) -> SurfaceMesh | None:
         """The same of frames of any size."""

@@ -61,7 +61,7 @@ class BodiesStage(GaussianStage):
 
     def coarse_surfaces(self, task: Task, surfaces: SurfaceOptions) -> SurfaceMesh | None:
         """Those of coarse pixels, which small frames have themselves; small noisy ones are for Gaussians."""
-        small = self.options.coarse.factor(task.scan) == 1
+        small = self.options.coarse.factor(task.scan.views.shape) == 1
         straight = self.options.start == "phase" and task.freedom is None and not is_noisy(task, self.options)
         return self.near_surfaces(task, surfaces) if straight or not small else None
 

@@ -27,6 +27,7 @@ from ..methods import (
     Surfaces,
     Voxels,
 )
+from ..methods.coarse_cloud import MOST_GAUSSIANS
 from ..optics.sampling import fringe_sampling, padding
 from ..scan import Exposures
 
@@ -61,6 +62,8 @@ class Costs:
     """The same in a fit of surfaces."""
     gaussian: float = 700.0
     """A Gaussian with gradients, Adam's moments and its tiles."""
+    filling: float = 250.0
+    """The same of one that fills surfaces of large frames, which is small."""
     simulated: float = 85.0
     """A wave sample of one view of a simulation."""
     written: float = 4.0
@@ -73,6 +76,8 @@ SAFETY = 1.1
 """Times the estimate that must be there: it errs by a fifth."""
 KEPT = 4
 """Copies of an object that a run folder may hold: itself, two checkpoints with their optimiser, one being written."""
+FULL = 0.03
+"""Share of a large field that is taken to be full of matter."""
 BINNINGS, FEWEST_COLUMNS = range(2, 9), 11
 """What is tried for --bin, and columns that must be left."""
 
@@ -210,9 +215,17 @@ def _bodies(sizes: Sizes, how: Gaussians, edges: bool) -> tuple[float, float, fl
     count = how.random_count if how.start == "random" else min(how.max_start, how.start_per_pixel * sizes.pixels)
     fine = _fine(sizes, how.volume)[0]
     memory, numbers = max(begun, waves + Costs.gaussian * count), 14 * count
-    if edges and how.start == "phase" and how.coarse.columns:  # surfaces from coarse pixels on, where they show bodies
-        return memory, 10 + 5.6e-6 * sizes.waves(1), numbers
-    return memory, (30 if edges else 12) + 2.3e-6 * fine, numbers
+    seconds, finer = (30 if edges else 12) + 2.3e-6 * fine, sizes.waves(1)
+    near = 10 + 5.6e-6 * finer  # surfaces from coarse pixels on, where they show bodies
+    if how.start != "phase" or how.coarse.columns == 0:
+        return memory, seconds, numbers
+    if edges:
+        return memory, near, numbers
+    if how.coarse.factor((sizes.rows, sizes.columns)) == 1:
+        return memory, seconds, numbers
+    filled = min(MOST_GAUSSIANS, FULL * sizes.voxels)
+    memory = max(memory, Costs.waves * finer + Costs.filling * filled)
+    return memory, max(seconds, near + 2e-7 * filled * sizes.views), 14 * filled
 
 
 def _fine(sizes: Sizes, how: HolographicTV) -> tuple[int, int]:
