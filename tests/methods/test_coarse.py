@@ -12,18 +12,23 @@ from helpers.bumpy import DELTA, bumpy, poses, surfaces
 from holosplat.baselines import HolographicTV
 from holosplat.beamline.simulate import simulate
 from holosplat.fit.loop import Fit
+from holosplat.fit.schedule import Schedule
 from holosplat.geometry import Grid
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import MaterialPrior
 from holosplat.mesh import TriangleMesh
 from holosplat.methods import Gaussians, Near, SmoothVolume, SurfaceOptions, Surfaces, Task, begun
 from holosplat.methods.auto import Bodies
+from holosplat.methods.coarse import STAGE as COARSE
 from holosplat.methods.coarse import CoarseToFine, mean_chord, on_pixels, unexplained
+from holosplat.methods.coarse_cloud import cloud_of_surfaces
 from holosplat.methods.cross_validation import CrossValidation
 from holosplat.methods.first_surfaces import first_surfaces
 from holosplat.methods.gaussian_options import FitOptions
 from holosplat.methods.gaussians import GaussianStage, nearby
 from holosplat.methods.method import run_quietly
+from holosplat.methods.surface_fit import SurfaceFit
+from holosplat.methods.surfaces import refine_surfaces
 from holosplat.model import measure
 from holosplat.projectors.surface import surface_occupancy
 from holosplat.representations import GaussianCloud, SurfaceMesh
@@ -204,6 +209,24 @@ def test_gaussians_of_large_frames_fill_the_coarse_surfaces(scan):
     far = stage.fit(replace(task, near=False), start)
     assert isinstance(far, Fit)
     assert far.schedule.steps == 10
+
+
+def test_surfaces_of_gaussians_in_large_frames_go_by_coarse_pixels(scan, monkeypatch):
+    """To those of the body, in the few steps of near ones; by options of one's own they are cut out on fine pixels."""
+    cloud, stages = cloud_of_surfaces(surfaces(body(19.7), unit=PITCH), task_of(scan)), list[str]()
+    found = refine_surfaces(cloud, scan, on_progress=lambda stage, part: stages.append(stage), coarse=QUICK)
+    assert dice(found, body()) > 0.985
+    assert found.unit_length == PITCH
+    assert f"{COARSE}: 2 × 2" in stages
+    assert stages.count("surfaces") == QUICK.last_steps
+    monkeypatch.setattr("holosplat.methods.surfaces.coarse_surfaces", lambda *given: pytest.fail("not asked for"))
+    own = SurfaceOptions(fit=SurfaceFit(schedule=Schedule(steps=3)))
+    stages.clear()
+    fine = refine_surfaces(cloud, scan, own, lambda stage, part: stages.append(stage), QUICK)
+    assert stages.count("surfaces") == 3
+    assert len(fine.faces) > 2 * len(found.faces)
+    small = CoarseToFine()  # to which these frames are small
+    assert refine_surfaces(fine, scan, SurfaceOptions(), coarse=small).faces.shape == fine.faces.shape
 
 
 def test_bodies_too_thin_for_coarse_pixels_start_on_their_own(scan):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
@@ -12,7 +13,7 @@ from ..matter import MaterialPrior
 from ..progress import Progress
 from ..representations import GaussianCloud, Stored, SurfaceMesh
 from ..scan import Scan
-from .coarse import CoarseToFine
+from .coarse import CoarseToFine, coarse_surfaces, on_pixels
 from .first_surfaces import is_noisy
 from .gaussian_options import Backend
 from .gaussians import Gaussians, GaussianStage
@@ -106,11 +107,35 @@ def refine_surfaces(
     scan: Scan,
     options: SurfaceOptions = SurfaceOptions(),
     on_progress: Progress = quiet,
+    coarse: CoarseToFine | None = None,
 ) -> SurfaceMesh:
-    """Surfaces cut out of `cloud`, or `cloud` itself if it is one, fitted to the training frames of `scan`; errors: of
-    both parts."""
-    stage, task = SurfaceStage(options), Task(scan.train(), MaterialPrior.unknown(), 0, on_progress)
-    fit = stage.fit(task, stage.start(task, cloud))
-    found = run_quietly(fit, task.report(STAGE))
+    """Surfaces cut out of `cloud`, or `cloud` itself if it is one, fitted to the training frames of `scan`.
+
+    By the usual options, those of Gaussians in large frames are cut out on coarse pixels where these show the bodies,
+    and go from there to finer ones (`coarse_surfaces`), as `coarse` or usually. Errors: of `extract_surfaces` and
+    `surface_fit`.
+    """
+    stage, task = (
+        SurfaceStage(options, coarse or CoarseToFine()),
+        Task(scan.train(), MaterialPrior.unknown(), 0, on_progress),
+    )
+    start = _by_coarse_pixels(cloud, task, stage) if options == SurfaceOptions() else None
+    if start is None:
+        start = stage.start(task, cloud)
+    else:
+        task = replace(task, near=True)
+    found = run_quietly(stage.fit(task, start), task.report(STAGE))
     assert isinstance(found, SurfaceMesh)
     return found
+
+
+def _by_coarse_pixels(cloud: Stored, task: Task, stage: SurfaceStage) -> SurfaceMesh | None:
+    """Surfaces of `cloud` near to those of large frames; None of small ones, and where coarse pixels show no bodies."""
+    if not isinstance(cloud, GaussianCloud) or stage.coarse.factor(task.scan.views.shape) == 1:
+        return None
+
+    def cut(coarse: Task) -> SurfaceMesh:
+        found = extract_surfaces(cloud, coarse.scan, stage.options.extraction)
+        return on_pixels(found, coarse.scan.views.finest, math.inf)
+
+    return coarse_surfaces(task, cut, stage.options, stage.coarse)
