@@ -27,9 +27,10 @@ from holosplat.methods.first_surfaces import first_surfaces
 from holosplat.methods.gaussian_options import FitOptions
 from holosplat.methods.gaussians import GaussianStage, nearby
 from holosplat.methods.method import run_quietly
-from holosplat.methods.surface_fit import SurfaceFit
+from holosplat.methods.surface_fit import SurfaceFit, oversampling
 from holosplat.methods.surfaces import refine_surfaces
 from holosplat.model import measure
+from holosplat.optics.sampling import fringe_sampling
 from holosplat.projectors.surface import surface_occupancy
 from holosplat.representations import GaussianCloud, SurfaceMesh
 from holosplat.scan import Exposures, Scan
@@ -206,6 +207,7 @@ def test_gaussians_of_large_frames_fill_the_coarse_surfaces(scan):
     fit = stage.fit(task, start)
     assert isinstance(fit, Fit)
     assert fit.schedule.steps == QUICK.fit_steps
+    assert fit.oversample == oversampling(scan) > fringe_sampling(scan.exposures)
     far = stage.fit(replace(task, near=False), start)
     assert isinstance(far, Fit)
     assert far.schedule.steps == 10

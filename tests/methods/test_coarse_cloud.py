@@ -121,7 +121,7 @@ def test_projections_are_those_of_the_surfaces_up_to_the_pixels_limit():
     def worst(cloud: GaussianCloud) -> float:
         found = cloud.project(task.scan.views)[1].detach().numpy()
         pairs = [fourier_ring_correlation(one, other) for one, other in zip(true, found)]
-        return min(float(curve[frequency <= 0.45].min()) for frequency, curve in pairs)
+        return min(float(curve[frequency <= 0.4].min()) for frequency, curve in pairs)
 
     cloud = cloud_of_surfaces(mesh, task)
     middle = Grid.of_views(task.scan.views).origin

@@ -75,8 +75,10 @@ def test_gaussians_that_fill_surfaces_of_large_frames_have_finer_waves():
     said = of_reconstruction(sizes, method)
     assert said.memory > Costs.waves * sizes.waves(1)
     assert 0.8 < said.memory / 2.8e9 < 1.5
-    own = of_reconstruction(sizes, replace(method, coarse=replace(method.coarse, columns=0)))
-    assert own.disk < said.disk / 3
+    without = replace(method, coarse=replace(method.coarse, columns=0))
+    assert of_reconstruction(sizes, without).disk < said.disk / 3
+    larger = Sizes.of(exposures((1024, 1024), 12, 0.4e-6))
+    assert of_reconstruction(larger, method).memory > 1.5 * of_reconstruction(larger, without).memory
 
 
 def test_auto_takes_what_the_larger_of_its_methods_takes():
