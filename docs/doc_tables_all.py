@@ -256,7 +256,8 @@ TABLES |= {
         ("short", lambda: thesis.configurations("short")),
         ("third", lambda: thesis.configurations("third")),
         ("full", lambda: thesis.configurations("full")),
-        ("others", thesis.others),
+        ("others", lambda: thesis.others("short")),
+        ("others-third", lambda: thesis.others("third")),
         ("findings", thesis.verdicts),
         ("left", thesis.left),
     )

@@ -139,9 +139,9 @@ def configurations(schedule: str) -> str:
     return "\n".join(table([row for row in read_rows() if where(row) == (schedule, *PLAIN)]))
 
 
-def others() -> str:
+def others(schedule: str) -> str:
     """`8k-v4` of the other case and in other physics, beside itself."""
-    main = [row for row in read_rows() if (row["schedule"], row["name"]) == ("short", MAIN)]
+    main = [row for row in read_rows() if (row["schedule"], row["name"]) == (schedule, MAIN)]
     lines = []
     for (case, physics), _ in groupby(sorted(main, key=_setting), key=_setting):
         lines += [line(f"{case}, {physics}", [row for row in main if _setting(row) == (case, physics)])]
