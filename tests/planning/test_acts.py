@@ -35,12 +35,26 @@ def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return importlib.import_module("needs_acts")
 
 
-@pytest.mark.parametrize("row", list(csv.DictReader(TABLE.open())), ids=lambda row: f"{row['act']} {row['sizes']}")
+TOO_MUCH = pytest.mark.xfail(
+    reason="two of five voxels are taken to show matter, of which these scenes have fewer", strict=True
+)
+"""Of pixel-aligned fields: 1.5 to 2.2 times what they take is said."""
+
+
+def measured_rows() -> list[object]:
+    """Those of the table; of pixel-aligned fields the first alone is said rightly."""
+    with TABLE.open() as file:
+        rows = list(csv.DictReader(file))
+    wrong = [row for row in rows if row["act"] == "onix"][1:]
+    name = "{act} {sizes}".format_map
+    return [pytest.param(row, id=name(row), marks=[TOO_MUCH] if row in wrong else []) for row in rows]
+
+
+@pytest.mark.parametrize("row", measured_rows())
 def test_what_is_said_is_near_what_was_measured(script, row):
-    """Within a factor of 1.3 above and below; of pixel-aligned fields more is said, for two of five voxels are taken to
-    show matter, of which the measured scenes have fewer."""
+    """Within a factor of 1.3 above and below."""
     said = script.ACTS[row["act"]][1](json.loads(row["sizes"])).memory / 1e6
-    assert 1 / 1.3 < said / float(row["measured_mb"]) < (2.2 if row["act"] == "onix" else 1.3)
+    assert 1 / 1.3 < said / float(row["measured_mb"]) < 1.3
 
 
 def test_every_act_is_measured(script):

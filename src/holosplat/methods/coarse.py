@@ -63,7 +63,7 @@ class CoarseToFine:
     """The same on the frames' own pixels."""
     fit_steps: int = 10
     """Steps of the fit of Gaussians from there: 40 gain 0.001 of SSIM on held-out frames and lose 0.003 of FRCM (256
-    pixels without noise), and take four times as long."""
+    pixels without noise, looked at once; no script keeps it), and take four times as long."""
     fit_rate: Weight = 0.1
     """Adam's rates in these steps, as a share of those of a fit that begins far away: its first ones are as long for
     every parameter, and would blur what is sharp."""

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from ..matter import Matter
 from .gaussians import GaussianCloud, raw_of
+from .initialise import SMALLEST
 
 HALVES = torch.tensor([[x, y, z] for z in (-0.25, 0.25) for y in (-0.25, 0.25) for x in (-0.25, 0.25)]).double()
 """Centres `(x, y, z)` of the eight halves of a cell, in the order of an array [2, 2, 2] of (z, y, x)."""
@@ -24,8 +25,6 @@ SMOOTH = 1 / 8
 """Variance added along each axis. Gaussians as narrow as their matter leave gaps between the cells of up to three
 quarters of a full density; with 1/12 volumes on the same cells, which are Gaussians' means nearly, read 3 % too high,
 with 1/6 edges are blurred half as much again (looked at on one scene of 256² pixels; no script keeps it)."""
-SMALLEST = 1e-3
-"""Smallest amplitude: softplus needs some slope to start from."""
 
 
 def moments(halves: Tensor, filled: float) -> tuple[Tensor, Tensor, Tensor]:
