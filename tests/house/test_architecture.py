@@ -21,7 +21,20 @@ Files = dict[str, str]
 """Path below src/holosplat → source text."""
 
 TIERS = (
-    ("units", "version", "checks", "ranges", "lazy", "tables", "native", "backends", "memory", "progress", "display")
+    (
+        "units",
+        "version",
+        "checks",
+        "ranges",
+        "lazy",
+        "tables",
+        "native",
+        "launch",
+        "backends",
+        "memory",
+        "progress",
+        "display",
+    )
     + ("geometry", "frames", "divided_light", "scan", "volume", "mesh", "matter"),
     ("materials", "optics", "metrics", "projectors", "preprocess"),
     ("specimens", "representations", "model"),
@@ -193,13 +206,13 @@ def no_cycles(files: Files) -> list[str]:
 
 
 def backends_stand_alone(files: Files) -> list[str]:
-    """A backend file imports its own folder, `native`, and what `BACKEND_IMPORTS` adds."""
+    """A backend file imports its own folder, `native`, `launch`, and what `BACKEND_IMPORTS` adds."""
     complaints = []
     for path in files:
         if not any(fnmatch(path, pattern) for pattern in BACKENDS):
             continue
         for target, name, _ in _imports(files, path):
-            own = target.startswith(path.rsplit("/", 1)[0] + "/") or target == "native.py"
+            own = target.startswith(path.rsplit("/", 1)[0] + "/") or target in ("native.py", "launch.py")
             if target and not own and _room(target) not in BACKEND_IMPORTS.get(path, ()):
                 complaints.append(f"{path} imports {name}")
     return complaints

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from contextlib import nullcontext
-
-import torch
 from torch import Tensor
 
+from ...launch import launching
 from . import triton_adam
 
 
@@ -18,6 +16,5 @@ def step(
     `parameter -= factors[k] · first / (√second + factors[-1])`, after `first` and `second` have moved towards the
     gradient (by 0.1) and its square (by 0.001). factors: float32, on the device; nothing waits for it.
     """
-    here = factors.device
-    with torch.cuda.device(here) if here.type == "cuda" else nullcontext():
+    with launching(factors):
         triton_adam.step(parameters, [g.contiguous() for g in gradients], first, second, factors)

@@ -9,13 +9,13 @@ Sums run in a fixed order: results are bitwise the same in every run. Nothing wa
 from __future__ import annotations
 
 import math
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from ...launch import launching
 from . import triton_fidelity
 
 WINDOW, SIGMA = 11, 1.5
@@ -64,7 +64,7 @@ class _Fidelity(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         arrays = tuple(a.contiguous() for a in (predicted, frames, statistics))
         windows = (window(frames.shape[1]), window(frames.shape[2]))
-        with _on(predicted):
+        with launching(predicted):
             values, slopes = triton_fidelity.compare(arrays, windows, low, span, ctx.needs_input_grad[0])
         ctx.save_for_backward(*arrays[:2], slopes)
         ctx.windows, ctx.mapping = windows, (low, span)
@@ -74,11 +74,6 @@ class _Fidelity(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, l1: Tensor, ssim: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         upstream = torch.stack([l1, ssim])
-        with _on(upstream):
+        with launching(upstream):
             out = triton_fidelity.differentiate(ctx.saved_tensors, upstream, ctx.windows, *ctx.mapping)
         return out, None, None, None, None
-
-
-def _on(array: Tensor) -> AbstractContextManager[Any]:
-    """The device of `array` made current: Triton launches on the current one."""
-    return torch.cuda.device(array.device) if array.is_cuda else nullcontext()

@@ -7,7 +7,6 @@ the kernels and plans the transforms).
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +14,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from ...launch import launching
 from . import triton_waves
 from .factors import factor_gradients
 
@@ -35,7 +35,7 @@ class _Hologram(torch.autograd.Function):
         ctx: Any, lines: Tensor, matter: triton_waves.Refraction, path: OpticalPath, *_: Tensor | None
     ) -> Tensor:
         lines, crop = lines.contiguous(), (path.margin, path.factor)
-        with _on(lines):
+        with launching(lines):
             wave = triton_waves.exit_wave(lines, matter)
             wave = _inverse(_transfer(_forward(wave), path))
             if path.blur_rows is None:
@@ -55,7 +55,7 @@ class _Hologram(torch.autograd.Function):
             raise RuntimeError("the hologram's gradient can be taken once only; compute the frames anew.")
         ctx.wave, needs = None, ctx.needs_input_grad
         path_gradients: tuple[Tensor | None, Tensor | None] = (None, None)
-        with _on(lines):
+        with launching(lines):
             blur_gradients = _detected_backward(gradient, wave, path, any(needs[5:]))
             spectrum = _forward(wave)
             if any(needs[3:5]):
@@ -114,8 +114,3 @@ def _blurred(spectrum: Tensor, path: OpticalPath) -> Tensor:
     assert path.blur_columns is not None
     triton_waves.attenuate(spectrum, path.blur_rows.contiguous(), path.blur_columns.contiguous())
     return torch.fft.irfft2(spectrum, s=path.raster, norm="forward")
-
-
-def _on(array: Tensor) -> AbstractContextManager[Any]:
-    """The device of `array` made current: Triton launches on the current one."""
-    return torch.cuda.device(array.device) if array.is_cuda else nullcontext()

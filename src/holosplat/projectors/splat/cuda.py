@@ -7,13 +7,13 @@ sums in any order and differ in their last bits from run to run; gradients, for 
 
 from __future__ import annotations
 
-from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from ...launch import launching
 from . import triton_splat, triton_voxels
 
 
@@ -65,7 +65,7 @@ class _Splat(torch.autograd.Function):
         options: tuple[float, float],
     ) -> Tensor:
         cloud = tuple(a.contiguous() for a in (centres, scales, quaternions, amplitudes))
-        with _on(centres):
+        with launching(centres):
             image, records = triton_splat.draw(cloud, (rotations, shifts), shape, *options)
         ctx.save_for_backward(*cloud, rotations, shifts, *records)
         ctx.variance = options[1]
@@ -76,7 +76,7 @@ class _Splat(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         saved, of_poses = ctx.saved_tensors, any(ctx.needs_input_grad[4:6])
         inputs = (saved[:4], saved[4:6], saved[6:], gradient.contiguous())
-        with _on(gradient):
+        with launching(gradient):
             out, moved = triton_splat.gather(*inputs, ctx.variance, of_poses)
         return *out, *(moved or (None, None)), None, None
 
@@ -93,7 +93,7 @@ class _Voxelise(torch.autograd.Function):
         options: tuple[float, float],
     ) -> Tensor:
         cloud = tuple(a.contiguous() for a in (centres, scales, quaternions, amplitudes))
-        with _on(centres):
+        with launching(centres):
             volume, records = triton_voxels.draw(cloud, shape, *options)
         ctx.save_for_backward(*cloud, *records)
         ctx.variance = options[1]
@@ -103,11 +103,6 @@ class _Voxelise(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         saved = ctx.saved_tensors
-        with _on(gradient):
+        with launching(gradient):
             out = triton_voxels.gather(saved[:4], saved[4:], gradient.contiguous(), ctx.variance)
         return *out, None, None
-
-
-def _on(array: Tensor) -> AbstractContextManager[Any]:
-    """The device of `array` made current: Triton launches on the current one."""
-    return torch.cuda.device(array.device) if array.is_cuda else nullcontext()
