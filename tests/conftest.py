@@ -22,7 +22,16 @@ pytest.register_assert_rewrite("helpers")  # failures there say as much as in th
 
 TRITON = importlib.util.find_spec("triton") is not None
 GPU = TRITON and torch.cuda.is_available()
-KERNELS = ("projectors.splat", "optics.hologram", "fit.fidelity", "fit.adam")
+KERNELS = (
+    "projectors.splat",
+    "projectors.surface",
+    "projectors.voxels.lattice_kernels",
+    "projectors.voxels.slice_products",
+    "optics.hologram",
+    "fit.fidelity",
+    "fit.adam",
+    "baselines.tv_steps",
+)
 """Packages with Triton kernels."""
 
 TOGETHER = ("tests/cli", "tests/workflows")

@@ -81,12 +81,17 @@ def report(kernel: JITFunction, made: Any, given: dict[str, Any], said: str) -> 
 
 def operations(every_size: bool) -> list[Callable[[], None]]:
     """Calls that, together, launch every kernel; of one channel and of wide indices, too, where `every_size` asks."""
+    from holosplat.baselines.tv_steps import cuda as total_variation
     from holosplat.fit.adam import cuda as adam
     from holosplat.fit.fidelity import cuda as fidelity
     from holosplat.optics.hologram import OpticalPath
     from holosplat.optics.hologram import cuda as waves
     from holosplat.projectors.splat import cuda as splats
     from holosplat.projectors.splat import triton_boxes, triton_pixels
+    from holosplat.projectors.surface import cuda as surfaces
+    from holosplat.projectors.voxels.lattice_kernels import cuda as hats
+    from holosplat.projectors.voxels.lattice_kernels.frames import Lattice
+    from holosplat.projectors.voxels.slice_products import cuda as slices
 
     def cloud(channels: int) -> list[Tensor]:
         return [torch.ones(5, width, requires_grad=True) for width in (3, 3, 4, channels)]
@@ -107,6 +112,29 @@ def operations(every_size: bool) -> list[Callable[[], None]]:
     def move() -> None:
         adam.step(*([torch.ones(9)] for _ in range(4)), torch.ones(2))
 
+    def surface() -> None:
+        points, faces = torch.ones(2, 5, 3, dtype=torch.float64), torch.ones(7, 3, dtype=torch.int64)
+        image, weights = torch.ones(2, 8, 9, dtype=torch.float64), torch.ones(2, dtype=torch.float64)
+        surfaces.thickness(points, faces, (8, 9), 2)
+        surfaces.corner_shares(points, faces, image, weights)
+        surfaces.pose_gradients(points, points[0], faces, image)
+
+    def vary() -> None:
+        u, q = torch.ones(3, 4, 5), torch.ones(3, 3, 4, 5)
+        total_variation.ascend(u, q, 0.5, 1.0)
+        total_variation.descend(u, u, q, 1.0, 1.0, u, u)
+
+    def lattice() -> None:
+        poses = (torch.ones(2, 3, 3, dtype=torch.float64), torch.ones(2, 2, dtype=torch.float64))
+        kernels = hats.Kernels(Lattice((3, 4, 5), (0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (8, 9)), *poses)
+        kernels.project(torch.ones(3, 4, 5))
+        kernels.backproject(torch.ones(2, 8, 9))
+        kernels.pose_gradients(torch.ones(3, 4, 5), torch.ones(2, 8, 9))
+
+    def slice_matrix() -> None:
+        entries = (torch.ones(4, dtype=torch.int64), torch.ones(5, dtype=torch.int64), torch.ones(5))
+        slices.Products(lambda transposed: entries, (3, 3)).project(torch.ones(3, 4))
+
     def wide(call: Callable[[int], None], module: ModuleType) -> None:
         usual, module.WIDE_FROM = module.WIDE_FROM, 0
         call(2)
@@ -120,7 +148,8 @@ def operations(every_size: bool) -> list[Callable[[], None]]:
         for refraction in (np.ones((channels, 2)), torch.ones(1, channels, 2, dtype=torch.float64)):
             waves.hologram(lines, refraction, path).sum().backward()
 
-    calls: list[Callable[[], None]] = [compare, move, lambda: hologram(1, True), lambda: hologram(2, False)]
+    calls: list[Callable[[], None]] = [compare, move, surface, vary, lattice, slice_matrix]
+    calls += [lambda: hologram(1, True), lambda: hologram(2, False)]
     if every_size:
         calls += [lambda: wide(splat, triton_pixels), lambda: wide(voxelise, triton_boxes)]
     for c in (1, 2) if every_size else (2,):

@@ -1,1 +1,4 @@
-"""The two half-steps of primal–dual total variation on a volume, in place. Backends: `cpu` (C++), `reference`."""
+"""The two half-steps of primal–dual total variation on a volume, in place.
+
+Backends: `cpu` (C++), `cuda` (Triton), `reference`.
+"""

@@ -1,4 +1,4 @@
-"""Thickness and occupancy of closed surfaces in plain torch, float64: the specification of the compiled twin.
+"""Thickness and occupancy of closed surfaces in plain torch, float64, on any device: the specification of the twins.
 
 A line of constant row cuts a triangle in a segment whose depth is linear in the column, and the pixels' edges cut that
 into pieces. The thickness along the line is the sum of depths, positive where the beam leaves, negative where it
@@ -28,7 +28,7 @@ def thickness(points: Tensor, faces: Tensor, shape: tuple[int, int], lines: int)
 def corner_shares(points: Tensor, faces: Tensor, gradient: Tensor, weights: Tensor) -> Tensor:
     """What each corner of each face gets of the image's gradient [V, H, W], views weighed by `weights` [V]: [F, 3]."""
     found = torch.einsum("v,vfq->fq", weights, sampled(points, faces, gradient))
-    return found @ torch.tensor(QUADRATURE, dtype=points.dtype)
+    return found @ points.new_tensor(QUADRATURE)
 
 
 def pose_gradients(points: Tensor, vertices: Tensor, faces: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
@@ -36,7 +36,7 @@ def pose_gradients(points: Tensor, vertices: Tensor, faces: Tensor, gradient: Te
 
     points: [V, P, 3] as above; vertices: [P, 3], the same in the object frame.
     """
-    shares = sampled(points, faces, gradient) @ torch.tensor(QUADRATURE, dtype=points.dtype)
+    shares = sampled(points, faces, gradient) @ points.new_tensor(QUADRATURE)
     a, b, c = points[:, faces].unbind(2)
     normals = torch.linalg.cross(b - a, c - a) / 6  # vector area, shared by the three points
     pull = torch.einsum("vfc,vfx->vfcx", shares, normals)  # on each corner, in the lab frame
@@ -50,7 +50,7 @@ def sampled(points: Tensor, faces: Tensor, gradient: Tensor) -> Tensor:
     """
     h, w = gradient.shape[1:]
     corners = points[:, faces.reshape(-1), :2].reshape(len(points), *faces.shape, 2)
-    samples = torch.einsum("qc,vfcx->vfqx", torch.tensor(QUADRATURE, dtype=points.dtype), corners)
+    samples = torch.einsum("qc,vfcx->vfqx", points.new_tensor(QUADRATURE), corners)
     # grid_sample has its first and last pixel at -1 and 1; a single row or column has no such scale.
     samples = samples * (2 / torch.tensor([max(w - 1, 1), max(h - 1, 1)]).to(points)) - 1
     return grid_sample(gradient[:, None], samples, padding_mode="zeros", align_corners=True)[:, 0]
@@ -119,5 +119,5 @@ def _cut(one: Tensor, other: Tensor, weight: Tensor, start: Tensor, width: int) 
 def _every(start: Tensor, stop: Tensor) -> tuple[Tensor, Tensor]:
     """The index of each range [start, stop), repeated, and every integer in it."""
     counts = (stop - start).clamp(min=0)
-    owner = torch.arange(len(counts)).repeat_interleave(counts)
-    return owner, torch.arange(len(owner)) - (counts.cumsum(0) - counts)[owner] + start[owner]
+    owner = torch.arange(len(counts), device=counts.device).repeat_interleave(counts)
+    return owner, torch.arange(len(owner), device=counts.device) - (counts.cumsum(0) - counts)[owner] + start[owner]

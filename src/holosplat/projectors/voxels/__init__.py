@@ -13,7 +13,7 @@ def projector_for(
 ) -> SliceProjector | LatticeProjector:
     """The fastest linear projector that fits: slice matrices for views about y with matching rows, else the lattice.
 
-    backend: `cpu` or `reference`; slices: that of slice matrices, where it is another.
+    backend: `cpu`, `cuda` or `reference`; slices: that of slice matrices, where it is another.
     """
     if views.shares_axis and rows_match(grid, views):
         return SliceProjector(grid, views, slices or backend)

@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import math
+from types import ModuleType
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ... import native
+from ...backends import device, implementation
 from ...checks import require
 from ...geometry import Grid, Poses, Views
-
-KINK = 1e-6
-"""Pixels from a pixel's centre within which a voxel counts as lying on it."""
+from .lattice_kernels import reference
+from .lattice_kernels.frames import Lattice
 
 
 class LatticeProjector:
     """Each voxel casts a bilinear hat of its mass on the detector; forward and exact adjoint, float32.
 
-    Backends: `cpu` (compiled) and `reference` (`lattice_reference`, and its derivatives by autograd).
+    Backends: `cpu` (C++), `cuda` (Triton) and `reference` (plain torch, any float type, derivatives by autograd). Poses
+    and arrays are given and made where the backend computes.
 
     The hat's variance, 1/6 px², is the sum of the variances of a pixel-sized cube's shadow (1/12) and of a pixel
     (1/12), so voxels should be about as large as the raster's pixels. Single pixels carry a ripple of a few per cent
@@ -38,14 +39,12 @@ class LatticeProjector:
     def __init__(self, grid: Grid, views: Views | Poses, backend: str = "cpu") -> None:
         self.grid, self.views, self.backend = grid, views, backend
         self.array_shape = grid.shape
-        self._poses = Poses.of(views) if isinstance(views, Views) else _checked(views)
-        pixel, poses = views.pitch, self._poses
-        self._arrays = (poses.matrices.detach().clone(), poses.offsets.detach() / pixel)
-        self._native = native.Views(len(views), *views.shape, *(a.data_ptr() for a in self._arrays))
-        origin, pitch = ((native.c_double * 3)(*(a / pixel for a in ends)) for ends in (grid.origin, grid.voxel_size))
-        self._lattice = native.Lattice(*grid.shape, origin, pitch)
-        self._mass = _mass(grid, pixel)
-        self._spread = None if poses.scales is None else poses.scales.detach()[:, None, None].float() ** -2
+        self._device = device(backend)
+        poses = Poses.of(views, self._device) if isinstance(views, Views) else _checked(views, self._device)
+        self._poses = poses
+        self._kernels = _kernels(implementation(f"{__package__}.lattice_kernels", backend), grid, poses, detached=True)
+        self._mass = _mass(grid, poses.pitch)
+        self._scales = None if poses.scales is None else poses.scales.detach().clone()
 
     def lines(self, array: Tensor) -> Tensor:
         """As `project`, differentiable: in `array`, and in the poses that ask for gradients."""
@@ -54,47 +53,36 @@ class LatticeProjector:
         poses = self._poses
         lines = _Lines.apply(array, poses.matrices, poses.offsets, self)
         assert isinstance(lines, Tensor)
-        return lines if poses.scales is None else lines * poses.scales[:, None, None].float() ** -2
+        return _spread(lines, poses.scales)
 
     def project(self, array: Tensor) -> Tensor:
         """Line integrals [V, H, W] in metres × value of `array` [Z, Y, X]."""
-        _check_shape("volume", array, self.grid.shape)
-        if self.backend == "reference":
-            return lattice_reference(array, self.grid, self.views)
-        images = self.on_pixels(array)
-        return images if self._spread is None else images.mul_(self._spread)
+        return _spread(self.on_pixels(array), self._scales)
 
     def on_pixels(self, array: Tensor) -> Tensor:
-        """As `project`, before a voxel's mass is spread over larger pixels; by the compiled kernel."""
-        images = torch.empty(len(self.views), *self.views.shape)
-        self._call("holosplat_lattice_project", array, images)
+        """As `project`, before a voxel's mass is spread over larger pixels."""
+        self._require("volume", array, self.grid.shape)
+        images: Tensor = self._kernels.project(array)
         return images.mul_(self._mass)
 
     def backproject(self, lines: Tensor) -> Tensor:
         """The adjoint of `project`: [V, H, W] → [Z, Y, X]."""
-        _check_shape("line integrals", lines, (len(self.views), *self.views.shape))
-        if self.backend == "reference":
-            anything = torch.zeros(self.grid.shape, requires_grad=True)
-            return torch.autograd.grad(lattice_reference(anything, self.grid, self.views), anything, lines)[0]
-        return self.from_pixels(lines if self._spread is None else lines * self._spread)
+        return self.from_pixels(_spread(lines, self._scales))
 
     def from_pixels(self, lines: Tensor) -> Tensor:
         """The adjoint of `on_pixels`."""
-        volume = torch.empty(self.grid.shape)
-        self._call("holosplat_lattice_backproject", lines, volume)
+        self._require("line integrals", lines, (len(self.views), *self.views.shape))
+        volume: Tensor = self._kernels.backproject(lines)
         return volume.mul_(self._mass)
 
     def pose_gradients(self, array: Tensor, upstream: Tensor) -> tuple[Tensor, Tensor]:
         """Gradients of matrices [V, 3, 3] and offsets [V, 2] [1/m], of the gradient [V, H, W] of `on_pixels`.
 
-        float64; the matrices' last rows, which move voxels along the beam, are zero. By the compiled kernel.
+        float64; the matrices' last rows, which move voxels along the beam, are zero.
         """
-        rotations = torch.zeros(len(self.views), 2, 3, dtype=torch.float64)
-        shifts = torch.zeros(len(self.views), 2, dtype=torch.float64)
-        if min(self.views.shape) > 1:
-            self._call("holosplat_lattice_poses", array, upstream, rotations, shifts)
-        last = torch.zeros(len(self.views), 1, 3, dtype=torch.float64)
-        return torch.cat((rotations, last), 1).mul_(self._mass), shifts.mul_(self._mass / self.views.pitch)
+        rows, shifts = self._kernels.pose_gradients(array, upstream)
+        matrices = torch.cat((rows, rows.new_zeros(len(rows), 1, 3)), 1)
+        return matrices.mul_(self._mass), shifts.mul(self._mass / self.views.pitch)
 
     def volume_in(self, volume: Tensor) -> Tensor:
         """The volume as it is: this projector's order is [Z, Y, X]."""
@@ -108,14 +96,17 @@ class LatticeProjector:
 
     lines_out = lines_in
 
-    def _call(self, function: str, source: Tensor, *others: Tensor) -> None:
-        source = source.detach().float().contiguous()
-        pointers = [native.c_void_p(array.data_ptr()) for array in (source, *others)]
-        native.call(function, self._lattice, self._native, *pointers, torch.get_num_threads())
+    def _require(self, name: str, array: Tensor, wanted: tuple[int, ...]) -> None:
+        shape, here = tuple(array.shape), array.device.type
+        require(
+            shape == wanted, f"the {name} must have the shape {wanted} of this projector, but the shape is {shape}."
+        )
+        there = self._device.type
+        require(here == there, f"the {name} must be on the device {there!r} of this projector, but is on {here!r}.")
 
 
 class _Lines(torch.autograd.Function):
-    """The compiled projector, whose gradient is its adjoint; of the poses, `pose_gradients`."""
+    """The projector of a backend, whose gradient is its adjoint; of the poses, `pose_gradients`."""
 
     @staticmethod
     def forward(  # type: ignore[override]
@@ -134,21 +125,26 @@ class _Lines(torch.autograd.Function):
         return of_array, *poses, None
 
 
-def _checked(poses: Poses) -> Poses:
+def _checked(poses: Poses, device: torch.device) -> Poses:
     fits = poses.rotations.ndim == 3 and poses.rotations.shape[1:] == (3, 3)
     fits = fits and tuple(poses.shifts.shape) == (len(poses), 2)
     held = [(a.dtype, a.device.type) for a in (poses.rotations, poses.shifts)]
     require(
-        fits and set(held) == {(torch.float64, "cpu")},
-        "poses of voxels must be float64 tensors on the CPU, rotations (V, 3, 3) and shifts (V, 2), but they are "
-        f"{tuple(poses.rotations.shape)} and {tuple(poses.shifts.shape)}, {held}.",
+        fits and set(held) == {(torch.float64, device.type)},
+        f"poses of voxels must be float64 tensors on {device.type!r}, rotations (V, 3, 3) and shifts (V, 2), but they "
+        f"are {tuple(poses.rotations.shape)} and {tuple(poses.shifts.shape)}, {held}.",
     )
     return poses
 
 
-def _check_shape(name: str, array: Tensor, wanted: tuple[int, ...]) -> None:
-    shape = tuple(array.shape)
-    require(shape == wanted, f"the {name} must have the shape {wanted} of this projector, but the shape is {shape}.")
+def _kernels(backend: ModuleType, grid: Grid, poses: Poses, *, detached: bool) -> Any:
+    """A backend's projector for the poses; detached: for what they are now, without gradients."""
+    pixel, (x, y, z), (dx, dy, dz) = poses.pitch, grid.origin, grid.voxel_size
+    origin, pitch = (x / pixel, y / pixel, z / pixel), (dx / pixel, dy / pixel, dz / pixel)
+    matrices, shifts = poses.matrices, poses.offsets / pixel
+    if detached:
+        matrices, shifts = matrices.detach().clone(), shifts.detach()
+    return backend.Kernels(Lattice(grid.shape, origin, pitch, poses.shape), matrices, shifts)
 
 
 def _mass(grid: Grid, pixel: float) -> float:
@@ -156,28 +152,13 @@ def _mass(grid: Grid, pixel: float) -> float:
     return math.prod(grid.voxel_size) / pixel**2
 
 
+def _spread(lines: Tensor, scales: Tensor | None) -> Tensor:
+    """Line integrals whose mass is spread over pixels of other sizes."""
+    return lines if scales is None else lines * scales[:, None, None].to(lines.dtype) ** -2
+
+
 def lattice_reference(volume: Tensor, grid: Grid, views: Views | Poses) -> Tensor:
     """The plain form of `LatticeProjector.lines`, any float type: [Z, Y, X] → [V, H, W]."""
     poses = Poses.of(views) if isinstance(views, Views) else views
-    pixel, (h, w) = poses.pitch, poses.shape
-    x, y, z = (torch.as_tensor(axis / pixel, dtype=volume.dtype) for axis in grid.axes())
-    zz, yy, xx = torch.meshgrid(z, y, x, indexing="ij")
-    points = torch.stack([xx, yy, zz]).reshape(3, -1)
-    # On either side of a kink the values are the same, and the derivatives are not.
-    sides = (KINK, -KINK) if poses.requires_grad else (0.0,)
-    images = []
-    for rotation, shift in zip(poses.matrices, poses.offsets / pixel):
-        lab = rotation.to(volume.dtype)[:2] @ points
-        column, row = lab[0] - shift[0] + 0.5 * w - 0.5, lab[1] - shift[1] + 0.5 * h - 0.5
-        slack = 1e-6
-        kept = (column >= -slack) & (column <= w - 1 + slack) & (row >= -slack) & (row <= h - 1 + slack)
-        column, row, value = column[kept], row[kept], volume.reshape(-1)[kept] / len(sides)
-        image = torch.zeros(h * w, dtype=volume.dtype)
-        for side in sides:
-            j, i = (column + side).floor().long().clamp(0, w - 2), (row + side).floor().long().clamp(0, h - 2)
-            a, b, at = column - j, row - i, i * w + j
-            for offset, weight in ((0, (1 - a) * (1 - b)), (1, a * (1 - b)), (w, (1 - a) * b), (w + 1, a * b)):
-                image = image.index_add(0, at + offset, value * weight)
-        images.append(image.reshape(h, w))
-    lines = torch.stack(images) * _mass(grid, pixel)
-    return lines if poses.scales is None else lines * poses.scales[:, None, None].to(lines) ** -2
+    lines: Tensor = _kernels(reference, grid, poses, detached=False).project(volume)
+    return _spread(lines * _mass(grid, poses.pitch), poses.scales)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import lru_cache
 
@@ -10,7 +11,7 @@ import scipy.sparse
 import torch
 from torch import Tensor
 
-from ... import native
+from ...backends import device, implementation
 from ...checks import require
 from ...geometry import Grid, Views
 from ..sparse import torch_csr
@@ -24,7 +25,8 @@ KEPT = 16
 class SliceProjector:
     """Parallel-beam projector for views that share the y axis; forward and exact adjoint, float32.
 
-    Backends: `cpu` (compiled) and `reference` (torch's sparse products, of any float type).
+    Backends: `cpu` (C++), `cuda` (Triton) and `reference` (torch's sparse products). Arrays are given and made where
+    the backend computes.
 
     Its arrays are ordered for speed: volumes [Z, X, Y] and line integrals [V, W, H], so that all slices are the
     columns of one product with a sparse matrix; `volume_in`, `volume_out` and `lines_in`, `lines_out` convert.
@@ -38,33 +40,28 @@ class SliceProjector:
         self.grid, self.views, self.backend = grid, views, backend
         nz, ny, nx = grid.shape
         self.array_shape = (nz, nx, ny)
-        made = _kept if nz * nx * len(views) <= SMALL else _made
-        self._adjoint = made(_Asked(grid, views.fingerprint(), True, views))
-        if backend == "reference":
-            self._forward = made(_Asked(grid, views.fingerprint(), False, views))
+        self._rays = (len(views), views.shape[1])
+        self._products = implementation(f"{__package__}.slice_products", backend).Products(
+            self._entries, (math.prod(self._rays), nz * nx)
+        )
 
     def project(self, array: Tensor) -> Tensor:
         """Line integrals [V, W, H] in metres × value of a volume in the order [Z, X, Y]."""
-        rays = (len(self.views), self.views.shape[1])
-        if self.backend == "reference":
-            return (self._forward @ array.reshape(-1, array.shape[2])).reshape(*rays, -1)
-        return self._call("holosplat_slices_project", array, (*rays, array.shape[2]))
+        lines: Tensor = self._products.project(array.reshape(-1, array.shape[2]))
+        return lines.reshape(*self._rays, -1)
 
     def backproject(self, lines: Tensor) -> Tensor:
         """The adjoint of `project`: [V, W, H] → [Z, X, Y]."""
-        shape = (*self.array_shape[:2], lines.shape[2])
-        if self.backend == "reference":
-            return (self._adjoint @ lines.reshape(-1, lines.shape[2])).reshape(shape)
-        return self._call("holosplat_slices_backproject", lines, shape)
+        volume: Tensor = self._products.backproject(lines.reshape(-1, lines.shape[2]))
+        return volume.reshape(*self.array_shape[:2], -1)
 
-    def _call(self, function: str, source: Tensor, shape: tuple[int, int, int]) -> Tensor:
-        """What a compiled kernel makes of `source`: float32 of `shape`, whose last axis both have."""
-        source, found = source.detach().float().contiguous(), torch.empty(shape)
-        entries = (self._adjoint.crow_indices(), self._adjoint.col_indices(), self._adjoint.values())
-        slices = native.Slices(*self._adjoint.shape, shape[2], *(array.data_ptr() for array in entries))
-        pointers = [native.c_void_p(array.data_ptr()) for array in (source, found)]
-        native.call(function, slices, *pointers, torch.get_num_threads())
-        return found
+    def _entries(self, transposed: bool) -> tuple[Tensor, Tensor, Tensor]:
+        """Of the matrix [V·W, Z·X] or its transpose, where the backend computes: starts of rows, columns, values."""
+        nz, _, nx = self.grid.shape
+        made = _kept if nz * nx * len(self.views) <= SMALL else _made
+        matrix = made(_Asked(self.grid, self.views.fingerprint(), transposed, self.views))
+        there = device(self.backend)
+        return matrix.crow_indices().to(there), matrix.col_indices().to(there), matrix.values().to(there)
 
     def volume_in(self, volume: Tensor) -> Tensor:
         """[Z, Y, X] → [Z, X, Y]."""
