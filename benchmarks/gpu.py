@@ -1,11 +1,12 @@
-"""The GPU's splat, measured: pairs per second, forward and backward, and its errors.
+"""The GPU's kernels, measured: pairs per second of the splat, forward and backward, its errors; times of the others.
 
     python benchmarks/gpu.py --json
 
 A pair is a Gaussian and a pixel inside its integer box. 244 000 and 30 000 Gaussians with scales of 1 to 4 px, two
 channels, four views of 512 × 512 px, cut at three standard deviations; times are medians of CUDA events around
 single calls. Errors are largest differences over largest values, against the float64 reference on a part of the cloud
-that it can hold. Needs a CUDA GPU and triton.
+that it can hold. The others (`others`): surfaces of 16 views, voxels about an axis and in any pose, a step of total
+variation, at 512 × 512 px and 256³ voxels. Needs a CUDA GPU and triton.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
+import math
 import statistics
 import sys
 from collections.abc import Callable
@@ -27,6 +29,8 @@ from torch import Tensor
 
 CUTOFF, VARIANCE = 3.0, 1 / 12
 CHANNELS = 2
+
+Table = dict[str, tuple[float, float]]
 
 
 @dataclass(frozen=True)
@@ -133,6 +137,50 @@ def measure(sizes: Sizes, device: str, time: Callable[[Callable[[], Any], int], 
     }
 
 
+def others(side: int, edge: int, device: str, time: Callable[[Callable[[], Any], int], float] = seconds) -> Table:
+    """Milliseconds of the kernels of starts and surfaces, forward and backward (or the adjoint).
+
+    side: pixels along a frame; edge: voxels along a volume, and pixels along the frames of tomography.
+    """
+    import holosplat as hs
+    from holosplat.baselines.tv_steps import cuda as steps
+    from holosplat.projectors.surface import surface_thickness
+    from holosplat.projectors.voxels import LatticeProjector, SliceProjector
+    from holosplat.specimens.phantoms import unit_ball
+
+    found, repeats = Table(), 10
+    ball, faces = unit_ball(max(2, round(math.log2(side)) - 1))
+    points = torch.from_numpy(0.4 * side * ball).to(device).requires_grad_()
+    poses = tuple(torch.from_numpy(a).to(device) for a in (Rotation.random(16, rng=0).as_matrix(), np.zeros((16, 2))))
+    corners = torch.tensor(faces, device=device)
+
+    def draw_surface() -> Tensor:
+        return surface_thickness(points, corners, *poses, (side, side), backend="cuda", trusted=True)
+
+    image = draw_surface()
+    found[f"surfaces, {len(faces)} triangles"] = (
+        1e3 * time(draw_surface, repeats),
+        1e3 * time(lambda: torch.autograd.grad(image, points, image, retain_graph=True), repeats),
+    )
+    views = hs.Views.evenly_spaced(16, (edge, edge), 1.0)
+    grid = hs.Grid.of_views(views)
+    for name, kind in (("voxels about an axis", SliceProjector), ("voxels in any pose", LatticeProjector)):
+        projector = kind(grid, views, "cuda")
+        volume = torch.ones(projector.array_shape, device=device)
+        lines = projector.project(volume)
+        found[name] = (
+            1e3 * time(lambda p=projector, v=volume: p.project(v), repeats),  # type: ignore[misc]
+            1e3 * time(lambda p=projector, b=lines: p.backproject(b), repeats),  # type: ignore[misc]
+        )
+    u, q = torch.ones(grid.shape, device=device), torch.zeros(3, *grid.shape, device=device)
+    rest = [torch.ones_like(u) for _ in range(4)]
+    found["step of total variation"] = (
+        1e3 * time(lambda: steps.ascend(u, q, 0.5, 0.1), repeats),
+        1e3 * time(lambda: steps.descend(rest[0], rest[1], q, 1.0, 1.0, rest[2], rest[3]), repeats),
+    )
+    return found
+
+
 def origin() -> dict[str, str]:
     """Device, versions and commit."""
     import triton
@@ -156,7 +204,8 @@ def main() -> None:
     if not torch.cuda.is_available():
         sys.exit("This benchmark needs a CUDA GPU, and torch sees none.")
     cases = [measure(sizes, "cuda") for sizes in CASES]
-    report = {**origin(), "cases": cases}
+    rest = others(512, 256, "cuda")
+    report = {**origin(), "cases": cases, "others_ms": rest}
     if options.json:
         print(json.dumps(report, indent=2))
         return
@@ -167,6 +216,9 @@ def main() -> None:
         rates = [f"{c['forward_ms']:.3g} | {c['forward_pairs_per_s']:.3g}",
                  f"{c['backward_ms']:.3g} | {c['backward_pairs_per_s']:.3g}"]  # fmt: skip
         print(f"| {c['gaussians']} | {c['pairs']} | {' | '.join(rates)} | {max(c['errors'].values()):.1e} |")
+    print("\n| kernel | forward ms | backward ms |\n| --- | --- | --- |")
+    for name, (forward, backward) in rest.items():
+        print(f"| {name} | {forward:.3g} | {backward:.3g} |")
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@
     python benchmarks/sizes.py --pixels 512 1024 --method auto --csv docs/data/sizes.csv
     python benchmarks/sizes.py --pixels 512 --surfaces                  # and surfaces after the Gaussians
     python benchmarks/sizes.py --pixels 256 --bodies 60 --diameter 88   # pixels of 1.6 µm: a third of the field is full
+    python benchmarks/sizes.py --pixels 128 1024 2048 --method auto --backend cuda
 
 24 generated cells in a field of 410 µm, 20 keV, 10 cm, 12 views for the fit and 4 held out, haemoglobin known, without
 noise. Prints a Markdown table; `--csv` adds each row to a file as it comes. Each size runs in a process of its own,
@@ -28,7 +29,8 @@ import rows
 from machine import commit
 
 import holosplat as hs
-from holosplat.methods import METHODS
+from holosplat.backends import Backend, device_name, resolve
+from holosplat.methods import METHODS, Method
 from holosplat.methods.surface_fit import oversampling
 from holosplat.representations import Stored
 from holosplat.workflows.evaluate import Scores, score_object
@@ -88,26 +90,44 @@ def part_of(obj: hs.Object, grid: hs.Grid) -> np.ndarray:
         faces = obj.faces[(y.amax(1) >= low) & (y.amin(1) <= high)]
         if not len(faces):
             return np.zeros(grid.shape)
-        obj = hs.representations.SurfaceMesh(obj.vertices, faces, obj.unit_length, obj.matter, obj.lines)
+        obj = hs.representations.SurfaceMesh(obj.vertices, faces, obj.unit_length, obj.matter, obj.lines).on(
+            obj.backend
+        )
     return obj.voxelise(grid).delta.astype(np.float64)
 
 
+def machine_of(backend: str) -> str:
+    """The processors, and the GPU if that is what computes."""
+    cores = f"{os.cpu_count()} × {os.uname().machine}"
+    return f"{device_name(backend)}, {cores}" if backend == "cuda" else cores
+
+
+def on_backend(name: str, backend: Backend) -> Method:
+    """The method of that name; `TypeError` if it takes no other backend than the usual one."""
+    method = METHODS[name]
+    move = getattr(method, "on_backend", None)
+    if move is None and backend != "auto":
+        raise TypeError(f"{name} takes no backend")
+    return method if move is None else move(backend)  # type: ignore[no-any-return]
+
+
 def measure(
-    pixels: int, seed: int, method: str, bodies: int, diameter: float, surfaces: bool = False
+    pixels: int, seed: int, method: str, scene: tuple[int, float], surfaces: bool = False, backend: Backend = "auto"
 ) -> Iterator[dict[str, object]]:
-    """A row of the table; surfaces: and one for those that are fitted after it."""
+    """A row of the table; surfaces: and one for those that are fitted after it. scene: bodies, and their diameter."""
+    (bodies, diameter), used = scene, resolve(backend)
     pitch = FIELD / pixels
-    scene = hs.MeshScene.of_one_material(hs.specimens.random_cells(bodies, (FIELD,) * 3, seed, diameter), MATERIAL)
+    cells = hs.MeshScene.of_one_material(hs.specimens.random_cells(bodies, (FIELD,) * 3, seed, diameter), MATERIAL)
     views = hs.Views.evenly_spaced(16, (pixels, pixels), pitch)
-    scan = hs.simulate(scene, hs.Exposures.of(views, 20.0, 0.1, 0.05), seed=seed)
+    scan = hs.simulate(cells, hs.Exposures.of(views, 20.0, 0.1, 0.05), seed=seed)
     began, cpu = time.perf_counter(), time.process_time()
     with Peak() as peak:
-        result = hs.reconstruct(scan, hs.MaterialPrior.known(MATERIAL), METHODS[method], seed)
+        result = hs.reconstruct(scan, hs.MaterialPrior.known(MATERIAL), on_backend(method, backend), seed)
     taken = time.perf_counter() - began, time.process_time() - cpu
     grid = hs.Grid.of_views(views)
 
     def row(called: str, obj: Stored, scores: Scores, taken: tuple[float, float], gib: float) -> dict[str, object]:
-        found = scores.headline() | volume_numbers(obj, scene, grid)
+        found = scores.headline() | volume_numbers(obj, cells, grid)
         return {
             "pixels": pixels,
             "pitch_um": f"{1e6 * pitch:.3g}",
@@ -122,7 +142,7 @@ def measure(
             "start_seconds": f"{result.timing['start'] if called == method else 0.0:.1f}",
             "peak_gib": f"{gib:.2f}",
             "load": f"{os.getloadavg()[0]:.1f}",
-            "machine": f"{os.cpu_count()} × {os.uname().machine}",
+            "machine": machine_of(used),
             "commit": commit(),
         }
 
@@ -131,9 +151,10 @@ def measure(
         return
     began, cpu = time.perf_counter(), time.process_time()
     with Peak() as peak:
-        after = hs.methods.refine_surfaces(result.object, scan)
+        how = hs.methods.SurfaceOptions(fit=hs.methods.SurfaceFit(backend=backend))
+        after = hs.methods.refine_surfaces(result.object, scan, how)
     taken = time.perf_counter() - began, time.process_time() - cpu
-    scores = score_object(after, scan, None, oversampling(scan.train()))
+    scores = score_object(after, scan, None, oversampling(scan.train()), used)
     yield row(f"surfaces after {method}", after, scores, taken, peak.gib)
 
 
@@ -146,17 +167,21 @@ def main() -> None:
     parser.add_argument("--diameter", type=float, default=1e6 * DIAMETER, help="of the bodies [µm]")
     parser.add_argument("--seed", type=int, default=103)
     parser.add_argument("--surfaces", action="store_true", help="also fit surfaces after Gaussians")
+    parser.add_argument("--backend", default="auto", choices=("auto", "cpu", "cuda"))
     parser.add_argument("--csv", type=Path)
     parser.add_argument("--one", action="store_true", help="in this process")
     options = parser.parse_args()
     if options.one:
         scene = (options.bodies, 1e-6 * options.diameter)
-        for row in measure(options.pixels[0], options.seed, options.method[0], *scene, options.surfaces):
+        for row in measure(
+            options.pixels[0], options.seed, options.method[0], scene, options.surfaces, options.backend
+        ):
             print("| " + " | ".join(str(value) for value in row.values()) + " |", flush=True)
             if options.csv:
                 rows.write([*rows.read(options.csv), row], options.csv)
         return
     same = ["--bodies", str(options.bodies), "--diameter", str(options.diameter), "--seed", str(options.seed)]
+    same += ["--backend", options.backend]
     same += ["--csv", str(options.csv)] if options.csv else []
     same += ["--surfaces"] if options.surfaces else []
     for pixels in options.pixels:

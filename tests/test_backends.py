@@ -121,5 +121,5 @@ def test_the_command_line_lists_and_refuses(monkeypatch, capsys, tmp_path):
 
 
 def test_a_backend_that_an_operation_lacks_is_missing():
-    with pytest.raises(MissingError, match=r"tv_steps cannot use backend 'cuda'"):
-        backends.implementation("holosplat.baselines.tv_steps", "cuda")
+    with pytest.raises(MissingError, match=r"mesh cannot use backend 'cpu'"):
+        backends.implementation("holosplat.projectors.mesh", "cpu")

@@ -10,14 +10,16 @@ import importlib.util
 import os
 from importlib import import_module
 from types import ModuleType
+from typing import Literal, get_args
 
 import torch
 
 from . import native
 from .checks import InputError, MissingError
 
-NAMES = ("auto", "cpu", "cuda", "reference")
-"""Names of backends that a user may give."""
+Backend = Literal["auto", "cpu", "cuda", "reference"]
+"""What may be asked to compute."""
+NAMES: tuple[Backend, ...] = get_args(Backend)
 
 DESCRIPTIONS = {
     "cpu": "compiled C++ kernels, float32, SSE2 to AVX-512",
@@ -28,13 +30,17 @@ DESCRIPTIONS = {
 SUPPORT: dict[str, tuple[str, str, dict[str, str]]] = {
     "line integrals of Gaussians": ("projectors.splat", "splat", {}),
     "Gaussians on voxels": ("projectors.splat", "voxelise", {}),
+    "line integrals of closed surfaces": ("projectors.surface", "thickness", {}),
+    "line integrals of voxels": ("projectors.voxels.lattice_kernels", "Kernels", {}),
+    "line integrals of voxels about one axis": ("projectors.voxels.slice_products", "Products", {}),
     "wave optics": ("optics.hologram", "hologram", {"cpu": "C++, MKL's or scipy's FFT", "cuda": "Triton, torch's FFT"}),
     "L1 and SSIM of frames": ("fit.fidelity", "l1_and_ssim", {}),
     "statistics of the measured frames": ("fit.fidelity", "statistics", {"cuda": "plain torch"}),
     "Adam": ("fit.adam", "step", {}),
     "total variation of a volume": ("fit.total_variation", "total_variation", {"cuda": "plain torch"}),
+    "steps of total variation": ("baselines.tv_steps", "ascend", {}),
 }
-"""Every operation of a fit: its package, its function, and remarks on single backends."""
+"""Every operation of a run: its package, its function, and remarks on single backends."""
 
 _KIND = {"cpu": "C++", "cuda": "Triton", "reference": "plain torch"}
 
@@ -78,6 +84,16 @@ def resolve(name: str) -> str:
         f"backend {name!r} cannot be used here. {state}. Mend one of them (for cpu: install a C++ compiler, "
         "then holosplat again), or ask for backend 'reference', which is slow but needs neither."
     )
+
+
+def as_before(name: str) -> str:
+    """The backend that computed something elsewhere, or long ago, if it can be used here, or else the usual one."""
+    return resolve("auto" if name in ("cpu", "cuda") and missing(name) else name)
+
+
+def in_main_memory(backend: str) -> str:
+    """`backend` (resolved), but the CPU's for a GPU's: of what has no kernels there."""
+    return "cpu" if backend == "cuda" else backend
 
 
 def missing(backend: str) -> str:

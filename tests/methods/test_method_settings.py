@@ -138,11 +138,13 @@ def test_settings_that_are_none_are_refused(tmp_path, text, message):
 
 
 def of_version_0_1_0(name: str) -> Method:
-    """The preset as version 0.1.0 had it: that of today, but for what `thesis` has learnt of the thesis since."""
+    """The preset as version 0.1.0 had it: that of today, but for the start, which ran on the CPU, and what `thesis`
+    has learnt of the thesis since."""
     today = preset(name)
+    assert isinstance(today, Gaussians)
+    today = replace(today, volume=replace(today.volume, backend="cpu"))
     if name != "thesis":
         return today
-    assert isinstance(today, Gaussians)
     objective = replace(today.fit.objective, frc_ramp=0.5, anisotropy=0.0)
     density = replace(today.fit.density, prune_stop=0.0, grow_gradient=0.0)
     return replace(today, fit=replace(today.fit, objective=objective, density=density))

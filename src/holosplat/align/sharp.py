@@ -65,7 +65,7 @@ def sharpened(scan: Scan, numbers: Tensor, start: SurfaceMesh, search: PoseOptio
     are placed beside the finished surfaces.
     """
     train, test = np.flatnonzero(~scan.is_test), np.flatnonzero(scan.is_test)
-    options = SurfaceFit(schedule=Schedule(steps=search.edges, decay=DECAY))
+    options = SurfaceFit(schedule=Schedule(steps=search.edges, decay=DECAY), backend="cpu")
     frames, lit = torch.from_numpy(scan.frames), numbers[:, FLUX].exp().float()[:, None, None]
     begin = replace(scan, frames=(frames / lit).numpy(), exposures=aligned(numbers).exposures(scan.exposures))[train]
     uncertain = search.uncertain

@@ -11,11 +11,11 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Literal
 
 import torch
 from torch import Tensor
 
+from ..backends import Backend, resolve
 from ..checks import at_least
 from ..geometry import Grid, Views
 from ..materials import DeltaBeta
@@ -86,8 +86,8 @@ class HolographicTV:
     """Distance from the axis within which matter lies [m], such as the inner radius of a tube (0: anywhere)."""
     beyond: bool = True
     """Whether a volume without a bound has rows above and below the frames where matter goes on there."""
-    backend: Literal["cpu", "reference"] = "cpu"
-    """What computes it: the compiled kernels, or plain torch, which is slow."""
+    backend: Backend = "auto"
+    """What computes it."""
 
     def __post_init__(self) -> None:
         at_least(self, 1, "retrieval", "iterations", "max_voxels")
@@ -108,7 +108,9 @@ def holographic_tv(
     before the rounds, unless there are none.
     """
     with memory_kept():
-        return _holographic_tv(scan, material, options, on_progress, light, wanted)
+        options = replace(options, backend=resolve(options.backend))
+        volume, grid = _holographic_tv(scan, material, options, on_progress, light, wanted)
+        return volume.cpu(), grid
 
 
 def _holographic_tv(
@@ -129,7 +131,7 @@ def _holographic_tv(
     alone = absorption_alone(scan.exposures, material.beta / material.delta)  # then retrieval left nothing to correct
     volume, grid = solver.volume, Grid.of_views(_field(scan, solver))
     none = options.corrections == 0 or options.still_light or noise > options.noisy or alone.all()
-    if none or not wanted(volume, grid):
+    if none or not wanted(volume.cpu(), grid):
         return volume, grid
     return _agree(scan, material, solver, options, refine, on_progress, light)
 
@@ -179,7 +181,7 @@ def _settled(
         scan = replace(scan, frames=light.evened(measured).numpy())
         solver = _tomography(scan, material, options, on_progress)
         lines = refined(solver.lines(), samples) * scan.views.finest
-        predicted = frames_of(instrument, lines, material).detach()
+        predicted = frames_of(instrument, lines, material).detach().cpu()
         after = light.settled(measured, predicted)
         misfit = after.misfit(measured, predicted)
         if best is not None and misfit >= least:
@@ -205,13 +207,14 @@ def _agree(
     round that agrees best is returned, for the iteration may diverge; the first ones, in which the solver finds its
     dual variables, do not count.
     """
-    frames, pitch = torch.from_numpy(scan.frames), scan.views.finest
+    pitch = scan.views.finest
     field = _field(scan, coarse)
     beyond, views = (field.shape[0] - scan.views.shape[0]) // 2, field.in_units_of(pitch)
     correction = Correction(scan, material, beyond)
-    beside = None if light is None or light.background is None else SolvedLight(light.background, frames, light.air)
     finer = math.ceil(fringe_sampling(scan.exposures) / refine)
     instrument = Instrument(scan.exposures, refine * finer, backend=options.backend)
+    frames = torch.from_numpy(scan.frames).to(instrument.device)
+    beside = None if light is None or light.background is None else SolvedLight(light.background, frames, light.air)
     grid = Grid.of_views(views, refine)
     projector = projector_for(grid, views.refined(refine), options.backend)
     solver = coarse.on_finer(projector, refine, options.weight)
@@ -258,7 +261,8 @@ class Correction:
         wide, (views, rows, columns) = surrounded(missing + 1, self._exposures)
         room = min(self._beyond, rows.start)
         taller = (views, slice(rows.start - room, rows.stop + room), columns)
-        found = (-filtered(wide, self._inverse)[taller] * self._radian).float()
+        inverse, radian = (factor.to(missing.device) for factor in (self._inverse, self._radian))
+        found = (-filtered(wide, inverse)[taller] * radian).float()
         return carried_on(found, self._beyond - room)
 
 

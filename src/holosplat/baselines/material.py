@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from ..backends import Backend, resolve
 from ..checks import at_least, require
 from ..geometry import Grid
 from ..memory import memory_kept
@@ -52,11 +52,9 @@ class MaterialEstimate:
 
 DEFAULT = MaterialEstimate()
 
-Backend = Literal["cpu", "reference"]
-
 
 def estimate_ratio(
-    scan: Scan, on_progress: Progress, backend: Backend = "cpu", options: MaterialEstimate = DEFAULT
+    scan: Scan, on_progress: Progress, backend: Backend = "auto", options: MaterialEstimate = DEFAULT
 ) -> float:
     """A coarse δ/β of the matter in `scan`: the one that gives the most compact volume.
 
@@ -90,7 +88,7 @@ def _first_peak(levels: np.ndarray) -> int:
 
 
 def estimate_delta(
-    scan: Scan, ratio: float, on_progress: Progress, backend: Backend = "cpu", options: MaterialEstimate = DEFAULT
+    scan: Scan, ratio: float, on_progress: Progress, backend: Backend = "auto", options: MaterialEstimate = DEFAULT
 ) -> float:
     """δ of the one material in `scan` whose δ/β is `ratio`: the plateau of a non-negative tomography."""
     on_progress("estimate of delta", 0.0)
@@ -123,7 +121,8 @@ def level_of(occupancy: Tensor) -> float:
 def _trial_volume(scan: Scan, ratio: float, backend: Backend, options: MaterialEstimate) -> Tensor:
     """Occupancy by Paganin's retrieval and a little total variation, not negative and without an upper bound."""
     lines = paganin(torch.from_numpy(scan.frames), scan.exposures, TRIAL_DELTA, TRIAL_DELTA / ratio)
-    rays = rays_of(lines, scan.views, Grid.of_views(scan.views), backend)
+    used = resolve(backend)
+    rays = rays_of(lines, scan.views, Grid.of_views(scan.views), used)
     how = TotalVariation(weight=options.weight, first=options.iterations, iterations=0)
     with memory_kept():
-        return tv_solver(rays, None, how, lambda fraction: None, backend).volume
+        return tv_solver(rays, None, how, lambda fraction: None, used).volume.cpu()

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from ..backends import device
 from ..checks import InputError, require
 from ..geometry import Grid, Views
 from ..matter import DeltaBeta
@@ -38,7 +39,8 @@ class Rays:
 
 
 def rays_of(lines: Tensor, views: Views, grid: Grid, backend: str = "cpu") -> Rays:
-    """Line integrals [V, H, W] in metres and where they were taken, made ready for voxels of `grid`.
+    """Line integrals [V, H, W] in metres and where they were taken, made ready for voxels of `grid`, where `backend`
+    (resolved) computes.
 
     Where the voxels are finer than pixels, lines are interpolated (bilinearly) to a raster of the voxels' pitch.
     """
@@ -48,7 +50,7 @@ def rays_of(lines: Tensor, views: Views, grid: Grid, backend: str = "cpu") -> Ra
     cubic = bool(np.allclose(grid.voxel_size, edge))
     require(cubic, f"tomography needs cubic voxels, but their edges are {grid.voxel_size} pixels.")
     refine = max(1, round(1 / edge))
-    images = lines.float() / pitch
+    images = (lines.float() / pitch).to(device(backend))
     if refine > 1:
         views = views.refined(refine)
         images = interpolate(images[None], scale_factor=refine, mode="bilinear", align_corners=False)[0]

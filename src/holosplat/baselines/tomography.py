@@ -89,14 +89,15 @@ def tv_solver(
     weights: trust in each ray [V, H, W], above 0; with them, or with still light, frequencies are trusted alike to the
     end.
     """
-    start, coupling = torch.zeros(rays.grid.shape), 1 / rays.refine**2
+    like = rays.measured
+    start, coupling = like.new_zeros(rays.grid.shape), 1 / rays.refine**2
     solver = PrimalDual(rays.projector, start, options.weight, checked_upper(upper), coupling, backend)
     if weights is not None:
-        solver.weigh(weights)
+        solver.weigh(weights.to(like))
     if options.inside > 0:
-        solver.keep_inside(near_axis(rays.grid, options.inside))
+        solver.keep_inside(near_axis(rays.grid, options.inside).to(like.device))
     if options.still_light > 0:
-        solver.with_still_light(smooth_modes(rays.views.shape, options.still_light)[1:])
+        solver.with_still_light(smooth_modes(rays.views.shape, options.still_light, like.device)[1:])
     alike = weights is not None or options.still_light > 0
     images, total = rays.projector.lines_out(rays.measured), options.first + options.iterations
     for done in range(total):
@@ -128,8 +129,9 @@ def misfit_spectrum(rays: Rays, misfit: Tensor) -> Tensor:
     h, w = ordered.shape[1:]
     frequency = np.hypot(np.fft.fftfreq(h)[:, None], np.fft.rfftfreq(w))
     steps = int(shortest_side((h, w), (1.0, 1.0)))
-    ring = torch.from_numpy(np.minimum(np.rint(frequency * steps), steps // 2).astype(np.int64)).ravel()
-    sums = torch.zeros(steps // 2 + 1, dtype=power.dtype).index_add(0, ring, power.ravel())
+    near = np.minimum(np.rint(frequency * steps), steps // 2).astype(np.int64).ravel()
+    ring = torch.from_numpy(near).to(power.device)
+    sums = power.new_zeros(steps // 2 + 1).index_add(0, ring, power.ravel())
     means = sums / torch.bincount(ring, minlength=len(sums)).clamp_min(1)
     means[0] = means[1]  # of the mean itself there is one sample only, and the bounds push it
     floor = QUIETEST * float(means.mean())

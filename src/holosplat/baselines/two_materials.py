@@ -19,6 +19,7 @@ from scipy.optimize import nnls
 from torch import Tensor
 from torch.nn.functional import avg_pool3d
 
+from ..backends import Backend
 from ..checks import at_least
 from ..geometry import Grid
 from ..matter import LEAST_CONTRAST, DeltaBeta
@@ -30,7 +31,7 @@ from ..representations.voxel_lines import VoxelLines
 from ..scan import Scan
 from ..units import wavelength
 from ..volume import LineIntegrals
-from .material import Backend, plateau
+from .material import plateau
 
 STEP, ITERATIONS = 1e-10, 5
 """Of the linearisation in β."""
@@ -152,7 +153,7 @@ def absorption(
     values: Tensor,
     grid: Grid,
     deltas: Sequence[float],
-    backend: Backend = "cpu",
+    backend: Backend = "auto",
     options: TwoMaterials = DEFAULT,
 ) -> list[float]:
     """β, none below zero, of the materials of δ `deltas` with the occupancies `values` [C, Z, Y, X] on `grid`.
@@ -166,7 +167,7 @@ def absorption(
     sigma = options.blur * fringe
 
     def blurred(frames: Tensor) -> np.ndarray:
-        return gaussian_filter(frames.numpy().astype(np.float64), (0, sigma, sigma)).ravel()
+        return gaussian_filter(frames.cpu().numpy().astype(np.float64), (0, sigma, sigma)).ravel()
 
     measured = blurred(torch.from_numpy(scan.frames))
     betas = np.zeros(len(deltas))
@@ -178,20 +179,20 @@ def absorption(
     return [float(beta) for beta in betas]
 
 
-def at_one_ratio(scan: Scan, shares: Shares, ratio: float, backend: Backend = "cpu") -> Scan:
+def at_one_ratio(scan: Scan, shares: Shares, ratio: float, backend: Backend = "auto") -> Scan:
     """The scan as if both materials had the ratio δ/β `ratio`, by what the wave optics says of `shares`."""
     instrument, lines = _lines(scan, shares.values, shares.grid, backend)
     same = [(delta, delta / ratio) for delta, _ in shares.materials]
     change = _frames(instrument, lines, same) / _frames(instrument, lines, shares.materials).clamp_min(1e-3)
-    return replace(scan, frames=scan.frames * change.numpy())
+    return replace(scan, frames=scan.frames * change.cpu().numpy())
 
 
 def _lines(scan: Scan, values: Tensor, grid: Grid, backend: Backend) -> tuple[Instrument, Tensor]:
     """The instrument of a scan, and the line integrals [V, C, H, W] in metres that it wants of `values`."""
     instrument = Instrument(scan.exposures, fringe_sampling(scan.exposures), backend=backend)
-    if backend == "reference":
+    if instrument.backend == "reference":
         return instrument, voxel_line_integrals(values, grid, instrument.views, step=1.0)
-    return instrument, VoxelLines(grid, instrument.views)(values)
+    return instrument, VoxelLines(grid, instrument.views, instrument.backend)(values.to(instrument.device))
 
 
 def _frames(instrument: Instrument, lines: Tensor, materials: Iterable[tuple[float, float]]) -> Tensor:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from ..backends import Backend, device, resolve
 from ..checks import in_range, require
 from ..memory import memory_kept
 from ..model import Instrument, Model
@@ -18,6 +19,8 @@ from ..optics.sampling import resolving_oversample
 from ..progress import Advance
 from ..ranges import Photons, Seed, ranged
 from ..scan import Exposures, Scan, interleaved_split
+from ..specimens.mesh_series import MeshSeries
+from ..specimens.scene import MeshScene
 from ..volume import Object
 from .light import EVEN_LIGHT, UnevenLight
 
@@ -79,6 +82,8 @@ class Simulation:
     """Length of an exposure (default: no motion blur)."""
     light: UnevenLight = EVEN_LIGHT
     """How the light differs from the flat field (default: not at all)."""
+    backend: Backend = "cpu"
+    """Where waves, and rays through meshes, are computed: cuda for a GPU (default: cpu, the same frames everywhere)."""
 
     def __post_init__(self) -> None:
         if self.photons_per_pixel is not None:
@@ -119,18 +124,19 @@ class Simulation:
 def simulated_frames(obj: Object, exposures: Exposures, how: Simulation = Simulation()) -> Iterator[np.ndarray]:
     """Frames [H, W] float32 of `obj`, one after another; only one is in memory.
 
-    Plain torch (the `reference` of the optics, which fits use with that backend alone) on a fine raster in single
-    precision, less than 1e-5 of the contrast from double precision. A frame is the mean of the intensities at its
-    pulses, with the light and the noise that are asked for.
+    Plain torch (the `reference` of the optics, which fits use with that backend alone), on a GPU if the backend is
+    `cuda`, on a fine raster in single precision, less than 1e-5 of the contrast from double precision. A frame is the
+    mean of the intensities at its pulses, with the light and the noise that are asked for.
     """
-    fine, detect = how.samples(exposures), how.detector(exposures)
+    fine, detect, backend = how.samples(exposures), how.detector(exposures), resolve(how.backend)
+    obj = obj.on(backend) if isinstance(obj, (MeshScene, MeshSeries)) else obj
     with memory_kept():
         for i in range(len(exposures)):
-            instrument = Instrument(exposures[[i]], fine, torch.float32, "reference")
+            instrument = Instrument(exposures[[i]], fine, torch.float32, "reference", on=device(backend))
             model = Model(obj, instrument)
             frame = np.zeros(exposures.views.shape)
             for offset in how.shutter.offsets:
-                frame += model.frames(delay=float(offset))[0].numpy()
+                frame += model.frames(delay=float(offset))[0].cpu().numpy()
             frame /= how.shutter.pulses
             yield detect(frame, i)
 

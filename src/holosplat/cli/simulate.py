@@ -5,10 +5,10 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from tyro.conf import Positional
 
@@ -66,6 +66,8 @@ class ExperimentOptions:
     motion: MotionOptions = MotionOptions()
     misalignment: MisalignmentOptions = MisalignmentOptions()
     source: SourceOptions = SourceOptions()
+    backend: Literal["auto", "cpu", "cuda", "reference"] = "cpu"
+    """What computes waves and rays through meshes: cuda is a GPU (default: cpu, for the same frames everywhere)."""
 
 
 def simulate(
@@ -88,9 +90,11 @@ def simulate(
     """
     import numpy as np
 
+    from ..backends import resolve
     from ..beamline.series import held_out
 
     truth.require_usable(out)
+    resolve(experiment.backend)  # before anything is read
     motion, source, beamline = experiment.motion, experiment.source, beamline.told()
     require(beamline.exposures is None or not source.cone, "--cone goes with --distance; leave it, or --exposures.")
     of_source, beamline = source.facts(beamline), source.applied(beamline)
@@ -106,7 +110,8 @@ def simulate(
             moves = len(times) > 1
             require(moves or motion.frame_rate is None, "--frame-rate is of moving meshes; leave it out.")
             specimen = _Specimen(generated, times, _facts_of_still(imaged, files))
-    times, how = specimen.times, experiment.noise.simulation(motion.shutter(), experiment.light)
+    times = specimen.times
+    how = replace(experiment.noise.simulation(motion.shutter(), experiment.light), backend=experiment.backend)
     _warn_of_missing_field(specimen.matter, true_views.views, beamline.pixel_size)
     split = beamline.split(len(views) if motion.hold_out == "views" else len(times))
     is_test = held_out(split, len(views), len(times), motion.hold_out)

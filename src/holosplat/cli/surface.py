@@ -78,7 +78,7 @@ def surface(
     after = score_object(found, measured, volume, oversampling(measured.train(), how.fit))
     said = {"seconds": seconds, "settings": asdict(how), name.lower(): before.as_dict(), "surfaces": after.as_dict()}
     whole = load_reconstruction(folder).object
-    bodies = whole.parted(found.vertices.detach()) if isinstance(whole, MovingSurfaces) else found.bodies()
+    bodies = whole.parted(found.vertices.detach().cpu()) if isinstance(whole, MovingSurfaces) else found.bodies()
     write_bodies(out, bodies, found.matter, said)
     for of, scores in ((name, before), ("surfaces", after)):
         print(f"{of}:", *scores.lines(), sep="\n  ")

@@ -134,7 +134,8 @@ def freed(plan: Plan, freedom: Freedom | None, train: Scan) -> Plan:
     if len(freedom) > len(train):
         freedom = freedom[_fitted(len(freedom), len(train))]
     model, exposures = plan.problem.model, train.exposures
-    alignment = freedom.alignment(model.instrument.device)
+    on = model.instrument.device
+    alignment = freedom.alignment(on)
     (h, w), frames = exposures.views.shape, torch.from_numpy(train.frames)
     level = max(ROUNDED * float(noise_levels(frames).mean() / (frames.max() - frames.min())), LEAST_LEFT)
     own = {
@@ -143,7 +144,7 @@ def freed(plan: Plan, freedom: Freedom | None, train: Scan) -> Plan:
         "alignment.stretches": RATE_SHARE * freedom.distance,
         "alignment.magnified": RATE_PX / (0.5 * max(h, w)),
     }
-    expected = Expected(freedom, level / (h * w * len(train)), model.instrument.device)
+    expected = Expected(freedom, level / (h * w * len(train)), on)
 
     def rates(factor: float, step: int) -> Mapping[str, float]:
         return {**plan.rates(factor, step), **{name: rate * factor for name, rate in own.items()}}
@@ -154,7 +155,7 @@ def freed(plan: Plan, freedom: Freedom | None, train: Scan) -> Plan:
         return Apart(leaves, "alignment.", lambda own: Adam(own, model.instrument.backend), plan.optimiser)
 
     return replace(
-        plan, problem=problem, rates=rates, optimiser=optimiser, events=(*plan.events, Gauge(freedom, exposures))
+        plan, problem=problem, rates=rates, optimiser=optimiser, events=(*plan.events, Gauge(freedom, exposures, on))
     )
 
 
@@ -192,16 +193,17 @@ class Gauge(Stateless):
     An event of a fit: gradients and numbers are projected onto what changes frames. What is not free has no gradient.
     """
 
-    def __init__(self, freedom: Freedom, exposures: Exposures) -> None:
+    def __init__(self, freedom: Freedom, exposures: Exposures, device: torch.device | str = "cpu") -> None:
         free = freedom.deviations() > 0
         views, count = exposures.views, len(exposures)
         ones = np.full((count, 1), 0 if freedom.tells_mean(exposures) else 1.0)
-        self._projections = {
+        projections = {
             "alignment.shifts": projection(views.rotations[:, :2].reshape(-1, 3), np.tile(free[:2], count)),
             "alignment.turns": projection(_turns(views), np.tile(free[2:5], count)),
             "alignment.stretches": projection(ones, np.tile(free[5:6], count)),
             "alignment.magnified": projection(np.ones((count, 1)), np.tile(free[6:], count)),
         }
+        self._projections = {name: kept.to(device) for name, kept in projections.items()}
 
     def _each(self, leaves: Leaves, of: Callable[[Tensor], Tensor | None]) -> None:
         for name, kept in self._projections.items():

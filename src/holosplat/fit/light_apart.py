@@ -24,14 +24,15 @@ class LightApart:
     def __init__(self, amplitudes: Tensor, covariances: Tensor, over_noise: Callable[[Tensor], Tensor]) -> None:
         order = math.isqrt(covariances.shape[1]) - 1
         self._half, self._over_noise = 0.5 * amplitudes, over_noise
-        self._rows, self._columns = (cosines(n, order, "cpu").float() for n in amplitudes.shape[1:])
+        on = amplitudes.device
+        self._rows, self._columns = (cosines(n, order, on).float() for n in amplitudes.shape[1:])
         modes = (self._rows[:, None, :, None] * self._columns[None, :, None, :]).flatten(0, 1)
         products = [self._modes_in(over_noise(self._half * mode)) for mode in modes]
-        normal = torch.stack(products, dim=2).double()
+        normal = torch.stack(products, dim=2).double().cpu()  # a small system of each view
         strength, vectors = torch.linalg.eigh(covariances)
         roots = vectors * strength.clamp_min(0).sqrt()[:, None]
         inner = roots.mT @ normal @ roots + torch.eye(len(modes), dtype=torch.float64)
-        self._gain = (roots @ torch.linalg.solve(0.5 * (inner + inner.mT), roots.mT)).float()
+        self._gain = (roots @ torch.linalg.solve(0.5 * (inner + inner.mT), roots.mT)).float().to(on)
 
     def __call__(self, weighted: Tensor) -> Tensor:
         """Images [V, H, W] over their noise, without what light explains."""

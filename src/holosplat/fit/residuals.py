@@ -171,8 +171,9 @@ class Prediction:
     def view(self, i: int, finer: int = 1) -> Model:
         """The model of the exposure `i` alone, on waves `finer` times finer."""
         instrument = Instrument(self.exposures[[i]], finer * self.oversample, backend=self.backend)
-        alignment = self.alignment and Alignment(**{n: p[[i]] for n, p in self.alignment.parameters().items()})
-        light = self.light and LightField(self.light.coefficients[[i]], self.light.modes)
+        on = instrument.device
+        alignment = self.alignment and Alignment(**{n: p[[i]].to(on) for n, p in self.alignment.parameters().items()})
+        light = self.light and LightField(self.light.coefficients[[i]].to(on), self.light.modes.to(on))
         return Model(self.object, instrument, alignment, light)
 
 
@@ -217,13 +218,13 @@ def _changes(one: Model) -> Tensor:
     variance of the point-spread function [pixels²]; shifts of the detector [pixels]; light by a factor's modes. Of
     photographs the first four explain nothing.
     """
-    exposures, time = one.instrument.exposures, float(one.instrument.times[0])
+    exposures, time, on = one.instrument.exposures, float(one.instrument.times[0]), one.instrument.device
     planned = one.alignment or Alignment()
     lines, light = one.lines(time), 1.0 if one.light is None else one.light.factor()
     distance = planned.optical_distance(exposures)
-    distance = torch.from_numpy(exposures.optical.distance) if distance is None else distance
+    distance = torch.from_numpy(exposures.optical.distance).to(on) if distance is None else distance
     sigma = planned.psf_sigma_px(exposures)
-    sigma = torch.from_numpy(exposures.psf_sigma_px) if sigma is None else sigma
+    sigma = torch.from_numpy(exposures.psf_sigma_px).to(on) if sigma is None else sigma
 
     def seen(matter: LineIntegrals = lines, z: Tensor = distance, s: Tensor = sigma) -> Tensor:
         return (one.instrument.frames(matter, None, z, s) * light).double().cpu()
@@ -232,8 +233,8 @@ def _changes(one: Model) -> Tensor:
         return LineIntegrals(lines.channels, tuple((d * delta, b * beta) for d, b in lines.materials))
 
     def shifted(x: float, y: float) -> Tensor:
-        moved = torch.tensor([[x, y]], dtype=torch.float64)
-        shifts = moved if planned.shifts is None else planned.shifts.cpu() + moved
+        moved = torch.tensor([[x, y]], dtype=torch.float64).to(on)
+        shifts = moved if planned.shifts is None else planned.shifts + moved
         return replace(one, alignment=replace(planned, shifts=shifts)).frames().double().cpu()
 
     photographed = isinstance(one.object, Photographed)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from ..backends import device, resolve
 from ..checks import require
 from ..geometry import Grid
 from ..projectors.voxels import projector_for
@@ -83,16 +84,20 @@ class VolumeProblem:
         support: Tensor | None = None,
     ) -> None:
         require(level > 0, f"the level of the matter must be positive, but it is {level:g}.")
-        self.frames, self.prior, self.level, self.support = frames, prior, level, support
+        self.frames, self.prior, self.level = frames, prior, level
         views = frames.field
         pixels = views.in_units_of(views.finest)
         self.grid = Grid.of_views(pixels)
+        backend = resolve(backend)
+        self.device = device(backend)
         # torch's products: decisions on priors, and so the results, are those of earlier versions to the last bit
-        self._projector = projector_for(self.grid, pixels, backend, slices="reference")
+        slices = "cuda" if backend == "cuda" else "reference"
+        self._projector = projector_for(self.grid, pixels, backend, slices)
+        self.support = None if support is None else support.to(self.device)
         self._symbol = self._data_symbol()
         frequencies = [torch.fft.fftfreq(n) for n in self.grid.shape[:2]] + [torch.fft.rfftfreq(self.grid.shape[2])]
         z, y, x = (4 * torch.sin(math.pi * f).square() for f in frequencies)
-        self._laplacian = z[:, None, None] + y[:, None] + x
+        self._laplacian = (z[:, None, None] + y[:, None] + x).to(self.device)
 
     def lines(self, u: Tensor) -> Tensor:
         """Line integrals [V, H, W] in pixels of path length."""
@@ -144,7 +149,7 @@ class VolumeProblem:
 
     def _data_symbol(self) -> Tensor:
         """Spectrum of the response of the data's second derivative to one full voxel in the middle."""
-        impulse, middle = torch.zeros(self.grid.shape), [n // 2 for n in self.grid.shape]
+        impulse, middle = torch.zeros(self.grid.shape, device=self.device), [n // 2 for n in self.grid.shape]
         impulse[tuple(middle)] = 1.0
         lines, shape, beyond = self.lines(impulse), self.frames.shape, self.frames.beyond
         seen = lines[:, beyond : beyond + shape[0]]
@@ -231,27 +236,27 @@ class Descent:
         return None
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that `again` needs, for the same steps to the last bit."""
+        """Everything that `again` needs, for the same steps to the last bit, in main memory."""
         return {
-            "u": self.u,
+            "u": self.u.cpu(),
             "value": self.value,
-            "gradient": self._gradient,
-            "anchor": self._anchor,
-            "pairs": [list(pair) for pair in self._pairs],
+            "gradient": self._gradient.cpu(),
+            "anchor": self._anchor.cpu(),
+            "pairs": [[part.cpu() for part in pair] for pair in self._pairs],
             "done": self.done,
             "ended": self.ended,
             "kept": self.kept,
         }
 
     @classmethod
-    def again(cls, problem: Penalised, state: Mapping[str, Any]) -> Descent:
-        """The descent as `state_dict` left it."""
+    def again(cls, problem: Penalised, state: Mapping[str, Any], on: torch.device | str = "cpu") -> Descent:
+        """The descent as `state_dict` left it, on the device `on`."""
         found = cls.__new__(cls)
-        found.problem, found.u, found.value = problem, state["u"], float(state["value"])
-        found._gradient, found.done, found.ended = state["gradient"], int(state["done"]), bool(state["ended"])
+        found.problem, found.u, found.value = problem, state["u"].to(on), float(state["value"])
+        found._gradient, found.done, found.ended = state["gradient"].to(on), int(state["done"]), bool(state["ended"])
         found.kept = bool(state["kept"])
-        found._pairs = [(step, change) for step, change in state["pairs"]]
-        found._conditioned(state["anchor"])
+        found._pairs = [(step.to(on), change.to(on)) for step, change in state["pairs"]]
+        found._conditioned(state["anchor"].to(on))
         return found
 
 

@@ -71,18 +71,18 @@ class WhitenedFrames:
         """The views with the rows beyond."""
         self.instrument = Instrument(exposures, oversample or fringe_sampling(exposures), backend=backend)
         self.shape, self.pixel = (train.views.shape[0], train.views.shape[1]), train.views.finest
-        frames = torch.from_numpy(train.frames)
-        self._amplitudes = frames.clamp_min(0).sqrt()
-        self._light = None if light is None else light.factor().detach()
+        frames, on = torch.from_numpy(train.frames), self.instrument.device
+        self._amplitudes = frames.clamp_min(0).sqrt().to(on)
+        self._light = None if light is None else light.factor().detach().to(on)
         power = noise.power()
         error = model_error(frames, power)
-        self.power = (0.25 * (power + error + FAINTEST)).float()
+        self.power = (0.25 * (power + error + FAINTEST)).float().to(on)
         """P [V, H, W//2 + 1], of amplitudes."""
         self._own, self._apart = self.power, None
         if doubt is not None and doubt.background is not None:
-            self._own = (0.25 * (doubt.noise.power() + error + FAINTEST)).float()
+            self._own = (0.25 * (doubt.noise.power() + error + FAINTEST)).float().to(on)
             self._apart = LightApart(self._amplitudes, doubt.background.covariances, self._over_noise)
-        self._sharp = self._sharpening()
+        self._sharp = self._sharpening().to(on)
 
     @property
     def count(self) -> int:
@@ -108,7 +108,7 @@ class WhitenedFrames:
                 slope2 += frames.diff(dim=axis).square().mean(dim=(1, 2)) / p**2
         reach = torch.from_numpy(wavelength(exposures.energy_kev) * exposures.distance)
         shift = (reach.square() * slope2)[:, None, None] * squared_frequency(raster)
-        return (unit.square() * 0.25 * (h.square() + shift)).float() / self.power
+        return (unit.square() * 0.25 * (h.square() + shift)).float().to(self.power) / self.power
 
     def amplitudes(self, lines: Tensor) -> Tensor:
         """√I [V, H, W] of line integrals [V, H, W] in pixels of path length; differentiable."""

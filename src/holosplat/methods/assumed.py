@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from ..baselines.material import DEFAULT, Backend, MaterialEstimate, estimate_delta, estimate_ratio
+from ..backends import Backend
+from ..baselines.material import DEFAULT, MaterialEstimate, estimate_delta, estimate_ratio
 from ..matter import DeltaBeta, KnownRatio, MaterialPrior
 from ..progress import Progress
 from ..scan import Scan
@@ -12,7 +13,7 @@ def assumed_material(
     scan: Scan,
     prior: MaterialPrior,
     on_progress: Progress,
-    backend: Backend = "cpu",
+    backend: Backend = "auto",
     options: MaterialEstimate = DEFAULT,
 ) -> DeltaBeta:
     """δ and β of one material for all matter: as known, or as the training frames `scan` suggest.

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
+from ..backends import Backend
 from ..checks import InputError
 from ..fit.loop import Fit
 from ..matter import DeltaBeta, MatterKind
@@ -14,7 +15,6 @@ from ..representations import GaussianCloud, Stored, SurfaceMesh, VoxelGrid
 from .assumed import assumed_material
 from .cross_validation import CrossValidation, MissingMatter
 from .evidence import Evidence
-from .gaussian_options import Backend
 from .gaussians import Gaussians
 from .levels import Decision, LevelTest
 from .method import Method, Stage, Task, solve_stages
@@ -90,9 +90,14 @@ class Auto:
         return Decision(best, said)
 
     def on_backend(self, backend: Backend) -> Auto:
-        """The same method whose Gaussians are computed by `backend`."""
-        plain = self.levels.on_backend("reference" if backend == "reference" else "cpu")
-        return replace(self, gaussians=self.gaussians.on_backend(backend), levels=plain)
+        """The same method computed by `backend`."""
+        return replace(
+            self,
+            gaussians=self.gaussians.on_backend(backend),
+            surfaces=replace(self.surfaces, fit=replace(self.surfaces.fit, backend=backend)),
+            volume=self.volume.on_backend(backend),
+            levels=self.levels.on_backend(backend),
+        )
 
     def with_effort(self, effort: float) -> Auto:
         """The same method with `effort` times the steps, at least one."""

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from ..backends import resolve
 from ..checks import at_least
 from ..optics.noise import noise_levels
 from ..ranges import Pixels, Share, Weight, ranged
@@ -170,7 +171,7 @@ def _run(task: Task, start: SurfaceMesh, options: SurfaceFit) -> SurfaceMesh:
 def on_pixels(mesh: SurfaceMesh, pixel: float, edge: float) -> SurfaceMesh:
     """The surfaces in units of `pixel` [m], their triangles divided where their edges are longer than `edge` [pixels]
     in the mean."""
-    vertices, faces = mesh.vertices * (mesh.unit_length / pixel), mesh.faces
+    vertices, faces = mesh.vertices.cpu() * (mesh.unit_length / pixel), mesh.faces.cpu()
     while float(edge_lengths(vertices, faces).mean()) > edge:
         vertices, faces = subdivided(vertices, faces)
     return SurfaceMesh(vertices, faces, pixel, mesh.matter, mesh.lines)
@@ -188,6 +189,7 @@ def unexplained(mesh: SurfaceMesh, scan: Scan, surfaces: SurfaceOptions) -> floa
     """Part of the power of the frames' finest structure that `mesh` leaves unexplained, noise taken off; 0 where noise
     hides all of it. Finest is what two pixels in one do not show."""
     measured = torch.from_numpy(scan.frames).double()
+    mesh = mesh.on(resolve(surfaces.fit.backend))
     predicted = predicted_frames(scan.exposures, mesh, oversampling(scan, surfaces.fit)).double()
     noise = 0.75 * float(noise_levels(measured).square().mean())  # one of four orthogonal patterns is left out
     seen, left = (float(_finest(frames).square().mean()) - noise for frames in (measured, measured - predicted))

@@ -47,9 +47,10 @@ def cloud_of_surfaces(mesh: SurfaceMesh, task: Task) -> GaussianCloud:
 def matter_in_cells(mesh: SurfaceMesh, cell: float, origin: tuple[float, float, float]) -> Moments:
     """Moments of the matter in cells of an edge `cell` [m], of which one has its centre at `origin` [m]; in cells from
     there."""
-    points = (mesh.vertices.detach() * mesh.unit_length - torch.tensor(origin, dtype=torch.float64)) / cell
+    vertices = mesh.vertices.detach()
+    points = (vertices * mesh.unit_length - torch.tensor(origin).to(vertices)) / cell
     parts = [part for first, stop, faces in regions(points, mesh.faces) for part in _cells(points, faces, first, stop)]
-    mass, centre, covariance = (torch.cat(values) for values in zip(*parts))
+    mass, centre, covariance = (torch.cat(values).cpu() for values in zip(*parts))
     return mass, centre, covariance
 
 
@@ -58,8 +59,8 @@ def regions(points: Tensor, faces: Tensor) -> list[tuple[np.ndarray, np.ndarray,
 
     points: in cells. Shells whose boxes overlap share one: the inner wall of a hollow body alone is no body.
     """
-    label = shell_labels(faces.numpy(), len(points))
-    corners = points[faces].numpy()
+    label = shell_labels(faces.cpu().numpy(), len(points))
+    corners = points[faces].cpu().numpy()
     count = int(label.max()) + 1
     low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
     np.minimum.at(low, label, corners.min(axis=1))
@@ -73,7 +74,7 @@ def regions(points: Tensor, faces: Tensor) -> list[tuple[np.ndarray, np.ndarray,
         label = group[label]
         first = np.array([first[group == k].min(axis=0) for k in range(number)])
         stop = np.array([stop[group == k].max(axis=0) for k in range(number)])
-    shells = torch.from_numpy(label)
+    shells = torch.from_numpy(label).to(faces.device)
     return [(first[k], stop[k], faces[shells == k]) for k in range(len(first))]
 
 
@@ -85,7 +86,7 @@ def _cells(points: Tensor, faces: Tensor, first: np.ndarray, stop: np.ndarray) -
     low, high = y.amin(dim=1), y.amax(dim=1)
     for top in range(int(first[1]), int(stop[1]), rows):
         count = min(rows, int(stop[1]) - top)
-        corner = torch.tensor([first[0], top, first[2]], dtype=torch.float64)
+        corner = torch.tensor([first[0], top, first[2]]).to(points)
         here = faces[(high >= top - 0.75) & (low <= top + count - 0.25)]
         if len(here):
             inside = surface_occupancy(2 * (points - corner) + 0.5, here, (2 * depth, 2 * count, 2 * width), lines=2)

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
+from ..backends import Backend
 from ..baselines import HolographicTV
 from ..baselines.material import MaterialEstimate
 from ..baselines.two_materials import TwoMaterials
@@ -17,9 +18,6 @@ from ..learning.start import LearnedStart
 from ..ranges import Pixels, Rate, Share, Weight, ranged
 from .coarse import CoarseToFine
 from .ground import ExtraTerm
-
-Backend = Literal["auto", "cpu", "cuda", "reference"]
-"""What may be asked to compute a fit."""
 
 
 @dataclass(frozen=True)

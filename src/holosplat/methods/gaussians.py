@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 import torch
 
-from ..backends import resolve
+from ..backends import Backend, resolve
 from ..baselines.beyond import rows_of
 from ..fit.batches import block_shape
 from ..fit.density import DensityEvent
@@ -30,12 +30,12 @@ from .coarse import CoarseToFine, coarse_surfaces, last_steps
 from .coarse_cloud import cloud_of_surfaces
 from .field import field_of
 from .first_surfaces import first_surfaces
-from .gaussian_options import Backend, FitOptions, GaussianOptions, GaussianRates
+from .gaussian_options import FitOptions, GaussianOptions, GaussianRates
 from .ground import Ground, ground
 from .learned import learned_cloud
 from .method import Near, Stage, Task, run_quietly
 from .start import starting_cloud
-from .surface_fit import SurfaceOptions, oversampling
+from .surface_fit import SurfaceFit, SurfaceOptions, oversampling
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,8 @@ class Gaussians(GaussianOptions):
         return self.start != "random" or weights.overfull > 0 or weights.two_levels > 0
 
     def on_backend(self, backend: Backend) -> Gaussians:
-        """The same method computed by `backend`; the start runs on the CPU, or in plain torch."""
-        volume = replace(self.volume, backend="reference" if backend == "reference" else "cpu")
+        """The same method computed by `backend`, the start, too."""
+        volume = replace(self.volume, backend=backend)
         return replace(self, fit=replace(self.fit, backend=backend), volume=volume)
 
     def with_effort(self, effort: float) -> Gaussians:
@@ -82,16 +82,15 @@ class GaussianStage:
 
     def start(self, task: Task, before: Stored | None) -> Stored | Near:
         """The starting cloud: of surfaces on coarse pixels, or its own."""
-        surfaces = self.coarse_surfaces(task, SurfaceOptions())
+        how = SurfaceOptions(fit=SurfaceFit(backend=self.options.fit.backend))
+        surfaces = self.coarse_surfaces(task, how)
         if surfaces is None:
             return self.own_start(task)
-        surfaces = last_steps(self._without_validation(task), surfaces, SurfaceOptions(), self.options.coarse)
-        return Near(cloud_of_surfaces(surfaces, task).on(self.options.volume.backend))
+        surfaces = last_steps(self._without_validation(task), surfaces, how, self.options.coarse)
+        return Near(cloud_of_surfaces(surfaces, task).on(resolve(self.options.volume.backend)))
 
     def own_start(self, task: Task) -> GaussianCloud:
         """The starting cloud on the pixels of `task`."""
-        if resolve(self.options.fit.backend) == "cuda":
-            resolve("cpu")  # the start and the judging run there
         seen = self._without_validation(task)
         if self.options.start == "learned":
             return learned_cloud(seen, self.options, self._fitted)

@@ -116,7 +116,7 @@ def _surfaces(task: Task, cloud: GaussianCloud, steps: int) -> SurfaceMesh | Non
         start = extract_surfaces(cloud, task.scan, options.extraction)
     except InputError:  # no surface anywhere
         return None
-    fit: SurfaceFit = replace(options.fit, schedule=replace(options.fit.schedule, steps=steps))
+    fit: SurfaceFit = replace(options.fit, schedule=replace(options.fit.schedule, steps=steps), backend=cloud.backend)
     found = run_quietly(surface_fit(task.scan, start, fit, task.seed, task.uneven), task.report(STAGE))
     assert isinstance(found, SurfaceMesh)
     return found

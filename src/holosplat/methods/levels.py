@@ -10,13 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import numpy as np
 import torch
 from scipy.ndimage import binary_erosion
 from torch import Tensor
 
+from ..backends import Backend, resolve
 from ..baselines import HolographicTV, holographic_tv
 from ..baselines.material import plateau
 from ..baselines.two_materials import best_levels, told_apart
@@ -53,7 +53,7 @@ class LevelTest:
     def __post_init__(self) -> None:
         at_least(self, 1, "worse", "same")
 
-    def on_backend(self, backend: Literal["cpu", "reference"]) -> LevelTest:
+    def on_backend(self, backend: Backend) -> LevelTest:
         """The same test computed by `backend`."""
         return replace(self, volume=replace(self.volume, backend=backend))
 
@@ -82,7 +82,7 @@ def decide_matter(task: Task, options: LevelTest = LevelTest()) -> Decision:
     light = options.validation.light(task.scan, task.uneven)
     values, grid = holographic_tv(seen, material, replace(options.volume, upper=0.0), task.on_progress, light)
     matter, judge = Matter.one(*material), MissingMatter(aside, material)
-    backend = options.volume.backend
+    backend = resolve(options.volume.backend)
     free = _Misfit.of(judge, VoxelGrid(values[None], grid, matter).on(backend))
     pixel = max(1, round(seen.views.finest / grid.voxel_size[0]))
     flat = [_Misfit.of(judge, VoxelGrid(one[None], grid, matter).on(backend)) for one in flattened(values, pixel)]

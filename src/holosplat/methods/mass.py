@@ -75,13 +75,14 @@ def total_delta(
     level = plateau(delta.clamp_min(0))
     unit = level * math.prod(grid.voxel_size)
     material = DeltaBeta(level, level * float(beta.double().sum()) / whole)
-    backend = "reference" if found.backend == "reference" else "cpu"
+    backend = found.backend
     beyond = rows_beyond(delta.clamp_min(0), train, material.beta / material.delta)
     taller = _indices(there, Grid.of_views(train.views.taller(beyond)))[0] if beyond else delta
     frames = WhitenedFrames(train, material, noise, backend=backend, beyond=beyond)
-    ranges = Ranges(VolumeProblem(frames, ContinuousPrior(), 1.0, backend), predicted)
+    problem = VolumeProblem(frames, ContinuousPrior(), 1.0, backend)
+    ranges = Ranges(problem, predicted)
     limits = ranges.limits if ratio_doubt < DOUBTFUL else ranges.limits[-1:]
-    told = best(ranges.by_range(taller.clamp_min(0) / level, limits))
+    told = best(ranges.by_range((taller.clamp_min(0) / level).to(problem.device), limits))
     doubts = MODEL_SHARE**2 + ratio_doubt**2
     error = math.sqrt(SHAPES**2 * told.variance + doubts * told.value**2)
     return Total(told.value * unit, error * unit, float(delta.double().sum()) * math.prod(grid.voxel_size))

@@ -194,10 +194,10 @@ def begun(stage: Stage, task: Task, before: Stored | None) -> tuple[Stored, Task
 
 
 def finished(fit: Running) -> Stored:
-    """The object that a fit ended with, in main memory."""
+    """The object that a fit ended with, where it was fitted."""
     found = fit.result().object
     assert isinstance(found, tuple(KINDS.values()))
-    return found.on("reference" if fit.backend == "reference" else "cpu")
+    return found.on(fit.backend)
 
 
 def run_quietly(fit: Running, report: Advance) -> Stored:

@@ -36,7 +36,7 @@ def modulations(u: Tensor, level: float) -> list[Tensor]:
     sides = [u]
     for axis in range(3):
         n = u.shape[axis]
-        wave = torch.cos(math.pi * (torch.arange(n) + 0.5) / n)
+        wave = torch.cos(math.pi * (torch.arange(n, device=u.device) + 0.5) / n)
         sides.append(u * wave.reshape([-1 if a == axis else 1 for a in range(3)]))
     return [*sides, u * (u / level - 1), _halo(u, 8), _halo(u, 4)]
 
@@ -53,7 +53,7 @@ def _halo(u: Tensor, parts: int) -> Tensor:
 def shares_of(problem: VolumeProblem, u: Tensor, changes: list[Tensor]) -> tuple[Tensor, Tensor]:
     """The shares [K] of K changes that the frames of a volume u ask for, and their covariance [K, K], float64."""
     matrix, right = problem.frames.normal_equations(problem.lines(u), [problem.lines(change) for change in changes])
-    covariance = torch.linalg.inv(matrix + torch.eye(len(right), dtype=right.dtype) / SPREAD**2)
+    covariance = torch.linalg.inv(matrix + torch.eye(len(right)).to(right) / SPREAD**2)
     return covariance @ right, covariance
 
 
@@ -98,12 +98,13 @@ class Ranges:
 
     def __init__(self, problem: VolumeProblem, predicted: Tensor | None = None) -> None:
         self.problem, self.frames = problem, problem.frames
-        self._predicted, self._offset = predicted, torch.zeros(())
+        on = problem.device
+        self._predicted, self._offset = predicted, torch.zeros((), device=on)
         (h, w), longest = self.frames.shape, max(self.frames.shape)
-        self.radius = torch.hypot(torch.fft.fftfreq(h)[:, None], torch.fft.rfftfreq(w))
+        self.radius = torch.hypot(torch.fft.fftfreq(h)[:, None], torch.fft.rfftfreq(w)).to(on)
         octaves = max(0, int(math.log2(0.5 * longest / WAVES)))
         self.limits = [*(0.5 / 2**k for k in range(octaves, 0, -1)), 1.0]
-        self._twice = torch.full((w // 2 + 1,), 2.0)
+        self._twice = torch.full((w // 2 + 1,), 2.0, device=on)
         self._twice[0] = 1
         if w % 2 == 0:
             self._twice[-1] = 1
@@ -130,7 +131,7 @@ class Ranges:
         weighted = (spectra * weight).flatten(1)
         matrix = (weighted @ spectra.flatten(1).conj().T).real.double()
         right = (weighted @ left.flatten().conj()).real.double()
-        covariance = torch.linalg.inv(matrix + torch.eye(len(right), dtype=right.dtype) / LOST**2)
+        covariance = torch.linalg.inv(matrix + torch.eye(len(right)).to(right) / LOST**2)
         shares = covariance @ right
         count = float(((self.radius <= limit) * self._twice).sum()) * len(left)
         chi2 = (float((weight * left.abs().square()).double().sum()) - float(right @ shares)) / count

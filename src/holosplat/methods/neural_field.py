@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from ..backends import device, resolve
+from ..backends import Backend, device, resolve
 from ..baselines import HolographicTV
 from ..checks import at_least, require
 from ..fit.loop import Fit, Plan
@@ -31,7 +31,6 @@ from ..ranges import Rate, Weight, ranged
 from ..representations import NeuralField, Stored, VoxelGrid
 from ..representations.neural_field import Network, grown
 from ..scan import Scan
-from .gaussian_options import Backend
 from .ground import ExtraTerm, ground
 from .method import Stage, Task, run_quietly
 from .voxels import HolographicStage
@@ -112,8 +111,8 @@ class NeuralFields:
         return (HolographicStage(self.volume), NeuralStage(self.fit))
 
     def on_backend(self, backend: Backend) -> NeuralFields:
-        """The same method computed by `backend`; the start runs on the CPU, or in plain torch."""
-        volume = replace(self.volume, backend="reference" if backend == "reference" else "cpu")
+        """The same method computed by `backend`, the start, too."""
+        volume = replace(self.volume, backend=backend)
         return replace(self, fit=replace(self.fit, backend=backend), volume=volume)
 
     def with_effort(self, effort: float) -> NeuralFields:

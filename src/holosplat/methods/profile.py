@@ -124,7 +124,7 @@ class Profile:
     def air(self) -> float:
         """Part of all pixels whose rays pass beside the support."""
         problem = VolumeProblem(self.frames({}), self.options.prior, 1.0, self.options.start.backend)
-        return float((problem.lines(self.support.float()) <= 0).double().mean())
+        return float((problem.lines(self.support.float().to(problem.device)) <= 0).double().mean())
 
     @property
     def noise_share(self) -> float:
@@ -156,7 +156,9 @@ class Profile:
         with memory_kept():
             frames, options = self.frames(constants), self.options
             u = self._placed(self._volume(frames)) * self.support
-            values = [frames(torch.zeros(len(frames.field), *frames.field.shape)).value]
+            on = frames.instrument.device
+            values = [frames(torch.zeros(len(frames.field), *frames.field.shape, device=on)).value]
+            u = u.to(on)
             for _ in range(2):
                 if bool((u > 0).any()):
                     level = self._peak * float(u.sum() / self.support.sum())

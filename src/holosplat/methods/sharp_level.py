@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from ..baselines.material import DEFAULT, Backend, MaterialEstimate, level_of
+from ..backends import Backend
+from ..baselines.material import DEFAULT, MaterialEstimate, level_of
 from ..matter import DeltaBeta, KnownRatio
 from .assumed import assumed_material
 from .method import Task
@@ -13,7 +14,7 @@ EDGE = 96
 """Voxels along an edge of the volume whose level is taken, at most: it takes some ten seconds on one core."""
 
 
-def material_of_levels(task: Task, backend: Backend = "cpu", options: MaterialEstimate = DEFAULT) -> DeltaBeta:
+def material_of_levels(task: Task, backend: Backend = "auto", options: MaterialEstimate = DEFAULT) -> DeltaBeta:
     """The `assumed_material` of a task; where a level bounds its matter and has to be found, that of the likeliest
     volume.
 

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
+from ..backends import device, resolve
 from ..baselines.material import plateau
 from ..fit.interrupt import interrupts_held
 from ..fit.loop import DivergedError
@@ -121,7 +122,7 @@ class SmoothFit:
     best_step = 0
 
     def __init__(self, plan: SmoothPlan) -> None:
-        self.plan, self.backend = plan, plan.backend
+        self.plan, self.backend = plan, resolve(plan.backend)
         self.step, self.seconds = 0, 0.0
         self._legs, self._leg = plan.legs(), 0
         self._volume = plan.begun
@@ -157,7 +158,7 @@ class SmoothFit:
         """The volume as it is now, on voxels of a pixel."""
         found = self._volume
         if self._descent is not None:
-            found = found.with_parameters({"values": self._descent.u[None]})
+            found = found.with_parameters({"values": self._descent.u[None].cpu()})
         grid = self.plan.begun.grid
         return found if found.grid == grid else found.resampled(grid)
 
@@ -226,7 +227,7 @@ class SmoothFit:
         if leg.kind == "from start":
             if self._rival is None:
                 return False
-            self._descent = Descent(self._problem(frames, leg.factor), begun.values[0], self._kept)
+            self._descent = self._descent_from(begun.values[0], frames, leg)
             return True
         grid = begun.grid if leg.factor == 1 else Grid.of_views(frames.field)
         if self._volume.grid != grid:
@@ -239,8 +240,13 @@ class SmoothFit:
         if leg.kind == "from even":
             u = torch.full_like(u, self.plan.faint * plateau(u))
         self._level = leg.loose * plateau(u)
-        self._descent = Descent(self._problem(frames, leg.factor), u, self._kept)
+        self._descent = self._descent_from(u, frames, leg)
         return True
+
+    def _descent_from(self, u: Tensor, frames: WhitenedFrames, leg: Leg) -> Descent:
+        """A descent that begins at u [Z, Y, X], where the backend computes."""
+        problem = self._problem(frames, leg.factor)
+        return Descent(problem, u.to(problem.device), self._kept)
 
     def _end(self, leg: Leg, descent: Descent) -> None:
         """Take in what a descent has found.
@@ -272,7 +278,7 @@ class SmoothFit:
             other, value = self._rival
             clearly = CLEARLY if self.plan.faint else 1.0
             u, self._rival = (u if clearly * descent.value < value else other), None
-        found = self._volume.with_parameters({"values": u[None]})
+        found = self._volume.with_parameters({"values": u[None].cpu()})
         if not self._weakened(found, unexplained, problem):
             self._volume, self._leg = found, self._leg + 1
 
@@ -288,7 +294,7 @@ class SmoothFit:
         more = modulated(problem, u)
         if float(more.sum()) <= GROWING * float(self._volume.values.sum()):
             return False
-        self._volume, self._more = self._volume.with_parameters({"values": more[None]}), self._more + 1
+        self._volume, self._more = self._volume.with_parameters({"values": more[None].cpu()}), self._more + 1
         return True
 
     def _mended(self, problem: VolumeProblem, u: Tensor) -> Tensor:
@@ -316,7 +322,7 @@ class SmoothFit:
             return True
         self._settled = unexplained <= WEAKER or self._strength <= WEAKEST
         if not self._settled:
-            empty = _unexplained(problem, torch.zeros_like(found.values[0]))
+            empty = _unexplained(problem, torch.zeros_like(found.values[0], device=problem.device))
             self._stronger = (found, unexplained) if unexplained - 1 < WORTH * (empty - 1) else None
             self._again(self._strength / 2)
         return not self._settled
@@ -349,7 +355,7 @@ class SmoothFit:
             "level": self._level,
             "more": self._more,
             "values": self._values,
-            "rival": None if self._rival is None else list(self._rival),
+            "rival": None if self._rival is None else [self._rival[0].cpu(), self._rival[1]],
             "descent": None if self._descent is None else self._descent.state_dict(),
         }
 
@@ -361,11 +367,13 @@ class SmoothFit:
         self._settled, self._kept, before = bool(state["settled"]), bool(state["kept"]), state["stronger"]
         self._stronger = before and (VoxelGrid.from_state(before[0]), float(before[1]))
         self._volume = VoxelGrid.from_state(state["volume"])
-        self._rival = None if state["rival"] is None else (state["rival"][0], float(state["rival"][1]))
+        rival = state["rival"]
+        self._rival = rival and (rival[0].to(device(self.backend)), float(rival[1]))
         self._descent = None
         if state["descent"] is not None:
             factor = self._legs[self._leg].factor
-            self._descent = Descent.again(self._problem(self._frames_of(factor), factor), state["descent"])
+            problem = self._problem(self._frames_of(factor), factor)
+            self._descent = Descent.again(problem, state["descent"], problem.device)
 
 
 def _unexplained(problem: VolumeProblem, u: Tensor) -> float:

@@ -86,7 +86,7 @@ def _levels(method: Method) -> LevelTest:
     if isinstance(method, Auto):
         return method.levels
     volume = getattr(method, "volume", None)
-    return LevelTest().on_backend(volume.backend if isinstance(volume, HolographicTV) else "cpu")
+    return LevelTest().on_backend(volume.backend if isinstance(volume, HolographicTV) else "auto")
 
 
 def solve(method: Method, task: Task, matter: MatterKind | None = None) -> Stored:

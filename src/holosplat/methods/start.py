@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..backends import resolve
 from ..baselines import holographic_tv
 from ..baselines.two_materials import Shares, absorption, at_one_ratio, told_apart, two_levels
 from ..geometry import Grid
@@ -76,7 +77,7 @@ def _approximate(
 ) -> GaussianCloud:
     """`cloud` after it has learned the volume."""
     rates = tuple(vars(options.approximate_rates).values())
-    cloud = cloud.on(options.volume.backend)
+    cloud = cloud.on(resolve(options.volume.backend))
     cloud = approximate(cloud, volume, grid, options.approximate_steps, task.on_progress, rates)
     return freed(cloud) if options.separate and not task.prior.fixes_ratio else cloud
 

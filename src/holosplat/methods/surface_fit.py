@@ -10,9 +10,11 @@ from scipy.sparse import csc_array, csr_array, diags_array, eye_array
 from scipy.sparse.linalg import splu
 from torch import Tensor
 
+from ..backends import Backend, device, resolve
 from ..checks import in_range, positive, require
 from ..fit.freedom import Freedom, freed
 from ..fit.loop import Fit, Plan
+from ..fit.neighbours import membrane_inverse
 from ..fit.optimiser import Adam, Group
 from ..fit.problem import Problem, Term
 from ..fit.schedule import Schedule
@@ -77,6 +79,8 @@ class SurfaceFit:
     """The loop; waves are sampled one finer than for Gaussians unless it says how, for edges are sharper."""
     terms: tuple[ExtraTerm, ...] = ()
     """Further terms by name."""
+    backend: Backend = "auto"
+    """What computes the fit."""
 
     def __post_init__(self) -> None:
         positive("rate", self.rate, "pixels")
@@ -133,16 +137,19 @@ def surface_fit(
     freedom: of where these frames are, which is then fitted, too. Steps are Adam's in the coordinates (1 + λΔ) x, one
     length for all vertices (Nicolet, Jacobson & Jakob 2021, "Large steps in inverse rendering of geometry", section 3).
     """
-    finer = oversampling(scan.train(), options)
-    base = ground(scan, start, start.matter, options.objective, options.schedule, "cpu", finer=finer, light=light)
+    finer, backend, schedule = oversampling(scan.train(), options), resolve(options.backend), options.schedule
+    start = start.on(backend)
+    base = ground(scan, start, start.matter, options.objective, schedule, backend, finer=finer, light=light)
     terms = (base.frames, *_bending(base.train, start, options.objective), *base.extra(options.terms))
-    group = Group(BETAS, EPSILON, solve=_membrane(start, options.stiffness), together=True)
+    solve = (_membrane_on_gpu if backend == "cuda" else _membrane)(start, options.stiffness)
+    group = Group(BETAS, EPSILON, solve=solve, together=True)
     plan = Plan(
         problem=Problem(base.model, terms),
-        schedule=options.schedule,
-        optimiser=lambda leaves: Adam(leaves, "cpu", {VERTICES: group}),
+        schedule=schedule,
+        optimiser=lambda leaves: Adam(leaves, backend, {VERTICES: group}),
         rates=lambda factor, step: {VERTICES: options.rate * factor},
         judge=base.judge,
+        capture=False,  # not yet tried as a CUDA graph
     )
     return Fit(freed(plan, freedom, base.train), seed)
 
@@ -158,8 +165,8 @@ def _bending(train: Scan, start: SurfaceMesh, objective: Objective) -> list[Term
     frames = torch.from_numpy(train.frames)
     weight = objective.bending * (1 + objective.noise_gain * noise_share(frames)) / frames[0].numel()
     count = len(start.vertices)
-    away = csr_array(eye_array(count) - neighbour_mean(start.faces.numpy(), count))
-    return [Bending(weight, csr_array(away @ away))]
+    away = csr_array(eye_array(count) - neighbour_mean(start.faces.cpu().numpy(), count))
+    return [Bending(weight, csr_array(away @ away), start.backend)]
 
 
 def _membrane(start: SurfaceMesh, stiffness: float) -> Callable[[Tensor], Tensor]:
@@ -169,3 +176,9 @@ def _membrane(start: SurfaceMesh, stiffness: float) -> Callable[[Tensor], Tensor
     laplacian = diags_array(edges.sum(1)) - edges
     solve = splu(csc_array(eye_array(count) + stiffness * laplacian)).solve
     return lambda gradient: torch.from_numpy(solve(gradient.numpy()))
+
+
+def _membrane_on_gpu(start: SurfaceMesh, stiffness: float) -> Callable[[Tensor], Tensor]:
+    """The same on the GPU, which does not wait for the CPU."""
+    edges = adjacency(start.faces.cpu().numpy(), len(start.vertices))
+    return membrane_inverse(edges, stiffness, device(start.backend))

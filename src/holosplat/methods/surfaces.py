@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
+from ..backends import Backend
 from ..checks import require
 from ..fit.loop import Fit
 from ..matter import MaterialPrior
@@ -15,7 +16,6 @@ from ..representations import GaussianCloud, Stored, SurfaceMesh
 from ..scan import Scan
 from .coarse import CoarseToFine, coarse_surfaces, on_pixels
 from .first_surfaces import is_noisy
-from .gaussian_options import Backend
 from .gaussians import Gaussians, GaussianStage
 from .method import Near, Stage, Task, quiet, run_quietly
 from .surface_fit import SurfaceOptions, extract_surfaces, surface_fit
@@ -40,8 +40,8 @@ class Surfaces(SurfaceOptions):
         self.gaussians.require_files()
 
     def on_backend(self, backend: Backend) -> Surfaces:
-        """The same method whose Gaussians are computed by `backend`; surfaces are fitted on the CPU."""
-        return replace(self, gaussians=self.gaussians.on_backend(backend))
+        """The same method computed by `backend`."""
+        return replace(self, gaussians=self.gaussians.on_backend(backend), fit=replace(self.fit, backend=backend))
 
     def with_effort(self, effort: float) -> Surfaces:
         """The same method with `effort` times the steps, at least one."""
@@ -119,7 +119,8 @@ def refine_surfaces(
         SurfaceStage(options, coarse or CoarseToFine()),
         Task(scan.train(), MaterialPrior.unknown(), 0, on_progress),
     )
-    start = _by_coarse_pixels(cloud, task, stage) if options == SurfaceOptions() else None
+    usual = replace(options, fit=replace(options.fit, backend="auto")) == SurfaceOptions()
+    start = _by_coarse_pixels(cloud, task, stage) if usual else None
     if start is None:
         start = stage.start(task, cloud)
     else:

@@ -7,6 +7,7 @@ from typing import ClassVar
 
 import torch
 
+from ..backends import Backend
 from ..baselines import HolographicTV, holographic_tv
 from ..baselines.beyond import rows_of
 from ..baselines.material import MaterialEstimate
@@ -75,6 +76,10 @@ class SmoothVolume:
     def stages(self) -> tuple[Stage, ...]:
         """One: the start, and the fit."""
         return (SmoothStage(self),)
+
+    def on_backend(self, backend: Backend) -> SmoothVolume:
+        """The same method computed by `backend`."""
+        return replace(self, volume=replace(self.volume, backend=backend))
 
     def with_effort(self, effort: float) -> SmoothVolume:
         """The same method with `effort` times the iterations, at least one."""

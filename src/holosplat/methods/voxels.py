@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import torch
 
+from ..backends import Backend
 from ..baselines import HolographicTV, holographic_tv
 from ..baselines.beyond import rows_of
 from ..checks import at_least, require
@@ -45,6 +46,10 @@ class HolographicVoxels:
     def stages(self) -> tuple[Stage, ...]:
         """One, without a fit."""
         return (HolographicStage(self.volume),)
+
+    def on_backend(self, backend: Backend) -> HolographicVoxels:
+        """The same method computed by `backend`."""
+        return replace(self, volume=replace(self.volume, backend=backend))
 
 
 @dataclass(frozen=True)

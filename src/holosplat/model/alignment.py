@@ -109,14 +109,15 @@ class Alignment:
 
     def exposures(self, planned: Exposures) -> Exposures:
         """The `planned` exposures, corrected."""
+        on = next((p.device for p in self.parameters().values()), "cpu")
         with torch.no_grad():
-            poses = self.poses(Poses.of(planned.views), planned.views.pitch)
+            poses = self.poses(Poses.of(planned.views, on), planned.views.pitch)
             distance, sigma = self.distance(planned), self.psf_sigma_px(planned)
         return replace(
             planned,
             views=poses.views(),
-            distance=planned.distance if distance is None else distance.numpy(),
-            psf_sigma_px=planned.psf_sigma_px if sigma is None else sigma.numpy(),
+            distance=planned.distance if distance is None else distance.cpu().numpy(),
+            psf_sigma_px=planned.psf_sigma_px if sigma is None else sigma.cpu().numpy(),
         )
 
 

@@ -30,6 +30,7 @@ class Instrument:
     `auto` (see `backends`); float64 (`dtype`) is what only `reference` computes in, and stands for it.
     `dispersion`: factors [V, 2], or of each channel of matter [V, C, 2], of δ and β at the frames' energies over those
     at the reference energy (`materials.dispersion`; default: `scan.far_from_edges`, 1 where all energies are one).
+    `on`: the device (default: that of the backend; `reference` computes on any).
     """
 
     def __init__(
@@ -39,6 +40,7 @@ class Instrument:
         dtype: torch.dtype = torch.float32,
         backend: str = "cpu",
         dispersion: np.ndarray | None = None,
+        on: torch.device | None = None,
     ) -> None:
         require(oversample >= 1, f"oversample must be at least 1, but it is {oversample}.")
         known = dtype in (torch.float32, torch.float64)
@@ -46,7 +48,7 @@ class Instrument:
         self.exposures, self.oversample, self.dtype = exposures, int(oversample), dtype
         self._optical = exposures.optical
         self.backend = resolve("reference" if dtype == torch.float64 else backend)
-        self.device = device(self.backend)
+        self.device = on or device(self.backend)
         self.margin = padding(exposures, self.oversample)
         self.views = exposures.views.padded(self.margin).refined(self.oversample)
         rows, columns = self.views.shape

@@ -124,6 +124,7 @@ def approximate(
     leaves = [p.detach().clone().requires_grad_() for p in cloud.parameters().values()]
     cloud = cloud.replaced(leaves)
     states = [[torch.zeros_like(leaf), torch.zeros_like(leaf), torch.zeros((), device=leaf.device)] for leaf in leaves]
+    occupancy = occupancy.to(leaves[0].device)
     power = float(occupancy.square().sum())
     with memory_kept():
         for step in range(steps):

@@ -40,9 +40,10 @@ def moments(halves: Tensor, filled: float) -> tuple[Tensor, Tensor, Tensor]:
     weights = cells[here].reshape(-1, 8).double()
     mass = weights.mean(dim=1)
     weights = weights / (8 * mass[:, None])
-    offset = weights @ HALVES
-    second = torch.einsum("nk,ki,kj->nij", weights, HALVES, HALVES)
-    covariance = second - offset[:, :, None] * offset[:, None] + HALF * torch.eye(3, dtype=torch.float64)
+    halves = HALVES.to(weights)
+    offset = weights @ halves
+    second = torch.einsum("nk,ki,kj->nij", weights, halves, halves)
+    covariance = second - offset[:, :, None] * offset[:, None] + HALF * torch.eye(3).to(weights)
     return mass, here.nonzero().flip(1) + offset, covariance
 
 

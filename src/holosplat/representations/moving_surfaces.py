@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..backends import in_main_memory
 from ..checks import positive, require
 from ..display import of_object
 from ..geometry import Grid, Poses, Views
@@ -107,7 +108,7 @@ class MovingSurfaces:
     def on(self, backend: str) -> MovingSurfaces:
         """The bodies for another backend (resolved); their projector runs on the CPU."""
         bodies = self.with_parameters({})
-        bodies.backend = backend
+        bodies.backend = in_main_memory(backend)
         return bodies
 
     @property

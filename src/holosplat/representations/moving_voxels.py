@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..backends import in_main_memory
 from ..checks import require
 from ..display import of_object
 from ..geometry import Grid, Poses, Views
@@ -80,7 +81,7 @@ class OnVoxels:
     def on(self, backend: str) -> Self:
         """The same for another backend (resolved); it runs on the CPU."""
         found = self.with_parameters({name: tensor.cpu() for name, tensor in self.parameters().items()})
-        found.backend = backend
+        found.backend = in_main_memory(backend)
         return found
 
     @property

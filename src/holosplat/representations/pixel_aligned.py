@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.func import functional_call
 from torch.nn.functional import softplus
 
+from ..backends import in_main_memory
 from ..checks import positive, require
 from ..display import of_object
 from ..geometry import Grid, Poses, Views
@@ -131,7 +132,7 @@ class PixelAlignedField:
     def on(self, backend: str) -> PixelAlignedField:
         """The field for another backend (resolved); it runs on the CPU."""
         field = self.with_parameters({name: weight.cpu() for name, weight in self.weights.items()})
-        field.backend = backend
+        field.backend = in_main_memory(backend)
         return field
 
     @property

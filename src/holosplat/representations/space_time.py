@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
+from ..backends import in_main_memory
 from ..checks import positive, require
 from ..display import of_object
 from ..geometry import Grid, Poses, Views
@@ -228,7 +229,7 @@ class SpaceTimeField:
     def on(self, backend: str) -> SpaceTimeField:
         """The field for another backend (resolved); it runs on the CPU."""
         found = self.with_parameters({name: tensor.cpu() for name, tensor in self.parameters().items()})
-        found.backend = backend
+        found.backend = in_main_memory(backend)
         return found
 
     @property

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..backends import device
 from ..checks import InputError, positive, require
 from ..display import of_object
 from ..geometry import Grid, Poses, Views
@@ -46,7 +47,12 @@ class SurfaceMesh:
     def with_parameters(self, parameters: Mapping[str, Tensor]) -> SurfaceMesh:
         """The same triangles with other vertices."""
         vertices = parameters.get("vertices", self.vertices)
-        return SurfaceMesh(vertices, self.faces, self.unit_length, self.matter, self.lines)
+        return self._with(vertices, self.faces, self.backend)
+
+    def _with(self, vertices: Tensor, faces: Tensor, backend: str) -> SurfaceMesh:
+        surfaces = SurfaceMesh(vertices, faces, self.unit_length, self.matter, self.lines)
+        surfaces.backend = backend
+        return surfaces
 
     def state(self) -> dict[str, Any]:
         """Tensors and plain values that `from_state` makes the same surfaces of."""
@@ -72,10 +78,9 @@ class SurfaceMesh:
         return f"surfaces of {len(self.faces)} triangles"
 
     def on(self, backend: str) -> SurfaceMesh:
-        """The surfaces for another backend (resolved); their projector runs on the CPU."""
-        surfaces = self.with_parameters({})
-        surfaces.backend = backend
-        return surfaces
+        """The surfaces for another backend (resolved: `cpu`, `cuda`, `reference`), on that backend's device."""
+        there = device(backend)
+        return self._with(self.vertices.to(there), self.faces.to(there), backend)
 
     @property
     def stored_bytes(self) -> int:
@@ -84,15 +89,18 @@ class SurfaceMesh:
 
     def enclosing_grid(self, most_voxels: int) -> Grid:
         """A grid around all vertices, of `unit_length` a voxel, or coarser where those would be over `most_voxels`."""
-        return Grid.around(self.vertices.detach().numpy(), self.unit_length, most_voxels)
+        return Grid.around(self.vertices.detach().cpu().numpy(), self.unit_length, most_voxels)
 
     def at(self, time: float) -> SurfaceMesh:
         """The surfaces themselves: they do not move."""
         return self
 
     def project(self, views: Views | Poses) -> LineIntegrals:
-        """Line integrals (B, D), float64, differentiable in the vertices and in the numbers of `Poses`."""
-        poses = Poses.of(views) if isinstance(views, Views) else views
+        """Line integrals (B, D), float64, differentiable in the vertices and in the numbers of `Poses`.
+
+        Values are checked, but on a GPU, with Poses, which does not wait.
+        """
+        poses = Poses.of(views, self.vertices.device) if isinstance(views, Views) else views
         pitch = poses.pitch
         thickness = surface_thickness(
             self.vertices * (self.unit_length / pitch),
@@ -101,21 +109,23 @@ class SurfaceMesh:
             poses.shifts / pitch,
             poses.shape,
             self.lines,
+            self.backend,
             pixels=poses.scales,
+            trusted=self.backend == "cuda" and not isinstance(views, Views),
         )
         return LineIntegrals(thickness[:, None], self.matter.in_lengths(pitch))
 
     def voxelise(self, grid: Grid) -> Volume:
         """δ and β on `grid`, averaged over voxels."""
-        voxel = torch.tensor(grid.voxel_size, dtype=torch.float64)
-        offset = torch.tensor(grid.origin, dtype=torch.float64)
+        voxel, offset = (self.vertices.new_tensor(a, dtype=torch.float64) for a in (grid.voxel_size, grid.origin))
         vertices = (self.vertices.detach() * self.unit_length - offset) / voxel
-        occupancy = surface_occupancy(vertices, self.faces, grid.shape).numpy()
+        occupancy = surface_occupancy(vertices, self.faces, grid.shape).cpu().numpy()
         return self.matter.volume(occupancy[None], grid)
 
     def mesh(self, name: str = "surfaces") -> TriangleMesh:
         """All surfaces as one mesh [m]."""
-        return TriangleMesh(self.vertices.detach().numpy() * self.unit_length, self.faces.numpy(), name)
+        vertices = self.vertices.detach().cpu().numpy() * self.unit_length
+        return TriangleMesh(vertices, self.faces.cpu().numpy(), name)
 
     def bodies(self) -> list[TriangleMesh]:
         """One mesh [m] for each body, with its cavities, the largest first, named body000, body001 …

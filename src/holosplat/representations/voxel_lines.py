@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool3d, pad
 
+from ..backends import device
 from ..checks import require
 from ..geometry import Grid, Poses, Views
 from ..projectors.voxels import LatticeProjector, SliceProjector
@@ -23,7 +24,8 @@ Axis = tuple[int, float, float]
 
 
 class VoxelLines:
-    """Line integrals of voxels in `views`, differentiable in their values and in unknown poses; float32, on the CPU.
+    """Line integrals of voxels in `views`, differentiable in their values and in unknown poses; float32, where
+    `backend` (resolved) computes.
 
     Views about the y axis: across the axis exact strip integrals over the pixels asked for (`SliceProjector`), along
     it linear between the rows of voxels. Any other poses: hats of a voxel's size (`LatticeProjector`) from the voxels
@@ -35,13 +37,13 @@ class VoxelLines:
     integrals cannot say what a turn out of the axis does; values there differ from the strips' by the ripple.
     """
 
-    def __init__(self, grid: Grid, views: Views | Poses) -> None:
+    def __init__(self, grid: Grid, views: Views | Poses, backend: str = "cpu") -> None:
         self.grid = grid
         known = views.views() if isinstance(views, Poses) and not views.requires_grad else views
         if isinstance(known, Views) and known.shares_axis:
-            self._lines = _AboutAxis(grid, known)
+            self._lines = _AboutAxis(grid, known, backend)
         else:
-            self._lines = _AnyPose(grid, known)
+            self._lines = _AnyPose(grid, known, backend)
 
     def __call__(self, values: Tensor) -> Tensor:
         """Line integrals [V, C, H, W] in metres × value of `values` [C, Z, Y, X]."""
@@ -53,7 +55,7 @@ class VoxelLines:
 class _AboutAxis:
     """[Z, Y, X] → [V, H, W] for views that share the y axis."""
 
-    def __init__(self, grid: Grid, views: Views) -> None:
+    def __init__(self, grid: Grid, views: Views, backend: str) -> None:
         nz, ny, nx = grid.shape
         height, pitch = views.shape[0], views.pixel_size
         first = float(views.shifts[0, 1]) - 0.5 * (height - 1) * pitch
@@ -62,15 +64,15 @@ class _AboutAxis:
         low, high = (int(used[0]), int(used[-1]) + 1) if len(used) else (0, 1)
         self._outside = (low, height - high)
         cut = rows[low:high]
-        self._rows = (
-            None if cut.shape[0] == ny and torch.allclose(cut, torch.eye(ny), atol=1e-6) else cut.T.contiguous()
-        )
+        same = cut.shape[0] == ny and torch.allclose(cut, torch.eye(ny), atol=1e-6)
+        self._rows = None if same else cut.T.contiguous().to(device(backend))
         top = first + low * pitch
         (dx, _, dz), (x, _, z) = grid.voxel_size, grid.origin
         shifts = np.stack([views.shifts[:, 0], np.full(len(views), top + 0.5 * (high - low - 1) * pitch)], axis=1)
         part = Views(views.rotations, shifts, (high - low, views.shape[1]), pitch)
-        # torch's products, for voxels are fitted without kernels, too
-        self._projector = SliceProjector(Grid((nz, high - low, nx), (dx, pitch, dz), (x, top, z)), part, "reference")
+        # torch's products on the CPU, for voxels are fitted without kernels, too
+        made_by = "cuda" if backend == "cuda" else "reference"
+        self._projector = SliceProjector(Grid((nz, high - low, nx), (dx, pitch, dz), (x, top, z)), part, made_by)
 
     def __call__(self, values: Tensor) -> Tensor:
         array = values.transpose(1, 2)
@@ -83,14 +85,15 @@ class _AboutAxis:
 class _AnyPose:
     """[Z, Y, X] → [V, H, W] for poses of any kind."""
 
-    def __init__(self, grid: Grid, views: Views | Poses) -> None:
+    def __init__(self, grid: Grid, views: Views | Poses, backend: str) -> None:
         edge = views.pitch if views.finest > SAME * views.pitch else views.finest
         fx, fy, fz = (max(1, math.ceil(d / edge - 1e-6)) for d in grid.voxel_size)
         fine = grid.divided((fx, fy, fz))
         self._matrices = None if fine is grid else axis_matrices(grid, fine)
         (nz, ny, nx), (x, y, z) = fine.shape, (o - 0.5 * d for o, d in zip(fine.origin, fine.voxel_size))
         between = Grid((nz + 1, ny + 1, nx + 1), fine.voxel_size, (x, y, z))
-        self._projectors = (LatticeProjector(fine, views), LatticeProjector(between, views))
+        made_by = "cuda" if backend == "cuda" else "cpu"
+        self._projectors = (LatticeProjector(fine, views, made_by), LatticeProjector(between, views, made_by))
 
     def __call__(self, values: Tensor) -> Tensor:
         if self._matrices is not None:

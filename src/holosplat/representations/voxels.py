@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 from torch import Tensor
 
+from ..backends import device
 from ..checks import require
 from ..display import of_object
 from ..geometry import Grid, Poses, Views
@@ -69,8 +70,8 @@ class VoxelGrid:
         return 2 * self.values.numel()
 
     def on(self, backend: str) -> VoxelGrid:
-        """The grid for another backend (resolved); its projectors run on the CPU."""
-        grid = self.with_parameters({"values": self.values.cpu()})
+        """The grid for another backend (resolved), on that backend's device."""
+        grid = VoxelGrid(self.values.to(device(backend)), self.grid, self.matter)
         grid.backend = backend
         return grid
 
@@ -89,11 +90,11 @@ class VoxelGrid:
     def _lines(self, views: Views | Poses) -> VoxelLines:
         """The projector of `views`: made once, or anew where the poses are unknown and move."""
         if isinstance(views, Poses) and views.requires_grad:
-            return VoxelLines(self.grid, views)
+            return VoxelLines(self.grid, views, self.backend)
         seen = views if isinstance(views, Views) else views.views()
         key = seen.fingerprint()
         if key not in self._projectors:
-            self._projectors[key] = VoxelLines(self.grid, seen)
+            self._projectors[key] = VoxelLines(self.grid, seen, self.backend)
             while len(self._projectors) > MOST_PROJECTORS:
                 self._projectors.popitem(last=False)
         return self._projectors[key]

@@ -46,6 +46,10 @@ class MeshSeries:
         for scene in self.snapshots[1:]:
             _require_alike(self.snapshots[0], scene)
 
+    def on(self, backend: str) -> MeshSeries:
+        """The series for another backend (resolved)."""
+        return replace(self, snapshots=tuple(scene.on(backend) for scene in self.snapshots))
+
     def at(self, time: float) -> MeshScene:
         """The bodies at `time` [s]; `InputError` outside the series."""
         first, last = self.times[0], self.times[-1]
@@ -60,7 +64,7 @@ class MeshSeries:
         part = float(np.clip((time - self.times[k]) / (self.times[k + 1] - self.times[k]), 0, 1))
         before, after = self.snapshots[k], self.snapshots[k + 1]
         meshes = tuple(_between(a, b, part) for a, b in zip(before.meshes, after.meshes))
-        return MeshScene(meshes, before.materials)
+        return replace(before, meshes=meshes)
 
     def project(self, views: Views) -> LineIntegrals:
         """Line integrals at the first snapshot's time."""

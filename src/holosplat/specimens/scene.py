@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,6 +21,8 @@ class MeshScene:
 
     meshes: tuple[TriangleMesh, ...]
     materials: tuple[DeltaBeta, ...]
+    backend: str = "cpu"
+    """What projects them, resolved (see `backends`)."""
 
     @classmethod
     def of_one_material(cls, meshes: Sequence[TriangleMesh], material: DeltaBeta) -> MeshScene:
@@ -39,7 +41,11 @@ class MeshScene:
 
     def moved(self, translation: np.ndarray) -> MeshScene:
         """The scene shifted by `translation` (x, y, z) [m]."""
-        return MeshScene(tuple(m.transformed(np.eye(3), translation) for m in self.meshes), self.materials)
+        return replace(self, meshes=tuple(m.transformed(np.eye(3), translation) for m in self.meshes))
+
+    def on(self, backend: str) -> MeshScene:
+        """The scene for another backend (resolved)."""
+        return replace(self, backend=backend)
 
     def at(self, time: float) -> MeshScene:
         """The scene itself: it does not move."""
@@ -48,7 +54,7 @@ class MeshScene:
     def project(self, views: Views) -> LineIntegrals:
         """Line integrals of each material, or of δ and β where there are more than two; float64, 2 × 2 rays a pixel."""
         vertices, faces, values, kinds = self._soup()
-        return LineIntegrals(mesh_line_integrals(vertices, faces, values, views), kinds)
+        return LineIntegrals(mesh_line_integrals(vertices, faces, values, views, backend=self.backend), kinds)
 
     def voxelise(self, grid: Grid) -> Volume:
         """δ and β averaged over voxels (partial occupancy at surfaces)."""

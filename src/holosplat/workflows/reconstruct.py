@@ -11,6 +11,7 @@ import torch
 
 from ..align.geometry import Geometry
 from ..align.poses import PoseOptions
+from ..backends import as_before
 from ..checks import as_written, positive, require
 from ..fit.running import Record, Running
 from ..io.guess import write_guess
@@ -131,7 +132,7 @@ def load_reconstruction(folder: RunFolder) -> Reconstruction:
         timing = {name: float(value) for name, value in summary["timing_s"].items()}
         energy, oversample = positive("energy_kev", summary["energy_kev"]), int(summary["oversample"])
         done, method = bool(summary["finished"]), str(summary.get("method", Gaussians.kind))
-        plain = summary.get("backend") == "reference"  # then it is judged without compiled kernels, too
+        backend = as_before(str(summary.get("backend", "auto")))
         told = bool(summary.get("material", {}).get("delta_told", True))
         said = Verdict.from_dict(summary["verdict"]) if "verdict" in summary else None
         total = TotalMatter.from_dict(summary["total"]) if "total" in summary else None
@@ -140,7 +141,7 @@ def load_reconstruction(folder: RunFolder) -> Reconstruction:
         with as_written(folder.config, "what reconstruct wrote"):
             light = read_light_options(config, summary)
     told_of = (choice, told, said, total, constants, light, geometry, still, read_rest(folder, found, config))
-    found = found.on("reference" if plain else "cpu")
+    found = found.on(backend)
     return Reconstruction(found, method, energy, oversample, timing, done, *told_of)
 
 

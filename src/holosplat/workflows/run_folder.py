@@ -159,7 +159,7 @@ class RunFolder:
     def save_checkpoint(self, state: dict[str, Any]) -> None:
         """Replace checkpoint.pt; the one before is kept beside it."""
         content = io.BytesIO()
-        torch.save({"run": self.name(), "state": state}, content)
+        torch.save({"run": self.name(), "state": _in_main_memory(state)}, content)
         with atomic_path(self.checkpoint) as temporary:
             temporary.write_bytes(content.getbuffer())
             if self.checkpoint.is_file():
@@ -252,3 +252,12 @@ def _is_whole(row: dict[str, Any]) -> bool:
         return all(text is not None and float(text or "nan") is not None for text in row.values())
     except (TypeError, ValueError):
         return False
+
+
+def _in_main_memory(state: Any) -> Any:
+    """The same dictionaries, lists and tuples with tensors in main memory, for machines without the device."""
+    if isinstance(state, torch.Tensor):
+        return state.cpu()
+    if isinstance(state, dict):
+        return {name: _in_main_memory(value) for name, value in state.items()}
+    return type(state)(map(_in_main_memory, state)) if isinstance(state, (list, tuple)) else state

@@ -11,10 +11,12 @@ import torch
 from scipy.sparse import csr_array
 from torch import Tensor
 
+from ...backends import device
 from ...geometry import Grid
 from ...model import Model
 from ...representations import GaussianCloud
 from ..batch import Batch
+from ..neighbours import Neighbours
 from ..problem import Part
 from ..total_variation import total_variation
 from . import comparisons
@@ -84,9 +86,11 @@ class Bending:
 
     names = ("bending",)
 
-    def __init__(self, weight: float, operator: csr_array) -> None:
-        """operator: L² [P, P], sparse float64."""
-        self._weight, self._operators = weight, (operator, csr_array(operator.T))
+    def __init__(self, weight: float, operator: csr_array, backend: str = "cpu") -> None:
+        """operator: L² [P, P], sparse float64; backend: resolved, of the vertices."""
+        pair, on = (operator, csr_array(operator.T)), device(backend)
+        self._operators = (Neighbours(pair[0], on), Neighbours(pair[1], on)) if backend == "cuda" else pair
+        self._weight = weight
         self.resolved = {"bending": weight}
 
     def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
@@ -95,18 +99,24 @@ class Bending:
         return [Part("bending", self._weight, squared_product(vertices, *self._operators))]
 
 
-def squared_product(x: Tensor, matrix: csr_array, transposed: csr_array) -> Tensor:
-    """Σ (A x)² [] of x [P, …], differentiable; matrix, transposed: A and Aᵀ, sparse, on the CPU."""
+def squared_product(x: Tensor, matrix: csr_array | Neighbours, transposed: csr_array | Neighbours) -> Tensor:
+    """Σ (A x)² [] of x [P, C], differentiable; matrix, transposed: A and Aᵀ, of scipy on the CPU, or where x is."""
     found = _SquaredProduct.apply(x, matrix, transposed)
     assert isinstance(found, Tensor)
     return found
 
 
 class _SquaredProduct(torch.autograd.Function):
-    """Σ (A x)² of a sparse A on the CPU; torch's own backward pass would transpose A anew in every step."""
+    """Σ (A x)² of a sparse A; torch's own backward pass would transpose A anew in every step."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, matrix: csr_array, transposed: csr_array) -> Tensor:  # type: ignore[override]
+    def forward(  # type: ignore[override]
+        ctx: Any, x: Tensor, matrix: csr_array | Neighbours, transposed: csr_array | Neighbours
+    ) -> Tensor:
+        if isinstance(matrix, Neighbours):
+            found = matrix @ x.detach()
+            ctx.slope = 2 * (transposed @ found)
+            return found.square().sum()
         product = matrix @ x.detach().numpy()
         ctx.slope = torch.from_numpy(2 * (transposed @ product))
         return x.new_tensor(np.square(product).sum())

@@ -249,7 +249,7 @@ def surrounded(frames: Tensor, exposures: Exposures) -> tuple[Tensor, tuple[slic
     wide = pad(frames[None].double() - 1, (mx, mx, my, my), mode="replicate")[0]
     fringe = np.sqrt(wavelength(exposures.energy_kev) * exposures.distance) / exposures.views.pixel_size
     length = torch.from_numpy(np.maximum(1.0, 0.5 * fringe))[:, None]
-    rows, columns = (torch.exp(-((_beyond(n, m) / length) ** 2)) for n, m in ((h, my), (w, mx)))
+    rows, columns = (torch.exp(-((_beyond(n, m) / length) ** 2)).to(wide) for n, m in ((h, my), (w, mx)))
     return wide * rows[:, :, None] * columns[:, None], (slice(None), slice(my, my + h), slice(mx, mx + w))
 
 

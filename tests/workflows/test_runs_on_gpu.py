@@ -1,0 +1,110 @@
+"""Whole runs with all tensors where a GPU's would be: none is left behind, and the results are the CPU's.
+
+The GPU is pretended (`helpers.pretended_gpu`), and the kernels' plain twins run: kernels have tests of their own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from helpers import two_balls
+from helpers.pretended_gpu import OnGpu, pretended_gpu
+from holosplat.align.poses import PoseOptions
+from holosplat.baselines import HolographicTV
+from holosplat.fit.schedule import Schedule
+from holosplat.matter import DeltaBeta, MaterialPrior
+from holosplat.methods import Auto, FitOptions, Gaussians, Method, solve
+from holosplat.methods.levels import LevelTest
+from holosplat.methods.method import Task
+from holosplat.methods.volume import SmoothVolume
+from holosplat.scan import Scan
+from holosplat.workflows.evaluate import evaluate
+from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
+from holosplat.workflows.run_folder import RunFolder
+
+triton = pytest.importorskip("triton")
+
+KNOWN = MaterialPrior.known(DeltaBeta(two_balls.DELTA, two_balls.BETA))
+START = HolographicTV(retrieval=5, iterations=10, corrections=1, inner=2, settling=0, refine=1)
+GAUSSIANS = Gaussians(volume=START, approximate_steps=3, fit=FitOptions(schedule=Schedule(steps=3)))
+LEVELS = LevelTest(volume=replace(START, upper=0.0, beyond=False))
+AUTO = replace(Auto(gaussians=GAUSSIANS).with_effort(0.05), gaussians=GAUSSIANS, levels=LEVELS)
+SMOOTH = SmoothVolume(volume=replace(START, upper=0.0), coarser=(), rounds=1, iterations=2)
+
+
+@pytest.fixture
+def on_gpu(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """All of the test sees a GPU."""
+    with pretended_gpu(monkeypatch, kernels=False):
+        yield
+
+
+def frames(photons: float | None = None) -> Scan:
+    """Five frames of two balls, the last of which is held out."""
+    scan = two_balls.scan(photons, count=5)
+    return replace(scan, is_test=np.arange(5) == 4)
+
+
+def found(method: Method, scan: Scan) -> dict[str, np.ndarray]:
+    """The parameters of what a method makes of the training frames, in main memory."""
+    result = solve(method, Task(scan.train(), KNOWN, 0))
+    return {name: value.detach().cpu().numpy() for name, value in result.parameters().items()}
+
+
+@pytest.mark.parametrize("method", [GAUSSIANS, AUTO], ids=["Gaussians", "surfaces"])
+def test_a_method_finds_what_it_finds_on_the_cpu(method, monkeypatch):
+    true = found(method.on_backend("cpu"), frames())
+    with pretended_gpu(monkeypatch, kernels=False):
+        same = found(method.on_backend("cuda"), frames())
+    for name, values in true.items():
+        if name != "quaternions":  # a round Gaussian has any
+            assert np.linalg.norm(same[name] - values) < 1e-3 * np.linalg.norm(values), name
+
+
+def test_a_smooth_volume_is_that_of_the_cpu(monkeypatch):
+    cpu, gpu = (replace(SMOOTH, volume=replace(SMOOTH.volume, backend=name)) for name in ("cpu", "cuda"))
+    true = found(cpu, frames(1000.0))["values"]
+    with pretended_gpu(monkeypatch, kernels=False):
+        same = found(gpu, frames(1000.0))["values"]
+    assert np.linalg.norm(same - true) < 1e-3 * np.linalg.norm(true)
+
+
+def test_what_a_fit_ends_with_stays_where_it_was(on_gpu):
+    result = solve(GAUSSIANS.on_backend("cuda"), Task(frames().train(), KNOWN, 0))
+    assert result.backend == "cuda"
+    assert all(isinstance(value, OnGpu) for value in result.parameters().values())
+
+
+@pytest.mark.parametrize("method", [GAUSSIANS, AUTO], ids=["Gaussians", "surfaces"])
+def test_a_run_folder_is_written_judged_and_read_again(method, on_gpu, tmp_path):
+    scan, folder = frames(), RunFolder(tmp_path / "run")
+    done = reconstruct(scan, KNOWN, method.on_backend("cuda"), folder=folder, matter="levels")
+    assert folder.read_summary()["backend"] == "cuda"
+    assert folder.read_summary()["device"] == "a pretended GPU"
+    again = load_reconstruction(folder)
+    assert again.object.backend == "cuda"
+    first, second = (evaluate(each, scan, None) for each in (done, again))
+    assert first.test is not None
+    assert second.test is not None
+    assert second.test.ssim == pytest.approx(first.test.ssim, abs=1e-4)
+    assert first.test.ssim > 0.5
+
+
+def test_a_run_goes_on_from_its_checkpoint(on_gpu, tmp_path):
+    def stop(stage: str, fraction: float, record: dict[str, float]) -> None:
+        if record.get("step") == 2:
+            raise KeyboardInterrupt
+
+    scan, folder, method = frames(), RunFolder(tmp_path / "run"), GAUSSIANS.on_backend("cuda")
+    assert not reconstruct(scan, KNOWN, method, folder=folder, matter="levels", on_progress=stop).finished
+    assert reconstruct(scan, KNOWN, method, folder=folder, matter="levels", resume=True).finished
+
+
+def test_a_run_that_finds_where_frames_are(on_gpu):
+    refine = PoseOptions()
+    done = reconstruct(frames(), KNOWN, GAUSSIANS.on_backend("cuda"), matter="levels", refine=refine)
+    assert done.geometry is not None
