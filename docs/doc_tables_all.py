@@ -109,6 +109,13 @@ TABLES["rerun"] = Table(
     "docs/data/main_job.csv",
     "an hour",
 )
+TABLES["snapshot"] = Table(
+    runs.snapshot,
+    ("main_job.csv",),
+    "OMP_NUM_THREADS=1 python benchmarks/main_job.py --cases snapshot --meshes DIR/rbc*_049.vtk --surfaces --csv "
+    "docs/data/main_job.csv",
+    "two minutes",
+)
 TABLES["sizes"] = Table(
     runs.sizes,
     ("sizes.csv",),

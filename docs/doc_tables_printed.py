@@ -30,7 +30,6 @@ PRINTED = {
     ),
     "retrievals": ("OMP_NUM_THREADS=1 python benchmarks/phase_retrieval.py --views 3", "half an hour"),
     "photons": ("holosplat plan, as the page has it", "a minute"),
-    "snapshot": (f"{MAIN_JOB} --cases snapshot --meshes DIR/rbc*_049.vtk", "two minutes"),
     "versions": ("both versions one after the other, as the page says", "an hour"),
     "simulation-costs": ("python benchmarks/simulate.py", "minutes, alone on two cores"),
     "simulation-errors": ("python benchmarks/simulate.py", "minutes"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -164,8 +164,17 @@ def _jobs(rows: Sequence[Mapping[str, Any]], seconds: str, called: str) -> str:
 
 
 def rerun() -> str:
-    """The jobs whose rows stand in main_job.csv."""
-    return _jobs(read("main_job.csv"), "cpu_seconds", "processor time / s")
+    """The generated jobs whose rows stand in main_job.csv."""
+    return _rerun(lambda case: case != "snapshot")
+
+
+def snapshot() -> str:
+    """The job of another program's cells."""
+    return _rerun(lambda case: case == "snapshot")
+
+
+def _rerun(wanted: Callable[[str], bool]) -> str:
+    return _jobs([row for row in read("main_job.csv") if wanted(row["case"])], "cpu_seconds", "processor time / s")
 
 
 def sizes() -> str:
