@@ -21,6 +21,7 @@ from ..representations import KINDS, Stored
 from ..scan import Scan
 from .beginning import Beginning
 from .keeper import Keeper
+from .window import windows_of
 
 
 def quiet(stage: str, fraction: float) -> None:
@@ -91,6 +92,21 @@ class Task:
         if found.background is not None:
             scan = replace(scan, frames=found.evened(frames).numpy())
         return replace(self, scan=scan, lit=found)
+
+    def in_windows(self) -> Task:
+        """The same task on windows about its matter where these save much (`windows_of`), or the task itself.
+
+        Uneven light and free poses are told by whole frames; so is light that was not looked at (`evened`).
+        """
+        if self.lit is None or self.lit.background is not None or self.freedom is not None:
+            return self
+        found = windows_of(self.scan, self.noise)
+        if found is None:
+            return self
+        self.on_progress("windows of {} × {} pixels".format(*found.shape), 0.0)
+        air, noise = torch.from_numpy(found.cut(self.lit.air.numpy())), self.lit.noise.white
+        lit = Light(air, NoiseModel.white_only(noise, found.shape), None)
+        return replace(self, scan=found.of(self.scan), lit=lit)
 
     def moved(self, fitted: Model) -> Task:
         """The same task with the frames where a fit has found them."""
@@ -187,7 +203,7 @@ class Method(Protocol):
 
 def begun(stage: Stage, task: Task, before: Stored | None) -> tuple[Stored, Task]:
     """What `stage` starts from, and the task with how near that is; what was near stays so if it is handed on."""
-    start = stage.start(task, before)
+    start = stage.start(task.in_windows(), before)
     if isinstance(start, Near):
         return start.object, replace(task, near=True)
     return start, replace(task, near=task.near and start is before)
@@ -216,7 +232,7 @@ def solve_stages(method: Method, task: Task) -> Stored:
     for number, stage in enumerate(method.stages()):
         before = keeper.handed(stage, found, task.freedom is not None)
         found, task = begun(stage, task, before)
-        fit = stage.fit(task, found)
+        fit = stage.fit(task.in_windows(), found)
         if found is not before and (number == 0 or fit is None):
             keeper.look(stage.name if number else "start", found, fit.oversample if fit else 0, fitted=False)
         if fit is not None:

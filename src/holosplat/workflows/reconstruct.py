@@ -209,7 +209,7 @@ class _Run:
             stage, saved = stages[number], self._saved if number == first else None
             before = self._keeper.handed(stage, found, self.task.freedom is not None)
             start = self._start_again(saved) if saved else self._started(stage, before)
-            fit = stage.fit(self.task, start)
+            fit = stage.fit(self.task.in_windows(), start)
             oversample = fit.oversample if fit else 0
             if saved is None and start is not before and (number == 0 or fit is None):
                 self._keeper.look(stage.name if number else "start", start, oversample, fitted=False)
