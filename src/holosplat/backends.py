@@ -86,13 +86,8 @@ def resolve(name: str) -> str:
     )
 
 
-def as_before(name: str) -> str:
-    """The backend that computed something elsewhere, or long ago, if it can be used here, or else the usual one."""
-    return resolve("auto" if name in ("cpu", "cuda") and missing(name) else name)
-
-
 def in_main_memory(backend: str) -> str:
-    """`backend` (resolved), but the CPU's for a GPU's: of what has no kernels there."""
+    """`backend` (resolved), but the CPU's for a GPU's."""
     return "cpu" if backend == "cuda" else backend
 
 

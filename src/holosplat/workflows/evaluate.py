@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..backends import resolve
 from ..checks import require
 from ..fit.residuals import Prediction
 from ..matter import DeltaBeta
@@ -125,7 +126,7 @@ class Evaluation(Scores):
 def render(reconstruction: Reconstruction, exposures: Exposures) -> np.ndarray:
     """Frames [N, H, W] float32 that the reconstruction predicts."""
     _require_energy(reconstruction, exposures)
-    found = reconstruction.object
+    found = _where_it_is_judged(reconstruction)
     return render_object(found, exposures, reconstruction.oversample, found.backend)
 
 
@@ -149,7 +150,7 @@ def evaluate(reconstruction: Reconstruction, scan: Scan | None, truth: Volume | 
     are compared in the light that each frame shows in its own air (`light_of`), held-out frames too, and in that which
     the training frames were found to have in common.
     """
-    found = reconstruction.object
+    found = _where_it_is_judged(reconstruction)
     lit = None
     if scan is not None:
         _require_energy(reconstruction, scan.exposures)
@@ -166,13 +167,19 @@ def held_out_verdict(reconstruction: Reconstruction, scan: Scan, lit: Light | No
     lit: the light of all its frames, which is divided out; what air does not tell of it counts as noise.
     """
     _require_energy(reconstruction, scan.exposures)
-    found, test, noise = reconstruction.object, scan.test(), None
+    found, test, noise = _where_it_is_judged(reconstruction), scan.test(), None
     if not len(test):
         return None
     if lit is not None:
         whole = replace(scan, frames=lit.evened(torch.from_numpy(scan.frames)).numpy())
         test, noise = whole.test(), lit.doubt[np.flatnonzero(scan.is_test)]
     return judge(Prediction(found, test.exposures, reconstruction.oversample, backend=found.backend), test, noise)
+
+
+def _where_it_is_judged(reconstruction: Reconstruction) -> Stored:
+    """The object on a GPU if there is one, or on the CPU; in plain torch if that computed it."""
+    found = reconstruction.object
+    return found if found.backend == "reference" else found.on(resolve("auto"))
 
 
 def _factor(lit: Light | None) -> np.ndarray | None:

@@ -11,7 +11,7 @@ import torch
 
 from ..align.geometry import Geometry
 from ..align.poses import PoseOptions
-from ..backends import as_before
+from ..backends import in_main_memory
 from ..checks import as_written, positive, require
 from ..fit.running import Record, Running
 from ..io.guess import write_guess
@@ -132,7 +132,7 @@ def load_reconstruction(folder: RunFolder) -> Reconstruction:
         timing = {name: float(value) for name, value in summary["timing_s"].items()}
         energy, oversample = positive("energy_kev", summary["energy_kev"]), int(summary["oversample"])
         done, method = bool(summary["finished"]), str(summary.get("method", Gaussians.kind))
-        backend = as_before(str(summary.get("backend", "auto")))
+        plain = summary.get("backend") == "reference"  # then it is judged without compiled kernels, too
         told = bool(summary.get("material", {}).get("delta_told", True))
         said = Verdict.from_dict(summary["verdict"]) if "verdict" in summary else None
         total = TotalMatter.from_dict(summary["total"]) if "total" in summary else None
@@ -141,7 +141,7 @@ def load_reconstruction(folder: RunFolder) -> Reconstruction:
         with as_written(folder.config, "what reconstruct wrote"):
             light = read_light_options(config, summary)
     told_of = (choice, told, said, total, constants, light, geometry, still, read_rest(folder, found, config))
-    found = found.on(backend)
+    found = found.on("reference" if plain else "cpu")
     return Reconstruction(found, method, energy, oversample, timing, done, *told_of)
 
 
@@ -292,7 +292,7 @@ class _Run:
         samples = best.oversample if best else fit.oversample if fit else 0
         oversample = samples or fringe_sampling(exposures)
         done = Reconstruction(
-            found,
+            found.on(in_main_memory(found.backend)),
             self.asked,
             exposures.reference_energy,
             oversample,
@@ -310,7 +310,7 @@ class _Run:
             self.make_folder(found.backend)
             if fit is None:
                 self.folder.start_metrics([])
-            write_object(self.folder.object, found)
+            write_object(self.folder.object, done.object)
             background = self.task.uneven and self.task.uneven.background
             if background is not None or done.still is not None:
                 write_light(self.folder.light, background, done.still)
@@ -361,7 +361,7 @@ class _Journal:
         fit = self._fit
         name = self._run.method.stages()[self._number].name
         self._run.on_progress(name, fit.share, record)
-        self._run.on_state(name, fit.share, record, lambda: fit.result().object)
+        self._run.on_state(name, fit.share, record, lambda: finished(fit).on(in_main_memory(fit.backend)))
         up_to_date = record["step"] == fit.step  # on a GPU, records come late and in batches
         if up_to_date and time.perf_counter() - self._last > CHECKPOINT_SECONDS:
             self._save()
