@@ -70,7 +70,9 @@ class VoxelGrid:
         return 2 * self.values.numel()
 
     def on(self, backend: str) -> VoxelGrid:
-        """The grid for another backend (resolved), on that backend's device."""
+        """The grid for another backend (resolved), on that backend's device; itself where it is that already."""
+        if backend == self.backend:
+            return self
         grid = VoxelGrid(self.values.to(device(backend)), self.grid, self.matter)
         grid.backend = backend
         return grid
