@@ -77,6 +77,16 @@ def test_what_is_predicted_in_a_window_is_what_is_predicted_there_of_the_whole(p
     np.testing.assert_allclose(own, found.cut(whole), atol=2e-3 * np.ptp(own))
 
 
+def test_views_about_one_axis_keep_the_same_rows():
+    scan = frames("one axis")
+    marked = scan.frames.copy()
+    marked[1, 30:40, 150:160] += 0.3
+    found = found_in(replace(scan, frames=marked))
+    assert len(set(found.tops)) == 1
+    assert found.tops[0] + MARGIN <= 32
+    assert found.tops[0] + found.shape[0] >= 0.5 * SHAPE[0] - 30 + MARGIN
+
+
 def test_a_faint_wide_shadow_is_seen_by_the_mean_of_many_pixels():
     sigma, contrast = 0.03, 0.03 * torch.randn(256, 320, generator=torch.Generator().manual_seed(1)).double()
     assert not shown(contrast, sigma).any()
@@ -90,7 +100,7 @@ def test_nothing_is_left_out_where_it_would_save_little_or_tells_something():
     scan = frames("one axis")
     small = scan.cropped(slice(20, 220), slice(100, 280))
     empty = replace(scan, frames=np.ones_like(scan.frames))
-    noisy = replace(noise_of(scan), grain=torch.ones_like(noise_of(scan).grain))
+    noisy = replace(noise_of(scan), grain=torch.full_like(noise_of(scan).grain, 1e-12))
     crowded = replace(scan, frames=scan.frames + scan.frames[:, ::-1, ::-1] - 1)
     assert windows_of(scan, noise_of(scan)) is not None
     assert windows_of(small, noise_of(small)) is None
