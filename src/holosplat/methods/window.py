@@ -28,7 +28,7 @@ BLOCKS = (8, 32)
 CHANCE = 1e-9
 """Probability that noise alone makes a block show more than noise: frames have some thousands of blocks."""
 TOLERANCE = 2e-3
-"""Part of a frame's largest contrast below which light counts as even: the seventh fringe of an edge has so little."""
+"""Part of a frame's largest contrast below which light counts as even, where there is no noise to say so."""
 MARGIN = 16
 """Pixels about all blocks that show more."""
 MULTIPLE = 16
