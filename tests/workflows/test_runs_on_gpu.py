@@ -10,18 +10,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 from helpers import two_balls
 from helpers.pretended_gpu import OnGpu, pretended_gpu
 from holosplat.align.poses import PoseOptions
 from holosplat.baselines import HolographicTV
 from holosplat.fit.schedule import Schedule
-from holosplat.matter import DeltaBeta, MaterialPrior
+from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import Auto, FitOptions, Gaussians, Method, solve
+from holosplat.methods.coarse import on_pixels
 from holosplat.methods.levels import LevelTest
 from holosplat.methods.method import Task
 from holosplat.methods.volume import SmoothVolume
+from holosplat.representations import SurfaceMesh
 from holosplat.scan import Scan
+from holosplat.specimens.phantoms import unit_ball
 from holosplat.workflows.evaluate import evaluate
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
@@ -108,3 +112,12 @@ def test_a_run_that_finds_where_frames_are(on_gpu):
     refine = PoseOptions()
     done = reconstruct(frames(), KNOWN, GAUSSIANS.on_backend("cuda"), matter="levels", refine=refine)
     assert done.geometry is not None
+
+
+def test_surfaces_of_coarse_pixels_go_on_to_finer_ones(on_gpu):
+    vertices, faces = unit_ball(1)
+    matter = Matter.one(two_balls.DELTA, two_balls.BETA)
+    coarse = SurfaceMesh(torch.tensor(4 * vertices), torch.tensor(faces), 2e-6, matter).on("cuda")
+    finer = on_pixels(coarse, 1e-6, 2.5)
+    assert len(finer.faces) > len(faces)
+    assert float(finer.vertices.norm(dim=1).mean()) == pytest.approx(8.0, rel=0.05)
