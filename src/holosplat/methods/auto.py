@@ -172,9 +172,10 @@ class Bodies:
 
     def stages(self) -> Sequence[Stage]:
         """Those of the Gaussians, the surfaces, and the volume."""
-        closed = SurfacesWhereClosed(self.surfaces, self.gaussians.coarse)
+        bodies = BodiesStage(self.gaussians, surfaces=self.surfaces)
+        closed = SurfacesWhereClosed(self.surfaces, self.gaussians.coarse, bodies.best_cut)
         last = VolumeWhereUnexplained(self.volume, self.unexplained, self.gaussians, self.trials)
-        return (BodiesStage(self.gaussians, surfaces=self.surfaces), closed, last)
+        return (bodies, closed, last)
 
 
 @dataclass(frozen=True)

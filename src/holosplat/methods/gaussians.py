@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -29,7 +30,7 @@ from .coarse import STAGE as COARSE
 from .coarse import CoarseToFine, coarse_surfaces, last_steps
 from .coarse_cloud import cloud_of_surfaces
 from .field import field_of
-from .first_surfaces import first_surfaces
+from .first_surfaces import Way, first_surfaces
 from .gaussian_options import FitOptions, GaussianOptions, GaussianRates
 from .ground import Ground, ground
 from .learned import learned_cloud
@@ -133,7 +134,7 @@ class GaussianStage:
         if how.columns == 0 or options.start == "random" or not task.bounded:
             return None
 
-        def first(coarse: Task) -> SurfaceMesh | None:
+        def first(coarse: Task) -> Sequence[Way]:
             return first_surfaces(coarse, options, surfaces, self.solved)
 
         return coarse_surfaces(self._without_validation(task), first, surfaces, how)

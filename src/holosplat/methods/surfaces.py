@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import ClassVar
 
 from ..backends import Backend
-from ..checks import require
+from ..checks import InputError, require
 from ..fit.loop import Fit
 from ..matter import MaterialPrior
 from ..progress import Progress
 from ..representations import GaussianCloud, Stored, SurfaceMesh
 from ..scan import Scan
-from .coarse import CoarseToFine, coarse_surfaces, on_pixels
-from .first_surfaces import is_noisy
+from .coarse import CoarseToFine, begun_surfaces, coarse_surfaces, missing_matter, on_pixels, settled
+from .first_surfaces import Way, is_noisy, surfaces_of_volume
 from .gaussians import Gaussians, GaussianStage
+from .keeper import CLEARLY
 from .method import Near, Stage, Task, quiet, run_quietly
 from .surface_fit import SurfaceOptions, extract_surfaces, surface_fit
 
@@ -33,7 +35,8 @@ class Surfaces(SurfaceOptions):
 
     def stages(self) -> Sequence[Stage]:
         """Those of the Gaussians, and the surfaces."""
-        return (BodiesStage(self.gaussians, surfaces=self), SurfaceStage(self, self.gaussians.coarse))
+        bodies = BodiesStage(self.gaussians, surfaces=self)
+        return (bodies, SurfaceStage(self, self.gaussians.coarse, bodies.best_cut))
 
     def require_files(self) -> None:
         """Those of the Gaussians."""
@@ -62,9 +65,38 @@ class BodiesStage(GaussianStage):
 
     def coarse_surfaces(self, task: Task, surfaces: SurfaceOptions) -> SurfaceMesh | None:
         """Those of coarse pixels, which small frames have themselves; small noisy ones are for Gaussians."""
-        small = self.options.coarse.factor(task.scan.views.shape) == 1
-        straight = self.options.start == "phase" and task.freedom is None and not is_noisy(task, self.options)
-        return self.near_surfaces(task, surfaces) if straight or not small else None
+        straight = self._straight(task) and not is_noisy(task, self.options)
+        return self.near_surfaces(task, surfaces) if straight or not self._small(task) else None
+
+    def best_cut(self, task: Task, cloud: GaussianCloud, cut: Callable[[], SurfaceMesh]) -> SurfaceMesh:
+        """The surfaces that `cut` gets out of `cloud`; but of small noisy frames that this explains badly, those of the
+        volume after rounds of agreement, if they explain clearly more.
+
+        Errors: those of `cut`, where there are no others.
+        """
+        how = self.options.coarse
+        alone = not (self._small(task) and self._straight(task) and task.bounded and is_noisy(task, self.options))
+        if alone or self._missing(cloud, task) <= how.missing_matter:
+            return cut()
+        seen = self._without_validation(task)
+        other = begun_surfaces(seen, lambda at: surfaces_of_volume(at, self.options, self.surfaces), self.surfaces, how)
+        if other is None:
+            return cut()
+        try:
+            own = settled(seen, cut(), self.surfaces, how)
+        except InputError:  # Gaussians hold no surface
+            return other
+        return other if self._missing(other, seen) < CLEARLY * self._missing(own, seen) else own
+
+    def _missing(self, found: SurfaceMesh | GaussianCloud, task: Task) -> float:
+        return missing_matter(found, task, self.surfaces)
+
+    def _small(self, task: Task) -> bool:
+        return self.options.coarse.factor(task.scan.views.shape) == 1
+
+    def _straight(self, task: Task) -> bool:
+        """Whether surfaces of small frames may come before Gaussians."""
+        return self.options.start == "phase" and task.freedom is None and self.options.coarse.columns > 0
 
     def fit(self, task: Task, start: Stored) -> Fit | None:  # type: ignore[override]
         """The fit of the cloud; none of surfaces, for the next stage has it."""
@@ -78,6 +110,8 @@ class SurfaceStage:
     options: SurfaceOptions
     coarse: CoarseToFine = field(default_factory=CoarseToFine)
     """How few steps a near start takes."""
+    choose: Callable[[Task, GaussianCloud, Callable[[], SurfaceMesh]], SurfaceMesh] | None = None
+    """What a task begins with, by Gaussians and what cuts surfaces out of them; None: with these."""
     name: str = STAGE
 
     def start(self, task: Task, before: Stored | None) -> Stored:
@@ -91,7 +125,8 @@ class SurfaceStage:
             "reconstruct with --method gaussians first.",
         )
         assert isinstance(before, GaussianCloud)
-        return extract_surfaces(before, task.scan, self.options.extraction)
+        cut = partial(extract_surfaces, before, task.scan, self.options.extraction)
+        return cut() if self.choose is None else self.choose(task, before, cut)
 
     def fit(self, task: Task, start: Stored) -> Fit:
         """The fit of the surfaces to the training frames."""
@@ -135,8 +170,11 @@ def _by_coarse_pixels(cloud: Stored, task: Task, stage: SurfaceStage) -> Surface
     if not isinstance(cloud, GaussianCloud) or stage.coarse.factor(task.scan.views.shape) == 1:
         return None
 
+    def first(coarse: Task) -> Sequence[Way]:
+        return (lambda: cut(coarse),)
+
     def cut(coarse: Task) -> SurfaceMesh:
         found = extract_surfaces(cloud, coarse.scan, stage.options.extraction)
         return on_pixels(found, coarse.scan.views.finest, math.inf)
 
-    return coarse_surfaces(task, cut, stage.options, stage.coarse)
+    return coarse_surfaces(task, first, stage.options, stage.coarse)
