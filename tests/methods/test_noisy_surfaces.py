@@ -3,23 +3,18 @@ frames may take their place."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
-from helpers.bumpy import DELTA, bumpy, surfaces
+from helpers.bumpy import bumpy, surfaces
+from helpers.noisy_cells import MATTER, PITCH, error, mesh_of, task_of
 from holosplat.baselines import HolographicTV, holographic_tv
-from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.fit.schedule import Schedule
-from holosplat.geometry import Grid, Views
-from holosplat.materials import HAEMOGLOBIN
-from holosplat.matter import MaterialPrior
 from holosplat.methods import Gaussians, SurfaceOptions, Surfaces, Task
-from holosplat.methods.coarse import CoarseToFine, _first, begun_surfaces, missing_matter
+from holosplat.methods.coarse import CoarseToFine, Way, _first, begun_surfaces, missing_matter
 from holosplat.methods.coarse_cloud import cloud_of_surfaces
 from holosplat.methods.first_surfaces import first_surfaces, is_noisy, surfaces_of_volume
 from holosplat.methods.gaussian_options import FitOptions
@@ -27,14 +22,8 @@ from holosplat.methods.method import quiet
 from holosplat.methods.surface_fit import SurfaceFit
 from holosplat.methods.surfaces import BodiesStage
 from holosplat.representations import SurfaceMesh
-from holosplat.scan import Exposures, Scan
-from holosplat.specimens import random_cells
-from holosplat.specimens.scene import MeshScene
 from holosplat.workflows.reconstruct import reconstruct
 
-PITCH, SHAPE = 3.2e-6, (41, 55)
-MATTER = HAEMOGLOBIN.delta_beta(20.0)
-CELLS = random_cells(4, (40 * PITCH, 36 * PITCH, 40 * PITCH), 5, 18 * PITCH)
 OPTIONS = Gaussians(
     approximate_steps=5,
     fit=FitOptions(schedule=Schedule(steps=5)),
@@ -43,32 +32,12 @@ OPTIONS = Gaussians(
 HOW = SurfaceOptions(fit=SurfaceFit(schedule=Schedule(steps=20)))
 
 
-def scan_of(photons: float) -> Scan:
-    """Sixteen views of cells of 18 pixels, whose fringes pixels hardly resolve."""
-    scene = MeshScene.of_one_material(CELLS, MATTER)
-    views = Views.evenly_spaced(16, SHAPE, PITCH)
-    exposures = Exposures.of(views, 20.0, 0.1, 0.05)
-    return simulate(scene, exposures, photons_per_pixel=photons, seed=1, is_test=np.zeros(16, dtype=bool))
-
-
 @pytest.fixture(scope="module")
 def noisy() -> Task:
     """Of frames about half of whose contrast is noise."""
-    task = Task(scan_of(2000.0), MaterialPrior.known(MATTER)).evened()
+    task = task_of(2000.0)
     assert is_noisy(task, OPTIONS)
     return task
-
-
-def mesh_of(count: int = 4) -> SurfaceMesh:
-    """The first cells, in pixels."""
-    return surfaces(*(replace(cell, vertices=cell.vertices / PITCH) for cell in CELLS[:count]), unit=PITCH)
-
-
-def error(found) -> float:
-    """Of the occupancy, in parts of the truth."""
-    grid = Grid.of_views(Views.evenly_spaced(16, SHAPE, PITCH))
-    true, other = (np.asarray(one.voxelise(grid).delta, dtype=float) for one in (mesh_of(), found))
-    return float(np.linalg.norm(other - true) / np.linalg.norm(true))
 
 
 def test_what_is_missing_is_told_beyond_noise(noisy):
@@ -84,10 +53,10 @@ def test_rounds_of_agreement_in_noise_are_more_and_smoother():
 
 
 def test_a_volume_that_agrees_with_noisy_frames_is_nearer_to_the_truth(noisy):
-    errors, true = [], np.asarray(mesh_of().voxelise(Grid.of_views(noisy.scan.views)).delta) / DELTA
+    errors = list[float]()
     for how in (HolographicTV(), HolographicTV().in_noise()):
         found, _ = holographic_tv(noisy.scan, MATTER, replace(how, refine=1), quiet)
-        errors.append(float(np.linalg.norm(found.numpy() - true) / np.linalg.norm(true)))
+        errors.append(error(found.numpy()))
     assert errors[1] < 0.8 * errors[0]
 
 
@@ -103,8 +72,13 @@ def test_the_next_way_is_gone_where_the_first_explains_badly(noisy, left, asked,
     cells, tried = [mesh_of(1 + k) for k in range(len(left))], list[int]()
     judged = {len(mesh.faces): share for mesh, share in zip(cells, left)}
 
-    def way(k: int) -> Callable[[], SurfaceMesh]:
-        return lambda: (tried.append(k), cells[k])[1]
+    def way(k: int) -> Way:
+        def gone(before: SurfaceMesh | None) -> SurfaceMesh:
+            assert (None if before is None else len(before.faces)) == (len(cells[k - 1].faces) if k else None)
+            tried.append(k)
+            return cells[k]
+
+        return gone
 
     monkeypatch.setattr("holosplat.methods.coarse.missing_matter", lambda mesh, task, how: judged[len(mesh.faces)])
     how = CoarseToFine(coarse_steps=1, chord=0.0)
@@ -122,10 +96,21 @@ def test_gaussians_come_first_in_noise_and_a_way_without_surfaces_is_none(noisy)
         raise InputError("no matter")
 
     gaussians, _ = first_surfaces(noisy, OPTIONS, HOW, fitted)
-    assert gaussians() is None
+    assert gaussians(None) is None
     assert asked == ["Gaussians"]
-    clean = Task(scan_of(1e7), MaterialPrior.known(MATTER)).evened()
-    assert len(first_surfaces(clean, OPTIONS, HOW, fitted)) == 1
+
+
+def test_without_much_noise_surfaces_take_turns_with_what_explains_badly(monkeypatch):
+    clean, before, given, better = task_of(1e7), mesh_of(3), list[SurfaceMesh](), [mesh_of(4)]
+    monkeypatch.setattr(
+        "holosplat.methods.first_surfaces.in_turns", lambda task, before, *rest: (given.append(before), better[0])[1]
+    )
+    _, turns = first_surfaces(clean, OPTIONS, HOW, lambda task: pytest.fail("no Gaussians are wanted"))
+    assert turns(None) is None
+    assert turns(before) is better[0]
+    assert given == [before]
+    better[0] = before
+    assert turns(before) is None
 
 
 EXPLAINED = replace(OPTIONS, coarse=replace(OPTIONS.coarse, missing_matter=0.3))
@@ -178,10 +163,10 @@ def test_gaussians_without_a_surface_give_way(noisy, monkeypatch):
 
 def test_frames_without_much_noise_ask_nothing(monkeypatch):
     monkeypatch.setattr("holosplat.methods.surfaces.missing_matter", lambda *given: pytest.fail("not asked for"))
-    clean = Task(scan_of(1e7), MaterialPrior.known(MATTER)).evened()
+    clean = task_of(1e7)
     assert best_cut(clean, 1)[1] == 1
     learned = replace(OPTIONS, start="learned")
-    assert best_cut(Task(scan_of(2000.0), MaterialPrior.known(MATTER)).evened(), 1, learned)[1] == 1
+    assert best_cut(task_of(2000.0), 1, learned)[1] == 1
 
 
 def test_surfaces_of_the_volume_explain_noisy_frames(noisy):

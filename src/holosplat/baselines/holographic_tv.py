@@ -15,7 +15,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from ..backends import Backend, resolve
+from ..backends import Backend, device, resolve
 from ..checks import at_least
 from ..geometry import Grid, Views
 from ..materials import DeltaBeta
@@ -119,6 +119,28 @@ def holographic_tv(
     with memory_kept():
         options = replace(options, backend=resolve(options.backend))
         volume, grid = _holographic_tv(scan, material, options, on_progress, light, wanted)
+        return volume.cpu(), grid
+
+
+def agreed(
+    scan: Scan,
+    material: DeltaBeta,
+    start: Tensor,
+    options: HolographicTV,
+    on_progress: Progress,
+    light: Light | None = None,
+) -> tuple[Tensor, Grid]:
+    """Occupancy [Z, Y, X] after rounds of agreement that begin with `start`, on voxels of a pixel, and its grid.
+
+    The voxels are those of `Grid.of_views`; rounds are made in any noise. Else as `holographic_tv`.
+    """
+    with memory_kept():
+        options = replace(options, backend=resolve(options.backend))
+        views = scan.views.in_units_of(scan.views.finest)
+        projector = projector_for(Grid.of_views(views), views, options.backend)
+        there = start.to(device(options.backend))
+        begun = PrimalDual(projector, there, options.weight, options.upper or None, backend=options.backend)
+        volume, grid = _agree(scan, material, begun, options, 1, on_progress, light)
         return volume.cpu(), grid
 
 

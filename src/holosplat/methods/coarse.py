@@ -54,6 +54,12 @@ class CoarseToFine:
     """Share of all matter, beyond noise, that what is found in noisy frames may leave unexplained before another way is
     tried: there noise hides the finest structure. In trials what was right left 0.04 to 0.05, and 0.09 or more where
     the error was a fifth and more."""
+    turns: int = 6
+    """How often, at most, such surfaces go back to the volume (`turns.in_turns`): a foam took three, 24 cells in 250
+    photons a pixel were still gaining, slowly, after six."""
+    turn_gain: Share = 0.002
+    """Part of the residual's square that a turn must take away for another one: turns that left the matter as it was
+    took 0.0005 at most, those that helped 0.005 or more."""
     coarse_steps: int = 40
     """Steps of the coarse surfaces."""
     finer_steps: int = 40
@@ -76,7 +82,7 @@ class CoarseToFine:
     every parameter, and would blur what is sharp."""
 
     def __post_init__(self) -> None:
-        at_least(self, 0, "columns")
+        at_least(self, 0, "columns", "turns")
         at_least(self, 1, "coarse_steps", "finer_steps", "last_steps", "views", "fit_steps")
 
     def factor(self, shape: tuple[int, int]) -> int:
@@ -109,9 +115,12 @@ class CoarseToFine:
         return replace(self, **{name: max(1, round(effort * getattr(self, name))) for name in names})
 
 
-First = Callable[[Task], Sequence[Callable[[], SurfaceMesh | None]]]
-"""Ways to surfaces to begin with, of the frames of a task; None where there are none. The next one is gone where what
-came of those before explains these frames badly."""
+Way = Callable[[SurfaceMesh | None], SurfaceMesh | None]
+"""How surfaces to begin with are made, beside what has come of the way before; None where there are none."""
+
+First = Callable[[Task], Sequence[Way]]
+"""Ways to surfaces to begin with, of the frames of a task. The next one is gone where those before it led to such as
+explain these frames badly."""
 
 
 def coarse_surfaces(task: Task, first: First, surfaces: SurfaceOptions, how: CoarseToFine) -> SurfaceMesh | None:
@@ -161,9 +170,9 @@ def begun_surfaces(task: Task, first: First, surfaces: SurfaceOptions, how: Coar
 def _first(task: Task, first: First, surfaces: SurfaceOptions, how: CoarseToFine) -> SurfaceMesh | None:
     """The first surfaces after some steps, by the first way that explains the frames, or else by the one that does
     best; None where there are none, or their bodies are too thin for the pixels."""
-    ways, tried = first(task), list[tuple[float, SurfaceMesh]]()
+    ways, tried, found = first(task), list[tuple[float, SurfaceMesh]](), None
     for way in ways:
-        start = way()
+        start = way(found)
         if start is None or mean_chord(start) < how.chord * task.scan.views.finest:
             continue
         found = settled(task, start, surfaces, how)

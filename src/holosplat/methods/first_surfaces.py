@@ -9,54 +9,68 @@ import torch
 from torch import Tensor
 
 from ..baselines import holographic_tv
-from ..checks import InputError, require
+from ..checks import InputError
 from ..geometry import Grid
 from ..matter import Matter
 from ..optics.noise import noise_share
 from ..representations import GaussianCloud, SurfaceMesh
-from .coarse import missing_matter, unexplained
+from .coarse import Way, settled, unexplained
 from .gaussian_options import GaussianOptions
 from .method import Task
 from .sharp_level import material_of_levels
 from .surface_fit import SurfaceOptions, cut_surfaces, extract_surfaces
-
-Way = Callable[[], SurfaceMesh | None]
-"""How first surfaces are made; None where there are none."""
+from .turns import cut_as_seen, in_turns
 
 
 def first_surfaces(
     task: Task, options: GaussianOptions, surfaces: SurfaceOptions, fitted: Callable[[Task], GaussianCloud]
 ) -> Sequence[Way]:
-    """Surfaces cut out of the volume of retrieval and tomography, on voxels of a pixel; None where there are none.
+    """Surfaces cut out of the volume of retrieval and tomography, on voxels of a pixel, and where these explain the
+    frames badly, such as have taken turns with that volume (`in_turns`).
 
     The task is `bounded`. In noise (`HolographicTV.noisy`), and where a network is asked, surfaces are those of
     Gaussians `fitted` to the frames, whose start and terms on the volume hold against it; and in noise those of the
     volume are the second way, for of bodies that pixels hardly resolve Gaussians may lose most.
     """
 
-    def of_volume() -> SurfaceMesh:
+    def of_volume(before: SurfaceMesh | None) -> SurfaceMesh:
         return _of_volume(task, options, surfaces)
 
-    def of_gaussians() -> SurfaceMesh | None:
+    def of_turns(before: SurfaceMesh | None) -> SurfaceMesh | None:
+        after = None if before is None else in_turns(task, before, options, surfaces)
+        return None if after is before else after
+
+    def of_gaussians(before: SurfaceMesh | None) -> SurfaceMesh | None:
         cloud = fitted(task)
         return extract_surfaces(cloud, task.scan, surfaces.extraction) if cloud.matter.single else None
 
     if options.start == "learned":
         return (_if_any(of_gaussians),)
-    return (_if_any(of_gaussians), _if_any(of_volume)) if is_noisy(task, options) else (_if_any(of_volume),)
+    if is_noisy(task, options):
+        return (_if_any(of_gaussians), *surfaces_of_volume(task, options, surfaces))
+    return (_if_any(of_volume), of_turns)
 
 
 def surfaces_of_volume(task: Task, options: GaussianOptions, surfaces: SurfaceOptions) -> Sequence[Way]:
-    """Of the ways of `first_surfaces`, that of a volume alone."""
-    return (_if_any(lambda: _of_volume(task, options, surfaces)),)
+    """Of the ways of `first_surfaces` in noise, that of a volume with which surfaces have taken turns."""
+
+    def of_volume(before: SurfaceMesh | None) -> SurfaceMesh:
+        matter = material_of_levels(task, options.volume.backend, options.estimate)
+        rounds = replace(options.volume.in_noise(), refine=1)
+        volume, grid = holographic_tv(task.scan, matter, rounds, task.on_progress, task.uneven)
+        cut = cut_as_seen(task, volume, grid, Matter.one(*matter), surfaces)
+        how = options.coarse.of_views(len(task.scan.train()))
+        return in_turns(task, settled(task, cut, surfaces, how), options, surfaces)
+
+    return (_if_any(of_volume),)
 
 
 def _if_any(way: Way) -> Way:
     """The same way, which ends with None where there is no matter, or no surface."""
 
-    def found() -> SurfaceMesh | None:
+    def found(before: SurfaceMesh | None) -> SurfaceMesh | None:
         try:
-            return way()
+            return way(before)
         except InputError:
             return None
 
@@ -69,28 +83,21 @@ def _of_volume(task: Task, options: GaussianOptions, surfaces: SurfaceOptions) -
     Edges of a first volume are a part of a pixel off, which surfaces mend in a few steps; rounds do not bring them
     nearer. Where bodies crowd, the volume lacks whole parts of them, which surfaces cannot mend: so where they leave
     more than `CoarseToFine.missing` of the finest structure unexplained, the volume of rounds is cut, too, and what
-    leaves less is taken. In noise, which hides that structure, all matter counts (`missing_matter`), and rounds are
-    those of `HolographicTV.in_noise`.
+    leaves less is taken.
     """
-    tried, noisy = list[tuple[float, SurfaceMesh]](), is_noisy(task, options)
+    tried = list[tuple[float, SurfaceMesh]]()
     matter = material_of_levels(task, options.volume.backend, options.estimate)
-    most = options.coarse.missing_matter if noisy else options.coarse.missing
 
     def poor(volume: Tensor, grid: Grid) -> bool:
         """Whether the surfaces of a volume, which join those that were tried, explain the frames badly."""
-        try:
-            cut = cut_surfaces(volume, grid, task.scan.views.finest, Matter.one(*matter), surfaces.extraction)
-        except InputError:  # no surface yet
-            return True
-        left = missing_matter(cut, task, surfaces) if noisy else unexplained(cut, task.scan, surfaces)
-        tried.append((left, cut))
-        return left > most
+        cut = cut_surfaces(volume, grid, task.scan.views.finest, Matter.one(*matter), surfaces.extraction)
+        tried.append((unexplained(cut, task.scan, surfaces), cut))
+        return tried[-1][0] > options.coarse.missing
 
-    how = replace(options.volume.in_noise() if noisy else options.volume, refine=1)
+    how = replace(options.volume, refine=1)
     last = holographic_tv(task.scan, matter, how, task.on_progress, task.uneven, poor)
-    if not tried or tried[0][0] > most:
+    if not tried or tried[0][0] > options.coarse.missing:
         poor(*last)
-    require(len(tried) > 0, "the volume holds no surface.")
     return min(tried, key=lambda one: one[0])[1]
 
 

@@ -27,10 +27,10 @@ from ..ranges import ranged
 from ..representations import GaussianCloud, Stored, SurfaceMesh
 from ..scan import Scan
 from .coarse import STAGE as COARSE
-from .coarse import CoarseToFine, coarse_surfaces, last_steps
+from .coarse import CoarseToFine, Way, coarse_surfaces, last_steps
 from .coarse_cloud import cloud_of_surfaces
 from .field import field_of
-from .first_surfaces import Way, first_surfaces
+from .first_surfaces import first_surfaces
 from .gaussian_options import FitOptions, GaussianOptions, GaussianRates
 from .ground import Ground, ground
 from .learned import learned_cloud

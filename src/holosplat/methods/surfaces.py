@@ -15,8 +15,8 @@ from ..matter import MaterialPrior
 from ..progress import Progress
 from ..representations import GaussianCloud, Stored, SurfaceMesh
 from ..scan import Scan
-from .coarse import CoarseToFine, begun_surfaces, coarse_surfaces, missing_matter, on_pixels, settled
-from .first_surfaces import Way, is_noisy, surfaces_of_volume
+from .coarse import CoarseToFine, Way, begun_surfaces, coarse_surfaces, missing_matter, on_pixels, settled
+from .first_surfaces import is_noisy, surfaces_of_volume
 from .gaussians import Gaussians, GaussianStage
 from .keeper import CLEARLY
 from .method import Near, Stage, Task, quiet, run_quietly
@@ -83,7 +83,7 @@ class BodiesStage(GaussianStage):
         if other is None:
             return cut()
         try:
-            own = settled(seen, cut(), self.surfaces, how)
+            own = settled(seen, cut(), self.surfaces, how.of_views(len(seen.scan.train())))
         except InputError:  # Gaussians hold no surface
             return other
         return other if self._missing(other, seen) < CLEARLY * self._missing(own, seen) else own
@@ -171,7 +171,7 @@ def _by_coarse_pixels(cloud: Stored, task: Task, stage: SurfaceStage) -> Surface
         return None
 
     def first(coarse: Task) -> Sequence[Way]:
-        return (lambda: cut(coarse),)
+        return (lambda before: cut(coarse),)
 
     def cut(coarse: Task) -> SurfaceMesh:
         found = extract_surfaces(cloud, coarse.scan, stage.options.extraction)

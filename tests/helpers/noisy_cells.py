@@ -1,0 +1,52 @@
+"""Red cells in small noisy frames, whose fringes pixels hardly resolve, and what is compared with them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from helpers.bumpy import surfaces
+from holosplat.beamline.simulate import simulate
+from holosplat.geometry import Grid, Views
+from holosplat.materials import HAEMOGLOBIN
+from holosplat.matter import MaterialPrior
+from holosplat.methods import Task
+from holosplat.representations import SurfaceMesh
+from holosplat.scan import Exposures, Scan
+from holosplat.specimens import random_cells
+from holosplat.specimens.scene import MeshScene
+
+PITCH, SHAPE = 3.2e-6, (41, 55)
+MATTER = HAEMOGLOBIN.delta_beta(20.0)
+CELLS = random_cells(4, (40 * PITCH, 36 * PITCH, 40 * PITCH), 5, 18 * PITCH)
+
+
+def scan_of(photons: float) -> Scan:
+    """Sixteen views of cells of 18 pixels."""
+    scene = MeshScene.of_one_material(CELLS, MATTER)
+    views = Views.evenly_spaced(16, SHAPE, PITCH)
+    exposures = Exposures.of(views, 20.0, 0.1, 0.05)
+    return simulate(scene, exposures, photons_per_pixel=photons, seed=1, is_test=np.zeros(16, dtype=bool))
+
+
+def task_of(photons: float) -> Task:
+    """The reconstruction of these of known matter; of 2000 photons about half of the contrast is noise."""
+    return Task(scan_of(photons), MaterialPrior.known(MATTER)).evened()
+
+
+def mesh_of(count: int = 4) -> SurfaceMesh:
+    """The first cells, in pixels."""
+    return surfaces(*(replace(cell, vertices=cell.vertices / PITCH) for cell in CELLS[:count]), unit=PITCH)
+
+
+def occupancy(found: SurfaceMesh) -> np.ndarray:
+    """On voxels of a pixel."""
+    there = found.voxelise(Grid.of_views(Views.evenly_spaced(16, SHAPE, PITCH)))
+    return np.asarray(there.delta, dtype=float) / found.matter.delta
+
+
+def error(found: SurfaceMesh | np.ndarray) -> float:
+    """Of an occupancy, in parts of the truth."""
+    true, other = occupancy(mesh_of()), found if isinstance(found, np.ndarray) else occupancy(found)
+    return float(np.linalg.norm(other - true) / np.linalg.norm(true))
