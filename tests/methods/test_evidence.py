@@ -92,3 +92,13 @@ def test_a_floor_is_never_below_what_noise_may_hide():
     assert Floor(0.5, 0.1).taken_off(0.8) == pytest.approx(0.3)
     assert Floor(0.5, 0.1).taken_off(0.4) == 0.1
     assert replace(Floor(0.0, 0.0), mean=0.2).taken_off(0.2) == 0
+
+
+def test_what_noise_may_hide_is_not_missing():
+    noise, of_true = noise_of(False), judge(TRUE)
+    evidence, missing = Evidence(of_true, noise), []
+    for seed in range(100):
+        of_true.measured = TRUE + noise.drawn(1000 + seed)
+        missing.append(evidence.missing(TRUE))
+    assert np.mean([share > 0 for share in missing]) < 0.2  # 2 standard deviations, of 16 draws
+    assert evidence.missing(FIRST) == evidence.share(FIRST) > 0

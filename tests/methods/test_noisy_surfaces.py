@@ -172,7 +172,7 @@ def test_frames_without_much_noise_ask_nothing(monkeypatch):
 def test_surfaces_of_the_volume_explain_noisy_frames(noisy):
     found = begun_surfaces(noisy, lambda task: surfaces_of_volume(task, OPTIONS, HOW), HOW, OPTIONS.coarse)
     assert found is not None
-    assert missing_matter(found, noisy, HOW) < 1.5 * missing_matter(mesh_of(), noisy, HOW)
+    assert missing_matter(found, noisy, HOW) < 0.3 * missing_matter(mesh_of(3), noisy, HOW)
     assert error(found) < 0.25
 
 

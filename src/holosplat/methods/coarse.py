@@ -232,10 +232,11 @@ def unexplained(mesh: SurfaceMesh, scan: Scan, surfaces: SurfaceOptions) -> floa
 
 
 def missing_matter(found: SurfaceMesh | GaussianCloud, task: Task, surfaces: SurfaceOptions) -> float:
-    """Share of all matter in the frames of `task` that `found` leaves unexplained, beyond their noise (`Evidence`)."""
+    """Share of all matter in the frames of `task` that `found` leaves unexplained; 0 where noise may hide all of it
+    (`Evidence`)."""
     judge = MissingMatter(task.scan, DeltaBeta(found.matter.delta, found.matter.beta))
     there = found.on(resolve(surfaces.fit.backend))
-    return Evidence(judge, task.noise).share(judge.predicted(there, oversampling(task.scan, surfaces.fit)))
+    return Evidence(judge, task.noise).missing(judge.predicted(there, oversampling(task.scan, surfaces.fit)))
 
 
 def _finest(frames: Tensor) -> Tensor:

@@ -14,6 +14,8 @@ from .cross_validation import MissingMatter
 
 DRAWS = 16
 """Of the noise, for what it leaves of the matter: a standard deviation by so many is right to a sixth."""
+HIDDEN = 2.0
+"""Standard deviations of what noise leaves of the matter that it may hide."""
 SMALLEST = sys.float_info.min
 
 
@@ -48,6 +50,11 @@ class Evidence:
     def share(self, predicted: Tensor) -> float:
         """The share of all matter alone."""
         return math.sqrt(self._beyond(predicted)[0])
+
+    def missing(self, predicted: Tensor) -> float:
+        """The same; 0 where noise may hide all of it."""
+        matter, _ = self._beyond(predicted)
+        return math.sqrt(matter) if matter > HIDDEN * self.matter.deviation else 0.0
 
     def sureness(self, first: Tensor, second: Tensor) -> float:
         """By how many standard deviations of the noise the `first` prediction [V, H, W] leaves less than the second.
