@@ -29,7 +29,16 @@ from holosplat.workflows.evaluate import volume_scores
 
 TABLE = Path(__file__).resolve().parents[1] / "docs/data/few_photons.csv"
 MAIN = tuple(f"main12@{photons}" for photons in (2000, 1000, 500, 250))
-SCENES = (*MAIN, "noise12-500@500", "crowded12@1000", "cells12@300", "shells8@300", "foam12@500", "cells4@500")
+SCENES = (
+    *MAIN,
+    "noise12-500@500",
+    "crowded12@1000",
+    "cells12@300",
+    "shells8@300",
+    "foam12@500",
+    "cells4@500",
+    "main4@1000",
+)
 
 
 @dataclass(frozen=True)

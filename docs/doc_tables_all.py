@@ -91,6 +91,7 @@ TABLES = {
     "imperfections": Table(
         runs.imperfections, ("simulation_imperfections.csv",), "python docs/make_simulation.py", "minutes"
     ),
+    "few-photons": Table(runs.few_photons, ("few_photons.csv",), "python benchmarks/few_photons.py", "half an hour"),
     "series": Table(runs.series, ("series.csv",), "python benchmarks/series.py --csv docs/data/series.csv", "an hour"),
     "fibre": Table(runs.fibre, ("fibre.csv",), "python benchmarks/fibre.py", "ten minutes"),
     "skalak": Table(runs.skalak, ("tweezers.csv",), "python benchmarks/tweezers.py", "minutes"),

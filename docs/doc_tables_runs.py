@@ -12,6 +12,8 @@ from typing import Any
 
 from doc_tables import DATA, Row, markdown, read, rounded
 
+BEFORE_TURNS = "755086a0cc"
+"""The commit of the rows of few_photons.csv to compare with."""
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 
 
@@ -305,3 +307,20 @@ def faults() -> str:
     """What commands did when they were disturbed, kind by kind."""
     head = ("kind", "trials", "traceback", "hang", "crash", "silent", "lost")
     return markdown(head, [[row[name] for name in head] for row in read("faults.csv")])
+
+
+def few_photons() -> str:
+    """Closed bodies in few photons, at the commit before surfaces took turns with the volume, and after."""
+    rows, lines = read("few_photons.csv"), list[list[str]]()
+    before = {(r["scene"], r["seed"]): r for r in rows if r["commit"] == BEFORE_TURNS}
+    after = {(r["scene"], r["seed"]): r for r in rows if r["commit"] != BEFORE_TURNS}
+    for key, old in before.items():
+        new, (scene, photons) = after[key], key[0].split("@")
+        scores = (f"{rounded(row['dice'], 3)}, {rounded(row['error'], 3)}" for row in (old, new))
+        said = (row["explained"].replace("True", "yes").replace("False", "no") for row in (old, new))
+        times = (f"{float(row['seconds']):.0f}" for row in (old, new))
+        joined = (" → ".join(pair) for pair in (scores, said, times))
+        lines.append([f"`{scene}`", photons, key[1], rounded(old["noise"], 2), *joined])
+    lines.sort(key=lambda line: (line[0], -float(line[1]), line[2]))
+    head = ("case", "photons", "seed", "noise / contrast", "Dice, error of δ", "called explained", "seconds of a core")
+    return markdown(head, lines)
