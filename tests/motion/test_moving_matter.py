@@ -115,14 +115,16 @@ def test_a_drift_is_found_and_all_times_are_better_than_each_by_itself():
     scene, scan = series((4e-6, -2e-6, 3e-6), 250.0)
     how = search(scan, iterations=10, final=24)
     found, grid = how.run(), Grid.of_views(scan.views)
+    moments = range(len(TIMES))
     own = [
         error(how.by_itself(scan.at_instant(k), "one").voxelise(grid), scene.at(TIMES[k]).voxelise(grid))
-        for k in (0, 3)
+        for k in moments
     ]
-    together = [error(found.object.at(TIMES[k]).voxelise(grid), scene.at(TIMES[k]).voxelise(grid)) for k in (0, 3)]
-    assert np.mean(together) < 0.97 * np.mean(own)
+    together = [error(found.object.at(TIMES[k]).voxelise(grid), scene.at(TIMES[k]).voxelise(grid)) for k in moments]
+    usual = np.median(own)  # one time by itself may be lucky, on one processor and not on another
+    assert np.median(together) < 0.95 * usual
     between = error(found.object.at(0.3).voxelise(grid), scene.at(0.3).voxelise(grid))
-    assert between < 1.05 * np.mean(own)
+    assert between < 1.05 * usual
 
 
 def test_where_one_time_shows_nothing_all_of_them_begin(drifting, monkeypatch):
