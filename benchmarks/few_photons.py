@@ -86,10 +86,8 @@ def main() -> None:
     commit = source_commit()
     for scene in wanted.scenes:
         for seed in wanted.seeds:
-            identity = (scene, str(seed), wanted.method, commit)
-            if any(
-                tuple(row[key] for key in ("scene", "seed", "method", "commit")) == identity for row in read(wanted.out)
-            ):
+            sought = {"scene": scene, "seed": str(seed), "method": wanted.method, "commit": commit}
+            if any(row.items() >= sought.items() for row in read(wanted.out)):
                 continue
             row = row_of(scene, seed, wanted.method, commit)
             shown(row)

@@ -121,10 +121,9 @@ def test_a_drift_is_found_and_all_times_are_better_than_each_by_itself():
         for k in moments
     ]
     together = [error(found.object.at(TIMES[k]).voxelise(grid), scene.at(TIMES[k]).voxelise(grid)) for k in moments]
-    usual = np.median(own)  # one time by itself may be lucky, on one processor and not on another
-    assert np.median(together) < 0.95 * usual
+    assert np.mean(together) < 0.97 * np.mean(own)  # of all times: one of them may be lucky, on one processor alone
     between = error(found.object.at(0.3).voxelise(grid), scene.at(0.3).voxelise(grid))
-    assert between < 1.05 * usual
+    assert between < 1.05 * np.mean(own)
 
 
 def test_where_one_time_shows_nothing_all_of_them_begin(drifting, monkeypatch):

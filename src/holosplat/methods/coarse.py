@@ -51,14 +51,14 @@ class CoarseToFine:
     """The same of small frames, which begin on their own pixels: there Gaussians show what surfaces of a first volume
     miss (cells left 0.4 to 0.7 %, a foam 10 %)."""
     missing_matter: Share = 0.06
-    """Share of all matter, beyond noise, that what is found may leave unexplained before another way is tried. In
-    trials what was right left 0.04 to 0.05, and 0.09 or more where the error was a fifth and more."""
+    """Share of all matter, beyond noise, that what is found may leave unexplained before another way is tried. What
+    was right left 0.04 to 0.05, and 0.09 or more where the error was a fifth and more (looked at once)."""
     turns: int = 6
     """How often, at most, surfaces that leave more go back to the volume (`turns.in_turns`): a foam took three, 24
-    cells in 250 photons a pixel two."""
+    cells in 250 photons a pixel two (looked at once; no script keeps it)."""
     turn_gain: Share = 0.002
     """Part of the residual's square that a turn must take away for another one: turns that left the matter as it was
-    took 0.0005 at most, those that helped 0.005 or more."""
+    took 0.0005 at most, those that helped 0.005 or more (looked at once)."""
     coarse_steps: int = 40
     """Steps of the coarse surfaces."""
     finer_steps: int = 40

@@ -69,8 +69,8 @@ class BodiesStage(GaussianStage):
         return self.near_surfaces(task, surfaces) if straight or not self._small(task) else None
 
     def best_cut(self, task: Task, cloud: GaussianCloud, cut: Callable[[], SurfaceMesh]) -> SurfaceMesh:
-        """The surfaces that `cut` gets out of `cloud`; but of small noisy frames that this explains badly, those of the
-        volume after rounds of agreement, if they explain clearly more.
+        """The surfaces that `cut` gets out of `cloud`; but of small noisy frames that this explains badly, such as
+        have taken turns with a volume, if they explain clearly more.
 
         Errors: those of `cut`, where there are no others.
         """
