@@ -38,8 +38,8 @@ from .tomography import TotalVariation, tv_solver
 from .wave_frames import frames_of, refined
 
 IN_NOISE = 1.0
-"""Weight of total variation in rounds of agreement with noisy frames [pixels of path length]: 0.3 left up to a half more
-of the volume's error, and 2 about as much (looked at once; no script keeps it)."""
+"""Weight of total variation in rounds of agreement with noisy frames [pixels of path length]: 0.3 left up to a half
+more of the volume's error, and 2 about as much (looked at once; no script keeps it)."""
 
 Wanted = Callable[[Tensor, Grid], bool]
 """Whether the volume [Z, Y, X] that tomography has found, and its grid, are to be made to agree with the holograms."""
