@@ -310,6 +310,11 @@ JOBS = (
     ("start learned", {"rows": 96, "columns": 112, "views": 4}),
     ("onix", {"rows": 48, "columns": 56, "views": 4}),
     ("onix", {"rows": 80, "columns": 80, "views": 6}),
+    ("onix", {"rows": 80, "columns": 80, "views": 3}),
+    ("onix", {"rows": 64, "columns": 64, "views": 8}),
+    ("onix", {"rows": 48, "columns": 56, "views": 10}),
+    ("onix", {"rows": 96, "columns": 96, "views": 4}),
+    ("onix", {"rows": 128, "columns": 128, "views": 3}),
 )
 """Commands and their sizes."""
 

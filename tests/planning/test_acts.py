@@ -35,19 +35,10 @@ def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return importlib.import_module("needs_acts")
 
 
-TOO_MUCH = pytest.mark.xfail(
-    reason="two of five voxels are taken to show matter, of which these scenes have fewer", strict=True
-)
-"""Of pixel-aligned fields: 1.5 to 2.2 times what they take is said."""
-
-
 def measured_rows() -> list[object]:
-    """Those of the table; of pixel-aligned fields the first alone is said rightly."""
+    """Those of the table."""
     with TABLE.open() as file:
-        rows = list(csv.DictReader(file))
-    wrong = [row for row in rows if row["act"] == "onix"][1:]
-    name = "{act} {sizes}".format_map
-    return [pytest.param(row, id=name(row), marks=[TOO_MUCH] if row in wrong else []) for row in rows]
+        return [pytest.param(row, id="{act} {sizes}".format_map(row)) for row in csv.DictReader(file)]
 
 
 @pytest.mark.parametrize("row", measured_rows())

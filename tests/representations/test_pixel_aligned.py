@@ -14,6 +14,7 @@ from holosplat.geometry import Grid, Views
 from holosplat.matter import Matter
 from holosplat.model import Instrument, Model
 from holosplat.representations import AlignedNetwork, PixelAligned, PixelAlignedField
+from holosplat.representations.aligned_network import InParts
 from holosplat.representations.pixel_aligned import places_of
 from holosplat.scan import Exposures
 
@@ -83,6 +84,25 @@ def test_what_is_told_without_gradients_is_the_same_but_for_rounding(octaves, mo
     places[:, :4, :2] = torch.tensor([[-1.0, -1.0], [1.0, 1.0], [0.0, 1.0], [1 / 13, -1 / 9]])
 
     torch.testing.assert_close(network.told(features, places), network(features, places), rtol=1e-12, atol=1e-13)
+
+
+def test_gradients_in_parts_are_those_of_all_points_at_once(monkeypatch):
+    """Of features and weights, in float64, in four pieces of which the last is smaller."""
+    monkeypatch.setattr("holosplat.representations.aligned_network.CHUNK", 64)
+    generator = torch.Generator().manual_seed(7)
+    network = PixelAligned(AlignedNetwork((3, 4), 5, 2), 1).double()
+    features = torch.randn(3, 5, 9, 13, generator=generator, dtype=torch.float64, requires_grad=True)
+    places = 1.2 * (2 * torch.rand(3, 215, 3, generator=generator, dtype=torch.float64) - 1)
+    asked = torch.randn(215, 2, generator=generator, dtype=torch.float64)
+    leaves = [features, *network.parameters()]
+
+    found = InParts.apply(network, places, *leaves)
+
+    gradients = torch.autograd.grad((found * asked).sum(), leaves, allow_unused=True)  # type: ignore[operator]
+    wanted = torch.autograd.grad((network(features, places) * asked).sum(), leaves, allow_unused=True)
+    for ours, theirs in zip(gradients, wanted):  # those of the encoder, which has no part in it, are zero or None
+        torch.testing.assert_close(ours, torch.zeros_like(ours) if theirs is None else theirs, rtol=1e-10, atol=1e-12)
+    assert sum(theirs is not None for theirs in wanted) == 8
 
 
 def test_every_view_counts():

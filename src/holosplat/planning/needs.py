@@ -37,7 +37,7 @@ class Costs:
 
     program: float = 0.42e9
     """The program and its libraries."""
-    report: float = 0.75e9
+    report: float = 0.66e9
     """All of it while a run is judged and its report drawn."""
     frames: float = 24.0
     """A pixel of a frame: itself, and copies that are corrected, evened and compared."""
@@ -51,11 +51,14 @@ class Costs:
     """A voxel of a smooth volume: six pairs of L-BFGS, gradients and priors."""
     plain: float = 52.0
     """A voxel of a tomography by itself."""
-    aligned: float = 300.0
-    """A voxel of a pixel-aligned field, of which two in five show matter (from runs 48 to 80 voxels across, which
-    needs.csv does not hold)."""
-    feature: float = 460.0
-    """Such a voxel in a view: the features and the numbers that the network makes of them, with gradients."""
+    points: float = 0.11e9
+    """The points of a pixel-aligned field that are evaluated at once, and the weights."""
+    aligned: float = 90.0
+    """A voxel of such a field, of which two in five show matter: a fifth more is taken where all do."""
+    place: float = 5.0
+    """Such a voxel in a view: where its shadow lies."""
+    features: float = 1500.0
+    """A pixel of its images: what the encoder makes of it, with gradients."""
     waves: float = 150.0
     """A wave sample of all views in a fit, with its gradient."""
     edges: float = 105.0
@@ -200,7 +203,8 @@ def _parts(sizes: Sizes, method: Method) -> tuple[float, float, float] | None:
     if isinstance(method, Onix | PixelNerf):
         small, steps = sizes.joined(method.fit.max_voxels), method.fit.schedule.steps
         seen = small.views * small.voxels
-        memory = Costs.aligned * small.voxels + Costs.feature * seen + Costs.waves * sizes.waves()
+        memory = Costs.points + Costs.aligned * small.voxels + Costs.place * seen + Costs.features * small.pixels
+        memory += Costs.waves * sizes.waves()
         return memory, 5 + 0.9e-6 * steps * seen, small.voxels
     gaussians = method if isinstance(method, Gaussians) else getattr(method, "gaussians", None)
     return _bodies(sizes, gaussians, gaussians is not method) if isinstance(gaussians, Gaussians) else None

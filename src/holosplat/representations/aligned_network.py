@@ -8,11 +8,14 @@ at the point (pixelNeRF, Yu et al. 2021; ONIX, Zhang et al. 2023). So any number
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.func import functional_call
 from torch.nn.functional import embedding_bag, grid_sample, interpolate, leaky_relu
 
 from ..checks import at_least, require
@@ -23,7 +26,7 @@ INPUTS = 3
 SLOPE = 0.1
 """Of the leaky rectifiers."""
 CHUNK = 1 << 12
-"""Points that are evaluated at once where no gradient is needed: what is made of them stays in the cache."""
+"""Points that are evaluated at once: what is made of them stays in the cache."""
 FIRST_LOGIT = -2.0
 """What a network without training says everywhere, before it is bounded: little, so that frames ask for more."""
 
@@ -101,7 +104,7 @@ class PixelAligned(nn.Module):
 
     def told(self, features: Tensor, places: Tensor) -> Tensor:
         """What `forward` gives, but for rounding, without gradients and several times faster: few points at a time,
-        whose features are rows of a table."""
+        whose features are rows of a table. `InParts` has gradients as well."""
         table = features.permute(0, 2, 3, 1).flatten(0, 2).contiguous()
         shape = (features.shape[0], features.shape[2], features.shape[3])
         with torch.no_grad():
@@ -124,6 +127,56 @@ class PixelAligned(nn.Module):
         rates = math.pi * 2.0 ** torch.arange(self.size.octaves, device=depth.device)
         phase = depth[..., None] * rates.to(depth)
         return torch.cat([phase.sin(), phase.cos()], -1)
+
+
+class InParts(torch.autograd.Function):
+    """`PixelAligned.told` with gradients for features and weights, which are made for few points at a time.
+
+    On the way back the numbers of these points are made once more by `forward`: that takes the memory of few points
+    instead of all, and less time, for what is made of them stays in the cache.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, net: PixelAligned, places: Tensor, features: Tensor, *weights: Tensor) -> Tensor:
+        """Numbers [N, C] at `places` [V, N, 3], by `features` [V, F, H, W] and the weights of `net` in its order."""
+        ctx.net, ctx.places = net, places
+        ctx.save_for_backward(features, *weights)
+        return called(net, "told", _by_name(net, weights), features, places)
+
+    @staticmethod
+    def backward(ctx: Any, *given: Tensor) -> tuple[Tensor | None, ...]:
+        """Gradients of features and weights, by those of the numbers [N, C]."""
+        leaves = [tensor.detach().requires_grad_() for tensor in ctx.saved_tensors]
+        weights = _by_name(ctx.net, leaves[1:])
+        total = [torch.zeros_like(leaf) for leaf in leaves]
+        for places, grad in zip(ctx.places.split(CHUNK, dim=1), given[0].split(CHUNK)):
+            with torch.enable_grad():
+                found = called(ctx.net, "forward", weights, leaves[0], places)
+            for sum_, part in zip(total, torch.autograd.grad(found, leaves, grad, allow_unused=True)):
+                if part is not None:
+                    sum_ += part
+        return None, None, *total
+
+
+def called(net: PixelAligned, name: str, weights: Mapping[str, Tensor], *arguments: Tensor) -> Tensor:
+    """What the method `name` of `net` returns with other weights, by their names."""
+    return functional_call(_Calling(net, name), {f"net.{key}": weight for key, weight in weights.items()}, arguments)
+
+
+def _by_name(net: PixelAligned, weights: Sequence[Tensor]) -> dict[str, Tensor]:
+    return {name: weight for (name, _), weight in zip(net.named_parameters(), weights)}
+
+
+class _Calling(nn.Module):
+    """A network one of whose methods is called, so that `functional_call` can give it other weights."""
+
+    def __init__(self, net: PixelAligned, name: str) -> None:
+        super().__init__()
+        self.net, self._name = net, name
+
+    def forward(self, *arguments: Tensor) -> Tensor:
+        """What the method returns."""
+        return getattr(self.net, self._name)(*arguments)
 
 
 def _corners(places: Tensor, shape: tuple[int, int, int]) -> tuple[Tensor, Tensor]:

@@ -10,7 +10,6 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from torch import Tensor
-from torch.func import functional_call
 from torch.nn.functional import softplus
 
 from ..backends import in_main_memory
@@ -20,7 +19,7 @@ from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..tables import from_table, to_table
 from ..volume import LineIntegrals, Volume
-from .aligned_network import INPUTS, AlignedNetwork, PixelAligned
+from .aligned_network import INPUTS, AlignedNetwork, InParts, PixelAligned, called
 from .voxels import VoxelGrid
 
 DEFAULT = AlignedNetwork()
@@ -68,7 +67,7 @@ class PixelAlignedField:
         self.images, self.views, self.mask, self.grid, self.matter = images, views, mask.bool(), grid, matter
         self.network, self.upper, self.backend = network, float(upper), "cpu"
         self._cells = self.mask.flatten().nonzero()[:, 0]
-        self._places = places_of(grid, views, self._cells).to(images.dtype)
+        self._places = places_of(grid, views, self._cells, images.dtype)
         self._still = VoxelGrid(images.new_zeros(len(matter), *grid.shape), grid, matter)
         self._last: tuple[bytes, VoxelGrid] | None = None
 
@@ -85,18 +84,14 @@ class PixelAlignedField:
 
     def values(self) -> Tensor:
         """Values [C, Z, Y, X] at the centres of the voxels, zero outside the mask; differentiable in the weights."""
-        features = self._call("encoded", self.images)
+        features = called(self._net, "encoded", self.weights, self.images)
         if len(self._cells):
-            name = "forward" if torch.is_grad_enabled() else "told"
-            found = self._bounded(self._call(name, features, self._places))
+            told = InParts.apply(self._net, self._places, features, *self.weights.values())
+            found = self._bounded(told)  # type: ignore[arg-type]
         else:
             found = self.images.new_zeros(0, len(self.matter))
         whole = found.new_zeros(self.mask.numel(), len(self.matter))
         return whole.index_copy(0, self._cells, found).T.reshape(-1, *self.grid.shape)
-
-    def _call(self, name: str, *arguments: Tensor) -> Tensor:
-        weights = {f"net.{key}": weight for key, weight in self.weights.items()}
-        return functional_call(_Calling(self._net, name), weights, arguments)
 
     def _bounded(self, raw: Tensor) -> Tensor:
         """Values [N, C] of the network's numbers [N, 2]."""
@@ -194,34 +189,22 @@ class PixelAlignedField:
         )
 
 
-class _Calling(torch.nn.Module):
-    """A network one of whose methods is called, so that `functional_call` can give it other weights."""
-
-    def __init__(self, net: PixelAligned, name: str) -> None:
-        super().__init__()
-        self.net, self._name = net, name
-
-    def forward(self, *arguments: Tensor) -> Tensor:
-        """What the method returns."""
-        return getattr(self.net, self._name)(*arguments)
-
-
-def places_of(grid: Grid, views: Views, cells: Tensor) -> Tensor:
+def places_of(grid: Grid, views: Views, cells: Tensor, dtype: torch.dtype = torch.float64) -> Tensor:
     """Where the centres of the voxels `cells` [N] (flat) of `grid` lie in each view: [V, N, 3], as `PixelAligned` takes
-    them; float64. Depths are those along the beam from the middle of the grid."""
+    them, reckoned in float64. Depths are those along the beam from the middle of the grid."""
     z, y, x = (torch.from_numpy(np.ascontiguousarray(axis)) for axis in grid.axes()[::-1])
     nz, ny, nx = grid.shape
     points = torch.stack([x[cells % nx], y[cells // nx % ny], z[cells // (nx * ny)]], 1)
     h, w = views.shape
     middle = torch.as_tensor(np.asarray(grid.centre, dtype=np.float64))
     half = 0.5 * positive("voxel size", grid.voxel_size[0], "metres") * max(nx, nz)
-    found = []
-    for rotation, shift, pixel in zip(views.rotations, views.shifts, views.pixel_sizes):
+    found = torch.empty(len(views), len(cells), 3, dtype=dtype)
+    for place, rotation, shift, pixel in zip(found, views.rotations, views.shifts, views.pixel_sizes):
         turn = torch.from_numpy(np.ascontiguousarray(rotation))
         across = (points @ turn[:2].T - torch.from_numpy(shift.copy())) / (0.5 * float(pixel))
         depth = (points - middle) @ turn[2] / half
-        found.append(torch.stack([across[:, 0] / w, across[:, 1] / h, depth], 1))
-    return torch.stack(found)
+        place[:, 0], place[:, 1], place[:, 2] = across[:, 0] / w, across[:, 1] / h, depth
+    return found
 
 
 def _require_shapes(given: Mapping[str, Tensor], wanted: Mapping[str, Tensor]) -> None:
