@@ -14,8 +14,9 @@ from holosplat.baselines import HolographicTV
 from holosplat.learning.lattice import Taps
 from holosplat.learning.start import LearnedStart
 from holosplat.learning.weights import Card, Trained
-from holosplat.methods import Gaussians, Task
+from holosplat.methods import Gaussians, Surfaces, Task
 from holosplat.methods.beginning import Beginning
+from holosplat.methods.coarse import CoarseToFine
 from holosplat.methods.cross_validation import MissingMatter
 from holosplat.methods.evidence import Evidence
 from holosplat.methods.gaussians import GaussianStage
@@ -23,6 +24,7 @@ from holosplat.methods.learned import _Trial
 from holosplat.methods.method import solve_stages
 from holosplat.methods.start import starting_cloud
 from holosplat.optics.noise_model import NoiseModel
+from holosplat.representations import GaussianCloud, SurfaceMesh
 from holosplat.specimens import Ball
 
 MATERIAL = hs.DeltaBeta(2e-7, 2e-10)
@@ -66,7 +68,8 @@ def begun(scan: hs.Scan, monkeypatch, aside: float, typical: float, prior=KNOWN)
     monkeypatch.setattr(LearnedStart, "network", property(lambda self: trained))
     told = list[Beginning]()
     task = Task(scan, prior, on_beginning=told.append)
-    found = GaussianStage(OPTIONS).own_start(task)
+    found = GaussianStage(OPTIONS).start(task, None)
+    assert isinstance(found, GaussianCloud)
     assert len(told) == 1
     return found.centres, starting_cloud(task, replace(OPTIONS, start="phase")).centres, told[0]
 
@@ -164,3 +167,27 @@ def test_a_run_with_a_guess_that_is_not_taken_is_that_without(scan, monkeypatch)
     assert all(
         torch.equal(value, plain.state()[name]) for name, value in ours.state().items() if isinstance(value, Tensor)
     )
+
+
+@pytest.mark.parametrize(("aside", "typical"), [(4e-6, 0.0), (4e-6, 1.0)], ids=["contradicted", "compared"])
+@pytest.mark.parametrize("rows", [24, 12], ids=["small frames", "large frames"])
+def test_surfaces_beside_a_guess_that_is_not_taken_are_those_without(monkeypatch, aside, typical, rows):
+    trained = Trained(Says(aside), Card(typical_misfit={"6": typical}))  # type: ignore[arg-type]
+    monkeypatch.setattr(LearnedStart, "network", property(lambda self: trained))
+    monkeypatch.setattr("holosplat.methods.coarse.FEWEST_ROWS", rows // 2)
+    views = hs.Views.evenly_spaced(6, (36, 38), PIXEL)
+    ball = hs.MeshScene.of_one_material([Ball(CENTRE / 2, 16 * PIXEL).mesh()], MATERIAL)
+    scan = hs.simulate(ball, hs.Exposures.of(views, 12.0, 0.02), is_test=np.zeros(6, dtype=bool), oversample=4)
+    short = replace(OPTIONS.fit, schedule=replace(OPTIONS.fit.schedule, steps=5))
+    coarse = CoarseToFine(columns=18 if rows == 12 else 128, chord=2.0, coarse_steps=4, finer_steps=3, last_steps=3)
+    told, found = list[Beginning](), dict[str, SurfaceMesh]()
+
+    for start in ("phase", "learned"):
+        gaussians = replace(OPTIONS, start=start, fit=short, coarse=coarse)
+        made = solve_stages(Surfaces(gaussians=gaussians).with_effort(0.1), Task(scan, KNOWN, on_beginning=told.append))
+        assert isinstance(made, SurfaceMesh)
+        found[start] = made
+
+    assert [each.taken for each in told] == ["phase"]
+    assert torch.equal(found["learned"].vertices, found["phase"].vertices)
+    assert torch.equal(found["learned"].faces, found["phase"].faces)

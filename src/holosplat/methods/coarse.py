@@ -131,7 +131,8 @@ def coarse_surfaces(task: Task, first: First, surfaces: SurfaceOptions, how: Coa
     most = how.missing_small if factor == 1 else how.missing
     finest = 1 if factor == 1 else 2
     while factor >= finest and found is None:
-        found = _first(binned(task, factor), first, surfaces, how)
+        coarse = binned(task, factor)
+        found = first_of(coarse, first(coarse), surfaces, how)
         factor //= 2
     if found is None:
         return None
@@ -163,13 +164,14 @@ def binned(task: Task, factor: int) -> Task:
 def begun_surfaces(task: Task, first: First, surfaces: SurfaceOptions, how: CoarseToFine) -> SurfaceMesh | None:
     """Surfaces on the frames' own pixels after their first steps, of thin bodies, too; None where there are none."""
     how = replace(how.of_views(len(task.scan.train())), chord=0.0)
-    return _first(binned(task, 1), first, surfaces, how)
+    own = binned(task, 1)
+    return first_of(own, first(own), surfaces, how)
 
 
-def _first(task: Task, first: First, surfaces: SurfaceOptions, how: CoarseToFine) -> SurfaceMesh | None:
-    """The first surfaces after some steps, by the first way that explains the frames, or else by the one that does
-    best; None where there are none, or their bodies are too thin for the pixels."""
-    ways, tried, found = first(task), list[tuple[float, SurfaceMesh]](), None
+def first_of(task: Task, ways: Sequence[Way], surfaces: SurfaceOptions, how: CoarseToFine) -> SurfaceMesh | None:
+    """The first surfaces after some steps on the pixels of `task`, by the first of `ways` that explains the frames, or
+    else by the one that does best; None where there are none, or their bodies are too thin for the pixels."""
+    tried, found = list[tuple[float, SurfaceMesh]](), None
     for way in ways:
         start = way(found)
         if start is None or mean_chord(start) < how.chord * task.scan.views.finest:

@@ -28,9 +28,9 @@ def first_surfaces(
     """Surfaces cut out of the volume of retrieval and tomography, on voxels of a pixel, and where these explain the
     frames badly, such as have taken turns with that volume (`in_turns`).
 
-    The task is `bounded`. In noise (`HolographicTV.noisy`), and where a network is asked, surfaces are those of
-    Gaussians `fitted` to the frames, whose start and terms on the volume hold against it; and in noise those of the
-    volume are the second way, for of bodies that pixels hardly resolve Gaussians may lose most.
+    The task is `bounded`. In noise (`HolographicTV.noisy`) surfaces are those of Gaussians `fitted` to the frames,
+    whose start and terms on the volume hold against it; and those of the volume are the second way, for of bodies that
+    pixels hardly resolve Gaussians may lose most.
     """
 
     def of_volume(before: SurfaceMesh | None) -> SurfaceMesh:
@@ -44,8 +44,6 @@ def first_surfaces(
         cloud = fitted(task)
         return extract_surfaces(cloud, task.scan, surfaces.extraction) if cloud.matter.single else None
 
-    if options.start == "learned":
-        return (_if_any(of_gaussians),)
     if is_noisy(task, options):
         return (_if_any(of_gaussians), *surfaces_of_volume(task, options, surfaces))
     return (_if_any(of_volume), of_turns)

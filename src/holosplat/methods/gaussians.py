@@ -33,7 +33,7 @@ from .field import field_of
 from .first_surfaces import first_surfaces
 from .gaussian_options import FitOptions, GaussianOptions, GaussianRates
 from .ground import Ground, ground
-from .learned import learned_cloud
+from .learned import guessed_cloud, ways_of_guess
 from .method import Near, Stage, Task, run_quietly
 from .start import starting_cloud
 from .surface_fit import SurfaceFit, SurfaceOptions, oversampling
@@ -82,6 +82,12 @@ class GaussianStage:
     name: str = "fit"
 
     def start(self, task: Task, before: Stored | None) -> Stored | Near:
+        """What the fit begins with; of small frames where a network is asked, what it is without one, or its guess."""
+        if self.options.start == "learned" and self._small(task):
+            return self._or_guess(task, replace(self, options=self._without_network).start(task, before))
+        return self._start(task)
+
+    def _start(self, task: Task) -> Stored | Near:
         """The starting cloud: of surfaces on coarse pixels, or its own."""
         how = SurfaceOptions(fit=SurfaceFit(backend=self.options.fit.backend))
         surfaces = self.coarse_surfaces(task, how)
@@ -90,12 +96,27 @@ class GaussianStage:
         surfaces = last_steps(self._without_validation(task), surfaces, how, self.options.coarse)
         return Near(cloud_of_surfaces(surfaces, task).on(resolve(self.options.volume.backend)))
 
-    def own_start(self, task: Task) -> GaussianCloud:
+    def own_start(self, task: Task) -> Stored | Near:
         """The starting cloud on the pixels of `task`."""
+        plain = starting_cloud(self._without_validation(task), self._without_network)
+        return self._or_guess(task, plain) if self.options.start == "learned" else plain
+
+    def _or_guess(self, task: Task, plain: Stored | Near) -> Stored | Near:
+        """The cloud of the network's guess where that is begun with, else what is begun with without it."""
+        start = plain.object if isinstance(plain, Near) else plain
+        assert isinstance(start, GaussianCloud | SurfaceMesh)
         seen = self._without_validation(task)
-        if self.options.start == "learned":
-            return learned_cloud(seen, self.options, self._fitted)
-        return starting_cloud(seen, self.options)
+        guess = guessed_cloud(seen, self.options, self._fitted, lambda: start)
+        return plain if guess is None else guess
+
+    @property
+    def _without_network(self) -> Gaussians:
+        """The same options where no network is asked."""
+        return replace(self.options, start="phase") if self.options.start == "learned" else self.options
+
+    def _small(self, task: Task) -> bool:
+        """Whether its frames begin on their own pixels."""
+        return self.options.coarse.factor(task.scan.views.shape) == 1
 
     def _without_validation(self, task: Task) -> Task:
         """`task` without the frames that validate its fit."""
@@ -125,8 +146,7 @@ class GaussianStage:
 
     def coarse_surfaces(self, task: Task, surfaces: SurfaceOptions) -> SurfaceMesh | None:
         """Surfaces near to those of the frames, where these are large and coarse pixels show the bodies."""
-        small = self.options.coarse.factor(task.scan.views.shape) == 1
-        return None if small else self.near_surfaces(task, surfaces)
+        return None if self._small(task) else self.near_surfaces(task, surfaces)
 
     def near_surfaces(self, task: Task, surfaces: SurfaceOptions) -> SurfaceMesh | None:
         """The same of frames of any size."""
@@ -134,14 +154,21 @@ class GaussianStage:
         if how.columns == 0 or options.start == "random" or not task.bounded:
             return None
 
+        plain = replace(self, options=self._without_network)
+
         def first(coarse: Task) -> Sequence[Way]:
-            return first_surfaces(coarse, options, surfaces, self.solved)
+            ways = first_surfaces(coarse, plain.options, surfaces, plain.solved)
+            if options.start == "phase":
+                return ways
+            return ways_of_guess(coarse, ways, options, surfaces, self._fitted)
 
         return coarse_surfaces(self._without_validation(task), first, surfaces, how)
 
     def solved(self, task: Task) -> GaussianCloud:
         """The cloud fitted to the frames of `task`."""
-        found = run_quietly(self.fit(task, self.own_start(task)), task.report(f"{COARSE}: Gaussians"))
+        start = self.own_start(task)
+        assert isinstance(start, GaussianCloud)
+        found = run_quietly(self.fit(task, start), task.report(f"{COARSE}: Gaussians"))
         assert isinstance(found, GaussianCloud)
         return found
 

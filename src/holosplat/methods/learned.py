@@ -9,7 +9,7 @@ run is the same as without a network.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from torch import Tensor
@@ -19,6 +19,7 @@ from ..learning.start import GuessedMatter, LearnedStart, contradicted, guessed
 from ..matter import DeltaBeta
 from ..representations import GaussianCloud, SurfaceMesh
 from .beginning import Beginning
+from .coarse import Way, first_of
 from .cross_validation import MissingMatter, predicted_frames
 from .evidence import Evidence
 from .gaussian_options import GaussianOptions
@@ -32,41 +33,85 @@ STAGE = "both starts"
 Fitted = Callable[[Task, GaussianCloud, int], GaussianCloud]
 """A cloud after so many steps."""
 
+Plain = Callable[[], GaussianCloud | SurfaceMesh]
+"""What the run begins with where no network is asked."""
 
-def learned_cloud(task: Task, options: GaussianOptions, fitted: Fitted) -> GaussianCloud:
-    """The cloud to start from: of the network's guess, or the ordinary one. `task.on_beginning` is told which, and why.
 
-    fitted: the fit of Gaussians. Errors: those of `guessed`, of the weights' file and of both starts.
+def ways_of_guess(
+    task: Task, ways: Sequence[Way], options: GaussianOptions, surfaces: SurfaceOptions, fitted: Fitted
+) -> Sequence[Way]:
+    """Ways to first surfaces: of Gaussians fitted from the network's guess, where that is begun with, else `ways`.
+
+    ways: those without a network, each of which is gone once only; fitted: the fit of Gaussians. Errors: as for
+    `guessed_cloud`.
     """
-    how, ordinary = options.learned, replace(options, start="phase")
+    ways, how = [_once(way) for way in ways], options.coarse.of_views(len(task.scan.train()))
+
+    def plain() -> GaussianCloud | SurfaceMesh:
+        found = first_of(task, ways, surfaces, how)
+        return starting_cloud(task, replace(options, start="phase")) if found is None else found
+
+    cloud = guessed_cloud(task, options, fitted, plain)
+    if cloud is None:
+        return ways
+
+    def of_guess(before: SurfaceMesh | None) -> SurfaceMesh | None:
+        return _cut(task, fitted(task, cloud, options.fit.schedule.steps), surfaces)
+
+    return (of_guess,)
+
+
+def _once(way: Way) -> Way:
+    """The same way, which is gone once: what came before it is the same every time."""
+    found = list[SurfaceMesh | None]()
+
+    def gone(before: SurfaceMesh | None) -> SurfaceMesh | None:
+        if not found:
+            found.append(way(before))
+        return found[0]
+
+    return gone
+
+
+def guessed_cloud(task: Task, options: GaussianOptions, fitted: Fitted, plain: Plain) -> GaussianCloud | None:
+    """The cloud of the network's guess, or None where the run is the same as without it. `task.on_beginning` is told
+    which, and why.
+
+    fitted: the fit of Gaussians; plain: what the guess has to do clearly better than, as surfaces where it is some.
+    Errors: those of `guessed`, of the weights' file and of both starts.
+    """
     if len(task.prior.materials) == 2:
         why = "The network guesses one material, and two are known: the run began with phase retrieval."
-        return _begun(task, Beginning("phase", why), starting_cloud(task, ordinary))
+        return _begun(task, Beginning("phase", why))
     material = material_of_levels(task, options.volume.backend, options.estimate)
-    trained = how.network
+    how, trained = options.learned, options.learned.network
     found = guessed(task.scan, material, trained.network, task.on_progress)
     guess = GuessedMatter.of(found, material, trained.network)
     refused = contradicted(found, how, trained.card)
     if refused:
         why = f"The frames contradict the network's guess ({refused}): the run began with phase retrieval."
-        return _begun(task, Beginning("phase", why, guess), starting_cloud(task, ordinary))
-    clouds = starting_cloud(task, ordinary), cloud_of(found.values, found.grid, material, task, options)
-    won, why = _compared(task, clouds, material, how, fitted)
-    return _begun(task, Beginning("learned" if won else "phase", why, guess), clouds[won])
+        return _begun(task, Beginning("phase", why, guess))
+    cloud = cloud_of(found.values, found.grid, material, task, options)
+    won, why = _compared(task, (plain(), cloud), material, options, fitted)
+    return _begun(task, Beginning("learned" if won else "phase", why, guess), cloud if won else None)
 
 
 def _compared(
-    task: Task, clouds: tuple[GaussianCloud, GaussianCloud], material: DeltaBeta, how: LearnedStart, fitted: Fitted
+    task: Task,
+    starts: tuple[GaussianCloud | SurfaceMesh, GaussianCloud],
+    material: DeltaBeta,
+    options: GaussianOptions,
+    fitted: Fitted,
 ) -> tuple[bool, str]:
-    """Whether the second cloud, of the guess, is begun with, and why.
+    """Whether the second start, of the guess, is begun with, and why.
 
     A short fit of both says whether the guess may be better. It is taken if it still is after the steps of a whole one:
     in noise the ordinary start takes longest to find edges.
     """
-    evidence, told = Evidence(MissingMatter(task.scan, material), task.noise), list[str]()
+    how, evidence, told = options.learned, Evidence(MissingMatter(task.scan, material), task.noise), list[str]()
     rounds = {"for a while": (how.trial_steps, how.trial_surfaces), "to the end": (how.last_steps, how.last_surfaces)}
     for said, steps in rounds.items():
-        plain, learned = (_Trial.of(task, cloud, evidence, steps, fitted) for cloud in clouds)
+        plain, learned = (_Trial.of(task, start, evidence, steps, fitted) for start in starts)
         told.append(
             f"fitted {said}, {{}} leaves {100 * learned.left:.2g} % of the frames unexplained, "
             f"and phase retrieval {100 * plain.left:.2g} %"
@@ -78,7 +123,7 @@ def _compared(
     return True, f"The run began with the network's guess: {'; '.join(each.format('it') for each in told)}."
 
 
-def _begun(task: Task, beginning: Beginning, cloud: GaussianCloud) -> GaussianCloud:
+def _begun(task: Task, beginning: Beginning, cloud: GaussianCloud | None = None) -> GaussianCloud | None:
     task.on_beginning(beginning)
     return cloud
 
@@ -93,12 +138,23 @@ class _Trial:
     closed: bool
 
     @classmethod
-    def of(cls, task: Task, cloud: GaussianCloud, evidence: Evidence, steps: tuple[int, int], fitted: Fitted) -> _Trial:
-        """That of `cloud`, as Gaussians, and then as surfaces where it has some: they hold edges, and cannot explain by
+    def of(
+        cls,
+        task: Task,
+        start: GaussianCloud | SurfaceMesh,
+        evidence: Evidence,
+        steps: tuple[int, int],
+        fitted: Fitted,
+    ) -> _Trial:
+        """That of `start`, as Gaussians, and then as surfaces where it has some: they hold edges, and cannot explain by
         half a density what is in the wrong place. steps: of both."""
         quiet = replace(task, on_progress=lambda stage, fraction: task.on_progress(STAGE, fraction))
-        found = fitted(quiet, cloud, steps[0])
-        surfaces = _surfaces(quiet, found, steps[1]) if task.bounded else None
+        if isinstance(start, SurfaceMesh):
+            surfaces = _settled(quiet, start, steps[1])
+            found = surfaces
+        else:
+            found = fitted(quiet, start, steps[0])
+            surfaces = _surfaces(quiet, found, steps[1]) if task.bounded else None
         samples = 0 if surfaces is None else oversampling(task.scan)
         predicted = predicted_frames(task.scan.exposures, found if surfaces is None else surfaces, samples)
         return cls(evidence.left(predicted), predicted, surfaces is not None)
@@ -111,12 +167,22 @@ class _Trial:
 
 def _surfaces(task: Task, cloud: GaussianCloud, steps: int) -> SurfaceMesh | None:
     """The surfaces of a cloud after so many steps; None where there are none."""
-    options = SurfaceOptions()
-    try:
-        start = extract_surfaces(cloud, task.scan, options.extraction)
-    except InputError:  # no surface anywhere
-        return None
-    fit: SurfaceFit = replace(options.fit, schedule=replace(options.fit.schedule, steps=steps), backend=cloud.backend)
+    start = _cut(task, cloud, SurfaceOptions())
+    return None if start is None else _settled(task, start, steps)
+
+
+def _settled(task: Task, start: SurfaceMesh, steps: int) -> SurfaceMesh:
+    """Surfaces after so many steps."""
+    fit = SurfaceFit()
+    fit = replace(fit, schedule=replace(fit.schedule, steps=steps), backend=start.backend)
     found = run_quietly(surface_fit(task.scan, start, fit, task.seed, task.uneven), task.report(STAGE))
     assert isinstance(found, SurfaceMesh)
     return found
+
+
+def _cut(task: Task, cloud: GaussianCloud, surfaces: SurfaceOptions) -> SurfaceMesh | None:
+    """The surfaces of a cloud; None where there are none."""
+    try:
+        return extract_surfaces(cloud, task.scan, surfaces.extraction)
+    except InputError:  # no surface anywhere
+        return None

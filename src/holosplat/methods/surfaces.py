@@ -58,7 +58,7 @@ class BodiesStage(GaussianStage):
 
     surfaces: SurfaceOptions = field(default_factory=SurfaceOptions)
 
-    def start(self, task: Task, before: Stored | None) -> Stored | Near:
+    def _start(self, task: Task) -> Stored | Near:
         """Surfaces near to the frames', or the starting cloud."""
         found = self.coarse_surfaces(task, self.surfaces)
         return self.own_start(task) if found is None else Near(found)
@@ -91,12 +91,9 @@ class BodiesStage(GaussianStage):
     def _missing(self, found: SurfaceMesh | GaussianCloud, task: Task) -> float:
         return missing_matter(found, task, self.surfaces)
 
-    def _small(self, task: Task) -> bool:
-        return self.options.coarse.factor(task.scan.views.shape) == 1
-
     def _straight(self, task: Task) -> bool:
         """Whether surfaces of small frames may come before Gaussians."""
-        return self.options.start == "phase" and task.freedom is None and self.options.coarse.columns > 0
+        return self.options.start != "random" and task.freedom is None and self.options.coarse.columns > 0
 
     def fit(self, task: Task, start: Stored) -> Fit | None:  # type: ignore[override]
         """The fit of the cloud; none of surfaces, for the next stage has it."""
