@@ -7,6 +7,7 @@ that has gone blind fails too.
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -282,6 +283,18 @@ def test_the_tests_mirror_the_rooms_in_short_files(files):
     names = [path.rsplit("/", 1)[-1] for path in found if "/test_" in path]
     assert sorted(set(names)) == sorted(names)
     assert not files_are_short(found)
+
+
+def test_the_pages_name_the_tiers(files):
+    """CONTRIBUTING.md lists all rooms, lowest first; architecture.md those above the nouns."""
+    contributing, architecture = (
+        (TESTS.parent / page).read_text(encoding="utf-8") for page in ("CONTRIBUTING.md", "docs/design/architecture.md")
+    )
+    listed = contributing.split("Imports run downwards only:")[1].split("Rooms of one tier")[0]
+    assert [set(tier.split()) for tier in listed.split("←")] == [set(tier) for tier in TIERS]
+    listed = architecture.split("Imports run downwards only: nouns ←")[1].split(". A test")[0]
+    said = [re.sub(r"\(.*?\)|[{},.]", " ", tier).split() for tier in listed.split("←")]
+    assert [set(tier) for tier in said] == [set(tier) for tier in TIERS[1:]]
 
 
 def test_the_exceptions_are_still_needed(files):
