@@ -76,7 +76,8 @@ def tasks() -> list[Task]:
     again += [replace(task, seed=seed) for seed in SEEDS[1:] for task in at_once[len(SMALL) :]]
     large = [Task(schedule, name) for schedule, name in product(("short", "third", "full"), LARGE)]
     first = [*at_once[:3], long[0], *short, *at_once[3 : len(SMALL)], *others, large[0], *at_once[len(SMALL) :]]
-    return [*first, *again, *long[1:], *large[1:], Task("full", MAIN, "thesis8")]
+    slow = [replace(task, schedule="full") for task in others]
+    return [*first, *again, *long[1:], *large[1:], *slow]
 
 
 def finished(runs: Path, task: Task) -> bool:
