@@ -62,6 +62,16 @@ def test_an_empty_object_is_said_to_be_empty():
     assert not on(scan, soft(0.0)).good
 
 
+def test_frames_of_noise_show_no_matter_whatever_was_fitted_to_them():
+    scan = a_scan(soft(), 3000)
+    noise = np.random.default_rng(3).normal(1.0, 0.02, scan.frames.shape).astype(np.float32)
+    found = on(replace(scan, frames=noise), soft(0.02, seed=2))
+    assert not found.good
+    assert found.words.startswith("No matter was found")
+    assert found.reasons[0] == "What the volume holds was fitted to noise."
+    assert "--bin" in found.reasons[1]
+
+
 @pytest.mark.parametrize("photons", [None, 3000, 100_000])
 def test_the_truth_is_good(photons):
     found = on(a_scan(soft(), photons), soft())

@@ -38,6 +38,8 @@ BELOW = 0.8
 """Residual over noise (rms) below which a fit has followed the noise."""
 ODD = 1.5
 """Residual of a view over the median one (rms) from which on the view is named."""
+NOISE_TOLD = 0.05
+"""Share of the noise's power that its estimate may be wrong by."""
 POWERS = ("residual", "noise", "contrast", "allowed")
 """What residuals have the power of, by view and band."""
 MOST_VIEWS = 4
@@ -103,6 +105,7 @@ LEAVES = (
 )
 NOTHING = "No matter was found: the frames are noise to within what is known of it, or matter is fainter than that."
 """What is said of an empty object that explains its frames: right where nothing was in the beam, and else wrong."""
+OF_NOISE = "What the volume holds was fitted to noise."
 HELP = (
     "If something was in the beam, take more photons, join pixels (--bin), or give more of what is known (--material)."
 )
@@ -114,10 +117,13 @@ that are looked at."""
 def judge(said: Prediction, frames: Scan, noise: NoiseModel | None = None) -> Verdict:
     """The verdict on what is said of `frames`, whose exposures the prediction has; noise: None to estimate it."""
     measured = torch.from_numpy(frames.frames)
-    found = verdict(residuals(said, measured, (noise or _noise(measured)).power()))
+    left = residuals(said, measured, (noise or _noise(measured)).power())
+    found = verdict(left)
     absorbing, refracting = _matter(said)
-    if found.good and not bool(absorbing.any() or refracting.any()):
-        return replace(found, good=False, words=NOTHING, reasons=(HELP, *found.reasons))
+    if not bool(absorbing.any() or refracting.any()):
+        return replace(found, good=False, words=NOTHING, reasons=(HELP, *found.reasons)) if found.good else found
+    if _shows_nothing(left):
+        return replace(found, good=False, words=NOTHING, reasons=(OF_NOISE, HELP))
     if found.good or not _leaves_the_field(refracting):
         return found
     return replace(found, reasons=(LEAVES, *found.reasons))
@@ -136,6 +142,13 @@ def _leaves_the_field(matter: torch.Tensor) -> bool:
     """Whether about as much `matter` [v, H, W] is in the outermost rows of the frames as in the others."""
     outer = torch.cat([matter[:, :OUTER_ROWS], matter[:, -OUTER_ROWS:]], dim=1)
     return float(outer.mean()) > LEAVING * float(matter.mean())
+
+
+def _shows_nothing(found: Residuals) -> bool:
+    """Whether frames have no more power than their noise in any band, whatever was fitted to them."""
+    counts, views = found.rings.counts, len(found.contrast)
+    chance = SURE * np.sqrt(2 / (counts * views))
+    return bool((found.contrast.mean(axis=0) <= (1 + NOISE_TOLD + chance) * found.noise.mean(axis=0)).all())
 
 
 def _noise(frames: torch.Tensor) -> NoiseModel:
