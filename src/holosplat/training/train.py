@@ -23,6 +23,7 @@ from ..learning.network import Guess
 from ..learning.weights import Card, write_weights
 from ..tables import to_table
 from .folder import Dataset
+from .limits import limits
 from .objective import loss
 from .options import TrainOptions
 from .sample import Sample
@@ -144,8 +145,9 @@ class Training:
     def finish(self, validation: Validation, made_by: dict[str, str]) -> Path:
         """Write the weights with their card; their file."""
         card = validation.card(self.network, to_table(self.data.ranges) | {"seed": self.data.seed}, made_by)
+        said = limits(self.data.ranges, self.options.shown.views, card.scores)
         path = self.folder / WEIGHTS
-        self._write(path, replace(card, training=_settings(self.data, self.options)["options"]))
+        self._write(path, replace(card, training=_settings(self.data, self.options)["options"], limits=said))
         return path
 
     def _write(self, path: Path, card: Card) -> None:
