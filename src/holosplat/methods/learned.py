@@ -18,6 +18,7 @@ from ..checks import InputError
 from ..learning.start import GuessedMatter, LearnedStart, contradicted, guessed
 from ..matter import DeltaBeta
 from ..representations import GaussianCloud, SurfaceMesh
+from ..units import in_percent
 from .beginning import Beginning
 from .cross_validation import MissingMatter, predicted_frames
 from .evidence import Evidence
@@ -68,8 +69,8 @@ def _compared(
     for said, steps in rounds.items():
         plain, learned = (_Trial.of(task, cloud, evidence, steps, fitted) for cloud in clouds)
         told.append(
-            f"fitted {said}, {{}} leaves {100 * learned.left:.2g} % of the frames unexplained, "
-            f"and phase retrieval {100 * plain.left:.2g} %"
+            f"fitted {said}, {{}} leaves {in_percent(learned.left)} of the frames unexplained, "
+            f"and phase retrieval {in_percent(plain.left)}"
         )
         if not learned.clearly_better(plain, evidence, how):
             first, *others = told

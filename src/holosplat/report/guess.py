@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from matplotlib.figure import Figure
 
+from ..units import in_percent
 from ..volume import Volume
 from .block import Block, drawn_block
 from .figures import plane_sizes, richest_planes, slice_row, slice_titles
@@ -27,7 +28,7 @@ def guess_block(shown: GuessShown) -> Block:
         text += (
             "d to f, the standard deviation of guesses without one of the views each: where it is large, few frames "
             "say what is there. g to i, the occupancy of the reconstruction. "
-            f"{100 * shown.unsure:.2g} % of its matter lies where guesses differ by more than {UNSURE:g}. There it may "
+            f"{in_percent(shown.unsure)} of its matter lies where guesses differ by more than {UNSURE:g}. There it may "
             "be a guess also after the fit, for other matter might explain the frames as well."
         )
     return drawn_block("What was guessed", text, "A network's guess, and its spread.", guess_figure(shown), "png")
