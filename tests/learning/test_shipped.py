@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import inspect
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ import torch
 
 from holosplat.learning.weights import SHIPPED, read_weights
 from holosplat.training.objective import dice
+from holosplat.training.options import TrainOptions
 from holosplat.training.ranges import Ranges
 from holosplat.training.sample import sample_of
 from holosplat.training.shown import whole
@@ -25,6 +27,7 @@ def test_they_are_small_and_say_what_they_were_trained_on():
     assert SHIPPED.stat().st_size < 5e6
     assert not card.made_by["commit"].endswith("dirty")
     assert card.trained_on["kinds"] == ["red-cells"]
+    assert f"made with {card.training['steps']}." in inspect.getsource(TrainOptions)
     assert set(card.typical_misfit) == {"2", "3", "4", "6"}
 
 
