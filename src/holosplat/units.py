@@ -74,6 +74,17 @@ def wavenumber(energy_kev: Energy) -> Energy:
     return 2 * math.pi / wavelength(energy_kev)
 
 
+def two_digits(value: float) -> str:
+    """`value` to two digits, or to a whole number from a hundred on; never with an exponent."""
+    rounded = np.rint(value) if abs(value) >= 99.5 else float(f"{value:.2g}")
+    return np.format_float_positional(rounded, trim="-")
+
+
+def in_percent(share: float) -> str:
+    """`share` in per cent, to `two_digits`: 100 %, 3.1 %, 0.43 %."""
+    return f"{two_digits(100 * float(share))} %"
+
+
 def span(values: np.ndarray) -> str:
     """The least and the greatest of `values` in words, to four digits; one number where these are the same."""
     low, high = (f"{value:.4g}" for value in (values.min(), values.max()))

@@ -58,8 +58,9 @@ def test_a_guess_that_the_frames_contradict_is_not_begun_with_and_the_run_says_s
 
     assert "start: The frames contradict the network's guess" in done.out
     assert RunFolder(tmp_path / "run").read_summary()["decided"]["begun"].endswith("began with phase retrieval.")
-    guess, spread = read_guess(tmp_path / "run" / "guess.h5")
+    guess, spread, of_copies = read_guess(tmp_path / "run" / "guess.h5")
     assert spread is not None
+    assert not of_copies
     assert guess.delta.shape == spread.shape
 
 

@@ -16,7 +16,8 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn.functional import embedding_bag
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map_only
@@ -156,6 +157,8 @@ class Pretence(TorchFunctionMode):
             return OnGpu(args[0].inner.new_tensor(*args[1:], **kwargs))
         if func in PRODUCTS and isinstance(args[0], OnGpu) and args[0].ndim == 1 and args[1].ndim == 2:
             return (args[0][None] @ args[1])[0]  # torch changes a shape in place, which wrappers do not notice
+        if func is embedding_bag and isinstance(args[1], OnGpu):  # torch makes its offsets past all modes
+            return (args[1][args[0]] * kwargs["per_sample_weights"][..., None]).sum(1)
         if func is Tensor.__setitem__ and isinstance(args[0], OnGpu):
             return _set(*args)
         if func is torch.as_tensor and isinstance(args[0], Tensor) and _is_gpu(kwargs.get("device")):
@@ -188,6 +191,15 @@ def _set(tensor: OnGpu, index: Any, value: Any) -> None:
     if isinstance(value, Tensor):
         refuse_mixed("assignment", value)
     tensor.inner[plain(index)] = plain(value)
+
+
+def _module_to(module: nn.Module, device: Any) -> nn.Module:
+    """A network moved as `nn.Module.to` does it, with parameters that are wrapped anew: torch would swap their data."""
+    for part in module.modules():
+        for name, weight in part._parameters.items():
+            if weight is not None:
+                part._parameters[name] = nn.Parameter(_to(weight.detach(), device), weight.requires_grad)
+    return module
 
 
 class _Products:
@@ -241,6 +253,8 @@ def pretended_gpu(patch: pytest.MonkeyPatch, kernels: bool = True) -> Iterator[N
 
     patch.setattr(GridExecutor, "__call__", unwrapped)
     patch.setattr(torch.autograd, "_engine_run_backward", backward)
+    patch.setattr(nn.Module, "to", _module_to)
+    patch.setattr(torch, "inference_mode", torch.no_grad)  # wrappers have no tensors of inference
     patch.setattr(torch.cuda, "is_available", lambda: True)
     patch.setattr(torch.cuda, "device", lambda device: nullcontext())
     patch.setattr(torch.cuda, "get_device_name", lambda *_: "a pretended GPU")

@@ -15,17 +15,18 @@ from holosplat.volume import Volume
 GRID = Grid((3, 4, 5), (1e-6, 1e-6, 1e-6), (0.0, 1e-6, 2e-6))
 
 
+@pytest.mark.parametrize("of_copies", [False, True])
 @pytest.mark.parametrize("spread", [None, np.random.default_rng(0).random(GRID.shape).astype(np.float32)])
-def test_a_guess_comes_back_and_is_a_volume_to_others(tmp_path, spread):
+def test_a_guess_comes_back_and_is_a_volume_to_others(tmp_path, spread, of_copies):
     delta = np.random.default_rng(1).random(GRID.shape).astype(np.float32)
-    write_guess(tmp_path / "guess.h5", Volume(delta, 1e-3 * delta, GRID), spread)
+    write_guess(tmp_path / "guess.h5", Volume(delta, 1e-3 * delta, GRID), spread, of_copies)
 
-    volume, found = read_guess(tmp_path / "guess.h5")
+    volume, found, of = read_guess(tmp_path / "guess.h5")
 
     assert np.array_equal(volume.delta, delta)
     assert volume.grid == read_volume(tmp_path / "guess.h5").grid == GRID
     assert (found is None) == (spread is None)
-    assert found is None or np.array_equal(found, spread)
+    assert found is None or (np.array_equal(found, spread) and of == of_copies)
 
 
 def test_a_spread_of_another_shape_is_refused(tmp_path):

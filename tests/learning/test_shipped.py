@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import importlib
+import inspect
+from pathlib import Path
+
 import pytest
 import torch
 
 from holosplat.learning.weights import SHIPPED, read_weights
 from holosplat.training.objective import dice
+from holosplat.training.options import TrainOptions
 from holosplat.training.ranges import Ranges
 from holosplat.training.sample import sample_of
 from holosplat.training.shown import whole
@@ -22,7 +27,18 @@ def test_they_are_small_and_say_what_they_were_trained_on():
     assert SHIPPED.stat().st_size < 5e6
     assert not card.made_by["commit"].endswith("dirty")
     assert card.trained_on["kinds"] == ["red-cells"]
+    assert f"made with {card.training['steps']}." in inspect.getsource(TrainOptions)
     assert set(card.typical_misfit) == {"2", "3", "4", "6"}
+
+
+def test_they_say_where_they_fail(monkeypatch):
+    """As `python benchmarks/card_of_weights.py` writes it: run it where docs/data/learned.csv has changed."""
+    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[2] / "benchmarks"))
+    card = read_weights().card
+
+    assert "It knows red cells alone, 10 to 22 pixels across" in card.limits
+    assert "It is worst in 2 views: on 16 scenes of another seed the mean Dice coefficient is 0.71." in card.limits
+    assert card.limits == importlib.import_module("card_of_weights").said_of(card)
 
 
 @pytest.mark.parametrize(("views", "least"), [(2, 0.5), (4, 0.7)])

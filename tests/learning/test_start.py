@@ -11,7 +11,7 @@ import holosplat as hs
 from holosplat.geometry import Views
 from holosplat.learning.lattice import Taps
 from holosplat.learning.network import FINE, THICKNESS
-from holosplat.learning.start import guessed, spread
+from holosplat.learning.start import GuessedMatter, guessed, spread
 from holosplat.specimens import Ball
 
 MATERIAL = hs.DeltaBeta(2e-7, 2e-10)
@@ -77,6 +77,37 @@ def test_what_the_views_agree_on_has_no_spread():
 
     inside = found.values > 0.99
     assert float(doubt[inside].mean()) < 0.05 < float(doubt.max())  # two views alone see matter beside it
+
+
+def two_views() -> hs.Scan:
+    return scan_of((40, 48))[np.arange(2)]
+
+
+def test_with_two_views_guesses_of_an_equivariant_network_have_no_spread():
+    network = Shadows()
+    found = guessed(two_views(), MATERIAL, network, lambda stage, fraction: None)  # type: ignore[arg-type]
+
+    kept = GuessedMatter.of(found, MATERIAL, network)  # type: ignore[arg-type]
+
+    assert kept.of_copies
+    assert kept.spread.shape == kept.volume.grid.shape
+    assert kept.spread.max() < 1e-5
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_with_two_views_it_shows_where_a_network_guesses_by_directions_of_its_own(axis):
+    class Sided(Shadows):
+        """Prefers one side of the field, whatever the frames say."""
+
+        def forward(self, images: Tensor, taps: Taps) -> tuple[Tensor, Tensor]:
+            guess = super().forward(images, taps)[1]
+            side = torch.linspace(-2, 2, guess.shape[axis]).reshape([-1 if n == axis else 1 for n in range(3)])
+            return guess + side, guess + side
+
+    network = Sided()
+    found = guessed(two_views(), MATERIAL, network, lambda stage, fraction: None)  # type: ignore[arg-type]
+
+    assert float(spread(found, network).max()) > 0.1  # type: ignore[arg-type]
 
 
 def test_an_empty_guess_leaves_everything():

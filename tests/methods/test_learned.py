@@ -81,7 +81,8 @@ def test_a_right_guess_is_begun_with(scan, monkeypatch):
     assert "The run began with the network's guess: fitted for a while, it leaves " in told.why
     assert found.shape != ordinary.shape or not torch.equal(found, ordinary)
     assert told.guess is not None
-    assert told.guess.spread is None  # there are two views
+    assert told.guess.of_copies  # there are two views
+    assert told.guess.spread.shape == told.guess.volume.grid.shape
 
 
 def test_a_guess_that_explains_less_changes_nothing(scan, monkeypatch):

@@ -26,9 +26,18 @@ def test_the_caption_says_how_much_of_the_matter_is_guessed():
     assert block.drawn
 
 
-def test_two_views_have_no_spread_and_the_caption_says_so():
+def test_the_caption_says_of_which_guesses_the_spread_is():
+    found = np.ones(GRID.shape, np.float32)
+
+    of_views, of_copies = (guess_block(GuessShown(found, found, found, GRID, "Begun.", of)) for of in (False, True))
+
+    assert "guesses without one of the views each" in of_views.caption
+    assert "guesses of the same scene mirrored and turned" in of_copies.caption
+
+
+def test_a_run_without_a_spread_says_so():
     found = np.ones(GRID.shape, np.float32)
 
     block = guess_block(GuessShown(found, found, None, GRID, "Begun."))
 
-    assert "one of two views alone says too little" in block.caption
+    assert "Where it is guessed, this run did not keep." in block.caption

@@ -104,6 +104,7 @@ def test_weights_go_to_the_method_of_their_name(data, tmp_path, sample):
 
     assert (found.size, found.card.made_by, found.card.training["network"]) == (SMALL, {"commit": "abc"}, "onix")
     assert set(found.card.scores) == {"2", "3"}
+    assert "It saw scenes in 2 and 3 views" in found.card.limits
     guess = AlignedFit(weights=str(path), schedule=Schedule(steps=0))
     field = solve(Onix(guess), Task(scan(), KNOWN, 5))
     assert isinstance(field, PixelAlignedField)

@@ -106,6 +106,7 @@ def test_weights_say_what_they_are(data, tmp_path):
     assert card.trained_on["across"] == [10.0, 22.0]
     assert card.training["steps"] == 6
     assert set(card.scores) == set(card.typical_misfit) == {"2", "3"}
+    assert card.limits.startswith("It knows red cells alone, 10 to 22 pixels across")
 
 
 def test_other_options_and_folders_are_refused(data, tmp_path):

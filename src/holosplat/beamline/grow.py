@@ -27,6 +27,7 @@ from ..specimens.flow.suspension import Medium, Suspension
 from ..specimens.membrane.model import Elasticity, Membrane
 from ..specimens.membrane.resting import resting_cell
 from ..specimens.red_cells import DIAMETER, SHUFFLES, place_cells
+from ..units import in_percent
 
 FORMAT = "holosplat cells 1"
 TRAVEL = 1e-6
@@ -240,7 +241,7 @@ def _require_kept(membrane: Membrane, nodes: Tensor, time: float) -> None:
         require(
             abs(float(change[cell])) <= most,
             f"the {name} of a cell must stay within {100 * most:g} % of that at rest, but that of cell {cell} changed "
-            f"by {100 * float(change[cell]):.2g} % at {time:.4g} s; raise {modulus}, or lower --flow.",
+            f"by {in_percent(float(change[cell]))} at {time:.4g} s; raise {modulus}, or lower --flow.",
         )
 
 

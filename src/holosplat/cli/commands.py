@@ -100,6 +100,7 @@ def reconstruct(
     from ..methods.method import takes_series
     from ..methods.uncertain import Uncertain
     from ..planning.acts import of_space_time
+    from ..planning.seen import can_be_seen
     from ..workflows.reconstruct import reconstruct as fit
     from ..workflows.run_folder import RunFolder, claimed
     from .motion import asks_for_motion, may_go_on, reconstruct_in_motion
@@ -118,11 +119,12 @@ def reconstruct(
     ways, folder = asked.ways(reading), RunFolder(out)
     measured = read_as(scan, replace(reading, told=reading.told.at_middle()))
     prior = asked.matter.without_ranges().prior(measured.exposures.reference_energy)
+    measured = measured.in_memory() if can_be_seen(measured) else measured
     seen = measured.exposures[~measured.is_test]
     if isinstance(method, Pinn):
         tell_frames(method.kind, seen, out, lambda frames: of_space_time(frames, method))
     elif not measured.is_series:
-        tell_reconstruction(seen, out, method, prior, ways["matter"])
+        tell_reconstruction(measured, out, method, prior, ways["matter"], ways["refine"] is not None)
     measured = measured.in_memory()
     plain = may_go_on(folder, resume) and ways["refine"] is None and ways["uncertain"] == Uncertain()
     if asks_for_motion(reading, method, ways["matter"], plain):

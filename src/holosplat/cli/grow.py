@@ -12,6 +12,7 @@ from ..io.lock import sole_writer
 from ..planning.acts import of_growth
 from ..planning.needs import Needs
 from ..specimens.membrane.resting import nodes_of
+from ..units import in_percent
 from .progress import INTERRUPTED, ProgressBar
 from .room import tell
 
@@ -36,7 +37,7 @@ def grow(out: Path, what: Growth, resume: bool = False) -> None:
     _say(
         f"wrote {SeriesFolder(out).collection}: {grown.snapshots} snapshots of {what.cells} cells, "
         f"{what.period:.4g} s apart; {grown.state.taken} steps, {grown.state.refused} refused; "
-        f"volume within {100 * grown.volume:.2g} %, area within {100 * grown.area:.2g} %"
+        f"volume within {in_percent(grown.volume)}, area within {in_percent(grown.area)}"
     )
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..planning.contrast import Setup
 from ..planning.plan import Motion, Plan, Recording, Sampling, Storage, Survey, Waves
+from ..units import in_percent
 
 WIDTH = 38
 MOST_ROWS = 9
@@ -30,7 +31,7 @@ Group = tuple[str, list[tuple[str, str]]]
 
 def _waves(plan: Plan) -> Group:
     waves = plan.waves
-    absorbed = f"{abs(100 * waves.absorption):.2g} % {'more' if waves.absorption >= 0 else 'less'} than the medium"
+    absorbed = f"{in_percent(abs(waves.absorption))} {'more' if waves.absorption >= 0 else 'less'} than the medium"
     rows = [
         ("Δδ, Δβ", f"{waves.delta:.3g}, {waves.beta:.3g}"),
         ("Fresnel number, object's radius", f"{waves.fresnel_object:.3g}"),

@@ -11,21 +11,23 @@ if TYPE_CHECKING:
     from ..matter import MaterialPrior, MatterKind
     from ..methods import Method
     from ..planning.needs import Needs
-    from ..scan import Exposures
+    from ..scan import Exposures, Scan
 
 
 def tell_reconstruction(
-    exposures: Exposures, out: Path, method: Method, prior: MaterialPrior, matter: MatterKind | None
+    scan: Scan, out: Path, method: Method, prior: MaterialPrior, matter: MatterKind | None, whole: bool = False
 ) -> None:
-    """Say what the reconstruction of training frames takes; `InputError` where there is less. Of a known material
-    frames nearly always say that it has levels."""
+    """Say what the reconstruction of the training frames of `scan` takes; `InputError` where there is less. Of a known
+    material frames nearly always say that it has levels. whole: whether it works on whole frames in any case."""
     from ..matter import Known
     from ..planning.needs import Sizes, of_reconstruction, smaller
+    from ..planning.seen import seen_of
 
+    exposures = scan.exposures[~scan.is_test]
     if len(exposures) == 0:
         return  # there is nothing to fit, as the fit will say
     kind = matter or ("levels" if isinstance(prior, Known) else None)
-    needs = of_reconstruction(Sizes.of(exposures), method, kind)
+    needs = of_reconstruction(Sizes.of(exposures), method, kind, seen_of(scan, method, whole))
     if needs is not None:
         tell(method.kind, needs, out, smaller(exposures, method, kind))
 

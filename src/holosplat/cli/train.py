@@ -12,12 +12,12 @@ from ..training.options import TrainOptions
 from .progress import INTERRUPTED, ProgressBar
 from .room import tell
 
-A_NIGHT = TrainOptions()
-"""What the shipped weights were made with."""
+DEFAULT = TrainOptions()
+"""More steps than the weights of the package were made with: their card says how many."""
 
 
 def train(
-    data: Positional[Path], out: Path, how: Annotated[TrainOptions, OmitArgPrefixes] = A_NIGHT, resume: bool = False
+    data: Positional[Path], out: Path, how: Annotated[TrainOptions, OmitArgPrefixes] = DEFAULT, resume: bool = False
 ) -> None:
     """Train a network on scenes of `holosplat dataset`: weights with a card, and curves.
 
@@ -43,7 +43,7 @@ def train(
     tell("the training", of_training(frames, views, how.network, how.size, how.steps), out)
     kind = Training if how.network == "start" else AlignedTraining
     training = (kind.resumed if resume else kind.begun)(scenes, out, how)
-    who = made_by(how.device)  # before files change under a night's work
+    who = made_by(how.device)  # before files change under hours of work
     with ProgressBar() as bar:
         told = Validation.of(
             scenes.ranges, scenes.seed, how.validation, lambda fraction: bar.show("scenes to validate", fraction, {})

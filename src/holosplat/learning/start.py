@@ -19,6 +19,7 @@ from ..progress import Progress
 from ..ranges import Natural, Share, Weight, ranged
 from ..scan import Scan
 from ..volume import Volume
+from .copies import COPIES
 from .images import images, retrieved_thickness
 from .lattice import Taps
 from .network import FINE, Guess, coarse, thickness_of
@@ -31,6 +32,8 @@ CLEARLY = 0.75
 """What larger pixels may leave unexplained, over what smaller ones leave: these show shapes better."""
 FEWEST = 32
 """Rows and columns of binned frames, at least."""
+FEWEST_VIEWS = 3
+"""Views of which one can be left out to see what the others say."""
 
 
 @dataclass(frozen=True)
@@ -116,19 +119,20 @@ def contradicted(found: Guessed, how: LearnedStart, card: Card) -> str:
 class GuessedMatter:
     """What a network guessed, to be kept and shown.
 
-    volume: δ and β; spread: [Z, Y, X] float32, standard deviation of occupancy in guesses without one of the views
-    each; None for two views, one of which says too little
+    volume: δ and β; spread: [Z, Y, X] float32, standard deviation of occupancy in several guesses; of_copies: whether
+    these are of copies of the scene, not without one of the views each
     """
 
     volume: Volume
-    spread: np.ndarray | None
+    spread: np.ndarray
+    of_copies: bool
 
     @classmethod
     def of(cls, found: Guessed, material: DeltaBeta, network: Guess) -> GuessedMatter:
-        """What `network` guesses of `material`, and what it guesses without one of the views each."""
+        """What `network` guesses of `material`, and where its guesses differ (`spread`)."""
         values = found.values.numpy()
         volume = Volume(values * material.delta, values * material.beta, found.grid)
-        return cls(volume, spread(found, network).numpy() if len(found.images) > 2 else None)
+        return cls(volume, spread(found, network).numpy(), len(found.images) < FEWEST_VIEWS)
 
 
 def _factors(scan: Scan) -> Sequence[int]:
@@ -156,15 +160,23 @@ def unexplained(values: Tensor, seen: Tensor, taps: Taps, factor: int = 1) -> fl
 
 def spread(found: Guessed, network: Guess) -> Tensor:
     """Standard deviation [Z, Y, X] of what `network` guesses without one of the views each: where it is large, few
-    frames say what is there. Zeros for two views, one of which says too little."""
-    count = len(found.images)
-    if count < 3:
-        return torch.zeros_like(found.values)
-    every = torch.arange(count)
+    frames say what is there. Of two views, one of which says too little, it is that of guesses of copies of the scene
+    (`COPIES`): where it is large, the network guesses what the frames do not say."""
+    few = len(found.images) < FEWEST_VIEWS
     with torch.inference_mode():
-        rest = [every[every != left_out] for left_out in range(count)]
-        guesses = [torch.sigmoid(network(found.images[some], found.taps.part(some))[1]) for some in rest]
-    return torch.stack(guesses).std(0).clone()
+        guesses = _of_copies(found, network) if few else _without_each(found, network)
+        return torch.stack(guesses).std(0).clone()
+
+
+def _without_each(found: Guessed, network: Guess) -> list[Tensor]:
+    every = torch.arange(len(found.images))
+    rest = [every[every != left_out] for left_out in every]
+    return [torch.sigmoid(network(found.images[some], found.taps.part(some))[1]) for some in rest]
+
+
+def _of_copies(found: Guessed, network: Guess) -> list[Tensor]:
+    guesses = [network(copy.images(found.images), copy.taps(found.taps))[1] for copy in COPIES]
+    return [torch.sigmoid(copy.back(guess)) for copy, guess in zip(COPIES, guesses)]
 
 
 def _shown(scan: Scan, material: DeltaBeta) -> tuple[Tensor, Views, Grid]:

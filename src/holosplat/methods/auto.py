@@ -12,6 +12,7 @@ from ..fit.loop import Fit
 from ..matter import DeltaBeta, MatterKind
 from ..ranges import Share, ranged
 from ..representations import GaussianCloud, Stored, SurfaceMesh, VoxelGrid
+from ..units import in_percent
 from .assumed import assumed_material
 from .cross_validation import CrossValidation, MissingMatter
 from .evidence import Evidence
@@ -86,7 +87,7 @@ class Auto:
             return decision
         said, best = f"{decision.why}; {tried.in_words}", min(tried.beyond, key=lambda matter: tried.beyond[matter])
         if best != decision.matter and not tried.clearly(best):
-            return replace(decision, why=f"{said}, noise {100 * tried.noise**0.5:.2g} %, which decides nothing")
+            return replace(decision, why=f"{said}, noise {in_percent(tried.noise**0.5)}, which decides nothing")
         return Decision(best, said)
 
     def on_backend(self, backend: Backend) -> Auto:
@@ -153,7 +154,7 @@ class Trial:
     @property
     def in_words(self) -> str:
         """What either leaves."""
-        said = (f"{KINDS[matter]} leave {100 * share:.2g} %" for matter, share in self.shares.items())
+        said = (f"{KINDS[matter]} leave {in_percent(share)}" for matter, share in self.shares.items())
         return f"in a trial, {' and '.join(said)} of the matter in views set aside unexplained"
 
 

@@ -18,6 +18,7 @@ from ..checks import InputError
 from ..learning.start import GuessedMatter, LearnedStart, contradicted, guessed
 from ..matter import DeltaBeta
 from ..representations import GaussianCloud, SurfaceMesh
+from ..units import in_percent
 from .beginning import Beginning
 from .coarse import Way, first_of
 from .cross_validation import MissingMatter, predicted_frames
@@ -113,8 +114,8 @@ def _compared(
     for said, steps in rounds.items():
         plain, learned = (_Trial.of(task, start, evidence, steps, fitted) for start in starts)
         told.append(
-            f"fitted {said}, {{}} leaves {100 * learned.left:.2g} % of the frames unexplained, "
-            f"and phase retrieval {100 * plain.left:.2g} %"
+            f"fitted {said}, {{}} leaves {in_percent(learned.left)} of the frames unexplained, "
+            f"and phase retrieval {in_percent(plain.left)}"
         )
         if not learned.clearly_better(plain, evidence, how):
             first, *others = told

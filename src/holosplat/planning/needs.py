@@ -30,6 +30,7 @@ from ..methods import (
 from ..methods.coarse_cloud import MOST_GAUSSIANS
 from ..optics.sampling import fringe_sampling, padding
 from ..scan import Exposures
+from ..units import two_digits
 
 
 class Costs:
@@ -73,6 +74,12 @@ class Costs:
     """A number that is written."""
     page: float = 8e6
     """The report and the tables of a run."""
+    judged: float = 75.0
+    """A wave sample of whole frames, by which surfaces that were fitted in windows are judged."""
+    judging: float = 1e-6
+    """Seconds that it takes."""
+    turns: float = 2.5
+    """Times what a fit of Gaussians takes: that, and turns of surfaces and volume, in noise."""
 
 
 SAFETY = 1.1
@@ -137,33 +144,80 @@ def on_larger_pixels(exposures: Exposures, binning: int) -> Exposures:
 
 @dataclass(frozen=True)
 class Needs:
-    """What a job takes at its peak: memory and disk [bytes], time [s], the last to a factor of three."""
+    """What a job takes at its peak: memory and disk [bytes], time [s], the last to a factor of three; most_seconds: the
+    time where frames may ask for more than they mostly do (0: they do not)."""
 
     memory: float
     disk: float
     seconds: float = 0.0
+    most_seconds: float = 0.0
 
     def line(self) -> str:
         """In words."""
-        time = f", and about {_time(self.seconds)}" if self.seconds else ""
+        time = f", and about {_times(self.seconds, self.most_seconds)}" if self.seconds else ""
         return f"takes about {_size(self.memory)} of memory, {_size(self.disk)} on the disk{time}"
 
     def times(self, count: int) -> Needs:
         """What so many of the same take, one after the other."""
-        return Needs(self.memory, count * self.disk, count * self.seconds)
+        return Needs(self.memory, count * self.disk, count * self.seconds, count * self.most_seconds)
 
     def fit(self, path: Path) -> bool:
         """Whether there is so much memory, and disk at `path`."""
         return SAFETY * self.memory <= free_memory() + Costs.program and self.disk <= free_disk(path)
 
 
-def of_reconstruction(sizes: Sizes, method: Method, matter: MatterKind | None = None) -> Needs | None:
+@dataclass(frozen=True)
+class Seen:
+    """What frames say of it (`planning.seen`). windows: sizes of those that a run works on, None for whole frames;
+    noisy: whether surfaces begin with Gaussians, and may take turns with a volume."""
+
+    windows: Sizes | None = None
+    noisy: bool = False
+
+
+UNSEEN = Seen()
+
+
+def of_reconstruction(
+    sizes: Sizes, method: Method, matter: MatterKind | None = None, seen: Seen = UNSEEN
+) -> Needs | None:
     """What `reconstruct` takes for training frames of such sizes; None for a method of which nothing is known.
 
     matter: its kind, where that is settled.
     """
-    fit = of_fit(sizes, method, matter)
-    return fit and replace(fit, memory=with_report(sizes, fit.memory))
+    worked = seen.windows or sizes
+    fit = of_fit(worked, method, matter)
+    if fit is None:
+        return None
+    if seen.windows is not None:
+        fit = _judged(fit, sizes)
+    if seen.noisy and (more := _turns(worked, method, matter)):
+        fit = replace(fit, most_seconds=fit.seconds + more)
+    return replace(fit, memory=with_report(sizes, fit.memory))
+
+
+def _judged(fit: Needs, whole: Sizes) -> Needs:
+    """A fit in windows, with the judging of its result by whole frames."""
+    finer = whole.waves(1)
+    memory = max(fit.memory, Costs.program + Costs.frames * whole.pixels + Costs.judged * finer)
+    return Needs(memory, fit.disk + Costs.written * whole.pixels, fit.seconds + Costs.judging * finer)
+
+
+def _turns(sizes: Sizes, method: Method, matter: MatterKind | None) -> float:
+    """Seconds that noise may add to surfaces, on the pixels that they begin on; 0 where there are none."""
+    how = (
+        method.gaussians if isinstance(method, Surfaces) or (isinstance(method, Auto) and matter == "levels") else None
+    )
+    if how is None:
+        return 0.0
+    factor = how.coarse.factor((sizes.rows, sizes.columns))
+    coarse = replace(sizes, rows=sizes.rows // factor, columns=sizes.columns // factor)
+    return Costs.turns * _gaussian_seconds(_fine(coarse, how.volume)[0], edges=True)
+
+
+def _gaussian_seconds(fine: float, edges: bool) -> float:
+    """Of a fit of Gaussians that begins with so many voxels, and of surfaces cut out of them, if there are `edges`."""
+    return (30 if edges else 12) + 2.3e-6 * fine
 
 
 def of_fit(sizes: Sizes, method: Method, matter: MatterKind | None = None) -> Needs | None:
@@ -219,7 +273,7 @@ def _bodies(sizes: Sizes, how: Gaussians, edges: bool) -> tuple[float, float, fl
     count = how.random_count if how.start == "random" else min(how.max_start, how.start_per_pixel * sizes.pixels)
     fine = _fine(sizes, how.volume)[0]
     memory, numbers = max(begun, waves + Costs.gaussian * count), 14 * count
-    seconds, finer = (30 if edges else 12) + 2.3e-6 * fine, sizes.waves(1)
+    seconds, finer = _gaussian_seconds(fine, edges), sizes.waves(1)
     near = 10 + 5.6e-6 * finer  # surfaces from coarse pixels on, where they show bodies
     if how.start != "phase" or how.coarse.columns == 0:
         return memory, seconds, numbers
@@ -305,7 +359,13 @@ def _one_voxel_a_pixel(method: Method) -> tuple[str, Method]:
 
 
 def _size(bytes_: float) -> str:
-    return f"{bytes_ / 1e9:.2g} GB" if bytes_ >= 0.95e9 else f"{max(1.0, bytes_ / 1e6):.0f} MB"
+    return f"{two_digits(bytes_ / 1e9)} GB" if bytes_ >= 0.95e9 else f"{max(1.0, bytes_ / 1e6):.0f} MB"
+
+
+def _times(least: float, most: float) -> str:
+    """A range of times; the first alone where there is no other."""
+    first, last = _time(least), _time(max(least, most))
+    return first if first == last else f"{first.removesuffix(last[last.index(' ') :])} to {last}"
 
 
 def _time(seconds: float) -> str:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..metrics import VolumeScores
-from ..units import wavenumber
+from ..units import in_percent, wavenumber
 from .block import Block, drawn_block
 from .content import ReportContent
 from .curves import correlation_figure, histogram_figure, history_figure
@@ -137,7 +137,7 @@ def _light(content: ReportContent) -> Block:
     if views is None:
         return Block(heading, "The light of the frames was taken to be even.")
     figure = light_figure(views, content.pixel_size)
-    size = [f"{100 * float(np.sqrt(np.mean(np.square(image - 1)))):.2g} %" for image in views.light]
+    size = [in_percent(float(np.sqrt(np.mean(np.square(image - 1))))) for image in views.light]
     text = (
         f"By the air of the training frames their light is {views.words}. Shown are {len(views.labels)} of them, the "
         f"light that they have beside what the reconstruction predicts (root mean square deviation from one: "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from matplotlib.figure import Figure
 
+from ..units import in_percent
 from ..volume import Volume
 from .block import Block, drawn_block
 from .figures import plane_sizes, richest_planes, slice_row, slice_titles
@@ -15,19 +16,24 @@ MOST_SPREAD = 0.5
 """Largest standard deviation of values between 0 and 1."""
 
 
+WITHOUT_EACH = "without one of the views each: where it is large, few frames say what is there"
+OF_COPIES = (
+    "of the same scene mirrored and turned, for one of two views alone says too little: where it is large, the network "
+    "guesses what the frames do not say; where it is small, it may err in all of them alike"
+)
+"""What guesses the spread is of."""
+
+
 def guess_block(shown: GuessShown) -> Block:
     """The figure with its caption."""
     text = f"{shown.words} a to c, the occupancy that the network guessed; "
     if shown.spread is None or shown.unsure is None:
-        text += (
-            "d to f, that of the reconstruction. Guesses without one of the views each would show where it is guessed, "
-            "but one of two views alone says too little: what two views leave open is not shown here."
-        )
+        text += "d to f, that of the reconstruction. Where it is guessed, this run did not keep."
     else:
         text += (
-            "d to f, the standard deviation of guesses without one of the views each: where it is large, few frames "
-            "say what is there. g to i, the occupancy of the reconstruction. "
-            f"{100 * shown.unsure:.2g} % of its matter lies where guesses differ by more than {UNSURE:g}. There it may "
+            f"d to f, the standard deviation of guesses {OF_COPIES if shown.of_copies else WITHOUT_EACH}. g to i, the "
+            "occupancy of the reconstruction. "
+            f"{in_percent(shown.unsure)} of its matter lies where guesses differ by more than {UNSURE:g}. There it may "
             "be a guess also after the fit, for other matter might explain the frames as well."
         )
     return drawn_block("What was guessed", text, "A network's guess, and its spread.", guess_figure(shown), "png")

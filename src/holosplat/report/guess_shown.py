@@ -16,14 +16,15 @@ UNSURE = 0.2
 @dataclass(frozen=True)
 class GuessShown:
     """occupancy, found: [Z, Y, X] of the guess and of the reconstruction, both in units of the material's δ; spread:
-    [Z, Y, X] standard deviation of guesses without one of the views each, or None; words: what the run began with, and
-    why."""
+    [Z, Y, X] standard deviation of guesses, or None; words: what the run began with, and why; of_copies: whether these
+    guesses are of copies of the scene, mirrored and turned, and not without one of the views each."""
 
     occupancy: np.ndarray
     found: np.ndarray
     spread: np.ndarray | None
     grid: Grid
     words: str
+    of_copies: bool = False
 
     def __post_init__(self) -> None:
         for name in ("occupancy", "found", "spread"):

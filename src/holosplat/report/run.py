@@ -117,11 +117,11 @@ def _guess(folder: RunFolder, reconstruction: Reconstruction) -> GuessShown | No
     """What a network guessed, beside what was found; None where none was asked."""
     if not folder.guess.is_file():
         return None
-    volume, spread = read_guess(folder.guess)
+    volume, spread, of_copies = read_guess(folder.guess)
     delta = float(np.abs(volume.delta).max()) or 1.0
     unit = reconstruction.object.matter.delta if reconstruction.object.matter.single else delta
     found = reconstruction.object.voxelise(volume.grid).delta / unit
-    return GuessShown(volume.delta / unit, found, spread, volume.grid, reconstruction.choice.begun)
+    return GuessShown(volume.delta / unit, found, spread, volume.grid, reconstruction.choice.begun, of_copies)
 
 
 def _forecast(folder: RunFolder) -> ForecastShown | None:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..units import in_percent
 from .content import ReportContent, flatten
 from .moving import Moving
 from .style import format_length, scientific
@@ -46,8 +47,8 @@ def _followed(moving: Moving) -> str:
     what = f"follows {count} bod{'y' if count == 1 else 'ies'} through {len(times)} times"
     if not moving.whole.any():
         return f"{what}, none of them ever whole in the field of view"
-    spread = 100 * float(np.nanmedian(moving.spread("volume_m3") / moving.mean("volume_m3")))
-    return f"{what}, whose volumes keep to ±{spread:.2g} % over time in the median"
+    spread = float(np.nanmedian(moving.spread("volume_m3") / moving.mean("volume_m3")))
+    return f"{what}, whose volumes keep to ±{in_percent(spread)} over time in the median"
 
 
 def key_figures(content: ReportContent) -> list[tuple[str, str, str]]:

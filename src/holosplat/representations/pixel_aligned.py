@@ -31,7 +31,8 @@ class PixelAlignedField:
     images: [V, 3, H, W] of the views that are encoded (`learning.images`), on their pixels; weights: of
     `PixelAligned`. A single material has the occupancy `upper · sigmoid` of the first number (upper 0: its softplus,
     without a bound). Where δ and β are free, δ is the softplus of the first and β that of the sum of both. Between the
-    centres of voxels the field is as `VoxelGrid` has it, and so are its line integrals.
+    centres of voxels the field is as `VoxelGrid` has it, and so are its line integrals. It is computed where the images
+    are, on which side the weights must be; fits have them in main memory, and training on a GPU has them there.
     Errors: `InputError` where the arrays do not fit together.
     """
 
@@ -65,10 +66,11 @@ class PixelAlignedField:
         _require_shapes(weights, dict(self._net.named_parameters()))
         self.weights = {name: weights[name].detach() for name, _ in self._net.named_parameters()}
         self.images, self.views, self.mask, self.grid, self.matter = images, views, mask.bool(), grid, matter
-        self.network, self.upper, self.backend = network, float(upper), "cpu"
-        self._cells = self.mask.flatten().nonzero()[:, 0]
-        self._places = places_of(grid, views, self._cells, images.dtype)
-        self._still = VoxelGrid(images.new_zeros(len(matter), *grid.shape), grid, matter)
+        self.network, self.upper, self.backend = network, float(upper), "cuda" if images.is_cuda else "cpu"
+        cells = self.mask.cpu().flatten().nonzero()[:, 0]
+        self._places = places_of(grid, views, cells, images.dtype).to(images.device)
+        self._cells = cells.to(images.device)
+        self._still = VoxelGrid(images.new_zeros(len(matter), *grid.shape), grid, matter).on(self.backend)
         self._last: tuple[bytes, VoxelGrid] | None = None
 
     def parameters(self) -> dict[str, Tensor]:

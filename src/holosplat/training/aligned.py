@@ -39,7 +39,7 @@ class AlignedTraining(Training):
         self.critic: Critic | None = None
         self._shown: tuple[Tensor, Tensor] | None = None
         if options.frames.adversary > 0:
-            self.critic = Critic()
+            self.critic = Critic().to(options.device)
             self.judge = torch.optim.AdamW(self.critic.parameters(), options.frames.adversary_rate, betas=BETAS)
 
     def _made(self) -> nn.Module:
@@ -53,6 +53,7 @@ class AlignedTraining(Training):
     def _value(self, sample: Sample, rng: np.random.Generator) -> tuple[Tensor, list[float]]:
         goal = self.options.frames
         lesson = aligned_lesson(sample, self.options.shown, goal.targets, self.options.network, rng)
+        lesson = lesson.on(self.options.device)
         voxels = lesson.field(dict(self.network.named_parameters()), self.size).at(0.0)
         misfit, misled = lesson.misfit(voxels), torch.zeros(())
         if self.critic is not None and self.step >= goal.pretrain * self.options.steps:
@@ -92,7 +93,7 @@ class AlignedValidation(Validation):
 
     def _scores(self, network: nn.Module, sample: Sample, count: int) -> tuple[float, float, float]:
         """Misfit of the frames held out, Dice coefficient, and the misfit again as what is left unexplained."""
-        lesson = first_views(sample, count, self.network)
+        lesson = first_views(sample, count, self.network).on(str(next(network.parameters()).device))
         with torch.no_grad():
             voxels = lesson.field(dict(network.named_parameters()), self.size).at(0.0)
             misfit = float(lesson.misfit(voxels))
@@ -100,4 +101,4 @@ class AlignedValidation(Validation):
 
 
 def _overlap(voxels: VoxelGrid, sample: Sample) -> float:
-    return share_of_overlap(voxels.values[0] > 0.5, torch.from_numpy(sample.occupancy) > 127)
+    return share_of_overlap(voxels.values[0].cpu() > 0.5, torch.from_numpy(sample.occupancy) > 127)

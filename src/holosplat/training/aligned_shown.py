@@ -33,13 +33,18 @@ FIT = AlignedFit()
 @dataclass(frozen=True)
 class AlignedLesson:
     """scene: all frames of a sample; noise: [N], of these; seen: those that the network is shown; targets: those that
-    it should predict; network: `onix` or `pixelnerf`."""
+    it should predict; network: `onix` or `pixelnerf`; device: where the network is, and all is compared."""
 
     scene: SampleScan
     noise: np.ndarray
     seen: np.ndarray
     targets: np.ndarray
     network: str
+    device: str = "cpu"
+
+    def on(self, device: str) -> AlignedLesson:
+        """The same on a device."""
+        return replace(self, device=device)
 
     @cached_property
     def rms(self) -> float:
@@ -57,7 +62,9 @@ class AlignedLesson:
             mask = grown(visual_hull(thickness, scan.views, grid, FIT.hull), FIT.margin)
         except InputError:
             mask = torch.ones(grid.shape, dtype=torch.bool)
-        field = PixelAlignedField(weights, shown, scan.views, mask, grid, Matter.one(*material), network=size)
+        field = PixelAlignedField(
+            weights, shown.to(self.device), scan.views, mask, grid, Matter.one(*material), network=size
+        )
         return field.with_parameters(weights)
 
     def misfit(self, voxels: VoxelGrid, which: np.ndarray | None = None) -> Tensor:
@@ -65,9 +72,9 @@ class AlignedLesson:
         waves, of thickness over that of the retrieved one."""
         chosen = self.targets if which is None else which
         if self.network == ONIX:
-            measured = torch.from_numpy(self.scene.scan.frames[chosen])
+            measured = self._here(self.scene.scan.frames[chosen])
             return (self._frames(voxels, self.scene.scan.exposures[chosen]) - measured).square().mean() / self.rms**2
-        wanted = torch.from_numpy(self.scene.thickness[chosen])
+        wanted = self._here(self.scene.thickness[chosen])
         lines = voxels.project(self.scene.scan.views[chosen]).channels[:, 0]
         return (lines - wanted).square().mean() / wanted.square().mean().clamp_min(1e-30)
 
@@ -81,10 +88,13 @@ class AlignedLesson:
 
     def real(self) -> Tensor:
         """A measured one of those that are shown."""
-        return torch.from_numpy(self.scene.scan.frames[self.seen[:1]] - 1)[None] / self.rms
+        return self._here(self.scene.scan.frames[self.seen[:1]] - 1)[None] / self.rms
+
+    def _here(self, images: np.ndarray) -> Tensor:
+        return torch.from_numpy(images).to(self.device)
 
     def _frames(self, voxels: VoxelGrid, exposures: Exposures) -> Tensor:
-        return Model(voxels, Instrument(exposures, fringe_sampling(exposures))).frames()
+        return Model(voxels, Instrument(exposures, fringe_sampling(exposures), backend=voxels.backend)).frames()
 
 
 def aligned_lesson(sample: Sample, how: Shown, targets: int, network: str, rng: np.random.Generator) -> AlignedLesson:

@@ -44,7 +44,7 @@ class TrainOptions:
     """How a network is trained."""
 
     steps: Natural = 24_000
-    """Steps, of one scene each: a night on two cores."""
+    """Steps, of one scene each; the weights of the package were made with 7000."""
     rate: Rate = 1.5e-3
     """Largest rate of AdamW; it falls to `least_rate` of it along half a cosine."""
     least_rate: Share = 0.03

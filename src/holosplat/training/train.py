@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 
+from ..backends import missing
 from ..checks import InputError, require
 from ..io.atomic import atomic_path
 from ..io.json import read_json, write_json
@@ -23,6 +24,7 @@ from ..learning.network import Guess
 from ..learning.weights import Card, write_weights
 from ..tables import to_table
 from .folder import Dataset
+from .limits import limits
 from .objective import loss
 from .options import TrainOptions
 from .sample import Sample
@@ -63,7 +65,8 @@ class Training:
 
     @classmethod
     def begun(cls, data: Dataset, folder: Path, options: TrainOptions) -> Training:
-        """A training in a new folder; `InputError` where there is something in it."""
+        """A training in a new folder; `InputError` where there is something in it, or its device cannot be used."""
+        _require_device(options)
         if folder.exists() and any(folder.iterdir()):
             raise InputError(f"{folder} must be new or empty, but it is not; choose another --out, or --resume.")
         folder.mkdir(parents=True, exist_ok=True)
@@ -72,7 +75,9 @@ class Training:
 
     @classmethod
     def resumed(cls, data: Dataset, folder: Path, options: TrainOptions) -> Training:
-        """The training in `folder` after its last checkpoint; `InputError` where it is one of other options or data."""
+        """The training in `folder` after its last checkpoint; `InputError` where it is one of other options or data, or
+        its device cannot be used."""
+        _require_device(options)
         settings = folder / SETTINGS
         require(settings.is_file(), f"{folder} holds no training that could go on; leave --resume.")
         require(
@@ -144,8 +149,9 @@ class Training:
     def finish(self, validation: Validation, made_by: dict[str, str]) -> Path:
         """Write the weights with their card; their file."""
         card = validation.card(self.network, to_table(self.data.ranges) | {"seed": self.data.seed}, made_by)
+        said = limits(self.data.ranges, self.options.shown.views, card.scores)
         path = self.folder / WEIGHTS
-        self._write(path, replace(card, training=_settings(self.data, self.options)["options"]))
+        self._write(path, replace(card, training=_settings(self.data, self.options)["options"], limits=said))
         return path
 
     def _write(self, path: Path, card: Card) -> None:
@@ -161,6 +167,13 @@ class Training:
         asked, device = self.options.precision, self.options.device
         short = device == "cuda" or has_bfloat16() if asked == "auto" else asked == "bfloat16"
         return torch.autocast(device, torch.bfloat16) if short else nullcontext()
+
+
+def _require_device(options: TrainOptions) -> None:
+    reason = missing(options.device)
+    require(
+        options.device == "cpu" or not reason, f"device {options.device} cannot be used: {reason}; take device cpu."
+    )
 
 
 def _settings(data: Dataset, options: TrainOptions) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from typing import Any
 
 from ..matter import MatterKind
 from ..methods.auto import VolumeWhereUnexplained
+from ..units import in_percent
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Choice:
         lines = [f"matter: {self.matter} ({self.why})"] if self.why else []
         lines += [f"start: {self.begun}"] if self.begun else []
         if self.kept and len(self.judged) > 1:
-            shares = ", ".join(f"{name} {100 * share:.2g} %" for name, share in self.judged.items())
+            shares = ", ".join(f"{name} {in_percent(share)}" for name, share in self.judged.items())
             lines.append(f"kept: {self.kept} (matter that training frames leave unexplained: {shares})")
         if self.matter == "levels" and self.kept == VolumeWhereUnexplained.name and "fit" in self.judged:
             lines.append("bodies of one level explain these frames badly: there may be several levels, or none")

@@ -277,7 +277,7 @@ class _Run:
         if self.folder is not None and not self.folder.config.is_file():
             self.folder.begin(self._config | environment(backend))
             if self._guess is not None:
-                write_guess(self.folder.guess, self._guess.volume, self._guess.spread)
+                write_guess(self.folder.guess, self._guess.volume, self._guess.spread, self._guess.of_copies)
 
     def note_resolved(self, stage: str, fit: Running) -> None:
         """Add to config.json what the options have become in a stage: wave samples a pixel, weights and widths."""

@@ -20,6 +20,7 @@ from ..methods.volume import binning
 from ..optics.noise_model import NoiseModel
 from ..representations import Stored, VoxelGrid
 from ..scan import Scan
+from ..units import in_percent
 
 MOST_VIEWS = 16
 """Views by which the total is told, at most, evenly chosen: beyond these it is shapes and voxels that are in doubt."""
@@ -108,7 +109,7 @@ def in_words(total: Total, quantity: str, delta: float | None = None, ratio_know
     held = f"; the volume itself holds {total.held:.3g}" if abs(total.held - total.value) > WIDE * total.error else ""
     if total.share <= TOLD:
         volume = "" if delta is None else f" ({total.value / delta:.3g} m³ of the material)"
-        return f"total {quantity} {total.value:.3g} m³ ± {100 * total.share:.2g} %{volume}{held}"
+        return f"total {quantity} {total.value:.3g} m³ ± {in_percent(total.share)}{volume}{held}"
     low, high = max(0.0, total.value - WIDE * total.error), max(0.0, total.value) + WIDE * total.error
     volume = "" if delta is None else f" ({low / delta:.2g} to {high / delta:.2g} m³ of the material)"
     cannot = "the frames cannot tell it" if ratio_known else "the frames cannot tell it without the ratio δ/β"

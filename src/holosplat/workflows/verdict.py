@@ -21,6 +21,7 @@ from ..optics.noise import noise_levels
 from ..optics.noise_model import NoiseModel
 from ..representations import Stored
 from ..scan import Scan
+from ..units import in_percent, two_digits
 
 TOO_MUCH = 1.15
 """Residual over what is allowed (rms) from which on a band counts as unexplained."""
@@ -221,8 +222,8 @@ def _is_fault(cause: Cause, size: float) -> bool:
 def _explained(found: Residuals, counts: np.ndarray) -> str:
     residual, noise, contrast = (_rms(p, counts) for p in (found.residual, found.noise, found.contrast))
     if noise < NOISELESS * contrast:
-        return f"The frames, which show no noise, are explained to {_percent(residual / contrast)} of their contrast."
-    return f"The frames are explained to within their noise: the residual is {residual / noise:.2g} of it."
+        return f"The frames, which show no noise, are explained to {in_percent(residual / contrast)} of their contrast."
+    return f"The frames are explained to within their noise: the residual is {two_digits(residual / noise)} of it."
 
 
 def _unexplained(found: Residuals, bad: np.ndarray, over: np.ndarray) -> str:
@@ -234,7 +235,11 @@ def _unexplained(found: Residuals, bad: np.ndarray, over: np.ndarray) -> str:
         last += 1
     residual, noise, contrast = (p.mean(axis=0)[worst] ** 0.5 for p in (found.residual, found.noise, found.contrast))
     noisy = _rms(found.noise, found.rings.counts) > NOISELESS * _rms(found.contrast, found.rings.counts)
-    size = f"{residual / noise:.2g} times the noise" if noisy else f"{_percent(residual / contrast)} of the contrast"
+    size = (
+        f"{two_digits(residual / noise)} times the noise"
+        if noisy
+        else f"{in_percent(residual / contrast)} of the contrast"
+    )
     wide = _band(found.rings.periods(last)[0], found.rings.periods(first)[1])
     said = "" if first == last else f"; it is too large at all periods {wide}"
     return (
@@ -249,7 +254,7 @@ def _reasons(found: Residuals, named: list[Cause], single: Mapping[str, Cause]) 
         either = " or ".join(_said(c) for c in (cause, *also))
         sentences.append(
             f"Likely cause: the frames would be explained better with {either} "
-            f"({min(cause.significance, 9999):.0f} σ; {_percent(min(cause.share, 1.0))} of what is too much)."
+            f"({min(cause.significance, 9999):.0f} σ; {in_percent(min(cause.share, 1.0))} of what is too much)."
         )
     if not sentences:
         sentences.append(
@@ -268,15 +273,15 @@ def _said(cause: Cause) -> str:
     """A change in words."""
     value, error = cause.value, cause.error
     if cause.name == "light":
-        return f"uneven light in each frame, of {_percent(float(np.sqrt((value**2).sum(axis=1).mean())))} (rms)"
+        return f"uneven light in each frame, of {in_percent(float(np.sqrt((value**2).sum(axis=1).mean())))} (rms)"
     if cause.name == "shifts":
         largest = float(np.abs(value).max())
         return f"single views shifted (by up to {largest:.2g} px)"
     number, size = float(value[0]), f"{abs(value[0]):.2g} ± {error[0]:.1g}"
     return {
-        "mass": f"{_percent(abs(number))} {'more' if number > 0 else 'less'} matter",
-        "absorption": f"{_percent(abs(number))} {'more' if number > 0 else 'less'} absorption (another δ/β)",
-        "distance": f"a distance {_percent(abs(number))} {'longer' if number > 0 else 'shorter'}",
+        "mass": f"{in_percent(abs(number))} {'more' if number > 0 else 'less'} matter",
+        "absorption": f"{in_percent(abs(number))} {'more' if number > 0 else 'less'} absorption (another δ/β)",
+        "distance": f"a distance {in_percent(abs(number))} {'longer' if number > 0 else 'shorter'}",
         "blur": f"a point-spread function {'wider' if number > 0 else 'narrower'} by {abs(number) ** 0.5:.2g} px",
         "shift_x": f"the axis of rotation {size} px to the {'left' if number > 0 else 'right'}",
         "shift_y": f"the detector {size} px {'lower' if number > 0 else 'higher'}",
@@ -291,15 +296,15 @@ def _remarks(found: Residuals, counts: np.ndarray) -> tuple[str, ...]:
     if len(odd):
         odd = odd[np.argsort(-of_view[odd])]
         listed = ", ".join(
-            f"{i + 1} ({of_view[i] / np.median(of_view):.2g} times the median)" for i in odd[:MOST_VIEWS]
+            f"{i + 1} ({two_digits(of_view[i] / np.median(of_view))} times the median)" for i in odd[:MOST_VIEWS]
         )
         more = f" and {len(odd) - MOST_VIEWS} more" if len(odd) > MOST_VIEWS else ""
         remarks.append(f"Views that stand out, counted from 1: {listed}{more}; look at their alignment and flux.")
     residual, noise, contrast = (_rms(p, counts) for p in (found.residual, found.noise, found.contrast))
     if noise > NOISELESS * contrast and residual < BELOW * noise:
         remarks.append(
-            f"The residual is below the noise ({residual / noise:.2g} of it): some of the noise is in the volume, or "
-            "the frames' fine structure was taken for noise."
+            f"The residual is below the noise ({two_digits(residual / noise)} of it): some of the noise is in the "
+            "volume, or the frames' fine structure was taken for noise."
         )
     return tuple(remarks)
 
@@ -317,10 +322,6 @@ def _rms(power: np.ndarray, counts: np.ndarray) -> float:
 def _band(shortest: float, longest: float) -> str:
     low = f"{1e6 * shortest:.3g}"
     return f"above {low} µm" if math.isinf(longest) else f"of {low} to {1e6 * longest:.3g} µm"
-
-
-def _percent(share: float) -> str:
-    return f"{100 * share:.2g} %" if share < 0.995 else f"{100 * share:.0f} %"
 
 
 def _rounded(values: np.ndarray) -> list[list[float]]:

@@ -15,6 +15,7 @@ from PIL import Image
 from ...io.atomic import atomic_path
 from ...report.page import template
 from ...report.style import scientific
+from ...units import in_percent, two_digits
 from ..rows import Row
 from .charts import Point, chart
 
@@ -96,11 +97,11 @@ def key_figures(frames: Sequence[Frame]) -> list[tuple[str, str, str]]:
     warm = [row.seconds for row in rows if row.begun == "warm"]
     alone = [row.seconds for row in rows if row.begun != "warm"]
     found = [("Times", str(len(rows)), f"{len(warm)} begun warm")]
-    found += [("A warm time", f"{np.median(warm):.2g} s", "median")] if warm else []
-    found += [("A time by itself", f"{np.median(alone):.2g} s", "median")] if alone else []
+    found += [("A warm time", f"{two_digits(float(np.median(warm)))} s", "median")] if warm else []
+    found += [("A time by itself", f"{two_digits(float(np.median(alone)))} s", "median")] if alone else []
     if rows[-1].total is not None:
         error = rows[-1].total_error
-        remark = "" if error is None else f"± {100 * error / abs(rows[-1].total or 1):.2g} %"
+        remark = "" if error is None else f"± {in_percent(error / abs(rows[-1].total or 1))}"
         found.append(
             (f"Total {rows[-1].quantity}, m³", scientific(rows[-1].total), f"of the last time {remark}".strip())
         )
@@ -137,7 +138,7 @@ def _cells(frame: Frame) -> dict[str, object]:
     total = "" if row.total is None else scientific(row.total)
     error = f" ± {scientific(row.total_error, 2)}" if row.total is not None and row.total_error is not None else ""
     explained = {True: "yes", False: "no", None: ""}[row.good]
-    left = "" if row.unexplained is None else f"{100 * row.unexplained:.3g} %"
+    left = "" if row.unexplained is None else in_percent(row.unexplained)
     bodies = str(len(row.bodies)) if row.bodies else ""
     cells = [
         f"{frame.time:.6g}",

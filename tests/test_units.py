@@ -1,0 +1,35 @@
+"""Numbers in words: two digits, and never an exponent."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from holosplat.units import in_percent, two_digits
+
+SOURCE = Path(__file__).resolve().parents[1] / "src"
+
+
+@pytest.mark.parametrize(
+    ("share", "said"),
+    [
+        *((0.0, "0 %"), (0.0043, "0.43 %"), (0.0305, "3 %"), (0.0314, "3.1 %"), (0.5, "50 %"), (0.9949, "99 %")),
+        *((0.996, "100 %"), (1.0, "100 %"), (1.374, "137 %"), (24.0, "2400 %"), (-0.0123, "-1.2 %")),
+        *((2.5e-8, "0.0000025 %"), (np.float32(0.73), "73 %"), (float("inf"), "inf %"), (float("nan"), "nan %")),
+    ],
+)
+def test_shares_are_said_in_per_cent(share, said):
+    assert in_percent(share) == said
+
+
+def test_two_digits_are_whole_numbers_from_a_hundred_on():
+    assert [two_digits(value) for value in (0.14, 1.44, 99.4, 99.6, 139.2)] == ["0.14", "1.4", "99", "100", "139"]
+
+
+def test_no_share_is_written_with_an_exponent():
+    """`:.2g` writes 100 as 1e+02: shares go through `in_percent`."""
+    texts = {path: path.read_text(encoding="utf-8") for path in SOURCE.rglob("*.py")}
+    assert [path.name for path, text in texts.items() if re.search(r":\.\dg\} ?%", text)] == []
