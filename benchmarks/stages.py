@@ -2,8 +2,8 @@
 
     python benchmarks/stages.py --pixels 128 256 512 [--csv docs/data/stages.csv]
 
-The scene of sizes.py, what `reconstruct` does by default, in one thread. A row is a stage as progress names it, with its
-processor time until the next one is named, and its share of the whole. So it says what a faster part could save at most.
+The scene of sizes.py, what `reconstruct` does by default, in one thread. A row is a stage as progress names it, with
+its processor time until the next one is named, and its share of the whole: what a faster part could save at most.
 """
 
 from __future__ import annotations
