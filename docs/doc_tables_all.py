@@ -117,6 +117,9 @@ TABLES["snapshot"] = Table(
     "docs/data/main_job.csv",
     "two minutes",
 )
+TABLES["stages"] = Table(
+    runs.stages, ("stages.csv",), "python benchmarks/stages.py --pixels 128 512 --csv docs/data/stages.csv", "minutes"
+)
 TABLES["sizes"] = Table(
     runs.sizes,
     ("sizes.csv",),

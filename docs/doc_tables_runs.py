@@ -192,6 +192,16 @@ def sizes() -> str:
     return markdown((*head, "time / s", "of processors / s", "peak / GiB", "load", "commit"), lines)
 
 
+def stages() -> str:
+    """What the stages of a run take, of sizes beside each other."""
+    rows = read("stages.csv")
+    sizes = sorted({int(row["pixels"]) for row in rows})
+    said = {(row["stage"], int(row["pixels"])): f"{row['seconds']} s, {float(row['share']):.1%}" for row in rows}
+    named = dict.fromkeys(row["stage"] for row in rows)
+    lines = [[stage, *(said.get((stage, size), "–").replace("%", " %") for size in sizes)] for stage in named]
+    return markdown(("stage", *(f"{size}²" for size in sizes)), lines)
+
+
 def worst(method: str) -> dict[str, str]:
     """The worst of the three scenes; times are those of the longest fit, of surfaces beyond the Gaussians'."""
     rows = [r for r in jobs() if r["method"] == method]
