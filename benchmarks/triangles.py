@@ -52,6 +52,8 @@ class Variant:
     steps: int = 40
 
 
+RATE, LAST_STEPS = 0.1, 30
+"""Of the fits, as in `CoarseToFine`."""
 SOFTER = ("stiffness", "bending")
 VARIANTS = {
     "all divided": Variant(),
@@ -117,14 +119,14 @@ def softer(options: SurfaceFit, start: SurfaceMesh, which: tuple[str, ...]) -> S
     return replace(options, stiffness=options.stiffness / longer**2) if "stiffness" in which else options
 
 
-def to_fine(task: Task, found: SurfaceMesh, how: CoarseToFine, variant: Variant) -> tuple[SurfaceMesh, dict[str, str]]:
+def to_fine(task: Task, found: SurfaceMesh, variant: Variant) -> tuple[SurfaceMesh, dict[str, str]]:
     """The surfaces on the frames' own pixels, and for each size of pixels triangles and seconds."""
-    fit, factor, told = SurfaceFit(), how.factor(task.scan.views.shape) // 2, dict[str, str]()
-    how = replace(how, finer_steps=round(how.finer_steps / 40 * variant.steps))
+    factor, told = CoarseToFine().factor(task.scan.views.shape) // 2, dict[str, str]()
     while factor:
         at, began = binned(task, factor), time.process_time()
-        limit, options = (variant.edge, how.between(fit)) if factor > 1 else (variant.last_edge, how.nearby(fit))
+        limit, steps = (variant.edge, variant.steps) if factor > 1 else (variant.last_edge, LAST_STEPS)
         start = prepared(found, at.scan.views.finest, limit, variant.beside)
+        options = SurfaceFit(rate=RATE, schedule=replace(SurfaceFit().schedule, steps=steps))
         options = softer(options, start, variant.softer)
         ended = run_quietly(surface_fit(at.scan, start, options, task.seed), lambda share: None)
         assert isinstance(ended, SurfaceMesh)
@@ -146,11 +148,10 @@ def main() -> None:
     torch.set_num_threads(1)
     cells, scan = scene_of(options.pixels, options.seed, options.photons)
     task = Task(scan, hs.MaterialPrior.known(MATERIAL), options.seed).evened()
-    how = CoarseToFine().of_views(len(scan.train()))
-    start = coarse_start(task, how)
+    start = coarse_start(task, CoarseToFine().of_views(len(scan.train())))
     for name in options.variants:
         began = time.process_time()
-        found, told = to_fine(task, start, how, VARIANTS[name])
+        found, told = to_fine(task, start, VARIANTS[name])
         seconds = time.process_time() - began
         scores = score_object(found, scan, None, oversampling(scan.train())).headline()
         scores |= volume_numbers(found, cells, hs.Grid.of_views(scan.views))
