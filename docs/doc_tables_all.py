@@ -126,6 +126,12 @@ TABLES["sizes"] = Table(
     "python benchmarks/sizes.py --pixels 128 256 512 1024 --method auto --csv docs/data/sizes.csv",
     "minutes",
 )
+TABLES["triangles"] = Table(
+    measured.triangles,
+    ("triangles.csv",),
+    "python benchmarks/triangles.py --csv docs/data/triangles.csv",
+    "half an hour",
+)
 REAL = "python benchmarks/real_data.py --data FOLDER"
 TABLES |= {
     name: Table(make, ("real_data.csv",), REAL, "half an hour")

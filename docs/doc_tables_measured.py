@@ -96,3 +96,14 @@ def compact_series() -> str:
         sizes = (f"{float(row[key]) / 1e3:.0f} kB" for key in ("plain_bytes", "alone_bytes", "series_bytes"))
         lines.append([row["name"], *sizes])
     return markdown(("objects", "as runs hold them", "compact, each by itself", "in one file"), lines)
+
+
+def triangles() -> str:
+    """Surfaces on fine pixels by more and fewer triangles."""
+    lines = list[list[str]]()
+    for row in sorted(read("triangles.csv"), key=lambda row: (-int(row["pixels"]), row["photons"])):
+        of = [row["pixels"], row["photons"] or "–", row["seed"], row["variant"], row["triangles"]]
+        scores = [rounded(row[name], 4) for name in ("ssim", "frcm", "dice", "relative_error_delta")]
+        lines.append([*of, f"{float(row['seconds']):.0f}", *scores, row["stages"]])
+    head = ("pixels", "photons", "seed", "triangles that are", "in all", "processor time / s", "SSIM", "FRCM", "Dice")
+    return markdown((*head, "error of δ", "on the way"), lines)

@@ -19,14 +19,14 @@ from ..backends import resolve
 from ..checks import at_least
 from ..matter import DeltaBeta
 from ..optics.noise import noise_levels
-from ..ranges import Pixels, Share, Weight, ranged
+from ..ranges import Pixels, Positive, Share, Weight, ranged
 from ..representations import GaussianCloud, SurfaceMesh
 from ..representations.subdivision import edge_lengths, subdivided
 from ..scan import Scan
 from .cross_validation import MissingMatter, predicted_frames
 from .evidence import Evidence
 from .method import Task, run_quietly
-from .surface_fit import SurfaceFit, SurfaceOptions, oversampling, surface_fit
+from .surface_fit import SurfaceFit, SurfaceOptions, oversampling, softened, surface_fit
 
 STAGE = "coarse pixels"
 FEWEST_ROWS = 32
@@ -61,7 +61,7 @@ class CoarseToFine:
     took 0.0005 at most, those that helped 0.005 or more (looked at once)."""
     coarse_steps: int = 40
     """Steps of the coarse surfaces."""
-    finer_steps: int = 40
+    finer_steps: int = 20
     """Steps of the surfaces on each finer pixel but the frames' own."""
     last_steps: int = 30
     """Steps on these, which cost most."""
@@ -69,6 +69,10 @@ class CoarseToFine:
     """Frames for which these steps are enough: of fewer, each tells less and costs less, and there are more steps."""
     near_rate: Weight = 0.1
     """Length of their first steps [pixels]: half of what surfaces cut out of Gaussians need."""
+    near_edge: Positive = 1.0
+    """Mean length of triangles' edges [pixels] beyond which stiffness and bending count in these steps as on edges of
+    this length, about that of marching cubes: by longer edges they smooth over more pixels, and surfaces end farther
+    away (method, "How many triangles")."""
     edge: Pixels = 1.5
     """Mean length of triangles' edges [pixels] from which on they are divided on pixels between."""
     last_edge: Pixels = 2.5
@@ -91,15 +95,16 @@ class CoarseToFine:
             factor *= 2
         return factor
 
-    def nearby(self, fit: SurfaceFit) -> SurfaceFit:
-        """The fit of surfaces that are near to those of the frames' own pixels: fewer and shorter steps."""
-        return self._short(fit, self.last_steps)
+    def nearby(self, fit: SurfaceFit, start: SurfaceMesh) -> SurfaceFit:
+        """The fit of `start`, near to surfaces of the frames' own pixels: fewer and shorter steps, no stiffer ones."""
+        return self._short(fit, start, self.last_steps)
 
-    def between(self, fit: SurfaceFit) -> SurfaceFit:
-        """The fit on pixels between the coarsest and the frames' own."""
-        return self._short(fit, self.finer_steps)
+    def between(self, fit: SurfaceFit, start: SurfaceMesh) -> SurfaceFit:
+        """The fit of `start` on pixels between the coarsest and the frames' own."""
+        return self._short(fit, start, self.finer_steps)
 
-    def _short(self, fit: SurfaceFit, steps: int) -> SurfaceFit:
+    def _short(self, fit: SurfaceFit, start: SurfaceMesh, steps: int) -> SurfaceFit:
+        fit = softened(fit, start, self.near_edge)
         return replace(fit, schedule=replace(fit.schedule, steps=steps), rate=self.near_rate)
 
     def of_views(self, count: int) -> CoarseToFine:
@@ -142,13 +147,14 @@ def coarse_surfaces(task: Task, first: First, surfaces: SurfaceOptions, how: Coa
     found = on_pixels(found, task.scan.views.finest, how.last_edge)
     if unexplained(found, task.scan, surfaces) <= most:
         return found
-    found = _run(replace(task, freedom=None), found, how.nearby(surfaces.fit))  # edges may be off by more
+    found = _run(replace(task, freedom=None), found, how.nearby(surfaces.fit, found))  # edges may be off by more
     return found if unexplained(found, task.scan, surfaces) <= most else None
 
 
 def last_steps(task: Task, found: SurfaceMesh, surfaces: SurfaceOptions, how: CoarseToFine) -> SurfaceMesh:
     """The surfaces that `coarse_surfaces` has `found`, fitted to the frames of `task` themselves."""
-    return _run(replace(task, freedom=None), found, how.of_views(len(task.scan.train())).nearby(surfaces.fit))
+    how = how.of_views(len(task.scan.train()))
+    return _run(replace(task, freedom=None), found, how.nearby(surfaces.fit, found))
 
 
 def binned(task: Task, factor: int) -> Task:
@@ -194,7 +200,7 @@ def settled(task: Task, start: SurfaceMesh, surfaces: SurfaceOptions, how: Coars
 def _fitted(task: Task, found: SurfaceMesh, surfaces: SurfaceOptions, how: CoarseToFine) -> SurfaceMesh:
     """The surfaces on the pixels of `task`."""
     start = on_pixels(found, task.scan.views.finest, how.edge)
-    return _run(task, start, how.between(surfaces.fit))
+    return _run(task, start, how.between(surfaces.fit, start))
 
 
 def _run(task: Task, start: SurfaceMesh, options: SurfaceFit) -> SurfaceMesh:

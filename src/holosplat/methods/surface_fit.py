@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from scipy.sparse import csc_array, csr_array, diags_array, eye_array
@@ -28,6 +28,7 @@ from ..optics.sampling import fringe_sampling
 from ..ranges import Rate, Weight, ranged
 from ..representations import GaussianCloud, SurfaceMesh, isosurface
 from ..representations.isosurface import adjacency, neighbour_mean
+from ..representations.subdivision import edge_lengths
 from ..scan import Scan
 from .field import field_of
 from .ground import ExtraTerm, ground
@@ -152,6 +153,18 @@ def surface_fit(
         capture=False,  # not yet tried as a CUDA graph
     )
     return Fit(freed(plan, freedom, base.train), seed)
+
+
+def softened(options: SurfaceFit, start: SurfaceMesh, edge: float) -> SurfaceFit:
+    """The options with stiffness and bending as on edges of `edge` [pixels], where those of `start` are longer in the
+    mean; else as they are.
+
+    The mean of a vertex' neighbours is h²/4 times the Laplacian away, if edges h are alike: λ reaches as far as λ h²
+    does, and Σ |L² x|² is h⁸ times the square of Δ² x, on h⁻² vertices a pixel².
+    """
+    longer = max(1.0, float(edge_lengths(start.vertices.detach(), start.faces).mean()) / edge)
+    objective = replace(options.objective, bending=options.objective.bending / longer**6)
+    return replace(options, stiffness=options.stiffness / longer**2, objective=objective)
 
 
 def oversampling(scan: Scan, options: SurfaceFit = SurfaceFit()) -> int:
