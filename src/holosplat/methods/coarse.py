@@ -61,7 +61,7 @@ class CoarseToFine:
     took 0.0005 at most, those that helped 0.005 or more (looked at once)."""
     coarse_steps: int = 40
     """Steps of the coarse surfaces."""
-    finer_steps: int = 20
+    finer_steps: int = 40
     """Steps of the surfaces on each finer pixel but the frames' own."""
     last_steps: int = 30
     """Steps on these, which cost most."""
