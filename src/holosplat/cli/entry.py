@@ -10,7 +10,6 @@ import os
 import sys
 from collections.abc import Callable
 from importlib import import_module
-from typing import NoReturn
 
 import tyro
 from tyro.conf import OmitArgPrefixes
@@ -19,6 +18,7 @@ from ..checks import OUT_OF_MEMORY, InputError
 from ..ranges import checked_later, with_checked_numbers
 from ..version import __version__
 from .progress import INTERRUPTED
+from .sentence import give_up
 from .signals import end_as_on_interrupt
 
 LONGEST = 200
@@ -129,13 +129,13 @@ def main() -> None:
                 config=(OmitArgPrefixes,),
             )
     except InputError as error:
-        _give_up(str(error))
+        give_up(str(error))
     except MemoryError as error:
-        _give_up(f"the memory of this machine is not enough{_said(error)}; take larger pixels (--bin) or fewer rows.")
+        give_up(f"the memory of this machine is not enough{_said(error)}; take larger pixels (--bin) or fewer rows.")
     except RecursionError:
-        _give_up("the input is nested too deeply; make it flat.")
+        give_up("the input is nested too deeply; make it flat.")
     except UnicodeError as error:
-        _give_up(f"a name or text is none in UTF-8: {error}; correct it.")
+        give_up(f"a name or text is none in UTF-8: {error}; correct it.")
     except KeyboardInterrupt:
         print("holosplat: interrupted", file=sys.stderr)
         raise SystemExit(INTERRUPTED) from None
@@ -143,17 +143,11 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
     except OSError as error:
-        _give_up(f"a file cannot be read or written{_said(error)}; check its path, its permissions and the disk.")
+        give_up(f"a file cannot be read or written{_said(error)}; check its path, its permissions and the disk.")
     except RuntimeError as error:
         if not OUT_OF_MEMORY.search(str(error)):
             raise
-        _give_up(f"the memory of this machine is not enough{_said(error)}; take larger pixels (--bin) or fewer rows.")
-
-
-def _give_up(sentence: str) -> NoReturn:
-    text = f"holosplat: {sentence}\n"
-    sys.stderr.write(text.encode("utf-8", "backslashreplace").decode("utf-8"))
-    raise SystemExit(2) from None
+        give_up(f"the memory of this machine is not enough{_said(error)}; take larger pixels (--bin) or fewer rows.")
 
 
 def _said(error: BaseException) -> str:
