@@ -12,7 +12,6 @@ from tyro.conf import Positional
 
 from ..checks import positive, require
 from ..io.formats import read_as
-from ..io.json import write_json
 from ..io.reading import Reading, ends_of
 from ..io.run_scan import run_reading, run_source
 from ..motion.cell_model import ChannelFrame
@@ -130,7 +129,7 @@ def forecast(run: Positional[Path], out: Path, how: ForecastFlags = ForecastFlag
         found = carry_on(tracked, scan, times, options, seed, on_progress=bar.show)
     with claimed(new):
         done = write_forecast(new, tracked, found, config_of(options, scan, folder.read_config(), seed))
-        write_json(new.source, _source(folder, scan, found, out))
+        new.write_source(_source(folder, scan, found, out))
         for line in found.lines():
             print(line)
         last = len(found.forecast.times) - 1

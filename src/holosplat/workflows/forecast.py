@@ -174,7 +174,7 @@ def write_forecast(folder: RunFolder, run: Reconstruction, found: Forecasted, co
     said = found.forecast
     done = replace(run, object=said.bodies, method=ForecastOptions.kind, timing={}, verdict=None, total=None)
     folder.begin(config | environment("cpu"))
-    write_object(folder.object, said.bodies)
+    write_object(folder.object, said.bodies, folder.marks())
     told = {"steps": 0, "times_s": said.times.tolist(), "bodies": said.bodies.count}
     folder.write_summary(summary_of(done, None, found.predicted) | told)
     write_scan(folder.path / FRAMES, found.predicted)
