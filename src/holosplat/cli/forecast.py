@@ -19,7 +19,7 @@ from ..motion.dynamics import DynamicsForecast
 from ..motion.fit import MotionFit
 from ..motion.forecast import PathForecast
 from ..planning.acts import of_forecast
-from ..ranges import Natural, Positive, Seconds, Seed, Signed, Small, ranged
+from ..ranges import Many, Positive, Seconds, Seed, Signed, Small, ranged
 from ..report.run import report_run
 from ..scan import Scan
 from ..specimens.flow.suspension import PLASMA_VISCOSITY
@@ -40,7 +40,7 @@ from .room import tell
 class ForecastFlags:
     """How bodies move on."""
 
-    times: Natural = 10
+    times: Many = 10
     """Times ahead."""
     step: Seconds | None = None
     """Between them [s] (default: the median step of the run)."""
@@ -59,7 +59,7 @@ class ForecastFlags:
     effort: float = 1.0
     """Factor of the numbers of steps of these fits."""
 
-    back: Natural = 8
+    back: Many = 8
     """Last times over which the flow is fitted, at most a third of the run's."""
     channel: tuple[Small, Small] | None = None
     """Extents [m] of a rectangular channel across the flow, along the other two axes in the order x, y, z."""
