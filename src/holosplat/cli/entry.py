@@ -7,6 +7,7 @@ each function imports its work where it starts, so that `holosplat COMMAND --hel
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable
 from importlib import import_module
@@ -23,6 +24,9 @@ from .signals import end_as_on_interrupt
 
 LONGEST = 200
 """Characters of another program's message, at most."""
+
+EMPTY = re.compile("(--[^=]+)=")
+"""An option to which nothing is given."""
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "plan": (
@@ -121,6 +125,7 @@ def main() -> None:
         print(f"holosplat {__version__}")
         return
     try:
+        _require_no_empty(sys.argv[1:])
         with checked_later():
             tyro.extras.subcommand_cli_from_dict(
                 _functions(sys.argv[1:]),
@@ -148,6 +153,15 @@ def main() -> None:
         if not OUT_OF_MEMORY.search(str(error)):
             raise
         give_up(f"the memory of this machine is not enough{_said(error)}; take larger pixels (--bin) or fewer rows.")
+
+
+def _require_no_empty(arguments: list[str]) -> None:
+    """`InputError` that names the first argument which is empty: the parser would take it for the folder one is in."""
+    for before, argument in zip(["holosplat", *arguments], arguments):
+        bare = EMPTY.fullmatch(argument)
+        if bare or not argument:
+            flag = bare[1] if bare else before if before.startswith("--") else f"the argument behind {before}"
+            raise InputError(f"{flag} must not be empty, but it is; give it a value, or leave it out instead.")
 
 
 def _said(error: BaseException) -> str:
