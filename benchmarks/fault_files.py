@@ -154,14 +154,15 @@ def _garble(file: h5py.File, rng: random.Random) -> None:
 
 
 FLAGS = {
-    "simulate": "energy-kev distance pixel-size psf-sigma-px views photons-per-pixel seed misalign-shift density",
+    "simulate": "energy-kev distance pixel-size psf-sigma-px views frames pulses photons-per-pixel seed misalign-shift "
+    "density",
     "reconstruct": "seed bin axis-column delta-beta density distance uncertain-shift",
-    "grow": "cells flow snapshots interval viscosity diameter",
+    "grow": "cells flow snapshots interval viscosity diameter frequency",
     "record": "flats darks photons-per-pixel seed gain bits",
 }
-VALUES = ("nan", "inf", "-inf", "-1", "1e30", "-1e30", str(2**70), str(10**12), "", "x", "1e-300", "\udc80")
+VALUES = ("nan", "inf", "-inf", "-1", "1e30", "-1e30", str(2**70), str(10**9), str(10**12), "", "x", "1e-300", "\udc80")
 
-MEANT = {("seed", str(10**12)), ("photons-per-pixel", str(10**12)), ("axis-column", str(10**12))}
+MEANT = {(flag, value) for flag in ("seed", "photons-per-pixel") for value in (str(10**9), str(10**12))}
 MEANT |= {(flag, "1e-300") for flag in ("psf-sigma-px", "misalign-shift", "uncertain-shift", "axis-column")}
 """What is no odd value: seeds are as large as they like, so many photons give no noise, so small a length is none, and
 --axis-column may say that the axis is anywhere."""

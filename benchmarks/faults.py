@@ -25,6 +25,7 @@ from pathlib import Path
 import machine
 from fault_files import flipped, hostile, odd, tampered, two
 from fault_kills import full, killed
+from fault_limits import denied, extreme, starved
 from fault_shop import WRITERS, Shop, Writer
 from forked import loaded, run, size_of
 from rows import read, write
@@ -37,6 +38,11 @@ SINGLE: dict[str, Callable[[Shop, random.Random, Path], str]] = {
     "hostile files": hostile,
     "odd values": odd,
     "two writers": two,
+    "extreme kernels": extreme,
+}
+LIMITED: dict[str, Callable[[Shop, Writer, random.Random, Path], str]] = {
+    "no permission": denied,
+    "little memory": starved,
 }
 
 
@@ -61,6 +67,8 @@ def trials(
             folder = Path(name)
             if kind in SINGLE:
                 outcome = SINGLE[kind](shop, rng, folder)
+            elif kind in LIMITED:
+                outcome = LIMITED[kind](shop, writer, rng, folder)
             else:
                 cost[writer.name] = cost.get(writer.name) or timed(shop, writer)
                 lasts, largest = cost[writer.name]
@@ -82,7 +90,7 @@ def main() -> None:
     """All kinds, and a table of them."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--trials", type=int, default=200, help="of each kind")
-    parser.add_argument("--kinds", nargs="*", default=[*DISTURBED, *SINGLE])
+    parser.add_argument("--kinds", nargs="*", default=[*DISTURBED, *LIMITED, *SINGLE])
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--seconds", type=float, default=1e9, help="of each kind, at most")
     parser.add_argument("--csv", type=Path)

@@ -36,18 +36,43 @@ class Ended:
         return "crash" if self.code is None and self.signal != signal.SIGKILL else ""
 
 
-def run(arguments: list[object], kill_after: float = 0.0, file_size: int = -1, limit: float = 60.0) -> Ended:
+def nothing() -> None:
+    """What a command does first, unless it is told otherwise."""
+
+
+def run(
+    arguments: list[object],
+    kill_after: float = 0.0,
+    file_size: int = -1,
+    limit: float = 60.0,
+    first: Callable[[], None] = nothing,
+) -> Ended:
     """A command, with everything it says.
 
     kill_after: seconds after which it is killed (0: never), as by a power cut of the process; file_size: bytes beyond
-    which no file grows (-1: any), as on a full disk; limit: seconds after which it counts as hanging.
+    which no file grows (-1: any), as on a full disk; limit: seconds after which it counts as hanging; first: what its
+    process does before the command begins.
     """
+
+    def act() -> None:
+        if file_size >= 0:
+            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
+        sys.argv = ["holosplat", *map(str, arguments)]
+        first()
+        main()
+
+    return attempted(act, kill_after, limit)
+
+
+def attempted(act: Callable[[], None], kill_after: float = 0.0, limit: float = 60.0) -> Ended:
+    """The same of any `act`."""
     reading, writing = os.pipe()
     begun = time.perf_counter()
     child = os.fork()
     if child == 0:
         os.close(reading)
-        _become(arguments, writing, file_size, limit)
+        _become(act, writing, limit)
     os.close(writing)
     if kill_after:
         _killed(child, kill_after)
@@ -68,8 +93,8 @@ def _killed(child: int, after: float) -> None:
     os.kill(child, signal.SIGKILL)
 
 
-def _become(arguments: list[object], writing: int, file_size: int, limit: float) -> None:
-    """Run the command in this process, which ends with it."""
+def _become(act: Callable[[], None], writing: int, limit: float) -> None:
+    """Do it in this process, which ends with it."""
     code = 1
     try:
         os.dup2(writing, 1)
@@ -77,11 +102,7 @@ def _become(arguments: list[object], writing: int, file_size: int, limit: float)
         sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         signal.setitimer(signal.ITIMER_REAL, limit)
-        if file_size >= 0:
-            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-            resource.setrlimit(resource.RLIMIT_FSIZE, (file_size, resource.getrlimit(resource.RLIMIT_FSIZE)[1]))
-        sys.argv = ["holosplat", *map(str, arguments)]
-        code = _code(main)
+        code = _code(act)
         sys.stdout.flush()
         sys.stderr.flush()
     finally:

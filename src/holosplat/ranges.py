@@ -55,6 +55,11 @@ Angle = Annotated[float, Within(0, 180, unit="degrees")]
 Positive = Annotated[float, Within(0, LARGEST, above=True)]
 Natural = Annotated[int, Within(1, MOST)]
 """A count of at least one."""
+Many = Annotated[int, Within(1, 10**5)]
+"""A count of views, moments, pulses or bodies simulated one by one: of more, nothing could be said for minutes."""
+ManyOrNone = Annotated[int, Within(0, 10**5)]
+Jobs = Annotated[int, Within(1, 1000)]
+"""Processes of a machine."""
 Share = Annotated[float, Within(0, 1)]
 SomeShare = Annotated[float, Within(0, 1, above=True)]
 Weight = Annotated[float, Within(0, 1e6)]

@@ -29,7 +29,13 @@ def test_names_are_chosen_in_the_tables_order_or_refused():
 
 
 @pytest.mark.parametrize(
-    ("cases", "seeds", "words"), [((), (1,), "one of the cases"), (("a",), (), "seeds"), (("a",), (-1,), "0 or more")]
+    ("cases", "seeds", "words"),
+    [
+        ((), (1,), "one of the cases"),
+        (("a",), (), "seeds"),
+        (("a",), (-1,), "0 or more"),
+        (("a", "../b"), (1,), "but one is '../b'"),
+    ],
 )
 def test_a_suite_of_nothing_is_refused(recorder, cases, seeds, words):
     with pytest.raises(hs.InputError, match=words):
@@ -134,6 +140,15 @@ def test_bad_requests_are_refused_in_one_line(shop, tmp_path, arguments, words):
     assert code == 2
     assert words in err
     assert not (tmp_path / "bench").exists()
+
+
+def test_a_case_whose_name_can_be_no_files_is_refused_before_there_is_a_folder(shop, tmp_path, monkeypatch):
+    case = replace(make_case("round", 3), name="my case")
+    monkeypatch.setattr("holosplat.bench.case.load_case", lambda name, seed, snapshots: case)
+    code, _, err = holosplat("bench", "run", "--cases", "my case.toml", "--out", tmp_path / "bench")
+    assert code == 2
+    assert "names of cases and methods must be of letters, digits, '-', '_' and '+', but one is 'my case'" in err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_ctrl_c_says_how_to_go_on(shop, tmp_path, monkeypatch):

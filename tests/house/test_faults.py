@@ -10,6 +10,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from matplotlib.figure import Figure
 
 from holosplat.io.vtk import write_mesh
 from holosplat.specimens.red_cells import random_cells
@@ -27,24 +28,86 @@ def faults() -> ModuleType:
 
 @pytest.fixture(scope="module")
 def shop(faults, tmp_path_factory):
-    """One cell and its scan; nothing else is there."""
+    """One cell, its scan and a run; nothing else is there. Figures stay blank."""
     path = tmp_path_factory.mktemp("faults")
     shop = importlib.import_module("fault_shop")
     (cell,) = random_cells(1, (shop.COLUMNS * shop.PIXEL,) * 3, 1, 10 * shop.PIXEL)
     write_mesh(path / "cell.vtk", cell, "um")
     made = faults.Shop(path, (path / "cell.vtk",))
-    assert faults.run(made.simulate(made.scan)).code == 0
-    return made
+    made.quick.write_text(json.dumps(shop.QUICK))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", Figure.savefig)  # which is put back in the end
+        faults.loaded()
+        for command in (made.simulate(made.scan), made.reconstruct(made.run)):
+            assert faults.run(command).code == 0
+        yield made
 
 
 def writer(faults, name: str):
     return next(one for one in faults.WRITERS if one.name == name)
 
 
-@pytest.mark.parametrize("kind", ["kill -9", "full disk"])
-def test_writers_are_disturbed(faults, shop, kind):
+KINDS = [
+    "kill -9",
+    "full disk",
+    "no permission",
+    "little memory",
+    "bit flips",
+    "tampered runs",
+    "hostile files",
+    "odd values",
+    "two writers",
+    "extreme kernels",
+]
+
+
+def test_all_kinds_are_known(faults):
+    assert sorted(KINDS) == sorted([*faults.DISTURBED, *faults.LIMITED, *faults.SINGLE])
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_each_kind_is_tried(faults, shop, kind):
     found = faults.trials(shop, kind, 2, random.Random(2), (writer(faults, "convert"),))
     assert found == {"trials": 2}
+
+
+def test_kernels_are_given_extreme_numbers_of_every_kind(faults, shop):
+    assert faults.trials(shop, "extreme kernels", 30, random.Random(5)) == {"trials": 30}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_inputs_and_folders_are_barred(faults, shop, seed):
+    """By turns; both are as they were in the end."""
+    mode = shop.scan.stat().st_mode
+    assert faults.trials(shop, "no permission", 1, random.Random(seed), (writer(faults, "convert"),)) == {"trials": 1}
+    assert shop.scan.stat().st_mode == mode
+
+
+def test_what_is_taken_without_permission_is_counted(faults, shop, tmp_path, monkeypatch):
+    limits = importlib.import_module("fault_limits")
+    monkeypatch.setattr(limits, "powerless", lambda: None)
+    monkeypatch.setattr(limits, "run", lambda command, first: importlib.import_module("forked").Ended(0, 0, "", 0.1))
+    assert limits.denied(shop, writer(faults, "convert"), random.Random(1), tmp_path) == "silent"
+
+
+def test_memory_that_does_not_do_ends_in_a_sentence(faults, shop, tmp_path):
+    """Not even for the libraries, and for these alone."""
+    limits, kills = (importlib.import_module(name) for name in ("fault_limits", "fault_kills"))
+    command = writer(faults, "convert").command(shop, tmp_path)
+    for ended in (limits._anew(command, 200 << 20), faults.run(command, first=lambda: limits.limited(1 << 20))):
+        assert (ended.code, kills.sentence(ended)) == (2, "")
+        assert "memory" in ended.said
+
+
+def test_a_kernel_that_crashes_or_fails_is_counted(faults, shop, tmp_path, monkeypatch):
+    limits = importlib.import_module("fault_limits")
+    for act, verdict in (
+        (lambda *_: signal.raise_signal(signal.SIGTRAP), "crash"),
+        (lambda *_: 1 // 0, "traceback"),
+        (lambda *_: None, ""),
+    ):
+        monkeypatch.setattr(limits, "_used", act)
+        assert limits.extreme(shop, random.Random(1), tmp_path) == verdict
 
 
 def test_odd_values_and_hostile_meshes(faults, shop, monkeypatch):

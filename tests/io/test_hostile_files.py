@@ -14,9 +14,9 @@ import tifffile
 
 from holosplat.checks import InputError
 from holosplat.geometry import Views
-from holosplat.io import hdf5_guard, read_scan, write_scan
+from holosplat.io import guard, hdf5_guard, read_scan, write_scan
 from holosplat.io.formats import read, read_as
-from holosplat.io.guard import require_memory, xml_fault
+from holosplat.io.guard import read_array, require_memory, xml_fault
 from holosplat.io.reading import Reading, Told, read_angles
 from holosplat.io.stacks import stack_of
 from holosplat.io.vtk import read_meshes
@@ -203,6 +203,15 @@ def test_arrays_declare_what_they_hold(tmp_path):
         file.write(bytes(100))
     with pytest.raises(InputError, match=r"a\.npy must be a NumPy array, but reading it failed"):
         stack_of(path)
+
+
+def test_an_array_in_a_file_with_holes_is_held_against_the_memory(tmp_path, monkeypatch):
+    """Such a file is as long as it says, and takes nothing of the disk."""
+    np.save(tmp_path / "a.npy", np.zeros(500))
+    assert read_array(tmp_path / "a.npy", "numbers").size == 500
+    monkeypatch.setattr(guard, "machine_memory", lambda: 3999)
+    with pytest.raises(InputError, match=r"a\.npy takes 4e-06 GB, but this machine has 4e-06 GB of memory for it"):
+        read_array(tmp_path / "a.npy", "numbers")
 
 
 def test_archives_declare_what_they_hold(tmp_path):

@@ -222,11 +222,13 @@ def test_memory_is_that_of_the_control_groups(machine, version):
     group(place, names, 3 * 10**9, 2 * 10**9, 5 * 10**8)
     assert room.machine_memory() == 3 * 10**9
     assert room.free_memory() == 15 * 10**8
+    assert room.left_by_limits() == (room.UNLIMITED, 15 * 10**8)
 
 
 def test_memory_is_that_of_the_address_space(machine, monkeypatch):
     monkeypatch.setattr(resource, "getrlimit", lambda kind: (4 * 10**9, 8 * 10**9))
     assert (room.machine_memory(), room.free_memory()) == (4 * 10**9, 4 * 10**9 - 1_024_000_000)
+    assert room.left_by_limits() == (4 * 10**9 - 1_024_000_000, room.UNLIMITED)
 
 
 def test_room_on_the_disk_is_that_of_the_folder_above(folder, monkeypatch):

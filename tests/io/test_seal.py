@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 import random
+import time
+import tracemalloc
+import zlib
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 
+import holosplat.io.seal as module
 from holosplat.checks import InputError
 from holosplat.geometry import Views
 from holosplat.io import read_scan
@@ -104,6 +109,71 @@ def test_a_seal_that_cannot_be_is_refused(scan, change):
     scan.write_bytes(content[: -ENDING.size] + ENDING.pack(*parts))
     with pytest.raises(InputError, match="damaged"):
         require_sealed(scan)
+
+
+def forged(path: Path, content: bytes, packed: bytes, ranges: bytes) -> Path:
+    """A file whose seal has such ranges, and the checksum that goes with them."""
+    starts = np.frombuffer(ranges, "<i8").reshape(-1, 2).tolist()
+    rest, at = b"", 0
+    for offset, size in starts:
+        rest, at = rest + content[at : max(offset, 0)], max(at, offset + size)
+    digest = hashlib.sha256(ranges + rest + content[at:]).digest()
+    path.write_bytes(content + MAGIC + packed + ENDING.pack(len(content), len(packed), digest, MAGIC))
+    return path
+
+
+def zeros(size: int) -> bytes:
+    """So many zeros, deflated."""
+    packer, block = zlib.compressobj(), bytes(1 << 20)
+    return b"".join(packer.compress(block) for _ in range(size >> 20)) + packer.flush()
+
+
+def test_a_seal_that_unpacks_to_gigabytes_is_refused_without_doing_so(tmp_path):
+    """1 MB of deflated zeros, behind a file of 64 kB: 2²⁶ ranges, which took minutes and gigabytes."""
+    path = forged(tmp_path / "a.h5", bytes(1 << 16), zeros(1 << 30), b"")
+    tracemalloc.start()
+    began = time.perf_counter()
+    with pytest.raises(InputError, match=r"a\.h5 must be as it was written, but it is truncated or damaged"):
+        require_sealed(path)
+    seconds, (_, peak) = time.perf_counter() - began, tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert seconds < 2
+    assert peak < 16e6
+
+
+def test_a_seal_that_is_longer_than_deflate_makes_one_is_not_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "_unpacked", lambda *_: pytest.fail("it must not be unpacked"))
+    path = forged(tmp_path / "a.h5", bytes(1 << 16), bytes(3 << 20), b"")
+    with pytest.raises(InputError, match="truncated or damaged"):
+        require_sealed(path)
+
+
+@pytest.mark.parametrize(
+    ("ranges", "good"),
+    [
+        ([[3, 4], [10, 2]], True),
+        ([], True),
+        ([[3, 7], [10, 50]], True),
+        ([[3, 0]], False),
+        ([[3, -1]], False),
+        ([[-1, 4]], False),
+        ([[10, 2], [3, 4]], False),
+        ([[3, 8], [10, 2]], False),
+        ([[3, 4], [3, 4]], False),
+        ([[10, 51]], False),
+        ([[61, 1]], False),
+        ([[1 << 62, 1 << 62], [3, 4]], False),
+    ],
+)
+def test_ranges_hold_something_follow_each_other_and_lie_in_the_file(tmp_path, ranges, good):
+    """Their checksum is right."""
+    content = np.array(ranges, "<i8").tobytes()
+    path = forged(tmp_path / "a.h5", bytes(range(60)), zlib.compress(content), content)
+    if good:
+        require_sealed(path)
+        return
+    with pytest.raises(InputError, match="truncated or damaged"):
+        require_sealed(path)
 
 
 class Slow(io.BytesIO):

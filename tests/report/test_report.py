@@ -197,6 +197,12 @@ def test_any_part_may_be_absent(changes, figures, undrawn_reports):
     assert len(Page(render_page(content(**changes))).sources) == figures
 
 
+def test_the_page_says_of_which_run_it_is(bare_page, undrawn_reports):
+    assert "holosplat-run" not in bare_page
+    page = render_page(content(**BARE, run='0"1'))
+    assert '<meta name="holosplat-run" content="0&#34;1">' in page
+
+
 def test_empty_reconstruction_and_no_beta_are_reported():
     truth, found = scene()
     zero = np.zeros_like(found.delta)

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import csv
+import html
 import json
+import os
 import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,6 +23,7 @@ from holosplat.series.folder import SeriesFolder
 from holosplat.series.pages.charts import Point, chart, labels
 from holosplat.series.pages.page import SeriesPage, render_page
 from holosplat.series.run import run_left, states
+from holosplat.series.time import PHASE
 from holosplat.series.words import duration, table_of, time_left
 from holosplat.workflows.reconstruction import Reconstruction
 
@@ -69,6 +73,48 @@ def test_what_is_missing_is_said(partly):
     out = holosplat("series", "collect", partly.path)
     assert (out.code, "3 of 5 times are missing: 2, 3, 4" in out.err) == (4, True)
     assert "1 failed" in worked(holosplat("series", "status", partly.path)).out
+
+
+def terabytes(path: Path) -> None:
+    """A header that declares 40 TB, and 100 bytes."""
+    with path.open("wb") as file:
+        header = {"descr": "<f4", "fortran_order": False, "shape": (10**7, 10**6)}
+        np.lib.format.write_array_header_1_0(file, header)
+        file.write(bytes(100))
+
+
+def of_one_axis(path: Path) -> None:
+    np.save(path, np.zeros(5))
+
+
+def of_text(path: Path) -> None:
+    path.write_bytes(b"no array")
+
+
+def a_pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (terabytes, "but it is damaged or none: it declares 4e+13 bytes, but has"),
+        (of_one_axis, "must be a phase map of numbers [H, W], but it is float64 of the shape (5,)"),
+        (of_text, "must be a phase map (.npy), but it is damaged or none"),
+        (a_pipe, "must be a phase map, but it is a pipe or a device"),
+    ],
+)
+def test_a_phase_map_that_cannot_be_read_is_left_out_and_said(done, tmp_path, make, said):
+    folder = SeriesFolder(shutil.copytree(done.path, tmp_path / "series"))
+    path = folder.run(0, 0) / PHASE
+    path.unlink()
+    make(path)
+    worked(holosplat("series", "collect", folder.path))
+    page = html.unescape(folder.page.read_text())
+    assert "All times are done." in page
+    assert "time 0 has no picture: " in page
+    assert said in page
+    assert page.count("data:image/png") == 4 + 1
 
 
 def test_a_body_keeps_its_name():

@@ -86,6 +86,53 @@ def test_what_is_resumed_ends_as_what_was_never_interrupted(data, tmp_path):
         assert [row["step"] for row in csv.DictReader(file)] == ["1", "2", "3", "4", "5", "6"]
 
 
+@pytest.fixture
+def kept(data, tmp_path) -> Path:
+    """The checkpoint of a training that was interrupted at step 4."""
+    with pytest.raises(KeyboardInterrupt):
+        run(data, tmp_path / "run", stop=4)
+    return tmp_path / "run" / "checkpoint.pt"
+
+
+def changed(path: Path, **entries: object) -> None:
+    """The checkpoint with other entries; None: without."""
+    found = torch.load(path, weights_only=True) | entries
+    torch.save({name: value for name, value in found.items() if value is not None}, path)
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda content: content[:1000], lambda content: b"", lambda content: b"x" + content]
+)
+def test_a_damaged_checkpoint_is_refused(data, kept, damage):
+    kept.write_bytes(damage(kept.read_bytes()))
+    with pytest.raises(
+        InputError, match=r"checkpoint\.pt must be a checkpoint, but it is damaged; remove it, and --res"
+    ):
+        Training.resumed(data, kept.parent, OPTIONS)
+    kept.unlink()
+    assert Training.resumed(data, kept.parent, OPTIONS).step == 0
+
+
+@pytest.mark.parametrize(
+    ("entries", "said"),
+    [
+        ({"network": None}, "lacks or garbles 'network'"),
+        ({"optimiser": {}}, "lacks or garbles"),
+        ({"network": {}}, "lacks or garbles"),
+        ({"step": -5}, "step must be from 0 to 6, but it is -5"),
+        ({"step": 10**9}, "step must be from 0 to 6, but it is 1000000000"),
+        ({"step": "x"}, "lacks or garbles"),
+        ({"step": 2}, "rows must be 2 of 5 numbers"),
+        ({"rows": [[1.0]] * 3}, "rows must be 3 of 5 numbers"),
+        ({"rows": 5}, "lacks or garbles"),
+    ],
+)
+def test_a_checkpoint_that_is_not_of_the_training_is_refused(data, kept, entries, said):
+    changed(kept, **entries)
+    with pytest.raises(InputError, match=rf"checkpoint\.pt must be a checkpoint of this training, but it .*{said}"):
+        Training.resumed(data, kept.parent, OPTIONS)
+
+
 def test_a_training_learns_boxes(data, tmp_path):
     options = replace(OPTIONS, steps=60, keep_every=60, rate=1e-2)
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..checks import require, require_regular
 from ..io.guard import read_array
-from ..ranges import Signed, ranged
+from ..ranges import Many, Signed, ranged
 
 if TYPE_CHECKING:
     from ..geometry import Views
@@ -30,7 +30,7 @@ GEOMETRIES: dict[Geometry, tuple[float, ...]] = {
 class Directions:
     """The views of an experiment: exactly one of `views`, `angles_deg`, `rotations` and `geometry`."""
 
-    views: int | None = None
+    views: Many | None = None
     """Number of views, evenly spaced over 180°."""
     angles_deg: tuple[Signed, ...] = ()
     """Angles about the rotation axis [degrees]."""

@@ -21,7 +21,7 @@ from ..optics.illumination import Illumination, PulseModel, Pulses
 from ..optics.noise import PHOTON_RANGE
 from ..optics.resampling import FLIPS, Flip
 from ..progress import Advance
-from ..ranges import Photons, Seed, ranged
+from ..ranges import Many, Photons, Seed, ranged
 from ..scan import Exposures, Scan
 
 DEAD_BIT, HOT_BIT = 1 << 1, 1 << 3
@@ -35,9 +35,9 @@ class RecordingOptions:
 
     photons_per_pixel: Photons = 10_000.0
     """Mean photons detected in a pixel without the object."""
-    flats: int = 100
+    flats: Many = 100
     """Frames without the object, each of a pulse of its own; they come before the projections."""
-    darks: int = 20
+    darks: Many = 20
     """Frames without light; they come first."""
     flip: Flip = "none"
     """The order that the detector reverses: of its rows, of its columns, or of both."""

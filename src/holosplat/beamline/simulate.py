@@ -17,7 +17,7 @@ from ..optics.detector import poisson
 from ..optics.noise import PHOTON_RANGE
 from ..optics.sampling import resolving_oversample
 from ..progress import Advance
-from ..ranges import Photons, Seed, ranged
+from ..ranges import Many, Photons, Seed, ranged
 from ..scan import Exposures, Scan, interleaved_split
 from ..specimens.mesh_series import MeshSeries
 from ..specimens.scene import MeshScene
@@ -41,7 +41,7 @@ class Shutter:
 
     exposure: float = 0.0
     """Length of the exposure about the frame's time [s] (default: 0, no motion blur)."""
-    pulses: int = 1
+    pulses: Many = 1
     """Number of flashes, each in the middle of an equal part of the exposure; a steady beam has many."""
 
     def __post_init__(self) -> None:

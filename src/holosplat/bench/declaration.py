@@ -19,7 +19,7 @@ from ..geometry import Views, rotation_tilted, rotation_y
 from ..materials import DeltaBeta, parse_material
 from ..matter import MaterialPrior
 from ..optics.noise import PHOTON_RANGE
-from ..ranges import Grams, Metres, Natural, Photons, Pixels, Positive, Signed, Small, ranged
+from ..ranges import Grams, Many, ManyOrNone, Metres, Photons, Pixels, Positive, Signed, Small, ranged
 from ..scan import Exposures, interleaved_split
 from ..specimens.continuous import ContinuousScene
 from ..specimens.phantoms import Ball
@@ -103,8 +103,8 @@ class Interleaved:
     """`count` views evenly over 180° about the y axis, the last of every `hold_out_every` held out."""
 
     kind: ClassVar[str] = "interleaved"
-    count: Natural
-    hold_out_every: Natural = 4
+    count: Many
+    hold_out_every: Many = 4
 
     def __post_init__(self) -> None:
         enough = 2 <= self.hold_out_every <= self.count
@@ -122,8 +122,8 @@ class Between:
     """`train` views evenly over 180° about the y axis, and `test` held-out ones, each in the middle of a gap."""
 
     kind: ClassVar[str] = "between"
-    train: Natural
-    test: int
+    train: Many
+    test: ManyOrNone
 
     def __post_init__(self) -> None:
         require(

@@ -59,7 +59,7 @@ class BenchFolder:
 
     def case(self, case: str, seed: int) -> Path:
         """The folder of a case with a seed."""
-        return self.cases / f"{_good(case)}.{seed}"
+        return self.cases / f"{good_name(case)}.{seed}"
 
     def has_row(self, case: str, seed: int, method: str, retry: bool = False) -> bool:
         """Whether a row is there; with `retry`, a failed one does not count."""
@@ -98,17 +98,17 @@ class BenchFolder:
         return read_json(path) if path.is_file() else {}
 
     def _row(self, case: str, seed: int, method: str) -> Path:
-        return self.rows / f"{_good(case)}.{seed}.{_good(method)}.json"
+        return self.rows / f"{good_name(case)}.{seed}.{good_name(method)}.json"
 
     def _picture(self, case: str, seed: int, name: str) -> Path:
-        return self.pictures / f"{_good(case)}.{seed}.{_good(name)}.npz"
+        return self.pictures / f"{good_name(case)}.{seed}.{good_name(name)}.npz"
 
     def _require_marked(self, sentence: str) -> None:
         marked = self.marker.is_file() and read_json(self.marker).get("format") == FORMAT
         require(marked, f"{sentence} holds other files; choose another.")
 
 
-def _good(name: str) -> str:
+def good_name(name: str) -> str:
     """`name`, if it can be a part of a file's name."""
     good = NAME.fullmatch(name) is not None
     require(good, f"names of cases and methods must be of letters, digits, '-', '_' and '+', but one is {name!r}.")

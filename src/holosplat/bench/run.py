@@ -21,7 +21,7 @@ from ..workflows.evaluate import Scores, score_object
 from ..workflows.provenance import environment, scan_hash
 from .aligners import Aligner
 from .case import Case
-from .folder import BenchFolder
+from .folder import BenchFolder, good_name
 from .measured import MeasuredCase, agreement
 from .method import Method
 from .moved import judged_with
@@ -50,6 +50,8 @@ class Suite:
     def __post_init__(self) -> None:
         for what, chosen in (("cases", self.cases), ("methods", self.methods), ("seeds", self.seeds)):
             require(len(chosen) > 0, f"a benchmark needs at least one of the {what}; name one.")
+        for name in (*self.cases, *self.names()):
+            good_name(name)
         require(min(self.seeds) >= 0, f"seeds must be 0 or more, but one is {min(self.seeds)}.")
 
     def names(self) -> list[str]:

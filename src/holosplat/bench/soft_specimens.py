@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from ..matter import DeltaBeta
-from ..ranges import Metres, Natural, Small, ranged
+from ..ranges import Many, ManyOrNone, Metres, Small, ranged
 from ..specimens.continuous import ContinuousScene
 from ..specimens.soft_matter import body_with_absorber, coated_droplets, round_cell, shepp_logan, soft_cells, tissue
 
@@ -22,7 +22,7 @@ class SoftCells:
 
     kind: ClassVar[str] = "soft cells"
     has_core: ClassVar[bool] = False
-    count: Natural
+    count: Many
     diameters: tuple[Small, Small]
     box: Extents
     edge: Small
@@ -55,8 +55,8 @@ class Tissue:
     kind: ClassVar[str] = "tissue"
     has_core: ClassVar[bool] = False
     box: Extents
-    cells: int = 40
-    granules: int = 300
+    cells: ManyOrNone = 40
+    granules: ManyOrNone = 300
 
     def continuous(self, seed: int, matter: Sequence[DeltaBeta]) -> tuple[ContinuousScene, str]:
         """The scene that `seed` gives of `matter` against its medium, and what it is in words."""
@@ -86,7 +86,7 @@ class CoatedDroplets:
 
     kind: ClassVar[str] = "coated droplets"
     has_core: ClassVar[bool] = True
-    count: Natural
+    count: Many
     diameters: tuple[Small, Small]
     coating: Small
     box: Extents
@@ -107,7 +107,7 @@ class BodyWithAbsorber:
     has_core: ClassVar[bool] = True
     size: Extents
     bead: Small
-    beads: Natural = 1
+    beads: Many = 1
 
     def continuous(self, seed: int, matter: Sequence[DeltaBeta]) -> tuple[ContinuousScene, str]:
         """The scene that `seed` gives of `matter` against its medium, and what it is in words."""

@@ -13,7 +13,7 @@ import numpy as np
 from ..checks import InputError, in_range, require
 from ..io.vtk import SUFFIXES, read_meshes
 from ..mesh import TriangleMesh
-from ..ranges import Natural, Seed, Share, Small, SomeShare, ranged
+from ..ranges import Many, Seed, Share, Small, SomeShare, ranged
 from ..specimens.capsules import place_capsules
 from ..specimens.foam import random_foam
 from ..specimens.phantoms import Ball, star_of_balls
@@ -49,7 +49,7 @@ class RedCells:
 
     kind: ClassVar[str] = "red cells"
     has_core: ClassVar[bool] = False
-    count: Natural
+    count: Many
     diameter: Small
     box: Extents
     shape: Literal["cylinder", "box"] = "cylinder"
@@ -123,7 +123,7 @@ class Capsules:
 
     kind: ClassVar[str] = "capsules"
     has_core: ClassVar[bool] = True
-    count: Natural
+    count: Many
     diameters: tuple[Small, Small]
     shell: Small
     box: Extents
@@ -145,7 +145,7 @@ class FoamDrop:
     kind: ClassVar[str] = "foam"
     has_core: ClassVar[bool] = True
     drop: Small
-    count: Natural
+    count: Many
     median: Small
     spread: float = 0.4
 
@@ -164,7 +164,7 @@ class BallStar:
     kind: ClassVar[str] = "star of balls"
     has_core: ClassVar[bool] = False
     diameters: tuple[Small, ...]
-    spokes: Natural = 8
+    spokes: Many = 8
 
     def bodies(self, seed: int, snapshots: Path | None) -> Bodies:
         """The star that `seed` gives, with its balls."""

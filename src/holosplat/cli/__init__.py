@@ -6,6 +6,6 @@ import os
 # It must be said before torch loads its OpenMP; whoever sets the variable keeps the choice.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-from .entry import main
+from .start import main
 
 __all__ = ["main"]

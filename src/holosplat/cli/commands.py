@@ -147,7 +147,6 @@ def _scored(
     folder: RunFolder, result: Reconstruction, measured: Scan, scan: Path, reading: Reading
 ) -> tuple[Evaluation, Path]:
     """The scores of a run on its frames, and its report; the folder then knows where its frames are."""
-    from ..io.json import write_json
     from ..io.run_scan import run_source
     from ..report.run import report_run
     from ..workflows.evaluate import evaluate as score
@@ -155,7 +154,7 @@ def _scored(
     from .motion import report_of_middle
 
     found = {each.name: each.value for each in result.constants if each.name in reading.told.ranges()}
-    write_json(folder.source, run_source(scan, replace(reading, told=replace(reading.told, **found))))
+    folder.write_source(run_source(scan, replace(reading, told=replace(reading.told, **found))))
     placed = result.placed(measured)
     evaluation = score(result, placed, None)
     if instants_of(folder):

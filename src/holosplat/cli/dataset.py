@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, arg
 
-from ..ranges import Natural, Seed
+from ..ranges import Jobs, Seed, Within
 from ..training.ranges import Ranges
 from .progress import INTERRUPTED, ProgressBar
 from .room import tell
@@ -24,10 +24,10 @@ DRAWN = Ranges()
 
 def dataset(
     out: Path,
-    count: Natural = 1000,
+    count: Annotated[int, Within(1, 10**6)] = 1000,
     drawn: Annotated[Ranges, OmitArgPrefixes] = DRAWN,
     seed: Seed = 0,
-    jobs: Natural = 1,
+    jobs: Jobs = 1,
     layouts: Annotated[tuple[Layout, ...], arg(name="export")] = (),
 ) -> None:
     """Simulate scenes for learning, drawn at random from stated ranges, into a folder of shards with a datasheet.

@@ -7,10 +7,10 @@ each function imports its work where it starts, so that `holosplat COMMAND --hel
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable
 from importlib import import_module
-from typing import NoReturn
 
 import tyro
 from tyro.conf import OmitArgPrefixes
@@ -19,10 +19,14 @@ from ..checks import OUT_OF_MEMORY, InputError
 from ..ranges import checked_later, with_checked_numbers
 from ..version import __version__
 from .progress import INTERRUPTED
+from .sentence import give_up
 from .signals import end_as_on_interrupt
 
 LONGEST = 200
 """Characters of another program's message, at most."""
+
+EMPTY = re.compile("(--[^=]+)=")
+"""An option to which nothing is given."""
 
 COMMANDS: dict[str, tuple[str, str]] = {
     "plan": (
@@ -121,6 +125,7 @@ def main() -> None:
         print(f"holosplat {__version__}")
         return
     try:
+        _require_no_empty(sys.argv[1:])
         with checked_later():
             tyro.extras.subcommand_cli_from_dict(
                 _functions(sys.argv[1:]),
@@ -129,13 +134,13 @@ def main() -> None:
                 config=(OmitArgPrefixes,),
             )
     except InputError as error:
-        _give_up(str(error))
+        give_up(str(error))
     except MemoryError as error:
-        _give_up(f"the memory of this machine is not enough{_said(error)}; take larger pixels (--bin) or fewer rows.")
+        give_up(f"the memory of this machine is not enough{_said(error)}; take larger pixels (--bin) or fewer rows.")
     except RecursionError:
-        _give_up("the input is nested too deeply; make it flat.")
+        give_up("the input is nested too deeply; make it flat.")
     except UnicodeError as error:
-        _give_up(f"a name or text is none in UTF-8: {error}; correct it.")
+        give_up(f"a name or text is none in UTF-8: {error}; correct it.")
     except KeyboardInterrupt:
         print("holosplat: interrupted", file=sys.stderr)
         raise SystemExit(INTERRUPTED) from None
@@ -143,17 +148,20 @@ def main() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(1) from None
     except OSError as error:
-        _give_up(f"a file cannot be read or written{_said(error)}; check its path, its permissions and the disk.")
+        give_up(f"a file cannot be read or written{_said(error)}; check its path, its permissions and the disk.")
     except RuntimeError as error:
         if not OUT_OF_MEMORY.search(str(error)):
             raise
-        _give_up(f"the memory of this machine is not enough{_said(error)}; take larger pixels (--bin) or fewer rows.")
+        give_up(f"the memory of this machine is not enough{_said(error)}; take larger pixels (--bin) or fewer rows.")
 
 
-def _give_up(sentence: str) -> NoReturn:
-    text = f"holosplat: {sentence}\n"
-    sys.stderr.write(text.encode("utf-8", "backslashreplace").decode("utf-8"))
-    raise SystemExit(2) from None
+def _require_no_empty(arguments: list[str]) -> None:
+    """`InputError` that names the first argument which is empty: the parser would take it for the folder one is in."""
+    for before, argument in zip(["holosplat", *arguments], arguments):
+        bare = EMPTY.fullmatch(argument)
+        if bare or not argument:
+            flag = bare[1] if bare else before if before.startswith("--") else f"the argument behind {before}"
+            raise InputError(f"{flag} must not be empty, but it is; give it a value, or leave it out instead.")
 
 
 def _said(error: BaseException) -> str:

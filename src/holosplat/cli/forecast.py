@@ -12,7 +12,6 @@ from tyro.conf import Positional
 
 from ..checks import positive, require
 from ..io.formats import read_as
-from ..io.json import write_json
 from ..io.reading import Reading, ends_of
 from ..io.run_scan import run_reading, run_source
 from ..motion.cell_model import ChannelFrame
@@ -20,7 +19,7 @@ from ..motion.dynamics import DynamicsForecast
 from ..motion.fit import MotionFit
 from ..motion.forecast import PathForecast
 from ..planning.acts import of_forecast
-from ..ranges import Natural, Positive, Seconds, Seed, Signed, Small, ranged
+from ..ranges import Many, Positive, Seconds, Seed, Signed, Small, ranged
 from ..report.run import report_run
 from ..scan import Scan
 from ..specimens.flow.suspension import PLASMA_VISCOSITY
@@ -41,7 +40,7 @@ from .room import tell
 class ForecastFlags:
     """How bodies move on."""
 
-    times: Natural = 10
+    times: Many = 10
     """Times ahead."""
     step: Seconds | None = None
     """Between them [s] (default: the median step of the run)."""
@@ -60,7 +59,7 @@ class ForecastFlags:
     effort: float = 1.0
     """Factor of the numbers of steps of these fits."""
 
-    back: Natural = 8
+    back: Many = 8
     """Last times over which the flow is fitted, at most a third of the run's."""
     channel: tuple[Small, Small] | None = None
     """Extents [m] of a rectangular channel across the flow, along the other two axes in the order x, y, z."""
@@ -130,7 +129,7 @@ def forecast(run: Positional[Path], out: Path, how: ForecastFlags = ForecastFlag
         found = carry_on(tracked, scan, times, options, seed, on_progress=bar.show)
     with claimed(new):
         done = write_forecast(new, tracked, found, config_of(options, scan, folder.read_config(), seed))
-        write_json(new.source, _source(folder, scan, found, out))
+        new.write_source(_source(folder, scan, found, out))
         for line in found.lines():
             print(line)
         last = len(found.forecast.times) - 1

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from ..io.formats import read_as
-from ..io.json import write_json
 from ..io.reading import Reading
 from ..io.run_scan import run_source
 from ..matter import KnownTwo, MaterialPrior, MatterKind
@@ -77,7 +76,7 @@ def reconstruct_in_motion(
     if found is None:
         return _still("nothing moves, as far as the frames tell")
     result = found.reconstruction
-    write_json(folder.source, run_source(scan, reading))
+    folder.write_source(run_source(scan, reading))
     evaluation, report = score(result, measured, None), report_of_middle(folder, result, measured)
     for line in (*evaluation.lines(), *(result.verdict.lines("training frames") if result.verdict else ())):
         print(line)

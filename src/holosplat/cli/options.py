@@ -16,6 +16,7 @@ from ..ranges import (
     Angle,
     Frequency,
     Grams,
+    Many,
     Metres,
     Natural,
     Photons,
@@ -26,6 +27,7 @@ from ..ranges import (
     Signed,
     Small,
     Weight,
+    Within,
     ranged,
 )
 
@@ -117,7 +119,7 @@ class BeamlineOptions:
     """Effective pixel size [m]."""
     psf_sigma_px: Pixels = 0.0
     """Standard deviation of the Gaussian point-spread function [pixels]."""
-    views: Natural | None = None
+    views: Many | None = None
     """Number of views, evenly spaced over 180°."""
     angles_deg: tuple[Signed, ...] = ()
     """Or: the views' angles [degrees]."""
@@ -199,13 +201,13 @@ class MotionOptions:
 
     frame_rate: Frequency | None = None
     """Times a second [Hz]; the meshes are then snapshots of a motion, and between them move straight."""
-    frames: Natural | None = None
+    frames: Annotated[int, Within(1, 10**6)] | None = None
     """Number of times (default: as many as the snapshots cover)."""
     start: Seconds | None = None
     """Time of the first frames after the first snapshot [s] (default: as early as can be)."""
     exposure: Seconds = 0.0
     """Motion blur: how long a frame gathers light, about its time [s]."""
-    pulses: Natural = 1
+    pulses: Many = 1
     """Motion blur: flashes in that, evenly spaced, whose intensities are averaged."""
     hold_out: Literal["views", "times"] = "views"
     """What --test-every counts: views, the same ones at every time, or times, with all their views."""

@@ -14,7 +14,7 @@ from tyro.conf import arg
 
 from ..checks import in_range, require
 from ..progress import Advance
-from ..ranges import Frequency, Grams, Metres, Natural, Photons, Pixels, Positive, Seconds, Signed, Small, ranged
+from ..ranges import Frequency, Grams, Many, Metres, Natural, Photons, Pixels, Positive, Seconds, Signed, Small, ranged
 from .options import MaterialOptions
 from .progress import ProgressBar
 
@@ -149,7 +149,7 @@ class RangeOptions:
     """Shortest and longest distance [m] of a survey."""
     energy_range: tuple[Positive, Positive] | None = None
     """Lowest and highest photon energy [keV] of a survey."""
-    points: tuple[Natural, Natural] = (25, 13)
+    points: tuple[Many, Many] = (25, 13)
     """Distances and energies of the survey."""
     out: Path | None = None
     """Picture of the survey to write (.png); its table is written beside it (.csv)."""

@@ -11,7 +11,7 @@ from tyro.conf import Positional, arg, subcommand
 
 from ..checks import require
 from ..io.reading import Reading
-from ..ranges import Positive, Seed, ranged, with_checked_numbers
+from ..ranges import Jobs, Positive, Seed, ranged, with_checked_numbers
 from ..series.asked import Cut, Slurm
 from .bodies import BodyFlags, MotionFlags
 from .light import RunLightFlags
@@ -138,7 +138,7 @@ def plan(
 def run(
     folder: Positional[Path],
     task: Positional[int | None] = None,
-    jobs: int = 0,
+    jobs: Jobs = 0,
     retry: bool = False,
     dask: str | None = None,
     cluster: SlurmFlags = NO_SLURM,

@@ -44,6 +44,8 @@ if TYPE_CHECKING:
     Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene
 
 
+MOST_FRAMES = 10**6
+"""Frames of a scan, at most: more take hours on the smallest of detectors."""
 MESHES = SpecimenOptions()
 """What is imaged unless options say otherwise."""
 
@@ -111,6 +113,7 @@ def simulate(
             require(moves or motion.frame_rate is None, "--frame-rate is of moving meshes; leave it out.")
             specimen = _Specimen(generated, times, _facts_of_still(imaged, files))
     times = specimen.times
+    _require_few(len(views) * len(times))
     how = replace(experiment.noise.simulation(motion.shutter(), experiment.light), backend=experiment.backend)
     _warn_of_missing_field(specimen.matter, true_views.views, beamline.pixel_size)
     split = beamline.split(len(views) if motion.hold_out == "views" else len(times))
@@ -176,6 +179,14 @@ def _facts_of_still(imaged: SpecimenOptions, files: tuple[Path, ...]) -> dict[st
     if generated.specimen is None:
         return {"volume": ", ".join(path.name for path in files[:3]) + (" …" if len(files) > 3 else "")}
     return {"specimen": generated.specimen, "specimen_seed": str(generated.specimen_seed)}
+
+
+def _require_few(frames: int) -> None:
+    require(
+        frames <= MOST_FRAMES,
+        f"views and times must make at most {MOST_FRAMES} frames, but they make {frames}; take fewer of --views or "
+        "--frames.",
+    )
 
 
 def _warn_of_missing_field(matter: Still | MeshSeries, views: Views, pixel_size: float) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..checks import InputError, require
-from ..ranges import Metres, Natural, Positive, SomeShare, ranged
+from ..ranges import Many, Metres, Positive, SomeShare, ranged
 from .options import BeamlineOptions
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ class SourceOptions:
     """--distance and --pixel-size are the detector's own, in a cone beam from --source-distance."""
     bandwidth: SomeShare | None = None
     """Relative full width at half maximum of a Gaussian spectrum about --energy-kev."""
-    energies: Natural = 7
+    energies: Many = 7
     """Energies that stand for such a spectrum; each costs a simulation."""
     spectrum: Path | None = None
     """Or: a text file of two columns, energy [keV] and weight; the scan's energy is then their mean."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from ..checks import InputError, require
-from ..ranges import Grams, Natural, Seed, Signed, Small, ranged
+from ..ranges import Grams, Many, Seed, Signed, Small, ranged
 from .options import BeamlineOptions, MeshOptions, MotionOptions
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ class GeneratedOptions:
     """Kind of specimen."""
     specimen_size: Small | None = None
     """Its extent [m] (default: 0.85 of the shorter side of the field of view)."""
-    specimen_count: Natural = 9
+    specimen_count: Many = 9
     """Number of cells, droplets or bubbles."""
     specimen_edge: Small | None = None
     """Width of the edges of soft cells, of the head phantom and of a foam [m] (default: 3 pixels, or 4 % of the

@@ -10,7 +10,6 @@ from tyro.conf import Positional
 
 from ..checks import require
 from ..io.formats import read_as
-from ..io.json import write_json
 from ..io.reading import Reading
 from ..io.run_scan import run_source
 from ..motion.known import beam_directions
@@ -90,7 +89,7 @@ def track(
         print(f"interrupted{f'; go on with --out {out} --resume' if begun else ''}", file=sys.stderr)
         raise SystemExit(INTERRUPTED) from None
     with claimed(folder):
-        write_json(folder.source, run_source(scan, reading))
+        folder.write_source(run_source(scan, reading))
         evaluation = score(result, measured, None)
         report = report_run(folder, result, measured, evaluation, None)
     for line in (*evaluation.lines(), *result.choice.lines()):

@@ -64,7 +64,7 @@ def _arrays(path: Path) -> Iterator[Mapping[str, Any]]:
     """The arrays of an archive, or the datasets of an open HDF5 file."""
     if h5py.is_hdf5(path):
         with open_hdf5(path) as file:
-            yield {name: item for name, item in file.items() if isinstance(item, h5py.Dataset)}
+            yield {name: item for name, item in file.items() if _holds_values(item)}
         return
     try:
         with np.load(path, allow_pickle=False) as archive:
@@ -76,6 +76,11 @@ def _arrays(path: Path) -> Iterator[Mapping[str, Any]]:
         numbers = name not in arrays or arrays[name].dtype.kind in "iufb"
         require(numbers, f"{path}: {name} must hold numbers, but it does not.")
     yield arrays
+
+
+def _holds_values(item: Any) -> bool:
+    """Whether it is a dataset; one with a null dataspace holds nothing."""
+    return isinstance(item, h5py.Dataset) and item.shape is not None
 
 
 def _first(arrays: Mapping[str, Any], names: tuple[str, ...]) -> Any:
@@ -93,7 +98,7 @@ def recognises(path: Path) -> bool:
     """Whether a file of HDF5 or NumPy holds such arrays."""
     if h5py.is_hdf5(path):
         with open_hdf5(path) as file:
-            return any(isinstance(file.get(name), h5py.Dataset) for name in FRAMES)
+            return any(_holds_values(file.get(name)) for name in FRAMES)
     if path.suffix.lower() != ".npz" or not zipfile.is_zipfile(path):
         return False
     with zipfile.ZipFile(path) as archive:

@@ -63,7 +63,10 @@ def read_array(path: Path, what: str) -> np.ndarray:
             declared = _declared(file)
         if declared > path.stat().st_size:
             raise ValueError(f"it declares {declared:.3g} bytes, but has {path.stat().st_size}")
+        require_memory(str(path), declared)  # of a file with holes, which holds more than it takes
         return np.array(np.load(path, mmap_mode="r", allow_pickle=False))  # which maps no more than there is
+    except InputError:
+        raise
     except (OSError, ValueError, EOFError, TypeError, OverflowError) as error:
         raise InputError(f"{path} must be {what} (.npy), but it is damaged or none: {error}.") from None
 

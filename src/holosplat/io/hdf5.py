@@ -74,7 +74,12 @@ class Fields:
         found = self.group.get(name)
         if not isinstance(found, h5py.Dataset):
             raise InputError(f"{self.label(name)} must be a dataset, but it is a group or a broken link.")
-        if found.dtype.kind not in "iufb" or found.shape is None:
+        if found.shape is None:
+            raise InputError(
+                f"{self.label(name)} must hold numbers, but it holds nothing (a null dataspace); write them, or take "
+                "it out of the file."
+            )
+        if found.dtype.kind not in "iufb":
             raise InputError(f"{self.label(name)} must hold numbers, but its type is {found.dtype}.")
         return found
 
@@ -91,7 +96,9 @@ class Fields:
 
 
 def attribute_text(value: Any) -> str | None:
-    """An attribute as text, whichever of HDF5's string types it has; None for None."""
+    """An attribute as text, whichever of HDF5's string types it has; None for None, and for one that holds nothing."""
+    if isinstance(value, h5py.Empty):
+        return None
     if isinstance(value, np.ndarray):
         value = value.reshape(-1)[0] if value.size == 1 else str(value)
     if isinstance(value, bytes):
@@ -103,6 +110,7 @@ def attribute_numbers(label: str, value: Any, counts: tuple[int, ...]) -> np.nda
     """An attribute as float64 [n], n being one of `counts`; `InputError` otherwise."""
     array = np.asarray(value)
     if array.dtype.kind not in "iuf":
-        raise InputError(f"{label} must hold numbers, but it is {attribute_text(value)!r}.")
+        text = attribute_text(value)
+        raise InputError(f"{label} must hold numbers, but {'it holds nothing' if text is None else f'it is {text!r}'}.")
     array = array.astype(np.float64).reshape(-1)
     return array if array.size in counts else shaped(label, array, (counts[-1],))

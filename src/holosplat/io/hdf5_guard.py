@@ -83,6 +83,8 @@ def _others(file: h5py.File, path: Path, allowed: bool) -> list[Path]:
 def _dataset_files(dataset: h5d.DatasetID, path: Path, name: bytes, allowed: bool, size: int) -> list[Path]:
     """The HDF5 files that a dataset of the file `path` refers to, once its values are in order."""
     label, plan = f"{path}: /{name.decode(errors='replace')}", dataset.get_create_plist()
+    if dataset.shape is None:  # a null dataspace holds nothing, which whoever wants a value says
+        return []
     declared = dataset.get_type().get_size()
     for length in dataset.shape:
         declared *= length

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import h5py
 import numpy as np
@@ -15,11 +17,17 @@ from .hdf5_writing import new_hdf5, put
 FORMAT = "holosplat light 1"
 
 
-def write_light(path: Path, light: Background | None, still: np.ndarray | None = None) -> None:
+def write_light(
+    path: Path,
+    light: Background | None,
+    still: np.ndarray | None = None,
+    marks: Mapping[str, str] = MappingProxyType({}),
+) -> None:
     """Coefficients [V, (K + 1)²] of `exp(Σ c m)`, m the products of cosines of 0 to K half waves of `smooth_modes`, and
-    the light [H, W] that all frames have in common; None: there is none."""
+    the light [H, W] that all frames have in common; None: there is none.
+    marks: further attributes."""
     with new_hdf5(path) as file:
-        file.attrs["format"] = FORMAT
+        file.attrs.update(marks, format=FORMAT)
         if light is not None:
             file.attrs["half_waves"] = ORDER
             file.attrs["shape"] = np.asarray(light.shape)

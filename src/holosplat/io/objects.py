@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import h5py
@@ -26,13 +27,15 @@ MOST_TEXT = 60_000
 """Characters of the attribute, at most: HDF5 holds 64 kB of them."""
 
 
-def write_object(path: Path, obj: Stored) -> None:
-    """Write an Object: the attributes `format`, `kind` and `state` (JSON), and a dataset for each of its tensors."""
+def write_object(path: Path, obj: Stored, marks: Mapping[str, str] = MappingProxyType({})) -> None:
+    """Write an Object: the attributes `format`, `kind` and `state` (JSON), and a dataset for each of its tensors.
+
+    marks: further attributes."""
     tensors, plain = parted(obj.state())
     text = json.dumps(plain)
     assert len(text) < MOST_TEXT
     with new_hdf5(path) as file:
-        file.attrs.update(format=FORMAT, kind=obj.kind, state=text)
+        file.attrs.update(marks, format=FORMAT, kind=obj.kind, state=text)
         for name, tensor in tensors.items():
             put(file, name, tensor.detach().cpu().numpy())
 

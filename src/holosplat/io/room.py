@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 PROC, CGROUPS = Path("/proc"), Path("/sys/fs/cgroup")
@@ -21,8 +21,14 @@ def machine_memory() -> int:
 def free_memory() -> int:
     """Bytes of memory that this process can still take: what is available on the machine, and what its control group
     (a container, a cluster's job) and its address space (`ulimit -v`) have left. At least 0."""
-    left = [limit - used for limit, used in (*_groups(), *_address_space())]
+    left = [*_left(_groups()), *_left(_address_space())]
     return max(0, min([_entry("meminfo", "MemAvailable") or _physical(), *left]))
+
+
+def left_by_limits() -> tuple[int, int]:
+    """Bytes of address space, and of memory, that this process' limits leave it; `UNLIMITED` where there is none."""
+    space, memory = (min([UNLIMITED, *_left(limits)]) for limits in (_address_space(), _groups()))
+    return max(0, space), max(0, memory)
 
 
 def free_disk(path: str | Path) -> int:
@@ -31,6 +37,11 @@ def free_disk(path: str | Path) -> int:
     while not place.exists() and place != place.parent:
         place = place.parent
     return shutil.disk_usage(place).free
+
+
+def _left(limits: Iterable[tuple[int, int]]) -> Iterator[int]:
+    """What limits leave beside what is used."""
+    return (limit - used for limit, used in limits)
 
 
 def _physical() -> int:

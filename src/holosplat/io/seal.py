@@ -29,8 +29,8 @@ START = struct.Struct("<8sB31xQ")
 """The first bytes of an HDF5 file: its signature, the version 0 of what follows, and where it ends."""
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 BLOCK = 1 << 20
-MOST = 1 << 30
-"""Bytes of ranges, at most."""
+RANGE, CHUNK = 16, 13
+"""Bytes of a range, and those that a chunk takes of the file at least: a value, its checksum, and where they are."""
 
 
 def summed(file: h5py.File) -> np.ndarray:
@@ -71,10 +71,13 @@ def _is_as_sealed(raw: IO[bytes], size: int) -> bool:
     length, packed, digest, name = ENDING.unpack(raw.read(ENDING.size))
     if name != MAGIC:
         return not _has_begun(raw)
-    if length + len(MAGIC) + packed + ENDING.size != size or packed > MOST:
+    if length + len(MAGIC) + packed + ENDING.size != size:
+        return False
+    most = max(BLOCK, RANGE * (length // CHUNK))
+    if packed > most + most // 1000 + BLOCK:  # deflate makes nothing longer than that
         return False
     raw.seek(length + len(MAGIC))
-    ranges = _unpacked(raw.read(packed))
+    ranges = _unpacked(raw.read(packed), length, most)
     return ranges is not None and _digest(raw, length, ranges) == digest
 
 
@@ -89,14 +92,19 @@ def _has_begun(raw: IO[bytes]) -> bool:
     return bool(begun) and MAGIC.startswith(begun)
 
 
-def _unpacked(packed: bytes) -> np.ndarray | None:
-    """The ranges; None where they are damaged."""
+def _unpacked(packed: bytes, length: int, most: int) -> np.ndarray | None:
+    """The ranges of a file of `length` bytes, `most` bytes of them at most; None where they are damaged, or none that
+    such a file has: they hold something, one comes after the other, and all lie in the file."""
     try:
         unpacker = zlib.decompressobj()
-        values = np.frombuffer(unpacker.decompress(packed, MOST), dtype="<i8").reshape(-1, 2)
+        values = np.frombuffer(unpacker.decompress(packed, most), dtype="<i8").reshape(-1, 2)
     except (zlib.error, ValueError):
         return None
-    return values if (values >= 0).all() else None
+    if not unpacker.eof:
+        return None
+    starts, sizes = values[:, 0], values[:, 1]
+    sound = (sizes > 0).all() and (starts >= 0).all() and (sizes <= length - np.minimum(starts, length)).all()
+    return values if sound and (starts[1:] >= starts[:-1] + sizes[:-1]).all() else None
 
 
 def _digest(raw: IO[bytes], length: int, ranges: np.ndarray) -> bytes:
@@ -113,7 +121,7 @@ def _digest(raw: IO[bytes], length: int, ranges: np.ndarray) -> bytes:
 def _between(length: int, ranges: np.ndarray) -> Iterator[tuple[int, int]]:
     """Where the bytes lie that are in no range."""
     at = 0
-    for offset, size in ranges.tolist():
-        yield at, min(offset, length)
-        at = max(at, offset + size)
+    for offset, size in ranges:
+        yield at, int(offset)
+        at = int(offset + size)
     yield at, length

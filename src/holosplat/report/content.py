@@ -117,7 +117,7 @@ class ReportContent:
     - history: columns of metrics.csv, each [S]: step, seconds, loss, the loss' terms, count, val_ssim …
     - seconds: time of the reconstruction [s]
     - settings: the resolved configuration, nested or flat
-    - versions, machine, timing: tables of names and values; input_hash: of the scan
+    - versions, machine, timing: tables of names and values; input_hash: of the scan; run: its name
     """
 
     title: str
@@ -145,6 +145,7 @@ class ReportContent:
     machine: Mapping[str, Any] = field(default_factory=dict)
     timing: Mapping[str, Any] = field(default_factory=dict)
     input_hash: str = ""
+    run: str = ""
 
     def __post_init__(self) -> None:
         positive("energy", self.energy_kev, "keV")

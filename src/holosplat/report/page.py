@@ -27,6 +27,7 @@ def render_page(content: ReportContent) -> str:
     """`content` as HTML; equal content gives equal text."""
     return template("template.html").render(
         title=content.title,
+        run=content.run,
         summary=content.summary,
         verdict=verdict(content),
         key_figures=key_figures(content),

@@ -92,6 +92,7 @@ def report_run(
         machine=config["machine"],
         timing={stage: f"{seconds:.1f} s" for stage, seconds in reconstruction.timing.items()},
         input_hash=config["scan_hash"],
+        run=folder.name(),
     )
     return write_report(content, folder.report)
 

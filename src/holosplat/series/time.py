@@ -12,7 +12,6 @@ import torch
 
 from ..checks import InputError
 from ..io.atomic import atomic_path
-from ..io.json import write_json
 from ..matter import MaterialPrior
 from ..methods import Method
 from ..methods.continued import Continued
@@ -143,7 +142,7 @@ def _share(done: Reconstruction) -> float:
 
 def _written(shot: Shot, settings: Settings, folder: RunFolder, done: Reconstruction, row: Row, began: float) -> Row:
     with claimed(folder):
-        write_json(folder.source, shot.source)
+        folder.write_source(shot.source)
         scan = done.placed(shot.scan)
         evaluation = evaluate(done, scan, None)
         write_phase(folder.path / PHASE, done.object, scan)

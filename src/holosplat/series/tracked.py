@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..io.json import write_json
 from ..io.run_scan import run_source
 from ..metrics import ImageScores
 from ..motion.measures import moments
@@ -34,7 +33,7 @@ def track_window(scan: Scan, source: Source, plan: SeriesPlan, rows: Sequence[Ro
     done = track(part, source.prior, settings.motion, settings.seed, light=settings.light, folder=folder, resume=True)
     reading = replace(plan.reading, part=replace(plan.reading.part, time_frames=f"{first}:{last + 1}"))
     with claimed(folder):
-        write_json(folder.source, run_source(source.path, reading))
+        folder.write_source(run_source(source.path, reading))
         evaluation = evaluate(done, part, None)
         filled = [_filled(row, done, part, evaluation, folder) for row in rows]
         if settings.reports:

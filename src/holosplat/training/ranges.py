@@ -7,7 +7,7 @@ from typing import Literal
 
 from ..checks import at_least, require
 from ..geometry import Views
-from ..ranges import Angle, Natural, Pixels, Positive, Share, SomeShare, Weight, ranged
+from ..ranges import Angle, Many, Natural, Pixels, Positive, Share, SomeShare, Weight, ranged
 from ..scan import Exposures
 from ..units import wavelength
 
@@ -28,9 +28,9 @@ class Ranges:
     """Of a frame [pixels]."""
     columns: Natural = 80
     """Of a frame [pixels]."""
-    views: Natural = 6
+    views: Many = 6
     """Frames with noise, for training."""
-    held_out: Natural = 2
+    held_out: Many = 2
     """Frames without noise, which show how well others are foretold."""
     tilted: Share = 0.2
     """Share of scenes whose views have no common axis."""

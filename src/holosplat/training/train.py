@@ -17,12 +17,13 @@ from torch import Tensor
 from torch.nn.utils import clip_grad_norm_
 
 from ..backends import missing
-from ..checks import InputError, require
+from ..checks import InputError, as_written, require
 from ..io.atomic import atomic_path
 from ..io.json import read_json, write_json
 from ..learning.network import Guess
 from ..learning.weights import Card, write_weights
 from ..tables import to_table
+from ..workflows.run_folder import checkpoint_state
 from .folder import Dataset
 from .limits import limits
 from .objective import loss
@@ -86,11 +87,24 @@ class Training:
         )
         training, checkpoint = cls(data, folder, options), folder / CHECKPOINT
         if checkpoint.is_file():
-            kept = torch.load(checkpoint, weights_only=True, map_location=options.device)
-            for name, part in training.parts().items():
-                part.load_state_dict(kept[name])
-            training.step, training.rows = kept["step"], [tuple(row) for row in kept["rows"]]
+            training._take_up(checkpoint)
         return training
+
+    def _take_up(self, checkpoint: Path) -> None:
+        """Go on from a checkpoint; `InputError` where it is damaged, or not of this training."""
+        kept = checkpoint_state(checkpoint)
+        if kept is None:
+            raise InputError(
+                f"{checkpoint} must be a checkpoint, but it is damaged; remove it, and --resume begins anew."
+            )
+        with as_written(checkpoint, "a checkpoint of this training"):
+            for name, part in self.parts().items():
+                part.load_state_dict(kept[name])
+            step, rows = int(kept["step"]), [tuple(map(float, row)) for row in kept["rows"]]
+            require(0 <= step <= self.options.steps, f"step must be from 0 to {self.options.steps}, but it is {step}.")
+            whole = len(rows) == step and all(len(row) == len(self.columns) for row in rows)
+            require(whole, f"rows must be {step} of {len(self.columns)} numbers, but they are not.")
+        self.step, self.rows = step, rows
 
     def _made(self) -> torch.nn.Module:
         """The network as it begins."""

@@ -23,7 +23,7 @@ from ..motion.forecast import Forecast, Halves, PathForecast, extrapolate
 from ..motion.half_sets import LEAST, half_sets
 from ..optics.background import Light
 from ..progress import FitProgress
-from ..ranges import Seconds, ranged
+from ..ranges import Many, Seconds, ranged
 from ..representations import MovingSurfaces
 from ..scan import Scan
 from ..tables import to_table
@@ -51,7 +51,7 @@ class ForecastOptions:
 
     kind: ClassVar[str] = "forecast"
 
-    times: int = 10
+    times: Many = 10
     """Times ahead."""
     step: Seconds = 0.0
     """Between them [s] (0: the median step of the run)."""
@@ -174,7 +174,7 @@ def write_forecast(folder: RunFolder, run: Reconstruction, found: Forecasted, co
     said = found.forecast
     done = replace(run, object=said.bodies, method=ForecastOptions.kind, timing={}, verdict=None, total=None)
     folder.begin(config | environment("cpu"))
-    write_object(folder.object, said.bodies)
+    write_object(folder.object, said.bodies, folder.marks())
     told = {"steps": 0, "times_s": said.times.tolist(), "bodies": said.bodies.count}
     folder.write_summary(summary_of(done, None, found.predicted) | told)
     write_scan(folder.path / FRAMES, found.predicted)

@@ -107,9 +107,9 @@ def reconstruct_moving(
     )
     if folder is not None:
         folder.start_metrics([])
-        write_object(folder.object, found.object)
+        write_object(folder.object, found.object, folder.marks())
         if task.uneven is not None and task.uneven.background is not None:
-            write_light(folder.light, task.uneven.background)
+            write_light(folder.light, task.uneven.background, marks=folder.marks())
         seen = {"times_s": task.scan.instants.tolist(), "misfit": found.misfit, "asked": list(found.history)}
         folder.write_summary(summary_of(done, None, task.scan) | seen | {"light": task.light_in_words})
     return Motion(done, found.volume, found.history)

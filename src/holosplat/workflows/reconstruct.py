@@ -126,6 +126,7 @@ def load_reconstruction(folder: RunFolder) -> Reconstruction:
     folder.require_run()
     summary, config = folder.read_summary(), folder.read_config()
     found = folder.read_result()
+    folder.require_own(folder.light)
     still = read_still_light(folder.light) if folder.light.is_file() else None
     with as_written(folder.summary, "what reconstruct wrote"):
         require_plausible(summary)
@@ -310,10 +311,10 @@ class _Run:
             self.make_folder(found.backend)
             if fit is None:
                 self.folder.start_metrics([])
-            write_object(self.folder.object, done.object)
+            write_object(self.folder.object, done.object, self.folder.marks())
             background = self.task.uneven and self.task.uneven.background
             if background is not None or done.still is not None:
-                write_light(self.folder.light, background, done.still)
+                write_light(self.folder.light, background, done.still, self.folder.marks())
             said = {"times_s": self.task.scan.instants.tolist()} if takes_series(self.method) else {}
             said |= {"light": self.task.light_in_words}
             self.folder.write_summary(summary_of(done, fit, self.task.scan) | said)

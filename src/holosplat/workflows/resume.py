@@ -10,19 +10,8 @@ from ..methods.presets import SCHEMA
 from ..methods.uncertain import Uncertain
 from ..optics.background import LightOptions
 from ..tables import to_table
+from .binding import RESUMED_WITH
 from .run_folder import RunFolder
-
-RESUMED_WITH = {
-    "scan_hash": "scan file",
-    "method": "method and settings (--method, --preset, --config, --set, or the options of track)",
-    "prior": "material (--material, --delta-beta)",
-    "matter": "kind of matter (--matter)",
-    "seed": "seed (--seed)",
-    "light": "light (--light, --air)",
-    "uncertain": "ranges (--distance, --energy-kev, --delta-beta)",
-    "refine": "refinement (--refine, --uncertain-…)",
-}
-"""What must not change between the parts of a run, as messages call it."""
 
 
 def goes_on(folder: RunFolder | None, config: dict[str, Any], resume: bool) -> bool:

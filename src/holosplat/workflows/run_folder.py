@@ -22,9 +22,11 @@ from ..io.atomic import atomic_path
 from ..io.folder import require_new, require_parent
 from ..io.json import read_json, write_json
 from ..io.lock import sole_writer
+from ..io.marks import read_marks
 from ..io.objects import read_object
 from ..ranges import require_plausible
 from ..representations import Stored
+from .binding import CONFIG_SUM, RUN, config_sum, require_bound
 from .manifest import sha256, write_manifest
 
 OBJECT_SUM = "object_sha256"
@@ -77,12 +79,16 @@ class RunFolder:
     def begin(self, config: dict[str, Any]) -> None:
         """Make the folder with its config.json, and with it a new run, whose name checkpoint and summary repeat."""
         self.path.mkdir(exist_ok=True)
-        write_json(self.config, {"run": secrets.token_hex(8), **config})
+        write_json(self.config, {RUN: secrets.token_hex(8), **config})
 
     def write_summary(self, values: dict[str, Any]) -> None:
-        """Replace summary.json, with the name of the run and the SHA-256 of its object, which is written before."""
+        """Replace summary.json, with the marks of the run and the SHA-256 of its object, which is written before."""
         summed = {OBJECT_SUM: sha256(self.object)} if self.object.is_file() else {}
-        write_json(self.summary, values | {"run": self.name()} | summed)
+        write_json(self.summary, values | self.marks() | summed)
+
+    def write_source(self, values: dict[str, object]) -> None:
+        """Replace source.json, which says where the frames of the run are."""
+        write_json(self.source, values | self.marks())
 
     def read_result(self) -> Stored:
         """The object; `InputError` if it is not that of summary.json, which is written after it."""
@@ -92,20 +98,33 @@ class RunFolder:
             f"{self.object} must be what {self.summary.name} says was written, but it is another file; bring back the "
             "whole folder, or go on with --resume.",
         )
+        self.require_own(self.object)
         return found
 
+    def require_own(self, path: Path) -> None:
+        """`InputError` if an HDF5 file of this folder says that it is of another run, or of other settings."""
+        if path.is_file():
+            require_bound(path, read_marks(path, (RUN, CONFIG_SUM)), self._own(), self.config)
+
     def read_summary(self) -> dict[str, Any]:
-        """What summary.json holds; `InputError` if it is of another run than config.json."""
+        """What summary.json holds; `InputError` if it is of another run than config.json, or of other settings."""
         summary = _with_tables(self.summary, ("timing_s", "detector", "material", "verdict", "total", "geometry"))
-        require(
-            summary.get("run", "") == self.name() or "run" not in summary,
-            f"{self.summary} must be of the run in {self.config}, but it is of another one; bring back its own.",
-        )
+        require_bound(self.summary, summary, self._own(), self.config)
         return summary
 
     def name(self) -> str:
         """The name of the run, empty before it has begun and of older versions."""
-        return str(self.read_config().get("run", "")) if self.config.is_file() else ""
+        return self._own()[RUN]
+
+    def marks(self) -> dict[str, str]:
+        """What files of this run say of it: its name, and the hash of what it was started with (`config_sum`); nothing
+        before it has begun, and of older versions."""
+        own = self._own()
+        return own if own[RUN] else {}
+
+    def _own(self) -> dict[str, str]:
+        config = self.read_config() if self.config.is_file() else {}
+        return {RUN: str(config.get(RUN, "")), CONFIG_SUM: config_sum(config)}
 
     def read_config(self) -> dict[str, Any]:
         """What config.json holds; `InputError` if a part of it is not what it was."""
@@ -159,7 +178,7 @@ class RunFolder:
     def save_checkpoint(self, state: dict[str, Any]) -> None:
         """Replace checkpoint.pt; the one before is kept beside it."""
         content = io.BytesIO()
-        torch.save({"run": self.name(), "state": _in_main_memory(state)}, content)
+        torch.save(self.marks() | {"state": _in_main_memory(state)}, content)
         with atomic_path(self.checkpoint) as temporary:
             temporary.write_bytes(content.getbuffer())
             if self.checkpoint.is_file():
@@ -168,7 +187,7 @@ class RunFolder:
     def load_checkpoint(self) -> dict[str, Any] | None:
         """The last checkpoint, or the one before if that is damaged or not there; None if there is none.
 
-        Errors: `InputError` if none of them can be read, or one is of another run.
+        Errors: `InputError` if none of them can be read, or one is of another run, or of other settings.
         """
         damaged = False
         for path in (self.checkpoint, self.earlier_checkpoint):
@@ -178,11 +197,7 @@ class RunFolder:
             if found is None:
                 damaged = True
                 continue
-            require(
-                found.get("run", self.name()) == self.name(),
-                f"{path} must be of the run in {self.config}, but it is of another one; bring back its own, or start "
-                "anew.",
-            )
+            require_bound(path, found, self._own(), self.config)
             state = found.get("state", found)
             with as_written(path, "a checkpoint"):
                 require(isinstance(state, dict), "its state is no table.")

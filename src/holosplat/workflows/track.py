@@ -138,11 +138,11 @@ def _write(folder: RunFolder, done: Reconstruction, found: Followed, task: Task)
     """The object, the light, and what is said of the fits."""
     folder.start_metrics(dict.fromkeys(name for record in found.records for name in record))
     folder.append_metrics(found.records)
-    write_object(folder.object, found.bodies)
+    write_object(folder.object, found.bodies, folder.marks())
     if found.rest is not None:
         write_rest(folder, found.rest)
     if task.uneven is not None and task.uneven.background is not None:
-        write_light(folder.light, task.uneven.background)
+        write_light(folder.light, task.uneven.background, marks=folder.marks())
     told = {"steps": len(found.records), "times_s": task.scan.instants.tolist(), "bodies": found.bodies.count}
     told |= {"bodies_at_each_time": list(found.found), "light": task.light_in_words}
     folder.write_summary(summary_of(done, None, task.scan) | told)

@@ -12,7 +12,9 @@ import numpy as np
 from markupsafe import Markup
 from PIL import Image
 
+from ...checks import InputError, require, require_regular
 from ...io.atomic import atomic_path
+from ...io.guard import read_array
 from ...report.page import template
 from ...report.style import scientific
 from ...units import in_percent, two_digits
@@ -61,8 +63,7 @@ def write_page(path: Path, page: SeriesPage) -> None:
 def render_page(page: SeriesPage) -> str:
     """The page as HTML."""
     shown = [page.frames[i] for i in _evenly(len(page.frames))]
-    maps = [(frame, _read(frame.phase)) for frame in shown]
-    kept = [(frame, phase) for frame, phase in maps if phase is not None]
+    kept, unread = _maps(shown)
     low, high = _limits([phase for _, phase in kept])
     pictures = [
         {
@@ -84,7 +85,7 @@ def render_page(page: SeriesPage) -> str:
         charts=_charts(page.frames),
         rows=[_cells(frame) for frame in page.frames[-MOST_ROWS:]],
         failed=page.failed,
-        notes=page.notes,
+        notes=(*page.notes, *unread),
         refresh=int(1000 * page.refresh),
     )
 
@@ -160,13 +161,26 @@ def _evenly(count: int) -> list[int]:
     return sorted(set(np.linspace(0, count - 1, MOST_PICTURES).round().astype(int).tolist()))
 
 
-def _read(path: Path) -> np.ndarray | None:
-    """A phase map; None where there is none that can be read."""
-    try:
-        found = np.load(path, allow_pickle=False)
-    except (OSError, ValueError):
-        return None
-    return found.astype(np.float32) if found.ndim == 2 and found.dtype.kind == "f" else None
+def _maps(frames: Sequence[Frame]) -> tuple[list[tuple[Frame, np.ndarray]], list[str]]:
+    """The phase maps that are there, each with its time, and what is said of those that cannot be read."""
+    kept, unread = list[tuple[Frame, np.ndarray]](), list[str]()
+    for frame in frames:
+        if not frame.phase.exists():
+            continue
+        try:
+            kept.append((frame, _read(frame.phase)))
+        except InputError as error:
+            unread.append(f"time {frame.row.number} has no picture: {error}")
+    return kept, unread
+
+
+def _read(path: Path) -> np.ndarray:
+    """A phase map; `InputError` where it is none."""
+    require_regular(path, "a phase map")
+    found = read_array(path, "a phase map")
+    sound = found.ndim == 2 and found.dtype.kind == "f" and found.size > 0
+    require(sound, f"{path} must be a phase map of numbers [H, W], but it is {found.dtype} of the shape {found.shape}.")
+    return found.astype(np.float32)
 
 
 def _limits(maps: Sequence[np.ndarray]) -> tuple[float, float]:

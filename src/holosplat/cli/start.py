@@ -1,0 +1,47 @@
+"""The beginning of every command, before any library is loaded: whether there is memory for the libraries themselves.
+
+Without it, libraries end the process in ways of their own, or Python says which of them could not be mapped.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+
+from ..io.room import left_by_limits
+from .sentence import give_up
+
+MAPPED, RESIDENT = 1.0e9, 0.4e9
+"""Bytes of address space and of memory that commands take until they begin with their work."""
+UNMAPPED = re.compile("failed to map segment|cannot allocate|cannot enable executable stack", re.IGNORECASE)
+"""What loaders of libraries say where there is no memory for one."""
+
+
+def main() -> None:
+    """Run the command that the arguments name; where its libraries find no room, one sentence and exit code 2."""
+    if "torch" not in sys.modules:
+        _require_room()
+    try:
+        from .entry import main as run
+
+        run()
+    except ImportError as error:
+        if not UNMAPPED.search(str(error)):
+            raise
+        give_up(_too_little(f"a library finds no room ({str(error).splitlines()[0][:200]})"))
+    except MemoryError:
+        give_up(_too_little("its libraries find no room"))
+
+
+def _require_room() -> None:
+    """Give up where a limit of this process leaves less than its libraries take."""
+    space, memory = left_by_limits()
+    if space < MAPPED:
+        give_up(_too_little(f"ulimit -v leaves {space / 1e9:.2g} GB"))
+    if memory < RESIDENT:
+        give_up(_too_little(f"its control group (a container, a cluster's job) leaves {memory / 1e9:.2g} GB"))
+
+
+def _too_little(found: str) -> str:
+    needs = f"{MAPPED / 1e9:.1f} GB of address space and {RESIDENT / 1e9:.1f} GB of memory"
+    return f"the memory of this process must be at least {needs} before a command begins, but {found}; raise the limit."
