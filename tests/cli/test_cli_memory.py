@@ -100,5 +100,5 @@ def test_kernels_that_find_no_room_are_not_called_missing(tmp_path, monkeypatch)
         raise OSError(f"{name}: failed to map segment from shared object")
 
     monkeypatch.setattr(native.ctypes, "CDLL", full)
-    with pytest.raises(MemoryError, match="the compiled kernels find no room: .*failed to map segment"):
+    with pytest.raises(MemoryError, match=r"the compiled kernels find no room: .*failed to map segment"):
         native._open.__wrapped__(tmp_path, "none")
