@@ -28,6 +28,8 @@ VERSION = 0x20080522
 OVERRIDE = (1 << 1) | (1 << 2)
 """CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH: what lets root read and write everywhere."""
 EXTREME = (0.0, -0.0, float("nan"), float("inf"), -float("inf"), 3e38, -3e38, 1e30, -1e12, 1e-30, 1e-45, -1.0, 1e6)
+READERS = ("evaluate",)
+"""Commands that write nothing here: there is no truth, and the report is there already."""
 MARGIN = 1 << 30
 """Bytes of address space beside what a command has loaded: with as much, all commands work."""
 
@@ -48,7 +50,8 @@ def denied(shop: Shop, writer: Writer, rng: random.Random, folder: Path) -> str:
     finally:
         for path, mode in zip(barred, before):
             path.chmod(mode)
-    return sentence(ended) or ("silent" if ended.code == 0 else "")
+    silent = ended.code == 0 and writer.name not in READERS
+    return sentence(ended) or ("silent" if silent else "")
 
 
 def powerless() -> None:

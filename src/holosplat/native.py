@@ -222,6 +222,8 @@ def _open(folder: Path, isa: str) -> ctypes.CDLL:
             function = getattr(library, name)
             function.argtypes, function.restype = types, c_int64
     except (OSError, AttributeError) as error:
+        if "failed to map segment" in str(error):
+            raise MemoryError(f"the compiled kernels find no room: {error}") from error
         raise MissingError(f"The compiled kernels at {path} cannot be used ({error}). {_ADVICE}") from error
     if library.holosplat_abi() != ABI:
         raise MissingError(f"The compiled kernels at {path} are of another version. {_ADVICE}")

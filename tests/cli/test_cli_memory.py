@@ -9,6 +9,7 @@ import sys
 import pytest
 
 from helpers.cli import PROGRAM
+from holosplat import native
 from holosplat.cli import entry, start
 from holosplat.io.room import UNLIMITED
 
@@ -92,3 +93,12 @@ def test_a_library_that_is_missing_is_not_called_a_lack_of_memory(monkeypatch):
     fails_with(ImportError("No module named torch"), monkeypatch)
     with pytest.raises(ImportError, match="No module named torch"):
         start.main()
+
+
+def test_kernels_that_find_no_room_are_not_called_missing(tmp_path, monkeypatch):
+    def full(name: str) -> None:
+        raise OSError(f"{name}: failed to map segment from shared object")
+
+    monkeypatch.setattr(native.ctypes, "CDLL", full)
+    with pytest.raises(MemoryError, match=r"the compiled kernels find no room: .*failed to map segment"):
+        native._open.__wrapped__(tmp_path, "none")

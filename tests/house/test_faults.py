@@ -90,6 +90,11 @@ def test_what_is_taken_without_permission_is_counted(faults, shop, tmp_path, mon
     assert limits.denied(shop, writer(faults, "convert"), random.Random(1), tmp_path) == "silent"
 
 
+def test_a_command_that_only_reads_may_work_where_nothing_can_be_written(faults, shop, tmp_path):
+    limits = importlib.import_module("fault_limits")
+    assert limits.denied(shop, writer(faults, "evaluate"), random.Random(1), tmp_path) == ""
+
+
 def test_memory_that_does_not_do_ends_in_a_sentence(faults, shop, tmp_path):
     """Not even for the libraries, and for these alone."""
     limits, kills = (importlib.import_module(name) for name in ("fault_limits", "fault_kills"))
@@ -101,11 +106,12 @@ def test_memory_that_does_not_do_ends_in_a_sentence(faults, shop, tmp_path):
 
 def test_a_kernel_that_crashes_or_fails_is_counted(faults, shop, tmp_path, monkeypatch):
     limits = importlib.import_module("fault_limits")
-    for act, verdict in (
-        (lambda *_: signal.raise_signal(signal.SIGTRAP), "crash"),
-        (lambda *_: 1 // 0, "traceback"),
-        (lambda *_: None, ""),
-    ):
+    acts = {
+        "crash": lambda *_: signal.raise_signal(signal.SIGTRAP),
+        "traceback": lambda *_: 1 // 0,
+        "": lambda *_: None,
+    }
+    for verdict, act in acts.items():
         monkeypatch.setattr(limits, "_used", act)
         assert limits.extreme(shop, random.Random(1), tmp_path) == verdict
 
