@@ -122,7 +122,10 @@ def test_another_scan_is_remarked_upon(shop, tmp_path):
 
 def test_a_run_of_an_estimated_material_is_taken(shop, tmp_path):
     unknown = RunFolder(shutil.copytree(shop / "run", tmp_path / "unknown"))
+    found, summary = load_reconstruction(unknown).object, unknown.read_summary()
     write_json(unknown.config, unknown.read_config() | {"prior": MaterialPrior.unknown().as_dict()})
+    write_object(unknown.object, found)
+    unknown.write_summary(summary)  # of the settings as they are now
     options = ["--scan", shop / "scan.nxs", "--steps", 1]
     assert "what the run estimated" in worked(holosplat("surface", unknown.path, "--out", tmp_path / "b", *options)).err
     known = worked(holosplat("surface", shop / "run", "--out", tmp_path / "c", *options))
