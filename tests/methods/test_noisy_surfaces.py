@@ -14,7 +14,7 @@ from holosplat.baselines import HolographicTV, holographic_tv
 from holosplat.checks import InputError
 from holosplat.fit.schedule import Schedule
 from holosplat.methods import Gaussians, SurfaceOptions, Surfaces, Task
-from holosplat.methods.coarse import CoarseToFine, Way, _first, begun_surfaces, missing_matter
+from holosplat.methods.coarse import CoarseToFine, Way, begun_surfaces, first_of, missing_matter
 from holosplat.methods.coarse_cloud import cloud_of_surfaces
 from holosplat.methods.first_surfaces import first_surfaces, is_noisy, surfaces_of_volume
 from holosplat.methods.gaussian_options import FitOptions
@@ -82,7 +82,7 @@ def test_the_next_way_is_gone_where_the_first_explains_badly(noisy, left, asked,
 
     monkeypatch.setattr("holosplat.methods.coarse.missing_matter", lambda mesh, task, how: judged[len(mesh.faces)])
     how = CoarseToFine(coarse_steps=1, chord=0.0)
-    found = _first(noisy, lambda task: [way(k) for k in range(len(left))], HOW, how)
+    found = first_of(noisy, [way(k) for k in range(len(left))], HOW, how)
     assert found is not None
     assert len(found.faces) == len(cells[taken].faces)
     assert tried == list(range(asked))
@@ -165,8 +165,13 @@ def test_frames_without_much_noise_ask_nothing(monkeypatch):
     monkeypatch.setattr("holosplat.methods.surfaces.missing_matter", lambda *given: pytest.fail("not asked for"))
     clean = task_of(1e7)
     assert best_cut(clean, 1)[1] == 1
-    learned = replace(OPTIONS, start="learned")
-    assert best_cut(task_of(2000.0), 1, learned)[1] == 1
+    at_random = replace(OPTIONS, start="random")
+    assert best_cut(task_of(2000.0), 1, at_random)[1] == 1
+
+
+def test_where_a_network_is_asked_gaussians_give_way_as_without(noisy):
+    found, _ = best_cut(noisy, 2, replace(OPTIONS, start="learned"))
+    assert torch.equal(found.vertices, best_cut(noisy, 2)[0].vertices)
 
 
 def test_surfaces_of_the_volume_explain_noisy_frames(noisy):
