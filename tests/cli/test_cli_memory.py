@@ -79,6 +79,7 @@ def fails_with(error: BaseException, monkeypatch: pytest.MonkeyPatch) -> None:
         (ImportError("libtorch_cpu.so: failed to map segment from shared object"), "(libtorch_cpu.so: failed to map"),
         (ImportError("a.so: cannot allocate memory in static TLS block"), "a library finds no room (a.so: cannot"),
         (MemoryError(), "its libraries find no room"),
+        (SystemError("<built-in function compile> returned NULL without setting an exception"), "Python finds no room"),
     ],
 )
 def test_a_library_that_finds_no_room_is_one_sentence(error, said, monkeypatch, capsys):

@@ -102,7 +102,7 @@ def test_memory_that_does_not_do_ends_in_a_sentence(faults, shop, tmp_path):
     never, after = limits._anew(command, 200 << 20), faults.run(command, first=lambda: limits.limited(1 << 20))
     assert never.code == 2
     for ended in (never, after):
-        assert kills.sentence(ended) == ""
+        assert kills.sentence(ended) == "", ended.said
         assert ended.code == 0 or "memory" in ended.said
 
 
