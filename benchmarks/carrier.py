@@ -20,8 +20,8 @@ import rows
 from machine import commit
 
 import motion
-from holosplat.motion.rest_shape import KnownBody
-from holosplat.motion.sightings import centroid
+from holosplat.bodies.moments import centroid
+from holosplat.bodies.rest_shape import KnownBody
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces
 from holosplat.specimens.mesh_series import MeshSeries

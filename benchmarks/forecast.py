@@ -23,6 +23,8 @@ import torch
 from machine import commit
 
 import holosplat as hs
+from holosplat.bodies.moments import centroid
+from holosplat.bodies.rest_shape import KnownBody
 from holosplat.geometry import Grid
 from holosplat.io.atomic import atomic_path
 from holosplat.io.objects import read_object, write_object
@@ -33,8 +35,6 @@ from holosplat.motion.dynamics import DynamicsForecast, carry
 from holosplat.motion.elastic import Rest
 from holosplat.motion.forecast import Forecast, Halves, PathForecast, extrapolate
 from holosplat.motion.half_sets import half_sets
-from holosplat.motion.rest_shape import KnownBody
-from holosplat.motion.sightings import centroid
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces
 from holosplat.specimens.mesh_series import MeshSeries

@@ -26,6 +26,8 @@ from espresso_flow import Run
 from machine import commit, memory_megabytes
 
 import holosplat as hs
+from holosplat.bodies.moments import centroid
+from holosplat.bodies.rest_shape import KnownBody
 from holosplat.geometry import Grid
 from holosplat.io.atomic import atomic_path
 from holosplat.mesh import TriangleMesh
@@ -33,8 +35,6 @@ from holosplat.metrics import volume_scores
 from holosplat.motion.fit import MotionFit
 from holosplat.motion.halves import standard_errors
 from holosplat.motion.measures import area
-from holosplat.motion.rest_shape import KnownBody
-from holosplat.motion.sightings import centroid
 from holosplat.motion.track import Followed, TrackOptions, follow
 from holosplat.representations import MovingSurfaces
 from holosplat.specimens.mesh_series import MeshSeries

@@ -23,11 +23,11 @@ from scipy.ndimage import label
 from torch import Tensor
 
 import holosplat as hs
+from holosplat.bodies.touching import parted
 from holosplat.learning.start import Guessed, LearnedStart, guessed
 from holosplat.matter import Matter
 from holosplat.motion.guesses import CLEARLY, left_by_bodies
 from holosplat.motion.sightings import SightingOptions, occupancy
-from holosplat.motion.touching import parted
 from holosplat.representations import VoxelGrid
 from motion import MATERIAL, cells_in_flow, imaged
 

@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from holosplat.bodies.poses import Explained, Pose
+from holosplat.bodies.rest_shape import KnownBody
+from holosplat.bodies.shadows import Shadows
 from holosplat.geometry import rotation_y
 from holosplat.mesh import TriangleMesh
-from holosplat.motion.poses import Explained, Pose
-from holosplat.motion.rest_shape import KnownBody
-from holosplat.motion.shadows import Shadows
 
 SHAPE, STEPS = (47, 33), (-1.0, 0.0, 1.0)
 RADIUS = 4.5

@@ -41,6 +41,7 @@ TIERS = (
     ("specimens", "representations", "model"),
     ("io",),
     ("fit", "baselines", "learning"),
+    ("bodies",),
     ("methods",),
     ("align",),
     ("motion",),

@@ -10,6 +10,7 @@ import torch
 
 from helpers.moving_ellipsoids import true_paths
 from holosplat.beamline.simulate import simulate
+from holosplat.bodies.moments import moments
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.io.objects import write_object
@@ -18,7 +19,6 @@ from holosplat.mesh import TriangleMesh
 from holosplat.methods import Auto, Gaussians, SmoothVolume, Surfaces, Task
 from holosplat.methods.continued import Continued, Effort
 from holosplat.methods.method import run_quietly
-from holosplat.motion.measures import moments
 from holosplat.representations import SurfaceMesh, VoxelGrid, approximate, cloud_from_volume
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import icosphere

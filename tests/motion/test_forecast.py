@@ -10,6 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
+from holosplat.bodies.moments import centroid
 from holosplat.checks import InputError
 from holosplat.fit.schedule import Schedule
 from holosplat.matter import Matter
@@ -18,7 +19,6 @@ from holosplat.metrics.distances import normal_distance
 from holosplat.motion.fit import MotionFit
 from holosplat.motion.forecast import PathForecast, across, extrapolate, normals
 from holosplat.motion.half_sets import half_sets
-from holosplat.motion.sightings import centroid
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.red_cells import icosphere
 

@@ -10,23 +10,23 @@ import torch
 
 import holosplat as hs
 from helpers.motion_shadows import FLOW, OTHER, RADIUS, TURN, cell, pose, shadows
+from holosplat.bodies import replaced
+from holosplat.bodies.moments import centroid
+from holosplat.bodies.poses import Explained, Pose
+from holosplat.bodies.pursuit import exchanged
+from holosplat.bodies.replaced import pursued
+from holosplat.bodies.rest_shape import KnownBody, surface, thinned
+from holosplat.bodies.steps import Steps
+from holosplat.bodies.templates import Search, Templates
 from holosplat.checks import InputError
 from holosplat.cli.track import BodyFlags
 from holosplat.io.vtk import write_mesh
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
-from holosplat.motion import replaced
 from holosplat.motion.elastic import Elastic, RestShapeKept
 from holosplat.motion.known import best_size, drift, poses_like
-from holosplat.motion.poses import Explained, Pose
-from holosplat.motion.pursuit import exchanged
-from holosplat.motion.replaced import pursued
-from holosplat.motion.rest_shape import KnownBody, surface, thinned
-from holosplat.motion.sightings import centroid
-from holosplat.motion.steps import Steps
 from holosplat.motion.strain import strain_energy
-from holosplat.motion.templates import Search, Templates
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.mesh_series import MeshSeries

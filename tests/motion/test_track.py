@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from helpers.moving_ellipsoids import BODIES, MATERIAL, PIXEL, STEP, TIMES, scan, true_paths, truth
+from holosplat.bodies.moments import centroid
 from holosplat.checks import InputError
 from holosplat.fit.schedule import Schedule
 from holosplat.geometry import Grid
@@ -20,7 +21,7 @@ from holosplat.motion.fit import MotionFit, motion_fit
 from holosplat.motion.mergers import shared, without_merger
 from holosplat.motion.pieces import PathOptions, chosen_paths, refined
 from holosplat.motion.remainder import apart, beside, joined, only, sure_ones, whole_ones
-from holosplat.motion.sightings import centroid, sightings
+from holosplat.motion.sightings import sightings
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.red_cells import icosphere

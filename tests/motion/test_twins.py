@@ -11,6 +11,9 @@ from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from helpers.motion_shadows import OTHER, TURN, cell
+from holosplat.bodies.moments import moments
+from holosplat.bodies.steps import Steps
+from holosplat.bodies.twin import distance, map_near, twin_map, twin_of, two_beams
 from holosplat.fit.schedule import Schedule
 from holosplat.geometry import rotation_y
 from holosplat.materials import HAEMOGLOBIN
@@ -18,20 +21,7 @@ from holosplat.matter import Matter
 from holosplat.motion import twins
 from holosplat.motion.elastic import Elastic, Rest
 from holosplat.motion.fit import MotionFit
-from holosplat.motion.measures import moments
-from holosplat.motion.steps import Steps
-from holosplat.motion.twins import (
-    Trials,
-    chosen_twins,
-    distance,
-    in_question,
-    map_near,
-    twin_map,
-    twin_of,
-    twinned,
-    two_beams,
-    without_details,
-)  # fmt: skip
+from holosplat.motion.twins import Trials, chosen_twins, in_question, twinned, without_details
 from holosplat.representations import MovingSurfaces, TimeBasis
 
 PIXEL, SHAPE = 1e-6, (29, 35)

@@ -14,10 +14,10 @@ import torch
 from PIL import Image
 
 from helpers.moving_ellipsoids import PIXEL, STEP, TIMES, scan, true_paths, truth
+from holosplat.bodies.moments import centroid
 from holosplat.geometry import Grid, Views
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
-from holosplat.motion.sightings import centroid
 from holosplat.report.animation import encoded
 from holosplat.report.body_picture import body_colours, paint_bodies
 from holosplat.report.content import ReportContent

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from helpers.moving_ellipsoids import PIXEL, TIMES, scan, true_paths
+from holosplat.bodies.rest_shape import KnownBody
 from holosplat.checks import InputError
 from holosplat.motion.known import at_rest
-from holosplat.motion.rest_shape import KnownBody
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.workflows.rest_file import read_rest, write_rest
 from holosplat.workflows.run_folder import RunFolder

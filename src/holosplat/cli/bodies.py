@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+from ..bodies.rest_shape import KnownBody
 from ..checks import positive
-from ..motion.rest_shape import KnownBody
 from ..motion.track import TrackOptions
 from ..ranges import Metres, Share, Weight, ranged
 

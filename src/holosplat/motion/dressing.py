@@ -14,11 +14,12 @@ import torch
 from scipy.optimize import minimize
 from scipy.spatial import KDTree
 
+from ..bodies.moments import moments, stretched_like
 from ..checks import require
 from ..mesh import TriangleMesh
 from ..specimens.membrane.model import Membrane
 from .forecast import areas, normals
-from .measures import area, moments, stretched_like
+from .measures import area
 
 STIFFNESS = (1e-6, 3e-6, 1e-5, 3e-5, 1e-4, 1e-4, 1e-4)
 """Springs between the surfaces [N/m a node], one round after the other: at the last one, forces of the membrane, some

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from ..bodies.rest_shape import surface
 from ..checks import require
 from ..fit.batch import Batch
 from ..fit.problem import Part
@@ -22,7 +23,6 @@ from ..mesh import TriangleMesh
 from ..model import Model
 from ..representations import MovingSurfaces
 from ..specimens.membrane.model import Elasticity, Membrane
-from .rest_shape import surface
 from .terms import COEFFICIENTS
 
 BENDING, AREA = 8e-3, 345.0

@@ -8,6 +8,12 @@ from itertools import pairwise
 import numpy as np
 import torch
 
+from ..bodies.moments import moments, stretched_like
+from ..bodies.poses import FREER, Explained, Pose
+from ..bodies.replaced import Heard, pursued
+from ..bodies.rest_shape import KnownBody
+from ..bodies.shadows import Shadows
+from ..bodies.steps import Steps
 from ..checks import require
 from ..geometry import Views
 from ..matter import DeltaBeta, Matter
@@ -15,12 +21,6 @@ from ..mesh import TriangleMesh
 from ..representations import MovingSurfaces, TimeBasis
 from ..scan import Scan
 from .elastic import Elastic, Rest
-from .measures import moments, stretched_like
-from .poses import FREER, Explained, Pose
-from .replaced import Heard, pursued
-from .rest_shape import KnownBody
-from .shadows import Shadows
-from .steps import Steps
 
 SEARCH_RADIUS = 2.8
 """Radius of the ball of a body's volume in pixels of the search, whose frames are binned to about that."""

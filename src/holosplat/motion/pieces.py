@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from ..bodies.steps import Steps
 from ..checks import at_least, in_range
 from ..fit.residuals import Prediction
 from ..optics.background import Light
@@ -15,7 +16,6 @@ from ..representations import MovingSurfaces
 from ..scan import Scan
 from .elastic import Rest
 from .fit import MotionFit, motion_fit
-from .steps import Steps
 
 SURE = 2.0
 """Standard errors by which more pieces must be better."""

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from ..baselines import HolographicTV, holographic_tv
+from ..bodies.moments import centroid
+from ..bodies.touching import parted
 from ..checks import InputError, in_range
 from ..geometry import Grid, Views
 from ..learning.network import Guess
@@ -19,7 +21,6 @@ from ..progress import Progress
 from ..ranges import Pixels, Weight, ranged
 from ..representations import SurfaceMesh, isosurface
 from ..scan import Scan
-from .touching import parted
 
 
 @dataclass(frozen=True)
@@ -108,11 +109,3 @@ def is_cut(body: TriangleMesh, views: Views, edge: float = 1.0) -> bool:
     half = 0.5 * np.array([columns, rows]) * views.pixel_sizes[:, None] - edge * views.pixel_sizes[:, None]
     beyond = (np.abs(seen) > half[:, None]).any(1)  # [V, 2]: of columns, of rows
     return bool(beyond[:, 1].any() or beyond[:, 0].all())
-
-
-def centroid(mesh: TriangleMesh) -> np.ndarray:
-    """Centre of mass `(x, y, z)` [m] of what a closed mesh encloses."""
-    origin = mesh.vertices.mean(0)
-    a, b, c = np.moveaxis((mesh.vertices - origin)[mesh.faces], 1, 0)
-    parts = np.einsum("fi,fi->f", a, np.cross(b, c)) / 6
-    return origin + (parts[:, None] * (a + b + c) / 4).sum(0) / parts.sum()

@@ -10,6 +10,8 @@ from typing import Any
 
 import torch
 
+from ..bodies.rest_shape import KnownBody
+from ..bodies.steps import Steps
 from ..checks import InputError, as_written, require
 from ..fit.running import Record
 from ..learning.network import Guess
@@ -28,10 +30,8 @@ from .known import KnownBodies, at_rest
 from .mergers import without_merger
 from .pieces import chosen_paths
 from .remainder import apart, beside, joined, only, sure_ones, whole_ones
-from .rest_shape import KnownBody
 from .sightings import Sighting, SightingOptions, sightings
 from .start import first_paths
-from .steps import Steps
 from .track_options import TrackOptions
 from .twins import Trials, chosen_twins
 

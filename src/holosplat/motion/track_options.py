@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
+from ..bodies.rest_shape import KnownBody
 from ..fit.schedule import Schedule
 from ..learning.start import LearnedStart
 from ..ranges import Share, ranged
 from .fit import MotionFit, converged
 from .identities import LinkOptions
 from .pieces import PathOptions
-from .rest_shape import KnownBody
 from .sightings import SightingOptions
 
 

@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ..bodies.moments import moments
 from ..checks import InputError
 from ..io.atomic import atomic_path
 from ..matter import MaterialPrior
 from ..methods import Method
 from ..methods.continued import Continued
-from ..motion.measures import moments
 from ..progress import FitProgress
 from ..representations import Stored, SurfaceMesh
 from ..scan import Scan

@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..bodies.moments import moments
 from ..io.run_scan import run_source
 from ..metrics import ImageScores
-from ..motion.measures import moments
 from ..representations import MovingSurfaces
 from ..scan import Scan
 from ..workflows.evaluate import Evaluation, evaluate

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from helpers.motion_shadows import FLOW, OTHER, TURN, cell, pose, shadows
-from holosplat.motion import replaced
-from holosplat.motion.pool import Pool, annealed
-from holosplat.motion.poses import FREER, Explained
-from holosplat.motion.replaced import Replaced
-from holosplat.motion.templates import Search, Templates
+from holosplat.bodies import replaced
+from holosplat.bodies.pool import Pool, annealed
+from holosplat.bodies.poses import FREER, Explained
+from holosplat.bodies.replaced import Replaced
+from holosplat.bodies.templates import Search, Templates
 
 
 def test_a_choice_is_the_best_of_all():

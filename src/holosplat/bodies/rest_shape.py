@@ -13,7 +13,7 @@ from ..mesh import TriangleMesh
 from ..ranges import Metres, Weight, ranged
 from ..specimens.membrane.resting import FREQUENCIES, resting_cell
 from ..specimens.repair import closed
-from .sightings import centroid
+from .moments import centroid
 
 RED_CELL = "red-cell"
 LEAST_PX, MOST_PX = 3.0, 300.0
