@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from holosplat.bodies.cut import is_cut
 from holosplat.bodies.moments import centroid, moments
 from holosplat.geometry import Views
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
 from holosplat.motion.measures import angular_velocity, columns, measure, measured, row, volume_velocity
-from holosplat.motion.sightings import Sighting, is_cut
+from holosplat.motion.sightings import Sighting
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.scan import Exposures
 from holosplat.specimens.red_cells import icosphere

@@ -59,6 +59,9 @@ class LearnedStart:
     more, the run is the same as without the network."""
     sure: Weight = 3.0
     """Standard deviations of the noise by which the frames must speak for it."""
+    cells: bool = True
+    """Whether red cells, where the network knows these alone and beams are two, are also looked for by their shape at
+    rest: two views hardly say shapes. They are begun with where they do clearly better than the other starts."""
 
     @property
     def network(self) -> Trained:

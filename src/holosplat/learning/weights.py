@@ -39,6 +39,11 @@ class Card:
     typical_misfit: dict[str, float] = field(default_factory=dict)
     limits: str = ""
 
+    @property
+    def of_red_cells(self) -> bool:
+        """Whether all scenes that were trained on are of red cells."""
+        return set(self.trained_on.get("kinds", ())) in ({"red-cells"}, {"red-cells", "crowd"}, {"crowd"})
+
     def typical(self, views: int) -> float:
         """What guesses from so many views typically leave unexplained: by the next smaller number that was tried."""
         known = sorted(int(count) for count in self.typical_misfit)

@@ -7,14 +7,14 @@ from typing import Literal
 
 from ..learning.start import GuessedMatter
 
-Start = Literal["learned", "phase"]
+Start = Literal["learned", "cells", "phase"]
 
 
 @dataclass(frozen=True)
 class Beginning:
     """What was begun with.
 
-    taken: the network's guess, or phase retrieval and tomography
+    taken: the network's guess, red cells of its size by their shape at rest, or phase retrieval and tomography
     why: in a sentence
     guess: what the network said, also where it was not taken; None where it was not asked
     """

@@ -33,7 +33,7 @@ from .field import field_of
 from .first_surfaces import first_surfaces
 from .gaussian_options import FitOptions, GaussianOptions, GaussianRates
 from .ground import Ground, ground
-from .learned import guessed_cloud, ways_of_guess
+from .learned import guessed_start, ways_of_guess
 from .method import Near, Stage, Task, run_quietly
 from .start import starting_cloud
 from .surface_fit import SurfaceFit, SurfaceOptions, oversampling
@@ -93,7 +93,10 @@ class GaussianStage:
         surfaces = self.coarse_surfaces(task, how)
         if surfaces is None:
             return self.own_start(task)
-        surfaces = last_steps(self._without_validation(task), surfaces, how, self.options.coarse)
+        return self.near(task, last_steps(self._without_validation(task), surfaces, how, self.options.coarse))
+
+    def near(self, task: Task, surfaces: SurfaceMesh) -> Near:
+        """What is begun with where `surfaces` of the frames of `task` are known: the Gaussians that fill them."""
         return Near(cloud_of_surfaces(surfaces, task).on(resolve(self.options.volume.backend)))
 
     def own_start(self, task: Task) -> Stored | Near:
@@ -102,11 +105,13 @@ class GaussianStage:
         return self._or_guess(task, plain) if self.options.start == "learned" else plain
 
     def _or_guess(self, task: Task, plain: Stored | Near) -> Stored | Near:
-        """The cloud of the network's guess where that is begun with, else what is begun with without it."""
+        """What is begun with of the network's guess, else what is begun with without it."""
         start = plain.object if isinstance(plain, Near) else plain
         assert isinstance(start, GaussianCloud | SurfaceMesh)
         seen = self._without_validation(task)
-        guess = guessed_cloud(seen, self.options, self._fitted, lambda: start)
+        guess = guessed_start(seen, self.options, self._fitted, lambda: start)
+        if isinstance(guess, SurfaceMesh):
+            return self.near(task, guess)
         return plain if guess is None else guess
 
     @property

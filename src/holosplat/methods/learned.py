@@ -11,6 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TypeVar
 
 from torch import Tensor
 
@@ -25,6 +27,7 @@ from .cross_validation import MissingMatter, predicted_frames
 from .evidence import Evidence
 from .gaussian_options import GaussianOptions
 from .method import Task, run_quietly
+from .posed import red_cells
 from .sharp_level import material_of_levels
 from .start import cloud_of, starting_cloud
 from .surface_fit import SurfaceFit, SurfaceOptions, extract_surfaces, oversampling, surface_fit
@@ -34,6 +37,8 @@ STAGE = "both starts"
 Fitted = Callable[[Task, GaussianCloud, int], GaussianCloud]
 """A cloud after so many steps."""
 
+Begun = TypeVar("Begun", GaussianCloud, SurfaceMesh)
+
 Plain = Callable[[], GaussianCloud | SurfaceMesh]
 """What the run begins with where no network is asked."""
 
@@ -41,10 +46,11 @@ Plain = Callable[[], GaussianCloud | SurfaceMesh]
 def ways_of_guess(
     task: Task, ways: Sequence[Way], options: GaussianOptions, surfaces: SurfaceOptions, fitted: Fitted
 ) -> Sequence[Way]:
-    """Ways to first surfaces: of Gaussians fitted from the network's guess, where that is begun with, else `ways`.
+    """Ways to first surfaces: of Gaussians fitted from the network's guess, or red cells by their shape, where one of
+    these is begun with, else `ways`.
 
     ways: those without a network, each of which is gone once only; fitted: the fit of Gaussians. Errors: as for
-    `guessed_cloud`.
+    `guessed_start`.
     """
     ways, how = [_once(way) for way in ways], options.coarse.of_views(len(task.scan.train()))
 
@@ -52,12 +58,14 @@ def ways_of_guess(
         found = first_of(task, ways, surfaces, how)
         return starting_cloud(task, replace(options, start="phase")) if found is None else found
 
-    cloud = guessed_cloud(task, options, fitted, plain)
-    if cloud is None:
+    start = guessed_start(task, options, fitted, plain)
+    if start is None:
         return ways
 
     def of_guess(before: SurfaceMesh | None) -> SurfaceMesh | None:
-        return _cut(task, fitted(task, cloud, options.fit.schedule.steps), surfaces)
+        if isinstance(start, SurfaceMesh):
+            return start
+        return _cut(task, fitted(task, start, options.fit.schedule.steps), surfaces)
 
     return (of_guess,)
 
@@ -74,12 +82,14 @@ def _once(way: Way) -> Way:
     return gone
 
 
-def guessed_cloud(task: Task, options: GaussianOptions, fitted: Fitted, plain: Plain) -> GaussianCloud | None:
-    """The cloud of the network's guess, or None where the run is the same as without it. `task.on_beginning` is told
-    which, and why.
+def guessed_start(
+    task: Task, options: GaussianOptions, fitted: Fitted, plain: Plain
+) -> GaussianCloud | SurfaceMesh | None:
+    """The cloud of the network's guess, or red cells of its size by their shape at rest (`posed.red_cells`), or None
+    where the run is the same as without it. `task.on_beginning` is told which, and why.
 
     fitted: the fit of Gaussians; plain: what the guess has to do clearly better than, as surfaces where it is some.
-    Errors: those of `guessed`, of the weights' file and of both starts.
+    Errors: those of `guessed`, of the weights' file and of all starts.
     """
     if len(task.prior.materials) == 2:
         why = "The network guesses one material, and two are known: the run began with phase retrieval."
@@ -92,41 +102,78 @@ def guessed_cloud(task: Task, options: GaussianOptions, fitted: Fitted, plain: P
     if refused:
         why = f"The frames contradict the network's guess ({refused}): the run began with phase retrieval."
         return _begun(task, Beginning("phase", why, guess))
-    cloud = cloud_of(found.values, found.grid, material, task, options)
-    won, why = _compared(task, (plain(), cloud), material, options, fitted)
+    starts = _Starts(task, options, material, fitted)
+    cloud, ordinary = cloud_of(found.values, found.grid, material, task, options), plain()
+    won, why = starts.compared(ordinary, cloud)
+    if how.cells and task.bounded and trained.card.of_red_cells:
+        cells = red_cells(task, found, material)
+        better, said = (False, "") if cells is None else starts.cells_beside(cells, cloud if won else ordinary, won)
+        if better:
+            return _begun(task, Beginning("cells", said, guess), cells)
+        why += f" {said}" if said else ""
     return _begun(task, Beginning("learned" if won else "phase", why, guess), cloud if won else None)
 
 
-def _compared(
-    task: Task,
-    starts: tuple[GaussianCloud | SurfaceMesh, GaussianCloud],
-    material: DeltaBeta,
-    options: GaussianOptions,
-    fitted: Fitted,
-) -> tuple[bool, str]:
-    """Whether the second start, of the guess, is begun with, and why.
+@dataclass(frozen=True)
+class _Starts:
+    """Compares starts by what they leave of the frames after fits."""
 
-    A short fit of both says whether the guess may be better. It is taken if it still is after the steps of a whole one:
-    in noise the ordinary start takes longest to find edges.
-    """
-    how, evidence, told = options.learned, Evidence(MissingMatter(task.scan, material), task.noise), list[str]()
-    rounds = {"for a while": (how.trial_steps, how.trial_surfaces), "to the end": (how.last_steps, how.last_surfaces)}
-    for said, steps in rounds.items():
-        plain, learned = (_Trial.of(task, start, evidence, steps, fitted) for start in starts)
-        told.append(
-            f"fitted {said}, {{}} leaves {in_percent(learned.left)} of the frames unexplained, "
-            f"and phase retrieval {in_percent(plain.left)}"
+    task: Task
+    options: GaussianOptions
+    material: DeltaBeta
+    fitted: Fitted
+
+    @cached_property
+    def evidence(self) -> Evidence:
+        """By which they are judged."""
+        return Evidence(MissingMatter(self.task.scan, self.material), self.task.noise)
+
+    def compared(self, plain: GaussianCloud | SurfaceMesh, cloud: GaussianCloud) -> tuple[bool, str]:
+        """Whether the cloud, of the guess, is begun with, and why.
+
+        A short fit of both says whether the guess may be better. It is taken if it still is after the steps of a whole
+        one: in noise the ordinary start takes longest to find edges.
+        """
+        how, told = self.options.learned, list[str]()
+        rounds = {"for a while": (how.trial_steps, how.trial_surfaces), "to the end": self._whole}
+        for said, steps in rounds.items():
+            ordinary, learned = (self._tried(start, steps) for start in (plain, cloud))
+            told.append(
+                f"fitted {said}, {{}} leaves {in_percent(learned.left)} of the frames unexplained, "
+                f"and phase retrieval {in_percent(ordinary.left)}"
+            )
+            if not learned.clearly_better(ordinary, self.evidence, how):
+                first, *others = told
+                why = "; ".join((first.format("the network's guess"), *(each.format("it") for each in others)))
+                return False, f"The run began with phase retrieval: {why}."
+        return True, f"The run began with the network's guess: {'; '.join(each.format('it') for each in told)}."
+
+    def cells_beside(self, cells: SurfaceMesh, best: GaussianCloud | SurfaceMesh, of_guess: bool) -> tuple[bool, str]:
+        """Whether `cells` are begun with in place of the better one of the other starts, and why."""
+        ours, other = (self._tried(start, self._whole) for start in (cells, best))
+        taken = ours.clearly_better(other, self.evidence, self.options.learned)
+        name = "the network's guess" if of_guess else "phase retrieval"
+        said = (
+            f"fitted to the end, they leave {in_percent(ours.left)} of the frames unexplained, and {name} "
+            f"{in_percent(other.left)}"
         )
-        if not learned.clearly_better(plain, evidence, how):
-            first, *others = told
-            why = "; ".join((first.format("the network's guess"), *(each.format("it") for each in others)))
-            return False, f"The run began with phase retrieval: {why}."
-    return True, f"The run began with the network's guess: {'; '.join(each.format('it') for each in told)}."
+        return taken, (
+            f"The run began with red cells of the guess's size, found by their shape at rest: {said}."
+            if taken
+            else f"Red cells of the guess's size, by their shape at rest, were not begun with: {said}."
+        )
+
+    @property
+    def _whole(self) -> tuple[int, int]:
+        return self.options.learned.last_steps, self.options.learned.last_surfaces
+
+    def _tried(self, start: GaussianCloud | SurfaceMesh, steps: tuple[int, int]) -> _Trial:
+        return _Trial.of(self.task, start, self.evidence, steps, self.fitted)
 
 
-def _begun(task: Task, beginning: Beginning, cloud: GaussianCloud | None = None) -> GaussianCloud | None:
+def _begun(task: Task, beginning: Beginning, start: Begun | None = None) -> Begun | None:
     task.on_beginning(beginning)
-    return cloud
+    return start
 
 
 @dataclass(frozen=True)

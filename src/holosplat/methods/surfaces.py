@@ -61,7 +61,11 @@ class BodiesStage(GaussianStage):
     def _start(self, task: Task) -> Stored | Near:
         """Surfaces near to the frames', or the starting cloud."""
         found = self.coarse_surfaces(task, self.surfaces)
-        return self.own_start(task) if found is None else Near(found)
+        return self.own_start(task) if found is None else self.near(task, found)
+
+    def near(self, task: Task, surfaces: SurfaceMesh) -> Near:
+        """`surfaces` themselves."""
+        return Near(surfaces)
 
     def coarse_surfaces(self, task: Task, surfaces: SurfaceOptions) -> SurfaceMesh | None:
         """Those of coarse pixels, which small frames have themselves; small noisy ones are for Gaussians."""

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-import torch
 
 from ..bodies.moments import moments, stretched_like
-from ..bodies.poses import FREER, Explained, Pose
-from ..bodies.replaced import Heard, pursued
+from ..bodies.poses import Pose
+from ..bodies.replaced import Heard
 from ..bodies.rest_shape import KnownBody
+from ..bodies.search import BodySearch, sized
 from ..bodies.shadows import Shadows
 from ..bodies.steps import Steps
 from ..checks import require
@@ -22,12 +23,8 @@ from ..representations import MovingSurfaces, TimeBasis
 from ..scan import Scan
 from .elastic import Elastic, Rest
 
-SEARCH_RADIUS = 2.8
-"""Radius of the ball of a body's volume in pixels of the search, whose frames are binned to about that."""
 SPREAD = (0.85, 1.0, 1.15)
 """Velocities of the search over that of all matter together: a channel's flow is slower at its walls."""
-SIZES, SIZE_STEPS = 9, 8
-"""Sizes that are tried for all bodies, and steps to better poses at the best one."""
 
 
 class KnownBodies:
@@ -39,11 +36,10 @@ class KnownBodies:
         self.material, self.body, self.size = material, body, size
         self.first, self.last = float(times[0]), float(times[-1])
         chosen = times[np.unique(np.rint(np.linspace(0, len(times) - 1, body.instants)).astype(int))]
-        self.coarse, self.fine = body.mesh(self.pixel, coarse=True), body.mesh(self.pixel)
-        radius = (3 * self.coarse.volume / (4 * np.pi)) ** (1 / 3)
-        self.bin = max(1, round(radius / SEARCH_RADIUS))
         frames = train[np.flatnonzero(np.isin(train.exposures.time, chosen))]
-        self.seen = Shadows.of(frames, material, self.first, self.last).binned(self.bin)
+        self.fine = body.mesh(self.pixel)
+        self.search = BodySearch.of(frames, material, body, (self.first, self.last))
+        self.seen, self.bin = self.search.seen, self.search.bin
         self.velocities = drift(self.seen) * np.array(SPREAD)[:, None]
         self.of_begun = False
 
@@ -62,16 +58,15 @@ class KnownBodies:
         finds the size of all bodies. steps: in which it is done.
         """
         steps = steps or Steps()
-        seen, mesh = self.seen, _sized(self.coarse, self.size / self.bin)
+        search, mesh = self.search, sized(self.search.mesh, self.size)
         if known is not None:
-            seen = seen.without(self._shadows(known))
+            search = replace(search, seen=self.seen.without(self._shadows(known)))
         like = [] if begun is None else poses_like(begun, mesh, (self.first, self.last), self.pixel * self.bin)
-        found, self.of_begun = pursued(mesh, seen, self.velocities, like, seed, on_progress, steps)
+        found, self.of_begun = search.poses(self.velocities, like, self.size, seed, on_progress, steps)
         if not found:
             return None
         if known is None and self.body.uncertain > 0:
-            self.size = best_size(mesh, seen, found, self.body.uncertain)
-            found = Explained(_sized(mesh, self.size), seen, FREER, steps).improved(found, SIZE_STEPS)
+            self.size, found = search.of_best_size(found, self.size, steps)
         return self._paths([pose.scaled(self.bin) for pose in found], basis)
 
     def _shadows(self, bodies: MovingSurfaces) -> np.ndarray:
@@ -81,7 +76,7 @@ class KnownBodies:
         return self.seen.project(nodes, bodies.faces).numpy()
 
     def _paths(self, poses: Sequence[Pose], basis: TimeBasis) -> MovingSurfaces:
-        rest = _sized(self.fine, self.size)
+        rest = sized(self.fine, self.size)
         middle, half = 0.5 * (self.last + self.first), 0.5 * (self.last - self.first)
         when = np.linspace(-1, 1, 4 * basis.count)
         nodes = [np.array([pose.nodes(rest.vertices, t) for t in when]) for pose in poses]
@@ -103,20 +98,7 @@ def poses_like(bodies: MovingSurfaces, rest: TriangleMesh, ends: tuple[float, fl
 
 def at_rest(body: KnownBody, pixel: float, size: float) -> Rest:
     """What is known of the shape of all bodies that are `size` times as large as `body`, on paths in `pixel` [m]."""
-    return Rest(Elastic(_sized(body.mesh(pixel), size)), body.stiffness)
-
-
-def best_size(mesh: TriangleMesh, seen: Shadows, poses: Sequence[Pose], uncertain: float) -> float:
-    """The factor within 1 ± `uncertain` by which all bodies of rest shape `mesh` in `poses` explain `seen` best."""
-    factors = np.linspace(1 - uncertain, 1 + uncertain, SIZES)
-    explained = [Explained(_sized(mesh, float(factor)), seen) for factor in factors]
-    width = explained[SIZES // 2]
-    costs = np.array([float(width.cost(width.target - torch.from_numpy(one.images(poses)))) for one in explained])
-    k = int(np.clip(costs.argmin(), 1, SIZES - 2))
-    before, here, after = costs[k - 1 : k + 2]
-    bent = before - 2 * here + after
-    step = 0.5 * (before - after) / bent if bent > 0 else 0.0
-    return float(np.clip(factors[k] + step * (factors[1] - factors[0]), factors[0], factors[-1]))
+    return Rest(Elastic(sized(body.mesh(pixel), size)), body.stiffness)
 
 
 def beam_directions(views: Views) -> np.ndarray:
@@ -157,7 +139,3 @@ def _moved(seen: Shadows, pairs: Sequence[tuple[int, int]]) -> np.ndarray:
     return np.array(
         [(column + seen.shape[1]) % size[1] - seen.shape[1], (row + seen.shape[0]) % size[0] - seen.shape[0]]
     )
-
-
-def _sized(mesh: TriangleMesh, factor: float) -> TriangleMesh:
-    return TriangleMesh(mesh.vertices * factor, mesh.faces, mesh.name)

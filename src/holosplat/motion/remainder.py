@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from scipy.spatial import KDTree
 
+from ..bodies.cut import is_cut
 from ..fit.residuals import Prediction
 from ..geometry import Views
 from ..mesh import TriangleMesh
 from ..representations import MovingSurfaces
 from ..scan import Scan
-from .sightings import is_cut
 
 CENTRES, PART, NEAR_PX = 0.6, 0.5, 2.0
 """When a body is one of its own: radii between centres, share of the median volume, and distance [pixels]."""

@@ -5,21 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from ..baselines import HolographicTV, holographic_tv
+from ..bodies.cut import EDGE, LEAST_VOLUME, LEVEL, SMOOTHING, cut_bodies, is_cut
 from ..bodies.moments import centroid
-from ..bodies.touching import parted
-from ..checks import InputError, in_range
-from ..geometry import Grid, Views
+from ..checks import in_range
+from ..geometry import Grid
 from ..learning.network import Guess
 from ..learning.start import guessed
-from ..matter import DeltaBeta, Matter
+from ..matter import DeltaBeta
 from ..mesh import TriangleMesh
 from ..progress import Progress
 from ..ranges import Pixels, Weight, ranged
-from ..representations import SurfaceMesh, isosurface
 from ..scan import Scan
 
 
@@ -53,13 +51,13 @@ class SightingOptions:
 
     volume: HolographicTV = field(default_factory=lambda: HolographicTV(iterations=60, corrections=0))
     """The volume of one time by itself: 160 iterations find no other bodies than 60 do."""
-    level: float = 0.5
+    level: float = LEVEL
     """Occupancy at the surface."""
-    least_volume: Weight = 30.0
+    least_volume: Weight = LEAST_VOLUME
     """Bodies of fewer voxels are left out: noise, or too little to be followed."""
-    smoothing: int = 10
+    smoothing: int = SMOOTHING
     """Steps that smooth away the voxels' traces."""
-    edge: Pixels = 1.0
+    edge: Pixels = EDGE
     """Bodies that come nearer to the field's edge than this are cut by it [pixels]."""
 
     def __post_init__(self) -> None:
@@ -78,14 +76,8 @@ def sightings(
     network: guesses the volume, which is made by total variation without one.
     """
     values, grid = occupancy(scan, material, options, on_progress, network)
-    pixel = scan.views.finest
-    least = options.least_volume * (pixel / grid.voxel_size[0]) ** 3
-    try:
-        mesh = isosurface(parted(values.numpy(), options.level, least), grid, options.level, least, options.smoothing)
-        unit = torch.from_numpy(mesh.vertices / pixel)
-        bodies = SurfaceMesh(unit, torch.from_numpy(mesh.faces), pixel, Matter.one(*material)).bodies()
-    except InputError:  # nothing reaches the level, or cavities alone do
-        return []
+    how = options.level, options.least_volume, options.smoothing
+    bodies = cut_bodies(values.numpy(), grid, scan.views.finest, *how)
     return [Sighting(body, is_cut(body, scan.views, options.edge)) for body in bodies]
 
 
@@ -97,15 +89,3 @@ def occupancy(
         return holographic_tv(scan, material, options.volume, on_progress)
     found = guessed(scan, material, network, on_progress)
     return found.values, found.grid
-
-
-def is_cut(body: TriangleMesh, views: Views, edge: float = 1.0) -> bool:
-    """Whether `body` comes within `edge` pixels of the rows' ends in any view, or of the columns' in all of them.
-
-    What one view's columns cut, others may see whole; rows are common to all views about one axis, but need not be.
-    """
-    seen = np.einsum("vij,pj->vpi", views.rotations[:, :2], body.vertices) - views.shifts[:, None]
-    rows, columns = views.shape
-    half = 0.5 * np.array([columns, rows]) * views.pixel_sizes[:, None] - edge * views.pixel_sizes[:, None]
-    beyond = (np.abs(seen) > half[:, None]).any(1)  # [V, 2]: of columns, of rows
-    return bool(beyond[:, 1].any() or beyond[:, 0].all())
