@@ -11,6 +11,11 @@ class Kept:
     def __init__(self, states=(), most: int = 10**6) -> None:
         self.states, self.most = list(states), most
 
+    @property
+    def plain(self):
+        """The states of bodies of any shape, of `follow`'s."""
+        return [state["any"] for state in self.states]
+
     def load(self):
         return copy.deepcopy(self.states[-1]) if self.states else None
 

@@ -16,6 +16,7 @@ from holosplat.bodies.poses import Explained, Pose
 from holosplat.bodies.pursuit import exchanged
 from holosplat.bodies.replaced import pursued
 from holosplat.bodies.rest_shape import KnownBody, surface, thinned
+from holosplat.bodies.search import best_size
 from holosplat.bodies.steps import Steps
 from holosplat.bodies.templates import Search, Templates
 from holosplat.checks import InputError
@@ -25,7 +26,7 @@ from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
 from holosplat.motion.elastic import Elastic, RestShapeKept
-from holosplat.motion.known import best_size, drift, poses_like
+from holosplat.motion.known import drift, poses_like
 from holosplat.motion.strain import strain_energy
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces, TimeBasis

@@ -12,7 +12,7 @@ import torch
 from helpers.kept import Kept
 from helpers.moving_ellipsoids import MATERIAL, PIXEL, TIMES, scan, true_paths
 from holosplat.fit.schedule import Schedule
-from holosplat.motion import pieces, track
+from holosplat.motion import following, pieces
 from holosplat.motion.fit import motion_fit
 from holosplat.motion.halves import ASTRAY, astray, halves_of, standard_errors, tell_shapes
 from holosplat.motion.pieces import PathOptions
@@ -27,12 +27,14 @@ STAGES = ("sightings", "first paths", "stiff", "beside", "paths", "soft", "twins
 @pytest.fixture(autouse=True)
 def frequent(monkeypatch):
     """Fits are kept after every step, and each time sees the true bodies at once."""
-    monkeypatch.setattr(track, "CHECKPOINT_SECONDS", -1.0)
-    monkeypatch.setattr(track, "sightings", lambda frames, material, options, network: seen(float(frames.instants[0])))
+    monkeypatch.setattr(following, "CHECKPOINT_SECONDS", -1.0)
+    monkeypatch.setattr(
+        following, "sightings", lambda frames, material, options, network: seen(float(frames.instants[0]))
+    )
 
 
 def seen(time: float):
-    return [track.Sighting(mesh, False) for mesh in true_paths().bodies(time)]
+    return [following.Sighting(mesh, False) for mesh in true_paths().bodies(time)]
 
 
 def three_views():
@@ -40,15 +42,15 @@ def three_views():
 
 
 @cache
-def whole() -> tuple[Kept, track.Followed]:
+def whole() -> tuple[Kept, following.Followed]:
     kept = Kept()
     return kept, follow(scan(), MATERIAL, QUICK, journal=kept)
 
 
 def test_every_stage_is_kept():
-    named = [state["next"] for state in whole()[0].states]
+    named = [state["next"] for state in whole()[0].plain]
     assert [name for k, name in enumerate(named) if name not in named[:k]] == list(STAGES)
-    assert sum(state["fit"] is not None for state in whole()[0].states) == 3 * (1 + 1 + 4)
+    assert sum(state["fit"] is not None for state in whole()[0].plain) == 3 * (1 + 1 + 4)
 
 
 @pytest.mark.parametrize("cut", ["sightings", "first paths", "in stiff", "beside", "in soft", "in halves", "done"])
@@ -56,9 +58,7 @@ def test_a_run_that_was_cut_off_goes_on_as_if_nothing_had_happened(cut):
     """From every stage, and from the middle of fits: bodies, halves and records are the same bit for bit."""
     states, result = whole()
     name, within = cut.removeprefix("in "), cut.startswith("in ")
-    number = next(
-        k for k, one in enumerate(states.states) if one["next"] == name and (one["fit"] is not None) == within
-    )
+    number = next(k for k, one in enumerate(states.plain) if one["next"] == name and (one["fit"] is not None) == within)
     again = follow(scan(), MATERIAL, QUICK, journal=Kept(states.states[: number + 1]))
     assert torch.equal(again.bodies.coefficients, result.bodies.coefficients)
     assert len(again.halves) == len(result.halves) == 4
@@ -75,19 +75,19 @@ def test_the_fit_after_twins_goes_on_too(monkeypatch):
     def moved(run, bodies):
         return bodies.with_parameters({"coefficients": bodies.coefficients + 0.3})
 
-    monkeypatch.setattr(track._Following, "told_from_twins", moved)
+    monkeypatch.setattr(following.Following, "told_from_twins", moved)
     result = follow(scan(), MATERIAL, QUICK, journal=(kept := Kept()))
-    named = [state["next"] for state in kept.states]
+    named = [state["next"] for state in kept.plain]
     assert named.index("twins") < named.index("soft again") < named.index("halves")
     assert not torch.equal(result.bodies.coefficients, whole()[1].bodies.coefficients)
-    number = next(k for k, one in enumerate(kept.states) if one["next"] == "soft again" and one["fit"] is not None)
+    number = next(k for k, one in enumerate(kept.plain) if one["next"] == "soft again" and one["fit"] is not None)
     again = follow(scan(), MATERIAL, QUICK, journal=Kept(kept.states[: number + 1]))
     assert torch.equal(again.bodies.coefficients, result.bodies.coefficients)
 
 
 def test_ctrl_c_in_a_fit_loses_no_step(monkeypatch):
     """It is passed on, after the state is kept."""
-    monkeypatch.setattr(track, "CHECKPOINT_SECONDS", 1e9)
+    monkeypatch.setattr(following, "CHECKPOINT_SECONDS", 1e9)
 
     def stop(stage, fraction, record):
         if stage == "soft fit" and fraction > 0.5:
@@ -96,15 +96,15 @@ def test_ctrl_c_in_a_fit_loses_no_step(monkeypatch):
     kept = Kept()
     with pytest.raises(KeyboardInterrupt):
         follow(scan(), MATERIAL, QUICK, journal=kept, on_progress=stop)
-    assert kept.states[-1]["next"] == "soft"
-    assert kept.states[-1]["fit"]["step"] == 2
+    assert kept.plain[-1]["next"] == "soft"
+    assert kept.plain[-1]["fit"]["step"] == 2
     again = follow(scan(), MATERIAL, QUICK, journal=kept)
     assert torch.equal(again.bodies.coefficients, whole()[1].bodies.coefficients)
 
 
 def test_times_that_were_looked_at_are_not_looked_at_again(monkeypatch):
     """Cut off by Ctrl-C at the third time, of which nothing is kept."""
-    monkeypatch.setattr(track, "CHECKPOINT_SECONDS", 1e9)
+    monkeypatch.setattr(following, "CHECKPOINT_SECONDS", 1e9)
     looked = list[float]()
 
     def look(frames, *given, network):
@@ -113,20 +113,20 @@ def test_times_that_were_looked_at_are_not_looked_at_again(monkeypatch):
             raise KeyboardInterrupt
         return seen(looked[-1])
 
-    monkeypatch.setattr(track, "sightings", look)
+    monkeypatch.setattr(following, "sightings", look)
     with pytest.raises(KeyboardInterrupt):
         follow(scan(), MATERIAL, QUICK, journal=(kept := Kept()))
-    assert [(one["next"], len(one["steps"])) for one in kept.states] == [("sightings", 2)]
+    assert [(one["next"], len(one["steps"])) for one in kept.plain] == [("sightings", 2)]
     again = follow(scan(), MATERIAL, QUICK, journal=kept)
     assert len(looked) == TIMES + 1 + TIMES  # the third twice; and all beside the bodies
     assert torch.equal(again.bodies.coefficients, whole()[1].bodies.coefficients)
 
 
 def test_fits_of_the_choice_of_paths_are_not_made_again(monkeypatch):
-    monkeypatch.setattr(track, "CHECKPOINT_SECONDS", 1e9)
+    monkeypatch.setattr(following, "CHECKPOINT_SECONDS", 1e9)
     free, fits = replace(QUICK, paths=PathOptions(degree=1)), list[int]()
     result = follow(scan(), MATERIAL, free, journal=(every := Kept()))
-    at = next(k for k, one in enumerate(every.states) if one["next"] == "paths")
+    at = next(k for k, one in enumerate(every.plain) if one["next"] == "paths")
 
     def fitted(frames, start, *given):
         fits.append(start.basis.pieces)
@@ -169,7 +169,7 @@ def test_halves_of_few_views_begin_apart(monkeypatch):
     assert 0.5 < float(one[0, own].square().sum(1).mean().sqrt()) / (ASTRAY * radius) < 3
     assert tell_shapes(scan())
     assert not tell_shapes(three_views())
-    monkeypatch.setattr(track._Following, "fitted", lambda run, name, frames, start, how, light: start)
+    monkeypatch.setattr(following.Following, "fitted", lambda run, name, frames, start, how, light: start)
     result = follow(three_views(), MATERIAL, QUICK)
     apart = result.halves[0].coefficients - result.halves[1].coefficients
     middle = 0.5 * (result.halves[0].coefficients + result.halves[1].coefficients)
@@ -183,8 +183,8 @@ def test_halves_that_begin_apart_are_fitted_to_the_end_where_no_shape_is_known(m
         steps.append((name, how.schedule.steps))
         return start
 
-    monkeypatch.setattr(track._Following, "fitted", fitted)
-    monkeypatch.setattr(track._Following, "on_chosen_paths", lambda run, bodies: bodies)
+    monkeypatch.setattr(following.Following, "fitted", fitted)
+    monkeypatch.setattr(following.Following, "on_chosen_paths", lambda run, bodies: bodies)
     long = replace(QUICK, soft=replace(QUICK.soft, schedule=Schedule(steps=7)))
     for frames, wanted in ((three_views(), [7, 7]), (scan(), [3, 3, 3, 3])):
         steps.clear()

@@ -16,7 +16,7 @@ from holosplat.fit.schedule import Schedule
 from holosplat.geometry import Grid
 from holosplat.matter import Matter
 from holosplat.metrics import volume_scores
-from holosplat.motion import track
+from holosplat.motion import following
 from holosplat.motion.fit import MotionFit, motion_fit
 from holosplat.motion.mergers import shared, without_merger
 from holosplat.motion.pieces import PathOptions, chosen_paths, refined
@@ -42,7 +42,7 @@ def followed():
         return found[:1] if len(looks) <= TIMES else found
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(track, "sightings", blind)
+        patch.setattr(following, "sightings", blind)
         return follow(scan(), MATERIAL, QUICK)
 
 

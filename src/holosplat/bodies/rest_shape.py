@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,6 +19,8 @@ from .moments import centroid
 RED_CELL = "red-cell"
 LEAST_PX, MOST_PX = 3.0, 300.0
 """Radius [pixels] of the ball of a body's volume: smaller ones have no orientation that frames tell."""
+GUESSED = 0.15
+"""By which part all red cells may be larger or smaller than a guess of them, whose volumes are hardly better."""
 COARSE, FEWEST, MOST = 180, 180, 3000
 """Triangles in the search, and in the fit at least and at most: there one has the area of a pixel."""
 
@@ -72,6 +75,18 @@ class KnownBody:
         meshes = read_meshes(self.shape, self.length_unit)
         require(len(meshes) == 1, f"{self.shape} must hold one body, but it holds {len(meshes)}; name a file of one.")
         return closed(meshes[0], self.length_unit)
+
+
+def extent_like(meshes: Sequence[TriangleMesh]) -> float:
+    """Largest extent [m] of a red cell at rest that has the median volume of `meshes` [m]."""
+    rest = resting_cell()
+    larger = (float(np.median([mesh.volume for mesh in meshes])) / rest.volume) ** (1 / 3)
+    return larger * float(np.ptp(rest.vertices, axis=0).max())
+
+
+def guessed_cells(extent: float) -> KnownBody:
+    """Red cells of about that largest extent [m], as guesses of them have it."""
+    return KnownBody(size=extent, uncertain=GUESSED)
 
 
 def surface(mesh: TriangleMesh) -> float:

@@ -47,6 +47,9 @@ class MotionFlags:
     learned: bool = True
     """Bodies of single times are found in what the package's network guesses, where frames do not contradict it and its
     bodies explain clearly more: red cells in two or three beams."""
+    cells: bool = True
+    """In two beams, bodies that the network guesses are followed as red cells, too, by their shape at rest, where that
+    leaves no more of the frames than bodies of any shape."""
     least_volume: float = 30.0
     """Bodies of fewer voxels, of a pixel's edge, are not followed."""
     volume_kept: Weight = 0.006
@@ -81,5 +84,12 @@ class MotionFlags:
         }
         usual = usual if self.learned else replace(usual, learned=None)
         return replace(
-            usual, paths=paths, sightings=found, rounds=self.rounds, twins=self.twins, intervals=self.intervals, **fits
+            usual,
+            paths=paths,
+            sightings=found,
+            rounds=self.rounds,
+            twins=self.twins,
+            cells=self.cells,
+            intervals=self.intervals,
+            **fits,
         )

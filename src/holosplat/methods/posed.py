@@ -17,7 +17,7 @@ import torch
 from ..bodies.cut import cut_bodies, is_cut
 from ..bodies.moments import moments
 from ..bodies.poses import Pose
-from ..bodies.rest_shape import KnownBody
+from ..bodies.rest_shape import KnownBody, extent_like, guessed_cells
 from ..bodies.search import BodySearch, sized
 from ..bodies.twin import distance, twin_map, two_beams
 from ..checks import InputError
@@ -26,13 +26,10 @@ from ..learning.start import Guessed
 from ..matter import DeltaBeta, Matter
 from ..mesh import TriangleMesh
 from ..representations import SurfaceMesh
-from ..specimens.membrane.resting import resting_cell
 from .method import Task
 from .surface_fit import SurfaceFit, surface_fit
 
 STAGE = "red cells by their shape"
-UNCERTAIN = 0.15
-"""By which part all cells may be larger or smaller than the guess says: it has volumes to some tens of per cent."""
 FIRST_STEPS, TRIAL_STEPS, LAST_STEPS = 400, 200, 120
 """Steps of the surfaces before twins are tried, of each trial, and after all of them. By trials of 80 steps fewer cells
 were told from their twins: Dice .895 and .951 in place of .918 and .972 (flowing cells, two times, looked at once)."""
@@ -60,17 +57,10 @@ def red_cells(task: Task, guess: Guessed, material: DeltaBeta) -> SurfaceMesh | 
         return None
     whole = [mesh for mesh in seen if not is_cut(mesh, views)] or seen
     try:
-        posed = _posed(task, material, _body(whole), seen)
+        posed = _posed(task, material, guessed_cells(extent_like(whole)), seen)
     except InputError:  # of less than three pixels, or hundreds
         return None
     return None if posed is None else _told_from_twins(task, posed, beams)
-
-
-def _body(whole: Sequence[TriangleMesh]) -> KnownBody:
-    """Red cells of the median volume of the meshes `whole` [m]."""
-    rest = resting_cell()
-    larger = (float(np.median([mesh.volume for mesh in whole])) / rest.volume) ** (1 / 3)
-    return KnownBody(size=larger * float(np.ptp(rest.vertices, axis=0).max()), uncertain=UNCERTAIN)
 
 
 @dataclass(frozen=True)

@@ -37,6 +37,9 @@ class TrackOptions:
     learned: LearnedStart | None = field(default_factory=LearnedStart)
     """The network that may guess their volumes, where frames do not contradict it and its bodies explain clearly more;
     None: none."""
+    cells: bool = True
+    """Whether, in two beams, bodies that a network of red cells guesses are followed as red cells, too: by their shape
+    at rest, where that leaves no more of the frames than bodies of any shape."""
     links: LinkOptions = field(default_factory=LinkOptions)
     """Which of them are one body."""
     paths: PathOptions = field(default_factory=PathOptions)

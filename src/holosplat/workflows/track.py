@@ -97,23 +97,23 @@ def track(
             task.delta_told,
             judge(said, train, task.noise if task.uneven else None),
             light=found_in(task),
-            rest=_rest(found, options),
+            rest=_rest(found),
         )
         if folder is not None:
             _write(folder, done, found, task)
-            write_tracks(folder, found.bodies, scan, _more(found, options, scan))
+            write_tracks(folder, found.bodies, scan, _more(found, scan))
         return done
 
 
-def _rest(found: Followed, options: TrackOptions) -> Rest | None:
-    if found.rest is None or options.body is None:
+def _rest(found: Followed) -> Rest | None:
+    if found.rest is None or found.body is None:
         return None
-    return Rest.of(found.rest, options.body.stiffness, found.bodies.unit_length)
+    return Rest.of(found.rest, found.body.stiffness, found.bodies.unit_length)
 
 
-def _more(found: Followed, options: TrackOptions, scan: Scan) -> dict[str, np.ndarray]:
+def _more(found: Followed, scan: Scan) -> dict[str, np.ndarray]:
     """Columns of tracks.csv [T, B] beside those of every run: the strain energy of red cells, and standard errors."""
-    red_cells = options.body is not None and options.body.shape == "red-cell"  # whose moduli are known
+    red_cells = found.body is not None and found.body.shape == "red-cell"  # whose moduli are known
     more = {STRAIN: strain_energy(found.bodies, scan.instants, found.rest)} if red_cells and found.rest else {}
     errors = standard_errors(found.bodies, found.halves, scan)
     return more | {f"{ERROR}{name}": values for name, values in errors.items()}

@@ -1,0 +1,364 @@
+"""Closed bodies followed through the frames of several times, stage by stage."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+
+from ..bodies.rest_shape import KnownBody, extent_like
+from ..bodies.steps import Steps
+from ..checks import InputError, as_written, require
+from ..fit.running import Record
+from ..learning.network import Guess
+from ..matter import DeltaBeta
+from ..mesh import TriangleMesh
+from ..optics.background import Light
+from ..progress import FitProgress
+from ..representations import MovingSurfaces, TimeBasis
+from ..scan import Scan
+from .elastic import Rest
+from .fit import MotionFit, motion_fit
+from .guesses import network_for
+from .halves import astray, halves_of, tell_shapes
+from .journal import Journal, from_sightings, to_sightings
+from .known import KnownBodies, at_rest
+from .mergers import without_merger
+from .pieces import chosen_paths
+from .remainder import apart, beside, joined, only, sure_ones, whole_ones
+from .sightings import Sighting, SightingOptions, sightings
+from .start import first_paths
+from .track_options import TrackOptions
+from .twins import Trials, chosen_twins
+
+CHECKPOINT_SECONDS = 20.0
+"""What a stage has come to is kept so often [s]."""
+STAGES = ("sightings", "first paths", "stiff", "beside", "paths", "soft", "twins", "soft again", "halves", "done")
+"""In about their order: stiff fits and looks beside their bodies take turns."""
+AFTER_SOFT = {"soft": "twins", "soft again": "halves"}
+"""The stages of soft fits, and what comes after each."""
+
+
+@dataclass(frozen=True)
+class Followed:
+    """What was found. bodies: on their paths; records: of the steps of all fits; oversample: wave samples a pixel
+    in these; timing: seconds of each stage; found: how many bodies each time shows by itself; halves: the bodies by
+    halves of the frames, two and two, empty without intervals; rest: their shape at rest [m], if that is known; begun:
+    what showed the bodies of single times, in words; body: what is known of their shape, told or found."""
+
+    bodies: MovingSurfaces
+    records: list[Record]
+    oversample: int
+    timing: dict[str, float]
+    found: tuple[int, ...]
+    halves: tuple[MovingSurfaces, ...] = ()
+    rest: TriangleMesh | None = None
+    begun: str = ""
+    body: KnownBody | None = None
+
+
+@dataclass
+class Following:
+    """What has been done so far, and what is next: sightings, then stiff fits and looks beside their bodies in turn,
+    then paths, the soft fit, and fits to halves of the frames."""
+
+    train: Scan
+    material: DeltaBeta
+    options: TrackOptions
+    seed: int
+    light: Light | None
+    journal: Journal
+    on_progress: FitProgress
+    stage: str = "sightings"
+    round: int = 0
+    bodies: MovingSurfaces | None = None
+    seen: list[list[Sighting]] = field(default_factory=list)
+    counts: list[int] = field(default_factory=list)
+    records: list[Record] = field(default_factory=list)
+    timing: dict[str, float] = field(default_factory=dict)
+    halves: list[MovingSurfaces] = field(default_factory=list)
+    oversample: int = 1
+    size: float = 1.0
+    """Of all bodies of known rest shape, beside what was said."""
+    guess: str = ""
+    """Whether a network guesses the volumes of single times, and why."""
+    cells: float = 0.0
+    """Largest extent [m] of red cells of the volume of those that a network of such guesses; 0 where none does."""
+    _begun: Mapping[str, Any] | None = None
+    """The state of the fit in which the run was cut off."""
+    _search: KnownBodies | None = None
+    _kept: float = field(default_factory=time.perf_counter)
+    """When the journal was written."""
+
+    def __post_init__(self) -> None:
+        self._steps = Steps(on_step=self._save_now_and_then)
+
+    def take_up(self) -> None:
+        """Go on where the journal ends."""
+        saved = self.journal.load()
+        if saved is not None:
+            with as_written("checkpoint.pt", "a checkpoint of this run"):
+                self._take_up(saved)
+
+    def _take_up(self, saved: Mapping[str, Any]) -> None:
+        self.stage, self.round, self.oversample = str(saved["next"]), int(saved["round"]), int(saved["oversample"])
+        self.bodies = None if saved["bodies"] is None else MovingSurfaces.from_state(saved["bodies"])
+        self.seen, self.counts = to_sightings(saved["seen"]), list(saved["counts"])
+        self.records, self.timing = list(saved["records"]), dict(saved["timing"])
+        self.halves = [MovingSurfaces.from_state(one) for one in saved["halves"]]
+        self._begun, self.size, self.guess = saved["fit"], float(saved["size"]), str(saved["guess"])
+        self.cells = float(saved["cells"])
+        self._steps = Steps(saved.get("steps", ()), self._save_now_and_then)
+
+    def _save(self, fit: Mapping[str, Any] | None = None) -> None:
+        """Write the journal; fit: the state of the one that runs, which starts at `bodies`."""
+        state = {"next": self.stage, "round": self.round, "oversample": self.oversample, "counts": self.counts}
+        state |= {"size": self.size, "guess": self.guess, "cells": self.cells}
+        state |= {"bodies": None if self.bodies is None else self.bodies.state(), "fit": fit}
+        state |= {"seen": from_sightings(self.seen), "records": self.records, "timing": self.timing}
+        self.journal.save(state | {"halves": [one.state() for one in self.halves], "steps": self._steps.done})
+        self._kept = time.perf_counter()
+
+    def _save_now_and_then(self) -> None:
+        """Write the journal in the midst of a stage of several steps, where it is time."""
+        if time.perf_counter() - self._kept > CHECKPOINT_SECONDS:
+            self._save()
+
+    def until(self, stage: str) -> None:
+        """Go on to the end of all that comes before `stage`, or to where an earlier run came."""
+        while self.stage not in (stage, "done") and STAGES.index(self.stage) < STAGES.index(stage):
+            self.advance()
+
+    def followed(self, said: str = "") -> Followed:
+        """What was found; said: of what the bodies are, beside what showed them."""
+        assert self.bodies is not None
+        told = self.records, self.oversample, self.timing, tuple(self.counts), tuple(self.halves)
+        return Followed(self.bodies, *told, self.shape_at_rest(), self.guess + said, self.options.body)
+
+    def advance(self) -> None:
+        """Do the stage that is next."""
+        if self.stage == "sightings":
+            network = self.network()
+            self.seen = [] if self.options.body and not network else self.look(self.train, network=network)
+            self.counts, self.stage = [len(one) for one in self.seen], "first paths"
+            if network is not None and self.options.learned and self.options.learned.network.card.of_red_cells:
+                whole = [one.mesh for at in self.seen for one in at if not one.cut]
+                self.cells = extent_like(whole) if whole else 0.0
+        elif self.stage == "first paths":
+            self.bodies, self.seen, self.stage = self.first(), [], "stiff"
+            if self.options.body is not None:
+                self.counts = [self.bodies.count] * len(self.train.instants)
+        elif self.bodies is not None:
+            self._go_on(self.bodies)
+        self._steps = Steps(on_step=self._save_now_and_then)
+        self._save()
+
+    def _go_on(self, bodies: MovingSurfaces) -> None:
+        """The stages after the first paths."""
+        if self.stage == "stiff":
+            whole = self.whole(self.fitted("stiff fit", self.train, bodies, self.options.stiff, self.light))
+            self.bodies = without_merger(whole, self.train.instants)
+            after = "beside" if self.round < self.options.rounds else "paths"
+            self.stage = after if self.bodies is whole else "stiff"
+        elif self.stage == "beside":
+            more = self.more(bodies)
+            self.round += 1
+            self.bodies, self.stage = (bodies, "paths") if more is None else (more, "stiff")
+        elif self.stage == "paths":
+            self.bodies, self.stage = self.on_chosen_paths(bodies), "soft"
+        elif self.stage == "twins":
+            self.bodies = self.told_from_twins(bodies)
+            self.stage = "halves" if self.bodies is bodies else "soft again"
+        elif self.stage in AFTER_SOFT:
+            self.bodies = self.fitted("soft fit", self.train, bodies, self.options.soft, self.light)
+            self.stage = AFTER_SOFT[self.stage]
+        else:
+            self._half(bodies)
+
+    def _half(self, bodies: MovingSurfaces) -> None:
+        """The next half of the frames, if there is one."""
+        parts = (
+            [half for pair in halves_of(self.train, bodies.basis) for half in pair] if self.options.intervals else []
+        )
+        if len(self.halves) < len(parts):
+            part = parts[len(self.halves)]
+            light = self.light and self.light.part(torch.from_numpy(part))
+            side = 1 - 2 * (len(self.halves) % 2)
+            told = tell_shapes(self.train)
+            bodies = bodies if told else astray(bodies, self.seed, side)
+            how = self.options.half if told or self.options.body else self.options.soft
+            self.halves.append(self.fitted("intervals", self.train[part], bodies, how, light))
+        if len(self.halves) == len(parts):
+            self.stage = "done"
+
+    @contextmanager
+    def _timed(self, name: str) -> Iterator[None]:
+        """Of what is done in steps; they are kept where Ctrl-C comes between."""
+        began = time.perf_counter()
+        try:
+            yield
+        except KeyboardInterrupt:
+            self._save()
+            raise
+        self.timing[name] = self.timing.get(name, 0.0) + time.perf_counter() - began
+
+    def network(self) -> Guess | None:
+        """What guesses the volumes of single times: asked at the time in the middle."""
+        if self.options.learned is None:
+            return None
+        at = self.train.at_instant(len(self.train.instants) // 2)
+        how = (self.options.sightings, self.options.learned)
+        with self._timed("sightings"):
+            found, self.guess = network_for(at, self.material, *how, lambda stage, part: None)
+        return found
+
+    def look(self, frames: Scan, level: float = 1.0, network: Guess | None = None) -> list[list[Sighting]]:
+        """The bodies that each time of `frames` shows by itself.
+
+        level: factor of the occupancy at the surface; network: what guesses the volumes.
+        """
+        how = replace(self.options.sightings, level=level * self.options.sightings.level)
+        times, found = frames.instants, list[list[Sighting]]()
+        with self._timed("sightings"):
+            for t in range(len(times)):
+                self.on_progress("bodies at each time", t / len(times), {})
+                found += to_sightings([self._steps.of(lambda t=t: self._look_at(frames.at_instant(t), how, network))])
+        return found
+
+    def _look_at(self, frames: Scan, how: SightingOptions, network: Guess | None) -> list[dict[str, Any]]:
+        """The bodies of one time, as the journal has them."""
+        return from_sightings([sightings(frames, self.material, how, network=network)])[0]
+
+    def first(self) -> MovingSurfaces:
+        """Bodies on first paths; the doubtful ones are left to be found beside the others."""
+        times, options = self.train.instants, self.options
+        basis = TimeBasis(float(times[0]), float(times[-1]), options.paths.degree)
+        if options.body is not None:
+            begun = None
+            with suppress(InputError):  # no track
+                begun = self._sighted(basis)
+            posed = self._posed(options.body, basis, begun=begun)
+            if posed is None:
+                raise InputError(
+                    f"no body of the shape {options.body.shape} was found in the frames; check its size, the material "
+                    "and the pixel size, or leave --body."
+                )
+            return posed
+        found = self._sighted(basis)
+        assert found is not None
+        sure = sure_ones(found, self.train.views, times)
+        return found if options.rounds == 0 or len(sure) == found.count else only(found, sure)
+
+    def _sighted(self, basis: TimeBasis) -> MovingSurfaces | None:
+        """The bodies of single times on first paths; None where none were looked for."""
+        times, pixel = self.train.instants, self.train.views.finest
+        return first_paths(self.seen, times, basis, pixel, self.material, self.options.links) if self.seen else None
+
+    @property
+    def rest(self) -> Rest | None:
+        """What is known of the bodies' shape."""
+        body = self.options.body
+        return None if body is None else at_rest(body, self.train.views.finest, self.size)
+
+    def shape_at_rest(self) -> TriangleMesh | None:
+        """In metres."""
+        if (rest := self.rest) is None:
+            return None
+        mesh = rest.elastic.membrane.mesh
+        return TriangleMesh(self.train.views.finest * mesh.vertices, mesh.faces, "rest")
+
+    def _posed(
+        self,
+        body: KnownBody,
+        basis: TimeBasis,
+        known: MovingSurfaces | None = None,
+        begun: MovingSurfaces | None = None,
+    ) -> MovingSurfaces | None:
+        """Bodies of known shape beside `known` ones, on first paths; a search may begin with `begun` ones."""
+        with self._timed("poses"):
+            self._search = self._search or KnownBodies(self.train, self.material, body, self.size)
+            found = self._search.bodies(
+                basis, known, begun, self.seed, lambda share: self.on_progress("poses", share, {}), self._steps
+            )
+            self.size = self._search.size
+        if begun is not None:
+            self.guess += (
+                f"; poses that begin with them explain {'more' if self._search.of_begun else 'less'} than others"
+            )
+        return found
+
+    def more(self, bodies: MovingSurfaces) -> MovingSurfaces | None:
+        """`bodies`, and those that frames show beside them; None where there are none."""
+        times = self.train.instants
+        if self.options.body is not None:
+            new = self._posed(self.options.body, bodies.basis, bodies)
+            own = [] if new is None else apart(new, bodies, times)
+            return joined(bodies, only(new, own)) if new is not None and own else None
+        found = self.look(beside(self.train, bodies, self.oversample), self.options.fainter)
+        try:
+            new = first_paths(found, times, bodies.basis, bodies.unit_length, self.material, self.options.links)
+        except InputError:  # no track
+            return None
+        apart_ones = apart(new, bodies, times)
+        return joined(bodies, only(new, apart_ones)) if apart_ones else None
+
+    def whole(self, bodies: MovingSurfaces) -> MovingSurfaces:
+        """`bodies` without pieces of others."""
+        kept = whole_ones(bodies, self.train.instants)
+        return bodies if len(kept) == bodies.count else only(bodies, kept)
+
+    def told_from_twins(self, bodies: MovingSurfaces) -> MovingSurfaces:
+        """`bodies` of known rest shape, or their twins, where there are two beams."""
+        if self.rest is None or not self.options.twins:
+            return bodies
+        how = (self.options.stiff, self.options.soft, self.oversample, self.seed, self.light, self._steps)
+        trials = Trials(self.train, self.rest, *how)
+        with self._timed("twins"):
+            return chosen_twins(bodies, trials, lambda share: self.on_progress("twins", share, {}))
+
+    def on_chosen_paths(self, bodies: MovingSurfaces) -> MovingSurfaces:
+        """`bodies` on paths of as many pieces as frames ask for."""
+        how = (self.options.paths, self.options.stiff, self.seed, self.light, self.rest)
+        self.on_progress("paths", 0.0, {})
+        with self._timed("paths"):
+            return chosen_paths(self.train, bodies, *how, steps=self._steps)
+
+    def fitted(
+        self, name: str, frames: Scan, start: MovingSurfaces, how: MotionFit, light: Light | None
+    ) -> MovingSurfaces:
+        """`start` after a fit to `frames`, from where an earlier run was cut off in it."""
+        fit = motion_fit(frames, start, how, self.seed, light, self.rest)
+        if self._begun is not None:
+            fit.load(dict(self._begun))
+            self._begun = None
+        before = len(self.records) - fit.step
+
+        def keep(record: Record) -> None:
+            self.records.append(record | {"step": before + record["step"]})
+            self.on_progress(name, fit.share, record)
+            if time.perf_counter() - self._kept > CHECKPOINT_SECONDS:
+                self._save(fit.state_dict())
+
+        try:
+            fit.run(keep)
+        except KeyboardInterrupt:
+            self._save(fit.state_dict())
+            raise
+        self.timing[name] = self.timing.get(name, 0.0) + fit.seconds
+        found, self.oversample = fit.result().object, fit.oversample
+        assert isinstance(found, MovingSurfaces)
+        return found.with_parameters({"coefficients": found.coefficients.detach()})
+
+
+def require_times(scan: Scan) -> None:
+    """`InputError` unless the training frames are of two times or more."""
+    count = len(scan.instants)
+    require(
+        count >= 2,
+        f"bodies are followed through frames of two times or more, but the training frames are of {count}; "
+        "use reconstruct.",
+    )
