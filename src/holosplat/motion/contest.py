@@ -2,8 +2,8 @@
 
 Two beams leave shapes open, and bodies of unknown shape stay poor in them, while red cells are found by their shape at
 rest. Where a network that knows red cells alone guesses bodies that frames do not contradict, cells of that size are
-looked for. They are kept where they explain the frames to their noise, or leave no more than bodies of any shape do:
-these are freer, so that of other bodies they leave less.
+looked for. They are kept where they leave no more of the frames than bodies of any shape, which are freer: of other
+bodies these leave less.
 """
 
 from __future__ import annotations
@@ -11,23 +11,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import torch
 
 from ..checks import InputError, as_written
 from ..fit.residuals import Prediction
-from ..optics.noise import noise_levels
-from ..representations import MovingSurfaces
-from ..scan import Scan
+from ..units import in_percent
 from .following import Followed, Following
 from .journal import Journal
 
-EXPLAINED = 1.05
-"""Residual over noise, root mean squares, up to which frames are explained and no other shapes are tried."""
-
-
 TINY = 1e-12
-"""Noise that is divided by at least."""
+"""Contrast that is divided by at least."""
 
 
 class Parts:
@@ -80,28 +73,19 @@ def cells_or_any(cells: Following, other: Following) -> Followed:
     except InputError:  # no cell of that size
         other.until("done")
         return other.followed("; no red cells of their size were found")
-    said = f"; as red cells of their size they leave {left:.2f} times the noise of the frames"
-    if left > EXPLAINED:
-        other.until("halves")
-        beside = residual(other)
-        said += f", as bodies of any shape {beside:.2f} times"
-        if beside < left:
-            other.until("done")
-            return other.followed(f"{said}, and are followed as such")
-    cells.until("done")
-    return cells.followed(f"{said}, and are followed as cells")
+    other.until("halves")
+    beside = residual(other)
+    said = f"; as red cells of their size they leave {in_percent(left)} of the contrast, as bodies of any shape "
+    said += f"{in_percent(beside)}, and are followed as "
+    kept, name = (cells, "cells") if left <= beside else (other, "such")
+    kept.until("done")
+    return kept.followed(said + name)
 
 
 def residual(of: Following) -> float:
-    """What its bodies leave of the frames over the frames' noise, root mean squares."""
+    """What its bodies leave of the frames, over their contrast, root mean squares."""
     assert of.bodies is not None
-    left = measured_less_predicted(of.train, of.bodies, of.oversample)
-    noise = float(noise_levels(torch.from_numpy(of.train.frames)).square().mean().sqrt())
-    return float(np.sqrt(np.mean(left**2))) / max(noise, TINY)
-
-
-def measured_less_predicted(train: Scan, bodies: MovingSurfaces, oversample: int) -> np.ndarray:
-    """[N, H, W]."""
-    said = Prediction(bodies, train.exposures, oversample)
+    said, frames = Prediction(of.bodies, of.train.exposures, of.oversample), torch.from_numpy(of.train.frames)
     with torch.no_grad():
-        return np.stack([train.frames[v] - said.view(v).frames()[0].numpy() for v in range(len(train))])
+        left = torch.stack([frames[v] - said.view(v).frames()[0] for v in range(len(frames))])
+    return float(left.square().mean().sqrt() / (frames - 1).square().mean().sqrt().clamp_min(TINY))
