@@ -122,6 +122,16 @@ def test_other_beams_times_and_sizes_are_left_alone():
     assert red_cells(Task(scan, PRIOR), guess(scan, 1.9e-6), MATERIAL) is None  # of less than three pixels
 
 
+def test_cells_unlike_the_guess_are_left(short, monkeypatch):
+    """The guess has the cells at places where the frames show none."""
+    scan, _ = scanned()
+    elsewhere = guess(scan)
+    elsewhere = replace(elsewhere, values=elsewhere.values.flip(0).flip(2))
+    assert red_cells(Task(scan, PRIOR), elsewhere, MATERIAL, typical=0.7) is None
+    monkeypatch.setattr(method, "MOST_CELLS", 1)
+    assert red_cells(Task(scan, PRIOR), guess(scan), MATERIAL) is None
+
+
 @pytest.mark.parametrize(("better", "of"), [(True, ["red-cells"]), (False, ["red-cells"]), (True, ["capsules"])])
 def test_cells_are_begun_with_where_they_do_better(monkeypatch, better, of):
     scan, _ = scanned()

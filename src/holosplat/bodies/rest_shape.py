@@ -78,10 +78,15 @@ class KnownBody:
 
 
 def extent_like(meshes: Sequence[TriangleMesh]) -> float:
-    """Largest extent [m] of a red cell at rest that has the median volume of `meshes` [m]."""
-    rest = resting_cell()
-    larger = (float(np.median([mesh.volume for mesh in meshes])) / rest.volume) ** (1 / 3)
-    return larger * float(np.ptp(rest.vertices, axis=0).max())
+    """Largest extent [m] of a red cell at rest as large as most of the matter's `meshes` [m].
+
+    Its volume is their median by volume: a guess has pieces of cells beside whole ones, which may be more, but not of
+    more matter.
+    """
+    rest, volumes = resting_cell(), np.sort([mesh.volume for mesh in meshes])[::-1]
+    whole = volumes.cumsum()
+    middle = float(volumes[np.searchsorted(whole, 0.5 * whole[-1])])
+    return (middle / rest.volume) ** (1 / 3) * float(np.ptp(rest.vertices, axis=0).max())
 
 
 def guessed_cells(extent: float) -> KnownBody:

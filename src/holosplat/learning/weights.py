@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
@@ -46,10 +47,17 @@ class Card:
 
     def typical(self, views: int) -> float:
         """What guesses from so many views typically leave unexplained: by the next smaller number that was tried."""
-        known = sorted(int(count) for count in self.typical_misfit)
-        if not known:
-            return 1.0
-        return self.typical_misfit[str(max([count for count in known if count <= views] or known[:1]))]
+        return _nearest(self.typical_misfit, views, 1.0)
+
+    def dice(self, views: int) -> float:
+        """Mean Dice coefficient of guesses from so many views and the truth, likewise; 0 where it is not said."""
+        return _nearest({count: said.get("dice", 0.0) for count, said in self.scores.items()}, views, 0.0)
+
+
+def _nearest(said: Mapping[str, float], views: int, unsaid: float) -> float:
+    """What is said of `views`, or of the next smaller number that is there, or the smallest."""
+    known = sorted(int(count) for count in said)
+    return said[str(max([count for count in known if count <= views] or known[:1]))] if known else unsaid
 
 
 @dataclass(frozen=True)

@@ -106,7 +106,7 @@ def guessed_start(
     cloud, ordinary = cloud_of(found.values, found.grid, material, task, options), plain()
     won, why = starts.compared(ordinary, cloud)
     if how.cells and task.bounded and trained.card.of_red_cells:
-        cells = red_cells(task, found, material)
+        cells = red_cells(task, found, material, trained.card.dice(len(task.scan)))
         better, said = (False, "") if cells is None else starts.cells_beside(cells, cloud if won else ordinary, won)
         if better:
             return _begun(task, Beginning("cells", said, guess), cells)

@@ -35,6 +35,12 @@ FIRST_STEPS, TRIAL_STEPS, LAST_STEPS = 400, 200, 120
 were told from their twins: Dice .895 and .951 in place of .918 and .972 (flowing cells, two times, looked at once)."""
 ROUNDS, MOST_TRIALS = 3, 60
 """How often every cell is tried as its twin, at most, and trials of cells in all: each fits all of them, twice."""
+MOST_CELLS = 20
+"""Bodies of a guess, at most: search and trials take minutes for so many, and go with the square of the number."""
+ALIKE = 0.8
+"""Dice coefficient of the cells and the guess, over that of guesses and truths of scenes like those that were learnt,
+which cells must have. Of right ones it was 0.98 to 1.3; of single continuous cells, whose shadows red cells turned
+the wrong way explain, 0.62 and 0.70 (five scenes, looked at once)."""
 APART = 0.05
 """Distance of a cell and its twin, over its extent, from which on it is tried: nearer ones become one in a fit."""
 BETTER = 1e-3
@@ -45,22 +51,34 @@ SEARCHED = 0.6
 Shape = Callable[[np.ndarray], np.ndarray]
 
 
-def red_cells(task: Task, guess: Guessed, material: DeltaBeta) -> SurfaceMesh | None:
+def red_cells(task: Task, guess: Guessed, material: DeltaBeta, typical: float = 0.0) -> SurfaceMesh | None:
     """Surfaces of the red cells of `material` in the frames of `task`, of which a network has made a `guess`; None for
-    other than two beams and one pixel size, and where no cells of the guess's size are found."""
+    other than two beams and one pixel size, where no cells of its size are found, and where these are unlike it.
+
+    typical: Dice coefficient of the network's guesses from so many views, of scenes like those that it learnt from
+    """
     views = task.scan.views
     beams = two_beams(views)
     if beams is None or np.ptp(views.pixel_sizes) > 0 or task.scan.is_series:
         return None
     seen = cut_bodies(guess.values.numpy(), guess.grid, views.finest)
-    if not seen:
+    if not 0 < len(seen) <= MOST_CELLS:
         return None
     whole = [mesh for mesh in seen if not is_cut(mesh, views)] or seen
     try:
         posed = _posed(task, material, guessed_cells(extent_like(whole)), seen)
     except InputError:  # of less than three pixels, or hundreds
         return None
-    return None if posed is None else _told_from_twins(task, posed, beams)
+    if posed is None or _alike(posed.surfaces(), guess) < ALIKE * typical:
+        return None
+    return _told_from_twins(task, posed, beams)
+
+
+def _alike(cells: SurfaceMesh, guess: Guessed) -> float:
+    """Dice coefficient of what both fill."""
+    ours = cells.voxelise(guess.grid).delta / cells.matter.delta
+    both, theirs = np.minimum(ours, guess.values.numpy()), guess.values.numpy()
+    return float(2 * both.sum() / max(ours.sum() + theirs.sum(), 1e-12))
 
 
 @dataclass(frozen=True)
