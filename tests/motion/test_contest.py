@@ -38,10 +38,10 @@ class Run:
     ("cells", "other", "kept", "looked"),
     [
         (0.30, 0.2, "other", ["halves", "done"]),
-        (0.30, 0.3, "cells", ["halves"]),
+        (0.30, 0.29, "cells", ["halves"]),
         (None, 0.2, "other", ["done"]),
     ],
-    ids=["any shape leaves less", "no shape leaves less", "no cells"],
+    ids=["any shape leaves clearly less", "no shape leaves clearly less", "no cells"],
 )
 def test_what_leaves_less_is_kept(monkeypatch, cells, other, kept, looked):
     monkeypatch.setattr(contest, "residual", lambda run: run.left)

@@ -194,6 +194,13 @@ class Fit:
             found = self._best.leaves if judged else self.trainable.snapshot()
         return self.plan.problem.model.with_parameters(found)
 
+    def left(self) -> float:
+        """The loss of all frames, and of terms on the object, that the result has."""
+        there = self._device
+        whole = Batch(None, torch.zeros(3, dtype=torch.float64, device=there), torch.tensor(1.0, device=there), 0)
+        with torch.no_grad():
+            return float(self.plan.problem.loss(self.result(), whole)[0])
+
     def columns(self) -> list[str]:
         """Names of everything that a record may hold, in the order of metrics.csv."""
         names = [name for term in self.plan.problem.terms for name in term.names]

@@ -21,7 +21,6 @@ from ..bodies.rest_shape import KnownBody, extent_like, guessed_cells
 from ..bodies.search import BodySearch, sized
 from ..bodies.twin import distance, twin_map, two_beams
 from ..checks import InputError
-from ..fit.batch import Batch
 from ..learning.start import Guessed
 from ..matter import DeltaBeta, Matter
 from ..mesh import TriangleMesh
@@ -39,8 +38,8 @@ MOST_CELLS = 20
 """Bodies of a guess, at most: search and trials take minutes for so many, and go with the square of the number."""
 ALIKE = 0.8
 """Dice coefficient of the cells and the guess, over that of guesses and truths of scenes like those that were learnt,
-which cells must have. Of right ones it was 0.98 to 1.3; of single continuous cells, whose shadows red cells turned
-the wrong way explain, 0.62 and 0.70 (five scenes, looked at once)."""
+which cells must have. Of right ones it was 0.88 to 1.3; of single continuous cells, whose shadows red cells turned
+the wrong way explain, 0.62 and 0.70 (six scenes, looked at once)."""
 APART = 0.05
 """Distance of a cell and its twin, over its extent, from which on it is tried: nearer ones become one in a fit."""
 BETTER = 1e-3
@@ -69,9 +68,10 @@ def red_cells(task: Task, guess: Guessed, material: DeltaBeta, typical: float = 
         posed = _posed(task, material, guessed_cells(extent_like(whole)), seen)
     except InputError:  # of less than three pixels, or hundreds
         return None
-    if posed is None or _alike(posed.surfaces(), guess) < ALIKE * typical:
+    if posed is None:
         return None
-    return _told_from_twins(task, posed, beams)
+    found = _told_from_twins(task, posed, beams)
+    return found if _alike(found, guess) >= ALIKE * typical else None
 
 
 def _alike(cells: SurfaceMesh, guess: Guessed) -> float:
@@ -103,12 +103,13 @@ class _Posed:
 
     def plain(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Middle [3] of a cell, and its vertices [P, 3] about that as the nearest linear map of the shape at rest, of
-        the same volume."""
+        the same volume; no numbers where one of the two is inside out."""
         mesh = replace(self.rest, vertices=self.nodes[number])
         volume, middle, _ = moments(mesh)
         shape = self.rest.vertices
         linear = shape @ np.linalg.lstsq(shape, mesh.vertices - middle, rcond=None)[0]
-        return middle, linear * (volume / replace(self.rest, vertices=linear).volume) ** (1 / 3)
+        share = volume / replace(self.rest, vertices=linear).volume
+        return middle, linear * (share ** (1 / 3) if share > 0 else np.nan)
 
     def second(self, vertices: np.ndarray) -> np.ndarray:
         """Second moments [3, 3] over the volume of a cell of `vertices` [P, 3]."""
@@ -167,7 +168,9 @@ def _told_from_twins(task: Task, posed: _Posed, beams: np.ndarray) -> SurfaceMes
 
 
 def _away(posed: _Posed, number: int, beams: np.ndarray) -> float:
-    return distance(posed.second(posed.plain(number)[1]), beams)
+    """How far a cell is from its twin, over its extent; 0 for one that a fit has turned inside out."""
+    vertices = posed.plain(number)[1]
+    return distance(posed.second(vertices), beams) if np.isfinite(vertices).all() else 0.0
 
 
 def _fitted(task: Task, posed: _Posed, steps: int) -> tuple[float, _Posed]:
@@ -176,10 +179,6 @@ def _fitted(task: Task, posed: _Posed, steps: int) -> tuple[float, _Posed]:
     how = replace(how, schedule=replace(how.schedule, steps=steps))
     fit = surface_fit(task.scan, posed.surfaces(), how, task.seed, task.uneven)
     fit.run(lambda record: None)
-    model = fit.result()
-    whole = Batch(None, torch.zeros(3, dtype=torch.float64), torch.tensor(1.0), 0)
-    with torch.no_grad():
-        loss = float(fit.plan.problem.loss(model, whole)[0])
-    found = model.object
+    found = fit.result().object
     assert isinstance(found, SurfaceMesh)
-    return loss, posed.moved_to(found)
+    return fit.left(), posed.moved_to(found)

@@ -2,8 +2,8 @@
 
 Two beams leave shapes open, and bodies of unknown shape stay poor in them, while red cells are found by their shape at
 rest. Where a network that knows red cells alone guesses bodies that frames do not contradict, cells of that size are
-looked for. They are kept where they leave no more of the frames than bodies of any shape, which are freer: of other
-bodies these leave less.
+looked for. They are kept unless bodies of any shape, which are freer, leave clearly less of the frames: of other bodies
+they do.
 """
 
 from __future__ import annotations
@@ -19,6 +19,9 @@ from ..units import in_percent
 from .following import Followed, Following
 from .journal import Journal
 
+CLEARLY = 0.95
+"""What bodies of any shape must leave of what cells leave: so much freer in two beams, they follow noise and explain by
+ghosts what they miss."""
 TINY = 1e-12
 """Contrast that is divided by at least."""
 
@@ -77,7 +80,7 @@ def cells_or_any(cells: Following, other: Following) -> Followed:
     beside = residual(other)
     said = f"; as red cells of their size they leave {in_percent(left)} of the contrast, as bodies of any shape "
     said += f"{in_percent(beside)}, and are followed as "
-    kept, name = (cells, "cells") if left <= beside else (other, "such")
+    kept, name = (other, "such") if beside < CLEARLY * left else (cells, "cells")
     kept.until("done")
     return kept.followed(said + name)
 

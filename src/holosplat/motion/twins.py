@@ -12,7 +12,6 @@ import torch
 from ..bodies.moments import moments
 from ..bodies.steps import Steps
 from ..bodies.twin import distance, map_near, twin_map, two_beams
-from ..fit.batch import Batch
 from ..fit.loop import Fit
 from ..mesh import TriangleMesh
 from ..optics.background import Light
@@ -207,10 +206,6 @@ def _second(mesh: TriangleMesh) -> np.ndarray:
 
 def _left(fit: Fit) -> tuple[float, torch.Tensor]:
     """The loss of all frames and priors after `fit`, and the coefficients of its bodies' paths."""
-    model = fit.result()
-    whole = Batch(None, torch.zeros(3, dtype=torch.float64), torch.tensor(1.0), 0)
-    with torch.no_grad():
-        loss = float(fit.plan.problem.loss(model, whole)[0])
-    found = model.object
+    found = fit.result().object
     assert isinstance(found, MovingSurfaces)
-    return loss, found.coefficients.detach()
+    return fit.left(), found.coefficients.detach()
