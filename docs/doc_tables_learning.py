@@ -7,6 +7,7 @@ from collections.abc import Callable, Sequence
 from doc_tables import Row, markdown, read, rounded
 
 STARTS = {"The run began with the": "guess", "The run began with phase": "phase", "The frames contradict": "refused"}
+STARTS |= {"The run began with red cells": "red cells"}
 """What a run says of its start, by its first words, and what the table says."""
 SCORES = ("dice", "ssim", "frcm")
 """Scores of which more is better."""
@@ -63,9 +64,11 @@ def learned_change() -> str:
     for case, each in found.items():
         changes = [[float(r["learned"][name]) - float(r["phase"][name]) for r in each] for name in (*SCORES, "error")]
         spans = [f"{min(values):+.3f} to {max(values):+.3f}".replace("-", "−") for values in changes]
-        taken = sum(r["learned"]["begun"].startswith("The run began with the") for r in each)
+        taken = sum(
+            r["learned"]["begun"].startswith(("The run began with the", "The run began with red")) for r in each
+        )
         lines.append([case, str(len(each)), str(taken), *spans])
-    columns = ("bodies", "runs", "began with the guess", "Dice", "SSIM", "FRCM", "error of δ")
+    columns = ("bodies", "runs", "began with the guess, or cells of its size", "Dice", "SSIM", "FRCM", "error of δ")
     return markdown(columns, lines)
 
 
