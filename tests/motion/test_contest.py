@@ -51,7 +51,7 @@ def test_what_leaves_less_is_kept(monkeypatch, cells, other, kept, looked):
     assert runs[0].seen == [["other"]]
     assert runs[0].guess == "other"
     assert runs[1].asked == looked
-    assert ("red cells" in said) == True  # noqa: E712
+    assert "red cells" in said
 
 
 def two_beams():

@@ -10,18 +10,10 @@ import torch
 
 import holosplat as hs
 from helpers.motion_shadows import FLOW, OTHER, RADIUS, TURN, cell, pose, shadows
-from holosplat.bodies import replaced
 from holosplat.bodies.moments import centroid
-from holosplat.bodies.poses import Explained, Pose
-from holosplat.bodies.pursuit import exchanged
-from holosplat.bodies.replaced import pursued
-from holosplat.bodies.rest_shape import KnownBody, surface, thinned
-from holosplat.bodies.search import best_size
-from holosplat.bodies.steps import Steps
-from holosplat.bodies.templates import Search, Templates
+from holosplat.bodies.rest_shape import KnownBody
 from holosplat.checks import InputError
 from holosplat.cli.track import BodyFlags
-from holosplat.io.vtk import write_mesh
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
@@ -31,13 +23,7 @@ from holosplat.motion.strain import strain_energy
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.specimens.mesh_series import MeshSeries
-from holosplat.specimens.red_cells import evans_fung_cell, icosphere
-
-
-def axis_error(found: Pose, turn: np.ndarray) -> float:
-    """Angle between the cells' axes [degrees], of either sign."""
-    axis = np.linalg.svd(found.matrix @ np.diag([1.0, 1.0, 0.3]))[0][:, 2]
-    return float(np.degrees(np.arccos(min(1.0, abs(axis @ turn[:, 2])))))
+from holosplat.specimens.red_cells import icosphere
 
 
 def test_strain_costs_nothing_at_rest_in_any_pose_and_of_any_size():
@@ -88,39 +74,6 @@ def test_the_term_is_the_mean_over_times_and_its_gradient_is_right():
         RestShapeKept(1.0, Elastic(TriangleMesh(*icosphere(1))), bodies)
 
 
-def test_two_beams_find_a_body_and_its_pose(monkeypatch):
-    """One cell that the frames cut at the end: centre, velocity and axis; the steps of another run give the same."""
-    truth = pose(TURN, (3.0, 11.0, -2.5), 1.1)
-    flow, steps = FLOW * np.array([0.9, 1.1])[:, None], Steps()
-    (found,), of_begun = pursued(cell(), shadows([truth]), flow, steps=steps)
-    assert not of_begun
-    with monkeypatch.context() as none:
-        none.setattr(Explained, "_better", lambda *given: pytest.fail("these poses were made better before"))
-        ((again,), _) = pursued(cell(), shadows([truth]), flow, steps=Steps(steps.done))
-    for name in ("matrix", "centre", "velocity", "turning"):
-        assert np.array_equal(getattr(again, name), getattr(found, name))
-    assert np.linalg.norm(found.centre - truth.centre) < 0.2
-    assert np.linalg.norm(found.velocity - truth.velocity) < 0.2
-    assert axis_error(found, TURN) < 5
-    assert np.linalg.det(found.matrix) == pytest.approx(1)
-
-
-def test_a_search_begins_with_what_is_known_where_that_explains_more(monkeypatch):
-    """Cells that nothing but the start shows, for no place is tried; a start at ghosts is worth less than none."""
-    truth = [pose(TURN, (6.0, 0.0, -5.0)), pose(OTHER, (-6.0, 1.0, 5.0), 1.2)]
-    near = [replace(one, centre=one.centre + 0.8) for one in truth]
-    astray = pose(TURN, (0.0, -18.0, 0.0))
-    seen = shadows(truth)
-    monkeypatch.setattr(replaced, "PATIENCE", 1)
-    assert not pursued(cell(), seen, FLOW[None], [astray])[1]
-    monkeypatch.setattr(Search, "tops", lambda *given: [])
-    found, of_begun = pursued(cell(), seen, FLOW[None], [*near, astray])
-    assert of_begun
-    assert len(found) == 2
-    for one in truth:
-        assert min(np.linalg.norm(other.centre - one.centre) for other in found) < 0.3
-
-
 def test_bodies_of_single_times_become_poses():
     """A body that moves and is longer along one axis than at rest; lengths in pixels of 2 µm."""
     longer = np.diag([1.5, 1.0, 1 / 1.5])
@@ -137,77 +90,9 @@ def test_bodies_of_single_times_become_poses():
     np.testing.assert_allclose(found.matrix @ found.matrix.T, TURN @ longer @ longer.T @ TURN.T, atol=0.02)
 
 
-def test_ghosts_are_exchanged_for_bodies():
-    """Two cells at one height: each in the shadow of the one in the first beam, of the other in the second."""
-    truth = [pose(TURN, (6.0, 0.0, -5.0)), pose(OTHER, (-6.0, 1.0, 5.0), 1.2)]
-    seen = shadows(truth)
-    every = Explained(cell(), seen)
-    search = Search(Templates.of(cell(), seen), seen, FLOW[None])
-    ghosts = [pose(TURN, (6.0, 0.5, 5.0)), pose(OTHER, (-6.0, 0.5, -5.0))]
-    found = exchanged(every, search, every.improved(ghosts, 8))
-    for one in truth:
-        assert min(np.linalg.norm(other.centre - one.centre) for other in found) < 0.5
-    again = exchanged(every, search, truth)
-    assert all(np.linalg.norm(a.centre - b.centre) < 0.2 for a, b in zip(again, truth))
-
-
-def test_the_size_of_all_bodies_is_found():
-    larger = replace(cell(), vertices=1.04 * cell().vertices)
-    truth = [pose(TURN, (0.0, 2.0, 1.0))]
-    assert best_size(cell(), shadows(truth, mesh=larger), truth, 0.1) == pytest.approx(1.04, abs=0.006)
-
-
 def test_matter_drifts_where_shadows_go():
     found = drift(shadows([pose(TURN, (3.0, 2.0, -2.5)), pose(OTHER, (-5.0, -3.0, 2.0))]))
     assert found == pytest.approx(FLOW, abs=0.6)
-
-
-def test_bins_and_projections_agree():
-    """Thickness of the same bodies in larger pixels, of which an odd row is left over."""
-    truth = [pose(TURN, (3.0, 2.0, -2.5))]
-    seen = shadows(truth)
-    seen = replace(seen, thickness=Explained(cell(), seen).images(truth))
-    coarse = seen.binned(2)
-    assert coarse.shape == (23, 16)
-    small = replace(cell(), vertices=0.5 * cell().vertices)
-    images = Explained(small, coarse).images([one.scaled(0.5) for one in truth])
-    for one, other in zip(images, coarse.thickness):
-        for axis in (0, 1):
-            places = np.arange(one.shape[axis])
-            middles = [image.sum(1 - axis) @ places / image.sum() for image in (one, other)]
-            assert middles[0] == pytest.approx(middles[1], abs=0.15)  # the wrong way round: 0.5
-    assert images.sum() == pytest.approx(coarse.thickness.sum(), rel=0.02)
-
-
-def test_meshes_are_read_sized_and_thinned(tmp_path):
-    fine = evans_fung_cell(subdivisions=4)
-    write_mesh(tmp_path / "body.vtp", fine, "um")
-    body = KnownBody(str(tmp_path / "body.vtp"), size=8e-6)
-    mesh = body.mesh(0.5e-6)
-    assert len(mesh.faces) < 1000
-    assert np.ptp(mesh.vertices, axis=0).max() == pytest.approx(16, rel=0.01)
-    assert mesh.volume == pytest.approx(
-        fine.volume * (8e-6 / np.ptp(fine.vertices, axis=0).max() / 0.5e-6) ** 3, rel=1e-6
-    )
-    same = thinned(fine, len(fine.faces))
-    assert surface(same) == pytest.approx(surface(fine))
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [({"shape": "blue-cell"}, "must be red-cell or a mesh file"), ({"size": 1e-7}, "3 to 300 pixels"),
-     ({"size": 1.0}, "3 to 300 pixels"), ({"uncertain": 0.5}, "uncertain"), ({"instants": 1}, "instants")],
-)  # fmt: skip
-def test_what_is_wrong_with_a_body_is_said(wrong, message):
-    with pytest.raises(InputError, match=message):
-        KnownBody(**wrong).mesh(0.5e-6)
-
-
-def test_an_open_mesh_is_no_body(tmp_path):
-    sphere, faces = icosphere(1)
-    write_mesh(tmp_path / "open.vtp", TriangleMesh(1e-6 * sphere, faces[1:]), "um")
-    with pytest.raises(InputError, match="must be a closed surface"):
-        KnownBody(str(tmp_path / "open.vtp")).mesh(1e-7)
 
 
 def test_flags_name_a_body():

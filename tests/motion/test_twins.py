@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 import holosplat as hs
 from helpers.motion_shadows import OTHER, TURN, cell
 from holosplat.bodies.moments import moments
-from holosplat.bodies.steps import Steps
-from holosplat.bodies.twin import distance, map_near, twin_map, twin_of, two_beams
+from holosplat.bodies.twin import map_near, twin_map, twin_of
 from holosplat.fit.schedule import Schedule
+from holosplat.fit.steps import Steps
 from holosplat.geometry import rotation_y
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import Matter
@@ -37,36 +37,6 @@ def cells(*turns: np.ndarray) -> MovingSurfaces:
     paths = [PIXEL * basis.fitted(np.array([0.0, TIMES[-1]]), np.array(one)) for one in ends]
     matter = Matter.one(*HAEMOGLOBIN.delta_beta(20.0))
     return MovingSurfaces.of_bodies(paths, [cell().faces] * len(turns), basis, PIXEL, matter)
-
-
-@pytest.mark.parametrize("angle", [90.0, 23.8])
-def test_twins_have_the_same_shadows_moments_and_volume(angle):
-    beams = rotation_y(np.array([0.0, angle]))
-    draws = np.random.default_rng(3).normal(size=(5, 3, 3))
-    for second in draws @ draws.transpose(0, 2, 1):
-        matrix = twin_map(second, beams[:, 2])
-        other = matrix @ second @ matrix.T
-        assert np.linalg.det(matrix) == pytest.approx(1)
-        assert np.abs(other - second).max() > 1e-2
-        for view in beams[:, :2]:
-            np.testing.assert_allclose(view @ other @ view.T, view @ second @ view.T, atol=1e-9)
-        back = twin_map(other, beams[:, 2])
-        np.testing.assert_allclose(back @ other @ back.T, second, atol=1e-9)
-
-
-def test_what_is_alike_on_both_sides_of_a_beam_is_its_own_twin():
-    np.testing.assert_allclose(twin_map(np.diag([1.0, 2.0, 3.0]), ACROSS), np.eye(3), atol=1e-12)
-
-
-def test_two_beams_are_two_directions_of_either_sense():
-    def views(*angles: float) -> hs.Views:
-        return hs.Views.from_angles(np.array(angles), SHAPE, PIXEL)
-
-    assert two_beams(views(0.0, 30.0, 48.0)) is None
-    assert two_beams(views(0.0, 180.0)) is None
-    found = two_beams(views(0.0, 90.0, 180.0, 0.0, 270.0))
-    assert found is not None
-    np.testing.assert_allclose(np.abs(found), np.abs(ACROSS), atol=1e-12)
 
 
 def test_one_body_takes_its_twins_place():
@@ -96,16 +66,6 @@ def test_a_body_that_turns_is_its_twin_at_all_times():
         np.testing.assert_allclose(second[1], twin_of(second[0], ACROSS), atol=0.02 * np.abs(second[0]).max())
     near = twin_map(second[0], ACROSS)
     np.testing.assert_allclose(map_near(second[0], ACROSS, near), near, atol=1e-9)
-
-
-def test_the_distance_of_twins():
-    """Of long rods along the diagonal of two beams: the twin lies along the other one, at √2 of the rod's extent."""
-    along, across = np.array([1.0, 0, 1]) / 2**0.5, np.array([1.0, 0, -1]) / 2**0.5
-    rod = 1e-4 * np.eye(3) + np.outer(along, along)
-    twin = twin_of(rod, ACROSS)
-    assert distance(rod, ACROSS) == pytest.approx(2**0.5, rel=0.02)
-    np.testing.assert_allclose(twin, 1e-4 * np.eye(3) + np.outer(across, across), atol=1e-9)
-    assert distance(np.eye(3), ACROSS) == pytest.approx(0, abs=1e-7)
 
 
 def test_details_go_and_size_place_and_linear_motion_stay():

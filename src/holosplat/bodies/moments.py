@@ -30,6 +30,13 @@ def centroid(mesh: TriangleMesh) -> np.ndarray:
     return origin + (parts[:, None] * (a + b + c) / 4).sum(0) / parts.sum()
 
 
+def second_moments(mesh: TriangleMesh) -> np.ndarray:
+    """[3, 3] of what a closed mesh encloses about its middle, over its volume, in the square of the unit of its
+    vertices."""
+    volume, _, second = moments(mesh)
+    return second / volume
+
+
 def stretched_like(mesh: TriangleMesh, rest: TriangleMesh) -> np.ndarray:
     """Matrix [3, 3] of determinant one by which the ellipsoid of second moments of `rest` becomes one like `mesh`'s."""
     (values, axes), (rests, frame) = (np.linalg.eigh(moments(one)[2]) for one in (mesh, rest))

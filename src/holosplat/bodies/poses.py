@@ -10,9 +10,9 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
+from ..fit.steps import Steps
 from ..mesh import TriangleMesh
 from .shadows import Shadows
-from .steps import Steps
 
 ROUNDED = 3.0
 """Standard deviations from which on a misfit counts by its size, no longer by its square: shadows of other bodies."""

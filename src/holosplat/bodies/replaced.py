@@ -9,12 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from ..fit.steps import Steps
 from ..mesh import TriangleMesh
 from .pool import Pool
 from .poses import FREER, Explained, Pose
 from .pursuit import LAST_STEPS, candidates, explaining, level_pairs, searched, swapped, two_beams
 from .shadows import Shadows
-from .steps import Steps
 from .templates import Search, Templates
 
 TRIES, MOST_ROUNDS, PATIENCE = 12, 20, 3

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from ..fit.steps import Steps
 from ..matter import DeltaBeta
 from ..mesh import TriangleMesh
 from ..scan import Scan
@@ -17,7 +18,6 @@ from .pursuit import merged
 from .replaced import Heard, pursued
 from .rest_shape import KnownBody
 from .shadows import Shadows
-from .steps import Steps
 from .templates import Search, Templates
 
 SEARCH_RADIUS = 2.8
@@ -57,24 +57,23 @@ class BodySearch:
         bodies in the poses `like` (`pursued`); all in pixels of the search."""
         return pursued(sized(self.mesh, size), self.seen, velocities, like, seed, on_progress, steps)
 
-    def merged(self, poses: list[Pose], size: float = 1.0) -> list[Pose]:
+    def merged(self, poses: list[Pose]) -> list[Pose]:
         """Poses of one body where two beams cross in place of two of which each shows one (`pursuit.merged`)."""
-        mesh, still = sized(self.mesh, size), np.zeros((1, 3))
-        search = Search(Templates.of(mesh, self.seen), self.seen, still)
-        return merged(Explained(mesh, self.seen, FREER), search, poses)
+        search = Search(Templates.of(self.mesh, self.seen), self.seen, np.zeros((1, 3)))
+        return merged(Explained(self.mesh, self.seen, FREER), search, poses)
 
-    def of_best_size(self, poses: Sequence[Pose], size: float, steps: Steps | None = None) -> tuple[float, list[Pose]]:
+    def of_best_size(
+        self, poses: Sequence[Pose], size: float = 1.0, steps: Steps | None = None
+    ) -> tuple[float, list[Pose]]:
         """The size of all bodies within `body.uncertain` of `size` that explains most in `poses`, and better poses."""
         mesh = sized(self.mesh, size)
         size *= best_size(mesh, self.seen, poses, self.body.uncertain)
         return size, Explained(sized(self.mesh, size), self.seen, FREER, steps).improved(poses, SIZE_STEPS)
 
-    def like(self, mesh: TriangleMesh, unit: float, size: float = 1.0) -> Pose:
-        """A pose at rest of a body `size` times as large, stretched like `mesh`, about its middle; unit: of `mesh`'s
-        vertices, in pixels of the frames."""
+    def like(self, mesh: TriangleMesh, pixel: float) -> Pose:
+        """A body at rest that is stretched like `mesh` [m], and has its middle; pixel: of the frames [m]."""
         still = np.zeros(3)
-        centre = moments(mesh)[1] * unit / self.bin
-        return Pose(stretched_like(mesh, sized(self.mesh, size)), centre, still, still)
+        return Pose(stretched_like(mesh, self.mesh), moments(mesh)[1] / (pixel * self.bin), still, still)
 
 
 def best_size(mesh: TriangleMesh, seen: Shadows, poses: Sequence[Pose], uncertain: float) -> float:

@@ -48,8 +48,8 @@ class MotionFlags:
     """Bodies of single times are found in what the package's network guesses, where frames do not contradict it and its
     bodies explain clearly more: red cells in two or three beams."""
     cells: bool = True
-    """In two beams, bodies that the network guesses are followed as red cells, too, by their shape at rest, where that
-    leaves no more of the frames than bodies of any shape."""
+    """In two beams, bodies that the network guesses are followed as red cells, too, by their shape at rest; these are
+    kept unless bodies of any shape leave clearly less of the frames."""
     least_volume: float = 30.0
     """Bodies of fewer voxels, of a pixel's edge, are not followed."""
     volume_kept: Weight = 0.006

@@ -4,15 +4,15 @@ with.
 The network knows the bodies that it was trained on. Of others its guess is wrong in a way that it does not see itself,
 and what the fit makes of it may be worse than what it makes of the ordinary start. So the guess has to leave clearly
 less of the frames unexplained than that, beyond their noise, and more surely than noise could; where it does not, the
-run is the same as without a network.
+run is the same as without a network. In two beams red cells by their shape at rest are a third start, of which the same
+is asked (`posed`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TypeVar
 
 from torch import Tensor
 
@@ -37,9 +37,10 @@ STAGE = "both starts"
 Fitted = Callable[[Task, GaussianCloud, int], GaussianCloud]
 """A cloud after so many steps."""
 
-Begun = TypeVar("Begun", GaussianCloud, SurfaceMesh)
+Start = GaussianCloud | SurfaceMesh
+"""What a run may begin with."""
 
-Plain = Callable[[], GaussianCloud | SurfaceMesh]
+Plain = Callable[[], Start]
 """What the run begins with where no network is asked."""
 
 
@@ -54,7 +55,7 @@ def ways_of_guess(
     """
     ways, how = [_once(way) for way in ways], options.coarse.of_views(len(task.scan.train()))
 
-    def plain() -> GaussianCloud | SurfaceMesh:
+    def plain() -> Start:
         found = first_of(task, ways, surfaces, how)
         return starting_cloud(task, replace(options, start="phase")) if found is None else found
 
@@ -82,9 +83,7 @@ def _once(way: Way) -> Way:
     return gone
 
 
-def guessed_start(
-    task: Task, options: GaussianOptions, fitted: Fitted, plain: Plain
-) -> GaussianCloud | SurfaceMesh | None:
+def guessed_start(task: Task, options: GaussianOptions, fitted: Fitted, plain: Plain) -> Start | None:
     """The cloud of the network's guess, or red cells of its size by their shape at rest (`posed.red_cells`), or None
     where the run is the same as without it. `task.on_beginning` is told which, and why.
 
@@ -122,13 +121,14 @@ class _Starts:
     options: GaussianOptions
     material: DeltaBeta
     fitted: Fitted
+    _trials: dict[tuple[int, tuple[int, int]], _Trial] = field(default_factory=dict)
 
     @cached_property
     def evidence(self) -> Evidence:
         """By which they are judged."""
         return Evidence(MissingMatter(self.task.scan, self.material), self.task.noise)
 
-    def compared(self, plain: GaussianCloud | SurfaceMesh, cloud: GaussianCloud) -> tuple[bool, str]:
+    def compared(self, plain: Start, cloud: GaussianCloud) -> tuple[bool, str]:
         """Whether the cloud, of the guess, is begun with, and why.
 
         A short fit of both says whether the guess may be better. It is taken if it still is after the steps of a whole
@@ -148,7 +148,7 @@ class _Starts:
                 return False, f"The run began with phase retrieval: {why}."
         return True, f"The run began with the network's guess: {'; '.join(each.format('it') for each in told)}."
 
-    def cells_beside(self, cells: SurfaceMesh, best: GaussianCloud | SurfaceMesh, of_guess: bool) -> tuple[bool, str]:
+    def cells_beside(self, cells: SurfaceMesh, best: Start, of_guess: bool) -> tuple[bool, str]:
         """Whether `cells` are begun with in place of the better one of the other starts, and why."""
         ours, other = (self._tried(start, self._whole) for start in (cells, best))
         taken = ours.clearly_better(other, self.evidence, self.options.learned)
@@ -167,11 +167,15 @@ class _Starts:
     def _whole(self) -> tuple[int, int]:
         return self.options.learned.last_steps, self.options.learned.last_surfaces
 
-    def _tried(self, start: GaussianCloud | SurfaceMesh, steps: tuple[int, int]) -> _Trial:
-        return _Trial.of(self.task, start, self.evidence, steps, self.fitted)
+    def _tried(self, start: Start, steps: tuple[int, int]) -> _Trial:
+        """What comes of a start, each once."""
+        key = id(start), steps
+        if key not in self._trials:
+            self._trials[key] = _Trial.of(self.task, start, self.evidence, steps, self.fitted)
+        return self._trials[key]
 
 
-def _begun(task: Task, beginning: Beginning, start: Begun | None = None) -> Begun | None:
+def _begun(task: Task, beginning: Beginning, start: Start | None = None) -> Start | None:
     task.on_beginning(beginning)
     return start
 
@@ -189,7 +193,7 @@ class _Trial:
     def of(
         cls,
         task: Task,
-        start: GaussianCloud | SurfaceMesh,
+        start: Start,
         evidence: Evidence,
         steps: tuple[int, int],
         fitted: Fitted,

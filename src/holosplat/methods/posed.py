@@ -8,15 +8,14 @@ free of the shape at rest, and each cell is tried as its twin (`bodies.twin`), w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
 from ..bodies.cut import cut_bodies, is_cut
-from ..bodies.moments import moments
-from ..bodies.poses import Pose
+from ..bodies.moments import moments, second_moments
 from ..bodies.rest_shape import KnownBody, extent_like, guessed_cells
 from ..bodies.search import BodySearch, sized
 from ..bodies.twin import distance, twin_map, two_beams
@@ -46,8 +45,6 @@ BETTER = 1e-3
 """Part of the loss that a trial must take away to be gone on from."""
 SEARCHED = 0.6
 """About the share of the work that the search is."""
-
-Shape = Callable[[np.ndarray], np.ndarray]
 
 
 def red_cells(task: Task, guess: Guessed, material: DeltaBeta, typical: float = 0.0) -> SurfaceMesh | None:
@@ -113,8 +110,7 @@ class _Posed:
 
     def second(self, vertices: np.ndarray) -> np.ndarray:
         """Second moments [3, 3] over the volume of a cell of `vertices` [P, 3]."""
-        volume, _, second = moments(replace(self.rest, vertices=vertices))
-        return second / volume
+        return second_moments(replace(self.rest, vertices=vertices))
 
     def with_cell(self, number: int, vertices: np.ndarray) -> _Posed:
         """The same with other `vertices` [P, 3] of one cell."""
@@ -127,18 +123,15 @@ def _posed(task: Task, material: DeltaBeta, body: KnownBody, seen: Sequence[Tria
     """The cells that shadows show, where the search may begin with the meshes `seen` [m]."""
     pixel, time = task.scan.views.pixel_size, float(task.scan.exposures.time[0])
     search = BodySearch.of(task.scan, material, body, (time - 1, time + 1))
-    like = [search.like(mesh, 1 / pixel) for mesh in seen]
+    like = [search.like(mesh, pixel) for mesh in seen]
     report = task.report(STAGE)
     poses, _ = search.poses(np.zeros((1, 3)), like, seed=task.seed, on_progress=lambda part: report(SEARCHED * part))
     if not poses:
         return None
-    size, poses = search.of_best_size(search.merged(poses), 1.0)
+    size, poses = search.of_best_size(search.merged(poses))
     rest = sized(body.mesh(pixel), size)
-    return _Posed(rest, _nodes(poses, search.bin, rest), Matter.one(*material), pixel)
-
-
-def _nodes(poses: Sequence[Pose], scale: float, rest: TriangleMesh) -> np.ndarray:
-    return np.array([pose.scaled(scale).nodes(rest.vertices, 0.0) for pose in poses])
+    nodes = np.array([pose.scaled(search.bin).nodes(rest.vertices, 0.0) for pose in poses])
+    return _Posed(rest, nodes, Matter.one(*material), pixel)
 
 
 def _told_from_twins(task: Task, posed: _Posed, beams: np.ndarray) -> SurfaceMesh:

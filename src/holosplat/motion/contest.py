@@ -2,8 +2,7 @@
 
 Two beams leave shapes open, and bodies of unknown shape stay poor in them, while red cells are found by their shape at
 rest. Where a network that knows red cells alone guesses bodies that frames do not contradict, cells of that size are
-looked for. They are kept unless bodies of any shape, which are freer, leave clearly less of the frames: of other bodies
-they do.
+looked for. They are kept unless bodies of any shape, which are freer, leave clearly less of the frames.
 """
 
 from __future__ import annotations
@@ -11,13 +10,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import torch
+import numpy as np
 
 from ..checks import InputError, as_written
-from ..fit.residuals import Prediction
 from ..units import in_percent
 from .following import Followed, Following
 from .journal import Journal
+from .remainder import predicted
 
 CLEARLY = 0.95
 """What bodies of any shape must leave of what cells leave: so much freer in two beams, they follow noise and explain by
@@ -66,18 +65,18 @@ class Part:
 def cells_or_any(cells: Following, other: Following) -> Followed:
     """What `cells`, of red cells, found, or `other`, of bodies of any shape, which has its sightings.
 
-    Errors: those of `other`, where there are no cells.
+    Errors: those of either; where there are no cells of that size, of `other` alone.
     """
     if cells.stage == "sightings":
         cells.seen, cells.counts, cells.guess, cells.stage = other.seen, other.counts, other.guess, "first paths"
     try:
-        cells.until("halves")
-        left = residual(cells)
+        cells.until("stiff")
     except InputError:  # no cell of that size
         other.until("done")
         return other.followed("; no red cells of their size were found")
+    cells.until("halves")
     other.until("halves")
-    beside = residual(other)
+    left, beside = residual(cells), residual(other)
     said = f"; as red cells of their size they leave {in_percent(left)} of the contrast, as bodies of any shape "
     said += f"{in_percent(beside)}, and are followed as "
     kept, name = (other, "such") if beside < CLEARLY * left else (cells, "cells")
@@ -88,7 +87,6 @@ def cells_or_any(cells: Following, other: Following) -> Followed:
 def residual(of: Following) -> float:
     """What its bodies leave of the frames, over their contrast, root mean squares."""
     assert of.bodies is not None
-    said, frames = Prediction(of.bodies, of.train.exposures, of.oversample), torch.from_numpy(of.train.frames)
-    with torch.no_grad():
-        left = torch.stack([frames[v] - said.view(v).frames()[0] for v in range(len(frames))])
-    return float(left.square().mean().sqrt() / (frames - 1).square().mean().sqrt().clamp_min(TINY))
+    frames = of.train.frames
+    left = frames - predicted(of.train, of.bodies, of.oversample)
+    return float(np.linalg.norm(left) / max(float(np.linalg.norm(frames - 1)), TINY))

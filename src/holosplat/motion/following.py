@@ -11,9 +11,9 @@ from typing import Any
 import torch
 
 from ..bodies.rest_shape import KnownBody, extent_like
-from ..bodies.steps import Steps
 from ..checks import InputError, as_written, require
 from ..fit.running import Record
+from ..fit.steps import Steps
 from ..learning.network import Guess
 from ..matter import DeltaBeta
 from ..mesh import TriangleMesh

@@ -14,8 +14,8 @@ from ..bodies.replaced import Heard
 from ..bodies.rest_shape import KnownBody
 from ..bodies.search import BodySearch, sized
 from ..bodies.shadows import Shadows
-from ..bodies.steps import Steps
 from ..checks import require
+from ..fit.steps import Steps
 from ..geometry import Views
 from ..matter import DeltaBeta, Matter
 from ..mesh import TriangleMesh

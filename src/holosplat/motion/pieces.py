@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from ..bodies.steps import Steps
 from ..checks import at_least, in_range
 from ..fit.residuals import Prediction
+from ..fit.steps import Steps
 from ..optics.background import Light
 from ..ranges import ranged
 from ..representations import MovingSurfaces

@@ -30,10 +30,15 @@ def beside(train: Scan, bodies: MovingSurfaces, oversample: int) -> Scan:
     Phases of bodies add up in the exit wave, whose product with the waves of others is what is measured; behind the
     sample that is right to first order in the phases, which a first guess of what is left can do with.
     """
+    said = predicted(train, bodies, oversample)
+    return replace(train, frames=(train.frames / np.maximum(said, DARKEST)).astype(np.float32))
+
+
+def predicted(train: Scan, bodies: MovingSurfaces, oversample: int) -> np.ndarray:
+    """[N, H, W]: the frames that `bodies` give in the exposures of `train`."""
     said = Prediction(bodies, train.exposures, oversample)
     with torch.no_grad():
-        predicted = np.stack([said.view(v).frames()[0].numpy() for v in range(len(train))])
-    return replace(train, frames=(train.frames / np.maximum(predicted, DARKEST)).astype(np.float32))
+        return np.stack([said.view(v).frames()[0].numpy() for v in range(len(train))])
 
 
 def joined(one: MovingSurfaces, other: MovingSurfaces) -> MovingSurfaces:

@@ -38,8 +38,8 @@ class TrackOptions:
     """The network that may guess their volumes, where frames do not contradict it and its bodies explain clearly more;
     None: none."""
     cells: bool = True
-    """Whether, in two beams, bodies that a network of red cells guesses are followed as red cells, too: by their shape
-    at rest, where that leaves no more of the frames than bodies of any shape."""
+    """Whether, in two beams, bodies that a network of red cells guesses are followed as red cells, too, by their shape
+    at rest; these are kept unless bodies of any shape leave clearly less of the frames."""
     links: LinkOptions = field(default_factory=LinkOptions)
     """Which of them are one body."""
     paths: PathOptions = field(default_factory=PathOptions)

@@ -9,10 +9,10 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from ..bodies.moments import moments
-from ..bodies.steps import Steps
+from ..bodies.moments import moments, second_moments
 from ..bodies.twin import distance, map_near, twin_map, two_beams
 from ..fit.loop import Fit
+from ..fit.steps import Steps
 from ..mesh import TriangleMesh
 from ..optics.background import Light
 from ..representations import MovingSurfaces
@@ -138,7 +138,7 @@ def _better(now: MovingSurfaces, number: int, before: MovingSurfaces, rivals: tu
 def in_question(bodies: MovingSurfaces, beams: np.ndarray, rest: Rest) -> list[int]:
     """Numbers of the bodies that are apart from their twins, those first that are farthest; without those whose twin is
     too far from the shape at `rest`."""
-    away = np.array([distance(_second(_middle_mesh(bodies, number)), beams) for number in range(bodies.count)])
+    away = np.array([distance(second_moments(_middle_mesh(bodies, number)), beams) for number in range(bodies.count)])
     found = [int(number) for number in np.argsort(-away) if away[number] > APART]
     return [k for k in found if _energy(twinned(bodies, k, beams), k, rest) < _energy(bodies, k, rest) + STRAINED]
 
@@ -149,12 +149,12 @@ def twinned(bodies: MovingSurfaces, number: int, beams: np.ndarray) -> MovingSur
     A body that turns has another map at each time: the one nearest to that of the time in the middle.
     """
     basis, (own, _) = bodies.basis, bodies.body(number)
-    middle = twin_map(_second(_middle_mesh(bodies, number)), beams)
+    middle = twin_map(second_moments(_middle_mesh(bodies, number)), beams)
     places, times = [], np.linspace(basis.first, basis.last, SAMPLES * basis.count)
     for time in times:
         mesh = _mesh(bodies, number, float(time))
         centre = moments(mesh)[1]
-        matrix = map_near(_second(mesh), beams, middle)
+        matrix = map_near(second_moments(mesh), beams, middle)
         places.append(((mesh.vertices - centre) @ matrix.T + centre) / bodies.unit_length)
     changed = bodies.coefficients.detach().clone()
     changed[:, own] = torch.from_numpy(basis.fitted(times, np.array(places)))
@@ -196,12 +196,6 @@ def _energy(bodies: MovingSurfaces, number: int, rest: Rest) -> float:
     weights = bodies.basis.weights(np.array([0.5 * (bodies.basis.first + bodies.basis.last)]))[0]
     nodes = torch.einsum("k,kpx->px", torch.from_numpy(weights), bodies.coefficients.detach()[:, own])
     return float(rest.elastic(nodes))
-
-
-def _second(mesh: TriangleMesh) -> np.ndarray:
-    """[3, 3] m², second moments over the volume."""
-    volume, _, second = moments(mesh)
-    return second / volume
 
 
 def _left(fit: Fit) -> tuple[float, torch.Tensor]:

@@ -1,0 +1,93 @@
+"""Bodies of known rest shape in shadows: poses found by two beams, and sizes, on a raster of odd sides."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from helpers.motion_shadows import FLOW, OTHER, TURN, cell, pose, shadows
+from holosplat.bodies import replaced
+from holosplat.bodies.poses import Explained, Pose
+from holosplat.bodies.pursuit import exchanged
+from holosplat.bodies.replaced import pursued
+from holosplat.bodies.search import best_size
+from holosplat.bodies.templates import Search, Templates
+from holosplat.fit.steps import Steps
+
+
+def axis_error(found: Pose, turn: np.ndarray) -> float:
+    """Angle between the cells' axes [degrees], of either sign."""
+    axis = np.linalg.svd(found.matrix @ np.diag([1.0, 1.0, 0.3]))[0][:, 2]
+    return float(np.degrees(np.arccos(min(1.0, abs(axis @ turn[:, 2])))))
+
+
+def test_two_beams_find_a_body_and_its_pose(monkeypatch):
+    """One cell that the frames cut at the end: centre, velocity and axis; the steps of another run give the same."""
+    truth = pose(TURN, (3.0, 11.0, -2.5), 1.1)
+    flow, steps = FLOW * np.array([0.9, 1.1])[:, None], Steps()
+    (found,), of_begun = pursued(cell(), shadows([truth]), flow, steps=steps)
+    assert not of_begun
+    with monkeypatch.context() as none:
+        none.setattr(Explained, "_better", lambda *given: pytest.fail("these poses were made better before"))
+        ((again,), _) = pursued(cell(), shadows([truth]), flow, steps=Steps(steps.done))
+    for name in ("matrix", "centre", "velocity", "turning"):
+        assert np.array_equal(getattr(again, name), getattr(found, name))
+    assert np.linalg.norm(found.centre - truth.centre) < 0.2
+    assert np.linalg.norm(found.velocity - truth.velocity) < 0.2
+    assert axis_error(found, TURN) < 5
+    assert np.linalg.det(found.matrix) == pytest.approx(1)
+
+
+def test_a_search_begins_with_what_is_known_where_that_explains_more(monkeypatch):
+    """Cells that nothing but the start shows, for no place is tried; a start at ghosts is worth less than none."""
+    truth = [pose(TURN, (6.0, 0.0, -5.0)), pose(OTHER, (-6.0, 1.0, 5.0), 1.2)]
+    near = [replace(one, centre=one.centre + 0.8) for one in truth]
+    astray = pose(TURN, (0.0, -18.0, 0.0))
+    seen = shadows(truth)
+    monkeypatch.setattr(replaced, "PATIENCE", 1)
+    assert not pursued(cell(), seen, FLOW[None], [astray])[1]
+    monkeypatch.setattr(Search, "tops", lambda *given: [])
+    found, of_begun = pursued(cell(), seen, FLOW[None], [*near, astray])
+    assert of_begun
+    assert len(found) == 2
+    for one in truth:
+        assert min(np.linalg.norm(other.centre - one.centre) for other in found) < 0.3
+
+
+def test_ghosts_are_exchanged_for_bodies():
+    """Two cells at one height: each in the shadow of the one in the first beam, of the other in the second."""
+    truth = [pose(TURN, (6.0, 0.0, -5.0)), pose(OTHER, (-6.0, 1.0, 5.0), 1.2)]
+    seen = shadows(truth)
+    every = Explained(cell(), seen)
+    search = Search(Templates.of(cell(), seen), seen, FLOW[None])
+    ghosts = [pose(TURN, (6.0, 0.5, 5.0)), pose(OTHER, (-6.0, 0.5, -5.0))]
+    found = exchanged(every, search, every.improved(ghosts, 8))
+    for one in truth:
+        assert min(np.linalg.norm(other.centre - one.centre) for other in found) < 0.5
+    again = exchanged(every, search, truth)
+    assert all(np.linalg.norm(a.centre - b.centre) < 0.2 for a, b in zip(again, truth))
+
+
+def test_the_size_of_all_bodies_is_found():
+    larger = replace(cell(), vertices=1.04 * cell().vertices)
+    truth = [pose(TURN, (0.0, 2.0, 1.0))]
+    assert best_size(cell(), shadows(truth, mesh=larger), truth, 0.1) == pytest.approx(1.04, abs=0.006)
+
+
+def test_bins_and_projections_agree():
+    """Thickness of the same bodies in larger pixels, of which an odd row is left over."""
+    truth = [pose(TURN, (3.0, 2.0, -2.5))]
+    seen = shadows(truth)
+    seen = replace(seen, thickness=Explained(cell(), seen).images(truth))
+    coarse = seen.binned(2)
+    assert coarse.shape == (23, 16)
+    small = replace(cell(), vertices=0.5 * cell().vertices)
+    images = Explained(small, coarse).images([one.scaled(0.5) for one in truth])
+    for one, other in zip(images, coarse.thickness):
+        for axis in (0, 1):
+            places = np.arange(one.shape[axis])
+            middles = [image.sum(1 - axis) @ places / image.sum() for image in (one, other)]
+            assert middles[0] == pytest.approx(middles[1], abs=0.15)  # the wrong way round: 0.5
+    assert images.sum() == pytest.approx(coarse.thickness.sum(), rel=0.02)
