@@ -40,8 +40,12 @@ def in_runs(rows: Sequence[dict[str, str]]) -> str:
     noisy, untold = (_taken(with_it, begun, end) for end in (NOISY, UNTOLD))
     return (
         f"In whole runs (docs/data/{RUNS.name}) its guess was taken in {noisy} with noise in the frames and in "
-        f"{untold} of matter that was not named. Frames contradicted its guesses of {_named(refused)}. Runs that began "
-        f"with its guess ended with a lower Dice coefficient of {_named(lost)}."
+        f"{untold} of matter that was not named. Frames contradicted its guesses of {_named(refused)}. "
+        + (
+            f"Runs that asked for it ended with a lower Dice coefficient of {_named(lost)}."
+            if lost
+            else "No run that asked for it ended with a lower Dice coefficient."
+        )
     )
 
 

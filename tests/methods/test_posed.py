@@ -89,6 +89,20 @@ def test_cells_are_found_with_their_shapes_and_size(short, size):
     assert scores.dice > 0.93
 
 
+def test_a_guess_of_cells_that_are_too_small_or_large_is_put_right(short):
+    """Of a guess by a tenth too narrow or too wide frames tell the size at rest, before any surface is fitted."""
+    scan, scene = scanned(size=1.2)
+    true = np.mean([mesh.volume for mesh in scene.meshes])
+    for radius in (3.0e-6, 3.7e-6):
+        seen = method.cut_bodies(guess(scan, radius).values.numpy(), guess(scan).grid, PIXEL)
+        began = np.mean([mesh.volume for mesh in seen])
+        posed = method._posed(Task(scan, PRIOR), MATERIAL, method.guessed_cells(method.extent_like(seen)), seen)
+        assert posed is not None
+        found = posed.rest.volume * PIXEL**3
+        assert abs(found / true - 1) < 0.1
+        assert abs(found / true - 1) < 0.5 * abs(began / true - 1)
+
+
 def test_a_cell_that_begins_as_its_twin_is_told(short, monkeypatch):
     """Both cells are put in their twins' places before anything is fitted."""
     scan, scene = scanned()
