@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from helpers.moving_ellipsoids import PIXEL, TIMES, scan, true_paths
-from holosplat.bodies.rest_shape import KnownBody
+from holosplat.bodies.rest_shape import KnownBody, guessed_cells
 from holosplat.checks import InputError
 from holosplat.motion.known import at_rest
 from holosplat.representations import MovingSurfaces, TimeBasis
@@ -51,6 +51,9 @@ def test_a_shape_at_rest_is_read_as_it_was_written(tmp_path):
     found = read_rest(folder, cells, config)
     assert found is not None
     assert found.stiffness == 70
+    untold = read_rest(folder, cells, {"method": {"body": None}})  # red cells that the run found by itself
+    assert untold is not None
+    assert untold.stiffness == guessed_cells(8e-6).stiffness
     nodes = torch.from_numpy(1.1 * mesh.vertices)
     assert float(found.elastic(nodes)) == pytest.approx(float(known.elastic(nodes)), rel=1e-5)
     with pytest.raises(InputError, match="has others"):

@@ -1,9 +1,10 @@
-"""rest.vtp of a run of track: the shape at rest of bodies whose shape was known."""
+"""rest.vtp of a run of track: the shape at rest of bodies whose shape was told, or found."""
 
 from __future__ import annotations
 
 from typing import Any
 
+from ..bodies.rest_shape import KnownBody
 from ..checks import as_written, require
 from ..io.vtk import read_meshes, write_mesh
 from ..mesh import TriangleMesh
@@ -27,7 +28,8 @@ def read_rest(folder: RunFolder, found: Stored, config: dict[str, Any]) -> Rest 
     if not (isinstance(found, MovingSurfaces) and folder.rest.is_file()):
         return None
     with as_written(folder.config, "what track wrote"):
-        stiffness = float(config["method"]["body"]["stiffness"])
+        told = config["method"]["body"]  # None where red cells were found
+        stiffness = KnownBody.stiffness if told is None else float(told["stiffness"])
     shape = read_meshes(folder.rest, LENGTH_UNIT)[0]
     own = [found.body(k)[1].numpy() for k in range(found.count)]
     fits = all(one.shape == shape.faces.shape and (one == shape.faces).all() for one in own)
