@@ -1,12 +1,14 @@
 """How well `forecast` tells cells that flow: rows of docs/data/forecast.csv.
 
-    python benchmarks/forecast.py DATA [--case flow4] [--times 24] [--first 0] [--write] [--keep FOLDER]
+    python benchmarks/forecast.py DATA [--case flow4] [--times 24] [--first 0] [--true] [--write] [--keep FOLDER]
 
 DATA, cells and frames are as for motion.py. The first `times` snapshots from `first` on are tracked; the forecasts of
 the next ones are compared with the cells themselves: distances along normals (rms over both surfaces), Dice, and SSIM
 of the predicted frames with frames without noise. Judged are the cells that are whole in the field at the last tracked
 time and are followed. `splines` are the fitted splines of single vertices as they go on; `wrong …` are dynamics with
-numbers that are wrong. With --keep the tracked bodies are kept in FOLDER, and taken from there.
+numbers that are wrong. With --keep the tracked bodies are kept in FOLDER, and taken from there. With --true nothing is
+tracked: bodies are the cells themselves, on quadratic splines through their own nodes, so that what is off is the
+forecasts' alone; their case is called `true`.
 """
 
 from __future__ import annotations
@@ -28,6 +30,7 @@ from holosplat.bodies.rest_shape import KnownBody
 from holosplat.geometry import Grid
 from holosplat.io.atomic import atomic_path
 from holosplat.io.objects import read_object, write_object
+from holosplat.matter import Matter
 from holosplat.metrics import image_scores, intensity_range, volume_scores
 from holosplat.metrics.distances import normal_distance
 from holosplat.motion.cell_model import ChannelFrame
@@ -37,6 +40,7 @@ from holosplat.motion.forecast import Forecast, Halves, PathForecast, extrapolat
 from holosplat.motion.half_sets import half_sets
 from holosplat.motion.track import TrackOptions, follow
 from holosplat.representations import MovingSurfaces
+from holosplat.representations.paths import TimeBasis
 from holosplat.specimens.mesh_series import MeshSeries
 from holosplat.workflows.evaluate import render_object
 from motion import ANGLES, BODY, MATERIAL, PIXEL, SHAPE, cells_in_flow, imaged
@@ -55,6 +59,8 @@ MODELS = {
     "wrong walls": replace(GIVEN, frame=ChannelFrame((48e-6, 36e-6)), free=False),
 }
 DICE = ("paths", "auto")
+PIECES = 3
+"""Of the true paths, as many as those of tracks have."""
 NEAR = 1.5e-6
 """A cell is followed if a body's centre stays within this distance [m], in the mean over three times."""
 
@@ -135,8 +141,17 @@ def tracked(scan: hs.Scan, seed: int, keep: Path | None, name: str) -> tuple[Mov
     return whole, halves
 
 
+def truly(cells: MeshSeries, times: int) -> MovingSurfaces:
+    """The cells themselves on smooth paths at the first `times` times."""
+    basis = TimeBasis(float(cells.times[0]), float(cells.times[times - 1]), 2, PIECES)
+    nodes = np.array([[mesh.vertices for mesh in scene.meshes] for scene in cells.snapshots[:times]])
+    paths = [basis.fitted(cells.times[:times], one) for one in nodes.transpose(1, 0, 2, 3)]
+    faces = [mesh.faces for mesh in cells.snapshots[0].meshes]
+    return MovingSurfaces.of_bodies(paths, faces, basis, PIXEL, Matter.one(*MATERIAL))
+
+
 def forecasts(
-    bodies: MovingSurfaces, halves: Halves, times: np.ndarray, ahead: np.ndarray
+    bodies: MovingSurfaces, halves: Halves | None, times: np.ndarray, ahead: np.ndarray
 ) -> Iterator[tuple[str, Forecast, str]]:
     """Every model's, by name, and what it found of the flow."""
     found = extrapolate(bodies, times, ahead, PathForecast(), halves)
@@ -148,13 +163,17 @@ def forecasts(
         yield name, found, " ".join(f"{key}={value:.4g}" for key, value in flow.items())
 
 
-def rows_of(case: str, data: Path, first: int, times: int, seed: int, keep: Path | None) -> Iterator[Row]:
-    """All models at all times ahead."""
+def rows_of(
+    case: str, data: Path, first: int, times: int, seed: int, keep: Path | None, true: bool = False
+) -> Iterator[Row]:
+    """All models at all times ahead; true: begun with the cells themselves."""
     cells = cells_in_flow(data, first, times + max(AHEAD))
     scan = imaged(cells, ANGLES[case], seed)
     kept = scan[np.flatnonzero(scan.exposures.time <= cells.times[times - 1])]
-    bodies, halves = tracked(kept, seed, keep, f"{case}_{first}_{times}_{seed}")
-    pairs, last = followed(bodies, cells, times - 1), times - 1
+    bodies, halves = (
+        (truly(cells, times), None) if true else tracked(kept, seed, keep, f"{case}_{first}_{times}_{seed}")
+    )
+    pairs, last, named = followed(bodies, cells, times - 1), times - 1, "true" if true else case
     exposures = hs.Exposures.of(hs.Views.from_angles(np.array(ANGLES[case]), SHAPE, PIXEL), 20.0, 0.1)
     frames = {h: hs.simulate(cells, exposures.repeated(cells.times[[last + h]])) for h in AHEAD}
     judge = Judge(cells, pairs, frames, intensity_range(kept.frames), last)
@@ -163,7 +182,7 @@ def rows_of(case: str, data: Path, first: int, times: int, seed: int, keep: Path
         for h, band in zip(AHEAD, found.band):
             error = 1e6 * float(np.sqrt(np.mean([band[k] ** 2 for _, k in pairs])))
             away, worst, ssim, dice = judge.scores(found.bodies, h, model in DICE)
-            row = (case, first, times, seed, model, h, away, worst, error, ssim, dice, len(pairs), said)
+            row = (named, first, times, seed, model, h, away, worst, error, ssim, dice, len(pairs), said)
             yield Row(*row, machine, commit())
 
 
@@ -186,11 +205,12 @@ def main() -> None:
     parser.add_argument("--times", type=int, default=24, help="that are tracked")
     parser.add_argument("--first", type=int, default=0, help="snapshot of the first time")
     parser.add_argument("--seed", type=int, default=1, help="of the photons and of the fits")
+    parser.add_argument("--true", action="store_true", help="forecasts from the cells themselves")
     parser.add_argument("--write", action="store_true")
     parser.add_argument("--keep", type=Path, help="folder of tracked bodies")
     asked = parser.parse_args()
     rows = []
-    for row in rows_of(asked.case, asked.data, asked.first, asked.times, asked.seed, asked.keep):
+    for row in rows_of(asked.case, asked.data, asked.first, asked.times, asked.seed, asked.keep, asked.true):
         print(*astuple(row)[:13], sep="; ", flush=True)
         rows.append(row)
     if asked.write:
