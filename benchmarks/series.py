@@ -8,7 +8,8 @@ Cases, on cells of haemoglobin that drift by 0.3 pixels from one time to the nex
 - warm: a window of times at 128 × 128 pixels: seconds of a time that begins by itself, and of those that go on from it,
   and the Dice of the last one beside that of the same time by itself.
 - volume: the same of continuous matter (a stirred blob), fitted as a smooth volume.
-- processes: windows of one time (--windows) by one process and by two, of one thread each, and by one of two threads.
+- processes: windows of one time (--windows) by one process and by two, of one thread each, and by one of two threads;
+  and plain Python, which shares nothing, by one process and by two: more than that the two cores do not give.
 - kills: a run that is killed (kill -9) at random moments, how many times it loses, and whether the rerun is bitwise
   equal.
 - overhead: what a task takes beside its fits, and what a process takes before its first one.
@@ -193,6 +194,16 @@ def processes(work: Path, options: Options) -> Measured:
         yield f"seconds, {name}", seconds[name]
         yield f"CPU seconds, {name}", used() - before
     yield "times faster, two processes than one", seconds["one process"] / seconds["two processes"]
+    alone, two = looped(1), looped(2)
+    yield "times faster, two processes of plain Python than one", 2 * alone / two
+
+
+def looped(jobs: int) -> float:
+    """Seconds that `jobs` processes take, each of which counts to fifty million."""
+    command = [sys.executable, "-c", "n = 0\nfor k in range(50_000_000): n += k"]
+    began = time.perf_counter()
+    assert not any(worker.wait() for worker in [subprocess.Popen(command) for _ in range(jobs)])
+    return time.perf_counter() - began
 
 
 def arrays(folder: SeriesFolder, moments: int, window: int) -> list[torch.Tensor]:

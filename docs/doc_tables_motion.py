@@ -184,6 +184,8 @@ def _miss(row: Row) -> str:
 
 
 def _named(case: str) -> str:
+    if case == "true":
+        return "Begun with the cells themselves, nothing tracked"
     beams = BEAMS[case.removesuffix(KNOWN).removesuffix(UNLEARNED)]
     return f"{beams}, `--body red-cell`" if case.endswith(KNOWN) else beams
 

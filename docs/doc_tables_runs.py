@@ -252,6 +252,10 @@ SERIES = {
     ): "a task, beside its reconstruction [CPU s]",
     ("overhead", "CPU seconds of a process whose task is done"): "a process, before it begins its first task [CPU s]",
     ("processes", "times faster, two processes than one"): "times faster by two processes than by one",
+    (
+        "processes",
+        "times faster, two processes of plain Python than one",
+    ): "times faster by two processes of plain Python, which share nothing",
     ("kills", "kills"): "kills (kill -9) at random moments",
     ("kills", "most times lost by a kill"): "times lost by one of them, at most",
     ("kills", "reruns that differ in a bit"): "reruns that differ in a bit",

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import pytest
 import torch
 
@@ -27,3 +30,19 @@ def test_the_insides_of_bulky_bodies_get_larger_gaussians():
     assert float(found.sum()) == pytest.approx(float(body.sum()), rel=0.01)
     assert float((found[5:13, 6:15, 7:19] - 1).abs().max()) < 0.15
     assert len(cloud_from_volume(body, grid, (1e-6, 1e-9), 1e-6, 1e-6, max_count=800)) <= 800
+
+
+def test_a_start_on_a_volume_loads_no_sympy():
+    """Which torch imports for some ways of backward, and which takes longer than small fits."""
+    code = """
+import sys, torch
+from holosplat.geometry import Grid
+from holosplat.representations import approximate, cloud_from_volume
+grid = Grid((7, 8, 9), (1e-6, 1e-6, 1e-6), (0.0, 0.0, 0.0))
+body = torch.zeros(grid.shape)
+body[2:5, 3:6, 4:7] = 1.0
+approximate(cloud_from_volume(body, grid, (1e-6, 1e-9), 1e-6, 1e-6), body, grid, 2, lambda *said: None)
+print("sympy" in sys.modules)
+"""
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert said == "False\n"

@@ -14,10 +14,11 @@ import pytest
 from helpers.cli import holosplat, refused, worked
 from helpers.series import planned
 from holosplat.checks import InputError, MissingError
+from holosplat.io.json import write_json
 from holosplat.series import run as running
 from holosplat.series.asked import Slurm
 from holosplat.series.dask_cluster import run_on_dask
-from holosplat.series.folder import SeriesFolder
+from holosplat.series.folder import FAILED, SeriesFolder
 from holosplat.series.run import Counts, run_processes
 from holosplat.series.slurm import ranges_of, script_of
 
@@ -74,6 +75,28 @@ def test_the_script_runs_a_task(fresh, tmp_path):
     environment = os.environ | {"SLURM_ARRAY_TASK_ID": "1", "SLURM_CPUS_PER_TASK": "3"}
     said = subprocess.run(["bash", script], env=environment, capture_output=True, text=True, check=True).stdout
     assert said.splitlines()[-4:] == ["series", "run", str(fresh.path.resolve()), "1"]
+
+
+def test_a_job_does_a_block_of_tasks(files, tmp_path):
+    """Jobs are numbered by their first tasks; what is done is passed over, and what failed unless that is asked for."""
+    series = planned(tmp_path / "blocks", files.scan)
+    text = script_of(series, [1, 2, 5, 9, 11], Slurm(block=4))
+    assert "#SBATCH --array=0,4,8\n" in text
+    assert text.splitlines()[-1].endswith('"$SLURM_ARRAY_TASK_ID" --block 4')
+    assert script_of(series, [1], Slurm(block=4), retry=True).splitlines()[-1].endswith("--block 4 --retry")
+    subprocess.run(["bash", "-n"], input=text, text=True, check=True)
+
+
+def test_a_block_is_what_is_left_from_a_task_on(fresh, done):
+    shutil.copytree(done.task(1), fresh.task(1))
+    fresh.task(2).mkdir()
+    write_json(fresh.task(2) / FAILED, {"reason": "tried"})
+    said = holosplat("series", "run", fresh.path, 1, "--block", 9)
+    assert said.code == 4
+    assert "1 done, 0 running, 1 failed, 0 left" in said.err
+    worked(holosplat("series", "run", fresh.path, 1, "--block", 9, "--retry"))
+    assert [fresh.state(window).state for window in fresh.plan().windows()] == ["left", "done", "done"]
+    refused(holosplat("series", "run", fresh.path, 3, "--block", 2), "counted from 0 to 2")
 
 
 def test_a_script_is_submitted_when_it_is_asked_for(fresh, tmp_path, monkeypatch):

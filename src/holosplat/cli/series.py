@@ -79,7 +79,7 @@ def _changed(*groups: object) -> list[str]:
 @dataclass(frozen=True)
 @ranged
 class SlurmFlags(Slurm):
-    """A Slurm array script, FOLDER/slurm.sh, of the tasks that are left, one in each job."""
+    """A Slurm array script, FOLDER/slurm.sh, of the tasks that are left, --block of them in each job."""
 
     slurm: bool = False
     """Write it."""
@@ -150,7 +150,7 @@ def run(
 
     Args:
         folder: Folder of the series.
-        task: Number of the task, from 0 on.
+        task: Number of the task, from 0 on. With --block N: of N tasks from it on those that are left.
         jobs: Or: all that are left, by so many processes of this machine, with cores / jobs threads each.
         retry: Do failed tasks again.
         dask: Or: all that are left, on the Dask cluster whose scheduler has this address, such as tcp://host:8786.
@@ -166,7 +166,9 @@ def run(
         cluster.carry_out(series, retry)
         return
     try:
-        if task is not None:
+        if task is not None and cluster.block > 1:
+            counts = run_left(series, retry, _tell_row, among=range(task, task + cluster.block))
+        elif task is not None:
             counts = counted([run_task(series, task, _tell_row)])
         elif dask is not None:
             from ..series.dask_cluster import run_on_dask

@@ -130,8 +130,10 @@ def approximate(
         for step in range(steps):
             on_progress("Gaussians for the volume", step / steps)
             density = cloud.density(grid)
-            # The gradient of Σ (density - occupancy)² / power, without the arrays that autograd would keep.
-            density.backward((density.detach() - occupancy).mul_(2 / power))
+            # The gradient of Σ (density - occupancy)² / power, without the arrays that autograd would keep; as a dot
+            # product, for backward with a gradient makes torch import sympy, which takes more than a second.
+            misses = (density.detach() - occupancy).mul_(2 / power)
+            torch.dot(density.flatten(), misses.flatten()).backward()
             for leaf, rate, state in zip(leaves, rates, states):
                 _adam_step(leaf, rate * 0.1 ** (step / steps), state)
     return cloud.detached()

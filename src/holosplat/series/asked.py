@@ -35,13 +35,15 @@ class Slurm:
     partition: str = ""
     """Partition (default: the cluster's)."""
     time: str = "01:00:00"
-    """Time limit of a task; a minute before, it is saved."""
+    """Time limit of a job; a minute before, its task is saved."""
     memory: str = ""
-    """Memory of a task, such as 8G (default: the cluster's; some refuse to be asked)."""
+    """Memory of a job, such as 8G (default: the cluster's; some refuse to be asked)."""
     cpus: Natural = 4
-    """Cores of a task, and its threads."""
+    """Cores of a job, and its threads."""
+    block: Natural = 1
+    """Tasks of a job, one after another: they share its start, which takes some seconds, and its time limit."""
     limit: int = 0
-    """Tasks that run at the same time, at most (0: as many as there is room for)."""
+    """Jobs that run at the same time, at most (0: as many as there is room for)."""
     account: str = ""
     """Account that is charged."""
     gres: str = ""

@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Container
 from dataclasses import dataclass
 
 from ..checks import require
@@ -50,13 +50,24 @@ def run_left(
     retry: bool = False,
     on_row: Told = nothing,
     on_task: Callable[[TaskState], None] = lambda state: None,
+    among: Container[int] | None = None,
 ) -> Counts:
     """Do all tasks that are left, one after another in this process; how far all of them are then.
+
+    among: numbers of tasks, of which alone this is said and done (default: all). Errors: `InputError` where these are
+    none of the series.
 
     Any number of processes may do so at once, also on several machines: a task is done by whoever locks it first, and
     those of others are passed over. Failed ones are left alone, unless `retry`. Ctrl-C is passed on.
     """
-    for state in states(folder):
+
+    def asked() -> list[TaskState]:
+        every = states(folder)
+        found = [state for state in every if among is None or state.number in among]
+        require(bool(found), f"tasks are counted from 0 to {len(every) - 1}, but none of these is asked for.")
+        return found
+
+    for state in asked():
         if state.state not in ("left", *(["failed"] if retry else [])):
             continue
         if not retry and (folder.task(state.number) / FAILED).is_file():  # since
@@ -65,7 +76,7 @@ def run_left(
             on_task(run_task(folder, state.number, on_row))
         except TakenError:
             continue
-    return counted(states(folder))
+    return counted(asked())
 
 
 def run_processes(

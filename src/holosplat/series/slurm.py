@@ -28,11 +28,16 @@ def ranges_of(numbers: Sequence[int]) -> str:
     return ",".join(str(low) if low == high else f"{low}-{high}" for low, high in parts)
 
 
-def script_of(folder: SeriesFolder, numbers: Sequence[int], options: Slurm) -> str:
-    """The script that runs the tasks `numbers`, one in each job of an array."""
+def script_of(folder: SeriesFolder, numbers: Sequence[int], options: Slurm, retry: bool = False) -> str:
+    """The script that runs the tasks `numbers`, a block of them in each job of an array.
+
+    A job's number is that of its first task; of a block, tasks that are done are passed over, and failed ones, too,
+    unless `retry`.
+    """
     path = str(folder.path.resolve())
     require(path.isprintable() and '"' not in path, f"{path!r} cannot stand in a Slurm script; use a plainer path.")
-    array = ranges_of(numbers) + (f"%{options.limit}" if options.limit else "")
+    firsts = sorted({number - number % options.block for number in numbers})
+    array = ranges_of(firsts) + (f"%{options.limit}" if options.limit else "")
     asked = {
         "job-name": "holosplat",
         "array": array,
@@ -47,13 +52,14 @@ def script_of(folder: SeriesFolder, numbers: Sequence[int], options: Slurm) -> s
     }
     lines = [f"#SBATCH --{name}={value}" for name, value in asked.items() if value]
     command = shlex.join([sys.executable, *PROGRAM, "series", "run", path])
+    block = (f" --block {options.block}" + " --retry" * retry) if options.block > 1 else ""
     return "\n".join(
         [
             "#!/bin/bash",
             *lines,
             "set -euo pipefail",
             'export OMP_NUM_THREADS="${SLURM_CPUS_PER_TASK:-1}"',
-            f'exec {command} "$SLURM_ARRAY_TASK_ID"',
+            f'exec {command} "$SLURM_ARRAY_TASK_ID"{block}',
             "",
         ]
     )
@@ -67,7 +73,7 @@ def write_script(folder: SeriesFolder, options: Slurm, retry: bool = False) -> t
     wanted = ("left", "failed") if retry else ("left",)
     numbers = [state.number for state in states(folder) if state.state in wanted]
     require(bool(numbers), f"{folder.path} has no task that is left; holosplat series status says how far it is.")
-    text = script_of(folder, numbers, options)
+    text = script_of(folder, numbers, options, retry)
     folder.logs.mkdir(exist_ok=True)
     with atomic_path(folder.script) as temporary:
         temporary.write_text(text, encoding="utf-8")
