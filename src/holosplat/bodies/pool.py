@@ -33,14 +33,15 @@ class Pool:
     every: Explained
     poses: list[Pose] = field(default_factory=list)
     _rows: list[csr_array] = field(default_factory=list)
-    _strains: list[float] = field(default_factory=list)
+    _own: list[float] = field(default_factory=list)
 
     def add(self, poses: Sequence[Pose]) -> None:
         """Further candidates."""
         for pose in poses:
             self.poses.append(pose)
-            self._rows.append(csr_array(self.every.images([pose]).reshape(1, -1).astype(np.float32)))
-            self._strains.append(self.every.strained([pose]))
+            shadow = self.every.each([pose])
+            self._rows.append(csr_array(shadow.reshape(1, -1).float().numpy()))
+            self._own.append(self.every.strained([pose]) + float(self.every.hidden(shadow)))
 
     def chosen(self, draws: np.random.Generator) -> list[Pose]:
         """Those that explain most together."""
@@ -49,7 +50,7 @@ class Pool:
         images = csr_array(vstack(self._rows))
         products = (images @ images.T).toarray().astype(np.float64) / self.every.noise**2
         gains = images @ self.every.seen.thickness.ravel() / self.every.noise**2
-        return [self.poses[k] for k in np.flatnonzero(annealed(products, gains - self._strains, draws))]
+        return [self.poses[k] for k in np.flatnonzero(annealed(products, gains - self._own, draws))]
 
 
 def annealed(products: np.ndarray, gains: np.ndarray, draws: np.random.Generator) -> np.ndarray:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -22,6 +23,9 @@ STRAIN, FREER = 0.02, 0.001
 """Cost of a squared strain of one, and of a turn by a radian, as a share of what the body casts: while bodies are
 found one after the other, when those that stand for several need larger strains; and then, for cells in flow have large
 strains, and their shadows tell the wrong ones better where these cost little."""
+HIDDEN = 0.15
+"""Cost of a body that one beam shows and another does not, as a share of what its shadow there would cost: at one time
+two of these explain what one body casts, and with more freedom."""
 SHADOW = 0.2
 """Part of a body's largest thickness from which on a pixel is in its shadow."""
 NUMBERS = 18
@@ -65,6 +69,12 @@ class Explained:
         self.instants = np.unique(seen.times)
         self.strain = strain
         self.worth = strain * mesh.volume ** (4 / 3) * len(seen) / self.noise**2
+
+    @cached_property
+    def shadow(self) -> float:
+        """What a whole shadow of the body at rest costs in a frame."""
+        still = Pose(np.eye(3), *np.zeros((3, 3)))
+        return float(self.cost(self.images([still]))) / len(self.seen)
 
     def beside(self, images: np.ndarray) -> Explained:
         """The same beside matter that casts `images` [N, H, W]."""
@@ -119,8 +129,19 @@ class Explained:
         return torch.from_numpy(np.array([self.images([pose]) for pose in poses]).reshape(-1, *self.target.shape))
 
     def value(self, poses: Sequence[Pose]) -> float:
-        """What is to be small: the cost of what `poses` leave, and of their strains and turns."""
-        return float(self.cost(self.seen.thickness - self.images(poses))) + self.strained(poses)
+        """What is to be small: the cost of what `poses` leave, of their strains and turns, and of where they hide."""
+        each = self.each(poses)
+        left = float(self.cost(self.seen.thickness - each.sum(0).numpy()))
+        return left + self.strained(poses) + float(self.hidden(each).sum())
+
+    def hidden(self, each: Tensor) -> Tensor:
+        """[K]: the cost of bodies that cast shadows `each` [K, N, H, W] in some beams, and not in others."""
+        seen = each.sum((2, 3)) / self.mesh.volume
+        lacking = torch.zeros(len(each), dtype=seen.dtype)
+        for time in self.instants:
+            own = seen[:, torch.from_numpy(self.seen.times == time)]
+            lacking += (own.amax(1, keepdim=True) - own).sum(1)
+        return HIDDEN * self.shadow * lacking
 
     def strained(self, poses: Sequence[Pose]) -> float:
         """The cost of strains and turns."""

@@ -6,10 +6,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-import torch
 
 from .poses import Explained, Pose
-from .templates import VISIBLE, Hit, Search
+from .templates import Hit, Search
 
 LEAST, ALSO = 0.35, 0.8
 """Share of what its shadow is worth by which a body must explain the frames; and share of the best one's from which on
@@ -83,33 +82,6 @@ def exchanged(every: Explained, search: Search, found: list[Pose]) -> list[Pose]
         if left.value(others) < left.value([found[i], found[j]]):
             found[i], found[j] = others
     return every.improved(found, STEPS)
-
-
-def merged(every: Explained, search: Search, found: list[Pose]) -> list[Pose]:
-    """The same bodies, but one where the beams cross in place of two of one height, each of which only one of two beams
-    shows: if it explains nearly all of its shadow (`SURE`).
-
-    At one time two bodies beyond the other beam's field explain as much as the one that casts both shadows, and have
-    more freedom; so the search for what explains most may end with them.
-    """
-    while two_beams(search):
-        shown = _shown(every, found)
-        pairs = [(i, j) if shown[i, 0] else (j, i) for i, j in level_pairs(every, found) if (shown[i] ^ shown[j]).all()]
-        for i, j in pairs:
-            rest = [pose for k, pose in enumerate(found) if k not in (i, j)]
-            one = swapped(every, search, found, i, j)[0]
-            if every.without(rest).share(one) >= SURE:
-                found = every.improved([*rest, one], STEPS)
-                break
-        else:
-            break
-    return found
-
-
-def _shown(every: Explained, found: Sequence[Pose]) -> np.ndarray:
-    """[K, 2] bool: whether each of two beams shows a body."""
-    each = every.each(found)[:, torch.from_numpy(_directions(every))]
-    return (each.sum((2, 3)) > VISIBLE * every.mesh.volume).numpy()
 
 
 def two_beams(search: Search) -> bool:

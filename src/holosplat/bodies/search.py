@@ -14,11 +14,9 @@ from ..mesh import TriangleMesh
 from ..scan import Scan
 from .moments import moments, stretched_like
 from .poses import FREER, Explained, Pose
-from .pursuit import merged
 from .replaced import Heard, pursued
 from .rest_shape import KnownBody
 from .shadows import Shadows
-from .templates import Search, Templates
 
 SEARCH_RADIUS = 2.8
 """Radius of the ball of a body's volume in pixels of the search, whose frames are binned to about that."""
@@ -56,11 +54,6 @@ class BodySearch:
         """Poses of bodies `size` times as large, on paths near `velocities` [K, 3], and whether the search began with
         bodies in the poses `like` (`pursued`); all in pixels of the search."""
         return pursued(sized(self.mesh, size), self.seen, velocities, like, seed, on_progress, steps)
-
-    def merged(self, poses: list[Pose]) -> list[Pose]:
-        """Poses of one body where two beams cross in place of two of which each shows one (`pursuit.merged`)."""
-        search = Search(Templates.of(self.mesh, self.seen), self.seen, np.zeros((1, 3)))
-        return merged(Explained(self.mesh, self.seen, FREER), search, poses)
 
     def of_best_size(
         self, poses: Sequence[Pose], size: float = 1.0, steps: Steps | None = None

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..matter import DeltaBeta
 from ..optics.noise import noise_level, noise_levels
-from ..optics.retrieval import tikhonov
+from ..optics.retrieval import tikhonov, without_halo
 from ..projectors.surface import surface_thickness
 from ..scan import Scan
 from ..units import wavelength, wavenumber
@@ -45,13 +45,15 @@ class Shadows:
         exposures, views, pitch = scan.exposures, scan.views, scan.views.pixel_size
         frames = torch.from_numpy(scan.frames)
         thickness = tikhonov(frames, exposures, *material).double() / pitch
+        noise = noise_level(thickness.float())
+        thickness = without_halo(thickness, noise)
         per_pixel = 2 * wavenumber(exposures.energy_kev) * exposures.refraction(*material)[0] * pitch
         return cls(
             thickness.numpy(),
             torch.from_numpy(np.ascontiguousarray(views.rotations)),
             torch.from_numpy(views.shifts / pitch),
             2 * (exposures.time - first) / (last - first) - 1,
-            noise_level(thickness.float()),
+            noise,
             wavelength(exposures.energy_kev) * exposures.distance / pitch**2,
             per_pixel / max(float(noise_levels(frames).mean()), QUIETEST),
         )

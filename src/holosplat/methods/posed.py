@@ -128,7 +128,7 @@ def _posed(task: Task, material: DeltaBeta, body: KnownBody, seen: Sequence[Tria
     poses, _ = search.poses(np.zeros((1, 3)), like, seed=task.seed, on_progress=lambda part: report(SEARCHED * part))
     if not poses:
         return None
-    size, poses = search.of_best_size(search.merged(poses))
+    size, poses = search.of_best_size(poses)
     rest = sized(body.mesh(pixel), size)
     nodes = np.array([pose.scaled(search.bin).nodes(rest.vertices, 0.0) for pose in poses])
     return _Posed(rest, nodes, Matter.one(*material), pixel)

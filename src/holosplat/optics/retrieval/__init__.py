@@ -16,6 +16,7 @@ from ...scan import Exposures
 from .admm import ADMM, admm
 from .bounded import Estimate, bounded_estimate
 from .contact import absorption_alone
+from .halo import without_halo
 from .iterative import Projections, gerchberg_saxton, hybrid_input_output
 from .linear import Linear, contrast_transfer, invert_contrast, paganin, retrieve_thickness
 from .nonlinear import Tikhonov, tikhonov
@@ -71,4 +72,5 @@ __all__ = [
     "paganin",
     "retrieve_thickness",
     "tikhonov",
+    "without_halo",
 ]
