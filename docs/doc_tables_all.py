@@ -275,6 +275,7 @@ TABLES |= {
         ("full", lambda: thesis.configurations("full")),
         ("others", lambda: thesis.others("short")),
         ("others-third", lambda: thesis.others("third")),
+        ("others-full", lambda: thesis.others("full")),
         ("findings", thesis.verdicts),
         ("left", thesis.left),
     )
