@@ -24,9 +24,10 @@ import numpy as np
 import torch
 from espresso_flow import Run
 from machine import commit, memory_megabytes
+from scipy.spatial.transform import Rotation
 
 import holosplat as hs
-from holosplat.bodies.moments import centroid
+from holosplat.bodies.moments import centroid, second_moments
 from holosplat.bodies.rest_shape import KnownBody
 from holosplat.geometry import Grid
 from holosplat.io.atomic import atomic_path
@@ -38,6 +39,7 @@ from holosplat.motion.measures import area
 from holosplat.motion.track import Followed, TrackOptions, follow
 from holosplat.representations import MovingSurfaces
 from holosplat.specimens.mesh_series import MeshSeries
+from holosplat.specimens.red_cells import icosphere
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "motion.csv"
 ABLATION = PAGE.with_name("motion_ablation.csv")
@@ -45,6 +47,8 @@ ANGLES = {
     "flow4": (0.0, 45.0, 90.0, 135.0),
     "flow3": (0.0, 30.0, 48.0),
     "flow2": (0.0, 90.0),
+    "flow2n": (0.0, 23.8),
+    "flow2-ellipsoids": (0.0, 90.0),
     "flow3-tomography": (0.0, 30.0, 48.0),
     "flow3-body": (0.0, 30.0, 48.0),
     "flow2-body": (0.0, 90.0),
@@ -54,6 +58,10 @@ BODY = "-body"
 """End of the names of cases in which the cells are known to be red cells."""
 UNLEARNED = "-tomography"
 """End of the names of cases in which no network is asked."""
+FOREIGN = "-ellipsoids"
+"""End of the names of cases of stiff ellipsoids of the cells' volume, which go and turn as the cells do."""
+ELLIPSOID = (1.4, 1.0, 1 / 1.4)
+"""Their half axes, over the radius of a ball of their volume; the shortest is across a resting cell."""
 SHAPE, PIXEL, PHOTONS = (128, 96), 0.5e-6, 1000.0
 MATERIAL = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
 TURN = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])
@@ -107,6 +115,22 @@ def cells_in_flow(data: Path, first: int, times: int, every: int = 1) -> MeshSer
     nodes, when = (run.nodes[first::every] - middle) @ TURN.T, run.times[first::every] - run.times[first]
     snapshots = [[TriangleMesh(cell, run.rest.faces, f"cell{k:02d}") for k, cell in enumerate(at)] for at in nodes]
     return MeshSeries(tuple(hs.MeshScene.of_one_material(at, MATERIAL) for at in snapshots), when)
+
+
+def ellipsoids(cells: MeshSeries) -> MeshSeries:
+    """Stiff ellipsoids in the place of `cells`, turned as the best rigid motion from the first time on turns these."""
+    (ball, faces), first = icosphere(3), cells.snapshots[0].meshes
+    radius = (3 * np.mean([mesh.volume for mesh in first]) / (4 * np.pi)) ** (1 / 3)
+    axes = [np.linalg.eigh(second_moments(mesh))[1][:, ::-1] for mesh in first]
+    snapshots = []
+    for scene in cells.snapshots:
+        found = []
+        for start, mesh, frame in zip(first, scene.meshes, axes):
+            turn, _ = Rotation.align_vectors(mesh.vertices - centroid(mesh), start.vertices - centroid(start))
+            own = turn.as_matrix() @ frame * np.array([1, 1, np.linalg.det(frame)])
+            found.append(TriangleMesh((ball * ELLIPSOID * radius) @ own.T + centroid(mesh), faces, mesh.name))
+        snapshots.append(hs.MeshScene.of_one_material(found, MATERIAL))
+    return MeshSeries(tuple(snapshots), cells.times)
 
 
 def imaged(cells: MeshSeries, angles: tuple[float, ...], seed: int) -> hs.Scan:
@@ -201,6 +225,7 @@ def options_without(prior: str) -> TrackOptions:
 def row_of(case: str, data: Path, first: int, times: int, every: int, seed: int, without: str) -> Row:
     """One run of `case`."""
     cells = cells_in_flow(data, first, times, every)
+    cells = ellipsoids(cells) if case.endswith(FOREIGN) else cells
     scan = imaged(cells, ANGLES[case], seed)
     began = time.perf_counter(), time.process_time()
     options = replace(options_without(without), body=KnownBody() if case.endswith(BODY) else None)
