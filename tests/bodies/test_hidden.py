@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from helpers.motion_shadows import OTHER, TURN, cell, pose, shadows
+from holosplat.bodies.pool import Pool
 from holosplat.bodies.poses import FREER, HIDDEN, Explained, Pose
 from holosplat.bodies.replaced import pursued
 from holosplat.bodies.shadows import Shadows
@@ -55,3 +56,10 @@ def test_a_body_that_one_beam_alone_shows_is_kept():
     found, _ = pursued(cell(), shadows([truth]), np.zeros((1, 3)), [truth])
     assert len(found) == 1
     assert np.abs(found[0].centre[:2] - truth.centre[:2]).max() < 0.5
+
+
+def test_a_choice_of_candidates_prefers_what_does_not_hide():
+    every = explained(shadows([still(TURN, TRUTH)]))
+    pool = Pool(every)
+    pool.add([*(still(TURN, ghost) for ghost in GHOSTS), still(TURN, TRUTH)])
+    assert [tuple(one.centre) for one in pool.chosen(np.random.default_rng(0))] == [TRUTH]

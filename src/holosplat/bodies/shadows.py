@@ -13,11 +13,15 @@ from ..matter import DeltaBeta
 from ..optics.noise import noise_level, noise_levels
 from ..optics.retrieval import tikhonov, without_halo
 from ..projectors.surface import surface_thickness
-from ..scan import Scan
+from ..scan import Exposures, Scan
 from ..units import wavelength, wavenumber
 
 QUIETEST = 1e-4
 """Noise of frames that is assumed at least."""
+AIR = 0.1
+"""Thickness that passes for air, at least [pixels]."""
+ALONG = 1e-9
+"""By how much directions of rows may differ [1], and places of rows [m], for these to be the same."""
 EVERYWHERE = 1e-3
 """Information at all frequencies beside that of phase contrast: frames in contact have that alone."""
 
@@ -46,7 +50,7 @@ class Shadows:
         frames = torch.from_numpy(scan.frames)
         thickness = tikhonov(frames, exposures, *material).double() / pitch
         noise = noise_level(thickness.float())
-        thickness = without_halo(thickness, noise)
+        thickness = _without_halos(thickness, exposures, noise)
         per_pixel = 2 * wavenumber(exposures.energy_kev) * exposures.refraction(*material)[0] * pitch
         return cls(
             thickness.numpy(),
@@ -107,3 +111,28 @@ class Shadows:
             images.append((own, found))
         order = np.argsort(np.concatenate([own for own, _ in images]))
         return torch.cat([found for _, found in images])[torch.from_numpy(order)]
+
+
+def _without_halos(thickness: Tensor, exposures: Exposures, noise: float) -> Tensor:
+    """Thickness [N, H, W] [pixels] without the halos of bodies that an edge cuts, at times where that is likelier.
+
+    What is fitted for a halo may be matter, where bodies fill an edge. So it is taken out at a time only if beams then
+    agree better on how much matter each row holds (the moments of order zero: Helgason 1999, The Radon Transform,
+    section 1.2), or if more of their frames is air.
+    """
+    cleared, limit = without_halo(thickness, noise), max(AIR, 2 * noise)
+    found, views = thickness.clone(), exposures.views
+    for time in np.unique(exposures.time):
+        own = np.flatnonzero(exposures.time == time)
+        before, after = thickness[own], cleared[own]
+        alike = np.ptp(views.rotations[own, 1], axis=0).max() < ALONG and np.ptp(views.shifts[own, 1]) < ALONG
+        agreed = alike and _disagreement(after) < _disagreement(before)
+        if agreed or (after.abs() < limit).sum() > (before.abs() < limit).sum():
+            found[own] = after
+    return found
+
+
+def _disagreement(thickness: Tensor) -> float:
+    """Of frames [N, H, W] on how much matter each row holds, over how much that is: a root mean square."""
+    rows = thickness.sum(2)
+    return float((rows - rows.mean(0)).square().mean().sqrt() / rows.abs().mean().clamp_min(1e-12))
