@@ -39,9 +39,8 @@ class Pool:
         """Further candidates."""
         for pose in poses:
             self.poses.append(pose)
-            shadow = self.every.each([pose])
-            self._rows.append(csr_array(shadow.reshape(1, -1).float().numpy()))
-            self._own.append(self.every.strained([pose]) + float(self.every.hidden(shadow)))
+            self._rows.append(csr_array(self.every.images([pose]).reshape(1, -1).astype(np.float32)))
+            self._own.append(self.every.strained([pose]) + float(self.every.hidden([pose])))
 
     def chosen(self, draws: np.random.Generator) -> list[Pose]:
         """Those that explain most together."""

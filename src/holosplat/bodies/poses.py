@@ -24,7 +24,7 @@ STRAIN, FREER = 0.02, 0.001
 found one after the other, when those that stand for several need larger strains; and then, for cells in flow have large
 strains, and their shadows tell the wrong ones better where these cost little."""
 HIDDEN = 0.15
-"""Cost of a body that one beam shows and another does not, as a share of what its shadow there would cost: at one time
+"""Cost at one time of a body that one beam shows and another does not, as a share of what its shadow there would cost:
 two of these explain what one body casts, and with more freedom."""
 SHADOW = 0.2
 """Part of a body's largest thickness from which on a pixel is in its shadow."""
@@ -130,18 +130,16 @@ class Explained:
 
     def value(self, poses: Sequence[Pose]) -> float:
         """What is to be small: the cost of what `poses` leave, of their strains and turns, and of where they hide."""
-        each = self.each(poses)
-        left = float(self.cost(self.seen.thickness - each.sum(0).numpy()))
-        return left + self.strained(poses) + float(self.hidden(each).sum())
+        left = float(self.cost(self.seen.thickness - self.images(poses)))
+        return left + self.strained(poses) + float(self.hidden(poses).sum())
 
-    def hidden(self, each: Tensor) -> Tensor:
-        """[K]: the cost of bodies that cast shadows `each` [K, N, H, W] in some beams, and not in others."""
-        seen = each.sum((2, 3)) / self.mesh.volume
-        lacking = torch.zeros(len(each), dtype=seen.dtype)
-        for time in self.instants:
-            own = seen[:, torch.from_numpy(self.seen.times == time)]
-            lacking += (own.amax(1, keepdim=True) - own).sum(1)
-        return HIDDEN * self.shadow * lacking
+    def hidden(self, poses: Sequence[Pose]) -> Tensor:
+        """[K]: the cost of bodies that cast shadows in some beams and not in others; none at several times, whose paths
+        tell such bodies."""
+        if len(self.instants) > 1:
+            return torch.zeros(len(poses), dtype=torch.float64)
+        seen = self.each(poses).sum((2, 3)) / self.mesh.volume
+        return HIDDEN * self.shadow * (seen.amax(1, keepdim=True) - seen).sum(1)
 
     def strained(self, poses: Sequence[Pose]) -> float:
         """The cost of strains and turns."""

@@ -50,7 +50,7 @@ class Shadows:
         frames = torch.from_numpy(scan.frames)
         thickness = tikhonov(frames, exposures, *material).double() / pitch
         noise = noise_level(thickness.float())
-        thickness = _without_halos(thickness, exposures, noise)
+        thickness = _without_halos(thickness, exposures, noise) if np.ptp(exposures.time) == 0 else thickness
         per_pixel = 2 * wavenumber(exposures.energy_kev) * exposures.refraction(*material)[0] * pitch
         return cls(
             thickness.numpy(),
@@ -114,22 +114,16 @@ class Shadows:
 
 
 def _without_halos(thickness: Tensor, exposures: Exposures, noise: float) -> Tensor:
-    """Thickness [N, H, W] [pixels] without the halos of bodies that an edge cuts, at times where that is likelier.
+    """Thickness [N, H, W] [pixels] of one time without the halos of bodies that an edge cuts, where that is likelier.
 
-    What is fitted for a halo may be matter, where bodies fill an edge. So it is taken out at a time only if beams then
-    agree better on how much matter each row holds (the moments of order zero: Helgason 1999, The Radon Transform,
-    section 1.2), or if more of their frames is air.
+    What is fitted for a halo may be matter, where bodies fill an edge. So it is taken out only if beams then agree
+    better on how much matter each row holds (the moments of order zero: Helgason 1999, The Radon Transform, section
+    1.2), or if more of the frames is air.
     """
-    cleared, limit = without_halo(thickness, noise), max(AIR, 2 * noise)
-    found, views = thickness.clone(), exposures.views
-    for time in np.unique(exposures.time):
-        own = np.flatnonzero(exposures.time == time)
-        before, after = thickness[own], cleared[own]
-        alike = np.ptp(views.rotations[own, 1], axis=0).max() < ALONG and np.ptp(views.shifts[own, 1]) < ALONG
-        agreed = alike and _disagreement(after) < _disagreement(before)
-        if agreed or (after.abs() < limit).sum() > (before.abs() < limit).sum():
-            found[own] = after
-    return found
+    cleared, limit, views = without_halo(thickness, noise), max(AIR, 2 * noise), exposures.views
+    alike = np.ptp(views.rotations[:, 1], axis=0).max() < ALONG and np.ptp(views.shifts[:, 1]) < ALONG
+    agreed = alike and _disagreement(cleared) < _disagreement(thickness)
+    return cleared if agreed or (cleared.abs() < limit).sum() > (thickness.abs() < limit).sum() else thickness
 
 
 def _disagreement(thickness: Tensor) -> float:
