@@ -15,8 +15,8 @@ MAPPED, RESIDENT = 1.0e9, 0.4e9
 """Bytes of address space and of memory that commands take until they begin with their work."""
 UNMAPPED = re.compile("failed to map segment|cannot allocate|cannot enable executable stack", re.IGNORECASE)
 """What loaders of libraries say where there is no memory for one."""
-UNSAID = "returned NULL without setting an exception"
-"""What Python says where its compiler has found no memory for a module."""
+UNSAID = re.compile("returned NULL without setting an exception|error return without exception set")
+"""What Python says where it has found no memory, for a module that it compiles or for anything else."""
 
 
 def main() -> None:
@@ -34,7 +34,7 @@ def main() -> None:
     except MemoryError:
         give_up(_too_little("its libraries find no room"))
     except SystemError as error:
-        if UNSAID not in str(error):
+        if not UNSAID.search(str(error)):
             raise
         give_up(_too_little("Python finds no room to read a library"))
 
