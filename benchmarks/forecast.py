@@ -170,10 +170,11 @@ def rows_of(
     cells = cells_in_flow(data, first, times + max(AHEAD))
     scan = imaged(cells, ANGLES[case], seed)
     kept = scan[np.flatnonzero(scan.exposures.time <= cells.times[times - 1])]
-    bodies, halves = (
-        (truly(cells, times), None) if true else tracked(kept, seed, keep, f"{case}_{first}_{times}_{seed}")
-    )
-    pairs, last, named = followed(bodies, cells, times - 1), times - 1, "true" if true else case
+    if true:
+        named, bodies, halves = "true", truly(cells, times), None
+    else:
+        named, (bodies, halves) = case, tracked(kept, seed, keep, f"{case}_{first}_{times}_{seed}")
+    pairs, last = followed(bodies, cells, times - 1), times - 1
     exposures = hs.Exposures.of(hs.Views.from_angles(np.array(ANGLES[case]), SHAPE, PIXEL), 20.0, 0.1)
     frames = {h: hs.simulate(cells, exposures.repeated(cells.times[[last + h]])) for h in AHEAD}
     judge = Judge(cells, pairs, frames, intensity_range(kept.frames), last)

@@ -97,6 +97,7 @@ def test_a_block_is_what_is_left_from_a_task_on(fresh, done):
     worked(holosplat("series", "run", fresh.path, 1, "--block", 9, "--retry"))
     assert [fresh.state(window).state for window in fresh.plan().windows()] == ["left", "done", "done"]
     refused(holosplat("series", "run", fresh.path, 3, "--block", 2), "counted from 0 to 2")
+    refused(holosplat("series", "run", fresh.path, "--block", 2), "--block goes with a task's number or --slurm")
 
 
 def test_a_script_is_submitted_when_it_is_asked_for(fresh, tmp_path, monkeypatch):

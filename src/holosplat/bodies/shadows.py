@@ -50,7 +50,8 @@ class Shadows:
         frames = torch.from_numpy(scan.frames)
         thickness = tikhonov(frames, exposures, *material).double() / pitch
         noise = noise_level(thickness.float())
-        thickness = _without_halos(thickness, exposures, noise) if np.ptp(exposures.time) == 0 else thickness
+        if np.ptp(exposures.time) == 0:  # a search of several times found fewer bodies so (docs/motion.md)
+            thickness = _without_halos(thickness, exposures, noise)
         per_pixel = 2 * wavenumber(exposures.energy_kev) * exposures.refraction(*material)[0] * pitch
         return cls(
             thickness.numpy(),

@@ -161,6 +161,8 @@ def run(
 
     ways = [task is not None, jobs != 0, dask is not None, cluster.slurm or cluster.submit]
     require(sum(ways) < 2, "give one of a task's number, --jobs, --dask and --slurm.")
+    alone = cluster.block == 1 or task is not None or cluster.slurm or cluster.submit
+    require(alone, "--block goes with a task's number or --slurm; give one of these, or leave it.")
     series = SeriesFolder(folder)
     if cluster.slurm or cluster.submit:
         cluster.carry_out(series, retry)
