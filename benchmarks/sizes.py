@@ -23,6 +23,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # without bytecode, a second of each run would be Python's compiler
 
 import numpy as np
 import rows

@@ -18,7 +18,7 @@ from torch import Tensor
 from ..backends import Backend, device, resolve
 from ..checks import at_least
 from ..geometry import Grid, Views
-from ..materials import DeltaBeta
+from ..matter import DeltaBeta
 from ..memory import memory_kept
 from ..model import Instrument, SolvedLight
 from ..optics.background import Light

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from ..checks import InputError
-from ..materials import DeltaBeta
+from ..matter import DeltaBeta
 from ..model import Instrument
 from ..optics.background import DARKEST, Background, Light, LightOptions
 from ..optics.noise_model import NoiseModel

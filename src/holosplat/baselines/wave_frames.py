@@ -5,7 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
-from ..materials import DeltaBeta
+from ..matter import DeltaBeta
 from ..model import Instrument
 from ..volume import LineIntegrals
 

@@ -38,8 +38,7 @@ if TYPE_CHECKING:
     from ..beamline.scenes import Filling
     from ..beamline.series import SeriesFiles, Timing
     from ..beamline.simulate import Shutter, Simulation
-    from ..materials import DeltaBeta
-    from ..matter import MaterialPrior, MatterKind
+    from ..matter import DeltaBeta, MaterialPrior, MatterKind
     from ..methods import Method
     from ..scan import Exposures
 

@@ -152,17 +152,16 @@ class WhitenedFrames:
         """√I₀ [V, H, W]."""
         return self._amplitudes
 
-    def slopes(self, lines: Tensor, changes: list[Tensor]) -> list[Tensor]:
-        """Derivatives [V, H, W] of the amplitudes at line integrals [V, H, W] along each of `changes`."""
+    def slopes(self, lines: Tensor, changes: list[Tensor], now: Tensor) -> list[Tensor]:
+        """Derivatives [V, H, W] of the amplitudes `now` of line integrals [V, H, W] along each of `changes`."""
         with torch.no_grad():
-            now = self.amplitudes(lines)
             return [(self.amplitudes(lines + LITTLE * change) - now) / LITTLE for change in changes]
 
     def normal_equations(self, lines: Tensor, changes: list[Tensor]) -> tuple[Tensor, Tensor]:
         """`Jᵀ P⁻¹ J` [K, K] and `-gradient` [K], float64, along K changes [V, H, W] of the line integrals."""
-        slopes = self.slopes(lines, changes)
         with torch.no_grad():
             now = self.amplitudes(lines)
+        slopes = self.slopes(lines, changes, now)
         weighted = [self.whitened(slope).double().flatten() for slope in slopes]
         missing = (self._amplitudes - now).double().flatten()
         matrix = torch.stack([torch.stack([s.double().flatten() @ w for w in weighted]) for s in slopes])

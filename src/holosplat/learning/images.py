@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..materials import DeltaBeta
+from ..matter import DeltaBeta
 from ..optics.retrieval import Tikhonov, tikhonov
 from ..scan import Exposures
 from .network import THICKNESS

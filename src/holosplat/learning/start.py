@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
 from ..geometry import Grid, Views
-from ..materials import DeltaBeta
+from ..matter import DeltaBeta
 from ..optics.noise import noise_levels
 from ..progress import Progress
 from ..ranges import Natural, Share, Weight, ranged

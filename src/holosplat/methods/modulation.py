@@ -124,10 +124,11 @@ class Ranges:
         """Least squares by frequencies up to `limit`."""
         changes, problem = modulations(u, plateau(u)), self.problem
         lines = problem.lines(u)
-        slopes = self.frames.slopes(lines, [problem.lines(change) for change in changes])
+        now = self.frames.amplitudes(lines)
+        slopes = self.frames.slopes(lines, [problem.lines(change) for change in changes], now)
         weight = self._weight(limit)
         spectra = torch.fft.rfft2(torch.stack(slopes), norm="ortho")
-        left = torch.fft.rfft2(self._left(lines), norm="ortho")
+        left = torch.fft.rfft2(self._left(now), norm="ortho")
         weighted = (spectra * weight).flatten(1)
         matrix = (weighted @ spectra.flatten(1).conj().T).real.double()
         right = (weighted @ left.flatten().conj()).real.double()
@@ -143,7 +144,7 @@ class Ranges:
     def misfit(self, u: Tensor, limit: float) -> float:
         """χ² of u by frequencies up to `limit`."""
         with torch.no_grad():
-            left = torch.fft.rfft2(self._left(self.problem.lines(u)), norm="ortho")
+            left = torch.fft.rfft2(self._left(self.frames.amplitudes(self.problem.lines(u))), norm="ortho")
         return float((self._weight(limit) * left.abs().square()).double().sum())
 
     def _weight(self, limit: float) -> Tensor:
@@ -154,9 +155,8 @@ class Ranges:
         beyond = self.frames.beyond
         return u[:, beyond : u.shape[1] - beyond].double().sum()
 
-    def _left(self, lines: Tensor) -> Tensor:
-        """What is left of measured amplitudes."""
-        now = self.frames.amplitudes(lines)
+    def _left(self, now: Tensor) -> Tensor:
+        """What amplitudes `now` leave of the measured ones."""
         if self._predicted is not None:
             self._offset, self._predicted = self._predicted.clamp_min(0).sqrt().to(now) - now, None
         return self.frames.measured - now - self._offset

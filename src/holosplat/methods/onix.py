@@ -25,8 +25,7 @@ from ..fit.terms.aligned import AlignedFrames, AlignedLines
 from ..geometry import Grid
 from ..learning.aligned_weights import ONIX, PIXELNERF, read_aligned
 from ..learning.images import images, retrieved_thickness
-from ..materials import DeltaBeta
-from ..matter import Matter
+from ..matter import DeltaBeta, Matter
 from ..optics.noise import noise_levels
 from ..ranges import Natural, Rate, Share, Weight, ranged
 from ..representations import AlignedNetwork, PixelAligned, PixelAlignedField, Stored

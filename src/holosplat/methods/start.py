@@ -14,7 +14,6 @@ from ..backends import resolve
 from ..baselines import holographic_tv
 from ..baselines.two_materials import Shares, absorption, at_one_ratio, told_apart, two_levels
 from ..geometry import Grid
-from ..materials import WATER
 from ..matter import DeltaBeta, KnownRatio, Matter
 from ..optics.noise import noise_share
 from ..optics.retrieval import retrieve_thickness
@@ -112,6 +111,8 @@ def _spacing_px(scan: Scan, options: GaussianOptions) -> float:
 
 def _random(task: Task, options: GaussianOptions) -> GaussianCloud:
     """The thesis' start; amplitudes are in units of the known material, or else of water."""
+    from ..materials import WATER  # which needs xraydb, and that a database
+
     task.on_progress("random start", 0.0)
     scan, prior = task.scan, task.prior
     material = WATER.delta_beta(scan.exposures.reference_energy)

@@ -12,8 +12,7 @@ from ..backends import resolve
 from ..baselines.holographic_tv import agreed
 from ..checks import InputError, require
 from ..geometry import Grid
-from ..materials import DeltaBeta
-from ..matter import Matter
+from ..matter import DeltaBeta, Matter
 from ..representations import SurfaceMesh
 from .coarse import settled
 from .cross_validation import predicted_frames

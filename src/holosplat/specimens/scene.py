@@ -9,7 +9,7 @@ import numpy as np
 
 from ..checks import require
 from ..geometry import Grid, Views
-from ..materials import DeltaBeta
+from ..matter import DeltaBeta
 from ..mesh import TriangleMesh
 from ..projectors.mesh import mesh_line_integrals, voxelise_meshes
 from ..volume import LineIntegrals, Volume

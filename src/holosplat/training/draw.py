@@ -14,7 +14,7 @@ from ..beamline.misalignment import Misalignment
 from ..bench.declaration import Beam, Declaration, Detector, Listed, Matter, Substance
 from ..bench.soft_specimens import SoftCells
 from ..bench.specimens import Capsules, CrowdedCells, FoamDrop, RedCells, Specimen
-from ..materials import DeltaBeta
+from ..matter import DeltaBeta
 from ..specimens.red_cells import DIAMETER, evans_fung_cell
 from ..units import wavelength
 from .ranges import Kind, Ranges
