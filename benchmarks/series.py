@@ -8,8 +8,8 @@ Cases, on cells of haemoglobin that drift by 0.3 pixels from one time to the nex
 - warm: a window of times at 128 × 128 pixels: seconds of a time that begins by itself, and of those that go on from it,
   and the Dice of the last one beside that of the same time by itself.
 - volume: the same of continuous matter (a stirred blob), fitted as a smooth volume.
-- processes: windows of one time (--windows) by one process and by two, of one thread each, and by one of two threads;
-  and plain Python, which shares nothing, by one process and by two: more than that the two cores do not give.
+- processes: windows of one time (--windows), and as many of sixteen, by one process and by two of one thread
+  each; and plain Python, which shares nothing, by one process and by two: more than that the two cores do not give.
 - kills: a run that is killed (kill -9) at random moments, how many times it loses, and whether the rerun is bitwise
   equal.
 - overhead: what a task takes beside its fits, and what a process takes before its first one.
@@ -64,11 +64,12 @@ from holosplat.series.task import run_task
 from holosplat.specimens.mesh_series import MeshSeries
 from holosplat.specimens.red_cells import random_cells
 
-THREADS = ("OMP_NUM_THREADS", "MKL_NUM_THREADS")
 PIXEL, CELL_PX, PHOTONS, STEP_PX = 0.5e-6, 16.0, 1000.0, 0.3
 ANGLES = (0.0, 45.0, 90.0, 135.0)
 SEED = 101
 """Settings were chosen on scenes of seeds below 100."""
+LONGER = 16
+"""Times of the longer windows, as many as `series plan` makes them."""
 COLUMNS = ("case", "measure", "value", "pixels", "count", "seed", "load_before", "load_after", "machine", "commit")
 
 
@@ -83,12 +84,13 @@ class Options:
 
 
 def drifting(pixels: int, cells: int, times: int) -> tuple[MeshSeries, hs.Scan]:
-    """Cells that drift, each its own way, and their frames."""
+    """Cells that drift, each its own way and back after sixteen times, and their frames."""
     material = hs.materials.HAEMOGLOBIN.delta_beta(20.0)
     still = random_cells(cells, (pixels * PIXEL,) * 3, SEED, CELL_PX * PIXEL)
     ways = np.random.default_rng(SEED).normal(size=(cells, 3))
     ways *= STEP_PX * PIXEL / np.linalg.norm(ways, axis=1, keepdims=True)
-    at = [[TriangleMesh(c.vertices + k * w, c.faces, c.name) for c, w in zip(still, ways)] for k in range(times)]
+    steps = [min(k % 32, 32 - k % 32) for k in range(times)]
+    at = [[TriangleMesh(c.vertices + k * w, c.faces, c.name) for c, w in zip(still, ways)] for k in steps]
     truth = MeshSeries(tuple(hs.MeshScene.of_one_material(m, material) for m in at), 1e-3 * np.arange(times))
     views = hs.Views.from_angles(np.array(ANGLES), (pixels, pixels), PIXEL)
     exposures = hs.Exposures.of(views, 20.0, 0.1).repeated(truth.times)
@@ -173,34 +175,40 @@ def quick() -> Method:
 
 def small(work: Path, times: int, pixels: int) -> Path:
     """The scan of small windows."""
+    work.mkdir(exist_ok=True)
     path = work / "small.nxs"
     write_scan(path, drifting(pixels, 3, times)[1])
     return path
 
 
 def processes(work: Path, options: Options) -> Measured:
-    """Windows of one time by one process and by two, all of which find Python's bytecode written."""
-    pixels = options.pixels or 48
-    scan, settings = small(work, options.windows, pixels), Settings(method=quick(), matter="levels")
-    seconds = {}
-    first = planned(work / "first", scan, settings, 1)
-    subprocess.run(
-        [sys.executable, *PROGRAM, "series", "run", str(first.path), "0"], check=True, stderr=subprocess.DEVNULL
-    )
-    for name, jobs, threads in (("one process", 1, 1), ("two processes", 2, 1), ("one process of two threads", 1, 2)):
-        folder = planned(work / name.replace(" ", "_"), scan, settings, 1)
-        environment = os.environ | {name: str(threads) for name in THREADS}
-        command = [sys.executable, *PROGRAM, "series", "run", str(folder.path)]
-        began, before = time.perf_counter(), used()
-        workers = [subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) for _ in range(jobs)]
-        assert [worker.wait() for worker in workers].count(0) > 0
-        assert {state.state for state in states(folder)} == {"done"}
-        seconds[name] = time.perf_counter() - began
-        yield f"seconds, {name}", seconds[name]
-        yield f"CPU seconds, {name}", used() - before
-    yield "times faster, two processes than one", seconds["one process"] / seconds["two processes"]
+    """Windows of one time, and of `LONGER` times, by one process and by two; all find Python's bytecode written."""
+    settings = Settings(method=quick(), matter="levels")
+    scan = small(work, LONGER * options.windows, options.pixels or 48)
+    short = small(work / "short", options.windows, options.pixels or 48)
+    working(planned(work / "first", small(work / "one", 1, 32), settings, 1), 1)
+    for about, path, times in (("", short, 1), (f", windows of {LONGER} times", scan, LONGER)):
+        seconds = dict[int, float]()
+        for jobs in (1, 2):
+            before = used()
+            folder = planned(work / f"by_{jobs}_in_{times}", path, settings, times)
+            seconds[jobs] = working(folder, jobs)
+            name = f"{'one process' if jobs == 1 else 'two processes'}{about}"
+            yield f"seconds, {name}", seconds[jobs]
+            yield f"CPU seconds, {name}", used() - before
+        yield f"times faster, two processes than one{about}", seconds[1] / seconds[2]
     alone, two = looped(1), looped(2)
     yield "times faster, two processes of plain Python than one", 2 * alone / two
+
+
+def working(folder: SeriesFolder, jobs: int) -> float:
+    """Seconds that `jobs` processes of one thread take for all tasks."""
+    command = [sys.executable, *PROGRAM, "series", "run", str(folder.path)]
+    began = time.perf_counter()
+    workers = [subprocess.Popen(command, stderr=subprocess.DEVNULL) for _ in range(jobs)]
+    assert [worker.wait() for worker in workers].count(0) > 0
+    assert {state.state for state in states(folder)} == {"done"}
+    return time.perf_counter() - began
 
 
 def looped(jobs: int) -> float:
