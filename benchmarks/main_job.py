@@ -1,6 +1,7 @@
 """The main job, measured: simulate, reconstruct, judge, on scenes that no setting was chosen on.
 
     python benchmarks/main_job.py --json                                  # 24 generated cells, seeds 101, 102, 103
+    python benchmarks/main_job.py --preset auto --csv docs/data/main_job_idle.csv    # as reconstruct does it unasked
     python benchmarks/main_job.py --cases ratio free poses noise nine plasma --surfaces     # harder ones, and surfaces
     python benchmarks/main_job.py --cases snapshot --meshes DIR/rbc*_049.vtk
     OMP_NUM_THREADS=1 python benchmarks/main_job.py --cases cells nine --surfaces --csv docs/data/main_job.csv
@@ -30,6 +31,7 @@ from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from holosplat.bench.declaration import Between
+from holosplat.methods import METHODS
 from holosplat.methods.surface_fit import oversampling
 from holosplat.workflows.evaluate import Scores, score_object
 from holosplat.workflows.provenance import environment
@@ -109,27 +111,35 @@ CASES: dict[str, Callable[[int], Case]] = {
 }
 
 
+AS_ASKED = "auto"
+"""What `holosplat reconstruct` does without a method: here surfaces, at once."""
+
+
 def run(case: Case, preset: str, seed: int, surfaces: bool = False) -> list[dict[str, Any]]:
-    """Simulate, reconstruct and score one case; with `surfaces`, a second row for those fitted from the Gaussians."""
+    """Simulate, reconstruct and score one case; with `surfaces`, a second row for those fitted from the Gaussians.
+
+    preset: of Gaussians, or `AS_ASKED`.
+    """
     scan = case.scan(seed)
     truth = case.scene.voxelise(hs.Grid.of_views(case.exposures.views))
     began, cpu = time.perf_counter(), time.process_time()
-    result = hs.reconstruct(scan, case.prior, hs.preset(preset), seed)
+    result = hs.reconstruct(scan, case.prior, METHODS[AS_ASKED] if preset == AS_ASKED else hs.preset(preset), seed)
     seconds, cpu_seconds = time.perf_counter() - began, time.process_time() - cpu
-    assert isinstance(result.object, hs.representations.GaussianCloud)
+    clouds = isinstance(result.object, hs.representations.GaussianCloud)
+    assert clouds or isinstance(result.object, hs.representations.SurfaceMesh)
     scores = hs.evaluate(result, scan, truth)
     material = scores.as_dict()["material"]
     rows = [
         {
-            "method": "gaussians",
+            "method": "gaussians" if clouds else "surfaces",
             "seconds": seconds,
             "cpu_seconds": cpu_seconds,
             **{f"{stage}_seconds": value for stage, value in result.timing.items()},
-            "gaussians": len(result.object),
+            "gaussians": len(result.object) if clouds else 0,
             **numbers(scores, material),
         }
     ]
-    if surfaces:
+    if surfaces and clouds:
         began, cpu = time.perf_counter(), time.process_time()
         found = hs.methods.refine_surfaces(result.object, scan)
         seconds += time.perf_counter() - began
@@ -153,7 +163,7 @@ def main() -> None:
     parser.add_argument("--cases", nargs="+", choices=(*CASES, "snapshot"), default=["cells"])
     parser.add_argument("--meshes", type=Path, nargs="*", default=[])
     parser.add_argument("--seeds", type=int, nargs="+", default=[101, 102, 103])
-    parser.add_argument("--preset", default="default")
+    parser.add_argument("--preset", default="default", help=f"of Gaussians, or {AS_ASKED}: as reconstruct chooses")
     parser.add_argument("--surfaces", action="store_true", help="also fit surfaces; times are those of both together")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--csv", type=Path, help="add rows to this file, but for those that it has")
@@ -164,7 +174,7 @@ def main() -> None:
     kept = read(options.csv) if options.csv else []
     for name in options.cases:
         for seed in [0] if name == "snapshot" else options.seeds:
-            if any((r["case"], r["seed"]) == (name, str(seed)) for r in kept):
+            if any((r["case"], r["seed"], r["preset"]) == (name, str(seed), options.preset) for r in kept):
                 continue
             case = snapshot(options.meshes) if name == "snapshot" else CASES[name](seed)
             rows += [{"case": name, **row} for row in run(case, options.preset, seed, options.surfaces)]
