@@ -36,6 +36,14 @@ def test_help_loads_nothing_heavy(arguments):
     assert f"holosplat {' '.join(arguments)}".strip() in said
 
 
+def test_nothing_is_searched_for_garbage_in_the_end():
+    """Functions that are registered first are called last."""
+    code = "import atexit, gc, sys\natexit.register(lambda: print(gc.get_freeze_count()))\n"
+    code += "sys.argv = ['holosplat', '--version']\nfrom holosplat.cli import main\nmain()"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert int(done.stdout.split()[-1]) > 0
+
+
 def test_the_check_sees_what_is_loaded(tmp_path, monkeypatch):
     """A module that loads h5py, put in the place of a command's, is noticed."""
     (tmp_path / "sitecustomize.py").write_text("import h5py\n")

@@ -5,6 +5,8 @@ Without it, libraries end the process in ways of their own, or Python says which
 
 from __future__ import annotations
 
+import atexit
+import gc
 import re
 import sys
 
@@ -23,6 +25,7 @@ def main() -> None:
     """Run the command that the arguments name; where its libraries find no room, one sentence and exit code 2."""
     if "torch" not in sys.modules:
         _require_room()
+        atexit.register(gc.freeze)  # else Python searches all libraries for garbage as it ends: half a second
     try:
         from .entry import main as run
 
