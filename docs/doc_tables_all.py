@@ -99,7 +99,10 @@ TABLES = {
 }
 TABLES |= {
     name: Table(
-        make, ("redesign/main_job_0.2.json",), "python benchmarks/main_job.py --surfaces --json > FILE", "three minutes"
+        make,
+        ("main_job_idle.csv",),
+        "python benchmarks/main_job.py --seeds 311 312 313 --csv FILE --preset auto, and again with --surfaces alone",
+        "five minutes",
     )
     for name, make in (("readme", runs.readme), ("main-job", runs.main_job), ("wanted", runs.wanted))
 }

@@ -33,6 +33,7 @@ from helpers.retrieval import (
 )
 from holosplat.checks import InputError
 from holosplat.geometry import Views
+from holosplat.optics import sampling
 from holosplat.optics.retrieval import (
     ADMM,
     RETRIEVALS,
@@ -45,7 +46,6 @@ from holosplat.optics.retrieval import (
     gerchberg_saxton,
     hybrid_input_output,
     iterative,
-    model,
     paganin,
     tikhonov,
 )
@@ -253,7 +253,7 @@ def test_each_view_is_on_its_own(name, monkeypatch):
     for v in range(2):
         alone = retrieve(frames[v : v + 1], where[[v]], DELTA, BETA)
         assert float((alone[0] - together[v]).abs().max()) < 0.01 * scale
-    monkeypatch.setattr(model, "MOST_SAMPLES", 1)
+    monkeypatch.setattr(sampling, "MOST_SAMPLES", 1)
     assert float((retrieve(frames, where, DELTA, BETA) - together).abs().max()) < 0.01 * scale
 
 

@@ -86,7 +86,7 @@ def reconstruct(
     strict: bool = False,
     live: LiveFlags = LIVE,
 ) -> None:
-    """Reconstruct a scan by Gaussians, or by another method, into a run folder.
+    """Reconstruct a scan, by what suits its matter or by a method of your choice, into a run folder.
 
     Args:
         scan: Scan: a file (NXtomo), or a folder (tiff, nerf-synthetic, r2-gaussian, or another run's).

@@ -56,7 +56,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "retrieve": ("retrieve", "Retrieve phase and thickness of single frames, into TIFF files or HDF5."),
     "reconstruct": (
         "commands",
-        "Reconstruct a scan by Gaussians, or by another method, into a run folder.",
+        "Reconstruct a scan, by what suits its matter or by a method of your choice, into a run folder.",
     ),
     "track": (
         "track",

@@ -16,7 +16,7 @@ from ..memory import memory_kept
 from ..model import Instrument, Model
 from ..optics.background import Light
 from ..optics.noise_model import NoiseModel
-from ..optics.sampling import fringe_sampling
+from ..optics.sampling import alike, fringe_sampling
 from ..ranges import ranged
 from ..scan import Exposures, Scan
 from ..volume import Object
@@ -64,12 +64,17 @@ class CrossValidation:
 
 
 def predicted_frames(exposures: Exposures, obj: Object, oversample: int = 0) -> Tensor:
-    """Frames [V, H, W] of `obj`, view by view to bound memory; oversample: wave samples a pixel (0: as the first fringe
-    needs)."""
+    """Frames [V, H, W] of `obj`, some views at a time to bound memory.
+
+    oversample: wave samples a pixel (0: as the first fringe needs).
+    """
     samples, backend = oversample or fringe_sampling(exposures), getattr(obj, "backend", "cpu")
-    one = (Instrument(exposures[[i]], samples, backend=backend) for i in range(len(exposures)))
+    frames = torch.empty(len(exposures), *exposures.views.shape)
     with torch.no_grad(), memory_kept():
-        return torch.cat([Model(obj, instrument).frames().cpu() for instrument in one])
+        for views in alike(exposures, samples):
+            instrument = Instrument(exposures[views], samples, backend=backend)
+            frames[torch.from_numpy(views)] = Model(obj, instrument).frames().cpu()
+    return frames
 
 
 class MissingMatter:
@@ -90,7 +95,7 @@ class MissingMatter:
         """Mean square of their contrast."""
 
     def predicted(self, obj: Object, oversample: int = 0) -> Tensor:
-        """Frames [V, H, W] of `obj`, view by view to bound memory.
+        """Frames [V, H, W] of `obj`, some views at a time to bound memory.
 
         oversample: wave samples a pixel (0: as the first fringe needs).
         """

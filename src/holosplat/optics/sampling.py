@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -16,6 +17,8 @@ at the edges of cells are lost (docs/method.md); more cost memory and time as th
 NARROWEST_FRINGE = 1 / 16
 """Pixels on a first fringe below which it needs no samples of its own: light moves by less than a thousandth of a pixel
 where the phase changes by one radian a pixel (λz/2πp²)."""
+MOST_SAMPLES = 4_000_000
+"""Samples of the waves of several views that are worked on at once, where they could follow in turn."""
 GUARD_PX = 5
 """Detector pixels of margin beyond the fringes' reach: room for the point-spread function and faint tails."""
 
@@ -82,3 +85,19 @@ def _is_5_smooth(n: int) -> bool:
         while n % p == 0:
             n //= p
     return n == 1
+
+
+def alike(exposures: Exposures, oversample: int = 0) -> Iterator[np.ndarray]:
+    """Indices of views that share distance, blur and energy, and so a raster, of `MOST_SAMPLES` at most or one by one.
+
+    oversample: wave samples a pixel (0: as the first fringe needs).
+    """
+    optical = exposures.optical
+    optics = np.stack((optical.distance, optical.psf_sigma_px, optical.energy_kev), axis=1)
+    for one in np.unique(optics, axis=0):
+        views = np.flatnonzero((optics == one).all(axis=1))
+        sample = exposures[views[:1]]
+        finer = oversample or fringe_sampling(sample)
+        rows, columns = sample.views.padded(padding(sample, finer)).refined(finer).shape
+        at_once = max(1, MOST_SAMPLES // (rows * columns))
+        yield from (views[i : i + at_once] for i in range(0, len(views), at_once))

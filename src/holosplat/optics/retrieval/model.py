@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, pad
@@ -17,7 +16,7 @@ from ...ranges import Weight, ranged
 from ...scan import Exposures
 from ...units import wavelength
 from ..hologram import hologram, optical_path
-from ..sampling import fringe_sampling, padding
+from ..sampling import alike, fringe_sampling, padding
 from .bounded import MODEL_ERROR, PRIOR, Estimate, bounded_estimate
 from .spectra import (
     Noise,
@@ -36,8 +35,6 @@ from .spectra import (
     squared_frequency,
 )
 
-MOST_SAMPLES = 4_000_000
-"""Samples of the waves worked on at once; more views follow in turn."""
 DARKEST = 1e-3
 """Least intensity under a root, whose slope would have no bound."""
 SHARPENING = 3
@@ -183,11 +180,11 @@ def view_by_view(
     solve: Callable[[Tensor, Exposures, Noise, Advance], Tensor],
     on_progress: Advance,
 ) -> Tensor:
-    """`solve(frames, exposures, noise, on_progress)` of views alike, `MOST_SAMPLES` at a time, with frames checked."""
+    """`solve(frames, exposures, noise, on_progress)` of views alike, some at a time, with frames checked."""
     frames = checked(frames, exposures, delta)
     noise = noise_found(frames, noise)
     found, done = torch.empty_like(frames), 0
-    for index in _batches(exposures):
+    for index in alike(exposures):
         start, share = done / len(exposures), len(index) / len(exposures)
         part = solve(
             frames[index], exposures[index], part_of(noise, index), lambda f, a=start, b=share: on_progress(a + b * f)
@@ -196,15 +193,3 @@ def view_by_view(
         done += len(index)
     on_progress(1.0)
     return found
-
-
-def _batches(exposures: Exposures) -> Iterator[np.ndarray]:
-    """Indices of views that share distance, blur and energy, and so a raster, few enough for memory."""
-    optics = np.stack((exposures.distance, exposures.psf_sigma_px, exposures.energy_kev), axis=1)
-    for one in np.unique(optics, axis=0):
-        alike = np.flatnonzero((optics == one).all(axis=1))
-        sample = exposures[alike[:1]]
-        oversample = fringe_sampling(sample)
-        rows, columns = sample.views.padded(padding(sample, oversample)).refined(oversample).shape
-        at_once = max(1, MOST_SAMPLES // (rows * columns))
-        yield from (alike[i : i + at_once] for i in range(0, len(alike), at_once))
