@@ -179,7 +179,7 @@ def test_a_body_that_is_seen_once_moves_as_the_others_say():
     for _ in range(2):  # as stiff and soft fits do: what is expected comes from the paths before
         term = with_middles(centres.detach().numpy())
         expected = term.expected
-        optimiser = torch.optim.LBFGS([centres], max_iter=200, line_search_fn="strong_wolfe", tolerance_change=1e-12)
+        optimiser = torch.optim.LBFGS([centres], max_iter=70, line_search_fn="strong_wolfe", tolerance_change=1e-12)
 
         def closure(term=term, optimiser=optimiser, centres=centres):
             optimiser.zero_grad()

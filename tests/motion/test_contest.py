@@ -95,7 +95,7 @@ def test_both_are_followed_and_a_run_goes_on_in_either_part(guessed):
     assert (whole.body is None) == whole.begun.endswith("such")
     assert "cells" in kept.states[-1]
     both = [k for k, state in enumerate(kept.states) if "cells" in state]
-    for number in (both[0] - 1, both[len(both) // 3], both[-1], len(kept.states) - 1):
+    for number in (both[0] - 1, both[4 * len(both) // 5], both[-1], len(kept.states) - 1):
         again = follow(two_beams(), MATERIAL, short(), journal=Kept(kept.states[: number + 1]))
         assert torch.equal(again.bodies.coefficients, whole.bodies.coefficients)
         assert again.begun == whole.begun
