@@ -12,10 +12,10 @@ from holosplat.report import hero_figure
 def main(demo: Path) -> None:
     """Draw docs/images/hero.png from the folder that `holosplat demo` made."""
     scan, truth = hs.io.read_scan(demo / "scan.nxs"), hs.io.read_volume(demo / "truth.h5")
-    cloud = hs.load_reconstruction(hs.RunFolder(demo / "run")).object
+    found = hs.load_reconstruction(hs.RunFolder(demo / "run")).object
     held_out = scan.test()
     figure = hero_figure(
-        held_out.frames[0], scan.views.pixel_size, cloud.voxelise(truth.grid), truth=truth, material=cloud.matter.delta
+        held_out.frames[0], scan.views.pixel_size, found.voxelise(truth.grid), truth=truth, material=found.matter.delta
     )
     images = Path(__file__).parent / "images"
     images.mkdir(exist_ok=True)

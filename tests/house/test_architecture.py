@@ -389,7 +389,7 @@ def test_imports_are_light(everything, files):
 
 
 def test_a_task_of_a_series_loads_no_table_of_atoms():
-    """Nor its database, which takes half a second: δ and β are numbers in a plan."""
+    """Nor its database: δ and β are numbers in a plan."""
     code = "import sys\nimport holosplat.series.run\nprint(*(m for m in ('xraydb', 'sqlalchemy') if m in sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

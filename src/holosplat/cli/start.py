@@ -25,7 +25,7 @@ def main() -> None:
     """Run the command that the arguments name; where its libraries find no room, one sentence and exit code 2."""
     if "torch" not in sys.modules:
         _require_room()
-        atexit.register(gc.freeze)  # else Python searches all libraries for garbage as it ends: half a second
+        atexit.register(gc.freeze)  # else Python searches all libraries for garbage as it ends
     try:
         from .entry import main as run
 
