@@ -23,9 +23,10 @@ from ..memory import memory_kept
 from ..model import Instrument, SolvedLight
 from ..optics.background import Light
 from ..optics.noise import noise_share
+from ..optics.noise_model import NoiseModel
 from ..optics.retrieval import Tikhonov, absorption_alone, tikhonov
-from ..optics.retrieval.bounded import MODEL_ERROR, PRIOR
-from ..optics.retrieval.spectra import Raster, filtered, noise_found, radian, response, spectra, surrounded
+from ..optics.retrieval.bounded import MODEL_ERROR
+from ..optics.retrieval.spectra import Prior, Raster, filtered, radian, response, spectra, surrounded
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..projectors.voxels import projector_for
@@ -40,6 +41,9 @@ from .wave_frames import frames_of, refined
 IN_NOISE = 1.0
 """Weight of total variation in rounds of agreement with noisy frames [pixels of path length]: 0.3 left up to a half
 more of the volume's error, and 2 about as much (looked at once; no script keeps it)."""
+
+MISSING = Prior(corner=6.0, decay=1.5)
+"""Expected power of what a volume lacks: flatter than that of matter, whose lowest frequencies it has found first."""
 
 Wanted = Callable[[Tensor, Grid], bool]
 """Whether the volume [Z, Y, X] that tomography has found, and its grid, are to be made to agree with the holograms."""
@@ -156,7 +160,7 @@ def _holographic_tv(
     scan, refine, factor = _working_resolution(scan, options)
     light = light if light is None or factor == 1 else light.part(torch.arange(len(scan)), factor)
     if light is None or light.background is None or options.still_light:  # still light is an unknown of tomography
-        solver = _tomography(scan, material, options, on_progress)
+        solver = _tomography(scan, material, options, on_progress, light)
     else:
         scan, light, solver = _settled(scan, material, options, on_progress, light)
     alone = absorption_alone(scan.exposures, material.beta / material.delta)  # then retrieval left nothing to correct
@@ -167,22 +171,31 @@ def _holographic_tv(
     return _agree(scan, material, solver, options, refine, on_progress, light)
 
 
-def _tomography(scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress) -> PrimalDual:
+def _tomography(
+    scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress, light: Light | None
+) -> PrimalDual:
     """Phase retrieval of each view and total variation: the solver, on voxels of one pixel.
 
     Where its volume has matter at the top or at the bottom, both are done anew with matter beyond the frames; but not
     where a bound says how much of it there is, for it is then right to a few rows without them.
     """
-    solver = _in_rows(scan, material, options, on_progress, 0)
+    solver = _in_rows(scan, material, options, on_progress, 0, light)
     free = options.beyond and options.upper == 0 and options.still_light == 0
     beyond = rows_beyond(solver.volume, scan, material.beta / material.delta) if free else 0
-    return _in_rows(scan, material, options, on_progress, beyond) if beyond else solver
+    return _in_rows(scan, material, options, on_progress, beyond, light) if beyond else solver
 
 
-def _in_rows(scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress, beyond: int) -> PrimalDual:
+def correlated(light: Light | None) -> NoiseModel | None:
+    """The noise where it is known to be correlated; None for white noise, which the frames themselves tell."""
+    return None if light is None or not light.noise.has_grain else light.noise
+
+
+def _in_rows(
+    scan: Scan, material: DeltaBeta, options: HolographicTV, on_progress: Progress, beyond: int, light: Light | None
+) -> PrimalDual:
     """The same for a volume with so many rows beyond the frames."""
     frames, field = torch.from_numpy(scan.frames), scan.views.taller(beyond)
-    how = Tikhonov(iterations=options.retrieval, backend=options.backend, leaves=beyond > 0)
+    how = Tikhonov(iterations=options.retrieval, backend=options.backend, leaves=beyond > 0, noise=correlated(light))
     report = partial(on_progress, "phase retrieval")
     lines = carried_on(tikhonov(frames, scan.exposures, *material, options=how, on_progress=report), beyond)
     rays = rays_of(lines, field, Grid.of_views(field), options.backend)
@@ -210,7 +223,7 @@ def _settled(
     best, least = None, float("inf")
     for _ in range(1 + options.relit):
         scan = replace(scan, frames=light.evened(measured).numpy())
-        solver = _tomography(scan, material, options, on_progress)
+        solver = _tomography(scan, material, options, on_progress, light)
         lines = refined(solver.lines(), samples) * scan.views.finest
         predicted = frames_of(instrument, lines, material).detach().cpu()
         after = light.settled(measured, predicted)
@@ -241,7 +254,7 @@ def _agree(
     pitch = scan.views.finest
     field = _field(scan, coarse)
     beyond, views = (field.shape[0] - scan.views.shape[0]) // 2, field.in_units_of(pitch)
-    correction = Correction(scan, material, beyond)
+    correction = Correction(scan, material, beyond, correlated(light))
     finer = math.ceil(fringe_sampling(scan.exposures) / refine)
     instrument = Instrument(scan.exposures, refine * finer, backend=options.backend)
     frames = torch.from_numpy(scan.frames).to(instrument.device)
@@ -278,13 +291,13 @@ class Correction:
     where noise hides a frequency, the views are not made to agree on it.
     """
 
-    def __init__(self, scan: Scan, material: DeltaBeta, beyond: int = 0) -> None:
+    def __init__(self, scan: Scan, material: DeltaBeta, beyond: int = 0, noise: NoiseModel | None = None) -> None:
         exposures, frames = scan.exposures.optical, torch.from_numpy(scan.frames)
         self._exposures, self._radian = exposures, radian(exposures, material.delta)
         wide, _ = surrounded(frames, exposures)
         raster = Raster((wide.shape[-2], wide.shape[-1]), exposures.views.pixel_size)
         h = response(exposures, material.beta / material.delta, raster)
-        known = spectra(frames, exposures, h, raster, noise_found(frames, None), MODEL_ERROR, PRIOR)
+        known = spectra(frames, exposures, h, raster, noise, MODEL_ERROR, MISSING)
         self._inverse, self._beyond = known.inverse, beyond
 
     def __call__(self, missing: Tensor) -> Tensor:

@@ -27,7 +27,6 @@ from .spectra import (
     detector_transfer,
     filtered,
     fresnel_phase,
-    noise_found,
     radian,
     response,
     spectra,
@@ -88,9 +87,7 @@ def paganin(
     raster = Raster((contrast.shape[-2], contrast.shape[-1]), exposures.views.pixel_size)
     ratio = absorption(exposures, beta / delta)
     h = 2 * (ratio + fresnel_phase(exposures, raster)) * detector_transfer(exposures, raster)
-    known = spectra(
-        frames, exposures, h, raster, noise_found(frames, options.noise), options.model_error, options.prior
-    )
+    known = spectra(frames, exposures, h, raster, options.noise, options.model_error, options.prior)
     contact = 1 + 2 * ratio * filtered(contrast, known.inverse)
     mu = column(2 * wavenumber(exposures.energy_kev) * exposures.refraction(delta, beta)[1])
     return (-torch.log(contact.clamp_min(1e-6)) / mu)[crop].to(frames.dtype)
@@ -117,9 +114,7 @@ def contrast_transfer(
     contrast, crop = surrounded(frames, exposures)
     raster = Raster((contrast.shape[-2], contrast.shape[-1]), exposures.views.pixel_size)
     h = response(exposures, beta / delta, raster)
-    known = spectra(
-        frames, exposures, h, raster, noise_found(frames, options.noise), options.model_error, options.prior
-    )
+    known = spectra(frames, exposures, h, raster, options.noise, options.model_error, options.prior)
     return (-filtered(contrast, known.inverse) * radian(exposures, delta))[crop].to(frames.dtype)
 
 

@@ -17,7 +17,7 @@ from ...scan import Exposures
 from ...units import wavelength
 from ..hologram import hologram, optical_path
 from ..sampling import alike, fringe_sampling, padding
-from .bounded import MODEL_ERROR, PRIOR, Estimate, bounded_estimate
+from .bounded import MODEL_ERROR, Estimate, bounded_estimate
 from .spectra import (
     Noise,
     Raster,
@@ -26,7 +26,6 @@ from .spectra import (
     checked,
     column,
     filtered,
-    noise_found,
     part_of,
     radian,
     response,
@@ -104,7 +103,7 @@ class WaveModel:
             frames.dtype,
         ).to(self.frames.device)
         self.spectra = spectra(
-            frames, exposures, response(exposures, ratio, self.raster), self.raster, noise, MODEL_ERROR, PRIOR
+            frames, exposures, response(exposures, ratio, self.raster), self.raster, noise, MODEL_ERROR
         )
         self.strongest = column(sensitivity(exposures, ratio) ** 2)
         self.support, self.phase = self._spread(estimate)
@@ -182,7 +181,6 @@ def view_by_view(
 ) -> Tensor:
     """`solve(frames, exposures, noise, on_progress)` of views alike, some at a time, with frames checked."""
     frames = checked(frames, exposures, delta)
-    noise = noise_found(frames, noise)
     found, done = torch.empty_like(frames), 0
     for index in alike(exposures):
         start, share = done / len(exposures), len(index) / len(exposures)

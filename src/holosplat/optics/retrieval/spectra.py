@@ -22,6 +22,7 @@ from ...units import wavelength, wavenumber
 from ..noise import noise_levels
 from ..noise_model import NoiseModel
 from ..sampling import smooth_margin
+from .phase_power import expected_shapes
 
 TINY = 1e-24
 """Variance added for frames without any contrast."""
@@ -151,18 +152,20 @@ def contrast_level(frames: Tensor) -> Tensor:
 class Spectra:
     """The response H and the expected power S of the phase, both [V, H, W//2 + 1], and two standard deviations [V] of
     the frames: of the white noise alone, and of this noise with the model error; grain: power [V, H, W//2 + 1] of
-    correlated noise beside both, None without any. All float64."""
+    correlated noise beside both, None without any; leak: power [V, H, W//2 + 1] that a frame's edges carry here from
+    half a cycle away. All float64."""
 
     response: Tensor
     power: Tensor
     noise: Tensor
     error: Tensor
     grain: Tensor | None = None
+    leak: Tensor | float = 0.0
 
     @property
     def unexplained(self) -> Tensor:
         """Power [V, H, W//2 + 1], or [V, 1, 1] where it is the same at all frequencies, that is not the phase's."""
-        white = self.error.square()[:, None, None]
+        white = self.error.square()[:, None, None] + self.leak
         return white if self.grain is None else white + self.grain
 
     def noise_of(self, gain: Tensor) -> Tensor:
@@ -184,24 +187,61 @@ def spectra(
     raster: Raster,
     noise: Noise,
     model_error: float,
-    prior: Prior,
+    prior: Prior | None = None,
+    *,
+    leaks: bool = False,
 ) -> Spectra:
     """Of frames [V, H, W] and a response h on `raster`; noise: theirs, or None to estimate it (as white noise).
 
-    model_error: the part of the frames' contrast that no model explains. The power has the prior's shape and explains
-    the frames' variance beyond their noise, at the frequencies that the detector resolves.
+    model_error: the part of the frames' contrast that no model explains. The power has the prior's shape, or the one
+    that the frames show themselves (`expected_shapes`), and explains the frames' variance beyond their noise, at the
+    frequencies that the detector resolves. leaks: whether what a frame's edges mix into a frequency counts as
+    unexplained, for what iterates and restores by its bounds what is damped so.
     """
     level, grain = _levels(frames, exposures, raster, noise)
     contrast = contrast_level(frames)
     all_noise = noise.level if isinstance(noise, NoiseModel) else level
     signal = (contrast.square() - all_noise.square()).clamp_min(LEAST_SIGNAL * contrast.square() + TINY)
-    f2 = squared_frequency(raster)
-    height, width = (n * exposures.views.pixel_size for n in exposures.views.shape)
-    shape = (f2 * height * width + prior.corner**2) ** -prior.decay
+    f2, field = squared_frequency(raster), math.prod(exposures.views.shape) * exposures.views.pixel_size**2
+    error = (level.square() + (model_error * contrast).square() + TINY).sqrt()
+    if prior is None:
+        corner, decay = (each[:, None, None] for each in _shown(frames, exposures, h, raster, error, noise))
+    else:
+        corner, decay = prior.corner, prior.decay
+    shape = (f2 * field + corner**2) ** -decay
     seen = f2 <= (0.5 / exposures.views.pixel_size) ** 2
     explained = (h.square() * shape)[:, seen].mean(dim=1)
-    error = (level.square() + (model_error * contrast).square() + TINY).sqrt()
-    return Spectra(h, shape * (signal / explained)[:, None, None], level, error, grain)
+    power = shape * (signal / explained)[:, None, None]
+    leak = _changes(h, raster, exposures).square() * power if leaks else 0.0
+    return Spectra(h, power, level, error, grain, leak)
+
+
+def _changes(h: Tensor, raster: Raster, exposures: Exposures) -> Tensor:
+    """By how much the response `h` changes [V, H, W//2 + 1] over half a cycle of the frame, which tells frequencies no
+    better: its edges mix them, so that where the response passes through zero it is not known to be zero."""
+    (rows, columns), (height, width) = raster.shape, exposures.views.shape
+    pixel = exposures.views.pixel_size / raster.pitch
+    steps = (0.5 * rows / (height * pixel), 0.5 * columns / (width * pixel))  # half a cycle in samples of the raster
+    along_y, along_x = torch.gradient(torch.fft.fftshift(h, dim=1), dim=(1, 2))
+    change = torch.hypot(steps[0] * along_y, steps[1] * along_x)
+    return torch.fft.ifftshift(change, dim=1)
+
+
+def _shown(
+    frames: Tensor, exposures: Exposures, h: Tensor, raster: Raster, error: Tensor, noise: Noise
+) -> tuple[Tensor, Tensor]:
+    """Corners and decays [V] of the power of the phase that frames show; h: the response on `raster`."""
+    own = Raster(exposures.views.shape, exposures.views.pixel_size)
+    rows, columns = (
+        torch.from_numpy(np.rint(np.abs(f.ravel()) * raster.pitch * n)).long() % n
+        for f, n in zip(own.frequencies, raster.shape)
+    )
+    gain = h[:, rows][:, :, columns.clamp_max(h.shape[2] - 1)].square()
+    rest = error.square()[:, None, None]
+    if isinstance(noise, NoiseModel):
+        rest = rest + noise.power_on(own.shape) - noise.white.square()[:, None, None]
+    cycles = (squared_frequency(own) * math.prod(own.shape)).sqrt() * own.pitch
+    return expected_shapes(frames, gain, cycles, rest)
 
 
 def _levels(frames: Tensor, exposures: Exposures, raster: Raster, noise: Noise) -> tuple[Tensor, Tensor | None]:
@@ -212,14 +252,6 @@ def _levels(frames: Tensor, exposures: Exposures, raster: Raster, noise: Noise) 
         return noise.white, power if noise.has_grain else None
     level = noise_levels(frames) if noise is None else torch.full((len(frames),), noise, dtype=torch.float64)
     return level, None
-
-
-def noise_found(frames: Tensor, noise: Noise) -> Noise:
-    """The noise of frames [V, H, W] if it is not given and has grain; else what is given."""
-    if noise is not None:
-        return noise
-    found = NoiseModel.of_frames(frames)
-    return found if found.has_grain else None
 
 
 def part_of(noise: Noise, index: np.ndarray) -> Noise:
