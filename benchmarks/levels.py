@@ -21,6 +21,7 @@ from machine import commit
 from holosplat.bench.case import case_names, load_case
 from holosplat.matter import Known, MaterialPrior
 from holosplat.methods import Task
+from holosplat.methods.illumination import prepared
 from holosplat.methods.levels import decide_matter
 
 COLUMNS = ("case", "seed", "prior", "factor", "matter", "sure", "seconds", "commit")
@@ -34,7 +35,7 @@ def rows(name: str, seed: int) -> list[dict[str, object]]:
         priors.append(MaterialPrior.of_ratio(case.prior.material.ratio))
     for prior in priors:
         began = time.process_time()
-        decision = decide_matter(Task(train, prior).evened())
+        decision = decide_matter(prepared(Task(train, prior)))
         values = (name, seed, prior.kind, f"{decision.factor:.3f}", decision.matter, decision.sure)
         found.append(dict(zip(COLUMNS, (*values, f"{time.process_time() - began:.1f}", commit()))))
     return found

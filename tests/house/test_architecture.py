@@ -38,7 +38,7 @@ TIERS = (
     )
     + ("geometry", "frames", "divided_light", "scan", "volume", "mesh", "matter"),
     ("materials", "optics", "metrics", "projectors", "preprocess"),
-    ("specimens", "representations", "model"),
+    ("specimens", "representations", "model", "inference"),
     ("io",),
     ("fit", "baselines", "learning"),
     ("bodies",),

@@ -186,8 +186,11 @@ def _tomography(
 
 
 def correlated(light: Light | None) -> NoiseModel | None:
-    """The noise where it is known to be correlated; None for white noise, which the frames themselves tell."""
-    return None if light is None or not light.noise.has_grain else light.noise
+    """The noise where it is known to be correlated, and what is not known of uneven light with it; None for white noise
+    in even light, which the frames themselves tell."""
+    if light is None or not (light.noise.has_grain or light.background is not None):
+        return None
+    return light.doubt
 
 
 def _in_rows(
@@ -220,17 +223,18 @@ def _settled(
     measured = (torch.from_numpy(scan.frames) * light.factor()).float()
     samples = fringe_sampling(scan.exposures)
     instrument = Instrument(scan.exposures, samples, backend=options.backend)
-    best, least = None, float("inf")
+    best, least, first = None, float("inf"), light.noise
     for _ in range(1 + options.relit):
         scan = replace(scan, frames=light.evened(measured).numpy())
         solver = _tomography(scan, material, options, on_progress, light)
         lines = refined(solver.lines(), samples) * scan.views.finest
         predicted = frames_of(instrument, lines, material).detach().cpu()
         after = light.settled(measured, predicted)
-        misfit = after.misfit(measured, predicted)
+        misfit = replace(after, noise=first).misfit(measured, predicted)
         if best is not None and misfit >= least:
             break
-        best, least, light = (scan, light, solver), misfit, after
+        noise = NoiseModel.of_residuals(after.evened(measured), predicted)
+        best, least, light = (scan, light, solver), misfit, replace(after, noise=noise)
     assert best is not None
     return best
 

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-BLOCK = 16
-"""Edge of the blocks [pixels] whose scatter gives the standard error: longer than residuals correlate."""
+BLOCK = 32
+"""Edge of the blocks [pixels], at most, whose scatter gives the standard error within a frame: on frames of some 80
+pixels, residuals correlate over the bodies that cause them."""
 SMALLEST = 1e-12
 """Part of the largest power that every power has at least, against the logarithm of zero."""
 
@@ -20,9 +22,11 @@ class Score:
 
     powers: [B, K] float64: mean square residual of each of B blocks in each of K octaves of spatial frequency, the
     finest first; the last octave holds everything coarser than a block
+    frames: number of frames, of which each has B / frames blocks
     """
 
     powers: np.ndarray
+    frames: int = 1
 
     @classmethod
     def of(cls, residual: Tensor) -> Score:
@@ -47,12 +51,15 @@ class Score:
             bands.append(torch.nn.functional.avg_pool2d(detail[None], half)[0].flatten() * (edge // size) ** 2)
             level, size = mean, half
         bands.append(level.square().flatten() * edge**2)
-        return cls(torch.stack(bands, dim=1).numpy())
+        return cls(torch.stack(bands, dim=1).numpy(), len(residual))
 
-    @property
-    def level(self) -> np.ndarray:
-        """Mean power [K] of all blocks."""
-        return self._means(self.powers.sum(axis=0)) / len(self.powers)
+    @classmethod
+    def joined(cls, scores: Sequence[Score]) -> Score:
+        """The score of several sets of frames, with one block a frame; of one set the same."""
+        if len(scores) == 1:
+            return scores[0]
+        whole = [one.powers.reshape(one.frames, -1, one.powers.shape[1]).mean(axis=1) for one in scores]
+        return cls(np.concatenate(whole), sum(one.frames for one in scores))
 
     def gain_over(self, other: Score) -> tuple[float, float]:
         """How much smaller the residual is than that of `other`, and the standard error of this.

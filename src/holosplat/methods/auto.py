@@ -1,4 +1,4 @@
-"""The method that `reconstruct` takes by default: what suits the matter, by views that are set aside for a moment."""
+"""The method that `reconstruct` takes by default: Gaussians or surfaces of bodies, or a smooth volume."""
 
 from __future__ import annotations
 
@@ -12,12 +12,10 @@ from ..fit.loop import Fit
 from ..matter import DeltaBeta, MatterKind
 from ..ranges import Share, ranged
 from ..representations import GaussianCloud, Stored, SurfaceMesh, VoxelGrid
-from ..units import in_percent
 from .assumed import assumed_material
 from .cross_validation import CrossValidation, MissingMatter
 from .evidence import Evidence
 from .gaussians import Gaussians
-from .levels import Decision, LevelTest
 from .method import Method, Stage, Task, solve_stages
 from .smooth_fit import SmoothFit
 from .surface_fit import SurfaceOptions
@@ -37,11 +35,7 @@ KINDS: Mapping[MatterKind, str] = {"levels": Gaussians.kind, "continuous": Smoot
 @dataclass(frozen=True)
 @ranged
 class Auto:
-    """Matter with levels: Gaussians, and closed surfaces where there are bodies. Continuous matter: a smooth volume.
-
-    Where neither frames nor knowledge say which it is, both are tried on coarse frames without some of the views, and
-    what clearly foretells these better, beyond their noise, is taken.
-    """
+    """Matter with levels: Gaussians, and closed surfaces where there are bodies. Continuous matter: a smooth volume."""
 
     kind: ClassVar[str] = "auto"
     mixes_kinds: ClassVar[bool] = True
@@ -50,8 +44,6 @@ class Auto:
     gaussians: Gaussians = field(default_factory=Gaussians)
     surfaces: SurfaceOptions = field(default_factory=SurfaceOptions)
     volume: SmoothVolume = field(default_factory=SmoothVolume)
-    levels: LevelTest = field(default_factory=LevelTest)
-    """How it is decided whether matter has levels."""
     trials: CrossValidation = field(default_factory=CrossValidation)
     """How views are set aside for trials."""
     unexplained: Share = 0.12
@@ -59,7 +51,7 @@ class Auto:
     too low, a volume is fitted in vain, for it must leave half of what they do to be taken."""
 
     def stages(self) -> Sequence[Stage]:
-        """Those for matter with levels; `chosen` decides."""
+        """Those for matter with levels."""
         return self.suited("levels").stages()
 
     def suited(self, matter: MatterKind) -> Method:
@@ -74,22 +66,6 @@ class Auto:
         """Those of the Gaussians."""
         self.gaussians.require_files()
 
-    def chosen(self, task: Task, decision: Decision) -> tuple[Method, Decision]:
-        """The method for `task`, of whose matter there is a `decision`; and that, if a trial has changed it."""
-        if not decision.sure and task.prior.kind != "known":
-            decision = self._tried(task, decision)
-        return self.suited(decision.matter), decision
-
-    def _tried(self, task: Task, decision: Decision) -> Decision:
-        """The decision by a trial; as it was where there are too few views for one."""
-        tried = Trial.of(task, self.gaussians, self.volume, self.trials)
-        if tried is None:
-            return decision
-        said, best = f"{decision.why}; {tried.in_words}", min(tried.beyond, key=lambda matter: tried.beyond[matter])
-        if best != decision.matter and not tried.clearly(best):
-            return replace(decision, why=f"{said}, noise {in_percent(tried.noise**0.5)}, which decides nothing")
-        return Decision(best, said)
-
     def on_backend(self, backend: Backend) -> Auto:
         """The same method computed by `backend`."""
         return replace(
@@ -97,7 +73,6 @@ class Auto:
             gaussians=self.gaussians.on_backend(backend),
             surfaces=replace(self.surfaces, fit=replace(self.surfaces.fit, backend=backend)),
             volume=self.volume.on_backend(backend),
-            levels=self.levels.on_backend(backend),
         )
 
     def with_effort(self, effort: float) -> Auto:
@@ -150,12 +125,6 @@ class Trial:
         """Whether one kind foretells the views clearly better than the other."""
         beyond = self.beyond
         return beyond[matter] < CLEARLY**2 * beyond[OTHER[matter]]
-
-    @property
-    def in_words(self) -> str:
-        """What either leaves."""
-        said = (f"{KINDS[matter]} leave {in_percent(share)}" for matter, share in self.shares.items())
-        return f"in a trial, {' and '.join(said)} of the matter in views set aside unexplained"
 
 
 @dataclass(frozen=True)

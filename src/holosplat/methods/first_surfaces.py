@@ -55,7 +55,7 @@ def surfaces_of_volume(task: Task, options: GaussianOptions, surfaces: SurfaceOp
     def of_volume(before: SurfaceMesh | None) -> SurfaceMesh:
         matter = material_of_levels(task, options.volume.backend, options.estimate)
         rounds = replace(options.volume.in_noise(), refine=1)
-        volume, grid = holographic_tv(task.scan, matter, rounds, task.on_progress, task.uneven)
+        volume, grid = holographic_tv(task.scan, matter, rounds, task.on_progress, task.unlike_null)
         cut = cut_as_seen(task, volume, grid, Matter.one(*matter), surfaces)
         how = options.coarse.of_views(len(task.scan.train()))
         return in_turns(task, settled(task, cut, surfaces, how), options, surfaces)
@@ -93,7 +93,7 @@ def _of_volume(task: Task, options: GaussianOptions, surfaces: SurfaceOptions) -
         return tried[-1][0] > options.coarse.missing
 
     how = replace(options.volume, refine=1)
-    last = holographic_tv(task.scan, matter, how, task.on_progress, task.uneven, poor)
+    last = holographic_tv(task.scan, matter, how, task.on_progress, task.unlike_null, poor)
     if not tried or tried[0][0] > options.coarse.missing:
         poor(*last)
     return min(tried, key=lambda one: one[0])[1]

@@ -11,6 +11,7 @@ import torch
 from ..baselines.material import MaterialEstimate
 from ..fit.freedom import Freedom, moved
 from ..fit.running import Running
+from ..inference import Decision
 from ..matter import MaterialPrior, MatterKind
 from ..model import Model
 from ..optics.background import Light, LightOptions
@@ -20,6 +21,7 @@ from ..progress import Advance, Progress
 from ..representations import KINDS, Stored
 from ..scan import Scan
 from .beginning import Beginning
+from .first_volumes import FirstVolumes
 from .keeper import Keeper
 from .window import windows_of
 
@@ -51,7 +53,9 @@ class Task:
     seed: seed of everything random
     on_progress: called with (stage, fraction done of it)
     light: what is assumed of the light
-    lit: what the frames say of it, once `evened` has looked
+    lit: what the frames say of it, once `illumination.prepared` has decided
+    decisions: what was decided so far, and by what evidence
+    first: first volumes of coarse frames, which decisions share
     matter: whether matter has levels, each with sharp edges, or is continuous (see `settled`)
     delta_told: whether prior or frames say what δ is
     freedom: of where the frames are, which fits then find, too; None: they are where the scan says
@@ -70,33 +74,18 @@ class Task:
     freedom: Freedom | None = None
     near: bool = False
     on_beginning: Callable[[Beginning], None] = unheard
+    decisions: tuple[Decision, ...] = ()
+    first: FirstVolumes | None = None
 
     def __post_init__(self) -> None:
         if not self.prior.fixes_ratio and shows_no_refraction(self.scan):
             object.__setattr__(self, "delta_told", False)
             object.__setattr__(self, "prior", MaterialPrior.of_ratio(STAND_IN_RATIO))
 
-    def evened(self) -> Task:
-        """The same task with frames as they would be in even light, as far as their air says what the light is.
-
-        Frames whose air is even within its noise stay as they are, and those that were divided by light before: what
-        that left open (`Scan.light`) is then what is not known of it. Errors: those of `Light.of`.
-        """
-        if self.lit is not None:
-            return self
-        frames, handed = torch.from_numpy(self.scan.frames), self.scan.light
-        if handed is not None and self.light.kind != "even":
-            return replace(self, lit=Light.handed(frames, self.light, handed))
-        found = Light.of(frames, self.light)
-        scan = self.scan
-        if found.background is not None:
-            scan = replace(scan, frames=found.evened(frames).numpy())
-        return replace(self, scan=scan, lit=found)
-
     def in_windows(self) -> Task:
         """The same task on windows about its matter where these save much (`windows_of`), or the task itself.
 
-        Uneven light and free poses are told by whole frames; so is light that was not looked at (`evened`).
+        Uneven light and free poses are told by whole frames; so is light of which nothing was decided.
         """
         if self.lit is None or self.lit.background is not None or self.freedom is not None:
             return self
@@ -125,6 +114,12 @@ class Task:
     def uneven(self) -> Light | None:
         """The light, where it is uneven."""
         return self.lit if self.lit is not None and self.lit.background is not None else None
+
+    @property
+    def unlike_null(self) -> Light | None:
+        """Light and noise, where one of them is not that of the null: uneven, or correlated."""
+        grainy = self.lit is not None and self.lit.noise.has_grain
+        return self.lit if grainy else self.uneven
 
     @property
     def light_in_words(self) -> str:
@@ -227,7 +222,7 @@ def solve_stages(method: Method, task: Task) -> Stored:
 
     Ctrl-C is passed on.
     """
-    task, found = task.evened(), None
+    found: Stored | None = None
     keeper = Keeper(task.scan, mixes_kinds(method))
     for number, stage in enumerate(method.stages()):
         before = keeper.handed(stage, found, task.freedom is not None)

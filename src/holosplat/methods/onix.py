@@ -187,7 +187,8 @@ def seen_of(scan: Scan, material: DeltaBeta) -> tuple[Tensor, Tensor]:
 def aligned_fit(task: Task, start: PixelAlignedField, options: AlignedFit, waves: bool) -> Fit:
     """The fit of `start` to the training frames of `task`, through the waves or to retrieved line integrals."""
     factor = max(1, round(start.grid.voxel_size[0] / task.scan.views.finest))
-    scan, light = task.scan.binned(factor), task.uneven and task.uneven.part(torch.arange(len(task.scan)), factor)
+    known, scan = task.unlike_null, task.scan.binned(factor)
+    light = known and known.part(torch.arange(len(task.scan)), factor)
     base = ground(scan, start, start.matter, options.objective, options.schedule, "cpu", light=light)
     noise = 0.0 if base.frames.spectral is None else base.frames.spectral.noise
     weight = (options.weight + options.noise_weight * noise) / len(base.train)

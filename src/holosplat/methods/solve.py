@@ -7,28 +7,28 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from ..backends import resolve
-from ..baselines import HolographicTV
 from ..checks import require
+from ..inference import Decision
 from ..matter import KnownTwo, MatterKind
 from ..representations import Stored
 from ..scan import Scan
 from ..tables import to_table
 from .auto import Auto
 from .gaussians import Gaussians
-from .levels import Decision, LevelTest, decide_matter
+from .illumination import prepared
+from .levels import CONTINUOUS, NAME, decide_matter
 from .method import Method, Task, solve_stages
-from .still import prepared
 from .uncertain import Determined, Uncertain, determine, likeliest_ratio, placed, told
 
 
 @dataclass(frozen=True)
 class Settled:
-    """What is run. method: with stages of its own; matter: of which kind it is taken to be; why: in words; constants:
+    """What is run. method: with stages of its own; matter: of which kind it is taken to be, by a `decision`; constants:
     what was uncertain, by the frames."""
 
     method: Method
     matter: MatterKind
-    why: str
+    decision: Decision
     constants: tuple[Determined, ...] = ()
 
     @classmethod
@@ -36,12 +36,22 @@ class Settled:
         """What was settled before, by the `table` of it in a run folder."""
         matter: MatterKind = "continuous" if table["matter"] == "continuous" else "levels"
         constants = tuple(Determined.from_dict(each) for each in table.get("constants", ()))
-        return cls(method.suited(matter) if isinstance(method, Auto) else method, matter, table["why"], constants)
+        return cls(
+            method.suited(matter) if isinstance(method, Auto) else method,
+            matter,
+            Decision.from_dict(table["why"]),
+            constants,
+        )
 
     def as_table(self) -> dict[str, Any]:
         """Plain values, which `again` takes."""
         constants = [to_table(each) for each in self.constants]
-        return {"method": self.method.kind, "matter": self.matter, "why": self.why, "constants": constants}
+        return {
+            "method": self.method.kind,
+            "matter": self.matter,
+            "why": self.decision.as_dict(),
+            "constants": constants,
+        }
 
     def placed(self, scan: Scan) -> Scan:
         """`scan` at the distance and energy that were found."""
@@ -49,7 +59,7 @@ class Settled:
 
     def task(self, task: Task) -> Task:
         """`task` with what was settled."""
-        return replace(told(task, self.constants), matter=self.matter)
+        return replace(told(task, self.constants), matter=self.matter, decisions=(*task.decisions, self.decision))
 
 
 def settled(
@@ -69,24 +79,17 @@ def settled(
     constants = determine(task, uncertain or Uncertain())
     task = told(task, constants)
     if matter:
-        decision = Decision(matter, "as you say")
+        decision = Decision(NAME, matter, "told")
     elif getattr(method, "wants_levels", True):
-        decision = decide_matter(task, _levels(method))
+        decision = decide_matter(task)
     else:
-        decision = Decision("levels", "it makes no difference to the method")
+        decision = Decision(NAME, "levels", "no matter to the method")
+    kind: MatterKind = "continuous" if decision.choice == CONTINUOUS else "levels"
     if isinstance(method, Auto):
-        method, decision = method.chosen(task, decision)
-    if decision.matter == "continuous" and not task.prior.fixes_ratio:
+        method = method.suited(kind)
+    if kind == "continuous" and not task.prior.fixes_ratio:
         constants = (*constants, likeliest_ratio(task))
-    return Settled(method, decision.matter, decision.why, constants)
-
-
-def _levels(method: Method) -> LevelTest:
-    """How it is decided, by what computes the method."""
-    if isinstance(method, Auto):
-        return method.levels
-    volume = getattr(method, "volume", None)
-    return LevelTest().on_backend(volume.backend if isinstance(volume, HolographicTV) else "auto")
+    return Settled(method, kind, decision, constants)
 
 
 def solve(method: Method, task: Task, matter: MatterKind | None = None) -> Stored:

@@ -59,7 +59,7 @@ def _from_phase_retrieval(task: Task, options: GaussianOptions) -> GaussianCloud
     how = replace(options.volume, upper=options.volume.upper if task.bounded else 0.0)
 
     def retrieve(frames: Scan) -> tuple[Tensor, Grid]:
-        return holographic_tv(frames, material, how, task.on_progress, task.uneven)
+        return holographic_tv(frames, material, how, task.on_progress, task.unlike_null)
 
     volume, grid = retrieve(scan)
     shares = _shares(task, options, material, (volume, grid), retrieve)

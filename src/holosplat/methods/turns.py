@@ -51,7 +51,7 @@ def in_turns(task: Task, found: SurfaceMesh, options: GaussianOptions, surfaces:
 def _cut_again(task: Task, found: SurfaceMesh, options: GaussianOptions, surfaces: SurfaceOptions) -> SurfaceMesh:
     """Surfaces of the volume after rounds that began with the bodies of `found`."""
     matter, start = DeltaBeta(found.matter.delta, found.matter.beta), _occupancy(task, found)
-    volume, grid = agreed(task.scan, matter, start, options.volume.in_noise(), task.on_progress, task.uneven)
+    volume, grid = agreed(task.scan, matter, start, options.volume.in_noise(), task.on_progress, task.unlike_null)
     return cut_as_seen(task, volume, grid, found.matter, surfaces)
 
 

@@ -99,7 +99,8 @@ class SmoothStage:
         """A first volume: δ in units of the known material's, or of the estimated one's."""
         options = self.options
         factor = binning(task.scan, options.max_voxels)
-        scan, light = task.scan.binned(factor), task.uneven and task.uneven.part(torch.arange(len(task.scan)), factor)
+        known, scan = task.unlike_null, task.scan.binned(factor)
+        light = known and known.part(torch.arange(len(task.scan)), factor)
         backend = options.volume.backend
         material = assumed_material(scan, task.prior, task.on_progress, backend, options.estimate)
         first, grid = holographic_tv(scan, material, replace(options.volume, upper=0.0), task.on_progress, light)

@@ -63,7 +63,7 @@ class HolographicStage:
         """Occupancies of the one material that all matter is taken for."""
         material = assumed_material(task.scan, task.prior, task.on_progress, self.options.backend)
         bounded = replace(self.options, upper=task.bound(1.0))
-        values, grid = holographic_tv(task.scan, material, bounded, task.on_progress, task.uneven)
+        values, grid = holographic_tv(task.scan, material, bounded, task.on_progress, task.unlike_null)
         return VoxelGrid(values[None], grid, Matter.one(*material))
 
     def fit(self, task: Task, start: Stored) -> None:

@@ -24,6 +24,7 @@ from ..fit.smooth_volume import descend
 from ..geometry import Grid
 from ..matter import DeltaBeta, MaterialPrior, Matter
 from ..methods import Task
+from ..methods.illumination import prepared
 from ..methods.smooth_fit import SmoothFit
 from ..methods.volume import SmoothStage, SmoothVolume
 from ..ranges import Pixels, Weight, ranged
@@ -143,7 +144,7 @@ class Search:
     def by_itself(self, scan: Scan, name: str) -> VoxelGrid:
         """The volume of frames of one time; its prior is taken on."""
         began = clock.perf_counter()
-        task = replace(self.task, scan=scan, lit=None, matter="continuous").evened()
+        task = prepared(replace(self.task, scan=scan, lit=None, matter="continuous"))
         task = replace(task, prior=MaterialPrior.known(self.frames.material))
         stage = SmoothStage(self.options.volume)
         start = stage.start(task, None)

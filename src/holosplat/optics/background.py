@@ -26,15 +26,8 @@ UNEVEN, SEEN = 6.0, 0.07
 it is so large a part of the frames' contrast."""
 SURE, FAINT = 60.0, 0.03
 """The same of light that is faint beside the contrast: far fringes that pass for air leave as much, but less surely."""
-GRAINY, HALVED = 4, 0.5
-"""Rounds, at most, in which light is divided out and the noise of the rest gives better light. Grain that falls below
-this part of what it was may still be steep light; true grain stays as it is, and there is one round."""
 FAINTEST = 1e-4
 """Noise [relative intensity] assumed at least: light is not known better."""
-STEADY = 0.93
-"""Part of the grain that is left at least where light is no part of it. The smooth modes that are divided out have then
-taken the lowest frequencies of the grain, so that its noise is that of the frames before: it was .98 to 1.03 in single
-frames of a grainy lamp, and .82 to .88 where light of two per cent counted as grain."""
 FINER = 0.15
 """Part of the light's unevenness in air that counts as noise at least: the modes do not describe the rest of it, and
 fitted to that as if it were known they run away where there is no air (measured by benchmarks/air_light.py)."""
@@ -46,6 +39,7 @@ DARKEST = 0.05
 
 Kind = Literal["auto", "even", "smooth"]
 Still = Literal["auto", "none"]
+Noise = Literal["auto", "white", "correlated"]
 
 
 @dataclass(frozen=True)
@@ -54,18 +48,22 @@ class LightOptions:
     """What is assumed of the light beside the flat fields."""
 
     kind: Kind = "auto"
-    """auto: smooth where the air is uneven beyond its noise, else even; even: none; smooth: in any case."""
+    """auto: smooth where evidence is for it, else even; even: none; smooth: in any case."""
     air: tuple[Box, ...] = ()
     """Boxes without matter or fringes in any frame: first row, end row, first column, end column (default: found)."""
     still: Still = "auto"
-    """auto: what all frames have in common, pixel by pixel, is light where air shows such light; none: there is none.
-    Where `kind` is even, there is none either."""
+    """auto: a pattern that all frames have in common, pixel by pixel, is divided out where evidence is for it; none:
+    there is none. Where `kind` is even, there is none either."""
+    noise: Noise = "auto"
+    """auto: correlated where evidence is for it, else white; white; correlated: in any case."""
 
     def __post_init__(self) -> None:
         require(
             self.kind in ("auto", "even", "smooth"), f"light must be auto, even or smooth, but it is {self.kind!r}."
         )
         require(self.still in ("auto", "none"), f"still light must be auto or none, but it is {self.still!r}.")
+        known = self.noise in ("auto", "white", "correlated")
+        require(known, f"noise must be auto, white or correlated, but it is {self.noise!r}.")
 
     def air_of(self, frames: Tensor) -> Tensor:
         """The air [V, H, W] bool of frames [V, H, W]."""
@@ -90,16 +88,11 @@ class Light:
         air = options.air_of(frames)
         noise = NoiseModel.of_frames(frames, air)
         background = _found(frames, noise, air, options.kind)
-        for _ in range(GRAINY if background is not None else 0):
-            assert background is not None
-            even, grain = frames / background.factor(), noise.grain_level
-            air = air if options.air else find_air(even) | air  # without steep light more of it is seen to be quiet
-            noise = NoiseModel.of_frames(even, air)
-            if noise.grain_level > STEADY * grain > 0:  # it is grain, of which light has taken the lowest frequencies
-                noise = NoiseModel.of_frames(frames, air)
+        if background is not None:  # without steep light, more of it is seen to be air, and what is left of it is noise
+            even = frames / background.factor()
+            air = find_air(even) | air
+            noise = NoiseModel.of_frames(even, air, correlated=True)
             background = Background.of_air(frames, air, noise)
-            if noise.grain_level >= HALVED * grain:  # it is grain, and not steep light
-                break
         return cls(air, noise, background)
 
     @classmethod
@@ -267,10 +260,14 @@ class Background:
         """The light [V, H, W], float64."""
         return (self.coefficients @ _modes(self.shape)).exp().reshape(-1, *self.shape)
 
-    def seen_beside(self, measured: Tensor, predicted: Tensor) -> Background:
-        """The light that measured frames [V, H, W] have beside those that matter predicts in even light."""
+    def seen_beside(self, measured: Tensor, predicted: Tensor, where: Tensor | None = None) -> Background:
+        """The light that measured frames [V, H, W] have beside those that matter predicts in even light.
+
+        where: pixels [H, W] bool that are looked at (default: all).
+        """
         modes = _modes(self.shape)
         seen = (measured > DARKEST) & (predicted > DARKEST)
+        seen = seen if where is None else seen & where
         ratio = torch.where(seen, measured.double() / predicted.double().clamp_min(DARKEST), 1.0).log()
         normal, right = _sums(ratio.flatten(1), seen.double().flatten(1), modes)
         mean, covariance = _posterior(normal, right, self.variances, self.powers)

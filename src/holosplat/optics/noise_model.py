@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from ..checks import require
@@ -20,19 +20,10 @@ RIDGE = 1e-3
 """Of the fit of these modes to air, relative to the information of a frame that is all air."""
 LAGS = 4
 """Correlations are believed up to a distance of this part of a frame's shorter side."""
-RIM = 0.15
-"""Part of the columns at either side where neighbours must be correlated, too: faint fringes are in the middle."""
-CALM_WINDOW, QUIET, CALM = 8.0, 0.1, 1.5
-"""So must they where the noise, in a window of this standard deviation [pixels], has no more than this factor of the
-power in the quietest parts, of this quantile: the power of fringes varies, that of grain does not."""
-ALIKE = 0.4
-"""In both places at least by this part of what they are in all air."""
+DARKEST = 0.05
+"""Predicted intensity below which frames are not compared with it relative to it."""
 PLATEAU = 0.35
 """Spatial frequency [cycles per pixel] from which on along both axes noise passes for white."""
-SURE = 6.0
-"""Standard errors by which neighbours must be correlated, or there is no grain."""
-FAINTEST = 0.03
-"""Grain of a smaller part of a frame's contrast is none: it may be fringes that fade away."""
 
 
 @dataclass(frozen=True)
@@ -91,13 +82,12 @@ class NoiseModel:
         return cls(white.double(), grain, shape[1])
 
     @classmethod
-    def of_frames(cls, frames: Tensor, air: Tensor | None = None) -> NoiseModel:
+    def of_frames(cls, frames: Tensor, air: Tensor | None = None, correlated: bool = False) -> NoiseModel:
         """The noise of relative frames [V, H, W], by their air [V, H, W] bool, or by air that they show themselves.
 
-        Grain is that which correlates neighbours in air beyond what slow light does (`DETREND`). Its spectrum is that
-        of the mean of all frames' correlations (Blackman & Tukey 1958, with Parzen's window), without the white noise.
-        The white noise is that of the highest frequencies in each frame's air. Of a frame without air it is what both
-        estimates of `noise.sure_noise` agree on: fringes that fill a frame are not noise.
+        The white noise is that of the highest frequencies in each frame's air; of a frame without air it is what both
+        estimates of `noise.sure_noise` agree on: fringes that fill a frame are not noise. correlated: whether what
+        correlates neighbours in air, beyond what slow light does (`DETREND`), is noise, too; else there is none such.
         """
         air = find_air(frames) if air is None else air
         usable = has_air(air)
@@ -107,7 +97,17 @@ class NoiseModel:
             return cls.white_only(white, shape)
         rest = _without_light(frames[usable].double(), air[usable])
         white[usable] = _finest(rest, air[usable])
-        return cls(white, _grain(rest, air[usable], white[usable], frames)[None].expand(len(frames), -1, -1), shape[1])
+        if not correlated:
+            return cls.white_only(white, shape)
+        return cls(white, _grain(rest, air[usable], white[usable])[None].expand(len(frames), -1, -1), shape[1])
+
+    @classmethod
+    def of_residuals(cls, frames: Tensor, predicted: Tensor) -> NoiseModel:
+        """The noise, white and correlated, that frames [V, H, W] have beside those `predicted` by a first volume."""
+        rest = frames.double() / predicted.double().clamp_min(DARKEST) - 1
+        everywhere = torch.ones(rest.shape, dtype=torch.bool)
+        white = _finest(rest, everywhere)
+        return cls(white, _grain(rest, everywhere, white)[None].expand(len(frames), -1, -1), frames.shape[-1])
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -181,54 +181,29 @@ def _finest(rest: Tensor, air: Tensor) -> Tensor:
     return power.sqrt()
 
 
-def _grain(rest: Tensor, air: Tensor, white: Tensor, frames: Tensor) -> Tensor:
-    """Power spectrum [H, W//2 + 1] of the correlated noise, the same for all frames; zero where none is sure."""
+def _grain(rest: Tensor, air: Tensor, white: Tensor) -> Tensor:
+    """Power spectrum [H, W//2 + 1] of correlated noise [V, H, W] in air, that of the mean of all frames' correlations
+    (Blackman & Tukey 1958, with Parzen's window) without the white noise."""
     h, w = rest.shape[1:]
-    correlation, among, sure = _correlation(rest, air)
-    none = torch.zeros(h, w // 2 + 1, dtype=torch.float64)
-    rim = torch.zeros(w, dtype=torch.bool)
-    rim[: max(1, round(RIM * w))] = rim[-max(1, round(RIM * w)) :] = True
-    for part in (air & rim, _calm(rest, air)):
-        _, there, surely = _correlation(rest * part, part)
-        sure = sure and surely and there > ALIKE * among
-    if not sure:
-        return none
     reach = max(2, min(h, w) // LAGS)
     rows, columns = (torch.fft.fftfreq(2 * n, 1 / (2 * n), dtype=torch.float64).abs() / reach for n in (h, w))
-    tapered = correlation * _parzen((rows[:, None].square() + columns.square()).sqrt())
+    tapered = _correlation(rest, air) * _parzen((rows[:, None].square() + columns.square()).sqrt())
     within = tapered[torch.fft.fftfreq(h, 1 / h).long()][:, torch.fft.fftfreq(w, 1 / w).long()]
     power = torch.fft.rfft2(within).real
     fy, fx = torch.fft.fftfreq(h).abs(), torch.fft.rfftfreq(w)
     high = (fy[:, None] > PLATEAU) & (fx > PLATEAU)
     plateau = float(power[high].mean()) if bool(high.any()) else float(white.square().mean())
-    grain = (power - plateau).clamp_min(0)
-    contrast = float((frames.double() - 1).square().mean().sqrt())
-    return grain if float(_mean_power(grain[None], (h, w))) ** 0.5 > FAINTEST * contrast else none
+    return (power - plateau).clamp_min(0)
 
 
-def _calm(rest: Tensor, air: Tensor) -> Tensor:
-    """The parts [V, H, W] bool of air in which the noise is about as weak as in its quietest parts."""
-    found = []
-    for image, seen in zip(rest.numpy(), air.double().numpy()):
-        share = gaussian_filter(seen, CALM_WINDOW, mode="constant").clip(1e-6)
-        power = gaussian_filter(gaussian_filter(image, 1.0) ** 2, CALM_WINDOW, mode="constant") / share
-        found.append((seen > 0) & (power <= CALM * np.quantile(power[seen > 0], QUIET)))
-    return torch.from_numpy(np.stack(found))
-
-
-def _correlation(rest: Tensor, air: Tensor) -> tuple[Tensor, float, bool]:
-    """Mean products [2H, 2W] of noise [V, H, W] with itself at all distances in air; of direct neighbours, relative to
-    the variance; and whether that is surely above zero."""
+def _correlation(rest: Tensor, air: Tensor) -> Tensor:
+    """Mean products [2H, 2W] of noise [V, H, W] with itself at all distances in air."""
     twice = (2 * rest.shape[1], 2 * rest.shape[2])
     sums, counts = (
         torch.fft.irfft2(torch.fft.rfft2(images, s=twice).abs().square().sum(dim=0), s=twice)
         for images in (rest, air.double())
     )
-    found = sums / counts.clamp_min(1.0)
-    neighbours = torch.stack((found[0, 1], found[1, 0], found[1, 1], found[1, -1]))
-    mean = float(neighbours.mean() / found[0, 0].clamp_min(1e-30))
-    error = (len(neighbours) * max(1.0, float(air.double().sum()))) ** -0.5
-    return found, mean, mean > SURE * error
+    return sums / counts.clamp_min(1.0)
 
 
 def _parzen(distance: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ from ..io.objects import write_object
 from ..matter import KnownTwo, MaterialPrior
 from ..methods import Task
 from ..methods.assumed import assumed_material
+from ..methods.illumination import prepared
 from ..methods.presets import SCHEMA
 from ..methods.uncertain import Uncertain
 from ..motion.carried import NOWHERE, CarriedOptions, Search, merged
@@ -79,7 +80,7 @@ def reconstruct_moving(
     assumed = light or LightOptions()
     config = _config(scan, prior, options, seed, assumed)
     going = goes_on(folder, config, resume)
-    task = Task(train, prior, seed, lambda stage, part: on_progress(stage, part, {}), assumed).evened()
+    task = prepared(Task(train, prior, seed, lambda stage, part: on_progress(stage, part, {}), assumed))
     mean = merged(task.scan)
     material = assumed_material(mean, task.prior, task.on_progress)
     search = Search(task, material, options, NOWHERE if folder is None else Checkpoint(folder))

@@ -22,9 +22,9 @@ from ..learning.start import GuessedMatter
 from ..matter import MaterialPrior, MatterKind
 from ..methods import Auto, Gaussians, Method, Settled, Stage, Task, begun, finished, settled
 from ..methods.beginning import Beginning
+from ..methods.illumination import prepared
 from ..methods.keeper import Keeper, placed_at, where
 from ..methods.method import mixes_kinds, require_files, takes_series
-from ..methods.still import prepared
 from ..methods.uncertain import Determined, Uncertain
 from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling
@@ -157,7 +157,6 @@ class _Run:
     on_state: FitState
     timing: dict[str, float] = field(default_factory=dict)
     asked: str = ""
-    why: str = ""
     constants: tuple[Determined, ...] = ()
     begun: str = ""
     _keeper: Keeper = field(init=False)
@@ -193,7 +192,7 @@ class _Run:
             self.timing["decision"] = time.perf_counter() - began
         if isinstance(self.method, Auto) and self.method.gaussians.start == "learned" and found.matter == "continuous":
             self.begun = "The matter is continuous, and the network guesses bodies: it was not asked."
-        self.method, self.why, self.constants = found.method, found.why, found.constants
+        self.method, self.constants = found.method, found.constants
         self.task = found.task(self.task)
         self._keeper.train = self.task.scan
         where = {} if geometry is None else {"geometry": geometry.as_dict()}
@@ -299,7 +298,13 @@ class _Run:
             oversample,
             dict(self.timing),
             complete,
-            Choice(self.task.matter, self.why, dict(self._keeper.judged), best.name if best else "", self.begun),
+            Choice(
+                self.task.matter,
+                dict(self._keeper.judged),
+                best.name if best else "",
+                self.begun,
+                self.task.decisions,
+            ),
             self.task.delta_told,
             judge_run(found, fit, self.task, oversample),
             self._total(found, fit, oversample),

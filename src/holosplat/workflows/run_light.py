@@ -11,7 +11,7 @@ import torch
 
 from ..methods import Method, Task
 from ..methods.cross_validation import predicted_frames
-from ..methods.still import still_order
+from ..methods.illumination import still_order
 from ..optics.background import Light, LightOptions
 from ..optics.still_light import mean_light
 from ..representations import Stored

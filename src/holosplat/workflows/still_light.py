@@ -11,7 +11,7 @@ from ..baselines import HolographicTV
 from ..checks import require
 from ..frames import divided
 from ..matter import MaterialPrior
-from ..methods.still import predicted_first
+from ..methods.illumination import predicted_first
 from ..optics.still_light import mean_light
 from ..progress import Progress
 from ..scan import Scan

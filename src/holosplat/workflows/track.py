@@ -20,6 +20,7 @@ from ..io.vtk import write_mesh
 from ..matter import KnownTwo, MaterialPrior
 from ..methods import Task
 from ..methods.assumed import assumed_material
+from ..methods.illumination import prepared
 from ..methods.presets import SCHEMA
 from ..methods.uncertain import Uncertain
 from ..motion.elastic import Rest
@@ -80,7 +81,7 @@ def track(
     with claimed(folder):
         if folder is not None and not goes_on(folder, config, resume):
             folder.begin(config | environment("cpu"))
-        task = Task(scan.train(), prior, seed, lambda stage, part: on_progress(stage, part, {}), assumed).evened()
+        task = prepared(Task(scan.train(), prior, seed, lambda stage, part: on_progress(stage, part, {}), assumed))
         train = task.scan
         material = assumed_material(train.at_instant(0), task.prior, task.on_progress)
         journal = NOWHERE if folder is None else Checkpoint(folder)

@@ -15,10 +15,10 @@ from ...progress import Progress
 from ...representations import Stored, VoxelSeries
 from ...scan import Scan
 from ..assumed import assumed_material
+from ..illumination import prepared
 from ..method import Method, Stage, Task, finished, quiet, solve_stages, takes_series
 from ..pinn import FEWEST_TIMES
 from ..solve import settled
-from ..still import prepared
 
 EACH = "each time by itself"
 

@@ -53,9 +53,20 @@ RETRIEVALS: dict[str, Retrieval] = {
 }
 """Every method by its name."""
 
+RETRIEVAL_OPTIONS = {
+    "paganin": Linear,
+    "ctf": Linear,
+    "tikhonov": Tikhonov,
+    "gerchberg-saxton": Projections,
+    "hybrid-input-output": Projections,
+    "admm": ADMM,
+}
+"""The class of each method's options; all have `noise`."""
+
 __all__ = [
     "ADMM",
     "RETRIEVALS",
+    "RETRIEVAL_OPTIONS",
     "Estimate",
     "Linear",
     "Prior",

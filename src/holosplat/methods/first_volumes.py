@@ -1,0 +1,139 @@
+"""First volumes of coarse frames: what hypotheses about light, noise and matter are compared by.
+
+Views are set aside in folds; the volumes of the others, by retrieval and tomography without bounds, predict them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ..baselines import HolographicTV, holographic_tv
+from ..inference import Score
+from ..matter import DeltaBeta, MaterialPrior, Matter
+from ..optics.background import Background, Light
+from ..optics.noise import noise_levels
+from ..progress import Progress
+from ..representations import VoxelGrid
+from ..scan import Scan
+from .assumed import assumed_material
+from .cross_validation import predicted_frames
+
+WIDTH = 64
+"""Frames are binned to about so many pixels at most, on which a volume takes a second."""
+FEWEST = 3
+"""Views from which on some are set aside; of fewer, noise is added and taken off again (`Folds`)."""
+MANY, MOST = 6, 3
+"""Views from which on two are set aside at a time, and folds at most: six views tell their scatter well enough."""
+CHECKED = 4
+"""Edge of the squares [pixels], in which unknown light of unseen frames is fitted and tested in turns."""
+
+T = TypeVar("T")
+
+BY_VIEWS, BY_FISSION = "views set aside", "data fission"
+
+
+@dataclass(frozen=True)
+class Folds:
+    """Coarse frames, and how parts of them are kept from a fit.
+
+    Of fewer views than `FEWEST` none can be spared. Then noise is split (Leiner et al. 2023): with noise of standard
+    deviation σ and normal ε, `y + σ ε` and `y - σ ε` are independent; one is fitted and the other predicted. That sees
+    what follows noise, and nothing of what lies between views.
+    """
+
+    scan: Scan
+    count: int
+    by: str
+
+    @classmethod
+    def of(cls, train: Scan) -> Folds:
+        """Of training frames of one time."""
+        scan, views = train.binned(train.largest_binning(math.ceil(max(train.views.shape) / WIDTH))), len(train)
+        if views < FEWEST:
+            return cls(scan, 1, BY_FISSION)
+        return cls(scan, MOST if views >= MANY else views, BY_VIEWS)
+
+    def split(self, fold: int) -> tuple[Scan, Scan]:
+        """What is fitted, and what is predicted. Folds share no view; many views are not all predicted."""
+        if self.by == BY_FISSION:
+            frames = torch.from_numpy(self.scan.frames)
+            draw = torch.randn(frames.shape, generator=torch.Generator().manual_seed(0))
+            noise = noise_levels(frames)[:, None, None].float() * draw
+            return tuple(replace(self.scan, frames=(frames + s * noise).numpy()) for s in (1, -1))  # type: ignore[return-value]
+        views = len(self.scan)
+        together = 1 if views < MANY else 2
+        chosen = np.unique(np.arange(together * self.count) * views // (together * self.count))
+        aside = chosen[fold :: self.count]
+        return self.scan[np.setdiff1d(np.arange(views), aside)], self.scan[aside]
+
+
+@dataclass
+class FirstVolumes:
+    """The volumes of a scan's folds under hypotheses, each made once."""
+
+    folds: Folds
+    prior: MaterialPrior
+    on_progress: Progress
+    options: HolographicTV = field(
+        default_factory=lambda: HolographicTV(
+            retrieval=20, iterations=80, corrections=3, upper=0.0, refine=1, beyond=False
+        )
+    )
+    taken: tuple[str, ...] = ()
+    """What was decided of light and noise."""
+    _material: DeltaBeta | None = None
+    _made: dict[tuple[object, int], object] = field(default_factory=dict)
+
+    @property
+    def material(self) -> DeltaBeta:
+        """The one material that stands for all matter, of the frames as they were measured."""
+        if self._material is None:
+            self._material = assumed_material(self.folds.scan, self.prior, self.on_progress, self.options.backend)
+        return self._material
+
+    def once(self, key: object, fold: int, make: Callable[[], T]) -> T:
+        """What `make` gives, made once for a key and a fold."""
+        if (key, fold) not in self._made:
+            self._made[key, fold] = make()
+        return self._made[key, fold]  # type: ignore[return-value]
+
+    def volume(self, seen: Scan, light: Light | None) -> VoxelGrid:
+        """The volume of frames that were measured in `light` (None: even light, white noise)."""
+        frames = torch.from_numpy(seen.frames)
+        even = seen if light is None else replace(seen, frames=light.evened(frames).numpy())
+        values, grid = holographic_tv(even, self.material, self.options, self.on_progress, light)
+        return VoxelGrid(values[None], grid, Matter.one(*self.material))
+
+
+def lit_by_halves(measured: Tensor, predicted: Tensor, known: Background) -> Tensor:
+    """Frames [V, H, W] predicted in even light, in the light that the measured ones have: in each half of a
+    checkerboard as the other half says, so that no pixel tells its own."""
+    shared = replace(
+        known,
+        coefficients=known.coefficients[:1].expand(len(measured), -1),
+        covariances=known.covariances[:1].expand(len(measured), -1, -1),
+        powers=known.powers.mean().expand(len(measured)),
+    )
+    y, x = np.mgrid[: measured.shape[1], : measured.shape[2]] // CHECKED
+    half, lit = torch.from_numpy((x + y) % 2 == 0), predicted.double().clone()
+    for part in (half, ~half):
+        factor = shared.seen_beside(measured, predicted, part).factor()
+        lit[:, ~part] *= factor[:, ~part]
+    return lit
+
+
+def score_of(measured: Tensor, predicted: Tensor) -> Score:
+    """Of the residual of unseen frames [V, H, W]."""
+    return Score.of(measured.double() - predicted.double())
+
+
+def predictions(volume: VoxelGrid, scan: Scan) -> Tensor:
+    """Frames [V, H, W] of a volume in even light."""
+    return predicted_frames(scan.exposures, volume)
