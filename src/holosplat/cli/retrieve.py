@@ -17,6 +17,7 @@ from ..matter import DeltaBeta, KnownRatio
 from ..ranges import Grams, Signed, ranged
 from .light import LightFlags
 from .options import PriorOptions
+from .places import Output
 from .progress import ProgressBar
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ class OneMaterial:
 
 def retrieve(
     scan: Positional[Path],
-    out: Path,
+    out: Output,
     matter: OneMaterial = OneMaterial(),
     method: RetrievalName = "tikhonov",
     illumination: LightFlags = LIGHT,
