@@ -197,6 +197,8 @@ def _write_geometry(
 
 def _write_table(path: Path, found: AlignedViews) -> None:
     """A row for each view."""
+    from ..io.atomic import atomic_path
+
     names = (
         "shift_x_px",
         "shift_y_px",
@@ -207,7 +209,7 @@ def _write_table(path: Path, found: AlignedViews) -> None:
         "magnification_share",
     )
     header = ["view", *names, *(f"error_{name}" for name in names), "flux", "before", "after"]
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(header)
         for v in range(len(found.changes)):

@@ -11,6 +11,7 @@ import numpy as np
 from tyro.conf import Positional
 
 from ..checks import require
+from ..io.atomic import atomic_path
 from ..io.phase_maps import PhaseMaps, is_file, require_place, write_phase_maps
 from ..io.reading import Reading
 from ..matter import DeltaBeta, KnownRatio
@@ -114,7 +115,8 @@ def _preview(path: Path, measured: Scan, found: Retrieved) -> None:
         view_labels(measured.views),
         measured.views.pixel_sizes,
     )
-    figure.savefig(path)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary)
 
 
 def _report(out: Path, measured: Scan, found: Retrieved, level: bool) -> None:

@@ -36,7 +36,7 @@ _known: dict[tuple[int, ...], None] = {}
 
 
 def opened_for_reading(path: Path) -> h5py.File:
-    """The file at `path`, which no other program may write meanwhile; without that on a file system that has no locks."""
+    """The file at `path`, which nobody else may write meanwhile; on a file system without locks, without that."""
     try:
         return h5py.File(path, "r")
     except OSError as error:
