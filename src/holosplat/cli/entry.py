@@ -11,6 +11,7 @@ import re
 import sys
 from collections.abc import Callable
 from importlib import import_module
+from io import TextIOWrapper
 
 import tyro
 from tyro.conf import OmitArgPrefixes
@@ -122,6 +123,8 @@ def main() -> None:
     Ctrl-C, SIGTERM and SIGHUP exit with 130, after what can be saved is.
     """
     end_as_on_interrupt()
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(errors="surrogateescape")  # names of files need be no UTF-8
     if sys.argv[1:] == ["--version"]:
         print(f"holosplat {__version__}")
         return
