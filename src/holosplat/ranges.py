@@ -122,10 +122,10 @@ def with_checked_numbers(function: Callable[Given, Returned]) -> Callable[Given,
     @wraps(function)
     def checked(*args: Given.args, **kwargs: Given.kwargs) -> Returned:
         signature = inspect.signature(function)
-        hints = _hints(function)
+        hints = hints_of(function)
         _later.clear()
         for name, value in signature.bind(*args, **kwargs).arguments.items():
-            _require_sound(_flag(name), value, signature.parameters[name].default, hints.get(name))
+            _require_sound(flag(name), value, signature.parameters[name].default, hints.get(name))
             _require_sound_within(value)
         return function(*args, **kwargs)
 
@@ -148,12 +148,13 @@ def _require_sound_within(made: Any) -> None:
     if not is_dataclass(made) or isinstance(made, type):
         return
     if not _ranged.isdisjoint(type(made).__mro__):
-        require_sound(made, _flag)
+        require_sound(made, flag)
     for one in fields(made):
         _require_sound_within(getattr(made, one.name, None))
 
 
-def _flag(name: str) -> str:
+def flag(name: str) -> str:
+    """How the command line calls the argument `name`."""
     return f"--{name.replace('_', '-')}"
 
 
@@ -217,11 +218,11 @@ def _takes_floats(hint: Any) -> bool:
 @cache
 def _fields(kind: type) -> tuple[tuple[str, Any, Any], ...]:
     """Name, default and type of each field of a dataclass that may hold numbers or texts."""
-    hints = _hints(kind)
+    hints = hints_of(kind)
     return tuple((one.name, one.default, hints.get(one.name)) for one in fields(kind) if one.init)  # pyright: ignore[reportArgumentType]
 
 
-def _hints(thing: Any) -> dict[str, Any]:
+def hints_of(thing: Any) -> dict[str, Any]:
     """The types of fields or arguments, as far as they can be told: some names are there for the type checker only."""
     try:
         return get_type_hints(thing, include_extras=True)

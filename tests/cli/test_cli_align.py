@@ -165,7 +165,7 @@ def test_a_series_has_one_geometry_and_its_reversed_beam_is_turned_back(tmp_path
 def test_requests_that_cannot_be_met_are_refused(turning, tmp_path):
     path, scan = turning
     out = tmp_path / "aligned.nxs"
-    refused(holosplat("align", path, "--axis-only", "--out", path), "name another file")
+    refused(holosplat("align", path, "--axis-only", "--out", path), "must not be what the command reads")
     refused(holosplat("align", path, "--axis-only", "--table", tmp_path / "t.csv", "--out", out), "--table")
     refused(holosplat("align", path, "--uncertain-shift", -1, "--out", out), "shift")
     few = tmp_path / "few.nxs"

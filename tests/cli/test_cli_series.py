@@ -171,7 +171,7 @@ BAD_SERIES: dict[str, tuple[list[object], list[str]]] = {
     ),
     "a truth of no time": (["--frame-rate", 1e6, "--truth", "t.h5", "--truth-frames", 7], ["0 to 6", "7"]),
     "times without a truth": (["--frame-rate", 1e6, "--truth-frames", 0], ["--truth-frames needs --truth"]),
-    "one file twice": (["--frame-rate", 1e6, "--truth", "s.nxs"], ["different files"]),
+    "one file twice": (["--frame-rate", 1e6, "--truth", "s.nxs"], ["must be different places"]),
     "a negative box": (["--frame-rate", 1e6, "--period", -80, 0, 0], ["period", "negative"]),
     "a unit for no collection": (["--frame-rate", 1e6, "--time-unit", "us"], ["time unit", ".pvd"]),
     "shifts of no size": (["--misalign-shift", -1], ["--misalign-shift", "-1"]),

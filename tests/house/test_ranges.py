@@ -20,7 +20,7 @@ from holosplat.bench import declaration, soft_specimens, specimens
 from holosplat.checks import InputError
 from holosplat.cli.entry import COMMANDS, command
 from holosplat.materials import DeltaBeta
-from holosplat.ranges import _fields, _hints, range_of, with_checked_numbers
+from holosplat.ranges import _fields, hints_of, range_of, with_checked_numbers
 
 ROOT = Path(holosplat.__file__).parent
 INTERNAL = {"Group", "Choice", "_Best", "_Unread", "Mark", "Block", "Blocks", "Decision", "Fields"}
@@ -138,7 +138,7 @@ def test_every_number_of_a_command_is_refused_or_within_its_range():
     """Options of commands are dataclasses above; these are the arguments beside them."""
     tried = 0
     for name in COMMANDS:
-        hints = _hints(command(name))
+        hints = hints_of(command(name))
         for field, parameter in inspect.signature(command(name)).parameters.items():
             if takes_numbers(hint := hints.get(field)):
                 for value in (math.nan, math.inf, 1e30, -1e30):
@@ -146,7 +146,7 @@ def test_every_number_of_a_command_is_refused_or_within_its_range():
                         with_checked_numbers(_stub(field, hint, parameter.default))(value)
                     tried += 1
             elif isinstance(hint, type) and dataclasses.is_dataclass(hint):
-                holds = any(takes_numbers(inner) for inner in _hints(hint).values())
+                holds = any(takes_numbers(inner) for inner in hints_of(hint).values())
                 assert not holds or f"{hint.__module__}.{hint.__name__}" in all_ranged(), (name, field)
     assert tried >= 30
 

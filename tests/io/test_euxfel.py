@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -11,7 +12,7 @@ import pytest
 
 from holosplat.checks import InputError
 from holosplat.geometry import rotation_y
-from holosplat.io import euxfel
+from holosplat.io import euxfel, hdf5_guard
 from holosplat.io.formats import loader_of, read, read_as
 from holosplat.io.reading import Reading, Told
 from holosplat.workflows.correct import CorrectionOptions, correct
@@ -114,6 +115,58 @@ def test_what_a_run_does_not_have_or_say_is_named(run, change, said, tmp_path):
         given["darks"] = tmp_path
     with pytest.raises(InputError, match=said):
         read(run, given)
+
+
+def stored_elsewhere(run: Path, shape=(TRAINS, PULSES, H, W), dtype="u2", **how) -> str:
+    """Put the pixels of the first camera in place of those of the run; the name of the dataset."""
+    name = f"INSTRUMENT/{CAMERA.format(1)}:daqOutput/data/image/pixels"
+    with h5py.File(run / "RAW-R0007-DA01-S00000.h5", "r+") as file:
+        del file[name]
+        if "layout" in how:
+            file.create_virtual_dataset(name, how["layout"])
+        else:
+            file.create_dataset(name, shape, dtype, **how)
+    return name
+
+
+@pytest.mark.parametrize("kind", ["external", "virtual"])
+def test_a_run_brings_values_of_other_files_only_where_that_is_allowed(run, tmp_path, monkeypatch, kind):
+    """External storage and virtual datasets read any file of this machine."""
+    monkeypatch.setattr(hdf5_guard, "_vouched", set())
+    frames = counts_of(5).astype("u2")
+    if kind == "external":
+        frames.tofile(tmp_path / "values")
+        stored_elsewhere(run, external=[(str(tmp_path / "values"), 0, frames.nbytes)])
+    else:
+        with h5py.File(tmp_path / "other.h5", "w") as file:
+            file["a"] = frames
+        layout = h5py.VirtualLayout(frames.shape, "u2")
+        layout[:] = h5py.VirtualSource(str(tmp_path / "other.h5"), "a", frames.shape)
+        stored_elsewhere(run, layout=layout)
+    told = Told(**SAID, sources="HPVX2_1")
+    with pytest.raises(InputError, match="has its values in another file; if you trust both, add --allow-external"):
+        read_as(run, Reading(told))
+    with pytest.raises(InputError, match="add --allow-external"):
+        read_as(run_of(tmp_path / "r2", counts_of(1)), Reading(Told(**SAID, sources="HPVX2_1", flats=run)))
+    found = read_as(run, Reading(replace(told, allow_external=True)))
+    np.testing.assert_array_equal(found.frames, frames.reshape(-1, H, W))
+
+
+@pytest.mark.parametrize(
+    ("shape", "dtype"),
+    [
+        ((TRAINS, PULSES, H, W), h5py.string_dtype()),
+        ((TRAINS, PULSES, H, W), "c8"),
+        ((TRAINS, PULSES, H, W), h5py.ref_dtype),
+        ((1, PULSES, H, W), "u2"),
+        ((TRAINS, PULSES, 0, W), "u2"),
+        ((TRAINS,), "u2"),
+    ],
+)
+def test_pixels_that_are_none_or_too_few_are_refused(run, shape, dtype):
+    stored_elsewhere(run, shape, dtype)
+    with pytest.raises(InputError, match="r0007"):
+        np.asarray(read(run, {**SAID, "sources": "HPVX2_1"}).frames)
 
 
 def test_without_the_package_its_name_is_said(run, monkeypatch):

@@ -201,7 +201,7 @@ def test_arrays_declare_what_they_hold(tmp_path):
         header = {"descr": "<f4", "fortran_order": False, "shape": (10**6, 10**4, 1000)}
         np.lib.format.write_array_header_1_0(file, header)
         file.write(bytes(100))
-    with pytest.raises(InputError, match=r"a\.npy must be a NumPy array, but reading it failed"):
+    with pytest.raises(InputError, match=r"a\.npy must be a NumPy array .*it declares 4e\+13 bytes"):
         stack_of(path)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import resource
 import zlib
@@ -235,3 +236,20 @@ def test_room_on_the_disk_is_that_of_the_folder_above(folder, monkeypatch):
     free = {folder.resolve(): SimpleNamespace(free=17)}
     monkeypatch.setattr(room.shutil, "disk_usage", free.__getitem__)
     assert room.free_disk(folder / "not" / "yet") == 17
+
+
+def test_a_file_system_without_locks_is_read(folder, monkeypatch):
+    """What HDF5 says there; any other failure is one."""
+    path, whole = virtual(folder / "a.h5", str(holding(folder / "b.h5"))), h5py.File
+    said = f"unable to lock file, errno = {errno.ENOLCK}, error message = 'No locks available'"
+
+    def unlocked(*args, locking: bool = True, **kwargs):
+        if locking:
+            raise OSError(said)
+        return whole(*args, locking=False, **kwargs)
+
+    monkeypatch.setattr(h5py, "File", unlocked)
+    assert np.array_equal(read(path), VALUES)
+    said = "unable to lock file, errno = 11, error message = 'Resource temporarily unavailable'"
+    with pytest.raises(InputError, match="Resource temporarily unavailable"):
+        read(path)

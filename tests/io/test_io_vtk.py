@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 from vtkmodules.util.numpy_support import numpy_to_vtk
@@ -11,6 +14,7 @@ from vtkmodules.vtkIOLegacy import vtkPolyDataWriter, vtkUnstructuredGridWriter
 from vtkmodules.vtkIOXML import vtkXMLImageDataWriter, vtkXMLPolyDataWriter, vtkXMLUnstructuredGridWriter
 
 from holosplat.checks import InputError
+from holosplat.io.solids import write_stl
 from holosplat.io.vtk import read_meshes, write_mesh
 from holosplat.mesh import TriangleMesh
 from holosplat.specimens.red_cells import evans_fung_cell, icosphere
@@ -145,6 +149,29 @@ def test_length_unit_scales_and_must_be_known(tmp_path):
     assert read_meshes(path, "mm")[0].volume / read_meshes(path, "um")[0].volume == pytest.approx(1e9)
     with pytest.raises(InputError, match=r"length_unit.*furlong"):
         read_meshes(path, "furlong")
+
+
+@pytest.mark.parametrize(("scale", "unit"), [(1e30, "um"), (100, "m"), (1e-12, "um")])
+def test_bodies_of_absurd_sizes_are_refused(tmp_path, scale, unit):
+    """Their frames would be blank."""
+    mesh = TriangleMesh(np.array(TETRAHEDRON, dtype=float), FACES)
+    write_mesh(tmp_path / "a.vtp", mesh.transformed(scale * np.eye(3), np.zeros(3)), "m")
+    with pytest.raises(InputError, match=r"a\.vtp must hold a body of 1e-09 m or more, at most 10 m from its origin"):
+        read_meshes(tmp_path / "a.vtp", unit)
+
+
+@pytest.mark.parametrize("suffix", [b".vtk", b".vtp", b".STL"])
+def test_a_name_that_is_no_utf8_is_read_and_written(tmp_path, suffix):
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/f\xff"))
+    folder.mkdir()
+    path = folder / os.fsdecode(b"cell\xe9" + suffix)
+    if suffix == b".STL":
+        write_stl(path, [evans_fung_cell(8e-6, 1)])
+    else:
+        write_mesh(path, evans_fung_cell(8e-6, 1))
+    (found,) = read_meshes(path, "um")
+    assert found.name == f"cell\ufffd{suffix.decode()}"
+    assert len(found.faces) == len(evans_fung_cell(8e-6, 1).faces)
 
 
 def test_folders_are_read_in_natural_order(tmp_path):

@@ -136,7 +136,7 @@ def test_a_folder_of_something_else_or_of_another_study_is_refused(measured, tmp
         run_study(replace(measured, physics="far"), [SMALL], QUICK, 5, folder)
     run_study(measured, [SMALL], QUICK, 5, folder)
     (folder.path / "8k-v4.maps.npz").write_bytes(b"no maps")
-    with pytest.raises(InputError, match=r"8k-v4.maps.npz must hold a study's maps"):
+    with pytest.raises(InputError, match=r"8k-v4.maps.npz must be the maps of a study"):
         load_study(folder)
     (folder.path / "8k-v4.curves.csv").write_text("step,seconds\n1,2\n")
     with pytest.raises(InputError, match=r"8k-v4.curves.csv must hold a study's curves"):

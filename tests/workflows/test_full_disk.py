@@ -5,12 +5,16 @@ from __future__ import annotations
 import os
 import resource
 from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
 
 import h5py
 import numpy as np
 import pytest
 
 from holosplat.checks import InputError
+from holosplat.cli.align import _write_table
+from holosplat.cli.retrieve import _preview
 from holosplat.geometry import Views
 from holosplat.io import write_scan
 from holosplat.io.atomic import atomic_path
@@ -114,3 +118,32 @@ def test_files_and_their_names_are_on_the_disk_when_they_are_there(tmp_path, mon
     with atomic_folder(tmp_path / "b") as temporary:
         (temporary / "c.txt").write_text("c")
     assert order == ["file", "folder", "folder"]
+
+
+def test_a_table_of_views_is_there_whole_or_not_at_all(tmp_path):
+    """The disk is full in the middle of it, after the estimate."""
+    path, count = tmp_path / "table.csv", 2000
+    path.write_text("old")
+    found = SimpleNamespace(changes=np.ones((count, 7)), errors=np.ones((count, 7)))
+    for name in ("flux", "before", "after"):
+        setattr(found, name, np.ones(count))
+    with room_of(9000), pytest.raises(InputError, match=r"table\.csv must be writable"):
+        _write_table(path, found)  # pyright: ignore[reportArgumentType]
+    assert path.read_text() == "old"
+    assert os.listdir(tmp_path) == ["table.csv"]
+    _write_table(path, found)  # pyright: ignore[reportArgumentType]
+    assert len(path.read_text().splitlines()) == count + 1
+
+
+def test_a_preview_is_there_whole_or_not_at_all(tmp_path, monkeypatch):
+    class Drawn:
+        def savefig(self, path: Path) -> None:
+            path.write_bytes(bytes(9000))
+
+    monkeypatch.setattr("holosplat.report.light.phase_figure", lambda *_: Drawn())
+    found = SimpleNamespace(light=SimpleNamespace(background=None), phase=SimpleNamespace(numpy=lambda: None))
+    views = Views.evenly_spaced(SHAPE[0], SHAPE[1:], 1e-6)
+    measured = SimpleNamespace(frames=None, views=views)
+    with room_of(5000), pytest.raises(InputError, match=r"preview\.png must be writable"):
+        _preview(tmp_path / "preview.png", measured, found)  # pyright: ignore[reportArgumentType]
+    assert os.listdir(tmp_path) == []

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
 import os
+import shutil
 import socket
 import subprocess
 import sys
@@ -12,6 +15,7 @@ import numpy as np
 import pytest
 
 from holosplat.checks import InputError
+from holosplat.io import lock
 from holosplat.io.atomic import atomic_path
 from holosplat.io.folder import atomic_folder, is_taken
 from holosplat.io.hdf5_writing import new_hdf5, put
@@ -38,17 +42,85 @@ def test_another_process_may_not_write_to_it(tmp_path):
     """A live one of this machine, by its number and beginning; nothing is touched."""
     with sole_writer(tmp_path / "run"):
         text = (tmp_path / "run" / LOCK).read_text()
-        code = (
-            "from pathlib import Path; from holosplat.io.lock import sole_writer; import sys\n"
-            "with sole_writer(Path(sys.argv[1])): pass"
-        )
-        done = subprocess.run(
-            [sys.executable, "-c", code, tmp_path / "run"], capture_output=True, text=True, check=False
-        )
+        done = ended_elsewhere(tmp_path / "run")
         assert done.returncode == 1
         assert f"must have one writer, but process {os.getpid()} on {socket.gethostname()} writes to it" in done.stderr
         assert (tmp_path / "run" / LOCK).read_text() == text
     assert not (tmp_path / "run").exists()
+
+
+def ended_elsewhere(folder, *before) -> subprocess.CompletedProcess:
+    """A process that writes to a folder, started by a command `before`."""
+    code = (
+        "from pathlib import Path; from holosplat.io.lock import sole_writer; import sys\n"
+        "with sole_writer(Path(sys.argv[1])): pass"
+    )
+    command = [*before, sys.executable, "-c", code, folder]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+CONTAINER = ("unshare", "--pid", "--fork")
+"""What gives a process another namespace of processes, as containers do, with the same name of the machine."""
+
+
+@pytest.mark.skipif(
+    shutil.which("unshare") is None or subprocess.run([*CONTAINER, "true"], check=False).returncode != 0,
+    reason="this user may not make a namespace of processes",
+)
+@pytest.mark.parametrize("locks", [True, False])
+def test_a_process_of_another_container_may_not_write_to_it(tmp_path, monkeypatch, locks):
+    """Its number is that of another process here, or of none: by the kernel's lock, and where there is none, too."""
+    if not locks:
+        monkeypatch.setattr(fcntl, "flock", without_locks)
+    with sole_writer(tmp_path / "run"):
+        done = ended_elsewhere(tmp_path / "run", *CONTAINER)
+        assert done.returncode == 1
+        assert "must have one writer" in done.stderr
+    assert ended_elsewhere(tmp_path / "run", *CONTAINER).returncode == 0
+
+
+def without_locks(*_: object) -> None:
+    raise OSError(errno.ENOLCK, "No locks available")
+
+
+def test_a_file_system_without_locks_is_written_to(tmp_path, monkeypatch, gone):
+    monkeypatch.setattr(fcntl, "flock", without_locks)
+    for text in ("", lock_of(gone)):
+        if text:
+            (tmp_path / LOCK).write_text(text)
+        with sole_writer(tmp_path):
+            assert json.loads((tmp_path / LOCK).read_text())["locked"] is False
+            done = ended_elsewhere(tmp_path)
+            assert "must have one writer" in done.stderr
+        tmp_path.mkdir(exist_ok=True)
+
+
+def test_a_lock_that_the_kernel_let_go_is_taken_over(tmp_path, gone):
+    """Whatever its number means here: of a process that is alive, of another container, or before a new start."""
+    for change in ({"process": os.getppid()}, {"namespace": "pid:[1]"}, {"boot": "before"}, {"host": "renamed"}):
+        (tmp_path / LOCK).write_text(json.dumps(lock._self() | {"process": gone, "locked": True} | change))
+        with sole_writer(tmp_path):
+            assert json.loads((tmp_path / LOCK).read_text())["process"] == os.getpid()
+        tmp_path.mkdir(exist_ok=True)
+
+
+def test_what_a_forked_child_holds_does_not_outlive_its_parent(tmp_path):
+    with sole_writer(tmp_path):
+        child = os.fork()
+        if child == 0:
+            os._exit(len(lock._held))
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+        assert "must have one writer" in ended_elsewhere(tmp_path).stderr
+
+
+def test_a_full_disk_leaves_no_draft_of_a_lock(tmp_path, monkeypatch):
+    def full() -> dict:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(lock, "_self", full)
+    with pytest.raises(InputError, match="No space left"), sole_writer(tmp_path):
+        raise AssertionError("it must not begin")
+    assert os.listdir(tmp_path) == []
 
 
 def test_a_process_writes_to_its_own_folder_within_itself(tmp_path):

@@ -14,7 +14,7 @@ from ..checks import InputError, as_written, in_range, require
 from ..fit.interrupt import interrupts_held
 from ..io.atomic import atomic_path
 from ..io.folder import require_new
-from ..io.guard import require_archive
+from ..io.guard import read_archive
 from ..io.json import read_json, write_json
 from ..io.pvd import TimeStep, write_pvd
 from ..io.vtk import write_mesh
@@ -162,15 +162,11 @@ class SeriesFolder:
         """The last snapshot and the state at it; None if there is none yet."""
         if not self.state.is_file():
             return None
-        try:
-            with np.load(self.state, allow_pickle=False) as file:
-                require_archive(file, self.state)
-                nodes, numbers, counts = file["nodes"], file["numbers"].tolist(), file["counts"].tolist()
-        except Exception as error:  # a damaged archive raises many kinds
-            raise InputError(f"{self.state} must be a state that grow wrote, but it is damaged; start anew.") from error
+        file = read_archive(self.state, what="a state that grow wrote")
         wanted = (growth.cells, len(suspension.membrane.mesh.vertices), 3)
-        require(nodes.shape == wanted and bool(np.isfinite(nodes).all()), f"{self.state} is damaged; start anew.")
         with as_written(self.state, "a state that grow wrote"):
+            nodes, numbers, counts = file["nodes"], file["numbers"].tolist(), file["counts"].tolist()
+            require(nodes.shape == wanted and bool(np.isfinite(nodes).all()), f"{self.state} is damaged; start anew.")
             (time, step), (snapshot, taken, refused) = numbers, counts
             good = step > 0 and 0 <= time < np.inf and min(snapshot, taken, refused) >= 0
             require(good and step < np.inf, f"{self.state} is damaged; start anew.")

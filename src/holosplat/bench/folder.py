@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import InputError, require
+from ..checks import require
 from ..io.atomic import atomic_path
 from ..io.folder import is_taken, require_parent
-from ..io.guard import require_archive
+from ..io.guard import read_archive
 from ..io.json import read_json, write_json
 from ..io.leftovers import is_hidden
 from .rows import Row, read_row, write_row
@@ -85,12 +85,7 @@ class BenchFolder:
         path = self._picture(case, seed, name)
         if not path.is_file():
             return None
-        try:
-            with np.load(path, allow_pickle=False) as arrays:
-                require_archive(arrays, path)
-                return dict(arrays)
-        except Exception as error:  # numpy and zipfile raise many kinds for damaged files
-            raise InputError(f"{path} must be a picture of the benchmark, but it is damaged; remove it.") from error
+        return read_archive(path, what="a picture of the benchmark")
 
     def describe_case(self, case: str, seed: int) -> dict[str, Any]:
         """What case.json says of a case; empty where its folder is gone."""

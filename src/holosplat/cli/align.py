@@ -15,6 +15,7 @@ from ..io.reading import Part, Reading
 from ..ranges import ranged
 from .light import LightFlags
 from .options import PriorOptions
+from .places import Output
 from .progress import ProgressBar
 from .quantities import Degrees, Pixels, Share
 from .room import tell_frames
@@ -94,15 +95,15 @@ class RefineOptions:
 
 def align(
     scan: Positional[Path],
-    out: Path,
+    out: Output,
     matter: PriorOptions = PriorOptions(),
     unknown: UncertainOptions = UncertainOptions(),
     reading: Reading = Reading(),
     *,
     illumination: LightFlags = LIGHT,
     axis_only: bool = False,
-    table: Path | None = None,
-    geometry_out: Path | None = None,
+    table: Output | None = None,
+    geometry_out: Output | None = None,
 ) -> None:
     """Find where the beams of a scan really are, and write the same frames with other exposures.
 
@@ -116,7 +117,7 @@ def align(
     import numpy as np
 
     from ..align import AlignedBeams
-    from ..io.atomic import require_apart, require_writable
+    from ..io.atomic import require_writable
     from ..io.formats import read_as
     from ..io.nxtomo import write_scan
     from ..planning.acts import of_alignment
@@ -124,7 +125,6 @@ def align(
 
     for path in (out, *([table] if table else []), *([geometry_out] if geometry_out else [])):
         require_writable(path)
-        require_apart(path, scan)
     require(table is None or not axis_only, "--table is of single views; leave it, or --axis-only.")
     require(geometry_out is None or reading.part.views is None, "--geometry-out is of all frames; leave --views.")
     measured, how = read_as(scan, reading), unknown.options()
@@ -197,6 +197,8 @@ def _write_geometry(
 
 def _write_table(path: Path, found: AlignedViews) -> None:
     """A row for each view."""
+    from ..io.atomic import atomic_path
+
     names = (
         "shift_x_px",
         "shift_y_px",
@@ -207,7 +209,7 @@ def _write_table(path: Path, found: AlignedViews) -> None:
         "magnification_share",
     )
     header = ["view", *names, *(f"error_{name}" for name in names), "flux", "before", "after"]
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(header)
         for v in range(len(found.changes)):

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 from tyro.conf import Positional, arg, subcommand
 
 from ..checks import require
-from ..ranges import Seed, with_checked_numbers
+from ..ranges import Seed
+from .places import Output, with_checked_arguments
 from .progress import INTERRUPTED, ProgressBar
 from .room import tell
 from .thesis import thesis
@@ -40,7 +41,7 @@ def run(
     cases: tuple[str, ...] = (),
     methods: tuple[str, ...] = (),
     seeds: tuple[Seed, ...] = (FIRST_SEED,),
-    out: Path = Path("bench"),
+    out: Output = Path("bench"),
     folders: Folders = Folders(),
     retry: bool = False,
     list_only: Annotated[bool, arg(name="list")] = False,
@@ -110,9 +111,9 @@ def report(folder: Positional[Path] = Path("bench")) -> None:
 
 def bench(
     act: Annotated[
-        Annotated[None, subcommand("run", constructor=with_checked_numbers(run))]
+        Annotated[None, subcommand("run", constructor=with_checked_arguments(run))]
         | Annotated[None, subcommand("report", constructor=report)]
-        | Annotated[None, subcommand("thesis", constructor=with_checked_numbers(thesis))],
+        | Annotated[None, subcommand("thesis", constructor=with_checked_arguments(thesis))],
         arg(name=""),
     ],
 ) -> None:

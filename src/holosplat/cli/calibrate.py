@@ -14,6 +14,7 @@ from ..io.reading import Part, Reading
 from ..ranges import Small, ranged
 from .light import LightFlags
 from .options import MaterialOptions
+from .places import Output
 from .progress import ProgressBar
 from .quantities import Degrees, Pixels, Share
 
@@ -77,7 +78,7 @@ class DoubtOptions:
 
 def calibrate(
     scan: Positional[Path],
-    out: Path,
+    out: Output,
     body: BodyOptions,
     filling: MaterialOptions = MaterialOptions(),
     unknown: DoubtOptions = DoubtOptions(),
@@ -92,12 +93,11 @@ def calibrate(
         out: Geometry to write (TOML).
     """
     from ..align import calibrate as find
-    from ..io.atomic import require_apart, require_writable
+    from ..io.atomic import require_writable
     from ..io.formats import read_as
     from ..matter import MaterialPrior
 
     require_writable(out)
-    require_apart(out, scan)
     whole = reading.part == Part(time_frame=reading.part.time_frame)
     require(whole, "a geometry is that of whole frames; leave --views, --test-views, --crop and --bin.")
     require(filling.material is not None, "calibrate needs the phantom's --material; add it.")

@@ -18,6 +18,7 @@ from .carried import CarriedFlags
 from .light import RunLightFlags
 from .live import LiveFlags, watched
 from .options import BeamlineOptions, MethodOptions, PriorOptions, TruthOptions
+from .places import Output
 from .progress import INTERRUPTED, ProgressBar
 from .room import tell_frames, tell_reconstruction
 
@@ -77,7 +78,7 @@ USUAL = Asked()
 
 def reconstruct(
     scan: Positional[Path],
-    out: Path,
+    out: Output,
     asked: Annotated[Asked, arg(name="")] = USUAL,
     seed: Seed = 0,
     resume: bool = False,
@@ -196,7 +197,7 @@ def _print_result(folder: RunFolder, result: Reconstruction, report: Path) -> No
 def render(
     run: Positional[Path],
     scan: Path,
-    out: Path,
+    out: Output,
     split: Literal["test", "train", "all"] = "test",
     reading: Reading = Reading(),
 ) -> None:
@@ -265,7 +266,7 @@ def evaluate(
             _say(f"report: {report_run(folder, result, measured, evaluation, true_volume)}")
 
 
-def demo(out: Path = Path("demo")) -> None:
+def demo(out: Output = Path("demo")) -> None:
     """Run the whole chain on generated red cells: simulate, reconstruct, evaluate, report.
 
     Args:

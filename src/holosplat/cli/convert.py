@@ -28,6 +28,7 @@ from ..ranges import Metres, Natural, Positive, ranged
 from ..scan import Scan
 from ..workflows.still_light import StillLight, evened
 from .options import PriorOptions
+from .places import Output
 from .progress import ProgressBar
 
 
@@ -96,7 +97,7 @@ GOES_WITH: dict[str, tuple[ScanFormat, ...]] = {
 
 def convert(
     source: Annotated[Positional[Path], arg(metavar="SOURCE")],
-    out: Annotated[Positional[Path], arg(metavar="OUT")],
+    out: Annotated[Positional[Output], arg(metavar="OUT")],
     to: ScanFormat,
     writing: WritingOptions,
     reading: Reading = Reading(),

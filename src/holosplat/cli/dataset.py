@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import OmitArgPrefixes, arg
 
 from ..ranges import Jobs, Seed, Within
 from ..training.ranges import Ranges
+from .places import Output
 from .progress import INTERRUPTED, ProgressBar
 from .room import tell
 
@@ -23,7 +23,7 @@ DRAWN = Ranges()
 
 
 def dataset(
-    out: Path,
+    out: Output,
     count: Annotated[int, Within(1, 10**6)] = 1000,
     drawn: Annotated[Ranges, OmitArgPrefixes] = DRAWN,
     seed: Seed = 0,

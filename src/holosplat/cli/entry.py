@@ -11,13 +11,15 @@ import re
 import sys
 from collections.abc import Callable
 from importlib import import_module
+from io import TextIOWrapper
 
 import tyro
 from tyro.conf import OmitArgPrefixes
 
 from ..checks import OUT_OF_MEMORY, InputError
-from ..ranges import checked_later, with_checked_numbers
+from ..ranges import checked_later
 from ..version import __version__
+from .places import with_checked_arguments
 from .progress import INTERRUPTED
 from .sentence import give_up
 from .signals import end_as_on_interrupt
@@ -121,6 +123,8 @@ def main() -> None:
     Ctrl-C, SIGTERM and SIGHUP exit with 130, after what can be saved is.
     """
     end_as_on_interrupt()
+    if isinstance(sys.stdout, TextIOWrapper):
+        sys.stdout.reconfigure(errors="surrogateescape")  # names of files need be no UTF-8
     if sys.argv[1:] == ["--version"]:
         print(f"holosplat {__version__}")
         return
@@ -172,7 +176,7 @@ def _said(error: BaseException) -> str:
 
 def command(name: str) -> Callable[..., None]:
     """The function of the command `name`, a key of `COMMANDS`, whose numbers are checked; imports its module."""
-    return with_checked_numbers(getattr(import_module(f".{COMMANDS[name][0]}", __package__), name))
+    return with_checked_arguments(getattr(import_module(f".{COMMANDS[name][0]}", __package__), name))
 
 
 def _functions(arguments: list[str]) -> dict[str, Callable[..., None]]:

@@ -13,6 +13,7 @@ from tyro.conf import Positional
 
 from ..checks import InputError, as_written, in_range, require
 from ..ranges import Pixels, ranged
+from .places import Output
 
 if TYPE_CHECKING:
     from ..workflows.reconstruct import Reconstruction
@@ -30,23 +31,23 @@ STL, GLB = ".stl", ".glb"
 class ObjectFiles:
     """The object of a run as it is, not its volume."""
 
-    compact: Path | None = None
+    compact: Output | None = None
     """File several times smaller than the run's, its numbers rounded to steps (HDF5); of a run of track it holds all
     times."""
     step_px: Pixels = 1 / 32
     """Step of places in it [pixels]; those of sizes, orientations and amplitudes go with it."""
     together: tuple[Path, ...] = ()
     """More runs of a series, in order, for the same file of --compact, which stores once what they have in common."""
-    splats: Path | None = None
+    splats: Output | None = None
     """PLY file of splat viewers (µm), of a run of Gaussians; their opacity is no phase (docs/formats.md)."""
 
 
 def export(
     run: Positional[Path],
-    volume: Path | None = None,
+    volume: Output | None = None,
     shape: tuple[int, int, int] | None = None,
     voxel_size: float | None = None,
-    bodies: Path | None = None,
+    bodies: Output | None = None,
     time_frame: int | Literal["all"] | None = None,
     objects: ObjectFiles = ObjectFiles(),
 ) -> None:

@@ -31,6 +31,7 @@ from ..workflows.reconstruct import load_reconstruction
 from ..workflows.refine import where_found
 from ..workflows.run_folder import RunFolder, claimed
 from ..workflows.track import COLLECTION, TRACKS
+from .places import Output
 from .progress import ProgressBar
 from .room import tell
 
@@ -105,7 +106,7 @@ def _number_or_range(name: str, text: str) -> tuple[float, float]:
     return value, value
 
 
-def forecast(run: Positional[Path], out: Path, how: ForecastFlags = ForecastFlags(), seed: Seed = 0) -> None:
+def forecast(run: Positional[Path], out: Output, how: ForecastFlags = ForecastFlags(), seed: Seed = 0) -> None:
     """Carry a run of track on: its bodies and their frames at later times, with a standard error.
 
     Frames of the scan after the run's last time (track --time-frames) judge the forecast, and are used for nothing

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 from ..beamline.grow import Growth, SeriesFolder
 from ..beamline.grow import grow as run
@@ -13,11 +12,12 @@ from ..planning.acts import of_growth
 from ..planning.needs import Needs
 from ..specimens.membrane.resting import nodes_of
 from ..units import in_percent
+from .places import Output
 from .progress import INTERRUPTED, ProgressBar
 from .room import tell
 
 
-def grow(out: Path, what: Growth, resume: bool = False) -> None:
+def grow(out: Output, what: Growth, resume: bool = False) -> None:
     """Let red cells flow through a channel, and write their meshes (VTK, µm) at every snapshot.
 
     Args:

@@ -17,16 +17,17 @@ from ..units import span
 from ..workflows.correct import CorrectionOptions
 from ..workflows.correct import correct as correct_file
 from ..workflows.join import join as join_files
+from .places import Output
 from .progress import ProgressBar
 
 
 def record(
     scan: Positional[Path],
-    out: Path,
+    out: Output,
     what: RecordingOptions,
     camera: Camera,
     light: Illumination,
-    truth: Path | None = None,
+    truth: Output | None = None,
     part: Part = Part(),
 ) -> None:
     """Record a noise-free scan as raw counts: pulses of a free-electron laser, a camera, flats and darks.
@@ -54,7 +55,7 @@ def record(
         _say(f"wrote {truth}: what the frames do not say")
 
 
-def correct(raw: Positional[Path], out: Path, how: CorrectionOptions, reading: Reading = Reading()) -> None:
+def correct(raw: Positional[Path], out: Output, how: CorrectionOptions, reading: Reading = Reading()) -> None:
     """Correct raw counts by dark and flat fields into a scan of relative intensities.
 
     Args:
@@ -76,7 +77,7 @@ def correct(raw: Positional[Path], out: Path, how: CorrectionOptions, reading: R
 
 def join(
     scans: Positional[tuple[Path, ...]],
-    out: Path,
+    out: Output,
     pixel_size: float | None = None,
     flip: tuple[Flip, ...] = (),
     part: Part = Part(),

@@ -30,6 +30,7 @@ from ..ranges import (
     Within,
     ranged,
 )
+from .places import Output
 
 if TYPE_CHECKING:
     import numpy as np
@@ -261,23 +262,21 @@ class MisalignmentOptions:
 class TruthOptions:
     """What is also written, for judging."""
 
-    truth: Path | None = None
+    truth: Output | None = None
     """Volume file: the true δ and β, of a series at its first time."""
     truth_frames: tuple[int, ...] = ()
     """Series: write the true volume at these times instead, counted from 0, to TRUTH_t0000.h5 and so on."""
-    true_exposures: Path | None = None
+    true_exposures: Output | None = None
     """Scan file: the same frames, with poses and distances as they were, not as --out tells them."""
 
     def require_usable(self, out: Path) -> None:
-        """`InputError` unless all files, `out` among them, can be written, and are different ones."""
+        """`InputError` unless all files, `out` among them, can be written."""
         from ..io.atomic import require_writable
 
         require(self.truth is not None or not self.truth_frames, "--truth-frames needs --truth.")
-        paths = [path for path in (out, self.truth, self.true_exposures) if path]
-        for path in paths:
-            require_writable(path)
-        different = len({path.resolve() for path in paths}) == len(paths)
-        require(different, "--out, --truth and --true-exposures must be different files.")
+        for path in (out, self.truth, self.true_exposures):
+            if path is not None:
+                require_writable(path)
 
     def volumes(self, times: int) -> list[tuple[Path, int]]:
         """Each volume file to write, and the number of its time, one of `times`."""

@@ -16,6 +16,7 @@ from ..checks import in_range, require
 from ..progress import Advance
 from ..ranges import Frequency, Grams, Many, Metres, Natural, Photons, Pixels, Positive, Seconds, Signed, Small, ranged
 from .options import MaterialOptions
+from .places import Output
 from .progress import ProgressBar
 
 if TYPE_CHECKING:
@@ -151,7 +152,7 @@ class RangeOptions:
     """Lowest and highest photon energy [keV] of a survey."""
     points: tuple[Many, Many] = (25, 13)
     """Distances and energies of the survey."""
-    out: Path | None = None
+    out: Output | None = None
     """Picture of the survey to write (.png); its table is written beside it (.csv)."""
 
     @property

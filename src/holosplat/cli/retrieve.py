@@ -11,12 +11,14 @@ import numpy as np
 from tyro.conf import Positional
 
 from ..checks import require
+from ..io.atomic import atomic_path
 from ..io.phase_maps import PhaseMaps, is_file, require_place, write_phase_maps
 from ..io.reading import Reading
 from ..matter import DeltaBeta, KnownRatio
 from ..ranges import Grams, Signed, ranged
 from .light import LightFlags
 from .options import PriorOptions
+from .places import Output
 from .progress import ProgressBar
 
 if TYPE_CHECKING:
@@ -59,7 +61,7 @@ class OneMaterial:
 
 def retrieve(
     scan: Positional[Path],
-    out: Path,
+    out: Output,
     matter: OneMaterial = OneMaterial(),
     method: RetrievalName = "tikhonov",
     illumination: LightFlags = LIGHT,
@@ -113,7 +115,8 @@ def _preview(path: Path, measured: Scan, found: Retrieved) -> None:
         view_labels(measured.views),
         measured.views.pixel_sizes,
     )
-    figure.savefig(path)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary)
 
 
 def _report(out: Path, measured: Scan, found: Retrieved, level: bool) -> None:

@@ -11,11 +11,12 @@ from tyro.conf import Positional, arg, subcommand
 
 from ..checks import require
 from ..io.reading import Reading
-from ..ranges import Jobs, Positive, Seed, ranged, with_checked_numbers
+from ..ranges import Jobs, Positive, Seed, ranged
 from ..series.asked import Cut, Slurm
 from .bodies import BodyFlags, MotionFlags
 from .light import RunLightFlags
 from .options import MethodOptions, PriorOptions
+from .places import Output, with_checked_arguments
 from .progress import INTERRUPTED
 
 if TYPE_CHECKING:
@@ -104,7 +105,7 @@ NO_SLURM = SlurmFlags()
 
 def plan(
     scans: Positional[tuple[Path, ...]],
-    out: Path,
+    out: Output,
     windows: Cut = WINDOWS,
     matter: PriorOptions = PriorOptions(),
     act: Annotated[Act, arg(name="")] = ACT,
@@ -238,10 +239,10 @@ def collect(folder: Positional[Path]) -> None:
 
 def series(
     act: Annotated[
-        Annotated[None, subcommand("plan", constructor=with_checked_numbers(plan))]
-        | Annotated[None, subcommand("run", constructor=with_checked_numbers(run))]
-        | Annotated[None, subcommand("status", constructor=with_checked_numbers(status))]
-        | Annotated[None, subcommand("collect", constructor=with_checked_numbers(collect))],
+        Annotated[None, subcommand("plan", constructor=with_checked_arguments(plan))]
+        | Annotated[None, subcommand("run", constructor=with_checked_arguments(run))]
+        | Annotated[None, subcommand("status", constructor=with_checked_arguments(status))]
+        | Annotated[None, subcommand("collect", constructor=with_checked_arguments(collect))],
         arg(name=""),
     ],
 ) -> None:

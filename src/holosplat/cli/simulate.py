@@ -23,6 +23,7 @@ from .options import (
     NoiseOptions,
     TruthOptions,
 )
+from .places import Output
 from .progress import ProgressBar
 from .room import tell_simulation
 from .source import SourceOptions
@@ -76,7 +77,7 @@ def simulate(
     files: Positional[tuple[Path, ...]] = (),
     *,
     beamline: BeamlineOptions,
-    out: Path,
+    out: Output,
     imaged: SpecimenOptions = MESHES,
     filling: MaterialOptions = MaterialOptions(),
     experiment: ExperimentOptions = ExperimentOptions(),

@@ -29,6 +29,7 @@ from ..workflows.moments import instants_of
 from ..workflows.provenance import scan_hash
 from ..workflows.reconstruct import load_reconstruction
 from ..workflows.run_folder import RunFolder
+from .places import Output
 from .progress import ProgressBar
 from .room import tell_frames
 from .scans import run_and_scan
@@ -38,7 +39,7 @@ LENGTH_UNIT = "um"
 
 def surface(
     run: Positional[Path],
-    out: Path,
+    out: Output,
     scan: Path | None = None,
     truth: Path | None = None,
     how: SurfaceOptions = SurfaceOptions(),

@@ -23,6 +23,7 @@ from ..workflows.track import track as follow
 from .bodies import BodyFlags, MotionFlags
 from .light import LightFlags
 from .options import PriorOptions
+from .places import Output
 from .progress import INTERRUPTED, ProgressBar
 from .room import tell_frames
 
@@ -36,7 +37,7 @@ UNKNOWN = BodyFlags()
 
 def track(
     scan: Positional[Path],
-    out: Path,
+    out: Output,
     matter: PriorOptions = PriorOptions(),
     how: MotionFlags = USUAL,
     seed: Seed = 0,

@@ -9,6 +9,7 @@ from typing import Annotated
 from tyro.conf import OmitArgPrefixes, Positional
 
 from ..training.options import TrainOptions
+from .places import Output
 from .progress import INTERRUPTED, ProgressBar
 from .room import tell
 
@@ -17,7 +18,7 @@ DEFAULT = TrainOptions()
 
 
 def train(
-    data: Positional[Path], out: Path, how: Annotated[TrainOptions, OmitArgPrefixes] = DEFAULT, resume: bool = False
+    data: Positional[Path], out: Output, how: Annotated[TrainOptions, OmitArgPrefixes] = DEFAULT, resume: bool = False
 ) -> None:
     """Train a network on scenes of `holosplat dataset`: weights with a card, and curves.
 

@@ -16,6 +16,7 @@ from ..series.watch_folder import WatchFolder
 from ..tables import to_table
 from .light import RunLightFlags
 from .options import MethodOptions, PriorOptions
+from .places import Output
 from .progress import INTERRUPTED
 from .series import Act, EachTime
 
@@ -25,7 +26,7 @@ HOW, EACH, LIGHT = Watching(), EachTime(), RunLightFlags()
 
 def watch(
     folder: Positional[Path],
-    out: Path,
+    out: Output,
     how: Watching = HOW,
     each: EachTime = EACH,
     matter: PriorOptions = PriorOptions(),

@@ -15,9 +15,9 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ..checks import InputError, require
-from .guard import require_archive
-from .hdf5 import open_hdf5
+from ..checks import require
+from .guard import read_archive
+from .hdf5 import Fields, open_hdf5
 from .loader import Loader
 from .raw_file import (
     DARK,
@@ -37,6 +37,7 @@ FRAMES = ("counts", "projections", "proj", "data")
 FLATS = ("flats", "flat", "white")
 DARKS = ("darks", "dark")
 ANGLES = ("angles_deg", "angles", "theta_deg")
+NAMES = (*FRAMES, *FLATS, *DARKS, *ANGLES, *RANGES)
 
 
 @contextmanager
@@ -53,7 +54,7 @@ def open_arrays(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterato
         stacks, kinds = together(str(path), parts)
         projections = kinds == PROJECTION
         found: dict[str, Any] = {} if angles is None else {"angles_deg": np.asarray(angles)}
-        found |= {name: float(np.asarray(arrays[name]).reshape(-1)[0]) for name in RANGES if name in arrays}
+        found |= {name: _number(f"{path}: {name}", arrays[name]) for name in RANGES if name in arrays}
         exposures = exposures_of(str(path), given, found, stacks[0].shape[1:], projections)  # type: ignore[arg-type]
         nothing_held_out = np.zeros(int(projections.sum()), dtype=bool)
         yield ScanFile(source, str(path), stacks, kinds, exposures, nothing_held_out, kinds_label=str(path))
@@ -64,17 +65,12 @@ def _arrays(path: Path) -> Iterator[Mapping[str, Any]]:
     """The arrays of an archive, or the datasets of an open HDF5 file."""
     if h5py.is_hdf5(path):
         with open_hdf5(path) as file:
-            yield {name: item for name, item in file.items() if _holds_values(item)}
+            fields = Fields(path, file)
+            yield {name: fields.dataset(name) for name in NAMES if _holds_values(file.get(name))}
         return
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            require_archive(archive, path)
-            arrays = {name: archive[name] for name in archive.files if name not in ("provenance",)}
-    except (OSError, ValueError, zipfile.BadZipFile) as error:
-        raise InputError(f"{path} must be a complete NumPy archive, but reading it failed: {error}.") from None
-    for name in (*FRAMES, *FLATS, *DARKS, *ANGLES, *RANGES):
-        numbers = name not in arrays or arrays[name].dtype.kind in "iufb"
-        require(numbers, f"{path}: {name} must hold numbers, but it does not.")
+    arrays = read_archive(path, NAMES)
+    for name, array in arrays.items():
+        require(array.dtype.kind in "iufb", f"{path}: {name} must hold numbers, but its type is {array.dtype}.")
     yield arrays
 
 
@@ -85,6 +81,11 @@ def _holds_values(item: Any) -> bool:
 
 def _first(arrays: Mapping[str, Any], names: tuple[str, ...]) -> Any:
     return next((arrays[name] for name in names if name in arrays), None)
+
+
+def _number(label: str, array: Any) -> float:
+    require(array.size == 1, f"{label} must be one number, but there are {array.size}; keep one.")
+    return float(array[()].reshape(-1)[0])
 
 
 def _stack(frames: Any) -> Stack | None:

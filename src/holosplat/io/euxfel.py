@@ -17,10 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import InputError, MissingError, finite, positive, require
+from ..checks import InputError, MissingError, as_written, finite, positive, require
 from ..frames import Frames
 from ..preprocess.flat_field import mean_frame, relative_intensity, unlit
 from ..scan import Exposures, Scan
+from .hdf5 import open_hdf5
 from .loader import Loader
 from .raw_file import DARK, FLAT, NOTHING, PROJECTION, TAKES, ScanFile, exposures_of, together
 from .reading import marked
@@ -28,6 +29,7 @@ from .reading import marked
 FILES = re.compile(r"(RAW|CORR|PROC)-R\d+-\w+-S\d+\.h5$")
 SOURCES = "*HPVX2*"
 PIXELS = "data.image.pixels"
+RUN = "a run of the European XFEL"
 TRAIN_INTERVAL_S = 0.1
 """Trains come ten times a second, and are numbered one by one (Decking et al. 2020, Nature Photonics 14, 391)."""
 
@@ -47,10 +49,11 @@ class KeyStack:
     def __getitem__(self, index: tuple[int, slice]) -> np.ndarray:
         number, rows = index
         train, pulse = self.places[number]
-        key = _run(str(self.path))[self.source, PIXELS]
-        single = len(key.entry_shape) == 2
-        frame = key.select_trains(_by_id()[[train]]).ndarray(roi=() if single else (slice(pulse, pulse + 1),))
-        return frame.reshape(self.shape[1:])[rows]
+        with as_written(self.path, RUN):
+            key = _run(str(self.path))[self.source, PIXELS]
+            single = len(key.entry_shape) == 2
+            frame = key.select_trains(_by_id()[[train]]).ndarray(roi=() if single else (slice(pulse, pulse + 1),))
+            return frame.reshape(self.shape[1:])[rows]
 
 
 @dataclass(frozen=True)
@@ -119,6 +122,11 @@ def open_euxfel(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterato
 
 def _cameras(path: Path, given: Mapping[str, Any]) -> tuple[KeyStack, ...]:
     """A stack for each camera that is wanted, of the trains that all of them have."""
+    with as_written(path, RUN):
+        return _stacks(path, given)
+
+
+def _stacks(path: Path, given: Mapping[str, Any]) -> tuple[KeyStack, ...]:
     run, wanted = _run(str(path)), [word.strip() for word in str(given.get("sources") or SOURCES).split(",")]
     having = [source for source in sorted(run.instrument_sources) if PIXELS in run.keys_for_source(source)]
     names = [source for source in having if any(fnmatch(source, f"*{word}*") for word in wanted)]
@@ -134,6 +142,9 @@ def _cameras(path: Path, given: Mapping[str, Any]) -> tuple[KeyStack, ...]:
         f"{path}: all cameras must have the same frames, [pulses, rows, columns], but theirs are "
         f"{', '.join(str(tuple(shape)) for shape in entry)}; take one by --sources.",
     )
+    kinds = {np.dtype(run[name, PIXELS].dtype) for name in names}
+    numbers = all(kind.kind in "iuf" for kind in kinds) and 0 not in entry[0]
+    require(numbers, f"{path}: {PIXELS} must hold numbers, but holds {', '.join(map(str, kinds))} {tuple(entry[0])}.")
     count = 1 if len(entry[0]) == 2 else entry[0][0]
     pulses = np.flatnonzero(marked("--pulses", given.get("pulses") or ":", count))
     places = tuple((int(train), int(pulse)) for train in trains for pulse in pulses)
@@ -188,16 +199,23 @@ def _told(stacks: tuple[KeyStack, ...]) -> dict[str, str]:
 
 @lru_cache(maxsize=4)
 def _run(path: str) -> Any:
+    """The run of the files in a folder, each of which is looked at as every HDF5 file is (`open_hdf5`)."""
     try:
-        from extra_data import RunDirectory
+        from extra_data import DataCollection
     except ImportError:
         raise MissingError(
             'runs of the European XFEL need extra_data; install it by pip install "holosplat[euxfel]".'
         ) from None
     try:
-        return RunDirectory(path)
+        files = sorted(file for file in Path(path).iterdir() if FILES.match(file.name))
+        for file in files:
+            with open_hdf5(file):
+                pass
+        return DataCollection.from_paths([str(file) for file in files], is_single_run=True)
+    except InputError:
+        raise
     except Exception as error:  # extra_data raises many kinds for damaged files
-        raise InputError(f"{path} must be a run of the European XFEL, but opening it failed: {error}.") from None
+        raise InputError(f"{path} must be {RUN}, but opening it failed: {error}.") from None
 
 
 def _by_id() -> Any:

@@ -45,9 +45,15 @@ def read(path: str | Path, given: Mapping[str, Any] | None = None) -> Scan:
 
 def read_as(path: str | Path, reading: Reading) -> Scan:
     """The scan at `path`, as `read`, with what is said of it beside its files, and cut to the part that is taken."""
-    if reading.told.allow_external:
-        allow_external(Path(path))
+    vouch(path, reading)
     return reading.applied(read(path, reading.told.given(loader_of(path).takes)))
+
+
+def vouch(path: str | Path, reading: Reading) -> None:
+    """Let `path`, and the flats and darks beside it, bring values of other files where `reading` allows that."""
+    if reading.told.allow_external:
+        for one in (path, reading.told.flats, reading.told.darks):
+            allow_external(Path(one or path))
 
 
 @contextmanager

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import re
+import zipfile
 import zlib
+from collections.abc import Container, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..checks import InputError, require
+from ..checks import LONGEST as SAID
+from ..checks import InputError, require, require_regular
 from .room import machine_memory
 
 RATIO = 1100
@@ -58,32 +62,59 @@ def require_inflated(label: str, packed: bytes, most: int) -> None:
 
 def read_array(path: Path, what: str) -> np.ndarray:
     """The array of numbers in a .npy file, which must be `what`; `InputError` for any other, or one cut short."""
-    try:
+    found = mapped_array(path, what)
+    require_memory(str(path), found.nbytes)  # of a file with holes, which holds more than it takes
+    return np.array(found)
+
+
+def mapped_array(path: Path, what: str) -> np.ndarray:
+    """The same, whose values are read when they are asked for."""
+    require_regular(path, what)
+    with _numpy(path, f"{what} (.npy)"):
         with path.open("rb") as file:
             declared = _declared(file)
         if declared > path.stat().st_size:
             raise ValueError(f"it declares {declared:.3g} bytes, but has {path.stat().st_size}")
-        require_memory(str(path), declared)  # of a file with holes, which holds more than it takes
-        return np.array(np.load(path, mmap_mode="r", allow_pickle=False))  # which maps no more than there is
-    except InputError:
+        found = np.load(path, mmap_mode="r", allow_pickle=False)  # which maps no more than there is
+        if not isinstance(found, np.ndarray):
+            found.close()
+            raise ValueError("it is an archive")
+        return found
+
+
+def read_archive(
+    path: Path, names: Container[str] | None = None, what: str = "a NumPy archive"
+) -> dict[str, np.ndarray]:
+    """The arrays in an .npz file, which must be `what`, by name, of all names or those in `names`; `InputError` for any
+    other file, for one that declares more than it can hold, and for more than there is memory for."""
+    require_regular(path, what)
+    with _numpy(path, f"{what} (.npz)"), zipfile.ZipFile(path) as archive:
+        for part in archive.infolist():
+            with archive.open(part) as file:
+                declared = _declared(file)
+            if declared > part.file_size:
+                raise ValueError(f"it declares {declared:.3g} bytes of {part.filename[:40]}, but has {part.file_size}")
+        size = sum(part.file_size for part in archive.infolist())
+        require_declared(str(path), size, path.stat().st_size)
+        require_memory(str(path), size)
+        with np.load(path, allow_pickle=False) as found:
+            arrays = {name: found[name] for name in found.files if names is None or name in names}
+        for name, array in arrays.items():
+            if not isinstance(array, np.ndarray):
+                raise ValueError(f"{name[:40]} is no array")
+        return arrays
+
+
+@contextmanager
+def _numpy(path: Path, what: str) -> Iterator[None]:
+    """`InputError` in place of what numpy and zipfile raise, of many kinds, for damaged files."""
+    try:
+        yield
+    except (InputError, MemoryError):
         raise
-    except (OSError, ValueError, EOFError, TypeError, OverflowError) as error:
-        raise InputError(f"{path} must be {what} (.npy), but it is damaged or none: {error}.") from None
-
-
-def require_archive(archive: Any, path: Path) -> None:
-    """`InputError` if an open NumPy archive declares more than it can hold, or more than there is memory for."""
-    size = sum(part.file_size for part in archive.zip.infolist())
-    for part in archive.zip.infolist():
-        with archive.zip.open(part) as file:
-            declared = _declared(file)
-        require(
-            declared <= part.file_size,
-            f"{path} declares {declared:.3g} bytes of {part.filename[:40]}, but holds {part.file_size:.3g}; it is "
-            "damaged, or no honest file.",
-        )
-    require_declared(str(path), size, path.stat().st_size)
-    require_memory(str(path), size)
+    except Exception as error:
+        said = " ".join(str(error).split())[:SAID] or type(error).__name__
+        raise InputError(f"{path} must be {what}, but it is damaged or none: {said}.") from None
 
 
 def _declared(file: Any) -> int:

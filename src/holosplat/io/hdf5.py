@@ -14,7 +14,7 @@ import numpy as np
 from ..checks import InputError, require_regular, shaped
 from ..units import unit_factor
 from .guard import require_memory
-from .hdf5_guard import require_own
+from .hdf5_guard import opened_for_reading, require_own
 from .seal import require_sealed
 
 
@@ -27,19 +27,13 @@ def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
         require_sealed(file)
         if not h5py.is_hdf5(file):
             raise InputError(f"{path} must be an HDF5 file, but it does not start like one.")
-        with h5py.File(file, "r") as opened:
+        with opened_for_reading(file) as opened:
             require_own(opened, file)
             yield opened
     except (OSError, RuntimeError, KeyError) as error:
-        hint = ", or the file system cannot lock it (then set HDF5_USE_FILE_LOCKING=FALSE)" if _no_lock(error) else ""
         raise InputError(
-            f"{path} must be a complete HDF5 file, but it is truncated, damaged or not readable{hint}: {error}."
+            f"{path} must be a complete HDF5 file, but it is truncated, damaged or not readable: {error}."
         ) from error
-
-
-def _no_lock(error: Exception) -> bool:
-    """Whether HDF5 failed as it could not lock the file, which some network file systems refuse."""
-    return "unable to lock file" in str(error)
 
 
 @dataclass(frozen=True)

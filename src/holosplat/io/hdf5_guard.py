@@ -5,6 +5,7 @@ A link, a virtual dataset or external storage can make a reader copy any file of
 
 from __future__ import annotations
 
+import errno
 import os
 import time
 from collections.abc import Iterator
@@ -27,9 +28,21 @@ AGED = 1_000_000_000
 """Nanoseconds without a change after which the times of a file tell the next one: clocks of file systems are coarse."""
 MOST_KNOWN = 1000
 """Files that are remembered, at most."""
+WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
+"""What locking a file fails with where the file system has no locks."""
 _vouched: set[Path] = set()
 _known: dict[tuple[int, ...], None] = {}
 """Files that hold all that they are read for, by device, number, size and times: a command opens one several times."""
+
+
+def opened_for_reading(path: Path) -> h5py.File:
+    """The file at `path`, which nobody else may write meanwhile; on a file system without locks, without that."""
+    try:
+        return h5py.File(path, "r")
+    except OSError as error:
+        if not any(f"errno = {number}," in str(error) for number in WITHOUT_LOCKS):
+            raise
+        return h5py.File(path, "r", locking=False)
 
 
 def allow_external(path: Path) -> None:
@@ -58,7 +71,7 @@ def require_own(file: h5py.File, path: Path) -> None:
         require(len(seen) <= MOST_FILES, f"{path} must bring values of at most {MOST_FILES} files, but has more.")
         require_sealed(other)
         try:
-            with h5py.File(other, "r") as opened:
+            with opened_for_reading(other) as opened:
                 later += _others(opened, other, allowed)
         except OSError as error:
             raise InputError(

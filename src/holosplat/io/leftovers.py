@@ -19,8 +19,16 @@ PATTERN = re.compile(r"^\..*~(?P<host>[0-9a-f]{8})-(?P<process>[0-9a-f]+)-[0-9a-
 
 
 def host() -> str:
-    """Eight digits that stand for this machine."""
-    return f"{zlib.crc32(socket.gethostname().encode()):08x}"
+    """Eight digits that stand for this machine, and for the container in it."""
+    return f"{zlib.crc32(f'{socket.gethostname()} {namespace()}'.encode()):08x}"
+
+
+def namespace() -> str:
+    """What tells numbers of processes from those of other containers of this machine, on Linux; empty elsewhere."""
+    try:
+        return os.readlink("/proc/self/ns/pid")
+    except OSError:
+        return ""
 
 
 def temporary_name(target: Path) -> Path:

@@ -130,6 +130,9 @@ def _unpacked(archive: Path, inner: str, sha256: str) -> Path:
     target = cache() / f"{archive.stem}-{sha256[:8]}"
     if not target.is_dir():
         target.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_folder(target) as temporary, zipfile.ZipFile(archive) as opened:
-            opened.extractall(temporary)
+        try:
+            with atomic_folder(target) as temporary, zipfile.ZipFile(archive) as opened:
+                opened.extractall(temporary)
+        except (zipfile.BadZipFile, NotImplementedError, RuntimeError) as error:
+            raise InputError(f"{archive} must be a ZIP archive, but it is damaged or none: {error}.") from None
     return target / inner

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import InputError, require, require_regular
+from ..checks import InputError, require
+from .guard import mapped_array
 from .leftovers import is_hidden
 from .tiff_guard import page_values
 
@@ -74,11 +75,7 @@ def _like(pattern: str | None) -> str:
 
 
 def _array(path: Path) -> np.ndarray:
-    require_regular(path, "a NumPy array")
-    try:
-        found = np.load(path, mmap_mode="r", allow_pickle=False)  # which needs no memory for what is not there
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path} must be a NumPy array, but reading it failed: {error}.") from None
+    found = mapped_array(path, "a NumPy array")
     require(found.ndim in (2, 3) and found.dtype.kind in "iuf", f"{path} must hold frames [N, H, W] of numbers.")
     return found.reshape(-1, *found.shape[-2:])
 

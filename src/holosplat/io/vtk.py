@@ -8,6 +8,7 @@ become one `InputError`.
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -28,6 +29,8 @@ from .vtk_guard import blocks_fault, cells_fault, legacy_fault, ply_fault
 SUFFIXES = (".vtk", ".vtu", ".vtp")
 MERGE_TOLERANCE = 1e-6
 """Vertices closer than this fraction of the mesh's diagonal are one vertex, written several times."""
+SMALLEST, FARTHEST = 1e-9, 10.0
+"""Extent of a body, at least, and how far from its origin it may reach, at most [m]."""
 SOLIDS = {
     ".stl": ("vtkIOGeometry", "vtkSTLReader"),
     ".ply": ("vtkIOPLY", "vtkPLYReader"),
@@ -86,7 +89,7 @@ def write_mesh(path: str | Path, mesh: TriangleMesh, length_unit: str = "um") ->
             writer.SetFileVersion(writer.VTK_LEGACY_READER_VERSION_4_2)
             writer.SetFileTypeToBinary()
             writer.SetHeader(f"{mesh.name[:200]} length_unit={length_unit}".replace("\n", " "))
-        writer.SetFileName(str(temporary))
+        writer.SetFileName(os.fsencode(temporary))
         writer.SetInputData(data)
         if not writer.Write() or complaints():
             raise InputError(f"{path} must be writable, but VTK could not write it: {complaints()}.")
@@ -115,11 +118,21 @@ def _read_mesh(path: Path, factor: float) -> TriangleMesh:
         points, faces = _checked_points(path, surface), _triangles(surface)
     if len(faces) == 0:
         raise InputError(f"{path} must hold triangles, strips or polygons, but its cells are points or lines.")
-    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
-    mesh = TriangleMesh(points * factor, faces, path.name).merged(MERGE_TOLERANCE * extent * factor)
+    extent, farthest = factor * float(np.linalg.norm(np.ptp(points, axis=0))), factor * float(np.abs(points).max())
+    require(
+        extent >= SMALLEST and farthest <= FARTHEST,
+        f"{path} must hold a body of {SMALLEST:g} m or more, at most {FARTHEST:g} m from its origin, but it is of "
+        f"{extent:.3g} m and reaches {farthest:.3g} m from it; correct its coordinates, or say their --length-unit.",
+    )
+    mesh = TriangleMesh(points * factor, faces, _readable(path.name)).merged(MERGE_TOLERANCE * extent)
     if _ends_within_a_line(path) and not _is_closed(mesh.faces):
         raise _damaged(path, "it ends in the middle of a line and its surface is not closed")
     return mesh
+
+
+def _readable(name: str) -> str:
+    """A file's name as text that every file and screen takes: what is no UTF-8 in it becomes a sign for that."""
+    return os.fsencode(name).decode("utf-8", "replace")
 
 
 def _damaged(path: Path, reason: str) -> InputError:
@@ -153,7 +166,7 @@ def _read_data(path: Path) -> Any:
     if fault := (xml_fault(content) or blocks_fault(content)) if xml else legacy_fault(content):
         raise _damaged(path, fault)
     reader = readers[kind]()
-    reader.SetFileName(str(path))
+    reader.SetFileName(os.fsencode(path))
     reader.Update()
     return reader.GetOutput()
 
@@ -169,7 +182,7 @@ def _read_solid(path: Path, content: bytes) -> Any:
         raise _damaged(path, fault)
     module, name = SOLIDS[suffix]
     reader = getattr(import_module(f"vtkmodules.{module}"), name)()
-    reader.SetFileName(str(path))
+    reader.SetFileName(os.fsencode(path))
     reader.Update()
     return reader.GetOutput()
 

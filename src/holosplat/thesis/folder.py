@@ -15,6 +15,7 @@ import torch
 from ..checks import InputError, require
 from ..io.atomic import atomic_path
 from ..io.folder import require_new
+from ..io.guard import read_archive
 from ..io.json import read_json, write_json
 from ..workflows.run_folder import checkpoint_state
 from .configurations import EVERY
@@ -95,11 +96,7 @@ class StudyFolder:
         path = self._file(name, "maps.npz")
         if not path.is_file():
             return {}
-        try:
-            with np.load(path, allow_pickle=False) as found:
-                return {key: found[key] for key in found.files}
-        except (OSError, ValueError, EOFError) as error:
-            raise InputError(f"{path} must hold a study's maps, but it does not: {error!r}; run it again.") from error
+        return read_archive(path, what="the maps of a study")
 
     def save_checkpoint(self, name: str, state: dict[str, Any]) -> None:
         """NAME.checkpoint.pt."""

@@ -11,8 +11,7 @@ import numpy as np
 from ..checks import require
 from ..frames import Frames
 from ..io.atomic import require_apart, require_writable
-from ..io.formats import loader_of, open_raw
-from ..io.hdf5_guard import allow_external
+from ..io.formats import loader_of, open_raw, vouch
 from ..io.nxtomo import scan_writer
 from ..io.raw_file import DARK, FLAT, PROJECTION, ScanFile
 from ..io.reading import Reading
@@ -173,8 +172,7 @@ def correct(
     """
     require_writable(out)
     require_apart(out, source)
-    if reading.told.allow_external:
-        allow_external(Path(source))
+    vouch(source, reading)
     with open_raw(source, reading.told.given(loader_of(source).takes)) as file:
         fielding = FlatFielding(file, options, on_progress)
         count = 0 if fielding.eigen is None else len(fielding.eigen)
