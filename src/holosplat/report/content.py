@@ -12,6 +12,7 @@ import numpy as np
 from ..align.geometry import Geometry
 from ..checks import InputError, positive, require, shaped
 from ..geometry import Views
+from ..inference import Decision
 from ..metrics import ImageScores, VolumeScores, require_same_grid, robust_material_delta
 from ..volume import Volume
 from ..workflows.totals import TotalMatter
@@ -117,6 +118,7 @@ class ReportContent:
     - history: columns of metrics.csv, each [S]: step, seconds, loss, the loss' terms, count, val_ssim …
     - seconds: time of the reconstruction [s]
     - settings: the resolved configuration, nested or flat
+    - decisions: between hypotheses, with the evidence
     - versions, machine, timing: tables of names and values; input_hash: of the scan; run: its name
     """
 
@@ -138,6 +140,7 @@ class ReportContent:
     view: View3D | None = None
     guess: GuessShown | None = None
     forecast: ForecastShown | None = None
+    decisions: tuple[Decision, ...] = ()
     history: Mapping[str, np.ndarray] = field(default_factory=dict)
     seconds: float | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)

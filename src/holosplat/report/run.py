@@ -84,6 +84,7 @@ def report_run(
         moving=moving,
         guess=_guess(folder, reconstruction),
         forecast=_forecast(folder),
+        decisions=reconstruction.choice.decisions,
         view=view_of(turned, volume, truth, scan),
         history=folder.history(),
         seconds=sum(reconstruction.timing.values()),

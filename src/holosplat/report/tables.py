@@ -86,6 +86,7 @@ def score_tables(content: ReportContent) -> list[Table]:
         _volume_table(content),
         _views_table(content),
         _geometry_table(content),
+        _decisions_table(content),
     )
     return [table for table in tables if table is not None]
 
@@ -192,6 +193,18 @@ def _views_table(content: ReportContent) -> Table | None:
     means = (f"{mean['ssim']:.4f}", f"{mean['frcm']:.4f}", f"{mean['psnr']:.2f}", f"{mean['l1']:.4f}")
     head = ("view", "SSIM", "FRCM", "PSNR (dB)", "L1")
     return Table("Held-out views", [*rows, ("mean", *means)], head)
+
+
+def _decisions_table(content: ReportContent) -> Table | None:
+    """What was decided, and by how much each candidate predicts unseen frames better than what stood before it."""
+    if not content.decisions:
+        return None
+    rows = []
+    for each in content.decisions:
+        tried = (f"{one.name}: {100 * one.gain:+.1f} ± {100 * one.error:.1f} %" for one in each.compared)
+        rows.append((each.name, each.choice, each.by, "; ".join(tried).replace("-", "−"), f"{each.seconds:.1f} s"))
+    head = ("decision", "choice", "by", "smaller residual of unseen frames", "time")
+    return Table("Decisions", rows, head)
 
 
 def _geometry_table(content: ReportContent) -> Table | None:

@@ -94,7 +94,7 @@ def track(
             found.oversample,
             found.timing,
             True,
-            Choice("levels", "closed bodies have a surface", {}, "soft fit", found.begun),
+            Choice("levels", {}, "soft fit", found.begun, task.decisions),
             task.delta_told,
             judge(said, train, task.noise if task.uneven else None),
             light=found_in(task),
