@@ -27,8 +27,8 @@ from rows import written
 import holosplat as hs
 from holosplat.bench.case import Case, load_case
 from holosplat.methods import smooth_fit
+from holosplat.methods.illumination import prepared
 from holosplat.methods.method import Task, begun, run_quietly
-from holosplat.methods.still import prepared
 from holosplat.methods.volume import SmoothStage
 
 SCENES: tuple[tuple[str, int, float | None], ...] = (

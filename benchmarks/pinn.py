@@ -36,6 +36,7 @@ from holosplat.geometry import Grid
 from holosplat.io.atomic import atomic_path
 from holosplat.mesh import TriangleMesh
 from holosplat.methods import Pinn, Task
+from holosplat.methods.illumination import prepared
 from holosplat.methods.pinn import EachTime
 from holosplat.metrics import volume_scores
 from holosplat.representations import SpaceTimeField
@@ -164,7 +165,7 @@ def rows_of(case: str, views: int, seed: int, chosen: list[str], data: Path | No
     scan = imaged(cells, views, PIXELS[case], seed)
     grid = Grid.of_views(scan.views)
     truth = [cells.at(t).voxelise(grid) for t in cells.times]
-    task = Task(scan, hs.MaterialPrior.known(MATERIAL), seed).evened()
+    task = prepared(Task(scan, hs.MaterialPrior.known(MATERIAL), seed))
     machine = f"{platform.machine()}, {torch.get_num_threads()} of 2 cores, shared"
     began = time.process_time()
     first = EachTime(Pinn().volume, Pinn().fit).start(task, None)

@@ -28,6 +28,7 @@ import holosplat as hs
 from holosplat.methods import Gaussians, SurfaceFit, SurfaceOptions, Task
 from holosplat.methods.coarse import CoarseToFine, binned, on_pixels, settled
 from holosplat.methods.first_surfaces import first_surfaces
+from holosplat.methods.illumination import prepared as lit
 from holosplat.methods.method import run_quietly
 from holosplat.methods.surface_fit import oversampling, surface_fit
 from holosplat.representations import GaussianCloud, SurfaceMesh
@@ -147,7 +148,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     cells, scan = scene_of(options.pixels, options.seed, options.photons)
-    task = Task(scan, hs.MaterialPrior.known(MATERIAL), options.seed).evened()
+    task = lit(Task(scan, hs.MaterialPrior.known(MATERIAL), options.seed))
     start = coarse_start(task, CoarseToFine().of_views(len(scan.train())))
     for name in options.variants:
         began = time.process_time()

@@ -21,6 +21,7 @@ from machine import commit
 from holosplat.bench.case import Case, load_case
 from holosplat.matter import KnownRatio, MaterialPrior
 from holosplat.methods import Task
+from holosplat.methods.illumination import prepared
 from holosplat.methods.uncertain import Uncertain, determine
 
 COLUMNS = ("case", "seed", "uncertain", "constant", "over_truth", "low", "high", "told", "seconds", "commit")
@@ -48,7 +49,7 @@ def rows(name: str, seed: int, question: str) -> list[dict[str, object]]:
     ranges = {each: (low * true[each], high * true[each]) for each, (low, high) in factors.items()}
     prior = MaterialPrior.unknown() if "delta_beta" in ranges else MaterialPrior.of_ratio(true["delta_beta"])
     began = time.process_time()
-    for one in determine(Task(case.scan().train(), prior).evened(), Uncertain(**ranges)):
+    for one in determine(prepared(Task(case.scan().train(), prior)), Uncertain(**ranges)):
         numbers = (f"{value / true[one.name]:.3f}" for value in (one.value, one.low, one.high))
         spent = f"{time.process_time() - began:.1f}"
         found.append(dict(zip(COLUMNS, (name, seed, question, one.name, *numbers, one.told, spent, commit()))))

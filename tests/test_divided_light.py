@@ -15,6 +15,7 @@ from holosplat.geometry import Views
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.matter import MaterialPrior
 from holosplat.methods import Task
+from holosplat.methods.illumination import prepared
 from holosplat.optics.background import Background, LightOptions
 from holosplat.optics.modes import smooth_modes
 from holosplat.scan import Exposures, Scan
@@ -95,14 +96,14 @@ def test_files_and_beams_that_are_joined_keep_it(tmp_path):
 
 def test_a_reconstruction_may_change_the_light_within_its_doubt():
     task = Task(scan(light()), MaterialPrior.of_ratio(100.0))
-    known, certain = task.evened(), replace(task, scan=scan(None)).evened()
+    known, certain = prepared(task), prepared(replace(task, scan=scan(None)))
     assert certain.uneven is None
     assert known.uneven is not None
     assert known.scan is task.scan  # was divided before
     assert known.light_in_words.startswith("divided out before")
     more = (known.noise.power() - certain.noise.power()).sum(dim=(1, 2))
     assert bool((more > 0).all())
-    assert replace(task, light=LightOptions("even")).evened().uneven is None
+    assert prepared(replace(task, light=LightOptions("even"))).uneven is None
     beside = light_of(task.scan, LightOptions("smooth"))
     assert beside is not None
     assert torch.equal(beside.factor(), torch.ones(COUNT, *SHAPE, dtype=torch.float64))

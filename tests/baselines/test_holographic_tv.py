@@ -20,6 +20,7 @@ from holosplat.materials import PLASMA, RED_CELL, DeltaBeta
 from holosplat.matter import MaterialPrior
 from holosplat.mesh import TriangleMesh
 from holosplat.methods import Task
+from holosplat.methods.illumination import prepared
 from holosplat.metrics import dice
 from holosplat.model import measure
 from holosplat.optics.detector import poisson
@@ -250,7 +251,7 @@ def test_the_start_finds_light_that_drifts_anew_beside_the_matter():
     lamp = UnevenLight(light_pattern=0.04, light_pattern_px=8.0, light_drift_px=20.0, light_seed=1).on(8, SHAPE)
     rng = np.random.default_rng(0)
     frames = np.stack([lamp.recorded(frame, n, 1e5, rng) for n, frame in enumerate(scan.frames)]).astype(np.float32)
-    task = Task(replace(scan, frames=frames), MaterialPrior.known(CELL)).evened()
+    task = prepared(Task(replace(scan, frames=frames), MaterialPrior.known(CELL)))
     assert task.uneven is not None
     errors = []
     for relit in (0, 2):

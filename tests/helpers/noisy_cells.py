@@ -12,6 +12,7 @@ from holosplat.geometry import Grid, Views
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import MaterialPrior
 from holosplat.methods import Task
+from holosplat.methods.illumination import prepared
 from holosplat.representations import SurfaceMesh
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens import random_cells
@@ -32,7 +33,7 @@ def scan_of(photons: float) -> Scan:
 
 def task_of(photons: float) -> Task:
     """The reconstruction of these of known matter; of 2000 photons about half of the contrast is noise."""
-    return Task(scan_of(photons), MaterialPrior.known(MATTER)).evened()
+    return prepared(Task(scan_of(photons), MaterialPrior.known(MATTER)))
 
 
 def mesh_of(count: int = 4) -> SurfaceMesh:

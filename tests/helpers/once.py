@@ -19,9 +19,12 @@ from torch import Tensor
 from holosplat.baselines import HolographicTV, holographic_tv
 from holosplat.baselines.material import estimate_delta, estimate_ratio
 from holosplat.geometry import Grid
+from holosplat.inference import Decision
 from holosplat.matter import DeltaBeta
 from holosplat.methods import Task
-from holosplat.methods.levels import Decision, LevelTest, decide_matter
+from holosplat.methods.first_volumes import FirstVolumes
+from holosplat.methods.illumination import decided
+from holosplat.methods.levels import decide_matter
 from holosplat.methods.sharp_level import material_of_levels
 from holosplat.optics.background import Light
 from holosplat.progress import Progress
@@ -67,13 +70,15 @@ def of(scan: Scan) -> Key:
 def once(memory: Once) -> Iterator[None]:
     """Within, runs take from `memory` what an earlier run on the same frames has found; uneven light is left alone."""
 
-    def decide(task: Task, options: LevelTest) -> Decision:
+    def decide(task: Task) -> Decision:
         if task.uneven is not None:
-            return decide_matter(task, options)
-        key = ("kind", *of(task.scan), task.prior, options)
-        return memory.answer(
-            key, lambda told: decide_matter(replace(task, on_progress=told), options), task.on_progress
-        )
+            return decide_matter(task)
+        key = ("kind", *of(task.scan), task.prior)
+        return memory.answer(key, lambda told: decide_matter(replace(task, on_progress=told)), task.on_progress)
+
+    def light(first: FirstVolumes, *how: Any) -> Any:
+        key = ("light", *of(first.folds.scan), first.prior, *how)
+        return memory.answer(key, lambda told: decided(replace(first, on_progress=told), *how), first.on_progress)
 
     def ratio(scan: Scan, on_progress: Progress, *how: Any) -> float:
         return memory.answer(("ratio", *of(scan), *how), lambda told: estimate_ratio(scan, told, *how), on_progress)
@@ -101,6 +106,7 @@ def once(memory: Once) -> Iterator[None]:
 
     shared = {
         "solve.decide_matter": decide,
+        "illumination.decided": light,
         "assumed.estimate_ratio": ratio,
         "assumed.estimate_delta": delta,
         "start.material_of_levels": level,

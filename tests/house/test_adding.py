@@ -110,7 +110,7 @@ def test_a_term_is_one_file_and_one_line(tmp_path, monkeypatch, scan):
     monkeypatch.setitem(terms.TERMS, name, build)
     quick = HolographicTV(iterations=30, corrections=1, inner=8, refine=1)
     plain = Voxels(volume=quick, fit=VoxelFit(steps=5, refine=1))
-    sparse = replace(plain, fit=replace(plain.fit, terms=(ExtraTerm(name, 3000.0),)))
+    sparse = replace(plain, fit=replace(plain.fit, terms=(ExtraTerm(name, 1000.0),)))
     without, with_it = (solve(method, Task(scan.train(), KNOWN)).values.sum() for method in (plain, sparse))
     assert 0 < with_it < 0.9 * without
 

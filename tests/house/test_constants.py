@@ -11,7 +11,8 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 SOURCE = ROOT / "src" / "holosplat"
 PAGE = ROOT / "docs" / "design" / "constants.md"
-ROOMS = ("align", "baselines", "bodies", "fit", "methods", "model", "motion", "optics", "preprocess", "representations")
+ROOMS = ("align", "baselines", "bodies", "fit", "inference", "methods", "model", "motion", "optics", "preprocess")
+ROOMS += ("representations",)
 FILES = ("matter.py", "materials.py")
 
 

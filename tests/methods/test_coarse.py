@@ -26,6 +26,7 @@ from holosplat.methods.cross_validation import CrossValidation
 from holosplat.methods.first_surfaces import first_surfaces
 from holosplat.methods.gaussian_options import FitOptions
 from holosplat.methods.gaussians import GaussianStage, nearby
+from holosplat.methods.illumination import prepared
 from holosplat.methods.method import run_quietly
 from holosplat.methods.surface_fit import SurfaceFit, oversampling
 from holosplat.methods.surfaces import refine_surfaces
@@ -68,7 +69,7 @@ def quick(coarse: CoarseToFine = QUICK) -> Gaussians:
 
 
 def task_of(scan: Scan) -> Task:
-    return Task(scan, MaterialPrior.known(MATTER)).evened()
+    return prepared(Task(scan, MaterialPrior.known(MATTER)))
 
 
 def dice(found, *true: TriangleMesh) -> float:

@@ -18,6 +18,7 @@ from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.mesh import TriangleMesh
 from holosplat.methods import Auto, Gaussians, SmoothVolume, Surfaces, Task
 from holosplat.methods.continued import Continued, Effort
+from holosplat.methods.illumination import prepared
 from holosplat.methods.method import run_quietly
 from holosplat.representations import SurfaceMesh, VoxelGrid, approximate, cloud_from_volume
 from holosplat.scan import Exposures, Scan
@@ -73,7 +74,7 @@ def test_matter_follows_its_frames_in_few_steps(scan, tmp_path, kind, left):
     """Of the way that the ball has gone, at most the share `left` is left; it began with what the other run found."""
     write_object(tmp_path / "object.h5", before(kind))
     method = Continued.of(Auto(), tmp_path / "object.h5")
-    task = Task(scan, MaterialPrior.known(MATERIAL)).evened()
+    task = prepared(Task(scan, MaterialPrior.known(MATERIAL)))
     (stage,) = method.stages()
     start = stage.start(task, None)
     assert middle(start) == pytest.approx(0, abs=0.02)

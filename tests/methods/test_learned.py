@@ -20,6 +20,7 @@ from holosplat.methods.coarse import CoarseToFine
 from holosplat.methods.cross_validation import MissingMatter
 from holosplat.methods.evidence import Evidence
 from holosplat.methods.gaussians import GaussianStage
+from holosplat.methods.illumination import prepared
 from holosplat.methods.learned import _Trial
 from holosplat.methods.method import solve_stages
 from holosplat.methods.start import starting_cloud
@@ -141,7 +142,7 @@ def test_frames_that_validate_are_left_out_with_their_light(scan):
         np.concatenate([scan.frames, scan.frames[:1]]), scan.exposures[np.array([0, 1, 0])], np.zeros(3, dtype=bool)
     )
     fit = replace(OPTIONS.fit, schedule=replace(OPTIONS.fit.schedule, validation_views=1))
-    task = Task(three, KNOWN).evened()
+    task = prepared(Task(three, KNOWN))
     seen = GaussianStage(replace(OPTIONS, fit=fit))._without_validation(task)
 
     assert len(seen.scan) == len(seen.noise) == 2

@@ -14,6 +14,7 @@ from holosplat.fit.freedom import Freedom
 from holosplat.geometry import Grid, Views, rotation_tilted
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import Auto, solve
+from holosplat.methods.illumination import prepared
 from holosplat.methods.method import Task
 from holosplat.methods.window import MARGIN, MULTIPLE, Windows, shown, windows_of
 from holosplat.model import measure
@@ -113,7 +114,7 @@ def test_a_task_looks_at_windows_only_in_even_light_and_known_poses():
     scan = frames("one axis")
     task = Task(scan, MaterialPrior.known(MATERIAL))
     assert task.in_windows() is task, "its light was not looked at"
-    task = task.evened()
+    task = prepared(task)
     part = task.in_windows()
     assert part.scan.views.shape == found_in(scan).shape
     assert part.lit is not None

@@ -138,8 +138,8 @@ def test_steep_light_is_not_taken_for_grain(shape):
     frames = measured(shape, light, 0.007)
     found = Light.of(frames, LightOptions(air=((0, shape[1], 0, 18), (0, shape[1], shape[2] - 18, shape[2]))))
     assert found.background is not None
-    assert NoiseModel.of_frames(frames, found.air).has_grain
-    assert not found.noise.has_grain
+    before = NoiseModel.of_frames(frames, found.air, correlated=True)
+    assert found.noise.grain_level < 0.5 * before.grain_level
     assert rms((found.background.factor().numpy() - light)[found.air.numpy()]) < 0.25 * 0.007
 
 
@@ -220,16 +220,3 @@ def test_true_light_on_small_noisy_frames_is_found(round_cell_frames):
         light = torch.from_numpy(uneven(tuple(round_cell_frames.shape), "clouds", 0.02, seed))
         noise = 5000**-0.5 * np.random.default_rng(seed).normal(size=light.shape)
         assert Light.of((round_cell_frames * light + torch.from_numpy(noise)).float()).background is not None
-
-
-@pytest.mark.parametrize(("size", "kept"), [(0.0, True), (0.08, False)])
-def test_grain_keeps_the_lowest_frequencies_that_smooth_light_takes_from_it(size, kept):
-    """One frame of a grainy lamp: its noise is that of the frame; with light that counts as grain, that of the rest."""
-    shape, draw = (1, 251, 201), np.random.default_rng(4)
-    grain = 0.02 * correlated_field(shape[1:], 3.0, draw)[None]
-    frames = measured(shape, (1 + grain) * uneven(shape, "clouds", size), 0.005)
-    sides = ((0, shape[1], 0, 75), (0, shape[1], shape[2] - 75, shape[2]))
-    found = Light.of(frames, LightOptions("smooth", sides))
-    whole = NoiseModel.of_frames(frames, found.air)
-    assert whole.has_grain
-    assert (found.noise.grain_level == whole.grain_level) is kept

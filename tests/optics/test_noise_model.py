@@ -56,7 +56,8 @@ def test_white_noise_has_its_deviation_and_no_grain(shape, sigma):
 @pytest.mark.parametrize("width", [1.0, 1.6])
 def test_grain_has_its_spectrum(shape, width):
     frames = 1 + white(shape, 0.01) + grain(shape, 0.01, width)
-    found = NoiseModel.of_frames(tensor(frames))
+    found = NoiseModel.of_frames(tensor(frames), correlated=True)
+    assert not NoiseModel.of_frames(tensor(frames)).has_grain  # nothing is correlated where nobody has asked
     assert found.white.numpy() == pytest.approx(0.01, rel=0.1)
     assert found.level.numpy() == pytest.approx(0.01 * 2**0.5, rel=0.08)
     wanted = grain_power(shape, 0.01, width)
@@ -81,11 +82,21 @@ def test_grain_beside_fringes_and_slow_light_is_that_of_the_air():
     shape = SHAPES[1]
     slow = 1 + 0.03 * np.linspace(-1, 1, shape[2]) + 0.02 * np.cos(np.linspace(0, 3, shape[1]))[:, None]
     frames = slow * (1 + rings(shape[1:])) * (1 + grain(shape, 0.01, 1.3)) + white(shape, 0.01)
-    found = NoiseModel.of_frames(tensor(frames))
-    assert found.has_grain
+    found = NoiseModel.of_frames(tensor(frames), correlated=True)
     assert found.level.numpy() == pytest.approx(0.01 * 2**0.5, rel=0.12)
-    given = NoiseModel.of_frames(tensor(frames), air_in_boxes([(0, 81, 0, 25), (0, 81, 95, 117)], 4, (81, 117)))
+    air = air_in_boxes([(0, 81, 0, 25), (0, 81, 95, 117)], 4, (81, 117))
+    given = NoiseModel.of_frames(tensor(frames), air, correlated=True)
     assert given.level.numpy() == pytest.approx(found.level.numpy(), rel=0.1)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_noise_beside_a_prediction_needs_no_air(shape):
+    """Fringes fill the frames, and what predicts them leaves the noise."""
+    matter = 1 + rings(shape[1:], 60.0, 0.2, 0.3)
+    frames = matter * (1 + white(shape, 0.01) + grain(shape, 0.01, 1.3))
+    found = NoiseModel.of_residuals(tensor(frames), tensor(np.broadcast_to(matter, shape).copy()))
+    assert found.white.numpy() == pytest.approx(0.01, rel=0.15)
+    assert found.level.numpy() == pytest.approx(0.01 * 2**0.5, rel=0.1)
 
 
 def test_power_on_another_raster_is_that_of_the_same_frequency():

@@ -20,7 +20,6 @@ from holosplat.fit.schedule import Schedule
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import Auto, FitOptions, Gaussians, Method, solve
 from holosplat.methods.coarse import on_pixels
-from holosplat.methods.levels import LevelTest
 from holosplat.methods.method import Task
 from holosplat.methods.volume import SmoothVolume
 from holosplat.representations import SurfaceMesh
@@ -35,8 +34,7 @@ triton = pytest.importorskip("triton")
 KNOWN = MaterialPrior.known(DeltaBeta(two_balls.DELTA, two_balls.BETA))
 START = HolographicTV(retrieval=5, iterations=10, corrections=1, inner=2, settling=0, refine=1)
 GAUSSIANS = Gaussians(volume=START, approximate_steps=3, fit=FitOptions(schedule=Schedule(steps=3)))
-LEVELS = LevelTest(volume=replace(START, upper=0.0, beyond=False))
-AUTO = replace(Auto(gaussians=GAUSSIANS).with_effort(0.05), gaussians=GAUSSIANS, levels=LEVELS)
+AUTO = replace(Auto(gaussians=GAUSSIANS).with_effort(0.05), gaussians=GAUSSIANS)
 SMOOTH = SmoothVolume(volume=replace(START, upper=0.0), coarser=(), rounds=1, iterations=2)
 
 

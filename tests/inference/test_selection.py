@@ -1,0 +1,113 @@
+"""The one score and the one policy: what a candidate leaves of unseen frames by octaves, and when it is taken."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from holosplat.checks import InputError
+from holosplat.inference import ERRORS, MARGIN, Compared, Decision, Score, select
+
+SHAPES = [(64, 96), (51, 73), (9, 33), (1, 40)]
+
+
+def noise(shape: tuple[int, ...], seed: int = 0) -> torch.Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_white_noise_has_the_same_power_in_all_octaves(shape):
+    powers = Score.of(0.3 * noise((40, *shape))).powers
+    assert powers.mean(axis=0) == pytest.approx(0.09, rel=0.12)
+
+
+@pytest.mark.parametrize("shape", SHAPES[:2])
+def test_the_gain_is_the_logarithm_of_the_residuals_ratio(shape):
+    residual = noise((4, *shape))
+    gain, error = Score.of(0.5 * residual).gain_over(Score.of(residual))
+    assert gain == pytest.approx(math.log(2))
+    assert error == pytest.approx(0, abs=1e-12)
+
+
+def test_every_octave_counts_alike():
+    """A change of the coarsest octave alone, which has a thousandth of the pixels' information, is seen."""
+    residual = noise((4, 64, 96))
+    blocks = residual.unflatten(2, (-1, 32)).unflatten(1, (-1, 32)).mean(dim=(2, 4), keepdim=True)
+    less = residual - 0.5 * blocks.expand(4, 2, 32, 3, 32).reshape(4, 64, 96)
+    octaves = Score.of(residual).powers.shape[1]
+    gain, _ = Score.of(less).gain_over(Score.of(residual))
+    assert gain == pytest.approx(math.log(2) / octaves, rel=1e-6)
+
+
+def test_the_error_is_that_of_repeated_draws():
+    gains, errors = [], []
+    for seed in range(60):
+        first, second = noise((6, 64, 64), 2 * seed), noise((6, 64, 64), 2 * seed + 1)
+        gain, error = Score.of(first).gain_over(Score.of(second))
+        gains.append(gain)
+        errors.append(error)
+    assert np.mean(errors) == pytest.approx(np.std(gains), rel=0.35)
+    assert abs(np.mean(gains)) < 3 * np.std(gains) / 60**0.5
+
+
+def test_joined_scores_have_one_block_a_frame():
+    parts = [Score.of(noise((2, 64, 64), seed)) for seed in range(3)]
+    joined = Score.joined(parts)
+    assert joined.powers.shape == (6, parts[0].powers.shape[1])
+    assert joined.powers.mean(axis=0) == pytest.approx(np.concatenate([p.powers for p in parts]).mean(axis=0))
+    assert Score.joined(parts[:1]) is parts[0]
+
+
+@pytest.mark.parametrize(
+    ("gain", "error", "wins"),
+    [(0.1, 0.01, True), (0.1, 0.051, False), (0.019, 0.0, False), (0.021, 0.0, True), (-0.5, 0.0, False)],
+)
+def test_a_candidate_wins_by_two_errors_and_two_per_cent(gain, error, wins):
+    assert (ERRORS, MARGIN) == (2.0, 0.02)
+    assert Compared("other", gain, error).wins == wins
+
+
+def residuals(factors: dict[str, tuple[float, ...]]):
+    """Scores of candidates whose residual in each fold is that of the null times a factor."""
+    return lambda name, fold: Score.of(factors[name][fold] * noise((2, 64, 64), fold))
+
+
+def test_the_null_wins_ties_and_the_simpler_candidate_too():
+    same = residuals({"null": (1.0,), "first": (1.0,), "second": (0.9,), "third": (0.895,)})
+    found = select("name", ["null", "first", "second", "third"], same, by="views set aside")
+    assert found.choice == "second"
+    assert [each.wins for each in found.compared] == [False, True, False]
+    assert found.compared[2].gain == pytest.approx(math.log(0.9 / 0.895), rel=1e-6)  # beside the second
+
+
+def test_what_wins_in_one_fold_must_win_over_all():
+    asked = []
+
+    def score(name, fold):
+        asked.append((name, fold))
+        return residuals({"null": (1.0, 1.0, 1.0), "other": (0.5, 2.5, 1.0)})(name, fold)
+
+    found = select("name", ["null", "other"], score, 3, by="views set aside")
+    assert found.choice == "null"
+    assert ("other", 1) in asked
+    assert ("other", 2) not in asked  # it had lost by then
+
+
+def test_rivals_beside_the_null_must_be_beaten_too():
+    score = residuals({"null": (1.0,), "free": (0.5,), "other": (0.7,)})
+    assert select("name", ["null", "other"], score, by="x").choice == "other"
+    assert select("name", ["null", "other"], score, by="x", beside={"other": ("free",)}).choice == "null"
+
+
+def test_a_decision_comes_back_from_plain_values():
+    found = Decision("light", "as measured", "views set aside", (Compared("uneven", -0.3, 0.1),), 1.5)
+    assert Decision.from_dict(found.as_dict()) == found
+    assert found.line == "light: as measured (views set aside: uneven -30.0% ± 10.0%)"
+
+
+def test_a_selection_of_nothing_is_refused():
+    with pytest.raises(InputError, match="at least one candidate"):
+        select("name", [], residuals({}), by="x")
