@@ -1,0 +1,124 @@
+"""Light, pattern and noise are hypotheses: each is taken where it predicts unseen frames, and not on other families."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from holosplat.beamline.light import UnevenLight, correlated_field
+from holosplat.beamline.simulate import simulate
+from holosplat.geometry import Views
+from holosplat.matter import DeltaBeta, MaterialPrior
+from holosplat.methods import Task
+from holosplat.methods.first_volumes import BY_FISSION, Folds
+from holosplat.methods.illumination import prepared
+from holosplat.optics.background import LightOptions
+from holosplat.scan import Exposures, Scan
+from holosplat.specimens.red_cells import random_cells
+from holosplat.specimens.scene import MeshScene
+from holosplat.specimens.soft_matter import soft_cells
+
+MATTER = DeltaBeta(4e-7, 4e-7 / 1500)
+PIXEL, SHAPE, VIEWS = 1e-6, (45, 52), 8
+PRIOR = MaterialPrior.of_ratio(MATTER.ratio)
+
+
+def of(scene, photons: float | None = None) -> Scan:
+    exposures = Exposures.of(Views.evenly_spaced(VIEWS, SHAPE, PIXEL), 20.0, 0.1)
+    return simulate(scene, exposures, photons_per_pixel=photons, seed=3, is_test=np.zeros(VIEWS, dtype=bool))
+
+
+@pytest.fixture(scope="module")
+def soft() -> Scan:
+    return of(soft_cells(2, (10e-6, 13e-6), (34e-6, 38e-6, 34e-6), MATTER, seed=5, edge=2e-6), 1e5)
+
+
+@pytest.fixture(scope="module")
+def sharp() -> Scan:
+    return of(MeshScene.of_one_material(random_cells(3, (34e-6, 36e-6, 34e-6), 5, 12e-6), MATTER), 1e5)
+
+
+def lit(scan: Scan, factor: np.ndarray) -> Scan:
+    return replace(scan, frames=(scan.frames * factor).astype(np.float32))
+
+
+def uneven() -> np.ndarray:
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]] / np.array(SHAPE)[:, None, None] - 0.5
+    draw = np.random.default_rng(2)
+    return np.stack([1 + 0.1 * (a * x + b * y) for a, b in draw.normal(size=(VIEWS, 2))])
+
+
+def choices(scan: Scan, light: LightOptions = LightOptions()) -> list[str]:
+    return [each.choice for each in prepared(Task(scan, PRIOR, light=light)).decisions]
+
+
+@pytest.mark.parametrize("family", ["soft", "sharp"])
+def test_even_light_is_left_alone(family, request):
+    task = prepared(Task(request.getfixturevalue(family), PRIOR))
+    assert task.uneven is None
+    assert task.lit is not None
+    assert task.lit.still is None
+    assert task.scan is request.getfixturevalue(family)
+
+
+@pytest.mark.parametrize("family", ["soft", "sharp"])
+def test_uneven_light_is_found(family, request):
+    scan = lit(request.getfixturevalue(family), uneven())
+    task = prepared(Task(scan, PRIOR))
+    assert task.uneven is not None
+    off = task.lit.factor().numpy() / uneven()  # type: ignore[union-attr]
+    assert float(off.std()) < 0.2 * float(uneven().std())
+
+
+@pytest.mark.parametrize("family", ["soft", "sharp"])
+def test_a_fixed_pattern_is_found(family, request):
+    pattern = 1 + 0.03 * np.random.default_rng(1).normal(size=SHAPE)
+    task = prepared(Task(lit(request.getfixturevalue(family), pattern[None]), PRIOR))
+    assert task.lit is not None
+    assert task.lit.still is not None
+    left = task.lit.still.numpy() / pattern
+    assert float(left.std()) < 0.5 * 0.03
+
+
+def test_grain_of_each_frame_is_no_pattern(sharp):
+    draw = np.random.default_rng(3)
+    grain = np.stack([1 + 0.02 * correlated_field(SHAPE, 1.5, draw) for _ in range(VIEWS)])
+    task = prepared(Task(lit(sharp, grain), PRIOR))
+    assert task.lit is not None
+    assert task.lit.still is None
+
+
+def test_what_is_told_is_not_decided(soft):
+    told = LightOptions("even", noise="white")
+    assert choices(soft, told) == []
+    assert prepared(Task(soft, PRIOR, light=replace(told, noise="correlated"))).noise.has_grain
+    assert not prepared(Task(soft, PRIOR, light=told)).noise.has_grain
+
+
+def test_two_views_are_judged_by_data_fission(soft):
+    few = soft[[0, 4]]
+    folds = Folds.of(few)
+    assert folds.by == BY_FISSION
+    first, second = (torch.from_numpy(part.frames) for part in folds.split(0))
+    assert torch.allclose(0.5 * (first + second), torch.from_numpy(few.frames), atol=1e-6)
+    assert float((first - second).std()) > 0
+    assert all("fixed pattern" not in each for each in choices(few))
+
+
+def test_folds_share_no_view(soft):
+    folds = Folds.of(soft)
+    unseen = [part for k in range(folds.count) for part in folds.split(k)[1].frames]
+    assert len({part.tobytes() for part in unseen}) == len(unseen) == 2 * folds.count
+    for k in range(folds.count):
+        seen, aside = folds.split(k)
+        assert len(seen) + len(aside) == VIEWS
+
+
+def test_the_lamp_of_a_simulated_beamline_is_found(sharp):
+    lamp = UnevenLight(light_smooth=0.03, light_seed=4).on(VIEWS, SHAPE)
+    rng = np.random.default_rng(0)
+    frames = np.stack([lamp.recorded(frame, n, 1e5, rng) for n, frame in enumerate(sharp.frames)])
+    assert "uneven light" in " ".join(choices(replace(sharp, frames=frames.astype(np.float32))))
