@@ -51,7 +51,8 @@ def uneven() -> np.ndarray:
     return np.stack([1 + 0.1 * (a * x + b * y) for a, b in draw.normal(size=(VIEWS, 2))])
 
 
-def choices(scan: Scan, light: LightOptions = LightOptions()) -> list[str]:
+def choices(scan: Scan, light: LightOptions | None = None) -> list[str]:
+    light = light or LightOptions()
     return [each.choice for each in prepared(Task(scan, PRIOR, light=light)).decisions]
 
 

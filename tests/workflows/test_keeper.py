@@ -38,7 +38,7 @@ def test_a_fit_that_goes_astray_ends_with_its_start(scan, tmp_path):
     assert done.choice.judged["start"] < done.choice.judged["fit"]
     summary = read_json(folder.summary)
     assert summary["kept"] == "start"
-    assert summary["decided"] == {"matter": "levels", "why": "as you say"}
+    assert summary["decided"] == {"matter": "levels"}
     loaded = load_reconstruction(folder)
     assert loaded.choice == done.choice
     assert np.array_equal(loaded.object.parameters()["centres"], done.object.parameters()["centres"])

@@ -180,7 +180,7 @@ def _print_result(folder: RunFolder, result: Reconstruction, report: Path) -> No
     from ..io.json import read_json
 
     if folder.light.is_file():
-        _say(f"light: {read_json(folder.summary)['light']}, by the frames' air ({folder.light})")
+        _say(f"light: {read_json(folder.summary)['light']} ({folder.light})")
     for constant in result.constants:
         print(constant.line())
     for line in result.geometry.lines() if result.geometry else ():

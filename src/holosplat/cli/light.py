@@ -5,10 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal
 
+from ..checks import InputError
 from ..ranges import ranged
 
 if TYPE_CHECKING:
     from ..optics.background import LightOptions
+
+
+DECISIONS: dict[str, dict[str, str]] = {
+    "light=even": {"kind": "even"},
+    "light=smooth": {"kind": "smooth"},
+    "pattern=none": {"still": "none"},
+    "noise=white": {"noise": "white"},
+    "noise=correlated": {"noise": "correlated"},
+}
+"""What can be told of the light and the noise, and the field of `LightOptions` that holds it."""
 
 
 @dataclass(frozen=True)
@@ -17,7 +28,7 @@ class LightFlags:
     """The light beside the flat fields."""
 
     light: Literal["auto", "even", "smooth"] = "auto"
-    """auto: smooth where the air of frames is uneven beyond its noise, else even; even: none; smooth: in any case."""
+    """auto: smooth where evidence is for it, else even; even: none; smooth: in any case."""
     air: tuple[tuple[int, int, int, int], ...] = ()
     """Boxes without matter or fringes in any frame: first row, end row, first column, end column (default: found)."""
 
@@ -34,9 +45,16 @@ class RunLightFlags(LightFlags):
     """The light beside the flat fields, of several frames."""
 
     still_light: Literal["auto", "none"] = "auto"
-    """auto: what all frames have in common in the same pixels is divided out, where their air shows that the light does
-    it; none: it is not."""
+    """auto: a pattern that all frames have in common in the same pixels is divided out, where unseen frames are then
+    predicted better; none: it is not."""
+    decide: tuple[str, ...] = ()
+    """Decisions that are told, as NAME=CHOICE: light=even or smooth, pattern=none, noise=white or correlated."""
 
     def options(self) -> LightOptions:
-        """What is assumed of the light."""
-        return replace(super().options(), still=self.still_light)
+        """What is assumed of the light. Errors: `InputError` for a decision that there is not."""
+        told = replace(super().options(), still=self.still_light)
+        for each in self.decide:
+            if each not in DECISIONS:
+                raise InputError(f"--decide must be one of {', '.join(DECISIONS)}, but it is {each!r}; correct it.")
+            told = replace(told, **DECISIONS[each])
+        return told
