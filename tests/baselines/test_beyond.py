@@ -116,7 +116,7 @@ def test_retrieval_and_corrections_go_on_beyond_the_frames():
     part = cut()
     frames, missing = torch.from_numpy(part.frames), torch.from_numpy(part.frames) - 1
     kept, free = (bounded_estimate(frames, part.exposures, RATIO, None, leaves).phase for leaves in (False, True))
-    assert float(free.sum()) > 1.2 * float(kept.sum())
+    assert float(free[:, :2].sum() + free[:, -2:].sum()) > float(kept[:, :2].sum() + kept[:, -2:].sum())
     inside, taller = (Correction(part, MATERIAL, beyond)(missing) for beyond in (0, BEYOND))
     assert taller.shape == (6, ROWS + 2 * BEYOND, SHAPE[1])
     assert torch.equal(taller[:, BEYOND:-BEYOND], inside)

@@ -52,7 +52,7 @@ def test_the_backend_is_that_of_fit_and_start():
     auto = chosen("--backend", "reference")
     found = chosen("--backend", "reference", "--method", "gaussians")
     assert auto.gaussians == found
-    assert auto.levels.volume.backend == auto.volume.volume.backend == auto.surfaces.fit.backend == "reference"
+    assert auto.volume.volume.backend == auto.surfaces.fit.backend == "reference"
     assert (found.fit.backend, found.volume.backend) == ("reference", "reference")
     assert chosen("--set", "gaussians.fit.backend=reference").gaussians.volume.backend == "auto"
 

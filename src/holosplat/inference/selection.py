@@ -51,7 +51,7 @@ class Decision:
             "choice": self.choice,
             "by": self.by,
             "compared": compared,
-            "seconds": round(self.seconds, 2),
+            "seconds": self.seconds,
         }
 
     @classmethod
@@ -97,7 +97,7 @@ def select(
         compared.append(found)
         if found.wins:
             best = candidate
-    return Decision(name, best, by, tuple(compared), time.perf_counter() - began)
+    return Decision(name, best, by, tuple(compared), round(time.perf_counter() - began, 2))
 
 
 def _least(candidate: str, rivals: Sequence[str], score: Callable[[str, int], Score], folds: range) -> Compared:

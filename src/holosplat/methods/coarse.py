@@ -247,6 +247,7 @@ def missing_matter(found: SurfaceMesh | GaussianCloud, task: Task, surfaces: Sur
 
 
 def _finest(frames: Tensor) -> Tensor:
-    """Frames [V, H, W] less their means over 2 × 2 pixels; an odd row and column are left out."""
-    even = frames[:, : frames.shape[1] // 2 * 2, : frames.shape[2] // 2 * 2]
-    return even - avg_pool2d(even[None], 2)[0].repeat_interleave(2, 1).repeat_interleave(2, 2)
+    """Frames [V, H, W] less their means over 2 × 2 pixels, of one row over two; an odd row and column are left out."""
+    h, w = (min(2, n) for n in frames.shape[1:])
+    even = frames[:, : frames.shape[1] // h * h, : frames.shape[2] // w * w]
+    return even - avg_pool2d(even[None], (h, w))[0].repeat_interleave(h, 1).repeat_interleave(w, 2)

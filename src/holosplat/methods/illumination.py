@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..backends import Backend
 from ..baselines import HolographicTV, holographic_tv
 from ..checks import InputError
 from ..inference import MARGIN, Decision, Score, select
@@ -36,6 +37,10 @@ FREE = " with free light of unseen frames"
 
 Hypothesis = tuple[str, ...]
 """What is added to the null, in the order in which it was taken."""
+
+
+Prepared = tuple[Hypothesis, tuple[Decision, ...]]
+"""What was taken, and the decisions that led to it."""
 
 
 @dataclass(frozen=True)
@@ -123,12 +128,13 @@ class Trials:
         return Trial(volume, light, seen, unseen, predictions(volume, unseen))
 
 
-def first_of_task(task: Task) -> FirstVolumes:
-    """The first volumes that the decisions of a task share."""
+def first_of_task(task: Task, backend: Backend = "auto") -> FirstVolumes:
+    """The first volumes that the decisions of a task share, computed by `backend` where they are new."""
     if task.first is not None:
         return task.first
     one_time = task.scan.at_instant(len(task.scan.instants) // 2) if task.scan.is_series else task.scan
-    return FirstVolumes(Folds.of(one_time), task.prior, task.on_progress)
+    found = FirstVolumes(Folds.of(one_time), task.prior, task.on_progress)
+    return replace(found, options=replace(found.options, backend=backend))
 
 
 def accepted(task: Task, first: FirstVolumes, fold: int) -> Trial:
@@ -178,7 +184,7 @@ def decided(
     return taken, tuple(made)
 
 
-def prepared(task: Task, method: Method | None = None) -> Task:
+def prepared(task: Task, method: Method | None = None, before: Prepared | None = None) -> Task:
     """The task with frames in even light, where evidence or `task.light` says that their light was not even.
 
     Frames that were divided by light before stay as they are: what that left open (`Scan.light`) is then what is not
@@ -201,11 +207,14 @@ def prepared(task: Task, method: Method | None = None) -> Task:
         if free
     ]
     told = tuple(["uneven light"] * (options.kind == "smooth"))
-    task.on_progress(STAGE, 0.0)
-    first = first_of_task(task)
-    first.taken, made = decided(first, options, told, tuple(open_to))
-    if options.noise == "correlated":
-        first.taken = (*first.taken, "correlated noise")
+    first = first_of_task(task, _volume_of(method).backend)
+    if before is None:
+        task.on_progress(STAGE, 0.0)
+        first.taken, made = decided(first, options, told, tuple(open_to))
+        if options.noise == "correlated":
+            first.taken = (*first.taken, "correlated noise")
+    else:
+        first.taken, made = before
     scan, light = _applied(task, light, first.taken)
     return replace(task, scan=scan, lit=light, decisions=(*task.decisions, *made), first=first)
 
@@ -237,8 +246,14 @@ def _applied(task: Task, light: Light, taken: Hypothesis) -> tuple[Scan, Light]:
 
 def still_order(method: Method | None) -> int:
     """Half waves of the fixed pattern that is an unknown of `method`; 0 where it has none."""
+    return _volume_of(method).still_light
+
+
+def _volume_of(method: Method | None) -> HolographicTV:
+    """The options of a method's first volume, or the usual ones."""
     volume = getattr(method, "volume", None)
-    return volume.still_light if isinstance(volume, HolographicTV) else 0
+    volume = getattr(volume, "volume", volume)
+    return volume if isinstance(volume, HolographicTV) else HolographicTV()
 
 
 def predicted_first(

@@ -11,7 +11,7 @@ import torch
 
 from ..align.geometry import Geometry
 from ..align.poses import PoseOptions
-from ..backends import in_main_memory
+from ..backends import in_main_memory, resolve
 from ..checks import as_written, positive, require
 from ..fit.running import Record, Running
 from ..io.guess import write_guess
@@ -47,7 +47,7 @@ from .refine import (
     with_held_out,
 )
 from .rest_file import read_rest
-from .resume import goes_on
+from .resume import decided_before, decisions_of, goes_on
 from .run_folder import RunFolder, claimed
 from .run_light import found_in, read_light_options, still_in
 from .run_record import config_of, summary_of
@@ -107,9 +107,10 @@ def reconstruct(
             geometry = saved_geometry(folder, resume) or trained_geometry(scan, prior, refine, assumed, tell)
             scan = geometry.applied(scan)
         train = scan.train()
-        task = prepared(Task(train, prior, seed, tell, assumed, freedom=freedom_of(geometry, refine)), method)
+        task = Task(train, prior, seed, tell, assumed, freedom=freedom_of(geometry, refine))
         run = _Run(task, method, folder, on_progress, on_state)
         run.begin(config, resume)
+        run.prepare()
         run.settle(matter, ranges, scan, geometry)
         done = run.complete()
         if refine is None or geometry is None:
@@ -178,6 +179,16 @@ class _Run:
                 self.begun = str(self._saved.get("begun", ""))
                 self._keeper.load(self._saved["kept"])
 
+    def prepare(self) -> None:
+        """Decide on light and noise, or do as was decided before."""
+        began = time.perf_counter()
+        if isinstance(self.method, Gaussians):
+            resolve(self.method.fit.backend)  # before the decision, which takes its time
+        before = decided_before(self.folder) if self._saved and self.folder is not None else None
+        self.task = prepared(self.task, self.method, before)
+        if before is None:
+            self.timing["decision"] = time.perf_counter() - began
+
     def settle(
         self, matter: MatterKind | None, uncertain: Uncertain, scan: Scan, geometry: Geometry | None = None
     ) -> None:
@@ -189,14 +200,16 @@ class _Run:
                 found = Settled.again(self.method, self.folder.read_config()["decided"])
         else:
             found = settled(self.method, self.task, matter, uncertain)
-            self.timing["decision"] = time.perf_counter() - began
+            self.timing["decision"] = self.timing.get("decision", 0.0) + time.perf_counter() - began
         if isinstance(self.method, Auto) and self.method.gaussians.start == "learned" and found.matter == "continuous":
             self.begun = "The matter is continuous, and the network guesses bodies: it was not asked."
         self.method, self.constants = found.method, found.constants
         self.task = found.task(self.task)
         self._keeper.train = self.task.scan
-        where = {} if geometry is None else {"geometry": geometry.as_dict()}
-        self._config["decided"] = found.as_table() | {"scan_hash": scan_hash(found.placed(scan))} | where
+        where: dict[str, Any] = {} if geometry is None else {"geometry": geometry.as_dict()}
+        self._config["decided"] = (
+            found.as_table() | decisions_of(self.task) | {"scan_hash": scan_hash(found.placed(scan))} | where
+        )
 
     def complete(self) -> Reconstruction:
         """Run what is left of the stages."""
@@ -290,7 +303,7 @@ class _Run:
         exposures = self.task.scan.exposures
         best = self._keeper.best if complete else None
         samples = best.oversample if best else fit.oversample if fit else 0
-        oversample = samples or fringe_sampling(exposures)
+        oversample, kept = samples or fringe_sampling(exposures), best.name if best else ""
         done = Reconstruction(
             found.on(in_main_memory(found.backend)),
             self.asked,
@@ -298,13 +311,7 @@ class _Run:
             oversample,
             dict(self.timing),
             complete,
-            Choice(
-                self.task.matter,
-                dict(self._keeper.judged),
-                best.name if best else "",
-                self.begun,
-                self.task.decisions,
-            ),
+            Choice(self.task.matter, dict(self._keeper.judged), kept, self.begun, self.task.decisions),
             self.task.delta_told,
             judge_run(found, fit, self.task, oversample),
             self._total(found, fit, oversample),

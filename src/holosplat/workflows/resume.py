@@ -6,6 +6,9 @@ import json
 from typing import Any
 
 from ..checks import as_written, require
+from ..inference import Decision
+from ..methods import Task
+from ..methods.illumination import STAGE, Prepared
 from ..methods.presets import SCHEMA
 from ..methods.uncertain import Uncertain
 from ..optics.background import LightOptions
@@ -56,3 +59,17 @@ def _without_backends(table: Any) -> None:
         table.pop("backend", None)
         for inner in table.values():
             _without_backends(inner)
+
+
+def decisions_of(task: Task) -> dict[str, Any]:
+    """Entries of config.json that `decided_before` reads: what was decided of light and noise, before the matter."""
+    taken = () if task.first is None else task.first.taken
+    return {"light": list(taken), "decisions": [each.as_dict() for each in task.decisions if each.name == STAGE]}
+
+
+def decided_before(folder: RunFolder) -> Prepared:
+    """What a run that goes on has decided of light and noise; `InputError` for a folder that does not say it."""
+    with as_written(folder.config, "of a run that has begun"):
+        table = folder.read_config()["decided"]
+        made = tuple(Decision.from_dict(each) for each in table["decisions"])
+        return tuple(str(each) for each in table["light"]), made

@@ -14,7 +14,7 @@ from torch.nn.functional import max_pool2d
 
 from ...scan import Exposures
 from ..noise import wavelet_noise
-from .spectra import Noise, Raster, filtered, response, spectra, surrounded
+from .spectra import Noise, Prior, Raster, filtered, response, spectra, surrounded
 
 STEPS = 25
 """Alternations between the frame and the bound. Where noise hides the lowest frequencies they go on to drift."""
@@ -24,6 +24,8 @@ SIGNIFICANT = 2.5
 """Standard deviations of its noise above which a pixel is matter."""
 MODEL_ERROR = 0.05
 """Part of a frame's contrast that the wave optics of sampled matter does not explain, measured on cells."""
+CUT = Prior(corner=6.0, decay=1.5)
+"""Expected power of a phase that a frame cuts, whose edges, and not its matter, make the frame's lowest frequencies."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +51,8 @@ def bounded_estimate(
     """
     contrast, crop = surrounded(frames, exposures)
     raster = Raster((contrast.shape[-2], contrast.shape[-1]), exposures.views.pixel_size)
-    known = spectra(frames, exposures, response(exposures, ratio, raster), raster, noise, MODEL_ERROR, leaks=True)
+    h, prior = response(exposures, ratio, raster), CUT if leaves else None
+    known = spectra(frames, exposures, h, raster, noise, MODEL_ERROR, prior, leaks=not leaves)
     trusted = 1 - known.inverse * known.response
     if noise is None:
         doubtful = wavelet_noise(frames) * known.inverse.square().mean(dim=(1, 2)).sqrt()

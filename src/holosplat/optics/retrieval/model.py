@@ -17,7 +17,7 @@ from ...scan import Exposures
 from ...units import wavelength
 from ..hologram import hologram, optical_path
 from ..sampling import alike, fringe_sampling, padding
-from .bounded import MODEL_ERROR, Estimate, bounded_estimate
+from .bounded import CUT, MODEL_ERROR, Estimate, bounded_estimate
 from .spectra import (
     Noise,
     Raster,
@@ -102,9 +102,8 @@ class WaveModel:
             (exposures.views.shape, (my, mx), self.oversample),
             frames.dtype,
         ).to(self.frames.device)
-        self.spectra = spectra(
-            frames, exposures, response(exposures, ratio, self.raster), self.raster, noise, MODEL_ERROR
-        )
+        h, prior = response(exposures, ratio, self.raster), CUT if leaves else None
+        self.spectra = spectra(frames, exposures, h, self.raster, noise, MODEL_ERROR, prior)
         self.strongest = column(sensitivity(exposures, ratio) ** 2)
         self.support, self.phase = self._spread(estimate)
 
