@@ -370,6 +370,8 @@ def _plain(kind: type, value: Any, where: str) -> Any:
     accepted = {float: (int, float), Path: (str,)}.get(kind, (kind,))
     good = isinstance(value, accepted) and (kind is bool or not isinstance(value, bool))
     names = {float: "a number", int: "a whole number", str: "a text", bool: "true or false", Path: "a path"}
-    good = good and (kind is not float or math.isfinite(value)) and (kind is not Path or "\0" not in value)
+    good = (
+        good and (kind is not float or math.isfinite(value)) and (names.get(kind) != "a path" or "\0" not in str(value))
+    )
     require(good, f"{where} must be {names.get(kind, 'none')}, but it is {shown(value)}.")
     return kind(value)

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from holosplat.checks import InputError
+from holosplat.io.reading import Reading
 from holosplat.io.table import Table
 from holosplat.projectors.surface import surface_thickness
 from holosplat.series.rows import Row, read_row, write_row
@@ -91,3 +92,8 @@ def test_surfaces_are_seen_from_poses_that_are_some(rotations, shifts, pixels):
     told = None if pixels is None else torch.ones(pixels)
     with pytest.raises(InputError, match="rotations, shifts and pixels must have the shapes"):
         surface_thickness(*body, torch.ones(rotations), torch.ones(shifts), (5, 7), pixels=told)
+
+
+def test_a_path_with_a_zero_byte_is_none():
+    with pytest.raises(InputError, match="angles must be a path"):
+        Reading.from_table({"angles": "a\0"})
