@@ -41,10 +41,12 @@ def positive(field: str, value: Any, unit: str = "") -> float:
     """`value` as a float, if it is a finite number above zero; `InputError` naming `field` otherwise."""
     try:
         number = float(value)
+    except OverflowError:
+        number = math.inf
     except (TypeError, ValueError):
         number = math.nan
     if not (math.isfinite(number) and number > 0):
-        shown = f"{number:g}" if isinstance(value, (int, float)) else repr(value)
+        shown = f"{number:g}" if isinstance(value, (int, float)) else repr(value)[:LONGEST]
         raise InputError(f"{field} must be a positive number{_of(unit)}, but it is {shown}; correct it.")
     return number
 

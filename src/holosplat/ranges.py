@@ -30,7 +30,7 @@ class Within:
 
     def fault(self, value: float) -> str:
         """What `value` must be instead of what it is; empty where it is one of them."""
-        if not math.isfinite(value):
+        if not (isinstance(value, Integral) or math.isfinite(value)):  # what is whole may be too large for a float
             return "must be a finite number"
         if value > self.high:
             return f"must be at most {_shown(self.high)} {self.unit}".rstrip()
@@ -239,6 +239,7 @@ def hints_of(thing: Any) -> dict[str, Any]:
 
 
 def _shown(number: float) -> str:
-    if not math.isfinite(number):
-        return str(float(number))
-    return str(number) if isinstance(number, Integral) and abs(number) < 1e7 else f"{float(number):g}"
+    try:
+        return str(number) if isinstance(number, Integral) and abs(number) < 1e7 else f"{float(number):g}"
+    except OverflowError:
+        return f"a number of {len(str(abs(number)))} digits"

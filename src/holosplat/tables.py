@@ -1,23 +1,34 @@
 """Nested frozen dataclasses and tables (TOML, JSON): read, write, merge, and change one field by its dotted path.
 
 A table is checked entry by entry: an unknown, missing or ill-typed entry is an `InputError` that names its path.
-A field's type is bool, int, float, str, Path, a `Literal`, a tuple, a dataclass, one of these or None, or a union of
-dataclasses. Each member of such a union has a name, its class variable `kind`; the table's entry `kind` chooses one.
+A field's type is bool, int, float, str, Path, a `Literal`, a tuple, a table by name, a dataclass, one of these or None,
+or a union of dataclasses. Each member of such a union has a name, its class variable `kind`; the table's entry `kind`
+chooses one.
 """
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import difflib
 import json
 import math
+import re
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from types import NoneType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from .checks import InputError, require, require_regular
+
+LARGEST = 1 << 64
+"""What no whole number of a table exceeds: larger ones are no numbers of an experiment, and no floats."""
+DOTTED = re.compile(r"""(?:[\w"'-]+[ \t]*\.[ \t]*){64}""")
+"""A key of TOML with more parts than any table is deep; of tens of thousands, the decoder takes gigabytes."""
+SHOWN = 60
+"""Characters of a value in messages, at most."""
 
 # --- files --------------------------------------------------------------------------------------------------
 
@@ -35,13 +46,66 @@ def read_table(path: Path) -> dict[str, Any]:
     except (OSError, ValueError) as error:
         raise InputError(f"{path} must be a readable {language} file, but reading it failed: {error}.") from None
     try:
-        table = tomllib.loads(text) if toml else json.loads(text, parse_constant=_no_number)
+        table = (_toml if toml else _json)(text)
     except RecursionError:
         raise InputError(f"{path} must be valid {language}, but it is nested too deeply; make it flat.") from None
     except ValueError as error:  # both decoders' errors
         raise InputError(f"{path} must be valid {language}, but: {error}.") from None
     require(isinstance(table, dict), f"{path} must hold a table, but it holds {type(table).__name__}.")
     return table
+
+
+def table_in(text: str) -> dict[str, Any]:
+    """The table that a JSON text holds. Raises `ValueError` for any other text."""
+    table = _json(text)
+    require(isinstance(table, dict), f"it must be a table, but it is {shown(table)}.")
+    return table
+
+
+def _json(text: str) -> Any:
+    found = json.loads(text, parse_constant=_no_number)
+    _require_numbers(found)
+    return found
+
+
+def _toml(text: str) -> dict[str, Any]:
+    if DOTTED.search(text):
+        raise RecursionError
+    found = tomllib.loads(text)
+    _require_numbers(found)
+    return found
+
+
+def read_rows(path: Path, what: str) -> list[dict[str, str]]:
+    """The rows of the CSV file that `path` must be, by column. Raises `InputError` for any other file."""
+    require_regular(path, what)
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            return list(csv.DictReader(file, restval=""))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path} must be {what}, but reading it failed: {error}.") from None
+
+
+def number_in(text: str) -> float:
+    """The number that a text is; NaN where it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def _require_numbers(value: Any) -> None:
+    """`ValueError` for a whole number within `value` that is none of an experiment."""
+    if isinstance(value, int) and abs(value) > LARGEST:
+        raise ValueError(f"a number of it has {value.bit_length() * 3 // 10} digits or more")
+    for inner in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
+        _require_numbers(inner)
+
+
+def shown(value: Any) -> str:
+    """A value in messages."""
+    text = repr(value)
+    return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
 
 
 def _no_number(name: str) -> Any:
@@ -91,7 +155,7 @@ def from_table(kind: Any, table: Any, where: str = "") -> Any:
     values: dict[str, Any] = {**table}
     if _has_tag(kind):
         _tagged([kind], values.pop("kind", kind.kind), where)
-    hints, fields = get_type_hints(kind), _fields(kind)
+    hints, fields = _hints(kind), _fields(kind)
     unknown = [name for name in values if name not in fields]
     require(not unknown, f"{_path(where, *unknown[:1])} is not known; remove it, or use one of {', '.join(fields)}.")
     missing = [name for name, field in fields.items() if name not in values and not _has_default(field)]
@@ -159,7 +223,7 @@ def paths(base: Any) -> dict[str, Any]:
 
 
 def _leaves(kind: type, value: Any) -> Iterator[tuple[tuple[str, ...], Any]]:
-    hints = get_type_hints(kind)
+    hints = _hints(kind)
     for name in _fields(kind):
         hint, held = hints[name], getattr(value, name, None)
         members = [member for member in _members(hint) if _is_dataclass(member)]
@@ -204,7 +268,7 @@ def _parsed(hint: Any, text: str) -> Any:
     members = _members(hint)
     if str in members or Path in members or any(isinstance(m, str) for m in members):
         return text.strip("\"'")
-    for read in (lambda: tomllib.loads(f"value = {text}")["value"], lambda: float(text)):
+    for read in (lambda: _toml(f"value = {text}")["value"], lambda: float(text)):
         try:
             return read()
         except ValueError:
@@ -217,6 +281,12 @@ def _parsed(hint: Any, text: str) -> Any:
 
 def _fields(kind: Any) -> dict[str, dataclasses.Field[Any]]:
     return {field.name: field for field in dataclasses.fields(kind) if field.init}
+
+
+@cache
+def _hints(kind: Any) -> dict[str, Any]:
+    """The types of a dataclass' fields, which take long to find."""
+    return get_type_hints(kind)
 
 
 def _is_dataclass(value: Any) -> bool:
@@ -249,10 +319,16 @@ def _checked(hint: Any, value: Any, where: str) -> Any:
     if value is None and (hint is NoneType or NoneType in get_args(hint)):
         return None
     members = _members(hint)
+    if hint is Any:
+        return value
+    if get_origin(hint) in (dict, Mapping):
+        if not isinstance(value, dict):
+            raise InputError(f"{where} must be a table, but it is {shown(value)}.")
+        return {name: _checked(members[-1], inner, _path(where, str(name))) for name, inner in value.items()}
     if get_origin(hint) is Literal:
         names = ", ".join(map(str, members))
         good = any(type(value) is type(member) and value == member for member in members)
-        require(good, f"{where} must be one of {names}, but it is {value!r}.")
+        require(good, f"{where} must be one of {names}, but it is {shown(value)}.")
         return value
     if get_origin(hint) is tuple:
         return _tuple(list(get_args(hint)), value, where)
@@ -268,7 +344,7 @@ def _one_of(kinds: list[Any], value: Any, where: str) -> Any:
     if not any(_is_dataclass(kind) for kind in kinds):
         texts = isinstance(value, str) and str in kinds
         return _plain(str if texts else kinds[0], value, where)
-    require(isinstance(value, dict), f"{where} must be a table, but it is {value!r}.")
+    require(isinstance(value, dict), f"{where} must be a table, but it is {shown(value)}.")
     require("kind" in value, f"{_path(where, 'kind')} is missing; add one of {', '.join(k.kind for k in kinds)}.")
     return from_table(_tagged(kinds, value["kind"], where), value, where)
 
@@ -283,10 +359,10 @@ def _tagged(kinds: list[Any], name: Any, where: str) -> Any:
 
 def _tuple(members: list[Any], value: Any, where: str) -> tuple[Any, ...]:
     """A list as a tuple: of one type and any length, or of as many entries as there are types."""
-    require(isinstance(value, list), f"{where} must be a list, but it is {value!r}.")
+    require(isinstance(value, list), f"{where} must be a list, but it is {shown(value)}.")
     if members[-1] is Ellipsis:
         members = members[:1] * len(value)
-    require(len(value) == len(members), f"{where} must have {len(members)} entries, but it is {value!r}.")
+    require(len(value) == len(members), f"{where} must have {len(members)} entries, but it is {shown(value)}.")
     return tuple(_checked(member, v, f"{where}[{i}]") for i, (member, v) in enumerate(zip(members, value)))
 
 
@@ -294,6 +370,8 @@ def _plain(kind: type, value: Any, where: str) -> Any:
     accepted = {float: (int, float), Path: (str,)}.get(kind, (kind,))
     good = isinstance(value, accepted) and (kind is bool or not isinstance(value, bool))
     names = {float: "a number", int: "a whole number", str: "a text", bool: "true or false", Path: "a path"}
-    good = good and (kind is not float or math.isfinite(value))
-    require(good, f"{where} must be {names.get(kind, 'none')}, but it is {value!r}.")
+    good = (
+        good and (kind is not float or math.isfinite(value)) and (names.get(kind) != "a path" or "\0" not in str(value))
+    )
+    require(good, f"{where} must be {names.get(kind, 'none')}, but it is {shown(value)}.")
     return kind(value)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..checks import InputError, require
+from ..checks import InputError, require_regular
 from ..optics.coherence import Spectrum
 from ..scan import Exposures
 from ..specimens.mesh_series import MeshSeries
@@ -65,7 +65,7 @@ def _refilled(scene: MeshScene, filling: Filling, energy_kev: float) -> MeshScen
 
 def read_spectrum(path: Path) -> Spectrum:
     """A spectrum from a text file of two columns, energy [keV] and weight; `#` begins a comment."""
-    require(path.is_file(), f"--spectrum must name a text file of energies and weights, but {path} does not exist.")
+    require_regular(path, "a text file of energies and weights (--spectrum)")
     try:
         table = np.loadtxt(path, ndmin=2)
     except (ValueError, UnicodeDecodeError):

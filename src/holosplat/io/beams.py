@@ -17,6 +17,8 @@ from ..tables import from_table, read_table
 from .atomic import atomic_path
 
 FORMAT = "holosplat geometry 1"
+MOST_VIEWS = 50_000
+"""Views of a file, at most: more take a minute to read, and no scan has them."""
 ERRORS = ("shift_px", "turn_deg", "distance_share", "magnification_share")
 
 Pair = tuple[Signed, Signed]
@@ -127,11 +129,11 @@ class Beams:
     def said(self, name: str) -> np.ndarray | None:
         """The numbers `name` [V] if all views have them; None if none has. Errors: `InputError` where some have."""
         values = [getattr(each, name) for each in self.view]
-        have = [v for v, value in enumerate(values) if value is not None]
-        if not have:
+        first = next((v for v, value in enumerate(values) if value is not None), None)
+        if first is None:
             return None
-        lacking = next((v for v in range(len(self)) if v not in have), None)
-        require(lacking is None, f"view[{lacking}].{name} is missing, which view[{have[0]}] has; add it, or leave all.")
+        lacking = next((v for v, value in enumerate(values) if value is None), None)
+        require(lacking is None, f"view[{lacking}].{name} is missing, which view[{first}] has; add it, or leave all.")
         return np.array(values, dtype=np.float64)
 
     def scalars(self) -> dict[str, float]:
@@ -206,6 +208,9 @@ def read_beams(path: str | Path) -> Beams:
     origin = table.pop("made_by", {})
     texts = isinstance(origin, dict) and all(isinstance(text, str) for text in origin.values())
     require(texts, f"{path}: made_by must be a table of texts, but it is {origin!r}.")
+    views = table.get("view")
+    count = len(views) if isinstance(views, list) else 0
+    require(count <= MOST_VIEWS, f"{path} must have at most {MOST_VIEWS} views, but it has {count}; take fewer.")
     require("format" in table, f"{path}: format is missing; a file of a geometry begins with format = {FORMAT!r}.")
     try:
         found = from_table(_File, table)

@@ -196,6 +196,9 @@ def _remove(lock: Path, seen: str) -> None:
 
 
 def _text(lock: Path) -> str | None:
+    """What a lock says; None where there is none."""
+    if os.path.lexists(lock) and not lock.is_file():  # such as a pipe, which may never end
+        return ""
     try:
         return lock.read_text(encoding="utf-8", errors="replace")
     except FileNotFoundError:

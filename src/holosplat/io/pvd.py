@@ -14,6 +14,7 @@ from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 from ..checks import InputError, require
+from ..tables import number_in
 from .atomic import atomic_path
 
 
@@ -69,11 +70,7 @@ def read_pvd(path: str | Path) -> list[TimeStep]:
 
 
 def _number(path: str | Path, entry: ElementTree.Element, name: str, default: str) -> float:
-    text = entry.get(name, default)
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
+    number = number_in(entry.get(name, default))
     require(
         math.isfinite(number),
         f"{path}: {name} of {entry.get('file')!r} must be a number, but it is {entry.get(name)!r}; write it anew.",

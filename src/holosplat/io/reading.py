@@ -12,7 +12,7 @@ import numpy as np
 
 from ..checks import InputError, finite, require, require_regular
 from ..ranges import Frequency, Natural, Signed, Small, ranged
-from ..tables import from_table, to_table
+from ..tables import LARGEST, from_table, number_in, shown, to_table
 from .tube import Tube
 
 if TYPE_CHECKING:
@@ -196,10 +196,7 @@ class Reading:
 def ends_of(name: str, text: str) -> tuple[float, float]:
     """The range that the `text` LOW:HIGH of the option `name` says. Errors: `InputError` for anything else."""
     words = text.split(":")
-    try:
-        low, high = (float(word) for word in words)
-    except ValueError:
-        low, high = math.nan, math.nan
+    low, high = (number_in(word) for word in words) if len(words) == 2 else (math.nan, math.nan)
     require(
         0 < low * high < math.inf and abs(low) < abs(high),
         f"--{name.replace('_', '-')} must be a number, or a range LOW:HIGH of numbers above 0, the smaller one first, "
@@ -240,10 +237,9 @@ def read_angles(path: Path) -> np.ndarray:
 
 
 def _number(path: Path, word: str) -> float:
-    try:
-        return float(word)
-    except ValueError:
-        raise InputError(f"{path} must hold angles in degrees, but it holds {word!r}.") from None
+    number = number_in(word)
+    require(not math.isnan(number), f"{path} must hold angles in degrees, but it holds {shown(word)}.")
+    return number
 
 
 def _corner(text: str, shape: tuple[int, int]) -> tuple[slice, slice]:
@@ -293,8 +289,9 @@ def _bounds(option: str, text: str, advice: str) -> tuple[int | None, int | None
 
 def _whole(option: str, word: str) -> int:
     try:
-        return int(word)
+        found = int(word)
     except ValueError:
-        raise InputError(
-            f"{option} must be made of whole numbers, as in 0:91:8 or 3,5, but it says {word!r}."
-        ) from None
+        found = None
+    if found is None or abs(found) > LARGEST:
+        raise InputError(f"{option} must be made of whole numbers, as in 0:91:8 or 3,5, but it says {shown(word)}.")
+    return found

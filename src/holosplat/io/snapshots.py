@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..checks import InputError, positive, require
+from ..checks import InputError, positive, require, require_regular
 from ..units import TIME_UNITS, unit_factor
 from .pvd import read_pvd
 from .vtk import mesh_files
@@ -137,6 +137,7 @@ def _time(files: list[Path], said: float | None) -> float:
 
 
 def _header_time(file: Path) -> float | None:
+    require_regular(file, "a mesh file")
     try:
         with file.open("rb") as opened:
             lines = opened.read(512).split(b"\n")

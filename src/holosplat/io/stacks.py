@@ -6,14 +6,13 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ..checks import InputError, require
 from .guard import mapped_array
 from .leftovers import is_hidden
-from .tiff_guard import page_values
+from .tiff_guard import page_values, pages_in
 
 IMAGES = (".tif", ".tiff", ".png")
 
@@ -87,24 +86,11 @@ def _page_count(file: Path) -> int:
 
     try:
         with tifffile.TiffFile(file) as opened:
-            return _pages_of(opened)
+            return sum(1 for _ in pages_in(opened, file))
     except InputError:
         raise
     except Exception as error:  # tifffile raises many kinds for damaged files
         raise InputError(f"{file} must be a complete TIFF file, but it is damaged or none: {error}.") from None
-
-
-def _pages_of(opened: Any) -> int:
-    """The pages of an open TIFF file; `InputError` where they run in a circle."""
-    places = set[int]()
-    while True:
-        try:
-            place = opened.pages[len(places)].offset
-        except IndexError:
-            return len(places)
-        name = opened.filehandle.path
-        require(place not in places, f"{name} must hold its pages one after another, but they run in a circle.")
-        places.add(place)
 
 
 def _image(file: Path, page: int) -> np.ndarray:

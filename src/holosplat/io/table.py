@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..checks import InputError, finite, require, shaped
+from ..tables import shown
 from .json import read_json
 
 
@@ -51,7 +52,7 @@ class Table:
         except ValueError:  # rows of unequal length
             array = np.array("uneven rows")
         if array.dtype.kind not in "iuf":
-            raise InputError(f"{self.label(name)} must hold numbers, but it is {_shown(value)}.")
+            raise InputError(f"{self.label(name)} must hold numbers, but it is {shown(value)}.")
         return finite(self.label(name), shaped(self.label(name), array.astype(np.float64), shape))
 
     def count(self, name: str) -> int:
@@ -62,13 +63,13 @@ class Table:
         """Whole numbers, none of them negative."""
         numbers = self.numbers(name, shape).reshape(-1)
         whole = bool((numbers == np.floor(numbers)).all() and (numbers >= 0).all())
-        require(whole, f"{self.label(name)} must hold whole numbers from 0 on, but it is {_shown(self.values[name])}.")
+        require(whole, f"{self.label(name)} must hold whole numbers from 0 on, but it is {shown(self.values[name])}.")
         return tuple(int(n) for n in numbers)
 
     def text(self, name: str) -> str:
         """A text."""
         value = self.need(name)
-        require(isinstance(value, str), f"{self.label(name)} must be a text, but it is {_shown(value)}.")
+        require(isinstance(value, str), f"{self.label(name)} must be a text, but it is {shown(value)}.")
         return value
 
     def require_format(self, known: str) -> None:
@@ -79,20 +80,20 @@ class Table:
     def flag(self, name: str) -> bool:
         """True or false."""
         value = self.need(name)
-        require(isinstance(value, bool), f"{self.label(name)} must be true or false, but it is {_shown(value)}.")
+        require(isinstance(value, bool), f"{self.label(name)} must be true or false, but it is {shown(value)}.")
         return value
 
     def table(self, name: str) -> Table:
         """A table within the table."""
         value = self.need(name)
-        require(isinstance(value, dict), f"{self.label(name)} must be a table, but it is {_shown(value)}.")
+        require(isinstance(value, dict), f"{self.label(name)} must be a table, but it is {shown(value)}.")
         return Table(self.path, value, f"{self.where}{name}.")
 
     def tables(self, name: str) -> list[Table]:
         """A list of tables."""
         value = self.need(name)
         good = isinstance(value, list) and all(isinstance(entry, dict) for entry in value)
-        require(good, f"{self.label(name)} must be a list of tables, but it is {_shown(value)}.")
+        require(good, f"{self.label(name)} must be a list of tables, but it is {shown(value)}.")
         return [Table(self.path, entry, f"{self.where}{name}[{n}].") for n, entry in enumerate(value)]
 
     def texts(self, name: str) -> dict[str, str]:
@@ -103,13 +104,10 @@ class Table:
     def file(self, name: str, suffix: str = "") -> Path:
         """A file below the folder of this one, whose path (before `suffix`) is the entry `name`."""
         folder = self.path.parent.resolve()
+        nameable = "\0" not in self.text(name)
+        require(nameable, f"{self.label(name)} must be the name of a file, but it is {shown(self.values[name])}.")
         found = (folder / (self.text(name) + suffix)).resolve()
         inside = found.is_relative_to(folder)
-        require(inside, f"{self.label(name)} must name a file in the folder, but it is {_shown(self.values[name])}.")
+        require(inside, f"{self.label(name)} must name a file in the folder, but it is {shown(self.values[name])}.")
         require(found.is_file(), f"{self.label(name)} names {self.text(name) + suffix}, but there is no such file.")
         return found
-
-
-def _shown(value: Any) -> str:
-    text = repr(value)
-    return text if len(text) <= 60 else text[:57] + "..."

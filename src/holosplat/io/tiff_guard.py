@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..checks import InputError
+from ..checks import InputError, require
 from .guard import RATIO, SMALL, require_declared, require_inflated, require_memory
 
 DEFLATE = (8, 32946)
@@ -25,13 +26,26 @@ def page_values(page: Any, file: Path) -> np.ndarray:
     return page.asarray()
 
 
+def pages_in(opened: Any, file: Path) -> Iterator[Any]:
+    """The pages of an open TIFF file; `InputError` where they run in a circle."""
+    places = set[int]()
+    while True:
+        try:
+            page = opened.pages[len(places)]
+        except IndexError:
+            return
+        require(page.offset not in places, f"{file} must hold its pages one after another, but they run in a circle.")
+        places.add(page.offset)
+        yield page
+
+
 def all_pages(file: Path) -> list[np.ndarray]:
     """The values of all pages of a TIFF file. Errors: `InputError` for one that is damaged or none."""
     import tifffile
 
     try:
         with tifffile.TiffFile(file) as opened:
-            return [page_values(page, file) for page in opened.pages]
+            return [page_values(page, file) for page in pages_in(opened, file)]
     except (InputError, MemoryError):
         raise
     except Exception as error:  # tifffile raises many kinds for damaged files

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..checks import InputError, require
+from ..checks import require
 from ..frames import divided
 from ..ranges import ranged
+from ..tables import number_in, shown
 
 if TYPE_CHECKING:
     from ..geometry import Views
@@ -37,14 +38,13 @@ class Tube:
     @classmethod
     def parsed(cls, text: str) -> Tube:
         """The tube that INNER:OUTER:ATTENUATION says. Errors: `InputError` for anything else."""
-        try:
-            inner, outer, attenuation = (float(word) for word in text.split(":"))
-        except ValueError:
-            said = f"it is {text!r}; write, for instance, 4e-3:4.5e-3:200."
-            raise InputError(
-                f"--tube must be INNER:OUTER:ATTENUATION, diameters [m] and µ of the wall [1/m], but {said}"
-            ) from None
-        return cls(inner, outer, attenuation)
+        numbers = [number_in(word) for word in text.split(":")]
+        require(
+            len(numbers) == 3 and not any(map(math.isnan, numbers)),
+            f"--tube must be INNER:OUTER:ATTENUATION, diameters [m] and µ of the wall [1/m], but it is {shown(text)}; "
+            "write, for instance, 4e-3:4.5e-3:200.",
+        )
+        return cls(*numbers)
 
     def transmission(self, views: Views) -> np.ndarray:
         """Share of the light [V, W] that passes the wall, by column: `exp(-µ t)`, t the wall's length along the ray.

@@ -89,7 +89,7 @@ def write_mesh(path: str | Path, mesh: TriangleMesh, length_unit: str = "um") ->
             writer.SetFileVersion(writer.VTK_LEGACY_READER_VERSION_4_2)
             writer.SetFileTypeToBinary()
             writer.SetHeader(f"{mesh.name[:200]} length_unit={length_unit}".replace("\n", " "))
-        writer.SetFileName(os.fsencode(temporary))  # type: ignore[arg-type]
+        writer.SetFileName(os.fsencode(temporary))  # pyright: ignore[reportArgumentType]  # which takes bytes, too
         writer.SetInputData(data)
         if not writer.Write() or complaints():
             raise InputError(f"{path} must be writable, but VTK could not write it: {complaints()}.")

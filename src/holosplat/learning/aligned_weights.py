@@ -11,11 +11,11 @@ import torch
 from safetensors.torch import save
 from torch import Tensor
 
-from ..checks import InputError, require
+from ..checks import InputError, as_written, require
 from ..io.atomic import atomic_path
 from ..representations import AlignedNetwork, PixelAligned
-from ..tables import from_table, to_table
-from .weights import Card, tensors_of
+from ..tables import to_table
+from .weights import Card, card_of, size_of, tensors_of
 
 VERSION = "aligned 1"
 """Of the network's layout."""
@@ -50,9 +50,10 @@ def read_aligned(path: Path, network: str) -> AlignedWeights:
         f"{path} must hold weights of the network {network}, but it holds {said.get('network', 'others')}; train it "
         f"(holosplat train --network {network}).",
     )
-    size = from_table(AlignedNetwork, json.loads(said["size"]))
+    with as_written(path, "what holosplat train wrote"):
+        size, card = size_of(AlignedNetwork, said, tensors), card_of(said)
     wanted = {name: tuple(weight.shape) for name, weight in PixelAligned(size).named_parameters()}
     found = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
     if wanted != found or not all(bool(torch.isfinite(tensor).all()) for tensor in tensors.values()):
         raise InputError(f"{path} must hold the weights of the network that it says, but it does not; train anew.")
-    return AlignedWeights(network, size, tensors, Card(**json.loads(said["card"])))
+    return AlignedWeights(network, size, tensors, card)

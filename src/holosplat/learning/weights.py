@@ -7,19 +7,20 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from ..checks import InputError, as_written, require_regular
+from ..checks import InputError, as_written, require, require_regular
 from ..io.atomic import atomic_path
-from ..tables import from_table
+from ..tables import from_table, table_in
 from .network import Guess, Size
 
 SHIPPED = Path(__file__).with_name("red_cells.safetensors")
 """Weights that may come with the package."""
+Kind = TypeVar("Kind")
 VERSION = 1
 """Of the network's layout."""
 
@@ -91,14 +92,32 @@ def read_weights(path: Path = SHIPPED) -> Trained:
             f"{said.get('holosplat', 'others')}; train anew (holosplat train)."
         )
     with as_written(path, "what holosplat train wrote"):
-        network = Guess(from_table(Size, json.loads(said["size"])))
-        card = Card(**json.loads(said["card"]))
+        network = Guess(size_of(Size, said, tensors))
+        card = card_of(said)
     try:
         network.load_state_dict(tensors)
     except RuntimeError as error:
         raise InputError(f"{path} must hold the weights of the network that it says, but: {error}.") from None
     network.eval().requires_grad_(False)
     return Trained(network, card)
+
+
+def size_of(kind: type[Kind], said: Mapping[str, str], tensors: Mapping[str, Tensor]) -> Kind:
+    """The size of a network that a file says, which is not larger than the weights in it; raises what `as_written`
+    takes for anything else."""
+    size = from_table(kind, table_in(said["size"]))
+    held = max((length for tensor in tensors.values() for length in tensor.shape), default=0)
+    named = [width for value in vars(size).values() for width in (value if isinstance(value, tuple) else (value,))]
+    require(max(named) <= held, f"a network of {max(named)} channels has larger weights than it holds.")
+    return size
+
+
+def card_of(said: Mapping[str, str]) -> Card:
+    """The card in a file, which answers what is asked of it; raises what `as_written` takes for anything else."""
+    card = from_table(Card, table_in(said["card"]))
+    asked = (card.of_red_cells, card.typical(2), card.dice(2))
+    require(all(number >= 0 for number in asked), "a number of the card is below zero.")
+    return card
 
 
 def tensors_of(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:

@@ -244,12 +244,12 @@ class Search:
 
     def take_up(self) -> None:
         """Go on where the journal ends."""
-        saved = self.journal.load()
-        if saved is None:
+        if (saved := self.journal.load()) is None:
             return
         with as_written("checkpoint.pt", "a checkpoint of this run"):
-            self._saved, self.history = dict(saved), list(saved["history"])
-            self.timing, self._strength = dict(saved["timing"]), float(saved["strength"])
+            self._saved, self.history = {**saved, "steps": int(saved.get("steps", 0))}, list(saved["history"])
+            self._strength = float(saved["strength"])
+            self.timing = {str(name): float(seconds) for name, seconds in saved["timing"].items()}
             self.prior = self.options.volume.prior.weakened(self._strength)
 
     def keep(self, state: _State | None = None) -> None:
@@ -271,7 +271,7 @@ class Search:
 
     def _stepped(self, name: str, make: Callable[[], _State]) -> _State:
         """What `make` finds, in the time of stage `name`; of steps that are done already, what the last one found."""
-        done, self._step = int(self._saved.get("steps", 0)), self._step + 1
+        done, self._step = self._saved.get("steps", 0), self._step + 1
         if self._step <= done:
             return self._saved_state()
         began, before = clock.perf_counter(), sum(self.timing.values())
@@ -281,9 +281,10 @@ class Search:
         return found
 
     def _saved_state(self) -> _State:
-        flow, fading = Flow.from_state(self._saved["flow"]), self._saved.get("fading")
         lattice = self.steady(self.options.cells).lattice
-        return _State(flow, self._saved["u"], None if fading is None else Fading(fading, lattice))
+        with as_written("checkpoint.pt", "a checkpoint of this run"):
+            told = Fading(self._saved["fading"], lattice) if "fading" in self._saved else None
+            return _State(Flow.from_state(self._saved["flow"]), self._saved["u"], told)
 
     def _begun(self) -> _State:
         return self._still(self.on(self.first(), self.factor))

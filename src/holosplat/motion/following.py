@@ -108,7 +108,9 @@ class Following:
         self.stage, self.round, self.oversample = str(saved["next"]), int(saved["round"]), int(saved["oversample"])
         self.bodies = None if saved["bodies"] is None else MovingSurfaces.from_state(saved["bodies"])
         self.seen, self.counts = to_sightings(saved["seen"]), list(saved["counts"])
-        self.records, self.timing = list(saved["records"]), dict(saved["timing"])
+        self.records = list(saved["records"])
+        self.timing = {str(name): float(seconds) for name, seconds in saved["timing"].items()}
+        require(self.stage in (*STAGES, "done"), f"next must be one of {', '.join(STAGES)}, but it is {self.stage}.")
         self.halves = [MovingSurfaces.from_state(one) for one in saved["halves"]]
         self._begun, self.size, self.guess = saved["fit"], float(saved["size"]), str(saved["guess"])
         self.cells = float(saved["cells"])

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
+from ..checks import as_written
 from ..io.atomic import atomic_path
+from ..tables import read_rows
 from .style import CYCLE, DPI, INK, WIDTH, letter, new_figure, styled
 
 SMOOTHED = 100
@@ -50,6 +51,6 @@ def _smooth(values: np.ndarray) -> np.ndarray:
 
 
 def _columns(path: Path) -> dict[str, np.ndarray]:
-    with path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+    with as_written(path, "the curves of a training"):
+        rows = read_rows(path, "the curves of a training")
+        return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from ..checks import as_written
 from ..geometry import Grid, Views
 from ..io.guess import read_guess
 from ..io.json import read_json
@@ -66,8 +67,16 @@ def report_run(
             test.frames, evaluation.predicted, _labels(test), evaluation.test, test.views.pixel_sizes
         )
     volume = found.voxelise(grid)
+    with as_written(folder.config, "of a run that has begun"):
+        own = config.get("method", config.get("settings", {}))
+        said: dict[str, Any] = {
+            "title": _title(config, reconstruction),
+            "settings": {"seed": config["seed"], "prior": config["prior"], **own},
+            "versions": dict(config["versions"]),
+            "machine": dict(config["machine"]),
+            "input_hash": str(config["scan_hash"]),
+        }
     content = ReportContent(
-        title=_title(config, reconstruction),
         summary=" ".join(filter(None, (_summary(reconstruction, scan, moving), remark))),
         reconstruction=volume,
         truth=truth,
@@ -88,12 +97,9 @@ def report_run(
         view=view_of(turned, volume, truth, scan),
         history=folder.history(),
         seconds=sum(reconstruction.timing.values()),
-        settings={"seed": config["seed"], "prior": config["prior"], **config.get("method", config.get("settings", {}))},
-        versions=config["versions"],
-        machine=config["machine"],
         timing={stage: f"{seconds:.1f} s" for stage, seconds in reconstruction.timing.items()},
-        input_hash=config["scan_hash"],
         run=folder.name(),
+        **said,
     )
     return write_report(content, folder.report)
 

@@ -21,6 +21,8 @@ from torch.nn.functional import embedding_bag, grid_sample, interpolate, leaky_r
 from ..checks import at_least, require
 from ..ranges import Natural, ranged
 
+MOST_LEVELS = 10
+"""Levels of the encoder, at most: the coarsest of eleven is of one pixel where the finest has a thousand."""
 INPUTS = 3
 """Channels of an image: contrast, retrieved thickness, noise, as `learning.images` makes them."""
 SLOPE = 0.1
@@ -44,7 +46,8 @@ class AlignedNetwork:
     """Waves that say how deep in a view a point lies (0: nothing does): their periods halve from the field's width."""
 
     def __post_init__(self) -> None:
-        require(len(self.image) > 1, f"image must have two levels or more, but it has {len(self.image)}.")
+        count = len(self.image)
+        require(1 < count <= MOST_LEVELS, f"image must have 2 to {MOST_LEVELS} levels, but it has {count}.")
         at_least(self, 0, "octaves")
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from ..io.atomic import atomic_path
+from ..tables import number_in
 from .folder import SeriesFolder, TaskState
 from .plan import Moment, SeriesPlan
 from .rows import Body, Row
@@ -172,7 +173,7 @@ def _body_lines(found: Collected) -> Iterable[list[object]]:
 
 
 def _number(value: object) -> str:
-    return "" if value is None else f"{float(str(value)):.6g}"
+    return "" if value is None else f"{number_in(str(value)):.6g}"
 
 
 def page_of(folder: SeriesFolder, found: Collected) -> SeriesPage:

@@ -86,6 +86,15 @@ class SeriesPlan:
                 found.append(Window(len(found), window, first - begin))
         return found
 
+    def require_few(self) -> None:
+        """`InputError` for too many tasks."""
+        count = sum(len(source.times) for source in self.sources) // self.cut.window  # at least
+        count = count if count > MOST_TASKS else len(self.windows())
+        require(
+            count <= MOST_TASKS,
+            f"a series has at most {MOST_TASKS} tasks, but these are {count}; choose a larger window.",
+        )
+
     def as_table(self) -> dict[str, Any]:
         """Plain values, ready for JSON; `from_table` reads them."""
         scans = [
@@ -117,7 +126,9 @@ class SeriesPlan:
             )
             reading = Reading.from_table(table["reading"], f"{where}: reading")
             cut = Cut(int(table["window"]), int(table["overlap"]))
-            return cls(sources, Settings.from_table(table["settings"]), reading, cut)
+            plan = cls(sources, Settings.from_table(table["settings"]), reading, cut)
+            plan.require_few()
+            return plan
 
 
 def plan_series(
@@ -140,10 +151,7 @@ def plan_series(
     require(len(scans) > 0, "a series needs a scan at least; name one.")
     sources = tuple(_source(path, settings, prior, reading) for path in scans)
     plan = SeriesPlan(sources, settings, reading, cut)
-    count = len(plan.windows())
-    require(
-        count <= MOST_TASKS, f"a series has at most {MOST_TASKS} tasks, but these are {count}; choose a larger window."
-    )
+    plan.require_few()
     return plan
 
 

@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from ..checks import as_written, require
 from ..io.json import read_json, write_json
+from ..tables import from_table
 
 ROW = "row.json"
 Begun = Literal["", "cold", "warm", "anew"]
@@ -67,7 +68,4 @@ def read_row(path: Path) -> Row:
     with as_written(path, "a row of a series"):
         odd = sorted({f.name for f in fields(Row)} ^ set(values))
         require(not odd, f"it differs in {', '.join(odd)} from this version's.")
-        bodies = tuple((float(x), float(y), float(z), float(v)) for x, y, z, v in values.pop("bodies"))
-        row = Row(**values, bodies=bodies)
-        require(row.status in ("done", "failed") and isinstance(row.number, int), "its status or number is odd.")
-        return row
+        return from_table(Row, values)

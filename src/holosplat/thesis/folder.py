@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..checks import InputError, require
+from ..checks import as_written, require
 from ..io.atomic import atomic_path
 from ..io.folder import require_new
 from ..io.guard import read_archive
 from ..io.json import read_json, write_json
+from ..tables import read_rows
 from ..workflows.run_folder import checkpoint_state
 from .configurations import EVERY
 
@@ -79,12 +80,9 @@ class StudyFolder:
     def curves(self, name: str) -> dict[str, np.ndarray]:
         """The columns of NAME.curves.csv, float64."""
         path = self._file(name, "curves.csv")
-        try:
-            with path.open(newline="") as file:
-                rows = list(csv.DictReader(file))
+        with as_written(path, "the curves of a study"):
+            rows = read_rows(path, "the curves of a study")
             return {key: np.array([float(row[key]) for row in rows]) for key in CURVES}
-        except (OSError, KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{path} must hold a study's curves, but it does not: {error!r}; run it again.") from error
 
     def write_maps(self, name: str, maps: Mapping[str, np.ndarray]) -> None:
         """NAME.maps.npz: what `looks.maps` makes."""

@@ -26,7 +26,7 @@ from ..progress import FitProgress
 from ..ranges import Many, Seconds, ranged
 from ..representations import MovingSurfaces
 from ..scan import Scan
-from ..tables import to_table
+from ..tables import read_rows, to_table
 from .evaluate import render_object
 from .provenance import environment, scan_hash
 from .reconstruction import Reconstruction
@@ -195,8 +195,8 @@ def write_forecast(folder: RunFolder, run: Reconstruction, found: Forecasted, co
 def read_band(folder: RunFolder) -> tuple[np.ndarray, np.ndarray]:
     """Times [N] s and standard errors [N, B] m, NaN where nothing tells them, of the forecast in `folder`."""
     path = folder.path / TABLE
-    with as_written(path, "what forecast wrote"), path.open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    with as_written(path, "what forecast wrote"):
+        rows = read_rows(path, "what forecast wrote")
         times = np.array(list(dict.fromkeys(float(row["time_s"]) for row in rows)))
         band = np.array([float(row["standard_error_m"]) for row in rows]).reshape(len(times), -1)
     return times, band

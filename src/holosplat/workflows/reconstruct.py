@@ -47,7 +47,7 @@ from .refine import (
     with_held_out,
 )
 from .rest_file import read_rest
-from .resume import decided_before, decisions_of, goes_on
+from .resume import decided_before, decisions_of, goes_on, require_alike
 from .run_folder import RunFolder, claimed
 from .run_light import found_in, read_light_options, still_in
 from .run_record import config_of, summary_of
@@ -175,7 +175,7 @@ class _Run:
         self._saved = self.folder.load_checkpoint()
         if self._saved:
             with self.as_written():
-                self.timing |= self._saved["timing"]
+                self.timing |= {str(name): float(seconds) for name, seconds in self._saved["timing"].items()}
                 self.begun = str(self._saved.get("begun", ""))
                 self._keeper.load(self._saved["kept"])
 
@@ -351,6 +351,7 @@ class _Journal:
         """Run the fit, from a saved state if there is one; whether it came to its end."""
         if saved is not None:
             with self._run.as_written():
+                require_alike(saved, self._fit.state_dict())
                 self._fit.load(saved)
         self._run.make_folder(self._fit.backend)
         self._run.note_resolved(self._run.method.stages()[self._number].name, self._fit)

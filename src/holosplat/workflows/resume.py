@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
+from numbers import Real
 from typing import Any
+
+import torch
 
 from ..checks import as_written, require
 from ..inference import Decision
@@ -12,7 +16,7 @@ from ..methods.illumination import STAGE, Prepared
 from ..methods.presets import SCHEMA
 from ..methods.uncertain import Uncertain
 from ..optics.background import LightOptions
-from ..tables import to_table
+from ..tables import shown, to_table
 from .binding import RESUMED_WITH
 from .run_folder import RunFolder
 
@@ -52,6 +56,19 @@ def _require_same(folder: RunFolder, old: dict[str, Any], same: dict[str, Any]) 
             old.get(key) == same[key],
             f"--resume needs the {name} that {folder.path} was started with; use the same, or another --out.",
         )
+
+
+def require_alike(saved: Any, own: Any, name: str = "") -> None:
+    """`InputError` where a saved state has a value of another kind than a fit's `own` at its beginning: a text for a
+    number, or a number for a table. What one of them lacks is left to the fit, as are lists."""
+    if saved is None or own is None:
+        return
+    kinds = (Mapping, torch.Tensor, str, Real)
+    kind = next((kind for kind in kinds if isinstance(own, kind)), object)
+    require(isinstance(saved, kind), f"{name or 'the state'} must be like {shown(own)}, but it is {shown(saved)}.")
+    if isinstance(own, Mapping):
+        for key in own.keys() & saved.keys():
+            require_alike(saved[key], own[key], str(key))
 
 
 def _without_backends(table: Any) -> None:

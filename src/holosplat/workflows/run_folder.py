@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ..checks import as_written, require
+from ..checks import as_written, require, require_regular
 from ..display import card, of_object
 from ..io.atomic import atomic_path
 from ..io.folder import require_new, require_parent
@@ -165,6 +165,7 @@ class RunFolder:
 
     def read_rows(self) -> list[dict[str, str]]:
         """The rows of metrics.csv as text, without those that a killed process left half-written."""
+        require_regular(self.metrics, "the rows of a fit")
         with self.metrics.open(newline="", encoding="utf-8", errors="replace") as file:
             reader = csv.DictReader(line for line in file if line.endswith("\n") and "\0" not in line)
             return [row for row in reader if _is_whole(row)]

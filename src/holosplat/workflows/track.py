@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import require
+from ..checks import as_written, require
 from ..fit.residuals import Prediction
 from ..io.atomic import atomic_path
 from ..io.folder import atomic_folder
@@ -32,7 +32,7 @@ from ..optics.background import LightOptions
 from ..progress import FitProgress
 from ..representations import MovingSurfaces
 from ..scan import Scan
-from ..tables import to_table
+from ..tables import read_rows, to_table
 from .choice import Choice
 from .provenance import environment, scan_hash
 from .reconstruction import Reconstruction
@@ -151,11 +151,12 @@ def _write(folder: RunFolder, done: Reconstruction, found: Followed, task: Task)
 
 def read_errors(folder: RunFolder) -> dict[str, np.ndarray]:
     """The standard errors [T, B] of tracks.csv, by their columns; empty where there are none."""
-    with (folder.path / TRACKS).open(newline="", encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    names = [name for name in rows[0] if name.startswith(ERROR)] if rows else []
-    times = len({row["time_s"] for row in rows})
-    return {n.removeprefix(ERROR): np.array([float(row[n]) for row in rows]).reshape(times, -1) for n in names}
+    path = folder.path / TRACKS
+    with as_written(path, "what track wrote"):
+        rows = read_rows(path, "what track wrote")
+        names = [name for name in rows[0] if name.startswith(ERROR)] if rows else []
+        times = len({row["time_s"] for row in rows})
+        return {n.removeprefix(ERROR): np.array([float(row[n]) for row in rows]).reshape(times, -1) for n in names}
 
 
 def write_tracks(

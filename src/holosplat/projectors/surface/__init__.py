@@ -56,6 +56,15 @@ def surface_thickness(
     """
     _check(vertices, faces, trusted)
     require(1 <= lines <= MOST_LINES, f"lines must be from 1 to {MOST_LINES}, but it is {lines}.")
+    views = len(shifts)
+    good = rotations.shape == (views, 3, 3) and shifts.shape == (views, 2) and min(shape) >= 0
+    good = good and (pixels is None or pixels.shape == (views,))
+    edges = "" if pixels is None else f" and {tuple(pixels.shape)}"
+    require(
+        good,
+        "rotations, shifts and pixels must have the shapes [V, 3, 3], [V, 2] and [V], but they are "
+        f"{tuple(rotations.shape)}, {tuple(shifts.shape)}{edges}, on rasters {tuple(shape)}.",
+    )
     poses, faces = (rotations.to(vertices), shifts.to(vertices)), faces.contiguous()
     if pixels is None:
         return _Thickness.apply(vertices, *poses, None, faces, shape, lines, backend)  # type: ignore[no-any-return]
