@@ -300,8 +300,7 @@ class _Run:
             write_json(self.folder.config, config | {"resolved": config.get("resolved", {}) | {stage: found}})
 
     def _result(self, found: Stored, fit: Running | None, complete: bool) -> Reconstruction:
-        exposures = self.task.scan.exposures
-        best = self._keeper.best if complete else None
+        exposures, best = self.task.scan.exposures, self._keeper.best if complete else None
         samples = best.oversample if best else fit.oversample if fit else 0
         oversample, kept = samples or fringe_sampling(exposures), best.name if best else ""
         done = Reconstruction(
