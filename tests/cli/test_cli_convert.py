@@ -130,7 +130,7 @@ def test_nothing_is_overwritten_nor_guessed(scan, tmp_path):
     before = scan.read_bytes()
     again = convert(scan, scan, "--to", "nxtomo")
     assert (again.code, scan.read_bytes()) == (2, before)
-    assert "must be new" in again.said
+    assert "OUT must not be what the command reads" in again.said
     nothing = convert(tmp_path, "--to", "nxtomo", tmp_path / "out.nxs")
     assert nothing.code == 2
     assert "an HDF5 file (nxtomo); an HDF5 file with " in nothing.said

@@ -139,7 +139,7 @@ def test_a_folder_of_something_else_or_of_another_study_is_refused(measured, tmp
     with pytest.raises(InputError, match=r"8k-v4.maps.npz must be the maps of a study"):
         load_study(folder)
     (folder.path / "8k-v4.curves.csv").write_text("step,seconds\n1,2\n")
-    with pytest.raises(InputError, match=r"8k-v4.curves.csv must hold a study's curves"):
+    with pytest.raises(InputError, match=r"8k-v4.curves.csv must be the curves of a study"):
         load_study(folder)
 
 

@@ -15,6 +15,8 @@ from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any, ParamSpec, TypeVar, get_args, get_origin
 
+from tyro.conf import Positional
+
 from ..checks import require
 from ..io.leftovers import LOCK
 from ..ranges import flag, hints_of, with_checked_numbers
@@ -23,6 +25,8 @@ from ..workflows.manifest import MANIFEST
 WRITTEN = "written"
 Output = Annotated[Path, WRITTEN]
 """A path of a command that is written."""
+POSITIONAL = get_args(Positional[Path])[1]
+"""What marks an argument that has no flag."""
 CONFIG = "config.json"
 OF_A_RUN = (MANIFEST, LOCK, "object.h5", "gaussians.h5", "checkpoint.pt", "metrics.csv")
 """Beside config.json: what tells the folder of a run from others."""
@@ -123,11 +127,16 @@ def _places(values: Mapping[str, Any], hints: Mapping[str, Any]) -> Iterator[Pla
             if is_dataclass(one) and not isinstance(one, type):
                 yield from _places(vars(one), hints_of(type(one)))
             elif isinstance(one, Path):
-                yield Place(flag(name), one, is_written(hints.get(name)))
+                yield Place(_called(name, hints.get(name)), one, is_written(hints.get(name)))
             elif isinstance(one, str) and one:
                 texts = {one, one.partition("=")[2], one.rpartition(":")[0]} - {""}
                 files = (Place(flag(name), Path(text), False) for text in texts if "\0" not in text)
                 yield from (file for file in files if file.is_there() and file.path.is_file())
+
+
+def _called(name: str, hint: Any) -> str:
+    """How messages call an argument: by its flag, or by its name in capitals where it stands alone."""
+    return name.upper() if POSITIONAL in getattr(hint, "__metadata__", ()) else flag(name)
 
 
 def is_written(hint: Any) -> bool:
