@@ -139,7 +139,7 @@ class Search:
         self.factor = 2 if min(views.shape) >= FEWEST_PIXELS else 1
         self.prior, self.history, self.timing = options.volume.prior, list[str](), dict[str, float]()
         self._strength, self._step, self._saved = 1.0, 0, dict[str, Any]()
-        self._extents = (views.width / views.finest, views.height / views.finest, views.width / views.finest)
+        self._extents = tuple(n / views.finest for n in (views.width, views.height, views.width))
 
     def by_itself(self, scan: Scan, name: str) -> VoxelGrid:
         """The volume of frames of one time; its prior is taken on."""
@@ -147,8 +147,7 @@ class Search:
         task = prepared(replace(self.task, scan=scan, lit=None, matter="continuous"))
         task = replace(task, prior=MaterialPrior.known(self.frames.material))
         stage = SmoothStage(self.options.volume)
-        start = stage.start(task, None)
-        fit: SmoothFit = stage.fit(task, start)
+        fit: SmoothFit = stage.fit(task, stage.start(task, None))
         fit.run(lambda record: self.task.on_progress(name, fit.share))
         self._strength = float(fit.state_dict()["strength"])
         self.prior = self.options.volume.prior.weakened(self._strength)
