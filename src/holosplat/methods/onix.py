@@ -187,7 +187,7 @@ def seen_of(scan: Scan, material: DeltaBeta) -> tuple[Tensor, Tensor]:
 def aligned_fit(task: Task, start: PixelAlignedField, options: AlignedFit, waves: bool) -> Fit:
     """The fit of `start` to the training frames of `task`, through the waves or to retrieved line integrals."""
     factor = max(1, round(start.grid.voxel_size[0] / task.scan.views.finest))
-    known, scan = task.unlike_null, task.scan.binned(factor)
+    known, scan = task.uneven, task.scan.binned(factor)
     light = known and known.part(torch.arange(len(task.scan)), factor)
     base = ground(scan, start, start.matter, options.objective, options.schedule, "cpu", light=light)
     noise = 0.0 if base.frames.spectral is None else base.frames.spectral.noise
