@@ -139,12 +139,13 @@ class Search:
         self.factor = 2 if min(views.shape) >= FEWEST_PIXELS else 1
         self.prior, self.history, self.timing = options.volume.prior, list[str](), dict[str, float]()
         self._strength, self._step, self._saved = 1.0, 0, dict[str, Any]()
-        self._extents = tuple(n / views.finest for n in (views.width, views.height, views.width))
+        wide, high = views.width / views.finest, views.height / views.finest
+        self._extents = (wide, high, wide)
 
     def by_itself(self, scan: Scan, name: str) -> VoxelGrid:
         """The volume of frames of one time; its prior is taken on."""
         began = clock.perf_counter()
-        task = prepared(replace(self.task, scan=scan, lit=None, matter="continuous"))
+        task = prepared(replace(self.task, scan=scan, lit=None, first=None, matter="continuous"))
         task = replace(task, prior=MaterialPrior.known(self.frames.material))
         stage = SmoothStage(self.options.volume)
         fit: SmoothFit = stage.fit(task, stage.start(task, None))
@@ -256,8 +257,8 @@ class Search:
         found = {} if state is None else {"flow": state.flow.state(), "u": state.u}
         if state is not None and state.fading is not None:
             found["fading"] = state.fading.coefficients
-        told = {"history": list(self.history), "timing": dict(self.timing), "strength": self._strength}
-        self.journal.save({"steps": self._step, **found, **told})
+        found |= {"history": list(self.history), "timing": dict(self.timing), "strength": self._strength}
+        self.journal.save({"steps": self._step, **found})
 
     def run(self) -> Carried:
         """The whole way, from the middle time on."""
