@@ -139,8 +139,7 @@ class Search:
         self.factor = 2 if min(views.shape) >= FEWEST_PIXELS else 1
         self.prior, self.history, self.timing = options.volume.prior, list[str](), dict[str, float]()
         self._strength, self._step, self._saved = 1.0, 0, dict[str, Any]()
-        wide, high = views.width / views.finest, views.height / views.finest
-        self._extents = (wide, high, wide)
+        self._extents = ((wide := views.width / views.finest), views.height / views.finest, wide)
 
     def by_itself(self, scan: Scan, name: str) -> VoxelGrid:
         """The volume of frames of one time; its prior is taken on."""
