@@ -50,5 +50,5 @@ def test_spectrum_files(tmp_path):
         path.write_text(text)
         with pytest.raises(InputError, match="two columns of numbers"):
             read_spectrum(path)
-    with pytest.raises(InputError, match="does not exist"):
+    with pytest.raises(InputError, match="there is no such file"):
         read_spectrum(tmp_path / "none.txt")

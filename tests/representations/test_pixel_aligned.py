@@ -183,5 +183,5 @@ def test_what_does_not_fit_together_is_refused():
         made(network=AlignedNetwork((3, 4), 6, 2))
     with pytest.raises(InputError, match="one material, or has δ and β free, but there are two"):
         made(matter=Matter.two((1e-6, 1e-9), (5e-7, 1e-9)))
-    with pytest.raises(InputError, match="image must have two levels or more"):
+    with pytest.raises(InputError, match="image must have 2 to 10 levels"):
         AlignedNetwork((4,))

@@ -137,7 +137,7 @@ def test_a_wide_fan_of_few_rows_reconstructs_by_default():
     """Frames are binned no further than their rows allow, where a default of a square frame's would be."""
     ball = (4.0, 0.0, -9.0, 24.0, BETA)
     scan = contact_scan([ball], (1, 137), photons=50_000)
-    found = reconstruct(scan, PRIORS["ratio"], Auto().with_effort(0.1))
+    found = reconstruct(scan, PRIORS["ratio"], Auto().with_effort(0.3))
     volume = found.object.voxelise(Grid.of_views(scan.views))
     assert mean_beta(volume, ball) == pytest.approx(1, abs=0.05)
     assert found.verdict is not None

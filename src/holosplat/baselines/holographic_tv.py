@@ -25,8 +25,8 @@ from ..optics.background import Light
 from ..optics.noise import noise_share
 from ..optics.noise_model import NoiseModel
 from ..optics.retrieval import Tikhonov, absorption_alone, tikhonov
-from ..optics.retrieval.bounded import MODEL_ERROR
-from ..optics.retrieval.spectra import Prior, Raster, filtered, radian, response, spectra, surrounded
+from ..optics.retrieval.bounded import FIXED, MODEL_ERROR
+from ..optics.retrieval.spectra import Raster, filtered, radian, response, spectra, surrounded
 from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..projectors.voxels import projector_for
@@ -41,9 +41,6 @@ from .wave_frames import frames_of, refined
 IN_NOISE = 1.0
 """Weight of total variation in rounds of agreement with noisy frames [pixels of path length]: 0.3 left up to a half
 more of the volume's error, and 2 about as much (looked at once; no script keeps it)."""
-
-MISSING = Prior(corner=6.0, decay=1.5)
-"""Expected power of what a volume lacks: flatter than that of matter, whose lowest frequencies it has found first."""
 
 Wanted = Callable[[Tensor, Grid], bool]
 """Whether the volume [Z, Y, X] that tomography has found, and its grid, are to be made to agree with the holograms."""
@@ -301,7 +298,7 @@ class Correction:
         wide, _ = surrounded(frames, exposures)
         raster = Raster((wide.shape[-2], wide.shape[-1]), exposures.views.pixel_size)
         h = response(exposures, material.beta / material.delta, raster)
-        known = spectra(frames, exposures, h, raster, noise, MODEL_ERROR, MISSING)
+        known = spectra(frames, exposures, h, raster, noise, MODEL_ERROR, FIXED)
         self._inverse, self._beyond = known.inverse, beyond
 
     def __call__(self, missing: Tensor) -> Tensor:

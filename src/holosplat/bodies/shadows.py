@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..matter import DeltaBeta
 from ..optics.noise import noise_level, noise_levels
-from ..optics.retrieval import tikhonov, without_halo
+from ..optics.retrieval import FIXED, Tikhonov, tikhonov, without_halo
 from ..projectors.surface import surface_thickness
 from ..scan import Exposures, Scan
 from ..units import wavelength, wavenumber
@@ -48,7 +48,8 @@ class Shadows:
         """What the frames of `scan`, of pixels of one size, show; first, last: times [s] of the whole scan."""
         exposures, views, pitch = scan.exposures, scan.views, scan.views.pixel_size
         frames = torch.from_numpy(scan.frames)
-        thickness = tikhonov(frames, exposures, *material).double() / pitch
+        how = Tikhonov(prior=FIXED)  # bodies are cut by the frames' edges
+        thickness = tikhonov(frames, exposures, *material, options=how).double() / pitch
         noise = noise_level(thickness.float())
         if np.ptp(exposures.time) == 0:  # a search of several times found fewer bodies so (docs/motion.md)
             thickness = _without_halos(thickness, exposures, noise)

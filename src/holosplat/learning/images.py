@@ -6,12 +6,13 @@ import torch
 from torch import Tensor
 
 from ..matter import DeltaBeta
-from ..optics.retrieval import Tikhonov, tikhonov
+from ..optics.retrieval import FIXED, Tikhonov, tikhonov
 from ..scan import Exposures
 from .network import THICKNESS
 
-RETRIEVAL = Tikhonov(iterations=20)
-"""Of each frame by itself: a third of the steps of the other starts, as a network mends what is left."""
+RETRIEVAL = Tikhonov(iterations=20, prior=FIXED)
+"""Of each frame by itself: a third of the steps of the other starts, as a network mends what is left; with the prior of
+the retrievals that it learned from."""
 CONTRAST = 0.5
 """Of the contrast's root mean square, in the images."""
 

@@ -26,8 +26,6 @@ UNEVEN, SEEN = 6.0, 0.07
 it is so large a part of the frames' contrast."""
 SURE, FAINT = 60.0, 0.03
 """The same of light that is faint beside the contrast: far fringes that pass for air leave as much, but less surely."""
-TURNS = 2
-"""How often light and the noise beside it are found from each other."""
 FAINTEST = 1e-4
 """Noise [relative intensity] assumed at least: light is not known better."""
 FINER = 0.15
@@ -90,10 +88,9 @@ class Light:
         air = options.air_of(frames)
         noise = NoiseModel.of_frames(frames, air)
         background = _found(frames, noise, air, options.kind)
-        for _ in range(TURNS if background is not None else 0):
-            assert background is not None
+        if background is not None:  # without steep light, more is seen to be air, and what is left of it is noise
             even = frames / background.factor()
-            air = find_air(even) | air  # without steep light, more of it is seen to be air, and what is left is noise
+            air = find_air(even) | air
             noise = NoiseModel.of_frames(even, air, correlated=True)
             background = Background.of_air(frames, air, noise)
         return cls(air, noise, background)

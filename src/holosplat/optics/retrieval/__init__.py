@@ -14,7 +14,7 @@ from torch import Tensor
 from ...progress import Advance
 from ...scan import Exposures
 from .admm import ADMM, admm
-from .bounded import Estimate, bounded_estimate
+from .bounded import FIXED, Estimate, bounded_estimate
 from .contact import absorption_alone
 from .halo import without_halo
 from .iterative import Projections, gerchberg_saxton, hybrid_input_output
@@ -65,6 +65,7 @@ RETRIEVAL_OPTIONS = {
 
 __all__ = [
     "ADMM",
+    "FIXED",
     "RETRIEVALS",
     "RETRIEVAL_OPTIONS",
     "Estimate",

@@ -50,7 +50,7 @@ def admm(
     """
 
     def solve(frames: Tensor, exposures: Exposures, noise: Noise, on_progress: Advance) -> Tensor:
-        model = WaveModel(frames, exposures, beta / delta, noise, options.backend, options.leaves)
+        model = WaveModel(frames, exposures, beta / delta, noise, options.backend, options.leaves, options.prior)
         return model.thickness(_alternate(model, options, on_progress), delta)
 
     return view_by_view(frames, exposures, delta, options.noise, solve, on_progress)

@@ -24,8 +24,9 @@ SIGNIFICANT = 2.5
 """Standard deviations of its noise above which a pixel is matter."""
 MODEL_ERROR = 0.05
 """Part of a frame's contrast that the wave optics of sampled matter does not explain, measured on cells."""
-CUT = Prior(corner=6.0, decay=1.5)
-"""Expected power of a phase that a frame cuts, whose edges, and not its matter, make the frame's lowest frequencies."""
+FIXED = Prior(corner=6.0, decay=1.5)
+"""Expected power of a phase where its frame does not show it: the frame's edges cut the matter, so that they make the
+lowest frequencies; or it is what a volume lacks, which is flatter than matter. Networks learned with it."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class Estimate:
 
 
 def bounded_estimate(
-    frames: Tensor, exposures: Exposures, ratio: float, noise: Noise, leaves: bool = False
+    frames: Tensor, exposures: Exposures, ratio: float, noise: Noise, leaves: bool = False, prior: Prior | None = None
 ) -> Estimate:
     """From frames [V, H, W] of a material with β/δ = `ratio`; noise: theirs, None to estimate it.
 
@@ -47,12 +48,13 @@ def bounded_estimate(
     matter (a support found anew in every round: the "shrinkwrap" of Marchesini et al. 2003).
 
     leaves: whether matter goes on above and below the frame. Air there would take a soft body away far into the frame,
-    for only the bends of its shadow are seen; it may then go on, and ends as smoothly as it can.
+    for only the bends of its shadow are seen; it may then go on, and ends as smoothly as it can. prior: expected power
+    (default: the one that the frames show, or `FIXED` where matter leaves them).
     """
     contrast, crop = surrounded(frames, exposures)
     raster = Raster((contrast.shape[-2], contrast.shape[-1]), exposures.views.pixel_size)
-    h, prior = response(exposures, ratio, raster), CUT if leaves else None
-    known = spectra(frames, exposures, h, raster, noise, MODEL_ERROR, prior, leaks=not leaves)
+    h, prior = response(exposures, ratio, raster), prior or (FIXED if leaves else None)
+    known = spectra(frames, exposures, h, raster, noise, MODEL_ERROR, prior, leaks=prior is None)
     trusted = 1 - known.inverse * known.response
     if noise is None:
         doubtful = wavelet_noise(frames) * known.inverse.square().mean(dim=(1, 2)).sqrt()

@@ -17,9 +17,10 @@ from ...scan import Exposures
 from ...units import wavelength
 from ..hologram import hologram, optical_path
 from ..sampling import alike, fringe_sampling, padding
-from .bounded import CUT, MODEL_ERROR, Estimate, bounded_estimate
+from .bounded import FIXED, MODEL_ERROR, Estimate, bounded_estimate
 from .spectra import (
     Noise,
+    Prior,
     Raster,
     absorption,
     check_noise,
@@ -57,6 +58,8 @@ class Regularised:
     """Implementation of the wave optics (see `backends`)."""
     leaves: bool = False
     """Whether matter goes on above and below the frames (`bounded_estimate`)."""
+    prior: Prior | None = None
+    """Expected power of the phase (default: the one that the frames show)."""
 
     def __post_init__(self) -> None:
         at_least(self, 1, "iterations")
@@ -81,8 +84,9 @@ class WaveModel:
         noise: Noise,
         backend: str = "cpu",
         leaves: bool = False,
+        prior: Prior | None = None,
     ) -> None:
-        estimate = bounded_estimate(frames, exposures, ratio, noise, leaves)
+        estimate = bounded_estimate(frames, exposures, ratio, noise, leaves, prior)
         energy = exposures.one_energy("the wave model of a phase retrieval")
         self.exposures, self.ratio = exposures, float(absorption(exposures, ratio)[0])
         self.backend = resolve("reference" if frames.dtype == torch.float64 else backend)
@@ -102,7 +106,7 @@ class WaveModel:
             (exposures.views.shape, (my, mx), self.oversample),
             frames.dtype,
         ).to(self.frames.device)
-        h, prior = response(exposures, ratio, self.raster), CUT if leaves else None
+        h, prior = response(exposures, ratio, self.raster), prior or (FIXED if leaves else None)
         self.spectra = spectra(frames, exposures, h, self.raster, noise, MODEL_ERROR, prior)
         self.strongest = column(sensitivity(exposures, ratio) ** 2)
         self.support, self.phase = self._spread(estimate)

@@ -53,7 +53,7 @@ def tikhonov(
     """
 
     def solve(frames: Tensor, exposures: Exposures, noise: Noise, on_progress: Advance) -> Tensor:
-        model = WaveModel(frames, exposures, beta / delta, noise, options.backend, options.leaves)
+        model = WaveModel(frames, exposures, beta / delta, noise, options.backend, options.leaves, options.prior)
         return model.thickness(descend(model, options, on_progress)[0], delta)
 
     return view_by_view(frames, exposures, delta, options.noise, solve, on_progress)

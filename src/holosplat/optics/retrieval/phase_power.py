@@ -9,7 +9,7 @@ from torch import Tensor
 CORNERS = np.geomspace(1.5, 16.0, 11)
 """Frequencies [cycles per field of view] below which the power may be level: no body seen whole is larger than the
 field, so that its power is level from about a cycle on, and a dozen times smaller ones are hardly resolved."""
-DECAYS = np.arange(1.0, 2.51, 0.25)
+DECAYS = np.arange(1.0, 2.01, 0.25)
 """Half the exponents of the fall-off that are tried: textures, bodies with sharp edges (2), and softer ones."""
 LOWEST = 2
 """Cycles a frame below which a periodogram of a cut frame holds what lies beside it."""
