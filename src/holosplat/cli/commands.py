@@ -95,7 +95,7 @@ def reconstruct(
         resume: Go on with an interrupted run.
         strict: Exit with 3 where the frames are not explained to within their noise; without it, that is a warning.
     """
-    from ..io.formats import read_as
+    from ..io.formats import read_frames
     from ..methods import Pinn
     from ..methods.method import takes_series
     from ..methods.uncertain import Uncertain
@@ -117,7 +117,7 @@ def reconstruct(
     if takes_series(method) and reading.part.time_frame == "all":
         reading = replace(reading, part=replace(reading.part, time_frame=None))
     ways, folder = asked.ways(reading), RunFolder(out)
-    measured = read_as(scan, replace(reading, told=reading.told.at_middle()))
+    measured = read_frames(scan, replace(reading, told=reading.told.at_middle()))
     prior = asked.matter.without_ranges().prior(measured.exposures.reference_energy)
     measured = measured.in_memory() if can_be_seen(measured) else measured
     seen = measured.exposures[~measured.is_test]

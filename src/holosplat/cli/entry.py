@@ -18,7 +18,7 @@ from tyro.conf import OmitArgPrefixes
 from ..checks import OUT_OF_MEMORY, InputError
 from ..ranges import checked_later, with_checked_numbers
 from ..version import __version__
-from .progress import INTERRUPTED
+from .progress import INTERRUPTED, say_notes
 from .sentence import give_up
 from .signals import end_as_on_interrupt
 
@@ -121,6 +121,7 @@ def main() -> None:
     Ctrl-C, SIGTERM and SIGHUP exit with 130, after what can be saved is.
     """
     end_as_on_interrupt()
+    say_notes()
     if sys.argv[1:] == ["--version"]:
         print(f"holosplat {__version__}")
         return

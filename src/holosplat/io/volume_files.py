@@ -16,7 +16,7 @@ from ..ranges import Small, ranged
 from ..volume import Volume
 from .atomic import atomic_path
 from .hdf5_writing import require_room
-from .tiff_guard import all_pages
+from .tiff_guard import all_images
 from .volumes import VOXEL_RANGE_M, read_volume
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
@@ -92,7 +92,7 @@ def write_ome_tiff(path: Path, volume: Volume) -> None:
 def _pages(path: Path) -> np.ndarray:
     """The pages [P, rows, columns] of a TIFF file."""
     require(path.is_file(), f"{path} must be a TIFF file, but there is none; correct the path.")
-    pages = all_pages(path)
+    pages = all_images(path)
     shapes = sorted({page.shape for page in pages})
     grey = len(shapes) == 1 and len(shapes[0]) == 2 and all(page.dtype.kind in "iuf" for page in pages)
     require(grey, f"{path} must hold grey images of one size, but it holds {', '.join(map(str, shapes)) or 'none'}.")

@@ -12,7 +12,6 @@ from ..checks import require
 from ..frames import Frames
 from ..io.atomic import require_apart, require_writable
 from ..io.formats import loader_of, open_raw
-from ..io.hdf5_guard import allow_external
 from ..io.nxtomo import scan_writer
 from ..io.raw_file import DARK, FLAT, PROJECTION, ScanFile
 from ..io.reading import Reading
@@ -26,13 +25,12 @@ from ..preprocess import (
     fixed_pattern,
     relative_intensity,
 )
+from ..preprocess.pixels import MOST_DEFECTS
 from ..progress import Advance
 from ..ranges import ranged
 from ..scan import Scan
 from .air_light import AirLight
 
-MOST_DEFECTS = 0.2
-"""A larger share of defective pixels is no camera to reconstruct from."""
 RIM = 0.05
 """Width of a frame's rim, as a part of its shorter side, that `normalise = "rim"` takes to be free of the object."""
 
@@ -173,8 +171,7 @@ def correct(
     """
     require_writable(out)
     require_apart(out, source)
-    if reading.told.allow_external:
-        allow_external(Path(source))
+    reading.told.vouch(Path(source))
     with open_raw(source, reading.told.given(loader_of(source).takes)) as file:
         fielding = FlatFielding(file, options, on_progress)
         count = 0 if fielding.eigen is None else len(fielding.eigen)
