@@ -238,20 +238,28 @@ def evaluate(
     Args:
         run: Run folder.
         scan: Scan (default: the one that was reconstructed).
-        truth: Volume file of the truth.
+        truth: Volume file of the truth, HDF5 or an OME-TIFF of export.
         as_json: Print JSON instead of a table.
     """
-    from ..io.volumes import read_volume
+    from ..io.volume_files import read_truth
     from ..report.run import report_run
     from ..workflows.evaluate import evaluate as score
+    from ..workflows.evaluate import require_same_field
     from ..workflows.moments import instants_of
     from ..workflows.provenance import scan_hash
     from ..workflows.run_folder import RunFolder, claimed
     from .scans import run_and_scan
 
     folder = RunFolder(run)
-    (result, measured), true_volume = run_and_scan(folder, scan, reading), read_volume(truth) if truth else None
+    (result, measured), true_volume = run_and_scan(folder, scan, reading), read_truth(truth) if truth else None
+    if truth is not None and true_volume is not None:
+        require_same_field(true_volume.grid, measured.views, truth)
     evaluation = score(result, measured, true_volume)
+    require(
+        evaluation.volume is None or evaluation.volume.dice > 0,
+        f"{truth} has no matter where the run has some: it is of another scan, or the run found nothing; name the "
+        "truth of this scan.",
+    )
     if as_json:
         print(json.dumps(evaluation.as_dict(), indent=2, allow_nan=False))
     else:

@@ -120,7 +120,7 @@ class Mended(Frames):
 
     def __init__(self, frames: np.ndarray | Frames) -> None:
         self._frames = frames
-        self.shape = (len(frames), *frames.shape[1:])
+        self.shape = (frames.shape[0], frames.shape[1], frames.shape[2])
 
     def read(self, numbers: np.ndarray) -> np.ndarray:
         """See `Frames.read`."""
