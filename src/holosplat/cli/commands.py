@@ -244,7 +244,7 @@ def evaluate(
     from ..io.volume_files import read_truth
     from ..report.run import report_run
     from ..workflows.evaluate import evaluate as score
-    from ..workflows.evaluate import require_same_field
+    from ..workflows.evaluate import require_overlap, require_same_field
     from ..workflows.moments import instants_of
     from ..workflows.provenance import scan_hash
     from ..workflows.run_folder import RunFolder, claimed
@@ -255,11 +255,8 @@ def evaluate(
     if truth is not None and true_volume is not None:
         require_same_field(true_volume.grid, measured.views, truth)
     evaluation = score(result, measured, true_volume)
-    require(
-        evaluation.volume is None or evaluation.volume.dice > 0,
-        f"{truth} has no matter where the run has some: it is of another scan, or the run found nothing; name the "
-        "truth of this scan.",
-    )
+    if truth is not None and evaluation.volume is not None:
+        require_overlap(evaluation.volume, truth)
     if as_json:
         print(json.dumps(evaluation.as_dict(), indent=2, allow_nan=False))
     else:

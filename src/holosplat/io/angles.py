@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..checks import InputError, finite, note, require, require_regular, warn
-from ..geometry import Views
 
 if TYPE_CHECKING:
+    from ..geometry import Views
     from ..scan import Scan
 
 RADIANS = re.compile(r"\b(rad|radians?)\b", re.IGNORECASE)

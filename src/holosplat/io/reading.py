@@ -14,7 +14,6 @@ from ..checks import InputError, require
 from ..ranges import Frequency, Natural, Signed, Small, ranged
 from ..tables import from_table, to_table
 from .angles import read_angles, tell_angles, tell_views
-from .hdf5_guard import allow_external
 from .tube import Tube
 
 if TYPE_CHECKING:
@@ -107,7 +106,11 @@ class Told:
 
     def vouch(self, path: Path) -> None:
         """From now on the scan at `path`, its flats and darks may bring values of other files, if that is said."""
-        for one in (path, self.flats, self.darks) if self.allow_external else ():
+        if not self.allow_external:
+            return
+        from .hdf5_guard import allow_external  # needs h5py, which reading an option does not
+
+        for one in (path, self.flats, self.darks):
             if one is not None:
                 allow_external(one)
 

@@ -175,6 +175,15 @@ def require_same_field(grid: Grid, views: Views, path: Path) -> None:
     )
 
 
+def require_overlap(scores: VolumeScores, path: Path) -> None:
+    """`InputError` if a run has no matter where the truth at `path` has some, and is no nearer to it than nothing."""
+    require(
+        scores.dice > 0 or scores.relative_error_delta < 1,
+        f"{path} has no matter where the run has some: it is of another scan, or the run found nothing; name the truth "
+        "of this scan.",
+    )
+
+
 def held_out_verdict(reconstruction: Reconstruction, scan: Scan, lit: Light | None = None) -> Verdict | None:
     """Whether the held-out frames of `scan` are explained to within their noise; None without such frames.
 
