@@ -254,3 +254,43 @@ def test_material_table_says_what_is_wrong(tmp_path, name, text, said):
 def test_material_table_that_is_not_there(tmp_path):
     with pytest.raises(InputError, match="there is no such file"):
         read_material_table(tmp_path / "none.json")
+
+
+@pytest.mark.parametrize(
+    ("written", "meant"),
+    [
+        *((text, "CaSO6H4") for text in ("CaSO4.2H2O", "CaSO4 2H2O", "CaSO4·2H2O", "CaSO4*2H2O", "CaSO4 . 2 H2O")),
+        *(("CaSO4.0.5H2O", "CaSO4.5H"), ("Na2CO3.10H2O", "Na2CO13H20"), ("Cu(NO3)2.3H2O", "CuN2O9H6")),
+        *(("NaCl.KCl", "NaCl2K"), ("YBa2Cu3O6.9", "YBa2Cu3O6.9"), ("Ba0.5Sr0.5TiO3", "BaSrTi2O6")),
+    ],
+)
+def test_hydrates_and_decimals_are_told_apart(written, meant):
+    assert Compound(written, 2.3).delta_beta(20) == near(Compound(meant, 2.3).delta_beta(20))
+
+
+@pytest.mark.parametrize(
+    ("isotope", "plain", "masses"),
+    [
+        *(
+            ("D2O", "H2O", (18.0153, 20.0276)),
+            ("T2O", "H2O", (18.0153, 22.0315)),
+            ("[2H]2O", "H2O", (18.0153, 20.0276)),
+        ),
+        *(
+            ("C2D6O", "C2H6O", (46.069, 52.106)),
+            ("[13C]H4", "CH4", (16.043, 17.03)),
+            ("[10B]4C", "B4C", (55.255, 52.06)),
+        ),
+        ("MgSO4.7D2O", "MgSO11H14", (246.47, 260.55)),
+    ],
+)
+def test_isotopes_weigh_what_they_weigh(isotope, plain, masses):
+    """As many electrons a molecule, and heavier molecules."""
+    wanted = Compound(plain, 1.1).delta_beta(20).delta * masses[0] / masses[1]
+    assert Compound(isotope, 1.1).delta_beta(20).delta == near(wanted, rel=1e-3)
+
+
+@pytest.mark.parametrize("formula", ["10B4C", "2H2O", "H 2O", "CaSO4..2H2O", "[13X]2", "Lr"])
+def test_formulas_that_may_mean_something_else_are_refused(formula):
+    with pytest.raises(InputError, match="must be a chemical formula"):
+        Compound(formula, 1.0)

@@ -8,7 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from holosplat.units import in_percent, two_digits
+from holosplat.checks import InputError
+from holosplat.units import (
+    ANGLE_UNITS,
+    ENERGY_UNITS,
+    LENGTH_UNITS,
+    TIME_UNITS,
+    in_percent,
+    two_digits,
+    unit_factor,
+)
 
 SOURCE = Path(__file__).resolve().parents[1] / "src"
 
@@ -33,3 +42,22 @@ def test_no_share_is_written_with_an_exponent():
     """`:.2g` writes 100 as 1e+02: shares go through `in_percent`."""
     texts = {path: path.read_text(encoding="utf-8") for path in SOURCE.rglob("*.py")}
     assert [path.name for path, text in texts.items() if re.search(r":\.\dg\} ?%", text)] == []
+
+
+@pytest.mark.parametrize(
+    ("unit", "table", "factor"),
+    [
+        *(("meters", LENGTH_UNITS, 1.0), ("Metre", LENGTH_UNITS, 1.0), ("Millimeters", LENGTH_UNITS, 1e-3)),
+        *(("Microns", LENGTH_UNITS, 1e-6), ("[mm]", LENGTH_UNITS, 1e-3), ("Angstroms", LENGTH_UNITS, 1e-10)),
+        *(("Deg", ANGLE_UNITS, np.pi / 180), ("DEGREES", ANGLE_UNITS, np.pi / 180), ("Radians", ANGLE_UNITS, 1.0)),
+        *(("KeV", ENERGY_UNITS, 1.0), ("Electronvolts", ENERGY_UNITS, 1e-3), ("milliseconds", TIME_UNITS, 1e-3)),
+    ],
+)
+def test_units_may_be_words(unit, table, factor):
+    assert unit_factor("length", unit, table) == pytest.approx(factor)
+
+
+@pytest.mark.parametrize(("unit", "table"), [("meV", ENERGY_UNITS), ("MM", LENGTH_UNITS), ("furlong", LENGTH_UNITS)])
+def test_capitals_of_short_units_matter(unit, table):
+    with pytest.raises(InputError, match="unknown unit"):
+        unit_factor("length", unit, table)

@@ -6,6 +6,7 @@ command line prints it without a traceback and exits with a non-zero code.
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import re
@@ -29,6 +30,16 @@ class InputError(ValueError):
 
 class MissingError(InputError, RuntimeError):
     """A required package is not installed; the message names it, and the ways out."""
+
+
+def note(text: str) -> None:
+    """Say what was found in the input: on standard error of a command, in Python by the logger `holosplat`."""
+    logging.getLogger("holosplat").info(text)
+
+
+def warn(text: str) -> None:
+    """Say what may be wrong in the input, where `note` says what is right."""
+    logging.getLogger("holosplat").warning(text)
 
 
 def require(condition: bool, message: str) -> None:

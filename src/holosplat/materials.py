@@ -8,6 +8,7 @@ use; energies in keV.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
@@ -27,6 +28,23 @@ ENERGY_RANGE_KEV = (0.1, 400.0)
 """Where Chantler's tables hold both f1 and f2 [keV]."""
 NAMES = "a name that `holosplat materials` lists, such as water, plasma, soft tissue or PMMA"
 """What messages say of named materials."""
+WITH = "H2O|D2O|T2O|NH3|HCl|H2O2|CH3OH|CH4O|C2H5OH|C2H6O"
+"""What crystals hold beside a salt: a point before a number of these joins them."""
+JOINT = re.compile(
+    rf"\s*[·•∙⋅*]\s*|\s*\.\s*(?=[A-Z(\[])|(?:\s*(?<!\.\d)\.\s*|\s+)(?=\d*\.?\d*\s*(?:{WITH})$)(?<![.·•∙⋅*\s]\d\s)"
+)
+"""What joins the parts of a formula."""
+NUMBERED, ALONE = re.compile(r"(\d*\.?\d*)\s*(\S+)$"), re.compile(r"()([^\s\d]\S*)$")
+"""A part of a formula with its number, and a formula of one part, which has none."""
+ISOTOPE = re.compile(r"\[(\d+)([A-Z][a-z]?)\]")
+HYDROGEN = {"D": "[2H]", "T": "[3H]"}
+MASSES = {
+    **{"H2": 2.01410, "H3": 3.01605, "He3": 3.01603, "Li6": 6.01512, "Li7": 7.01600},
+    **{"B10": 10.01294, "B11": 11.00931},
+}
+"""Masses [u] of the isotopes that are farthest from their number of nucleons in proportion (Wang et al. 2021)."""
+STAND_IN = "Lr"
+"""An element beyond uranium, which stands for an isotope while its atoms are counted."""
 MAX_DENSITY_G_CM3 = 30.0
 """Above osmium (22.6 g/cm³), the densest element: a higher density has a wrong unit."""
 
@@ -39,22 +57,45 @@ def _density(name: str, value: Any) -> float:
 
 
 @lru_cache(maxsize=256)
-def _checked_formula(formula: str) -> str:
-    if isinstance(formula, str) and xraydb.validate_formula(formula):
-        atoms = xraydb.chemparse(formula)
-        if sum(atoms.values()) > 0 and max(xraydb.atomic_number(symbol) for symbol in atoms) <= 92:
-            return formula
-    raise InputError(
-        f"material {formula!r} must be a chemical formula of elements up to uranium, such as 'H2O' or 'SiO2' "
-        f"(mind the capitals), or {NAMES}."
-    )
+def _atoms(formula: str) -> tuple[str, float]:
+    """A formula as `xraydb` knows it, and how many times heavier its isotopes make it.
+
+    Parts of a hydrate stand behind a point, `·`, `*` or a space, with their number before them (CaSO4.2H2O); a point
+    before a number is one of decimals elsewhere (O6.9). Isotopes are D, T, and others as [13C]. Errors: `InputError`.
+    """
+    counts: dict[str, float] = {}
+    isotopes = 0.0
+    try:
+        parts = re.split(JOINT, formula.strip())
+        for part in parts:
+            number, group = (NUMBERED if len(parts) > 1 else ALONE).match(part).groups()  # type: ignore[union-attr]
+            group, times = re.sub(r"([DT])(?![a-z])", lambda found: HYDROGEN[found[1]], group), float(number or 1)
+            plain = re.sub(ISOTOPE, r"\2", group)
+            for symbol, count in xraydb.chemparse(plain).items():
+                counts[symbol] = counts.get(symbol, 0.0) + times * count
+            for text, nucleons, symbol in {(found[0], found[1], found[2]) for found in re.finditer(ISOTOPE, group)}:
+                alone = re.sub(ISOTOPE, r"\2", group.replace(text, STAND_IN))
+                added = MASSES.get(symbol + nucleons, float(nucleons)) - xraydb.atomic_mass(symbol)
+                isotopes += times * xraydb.chemparse(alone)[STAND_IN] * added
+        heaviest = max(xraydb.atomic_number(symbol) for symbol in counts)
+        known = sum(counts.values()) > 0 and heaviest <= 92 and STAND_IN not in formula
+    except (AttributeError, KeyError, TypeError, ValueError):  # xraydb raises many kinds
+        known = False
+    if not known:
+        raise InputError(
+            f"material {formula!r} must be a chemical formula of elements up to uranium, such as 'H2O', 'SiO2' or "
+            f"'CaSO4.2H2O' (mind the capitals; isotopes as D or [13C]), or {NAMES}."
+        )
+    mass = sum(count * xraydb.atomic_mass(symbol) for symbol, count in counts.items())
+    return "".join(f"{symbol}{count:.9f}" for symbol, count in counts.items()), 1 + isotopes / mass
 
 
 @lru_cache(maxsize=1024)
 def _per_density(formula: str, energy_kev: float) -> DeltaBeta:
     """δ and β of `formula` at 1 g/cm³ (both are proportional to the density)."""
-    delta, beta, _ = xraydb.xray_delta_beta(formula, 1.0, 1e3 * energy_kev)
-    return DeltaBeta(float(delta), float(beta))
+    atoms, heavier = _atoms(formula)
+    delta, beta, _ = xraydb.xray_delta_beta(atoms, 1.0, 1e3 * energy_kev)
+    return DeltaBeta(float(delta) / heavier, float(beta) / heavier)
 
 
 @dataclass(frozen=True)
@@ -65,7 +106,7 @@ class Compound:
     density_g_cm3: float
 
     def __post_init__(self) -> None:
-        _checked_formula(self.formula)
+        _atoms(self.formula)
         object.__setattr__(self, "density_g_cm3", _density(self.formula, self.density_g_cm3))
 
     def delta_beta(self, energy_kev: float) -> DeltaBeta:
@@ -231,7 +272,7 @@ def parse_material(text: str, density_g_cm3: float | None = None) -> Material:
     named = _by_name().get(name.lower().replace("_", " "))
     if named is not None:
         return named if density_g_cm3 is None else replace(named, density_g_cm3=density_g_cm3)
-    _checked_formula(name)
+    _atoms(name)
     require(
         density_g_cm3 is not None,
         f"material {name!r} is a formula and needs its density in g/cm³; give it, or use {NAMES}.",

@@ -12,48 +12,39 @@ from .checks import InputError, finite, positive, require
 PLANCK_TIMES_C_KEV_M = 1.2398419843320026e-9
 """h·c in keV·m (CODATA 2018, exact)."""
 
+PREFIXES = {"": 0, "kilo": 3, "deci": -1, "centi": -2, "milli": -3, "micro": -6, "nano": -9, "pico": -12}
+"""Words before a unit, and their powers of ten."""
 LENGTH_UNITS = {
-    "m": 1.0,
-    "dm": 1e-1,
-    "cm": 1e-2,
-    "mm": 1e-3,
-    "um": 1e-6,
-    "µm": 1e-6,
-    "μm": 1e-6,
-    "micrometer": 1e-6,
-    "micron": 1e-6,
-    "nm": 1e-9,
-    "meter": 1.0,
-    "metre": 1.0,
-    "millimeter": 1e-3,
-    "millimetre": 1e-3,
-    "microns": 1e-6,
-    "micrometre": 1e-6,
-    "nanometer": 1e-9,
-    "nanometre": 1e-9,
-    "angstrom": 1e-10,
-    "Å": 1e-10,
+    **{"m": 1.0, "dm": 1e-1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "μm": 1e-6, "nm": 1e-9, "pm": 1e-12},
+    **{f"{part}{word}": 10.0**power for word in ("meter", "metre") for part, power in PREFIXES.items()},
+    **{"micron": 1e-6, "angstrom": 1e-10, "ångström": 1e-10, "Å": 1e-10},
 }
-ENERGY_UNITS = {"keV": 1.0, "kev": 1.0, "eV": 1e-3, "ev": 1e-3, "MeV": 1e3, "J": 1 / 1.602176634e-16}
+ENERGY_UNITS = {
+    **{"keV": 1.0, "kev": 1.0, "eV": 1e-3, "ev": 1e-3, "MeV": 1e3, "J": 1 / 1.602176634e-16},
+    **{"electronvolt": 1e-3, "kiloelectronvolt": 1.0, "joule": 1 / 1.602176634e-16},
+}
 ANGLE_UNITS = {
-    "deg": math.pi / 180,
-    "degree": math.pi / 180,
-    "degrees": math.pi / 180,
-    "°": math.pi / 180,
-    "rad": 1.0,
-    "radian": 1.0,
-    "radians": 1.0,
+    **dict.fromkeys(("deg", "degree", "°"), math.pi / 180),
+    **dict.fromkeys(("rad", "radian"), 1.0),
+    **dict.fromkeys(("mrad", "milliradian"), 1e-3),
 }
-TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9, "second": 1.0, "seconds": 1.0}
+TIME_UNITS = {
+    **{"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9, "sec": 1.0},
+    **{f"{part}second": 10.0**power for part, power in PREFIXES.items()},
+}
+WORDS = 3
+"""Units of so many letters are words, whose capitals and plural do not matter; MeV and meV are none."""
 
 
 def unit_factor(field: str, unit: str, table: dict[str, float]) -> float:
     """The factor that brings `unit` to the table's base unit; `InputError` naming `field` if it is unknown."""
-    try:
-        return table[unit.strip()]
-    except KeyError:
-        known = ", ".join(table)
-        raise InputError(f"{field} has the unknown unit {unit!r}; use one of {known}.") from None
+    said = unit.strip().strip("[]().")
+    words = {name.lower(): factor for name, factor in table.items() if len(name) >= WORDS and name != "MeV"}
+    word = said.lower()
+    factor = table.get(said, words.get(word, words.get(word.removesuffix("s"))))
+    if factor is None:
+        raise InputError(f"{field} has the unknown unit {unit!r}; use one of {', '.join(table)}.")
+    return factor
 
 
 Energy = TypeVar("Energy", float, np.ndarray)

@@ -39,12 +39,12 @@ def huge_pixels(file: h5py.File) -> None:
         put(f"{DETECTOR}/{axis}_pixel_size", 3.2)(file)
 
 
-def one_nan(file: h5py.File) -> None:
-    file[f"{DETECTOR}/data"][2, 3, 4] = np.nan
+def nan_image(file: h5py.File) -> None:
+    file[f"{DETECTOR}/data"][2] = np.nan
 
 
-def one_nan_held_out(file: h5py.File) -> None:
-    file[f"{DETECTOR}/data"][3, 3, 4] = np.nan
+def nan_image_held_out(file: h5py.File) -> None:
+    file[f"{DETECTOR}/data"][3] = np.nan
 
 
 def no_images(file: h5py.File) -> None:
@@ -62,8 +62,8 @@ BAD_SCANS: dict[str, tuple[Callable[[h5py.File], object], list[str]]] = {
     "wrong number of angles": (five_angles, ["rotation_angle", "8", "5"]),
     "unknown unit": (put(f"{DETECTOR}/distance", 0.1, "furlong"), ["detector/distance", "furlong", "mm"]),
     "negative distance": (put(f"{DETECTOR}/distance", -0.1), ["detector/distance", "positive", "-0.1"]),
-    "NaN images": (one_nan, ["detector/data", "finite", "1 of 5376"]),
-    "NaN in a held-out image": (one_nan_held_out, ["detector/data", "finite", "1 of 5376"]),
+    "NaN images": (nan_image, ["detector/data", "finite", "100% of a frame"]),
+    "a held-out image of NaN": (nan_image_held_out, ["detector/data", "finite", "100% of a frame"]),
     "no training frame": (put("entry/split", np.ones(8, int)), ["training frame", "/entry/split"]),
     "a pixel of 3.2 m": (huge_pixels, ["pixel_size", "3.2", "unit"]),
     "no images": (no_images, ["data", "missing"]),

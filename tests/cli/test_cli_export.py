@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 
+import numpy as np
 import tifffile
 
 from helpers.cli import holosplat, refused, worked
 from holosplat.io.objects import read_object
 from holosplat.io.series import read_series
+from holosplat.io.volume_files import read_truth, write_ome_tiff
+from holosplat.io.volumes import read_volume, write_volume
 
 
 def test_a_run_is_exported_in_few_bytes_and_as_a_tiff(shop, tmp_path):
@@ -46,3 +50,36 @@ def test_runs_of_a_series_share_a_compact_file(shop, tmp_path):
     assert "times smaller than 2 runs" in done.err
     assert list(read_series(tmp_path / "s.h5")) == ["run", "second"]
     refused(holosplat("export", shop.run, "--splats", tmp_path / "g.ply", "--together", second), "--together needs")
+
+
+def test_a_volume_is_named_by_its_format_and_nothing_is_written_over(shop, tmp_path):
+    for name in ("v.nrrd", "v", "v.vti", "v.npy"):
+        refused(holosplat("export", shop.run, "--volume", tmp_path / name), "--volume", ".h5", ".tif", ".zarr", name)
+    assert not list(tmp_path.iterdir())
+    for option, name in (("--volume", "v.h5"), ("--volume", "v.tif"), ("--compact", "c.h5"), ("--splats", "g.ply")):
+        (tmp_path / name).write_text("mine")
+        refused(holosplat("export", shop.run, option, tmp_path / name), "must be new or empty")
+        assert (tmp_path / name).read_text() == "mine"
+
+
+def test_the_truth_may_be_an_exported_tiff_of_the_same_field(shop, tmp_path):
+    truth, report = tmp_path / "truth.ome.tif", shop.run / "report.html"
+    before, volume = report.read_bytes(), read_volume(shop.truth)
+    write_ome_tiff(truth, volume)
+    found = read_truth(truth)
+    np.testing.assert_allclose(found.grid.origin, volume.grid.origin, rtol=1e-9)
+    np.testing.assert_allclose(found.grid.voxel_size, volume.grid.voxel_size, rtol=1e-9)
+    np.testing.assert_array_equal(found.delta, volume.delta.astype(np.float32))
+    by_tiff, by_hdf5 = (worked(holosplat("evaluate", shop.run, "--truth", path)) for path in (truth, shop.truth))
+    assert by_tiff.out == by_hdf5.out
+    report.write_bytes(before)
+    tifffile.imwrite(truth, volume.delta.astype(np.float32))
+    refused(holosplat("evaluate", shop.run, "--truth", truth), "another TIFF file")
+    grid = volume.grid
+    for moved, words in (
+        (replace(grid, origin=(grid.origin[0] + 1e-2, *grid.origin[1:])), "has no matter where the run has some"),
+        (replace(grid, voxel_size=tuple(20 * size for size in grid.voxel_size)), "of this scan"),
+    ):
+        write_volume(tmp_path / "other.h5", replace(volume, grid=moved))
+        refused(holosplat("evaluate", shop.run, "--truth", tmp_path / "other.h5"), words)
+    assert report.read_bytes() == before

@@ -70,12 +70,15 @@ def test_rendered_frames_are_in_the_scans_order_and_layout(shop, tmp_path, split
 
 
 def test_an_exported_volume_is_the_fields_or_as_asked(shop, tmp_path):
-    cloud, out = load_reconstruction(RunFolder(shop.run)).object, tmp_path / "volume.h5"
-    for options, grid in (
-        ([], Grid.centred((COLUMNS, ROWS, COLUMNS), PIXEL)),
-        (["--shape", 10, 12, 14, "--voxel-size", 5e-6], Grid.centred((10, 12, 14), 5e-6)),
-        (["--shape", 10, 12, 14], Grid.centred((10, 12, 14), PIXEL)),
+    cloud = load_reconstruction(RunFolder(shop.run)).object
+    for number, (options, grid) in enumerate(
+        (
+            ([], Grid.centred((COLUMNS, ROWS, COLUMNS), PIXEL)),
+            (["--shape", 10, 12, 14, "--voxel-size", 5e-6], Grid.centred((10, 12, 14), 5e-6)),
+            (["--shape", 10, 12, 14], Grid.centred((10, 12, 14), PIXEL)),
+        )
     ):
+        out = tmp_path / f"volume{number}.h5"
         worked(holosplat("export", shop.run, "--volume", out, *options))
         volume = read_volume(out)
         assert volume.grid.shape == grid.shape

@@ -22,7 +22,7 @@ from holosplat.io.reading import Reading, ends_of, marked, read_angles
 from holosplat.io.snapshots import find_snapshots
 from holosplat.io.stacks import stack_of
 from holosplat.io.table import Table
-from holosplat.io.tiff_guard import all_pages
+from holosplat.io.tiff_guard import all_images
 from holosplat.io.tube import Tube
 from holosplat.learning.aligned_weights import read_aligned
 from holosplat.learning.weights import read_weights
@@ -54,7 +54,7 @@ def circle(tmp_path) -> Path:
     return path
 
 
-@pytest.mark.parametrize("read", [stack_of, all_pages])
+@pytest.mark.parametrize("read", [stack_of, all_images])
 def test_pages_that_run_in_a_circle_end(circle, read):
     with pytest.raises(InputError, match="but they run in a circle"):
         read(circle)

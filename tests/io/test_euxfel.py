@@ -174,3 +174,14 @@ def test_without_the_package_its_name_is_said(run, monkeypatch):
     euxfel._run.cache_clear()
     with pytest.raises(InputError, match=r"holosplat\[euxfel\]"):
         read(run, SAID)
+
+
+def test_trains_that_are_lost_are_said(run, angles, caplog):
+    """Of the second camera a train has no frames."""
+    with h5py.File(run / "RAW-R0007-DA01-S00000.h5", "r+") as file:
+        index = file[f"INDEX/{CAMERA.format(2)}:daqOutput/data"]
+        index["count"][1] = 0
+    euxfel._run.cache_clear()
+    found = read_as(run, Reading(Told(**SAID, angles=angles)))
+    assert len(found) == 2 * (TRAINS - 1) * PULSES
+    assert f"1 of {TRAINS} trains are lost, for not all cameras have them: 10001" in caplog.text

@@ -14,6 +14,7 @@ import pytest
 
 import holosplat.frames as frames_module
 import holosplat.io.raw_file as raw_file
+import holosplat.io.stored_frames as stored_frames
 from holosplat.checks import InputError
 from holosplat.frames import Binned, Frames, Picked, divided
 from holosplat.geometry import Views, rotation_y
@@ -42,13 +43,14 @@ def stored(tmp_path: Path) -> Path:
 @pytest.fixture
 def reads(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The numbers of the frames that were read from files so far."""
-    numbers, read = [], raw_file.rows_of
+    numbers, read = [], stored_frames.rows_of
 
     def counted(stacks: object, number: int, *rest) -> np.ndarray:
         numbers.append(number)
         return read(stacks, number, *rest)
 
-    monkeypatch.setattr(raw_file, "rows_of", counted)
+    for module in (raw_file, stored_frames):
+        monkeypatch.setattr(module, "rows_of", counted)
     return numbers
 
 
@@ -175,13 +177,16 @@ def test_a_scan_can_be_written_over_its_own_file(stored):
     np.testing.assert_array_equal(read_scan(stored).frames, a_series().frames)
 
 
-def test_bad_values_are_named_when_they_are_read(stored):
+def test_values_that_are_no_numbers_are_filled_and_said(stored, caplog):
     with h5py.File(stored, "a") as file:
         file[DATA][3, 2, 5] = np.nan
+    whole = a_series().frames[3]
     scan = read_scan(stored)
     assert np.isfinite(scan[[2, 4]].frames).all()
-    with pytest.raises(InputError, match="data must hold finite numbers, but 1 of 546 values"):
-        scan[[3]].frames  # noqa: B018
+    assert not caplog.records
+    around = np.delete(whole[1:4, 4:7].ravel(), 4)
+    np.testing.assert_allclose(scan[[3]].frames[0, 2, 5], around.mean(), rtol=1e-6)
+    assert "1 pixels in 1 of 1 frames" in caplog.text
 
 
 def test_picked_and_binned_frames_can_be_stacked(stored):

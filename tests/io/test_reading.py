@@ -126,7 +126,7 @@ def test_what_a_file_lacks_is_asked_for_by_the_option_that_helps(file, tmp_path,
     ("text", "said"),
     [
         ("", "must hold the frames' angles in degrees, but it holds none"),
-        ("0 1\n2 3", "must hold one angle a line, but a line holds 2 numbers"),
+        ("0 1\n2 3", "must hold one angle a line, .* but a line holds 2 numbers"),
         ("0\nten", "but it holds 'ten'"),
         ("0\nnan", "holds .nan."),
         (None, "there is no such file"),

@@ -118,7 +118,7 @@ def align(
 
     from ..align import AlignedBeams
     from ..io.atomic import require_writable
-    from ..io.formats import read_as
+    from ..io.formats import read_frames
     from ..io.nxtomo import write_scan
     from ..planning.acts import of_alignment
     from ..scan import Scan
@@ -127,7 +127,7 @@ def align(
         require_writable(path)
     require(table is None or not axis_only, "--table is of single views; leave it, or --axis-only.")
     require(geometry_out is None or reading.part.views is None, "--geometry-out is of all frames; leave --views.")
-    measured, how = read_as(scan, reading), unknown.options()
+    measured, how = read_frames(scan, reading), unknown.options()
     if not axis_only:
         tell_frames("align", measured.exposures, out, lambda seen: of_alignment(seen, how))
     measured = measured.in_memory()

@@ -94,14 +94,14 @@ def calibrate(
     """
     from ..align import calibrate as find
     from ..io.atomic import require_writable
-    from ..io.formats import read_as
+    from ..io.formats import read_frames
     from ..matter import MaterialPrior
 
     require_writable(out)
     whole = reading.part == Part(time_frame=reading.part.time_frame)
     require(whole, "a geometry is that of whole frames; leave --views, --test-views, --crop and --bin.")
     require(filling.material is not None, "calibrate needs the phantom's --material; add it.")
-    shape, measured = body.body(), read_as(scan, reading).in_memory()
+    shape, measured = body.body(), read_frames(scan, reading).in_memory()
     material = filling.filling().of("", measured.exposures.reference_energy)
     with ProgressBar() as bar:
         found = find(

@@ -96,7 +96,7 @@ def reconstruct(
         resume: Go on with an interrupted run.
         strict: Exit with 3 where the frames are not explained to within their noise; without it, that is a warning.
     """
-    from ..io.formats import read_as
+    from ..io.formats import read_frames
     from ..methods import Pinn
     from ..methods.method import takes_series
     from ..methods.uncertain import Uncertain
@@ -118,7 +118,7 @@ def reconstruct(
     if takes_series(method) and reading.part.time_frame == "all":
         reading = replace(reading, part=replace(reading.part, time_frame=None))
     ways, folder = asked.ways(reading), RunFolder(out)
-    measured = read_as(scan, replace(reading, told=reading.told.at_middle()))
+    measured = read_frames(scan, replace(reading, told=reading.told.at_middle()))
     prior = asked.matter.without_ranges().prior(measured.exposures.reference_energy)
     measured = measured.in_memory() if can_be_seen(measured) else measured
     seen = measured.exposures[~measured.is_test]
@@ -239,20 +239,25 @@ def evaluate(
     Args:
         run: Run folder.
         scan: Scan (default: the one that was reconstructed).
-        truth: Volume file of the truth.
+        truth: Volume file of the truth, HDF5 or an OME-TIFF of export.
         as_json: Print JSON instead of a table.
     """
-    from ..io.volumes import read_volume
+    from ..io.volume_files import read_truth
     from ..report.run import report_run
     from ..workflows.evaluate import evaluate as score
+    from ..workflows.evaluate import require_overlap, require_same_field
     from ..workflows.moments import instants_of
     from ..workflows.provenance import scan_hash
     from ..workflows.run_folder import RunFolder, claimed
     from .scans import run_and_scan
 
     folder = RunFolder(run)
-    (result, measured), true_volume = run_and_scan(folder, scan, reading), read_volume(truth) if truth else None
+    (result, measured), true_volume = run_and_scan(folder, scan, reading), read_truth(truth) if truth else None
+    if truth is not None and true_volume is not None:
+        require_same_field(true_volume.grid, measured.views, truth)
     evaluation = score(result, measured, true_volume)
+    if truth is not None and evaluation.volume is not None:
+        require_overlap(evaluation.volume, truth)
     if as_json:
         print(json.dumps(evaluation.as_dict(), indent=2, allow_nan=False))
     else:

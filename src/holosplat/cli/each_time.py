@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..checks import require
-from ..io.formats import read_as
+from ..io.formats import read_frames
 from ..io.reading import Reading
 from ..matter import MaterialPrior
 from ..series.asked import Cut
@@ -39,7 +39,7 @@ def reconstruct_each(
     reading = replace(reading, part=replace(reading.part, time_frame=None))
     every = plan_series([scan], settings, prior, reading, Cut())
     planned = replace(every, cut=Cut(window=len(every.moments())))
-    seen, method, matter = read_as(scan, reading), settings.method, settings.matter
+    seen, method, matter = read_frames(scan, reading), settings.method, settings.matter
     tell_each_time(seen.exposures[~seen.is_test], out, method, matter)
     folder = SeriesFolder(out)
     if resume and out.exists():

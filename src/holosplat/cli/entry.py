@@ -20,7 +20,7 @@ from ..checks import OUT_OF_MEMORY, InputError
 from ..ranges import checked_later
 from ..version import __version__
 from .places import with_checked_arguments
-from .progress import INTERRUPTED
+from .progress import INTERRUPTED, say_notes
 from .sentence import give_up
 from .signals import end_as_on_interrupt
 
@@ -125,6 +125,7 @@ def main() -> None:
     end_as_on_interrupt()
     if isinstance(sys.stdout, TextIOWrapper):
         sys.stdout.reconfigure(errors="surrogateescape")  # names of files need be no UTF-8
+    say_notes()
     if sys.argv[1:] == ["--version"]:
         print(f"holosplat {__version__}")
         return

@@ -55,8 +55,8 @@ def export(
 
     Args:
         run: Run folder.
-        volume: Volume to write: a file of HDF5, or by its ending .ome.tif, .ome.tiff, .tif or .tiff an OME-TIFF, or
-            .ome.zarr or .zarr a folder of OME-Zarr (extra zarr), each with the channels δ and β.
+        volume: Volume to write, by its ending: .h5 or .hdf5, a file of HDF5; .ome.tif, .ome.tiff, .tif or .tiff, an
+            OME-TIFF; .ome.zarr or .zarr, a folder of OME-Zarr (extra zarr); each with the channels δ and β.
         shape: Voxels along z, y, x (default: the scan's field of view, Z = X = W, Y = H).
         voxel_size: Edge of a voxel [m] (default: the pixel size).
         bodies: Of a run of surfaces: a folder to make, with one VTK file a body (µm), the largest first, or of a run
@@ -96,14 +96,14 @@ def _ending(path: Path, ending: str) -> Path:
 
 
 def _export_compact(folder: RunFolder, out: Path, step_px: float, together: tuple[Path, ...]) -> None:
-    from ..io.atomic import require_writable
     from ..io.compact import steps_of
+    from ..io.folder import require_new
     from ..io.objects import write_compact
     from ..io.series import names_of, write_series
     from ..workflows.run_folder import RunFolder
 
     steps, folders = steps_of(step_px), [folder, *map(RunFolder, together)]
-    require_writable(out)
+    require_new(out)
     for each in folders:
         each.require_run()
     if together:
@@ -118,7 +118,7 @@ def _export_compact(folder: RunFolder, out: Path, step_px: float, together: tupl
 
 def _export_motion(folder: RunFolder, out: Path) -> bool:
     """Write a run of track as bodies that move; False, and nothing written, of any other."""
-    from ..io.atomic import require_writable
+    from ..io.folder import require_new
     from ..io.solids import write_moving_glb
     from ..representations import MovingSurfaces
     from ..workflows.moments import instants_of
@@ -127,27 +127,26 @@ def _export_motion(folder: RunFolder, out: Path) -> bool:
     found, times = load_reconstruction(folder).object, instants_of(folder)
     if not isinstance(found, MovingSurfaces):
         return False
-    require_writable(out)
+    require_new(out)
     write_moving_glb(out, found, times)
     _say(f"wrote {out}: {found.count} bodies in motion")
     return True
 
 
 def _export_splats(result: Reconstruction, out: Path) -> None:
-    from ..io.atomic import require_writable
+    from ..io.folder import require_new
     from ..io.splats import write_splats
     from ..representations import GaussianCloud
 
     found = result.object
     if not isinstance(found, GaussianCloud):
         raise InputError(f"--splats needs a run of Gaussians, but this one holds {found.described}; use --bodies.")
-    require_writable(out)
+    require_new(out)
     write_splats(out, found)
     _say(f"wrote {out}: {found.described}, whose opacity stands for thickness")
 
 
 def _export_bodies(one: Moment, out: Path) -> None:
-    from ..io.atomic import require_writable
     from ..io.folder import require_new
     from ..io.solids import write_glb, write_stl
     from .surface import write_bodies
@@ -157,11 +156,10 @@ def _export_bodies(one: Moment, out: Path) -> None:
         raise InputError(
             f"--bodies needs a run of surfaces, but this one holds {found.described}; use holosplat surface."
         )
+    require_new(out)
     if out.suffix.lower() in (STL, GLB):
-        require_writable(out)
         write_stl(out, one.bodies) if out.suffix.lower() == STL else write_glb(out, one.bodies, found.matter)
     else:
-        require_new(out)
         write_bodies(out, one.bodies, found.matter, {})
     _say(f"wrote {out}: {len(one.bodies)} bodies")
 
@@ -174,21 +172,24 @@ def _export_volume(
     voxel_size: float | None,
 ) -> None:
     from ..geometry import Grid
-    from ..io.atomic import require_writable
     from ..io.folder import require_new
     from ..io.json import read_json
     from ..io.ome_zarr import ZARR_SUFFIX, require_zarr, write_ome_zarr
-    from ..io.volume_files import TIFF_SUFFIXES, write_ome_tiff
+    from ..io.volume_files import TIFF_SUFFIXES, VOLUME_SUFFIXES, write_ome_tiff
     from ..io.volumes import write_voxels
     from ..planning.acts import of_export
     from ..scan import PIXEL_RANGE_M
     from .room import tell
 
+    known = (*VOLUME_SUFFIXES, ZARR_SUFFIX)
+    require(
+        volume.suffix.lower() in known,
+        f"--volume must be a file whose name ends with {', '.join(known)}, by which its format is chosen, but it is "
+        f"{volume}; name it so.",
+    )
     if volume.suffix.lower() == ZARR_SUFFIX:
         require_zarr()
-        require_new(volume)
-    else:
-        require_writable(volume)
+    require_new(volume)
     with as_written(folder.summary, "what reconstruct wrote"):
         detector = read_json(folder.summary)["detector"]
         rows, columns = int(detector["rows"]), int(detector["columns"])

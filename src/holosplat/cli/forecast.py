@@ -11,7 +11,7 @@ import numpy as np
 from tyro.conf import Positional
 
 from ..checks import positive, require
-from ..io.formats import read_as
+from ..io.formats import read_frames
 from ..io.reading import Reading, ends_of
 from ..io.run_scan import run_reading, run_source
 from ..motion.cell_model import ChannelFrame
@@ -144,7 +144,7 @@ def _whole_scan(folder: RunFolder) -> Scan:
     """The scan of a run of track, of all its times, later ones too, where the run found the geometry to be."""
     own = run_reading(folder.path)
     reading = replace(own, part=replace(own.part, time_frame=None, time_frames=None))
-    return where_found(folder, read_as(folder.source_scan(), reading).in_memory())
+    return where_found(folder, read_frames(folder.source_scan(), reading).in_memory())
 
 
 def _source(folder: RunFolder, scan: Scan, found: Forecasted, out: Path) -> dict[str, object]:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..io.formats import read_as
+from ..io.formats import read_frames
 from ..io.reading import Reading
 from ..io.run_scan import run_source
 from ..matter import KnownTwo, MaterialPrior, MatterKind
@@ -56,7 +56,7 @@ def reconstruct_in_motion(
     """
     seed, light, options = how
     reading = replace(reading, part=replace(reading.part, time_frame=None))
-    planned = read_as(scan, replace(reading, told=reading.told.at_middle()))
+    planned = read_frames(scan, replace(reading, told=reading.told.at_middle()))
     train = planned.exposures[~planned.is_test]
     count = len(np.unique(train.time))
     if isinstance(prior, KnownTwo):

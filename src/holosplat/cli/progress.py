@@ -1,7 +1,8 @@
-"""What long commands share: the progress bar, and the exit code of an interrupted one."""
+"""What commands say while they work: notes on the input, the progress bar, and the exit code of an interrupted one."""
 
 from __future__ import annotations
 
+import logging
 import sys
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -13,6 +14,33 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 TOLD = 0.03
 """Share of what was left at first that must be done before the time left is said."""
+
+
+class _Notes(logging.Handler):
+    """Prints what `checks.note` and `checks.warn` say on standard error, above a progress bar, and each of it once."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._known = set[str]()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """See `logging.Handler.emit`."""
+        text = ("warning: " if record.levelno >= logging.WARNING else "") + record.getMessage()
+        if text in self._known:
+            return
+        self._known.add(text)
+        tqdm = sys.modules.get("tqdm")
+        if tqdm is None:
+            print(text, file=sys.stderr)
+        else:
+            tqdm.tqdm.write(text, file=sys.stderr)
+
+
+def say_notes() -> None:
+    """From now on notes and warnings on the input are printed."""
+    logger = logging.getLogger("holosplat")
+    logger.setLevel(logging.INFO)
+    logger.handlers = [_Notes()]
 
 
 class ProgressBar:

@@ -75,10 +75,10 @@ def retrieve(
         method: Tikhonov through the full wave optics is the most reliable; docs/phase_retrieval.md compares them.
     """
     from ..baselines.retrieve import retrieve as act
-    from ..io.formats import read_as
+    from ..io.formats import read_frames
 
     require_place(out)
-    measured = read_as(scan, reading).in_memory()
+    measured = read_frames(scan, reading).in_memory()
     material, level = matter.at(measured.exposures.reference_energy)
     with ProgressBar() as bar:
         found = act(

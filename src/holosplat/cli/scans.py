@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from ..checks import require
-from ..io.formats import read_as
+from ..io.formats import read_frames
 from ..io.reading import Reading, at_time
 from ..io.run_scan import run_reading
 from ..mesh import TriangleMesh
@@ -30,9 +30,9 @@ def scan_for(folder: RunFolder, scan: Path | None, reading: Reading) -> Scan:
     """
     own = run_reading(folder.path) if folder.source.is_file() else Reading()
     if scan is None:
-        found = read_as(folder.source_scan(), reading.over(own))
+        found = read_frames(folder.source_scan(), reading.over(own))
     else:
-        found = read_as(scan, reading)
+        found = read_frames(scan, reading)
         if found.is_series:
             found = at_time(found, own.part.time_frame)
     if found.is_series and not instants_of(folder):

@@ -9,7 +9,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from ..checks import require
-from ..io.formats import read_as
+from ..io.formats import read_frames
 from ..io.reading import Reading
 from ..io.run_scan import run_source
 from ..motion.known import beam_directions
@@ -63,7 +63,7 @@ def track(
     options, folder = replace(how.options(), body=known.known()), RunFolder(out)
     if not resume:
         folder.require_new(advise_resume=True)
-    measured = read_as(scan, reading)
+    measured = read_frames(scan, reading)
     tell_frames("track", measured.exposures[~measured.is_test], out, lambda seen: of_track(seen, options))
     measured = measured.in_memory()
     if options.body is None and len(beam_directions(measured.train().views)) == 2:

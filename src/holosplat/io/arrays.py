@@ -25,13 +25,13 @@ from .raw_file import (
     NOTHING,
     PROJECTION,
     RANGES,
-    TAKES,
+    RAW_TAKES,
     ScanFile,
     Stack,
     exposures_of,
-    reader,
     together,
 )
+from .stored_frames import reader
 
 FRAMES = ("counts", "projections", "proj", "data")
 FLATS = ("flats", "flat", "white")
@@ -115,6 +115,6 @@ LOADER = Loader(
     f"a NumPy archive (.npz) or an HDF5 file with the array {FRAMES[0]}",
     _recognises,
     reader(open_arrays),
-    TAKES,
+    RAW_TAKES,
     open_arrays,
 )

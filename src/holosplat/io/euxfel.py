@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import InputError, MissingError, as_written, finite, positive, require
+from ..checks import InputError, MissingError, as_written, finite, positive, require, warn
 from ..frames import Frames
 from ..preprocess.flat_field import mean_frame, relative_intensity, unlit
 from ..scan import Exposures, Scan
@@ -153,10 +153,23 @@ def _stacks(path: Path, given: Mapping[str, Any]) -> tuple[KeyStack, ...]:
 
 def _trains(path: Path, run: Any, names: list[str], wanted: str | None) -> np.ndarray:
     """The trains' identities, of those of which all cameras have frames, in their order."""
-    common = set.intersection(*(set(run[name, PIXELS].drop_empty_trains().train_ids) for name in names))
+    having = [set(run[name, PIXELS].drop_empty_trains().train_ids) for name in names]
+    common = set.intersection(*having)
+    _tell_lost(path, common, set(run.train_ids).union(*having))
     require(len(common) > 0, f"{path} has no train of which all of {', '.join(names)} have frames; name others.")
     trains = np.array(sorted(common), dtype=np.int64)
     return trains[marked("--trains", wanted or ":", len(trains))]
+
+
+def _tell_lost(path: Path, common: set[int], known: set[int]) -> None:
+    """Warn of trains of which some camera has no frames, and of those that no file has, between the others."""
+    every = min(np.diff(sorted(known)), default=1)
+    lost = sorted((known | set(range(min(known, default=0), max(known, default=0), int(every)))) - common)
+    if lost and common:
+        shown = ", ".join(map(str, lost[:8])) + (" …" if len(lost) > 8 else "")
+        warn(
+            f"{path}: {len(lost)} of {len(lost) + len(common)} trains are lost, for not all cameras have them: {shown}"
+        )
 
 
 def _times(stack: KeyStack, given: Mapping[str, Any]) -> np.ndarray:

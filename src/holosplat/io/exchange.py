@@ -18,7 +18,8 @@ import numpy as np
 from ..units import ANGLE_UNITS, ENERGY_UNITS, LENGTH_UNITS
 from .hdf5 import Fields, open_hdf5
 from .loader import Loader
-from .raw_file import DARK, FLAT, NOTHING, PROJECTION, TAKES, ScanFile, exposures_of, reader, together
+from .raw_file import DARK, FLAT, NOTHING, PROJECTION, RAW_TAKES, ScanFile, exposures_of, together
+from .stored_frames import reader
 
 DATA, WHITE, BLACK, THETA = (f"exchange/{name}" for name in ("data", "data_white", "data_dark", "theta"))
 STACKS = ((PROJECTION, DATA), (FLAT, WHITE), (DARK, BLACK))
@@ -92,5 +93,5 @@ def _recognises(path: Path) -> bool:
 
 
 LOADER = Loader(
-    *("data-exchange", f"an HDF5 file with /{DATA}", _recognises, reader(open_exchange), TAKES), opens=open_exchange
+    *("data-exchange", f"an HDF5 file with /{DATA}", _recognises, reader(open_exchange), RAW_TAKES), opens=open_exchange
 )

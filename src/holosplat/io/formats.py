@@ -10,10 +10,11 @@ from typing import Any, Literal
 from ..checks import InputError, require
 from ..scan import Scan
 from . import arrays, euxfel, exchange, images, nerf_synthetic, nxtomo, r2_gaussian, run_scan, tiff
-from .hdf5_guard import allow_external
+from .kept_frames import with_fields
 from .loader import Loader
-from .raw_file import ScanFile, with_fields
+from .raw_file import ScanFile
 from .reading import Reading
+from .stored_frames import Mended
 
 ScanFormat = Literal["nxtomo", "nerf-synthetic", "tiff", "r2-gaussian"]
 """Formats that scans are written in."""
@@ -45,15 +46,15 @@ def read(path: str | Path, given: Mapping[str, Any] | None = None) -> Scan:
 
 def read_as(path: str | Path, reading: Reading) -> Scan:
     """The scan at `path`, as `read`, with what is said of it beside its files, and cut to the part that is taken."""
-    vouch(path, reading)
+    reading.told.vouch(Path(path))
     return reading.applied(read(path, reading.told.given(loader_of(path).takes)))
 
 
-def vouch(path: str | Path, reading: Reading) -> None:
-    """Let `path`, and the flats and darks beside it, bring values of other files where `reading` allows that."""
-    if reading.told.allow_external:
-        for one in (path, reading.told.flats, reading.told.darks):
-            allow_external(Path(one or path))
+def read_frames(path: str | Path, reading: Reading) -> Scan:
+    """The scan at `path`, as `read_as`, for those who take the logarithm of its frames or compare with them: pixels
+    that are not above 0 are filled from their neighbours, and their number is said."""
+    scan = read_as(path, reading)
+    return Scan.of(Mended(scan.source), scan.exposures, scan.is_test, scan.provenance, scan.light)
 
 
 @contextmanager

@@ -11,9 +11,10 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ..checks import InputError, require_regular, shaped
+from ..checks import InputError, MissingError, require_regular, shaped
 from ..units import unit_factor
 from .guard import require_memory
+from .hdf5_filters import filters_missing_in
 from .hdf5_guard import opened_for_reading, require_own
 from .seal import require_sealed
 
@@ -31,6 +32,11 @@ def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
             require_own(opened, file)
             yield opened
     except (OSError, RuntimeError, KeyError) as error:
+        if missing := filters_missing_in(file):
+            raise MissingError(
+                f"{path} is compressed by filters that HDF5 does not have here: {missing}; install them by pip install "
+                '"holosplat[codecs]" (hdf5plugin), or write the file anew without them (h5repack -f GZIP=4).'
+            ) from error
         raise InputError(
             f"{path} must be a complete HDF5 file, but it is truncated, damaged or not readable: {error}."
         ) from error

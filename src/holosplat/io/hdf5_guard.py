@@ -17,6 +17,7 @@ from h5py import h5d, h5l, h5o  # pyright: ignore[reportAttributeAccessIssue]  #
 from ..checks import InputError, require
 from .guard import DEEPEST, require_declared
 from .hdf5_chunks import require_chunks
+from .hdf5_filters import unknown_filters
 from .hdf5_sources import linked, require_external, virtual_sources
 from .seal import require_sealed
 
@@ -96,6 +97,7 @@ def _others(file: h5py.File, path: Path, allowed: bool) -> list[Path]:
 def _dataset_files(dataset: h5d.DatasetID, path: Path, name: bytes, allowed: bool, size: int) -> list[Path]:
     """The HDF5 files that a dataset of the file `path` refers to, once its values are in order."""
     label, plan = f"{path}: /{name.decode(errors='replace')}", dataset.get_create_plist()
+    unknown_filters(plan)  # loads those that are installed; others are named where values are read
     if dataset.shape is None:  # a null dataspace holds nothing, which whoever wants a value says
         return []
     declared = dataset.get_type().get_size()

@@ -33,6 +33,11 @@ def virtual_sources(path: Path, label: str, plan: h5p.PropDCID, declared: int) -
     return found
 
 
+def virtual_places(path: Path, name: str) -> list[Path]:
+    """The files that HDF5 may open for the source `name` of a virtual dataset of the file `path`."""
+    return [place for place in _places(path, name, VIRTUAL) if place.is_file()]
+
+
 def require_external(path: Path, label: str, plan: h5p.PropDCID, declared: int) -> None:
     """`InputError` unless the files of a dataset with external storage are regular, and hold what it declares."""
     parts = [plan.get_external(number) for number in range(plan.get_external_count())]

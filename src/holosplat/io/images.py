@@ -1,10 +1,12 @@
 """Frames as images of other programs, TIFF or PNG: one file, or a folder of them, with flats and darks beside it.
 
-In a folder, files named flat… and dark… (or in folders named flats and darks) correct the others.
+In a folder, files named flat… and dark… (or in folders of such names) correct the others, which may be in a folder of
+their own, such as projections. A text file named angles… beside them holds their angles. Capitals do not matter.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,15 +14,25 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import require
+from ..checks import InputError, note, require
+from ..scan import Exposures
+from .angles import angles_of, read_angles, tell_angles
+from .file_order import in_order
+from .leftovers import is_hidden
 from .loader import Loader
 from .nerf_synthetic import LOADER as NERF
 from .r2_gaussian import LOADER as R2
-from .raw_file import DARK, FLAT, NOTHING, PROJECTION, TAKES, ScanFile, exposures_of, reader, together
+from .raw_file import DARK, FLAT, NOTHING, PROJECTION, RAW_TAKES, ScanFile, exposures_of, together
 from .stacks import IMAGES, ImageStack, images_in, stack_of
+from .stored_frames import reader
 from .tiff import LOADER as TIFF
 
-FIELDS = ((FLAT, ("flats", "flat")), (DARK, ("darks", "dark")))
+FIELDS = ((FLAT, "flat|white|open_?beam"), (DARK, "dark"))
+"""How the names of flats and of darks, and of their folders, begin, or a word in them."""
+PROJECTIONS = re.compile("proj|tomo|sample|radio", re.IGNORECASE)
+"""How the names of folders of projections begin."""
+ANGLES = (".txt", ".csv", ".dat", ".log")
+"""Endings of files of angles."""
 
 
 @contextmanager
@@ -34,7 +46,9 @@ def open_images(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterato
     parts = [(PROJECTION, stack_of(source))] if source.is_file() else _in_folder(source, given.get("files"))
     stacks, kinds = together(str(path), [*parts, *_greys(source, parts, given)])
     projections = kinds == PROJECTION
-    exposures = exposures_of(str(path), given, {}, stacks[0].shape[1:], projections)  # type: ignore[arg-type]
+    found = {} if source.is_file() or given.get("angles_deg") is not None else _angles(source)
+    exposures = exposures_of(str(path), given, found, stacks[0].shape[1:], projections)  # type: ignore[arg-type]
+    _tell_order(source, stacks, kinds, exposures)
     nothing_held_out = np.zeros(int(projections.sum()), dtype=bool)
     yield ScanFile(source, str(path), stacks, kinds, exposures, nothing_held_out, kinds_label=str(path))
 
@@ -61,29 +75,89 @@ def _greys(path: Path, parts: list[tuple[int, Any]], given: Mapping[str, Any]) -
 
 
 def _in_folder(folder: Path, pattern: str | None) -> list[tuple[int, Any]]:
-    """The projections in a folder, and the flats and darks beside them."""
+    """The projections in a folder, or in a folder within it, and the flats and darks beside them."""
     beside = {kind: _fields_of_light(folder, names) for kind, names in FIELDS}
     taken = {file for files in beside.values() for file in files}
-    files = [file for file in images_in(folder, pattern) if file not in taken]
+    files = [file for place in _places(folder) for file in images_in(place, pattern) if file not in taken]
     named = f" named {pattern}" if pattern else ""
     require(len(files) > 0, f"{folder} must hold projections ({', '.join(IMAGES)}), but it holds none{named}.")
-    parts: list[tuple[int, Any]] = [(PROJECTION, ImageStack.of(files))]
+    parts: list[tuple[int, Any]] = [(PROJECTION, ImageStack.of(in_order(files)))]
     return parts + [(kind, ImageStack.of(found)) for kind, found in beside.items() if found]
 
 
-def _fields_of_light(folder: Path, names: tuple[str, ...]) -> list[Path]:
-    """Images whose names begin with one of `names`, or all in a folder of such a name."""
-    inner = [file for name in names if (folder / name).is_dir() for file in images_in(folder / name)]
-    return inner + [file for file in images_in(folder) if file.name.lower().startswith(names[-1])]
+def _places(folder: Path) -> list[Path]:
+    """The folders of projections: those within `folder` that are named so, or itself, or the only one that is left."""
+    inner = [path for path in _folders(folder) if not any(_is_named(path.name, names) for _, names in FIELDS)]
+    named = [path for path in inner if PROJECTIONS.match(path.name)]
+    own = [file for file in images_in(folder) if not any(_is_named(file.name, names) for _, names in FIELDS)]
+    places = named or ([folder] if own else inner)
+    if len(places) > 1:
+        raise InputError(
+            f"{folder} must hold the projections of one scan, but it has several folders of images: "
+            f"{', '.join(path.name for path in places)}; name one of them, with --flats, --darks and --angles."
+        )
+    return places
+
+
+def _folders(folder: Path) -> list[Path]:
+    """The folders of images within `folder`, by name."""
+    return sorted(path for path in folder.iterdir() if path.is_dir() and not is_hidden(path) and images_in(path))
+
+
+def _fields_of_light(folder: Path, names: str) -> list[Path]:
+    """Images whose names say that they are such, or all in folders of such a name."""
+    inner = [file for path in _folders(folder) if _is_named(path.name, names) for file in images_in(path)]
+    return inner + [file for file in images_in(folder) if _is_named(file.name, names)]
+
+
+def _is_named(name: str, names: str) -> bool:
+    """Whether a name begins with one of `names`, or has one of them as a word."""
+    return re.search(rf"^({names})|(?<![a-z])({names})(s|_?fields?)?(?![a-z])", name.lower()) is not None
+
+
+def _angles(folder: Path) -> dict[str, Any]:
+    """The angles of the text file in a folder, or in that of its projections, whose name begins with `angle`."""
+    found = sorted(
+        file
+        for place in dict.fromkeys((folder, *_places(folder)))
+        for file in place.iterdir()
+        if file.name.lower().startswith("angle") and file.suffix.lower() in ANGLES
+    )
+    require(
+        len(found) < 2,
+        f"{folder} has several files of angles, {', '.join(f.name for f in found)}; say one by --angles.",
+    )
+    if not found:
+        return {}
+    angles = read_angles(found[0])
+    tell_angles(angles, str(found[0]))
+    return {"angles_deg": angles}
+
+
+def _tell_order(source: Path, stacks: tuple[Any, ...], kinds: np.ndarray, exposures: Exposures) -> None:
+    """Say which files are the first and the last projection, with their angles, and the numbers of flats and darks."""
+    first, angles = stacks[0], angles_of(exposures.views)
+    if not isinstance(first, ImageStack) or angles is None or len(angles) < 2:
+        return
+    ends = ", ".join(f"{which} {first.name(n)} at {angles[n]:.6g}°" for which, n in (("first", 0), ("last", -1)))
+    flats, darks = (int((kinds == kind).sum()) for kind in (FLAT, DARK))
+    note(f"{source}: {len(angles)} projections ({ends}), {flats} flats and {darks} darks")
 
 
 def _recognises(path: Path) -> bool:
     if any(loader.recognises(path) for loader in (TIFF, NERF, R2)):
         return False
-    return path.suffix.lower() in IMAGES if path.is_file() else bool(images_in(path))
+    if path.is_file():
+        return path.suffix.lower() in IMAGES
+    return bool(images_in(path) or any(PROJECTIONS.match(inner.name) for inner in _folders(path)) or _has_fields(path))
+
+
+def _has_fields(folder: Path) -> bool:
+    """Whether a folder holds folders of flats or darks."""
+    return any(_is_named(inner.name, names) for inner in _folders(folder) for _, names in FIELDS)
 
 
 LOADER = Loader(
     *("images", f"images ({', '.join(IMAGES)}), one file or a folder of them", _recognises, reader(open_images)),
-    *((*TAKES, "files", "black", "white"), open_images),
+    *((*RAW_TAKES, "files", "black", "white"), open_images),
 )

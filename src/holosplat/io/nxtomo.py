@@ -20,8 +20,9 @@ from . import arrays, exchange
 from .divided_light import LIGHT, write_divided_light
 from .hdf5_writing import new_hdf5, put, room_for
 from .loader import Loader
-from .raw_file import NOTHING, PROJECTION, TAKES, reader
+from .raw_file import NOTHING, PROJECTION, RAW_TAKES
 from .scan_file import ANGLES, DATA, FLIPS, IMAGE_KEY, MASK, SPLIT, open_scan
+from .stored_frames import reader
 
 
 @dataclass(frozen=True)
@@ -184,4 +185,4 @@ def _recognises(path: Path) -> bool:
     return path.is_file() and h5py.is_hdf5(path) and not (exchange.recognises(path) or arrays.recognises(path))
 
 
-LOADER = Loader("nxtomo", "an HDF5 file", _recognises, read_scan, (*TAKES, "entry"), open_scan)
+LOADER = Loader("nxtomo", "an HDF5 file", _recognises, read_scan, (*RAW_TAKES, "entry"), open_scan)

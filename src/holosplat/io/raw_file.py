@@ -3,27 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass, field, replace
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-import h5py
 import numpy as np
 
-from ..checks import InputError, finite, in_range, require
+from ..checks import InputError, in_range, require
 from ..divided_light import DividedLight
-from ..frames import Frames
 from ..geometry import Views, rotation_y
-from ..preprocess.flat_field import mean_frame, relative_intensity, unlit
-from ..scan import DISTANCE_RANGE_M, ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan, checked_distance
-from .hdf5 import open_hdf5
-from .stacks import stack_of
+from ..preprocess.flat_field import mean_frame
+from ..scan import DISTANCE_RANGE_M, ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, checked_distance
+from .stacks import ImageStack
 
 PROJECTION, FLAT, DARK, INVALID = range(4)
 
 TAKES = ("energy_kev", "distance", "pixel_size", "angles_deg", "flats", "darks")
 """What may be said beside a file, and then goes before what the file says."""
+RAW_TAKES = (*TAKES, "leave_out")
+"""The same for files whose flats and darks are read frame by frame."""
 NOTHING: Mapping[str, Any] = {}
 RANGES = {
     "energy_kev": (ENERGY_RANGE_KEV, "keV"),
@@ -94,6 +93,15 @@ class ScanFile:
         """Which of the N frames are of `kind`."""
         return np.flatnonzero(self.kinds == kind)
 
+    def name(self, number: int) -> str:
+        """What messages call frame `number`: that, and the name of its file where each frame has one."""
+        begin = 0
+        for stack in self.stacks:
+            if isinstance(stack, ImageStack) and begin <= number < begin + stack.shape[0]:
+                return f"frame {number} ({stack.name(number - begin)})"
+            begin += stack.shape[0]
+        return f"frame {number}"
+
     def frame(self, number: int) -> np.ndarray:
         """Frame `number` [H, W] as float64, turned upright."""
         return self.rows(number, slice(0, self.exposures.views.shape[0]))
@@ -119,120 +127,6 @@ class ScanFile:
 
 Opens = Callable[[Path, Mapping[str, Any]], AbstractContextManager[ScanFile]]
 """Opens a file, with values that are said beside it (`TAKES`)."""
-
-
-@dataclass(frozen=True)
-class _Place:
-    """Where a dataset is: in the file that was opened, or in one to which it links, where that is allowed."""
-
-    file: Path
-    name: str
-
-    @classmethod
-    def of(cls, dataset: h5py.Dataset) -> _Place:
-        path = Path(dataset.file.filename).resolve()
-        return cls(path, str(dataset.name))
-
-
-@dataclass(frozen=True)
-class StoredFrames(Frames):
-    """The projections of a file, flat-field corrected when they are read.
-
-    stacks: of the file; a dataset of HDF5 by its place.
-    numbers: [N] of the projections among the file's frames.
-    dark, light: [H, W] mean dark field and mean flat field less that, light None where the file is corrected already.
-    stamp: of the file when it was opened.
-
-    The file is opened anew for each reading. Errors: `InputError` for a file that is gone or changed, or values not
-    finite.
-    """
-
-    path: Path
-    label: str
-    stacks: tuple[Stack | _Place, ...]
-    flips: tuple[bool, bool]
-    numbers: np.ndarray
-    dark: np.ndarray
-    light: np.ndarray | None
-    shape: tuple[int, int, int]
-    stamp: tuple[int, ...]
-
-    @classmethod
-    def of(cls, file: ScanFile) -> StoredFrames:
-        """Those of an open file, whose dark and flat frames are read for their means."""
-        numbers, path = file.numbers(PROJECTION), file.path.resolve()
-        dark, light = _fields_of_light(file)
-        stacks = tuple(_Place.of(stack) if isinstance(stack, h5py.Dataset) else stack for stack in file.stacks)
-        whole = (len(numbers), *file.exposures.views.shape)
-        return cls(path, file.label, stacks, file.flips, numbers, dark, light, whole, _stamp(path))
-
-    def read(self, numbers: np.ndarray) -> np.ndarray:
-        """See `Frames.read`."""
-        gone = f"{self.path} must be the file that was opened, but it is gone; put it back, or open another."
-        require(self.path.exists(), gone)
-        changed = f"{self.path} must be the file that was opened, but it has changed since; open it again."
-        require(_stamp(self.path) == self.stamp, changed)
-        frames = np.empty((len(numbers), *self.shape[1:]), dtype=np.float32)
-        files = {stack.file for stack in self.stacks if isinstance(stack, _Place)}
-        with ExitStack() as opened:
-            file = {path: opened.enter_context(open_hdf5(path)) for path in files}
-            stacks: list[Any] = [
-                file[stack.file][stack.name] if isinstance(stack, _Place) else stack for stack in self.stacks
-            ]
-            for i, n in enumerate(self.numbers[numbers]):  # one by one: raw frames are wider, and there may be many
-                raw = rows_of(stacks, int(n), slice(0, self.shape[1]), self.flips)
-                frames[i] = raw if self.light is None else relative_intensity(raw, self.dark, self.light)
-        return finite(self.label, frames)
-
-
-def reader(opens: Opens) -> Callable[[Path, Mapping[str, Any]], Scan]:
-    """What reads the projections of a file that `opens` opens, flat-field corrected, and how they were taken.
-
-    Frames marked flat and dark correct the others: (frame - mean dark) / (mean flat - mean dark); frames marked
-    invalid are dropped. The projections are read when they are asked for (`StoredFrames`).
-    """
-
-    def read(path: Path, given: Mapping[str, Any]) -> Scan:
-        with opens(path, given) as opened:
-            file = with_fields(opened, given)
-            return Scan.of(StoredFrames.of(file), file.exposures, file.is_test, file.provenance(), file.divided)
-
-    return read
-
-
-def with_fields(file: ScanFile, given: Mapping[str, Any]) -> ScanFile:
-    """The file with the flats and darks that are `given` beside it (paths of images or arrays), after its own."""
-    extra = [(kind, given.get(name)) for kind, name in ((FLAT, "flats"), (DARK, "darks"))]
-    if file.has_given_fields or all(path is None for _, path in extra):
-        return file
-    parts = [(kind, stack_of(path)) for kind, path in extra if path is not None]
-    stacks, kinds = together(str(file.path), [(PROJECTION, file.stacks[0]), *parts])
-    more = kinds[file.stacks[0].shape[0] :]
-    return replace(file, stacks=(*file.stacks, *stacks[1:]), kinds=np.concatenate([file.kinds, more]))
-
-
-def _stamp(path: Path) -> tuple[int, ...]:
-    """What changes when a file is written anew."""
-    found = path.stat()
-    return found.st_mtime_ns, found.st_size, found.st_ino
-
-
-def _fields_of_light(file: ScanFile) -> tuple[np.ndarray, np.ndarray | None]:
-    """The mean dark field [H, W], and the mean flat field less that, None where the file has no flats."""
-    flats, darks = file.numbers(FLAT), file.numbers(DARK)
-    if len(darks) and not len(flats):
-        raise InputError(f"{file.kinds_label} must mark flats (1) beside the dark ones (2), but it marks none.")
-    dark = file.mean(DARK)
-    if not len(flats):
-        return dark, None
-    light = file.mean(FLAT) - dark
-    bad = int(unlit(light).sum())
-    require(
-        bad == 0,
-        f"{file.label} must have flat frames brighter than dark ones everywhere, but in {bad} of {light.size} pixels "
-        "they are not; `holosplat correct` repairs such pixels.",
-    )
-    return dark, light
 
 
 # --- what files of other programs leave out -------------------------------------------------------------------

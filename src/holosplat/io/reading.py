@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from ..checks import InputError, finite, require, require_regular
+from ..checks import InputError, require
 from ..ranges import Frequency, Natural, Signed, Small, ranged
 from ..tables import LARGEST, from_table, number_in, shown, to_table
+from .angles import read_angles, tell_angles, tell_views
 from .tube import Tube
 
 if TYPE_CHECKING:
@@ -37,14 +38,19 @@ class Told:
     pixel_size: Small | None = None
     """Effective pixel size [m] (default: as the files say)."""
     angles: Path | None = None
-    """Text file of the frames' angles [degrees], one a line (default: as the files say)."""
+    """Text file of the frames' angles [degrees], one a line, or in a column that its first line names (default: as the
+    files say)."""
     exposures: Path | None = None
     """geometry.toml of the beams, as align and calibrate write it, which goes before what files say: a view for each
     frame, or for each frame of every time (default: as the files say)."""
     flats: Path | None = None
-    """Images without the object: a file (TIFF, PNG, .npy) or a folder of them (default: as the files have them)."""
+    """Images without the object: a file (TIFF, PNG, HDF5, .npy, .npz) or a folder of images (default: as the files have
+    them)."""
     darks: Path | None = None
     """Images without light, likewise."""
+    leave_out: str | None = None
+    """Frames to leave out, flats and darks too, counted from 0 as they stand in the files, as --views; those of --flats
+    and --darks follow (default: flats and darks that are unlike the others)."""
     files: str | None = None
     """Of a folder of images: the names of the projections, such as 'raw_*.tif' (default: all but flat* and dark*)."""
     entry: str | None = None
@@ -92,7 +98,21 @@ class Told:
         said = {name: value for name, value in vars(self).items() if value is not None and name not in OWN_WAY}
         beams = self._beams()
         said |= {name: value for name, value in (beams.scalars() if beams else {}).items() if name in takes}
-        return said if self.angles is None else {**said, "angles_deg": read_angles(self.angles)}
+        if self.angles is None:
+            return said
+        angles = read_angles(self.angles)
+        tell_angles(angles, str(self.angles))
+        return {**said, "angles_deg": angles}
+
+    def vouch(self, path: Path) -> None:
+        """From now on the scan at `path`, its flats and darks may bring values of other files, if that is said."""
+        if not self.allow_external:
+            return
+        from .hdf5_guard import allow_external  # needs h5py, which reading an option does not
+
+        for one in (path, self.flats, self.darks):
+            if one is not None:
+                allow_external(one)
 
     def placed(self, scan: Scan) -> Scan:
         """The scan in the exposures of --exposures, or with the axis and the sense of rotation that are said."""
@@ -173,6 +193,7 @@ class Reading:
     def applied(self, scan: Scan) -> Scan:
         """A scan that a loader has read, with its axis and sense of rotation, and cut to the part that is taken."""
         scan = self.told.placed(scan)
+        tell_views(scan)
         return self.part.of(scan if self.told.tube is None else Tube.parsed(self.told.tube).taken_out_of(scan))
 
     def as_table(self) -> dict[str, Any]:
@@ -216,30 +237,6 @@ def at_time(scan: Scan, time_frame: int | str | None) -> Scan:
         return scan
     require(time_frame != "each", "--time-frame each is of reconstruct; give the number of a time.")
     return scan.at_instant(time_frame) if isinstance(time_frame, int) else scan.as_static()
-
-
-def read_angles(path: Path) -> np.ndarray:
-    """The angles [N] in degrees of a text file: numbers separated by lines, spaces or commas; # begins a comment."""
-    require_regular(path, "a text file of angles (--angles)")
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"--angles must be a text file of angles, but reading {path} failed: {error}.") from None
-    rows = [line.split("#")[0].replace(",", " ").split() for line in lines]
-    rows = [row for row in rows if row]
-    one_a_line = all(len(row) == 1 for row in rows) or len(rows) == 1
-    require(
-        one_a_line, f"{path} must hold one angle a line, but a line holds {max(map(len, rows), default=0)} numbers."
-    )
-    words = [word for row in rows for word in row]
-    require(len(words) > 0, f"{path} must hold the frames' angles in degrees, but it holds none.")
-    return finite(f"{path}: angles", np.array([_number(path, word) for word in words]))
-
-
-def _number(path: Path, word: str) -> float:
-    number = number_in(word)
-    require(not math.isnan(number), f"{path} must hold angles in degrees, but it holds {shown(word)}.")
-    return number
 
 
 def _corner(text: str, shape: tuple[int, int]) -> tuple[slice, slice]:

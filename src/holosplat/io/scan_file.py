@@ -20,6 +20,8 @@ from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, checked_distance
 from ..units import ANGLE_UNITS, ENERGY_UNITS, LENGTH_UNITS, TIME_UNITS
 from .divided_light import read_divided_light
 from .hdf5 import Fields, attribute_text, open_hdf5
+from .nxtomo_geometry import FLIPS as FLIPS
+from .nxtomo_geometry import SHIFT, about_axis, flips_of, magnification
 from .raw_file import DARK, FLAT, INVALID, NOTHING, PROJECTION, ScanFile, angles_of_projections, require_said, said
 
 DATA = "instrument/detector/data"
@@ -27,7 +29,6 @@ DATA_NAMES = (DATA, "data/data")
 IMAGE_KEY = "instrument/detector/image_key"
 IMAGE_KEYS = ("instrument/detector/image_key_control", IMAGE_KEY, "data/image_key")
 MASK = "instrument/detector/pixel_mask"
-FLIPS = ("instrument/detector/y_flipped", "instrument/detector/x_flipped")
 DETECTOR = "instrument/detector/"
 PIXEL_SIZES = ("sample/{}_pixel_size", DETECTOR + "{}_magnified_pixel_size", DETECTOR + "{}_pixel_size")
 """Names of a pixel's size along x and y; those in the sample's plane come first."""
@@ -35,7 +36,6 @@ DISTANCES = ("sample/propagation_distance", "instrument/detector/distance")
 ENERGIES = ("instrument/beam/incident_energy", "beam/incident_energy", "instrument/monochromator/energy")
 ANGLES = ("sample/rotation_angle", "data/rotation_angle")
 ROTATION = "sample/view_rotation"
-SHIFT = "instrument/detector/shift"
 TIME = "sample/time"
 PSF_SIGMA = "instrument/detector/psf_sigma"
 SPLIT = "split"
@@ -66,11 +66,11 @@ def open_scan(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Iterator[
         is_test = _split(fields, kinds)
         require(bool((psf_sigma >= 0).all()), f"{fields.label(PSF_SIGMA)} must not be negative; correct it.")
         exposures = Exposures(views, energy, distance, psf_sigma, time)
-        flips = [bool(fields.numbers(name).any()) if fields.find(name) else False for name in FLIPS]
+        flips = flips_of(fields)
         data = fields.need(*DATA_NAMES)
         yield ScanFile(
             *(Path(path), fields.label(data), (fields.dataset(data),), kinds, exposures, is_test),
-            *((flips[0], flips[1]), _marked(fields, views.shape), _read_provenance(fields)),
+            *(flips, _marked(fields, views.shape), _read_provenance(fields)),
             fields.label(fields.find(*IMAGE_KEYS) or IMAGE_KEY),
             divided=read_divided_light(fields, kinds == PROJECTION),
         )
@@ -186,9 +186,12 @@ def _optional(
 def _views(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> Views:
     shape = fields.dataset(fields.need(*DATA_NAMES)).shape[1:]
     shifts = _optional(fields, kinds, SHIFT, LENGTH_UNITS, "m", (2,))
-    pixel_size = said(given, "pixel_size") or _pixel_sizes(fields, kinds)
+    pixel_size = said(given, "pixel_size") or _pixel_sizes(fields, kinds) / _magnification(
+        fields, kinds, PIXEL_SIZES[:2]
+    )
     if given.get("angles_deg") is not None or not fields.find(ROTATION):
-        return Views.of_pixels(_rotations_of_angles(fields, kinds, given), shifts, shape, pixel_size)
+        views = Views.of_pixels(_rotations_of_angles(fields, kinds, given), shifts, shape, pixel_size)
+        return views if fields.find(SHIFT) else about_axis(fields, views)
     rotations = _per_frame(fields, kinds, ROTATION, (3, 3))
     try:
         return Views.of_pixels(rotations, shifts, shape, pixel_size)
@@ -253,11 +256,23 @@ def _distances(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> n
     told = said(given, "distance")
     if told is not None:
         return np.full(int((kinds == PROJECTION).sum()), told)
-    name = fields.need(*DISTANCES, way_out="say it by --distance, or add it")
-    distances = _per_frame(fields, kinds, name) * fields.unit(name, LENGTH_UNITS, "m")
+    distances = _distances_of_file(fields, kinds) / _magnification(fields, kinds, DISTANCES[:1])
     for distance in (distances.min(), distances.max()):
-        checked_distance(float(distance), fields.label(name))
+        checked_distance(float(distance), fields.label(fields.find(*DISTANCES) or ""))
     return distances
+
+
+def _distances_of_file(fields: Fields, kinds: np.ndarray) -> np.ndarray:
+    name = fields.need(*DISTANCES, way_out="say it by --distance, or add it")
+    return _per_frame(fields, kinds, name) * fields.unit(name, LENGTH_UNITS, "m")
+
+
+def _magnification(fields: Fields, kinds: np.ndarray, effective: tuple[str, ...]) -> np.ndarray | float:
+    """(R + z) / R of a source R before the sample, by which pixels and distance are divided; 1 for a parallel beam, and
+    where the file has one of the `effective` names."""
+    if fields.find(*(name.format(axis) for name in effective for axis in "xy")):
+        return 1.0
+    return magnification(fields, lambda name: _per_frame(fields, kinds, name), DISTANCES[1])
 
 
 def _split(fields: Fields, kinds: np.ndarray) -> np.ndarray:

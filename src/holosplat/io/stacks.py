@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 from ..checks import InputError, require
 from .guard import mapped_array
 from .leftovers import is_hidden
-from .tiff_guard import page_values, pages_in
+from .tiff_guard import image_count, image_values, open_tiff
 
 IMAGES = (".tif", ".tiff", ".png")
 
@@ -34,6 +33,10 @@ class ImageStack:
         require(len(pages) > 0, f"{files[0]} must hold an image, but it holds none; it may be damaged.")
         first = _image(*pages[0])
         return cls(pages, (len(pages), *first.shape))
+
+    def name(self, number: int) -> str:
+        """The name of the file with image `number`."""
+        return self.pages[number][0].name
 
     def __getitem__(self, index: tuple[int, slice]) -> np.ndarray:
         number, rows = index
@@ -60,9 +63,8 @@ def stack_of(path: Path, pattern: str | None = None) -> ImageStack | np.ndarray:
 
 
 def images_in(folder: Path, pattern: str | None = None) -> list[Path]:
-    """The image files in a folder whose names match `pattern`, in the order of the numbers in their names."""
-    found = [file for file in folder.glob(pattern or "*") if _is_image(file)]
-    return sorted(found, key=lambda file: [(word.isdigit(), word.zfill(20)) for word in re.split(r"(\d+)", file.name)])
+    """The image files in a folder whose names match `pattern`, by name."""
+    return sorted(file for file in folder.glob(pattern or "*") if _is_image(file))
 
 
 def _is_image(file: Path) -> bool:
@@ -82,15 +84,8 @@ def _array(path: Path) -> np.ndarray:
 def _page_count(file: Path) -> int:
     if file.suffix.lower() == ".png":
         return 1
-    import tifffile
-
-    try:
-        with tifffile.TiffFile(file) as opened:
-            return sum(1 for _ in pages_in(opened, file))
-    except InputError:
-        raise
-    except Exception as error:  # tifffile raises many kinds for damaged files
-        raise InputError(f"{file} must be a complete TIFF file, but it is damaged or none: {error}.") from None
+    with open_tiff(file) as opened:
+        return image_count(opened, file)
 
 
 def _image(file: Path, page: int) -> np.ndarray:
@@ -116,7 +111,5 @@ def _png(file: Path) -> np.ndarray:
 
 
 def _tiff(file: Path, page: int) -> np.ndarray:
-    import tifffile
-
-    with tifffile.TiffFile(file) as opened:
-        return page_values(opened.pages[page], file)
+    with open_tiff(file) as opened:
+        return image_values(opened, file, page)

@@ -15,7 +15,7 @@ from .folder import atomic_folder
 from .json import write_json
 from .loader import Loader
 from .table import Table
-from .tiff_guard import all_pages
+from .tiff_guard import all_images
 
 FORMAT = "holosplat TIFF 1"
 SCAN = "scan.json"
@@ -64,7 +64,7 @@ def read_tiff(path: str | Path) -> Scan:
 
 def _pages(file: Path, count: int) -> list[np.ndarray]:
     """The `count` pages of a TIFF file, each [H, W]."""
-    pages = all_pages(file)
+    pages = all_images(file)
     require(len(pages) == count, f"{file} must hold {count} pages, one a frame, but it holds {len(pages)}.")
     for page in pages:
         grey = page.ndim == 2 and page.dtype.kind in "iuf"

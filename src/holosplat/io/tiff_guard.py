@@ -1,55 +1,141 @@
-"""Pages of TIFF files that nobody vouches for: they hold what they declare, and no more."""
+"""Images of TIFF files that nobody vouches for: they hold what they declare, and no more, and are turned upright."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..checks import InputError, require
+from ..checks import InputError, MissingError, note, require
 from .guard import RATIO, SMALL, require_declared, require_inflated, require_memory
 
 DEFLATE = (8, 32946)
 """TIFF's numbers of deflate, of which there are two."""
+WHITE_IS_ZERO, BLACK_IS_ZERO, COLOURS, PALETTE = range(4)
+"""TIFF's photometric interpretations that are read."""
+UPRIGHT = 1
 
 
-def page_values(page: Any, file: Path) -> np.ndarray:
-    """The values of a page of an open TIFF file, after a look at what it declares."""
+@contextmanager
+def open_tiff(file: Path) -> Iterator[Any]:
+    """`file` opened by tifffile. Errors: `InputError` for one that is damaged or none."""
+    import tifffile
+
+    try:
+        with tifffile.TiffFile(file) as opened:
+            yield opened
+    except (InputError, MemoryError):
+        raise
+    except Exception as error:  # tifffile raises many kinds for damaged files
+        if "imagecodecs" in str(error):
+            raise MissingError(
+                f"{file} is compressed in a way that needs a package ({error}); install it by pip install "
+                '"holosplat[codecs]" (imagecodecs), or save the file without compression.'
+            ) from None
+        raise InputError(f"{file} must be a complete TIFF file, but it is damaged or none: {error}.") from None
+
+
+def image_count(opened: Any, file: Path) -> int:
+    """The images of an open TIFF file: its pages or, where there is one page, the planes behind it (ImageJ writes
+    large stacks so). Errors: `InputError` for pages that run in a circle."""
+    places = set[int]()
+    while True:
+        try:
+            place = opened.pages[len(places)].offset
+        except IndexError:
+            break
+        require(place not in places, f"{file} must hold its pages one after another, but they run in a circle.")
+        places.add(place)
+    return len(places) if len(places) != 1 else _planes(opened, file)
+
+
+def _planes(opened: Any, file: Path) -> int:
+    """The planes of the one page of an open TIFF file."""
+    page, series = opened.pages[0], opened.series[0]
+    planes = int(np.prod(series.shape, dtype=object)) // max(1, int(np.prod(page.shape, dtype=object)))
+    if planes <= 1:
+        return 1
+    whole = series.dataoffset is not None and int(page.compression) == 1
+    size = file.stat().st_size - (series.dataoffset or 0)
+    declared = int(np.prod(series.shape, dtype=object)) * np.dtype(series.dtype).itemsize
+    require(
+        whole and declared <= size,
+        f"{file} must hold {planes} images behind its one page, but it is cut short or compressed; save it anew.",
+    )
+    return planes
+
+
+def image_values(opened: Any, file: Path, number: int) -> np.ndarray:
+    """The values of image `number` of an open TIFF file, after a look at what it declares.
+
+    It is turned upright as its orientation says, and white that is stored as 0 becomes the greatest number.
+    """
+    try:
+        page, plane = opened.pages[number], None
+    except IndexError:
+        page, plane = opened.pages[0], number
     label = f"{file}: an image of {'x'.join(map(str, page.shape))}"
     declared = int(np.prod(page.shape, dtype=object)) * np.dtype(page.dtype or "u1").itemsize
     require_memory(label, declared)
     require_declared(label, declared, file.stat().st_size)
     if int(page.compression) in DEFLATE:
         _require_segments(page, label, declared)
-    return page.asarray()
+    values = page.asarray() if plane is None else _plane(opened, plane, file)
+    return _upright(page, _grey(page, values, file), file)
 
 
-def pages_in(opened: Any, file: Path) -> Iterator[Any]:
-    """The pages of an open TIFF file; `InputError` where they run in a circle."""
-    places = set[int]()
-    while True:
-        try:
-            page = opened.pages[len(places)]
-        except IndexError:
-            return
-        require(page.offset not in places, f"{file} must hold its pages one after another, but they run in a circle.")
-        places.add(page.offset)
-        yield page
+def _plane(opened: Any, number: int, file: Path) -> np.ndarray:
+    """Plane `number` behind the one page of an open TIFF file."""
+    page = opened.pages[0]
+    dtype = np.dtype(page.dtype).newbyteorder(opened.byteorder)
+    size = int(np.prod(page.shape)) * dtype.itemsize
+    opened.filehandle.seek(opened.series[0].dataoffset + number * size)
+    content = opened.filehandle.read(size)
+    require(len(content) == size, f"{file} must hold {number + 1} images, but it is cut short; save it anew.")
+    return np.frombuffer(content, dtype).reshape(page.shape)
 
 
-def all_pages(file: Path) -> list[np.ndarray]:
-    """The values of all pages of a TIFF file. Errors: `InputError` for one that is damaged or none."""
-    import tifffile
+def all_images(file: Path) -> list[np.ndarray]:
+    """The values of all images of a TIFF file. Errors: `InputError` for one that is damaged or none."""
+    with open_tiff(file) as opened:
+        return [image_values(opened, file, number) for number in range(image_count(opened, file))]
 
-    try:
-        with tifffile.TiffFile(file) as opened:
-            return [page_values(page, file) for page in pages_in(opened, file)]
-    except (InputError, MemoryError):
-        raise
-    except Exception as error:  # tifffile raises many kinds for damaged files
-        raise InputError(f"{file} must be a complete TIFF file, but it is damaged or none: {error}.") from None
+
+def _grey(page: Any, values: np.ndarray, file: Path) -> np.ndarray:
+    """Values [rows, columns] that grow with the brightness, whatever numbers the file stores for it."""
+    tag = page.tags.get("PhotometricInterpretation")
+    kind = BLACK_IS_ZERO if tag is None else int(tag.value)
+    known = kind in (WHITE_IS_ZERO, BLACK_IS_ZERO, COLOURS, PALETTE)
+    require(known, f"{file} must hold grey images, but it holds {page.photometric!r}; save it as grey.")
+    if kind == WHITE_IS_ZERO:
+        require(
+            values.dtype.kind == "u",
+            f"{file} says that 0 is white, which has no meaning for {values.dtype}; save it with 0 as black.",
+        )
+        note(f"{file.parent}: images such as {file.name} have 0 as white; they are turned to 0 as black")
+        return np.asarray((1 << int(page.bitspersample)) - 1 - values, dtype=values.dtype)
+    if kind == PALETTE:
+        table = np.asarray(page.colormap)
+        grey = bool((table == table[0]).all())
+        require(grey, f"{file} must hold grey images, but its numbers are those of colours; save it as grey.")
+        return table[0][values]
+    return values
+
+
+def _upright(page: Any, values: np.ndarray, file: Path) -> np.ndarray:
+    """The image as its orientation (1 to 8 of TIFF 6.0) says that it is seen."""
+    tag = page.tags.get("Orientation")
+    kind = UPRIGHT if tag is None else int(tag.value)
+    if kind == UPRIGHT:
+        return values
+    require(1 <= kind <= 8, f"{file} must have an orientation from 1 to 8, but it is {kind}; save it anew.")
+    note(f"{file.parent}: images such as {file.name} are turned upright, as their orientation {kind} says")
+    if kind > 4:  # rows are columns
+        values, kind = values.swapaxes(0, 1), {5: 1, 6: 2, 7: 3, 8: 4}[kind]
+    return values[:: -1 if kind in (3, 4) else 1, :: -1 if kind in (2, 3) else 1]
 
 
 def _require_segments(page: Any, label: str, declared: int) -> None:

@@ -15,6 +15,8 @@ RESPONSE_RANGE = (1 / 3, 3.0)
 OUTLIER = 12.0
 """So is one whose dark, or the noise of it, is so many robust standard deviations off its neighbours'."""
 LEAST_COUNTS = 1.0
+MOST_DEFECTS = 0.2
+"""A larger share of defective pixels is no camera to reconstruct from."""
 NORMAL_MEDIAN = 0.6745
 """The median of |x| for a standard normal x."""
 

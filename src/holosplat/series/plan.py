@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..checks import as_written, require
-from ..io.formats import read_as
+from ..io.formats import read_frames
 from ..io.reading import Reading
 from ..matter import MaterialPrior
 from ..scan import Scan
@@ -156,7 +156,7 @@ def plan_series(
 
 
 def _source(path: Path, settings: Settings, prior: Callable[[float], MaterialPrior], reading: Reading) -> Source:
-    scan = read_as(path, reading)
+    scan = read_frames(path, reading)
     times = times_of(scan)
     fewest = 3 if settings.act == "track" else 1
     require(

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..checks import InputError, require
-from ..io.formats import read_as
+from ..io.formats import read_frames
 from ..io.json import write_json
 from ..io.lock import sole_writer
 from ..io.reading import Reading
@@ -134,7 +134,7 @@ class Scans:
 def opened(source: Source, reading: Reading) -> Scan:
     """The scan of a source; `InputError` if it is no longer what was planned with."""
     require(Path(source.path).exists(), f"{source.path} must be a scan of the series, but it is gone; bring it back.")
-    scan = read_as(source.path, reading)
+    scan = read_frames(source.path, reading)
     require(
         fingerprint(scan) == source.fingerprint,
         f"{source.path} must be as it was when the series was planned, but its frames differ; plan anew.",

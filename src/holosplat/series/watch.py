@@ -12,7 +12,7 @@ from pathlib import Path
 
 from ..checks import require
 from ..io.atomic import atomic_path
-from ..io.formats import read_as
+from ..io.formats import read_frames
 from ..io.lock import sole_writer
 from ..io.reading import Reading
 from ..io.run_scan import run_source
@@ -144,7 +144,7 @@ class Watch:
         scans = list[Scan]()
 
         def read() -> str:
-            scan = read_as(found.path, self.reading)
+            scan = read_frames(found.path, self.reading)
             at(scan, 0)  # the first frames can be read, and their values are numbers
             scans.append(scan)
             return ""

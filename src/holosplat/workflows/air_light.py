@@ -11,12 +11,46 @@ import torch
 
 from ..checks import InputError
 from ..divided_light import DividedLight
-from ..optics.air import Box, has_air
+from ..optics.air import Box, find_air, has_air
 from ..optics.background import ORDER, Light, LightOptions
 from ..optics.modes import cosines
 
 LONGEST = 128
 """Pixels along the longer side of the binned frames, at most."""
+BESIDE = 0.05
+"""Width of the left and the right border, as a part of a frame's."""
+BRIGHTER = 0.02
+"""Where a border is brighter than the frame's mean by this part, it shows air, or less matter than the middle."""
+
+
+@dataclass(frozen=True)
+class Look:
+    """All projections at once: frames [V, h, w] of pixels `factor` times larger; shape: (H, W) of a whole one."""
+
+    frames: np.ndarray
+    factor: int
+    shape: tuple[int, int]
+
+    @classmethod
+    def at(cls, frame: Callable[[int], np.ndarray], count: int) -> Look:
+        """At `count` relative frames [H, W], `frame(i)` one at a time."""
+        first = frame(0)
+        factor = min(math.ceil(max(first.shape) / LONGEST), *first.shape)
+        binned = np.stack([_binned(first if i == 0 else frame(i), factor) for i in range(count)])
+        return cls(binned, factor, (first.shape[0], first.shape[1]))
+
+    def air(self) -> float | None:
+        """The median level of air in the frames that show some; None where none does."""
+        frames = torch.from_numpy(self.frames)
+        air = find_air(frames)
+        levels = [float(frame[there].mean()) for frame, there in zip(frames, air) if has_air(there[None]).item()]
+        return float(np.median(levels)) if levels else None
+
+    def has_bright_border(self) -> bool:
+        """Whether the left or the right border is brighter than the frame, as where matter in the middle absorbs."""
+        width = max(1, round(BESIDE * self.frames.shape[2]))
+        sides = np.stack([self.frames[:, :, :width], self.frames[:, :, -width:]]).mean(axis=(2, 3)).max(axis=0)
+        return bool(np.median(sides / self.frames.mean(axis=(1, 2))) > 1 + BRIGHTER)
 
 
 @dataclass(frozen=True)
@@ -29,19 +63,15 @@ class AirLight:
     doubt: DividedLight
 
     @classmethod
-    def of(
-        cls, frame: Callable[[int], np.ndarray], count: int, air: Sequence[Box] = (), asked: bool = False
-    ) -> AirLight | None:
-        """Of `count` relative frames [H, W], `frame(i)` one at a time; None where none of them has air, or all is even.
+    def of(cls, look: Look, air: Sequence[Box] = (), asked: bool = False) -> AirLight | None:
+        """Of the projections in `look`; None where none of them has air, or all is even.
 
         air: boxes of it, or nothing to find it; asked: whether even light counts, too. Errors: `InputError` for boxes
         outside the frames.
         """
-        first = frame(0)
-        factor = min(math.ceil(max(first.shape) / LONGEST), *first.shape)
-        binned = np.stack([_binned(first if i == 0 else frame(i), factor) for i in range(count)])
-        options = LightOptions("smooth" if asked else "auto", tuple(_shrunk(box, factor, first.shape) for box in air))
-        frames = torch.from_numpy(binned)
+        boxes = tuple(_shrunk(box, look.factor, look.shape) for box in air)
+        options = LightOptions("smooth" if asked else "auto", boxes)
+        frames = torch.from_numpy(look.frames)
         usable = has_air(options.air_of(frames))
         if not bool(usable.any()):
             return None
@@ -54,8 +84,8 @@ class AirLight:
         known, count = found.background, len(coefficients)
         variances = known.variances.expand(count, -1)
         left = torch.where(usable[:, None, None], known.covariances, torch.diag_embed(variances))
-        powers = known.powers.numpy() * factor**2
-        doubt = DividedLight(left.numpy(), variances.numpy(), powers, (first.shape[0], first.shape[1]))
+        powers = known.powers.numpy() * look.factor**2
+        doubt = DividedLight(left.numpy(), variances.numpy(), powers, look.shape)
         return cls(coefficients.numpy(), int((~usable).sum()), doubt)
 
     def factor(self, number: int, shape: tuple[int, int]) -> np.ndarray:

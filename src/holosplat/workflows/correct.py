@@ -11,7 +11,7 @@ import numpy as np
 from ..checks import require
 from ..frames import Frames
 from ..io.atomic import require_apart, require_writable
-from ..io.formats import loader_of, open_raw, vouch
+from ..io.formats import loader_of, open_raw
 from ..io.nxtomo import scan_writer
 from ..io.raw_file import DARK, FLAT, PROJECTION, ScanFile
 from ..io.reading import Reading
@@ -25,19 +25,20 @@ from ..preprocess import (
     fixed_pattern,
     relative_intensity,
 )
+from ..preprocess.pixels import MOST_DEFECTS
 from ..progress import Advance
 from ..ranges import ranged
 from ..scan import Scan
-from .air_light import AirLight
+from .air_light import AirLight, Look
 
-MOST_DEFECTS = 0.2
-"""A larger share of defective pixels is no camera to reconstruct from."""
 RIM = 0.05
 """Width of a frame's rim, as a part of its shorter side, that `normalise = "rim"` takes to be free of the object."""
 
 Method = Literal["dynamic", "plain"]
 Normalise = Literal["air", "mean", "rim", "none"]
 
+LOOKED_AT = 16
+"""Frames that are looked at for the level of their air, at most."""
 ENOUGH_FLATS = 3
 """Flats that the dynamic method needs."""
 
@@ -52,7 +53,8 @@ class CorrectionOptions:
     dynamic with three flats or more)."""
     normalise: Normalise | None = None
     """What is brought to 1 in each frame: its air, by a smooth factor, its mean, its rim, or nothing (default: the air
-    where it is uneven beyond its noise, else dynamic the mean, plain nothing)."""
+    where it is uneven beyond its noise; the mean where flats change, and neither air nor a border brighter than the
+    rest is seen; else nothing)."""
     air: tuple[Box, ...] = ()
     """Boxes without matter in any frame: first row, end row, first column, end column (default: found)."""
     rings: int | None = None
@@ -80,7 +82,8 @@ class CorrectionOptions:
 class Corrected:
     """What was corrected: frames; defective pixels that the file marks, and that were found beside; components used;
     the method; flats in the file; what was normalised; projections without air, which took the others' mean light; the
-    pattern (rms) of what all frames had in common, if that was taken out."""
+    pattern (rms) of what all frames had in common, if that was taken out; least and greatest number that a frame was
+    divided by; level of the air in what was written, None where none was found."""
 
     frames: int
     marked: int
@@ -91,6 +94,8 @@ class Corrected:
     normalised: Normalise = "none"
     airless: int = 0
     rings: float = 0.0
+    divided: tuple[float, float] = (1.0, 1.0)
+    air: float | None = None
 
 
 class FlatFielding:
@@ -172,7 +177,7 @@ def correct(
     """
     require_writable(out)
     require_apart(out, source)
-    vouch(source, reading)
+    reading.told.vouch(Path(source))
     with open_raw(source, reading.told.given(loader_of(source).takes)) as file:
         fielding = FlatFielding(file, options, on_progress)
         count = 0 if fielding.eigen is None else len(fielding.eigen)
@@ -190,31 +195,39 @@ def correct(
         whole = Scan.of(frames, file.exposures, file.is_test, file.provenance() | described, doubt)
         scan = reading.applied(whole)
         with scan_writer(out, scan.exposures, scan.is_test, scan.provenance, light=scan.light) as add:
+            shown = set(np.linspace(0, len(scan) - 1, LOOKED_AT).round().astype(int).tolist())
+            written = []
             for i in range(len(scan)):
-                add(scan[[i]].frames[0])
+                add(frame := scan[[i]].frames[0])
+                written += [frame] if i in shown else []
                 on_progress(0.5 + 0.5 * (i + 1) / len(scan))
     airless = normal.light.airless if normal.light else 0
     found = (marked, fielding.found, count, fielding.method, fielding.flats, normal.what, airless)
-    return Corrected(len(scan), *found, float(normal.pattern.std()))
+    air = Look.at(lambda i: written[i].astype(np.float64), len(written)).air()
+    return Corrected(len(scan), *found, float(normal.pattern.std()), normal.divided, air)
 
 
 class Normalisation:
     """What is brought to 1 in each frame, by `options`; what: its name; light: by air, where that is it; pattern: the
-    faults [H, W] of all frames that are divided out, too."""
+    faults [H, W] of all frames that are divided out, too; divided: least and greatest number of what frames were."""
 
     def __init__(self, fielding: FlatFielding, options: CorrectionOptions) -> None:
         """Looks at all projections once where air may be found; `InputError` where it is asked for in vain."""
         self._path, wanted = fielding.file.path, options.normalise
         self.light: AirLight | None = None
-        asked = wanted == "air" or bool(options.air)
+        self.divided = (np.inf, 0.0)
+        asked, look = wanted == "air" or bool(options.air), None
         if asked or wanted is None:
             numbers = fielding.file.numbers(PROJECTION)
-            self.light = AirLight.of(lambda i: fielding(int(numbers[i])), len(numbers), options.air, asked)
+            look = Look.at(lambda i: fielding(int(numbers[i])), len(numbers))
+            self.light = AirLight.of(look, options.air, asked)
         require(
             not asked or self.light is not None,
             f"{self._path}: no projection shows air; give boxes of it by --air, or take --normalise mean.",
         )
-        otherwise: Normalise = "mean" if fielding.method == "dynamic" else "none"
+        changes = fielding.eigen is not None and len(fielding.eigen) > 0
+        matter = look is not None and (look.air() is not None or look.has_bright_border())
+        otherwise: Normalise = "mean" if changes and not matter else "none"
         self.what: Normalise = "air" if self.light else wanted or otherwise
         self.pattern = np.ones((1, 1))
         if options.rings is not None:
@@ -229,16 +242,21 @@ class Normalisation:
 
     def _evened(self, number: int, frame: np.ndarray) -> np.ndarray:
         if self.light is not None:
-            return frame / self.light.factor(number, (frame.shape[0], frame.shape[1]))
+            factor = self.light.factor(number, (frame.shape[0], frame.shape[1]))
+            return self._divided(frame, factor, float(factor.mean()))
         if self.what == "none":
-            return frame
+            return self._divided(frame, np.ones(()), 1.0)
         counted = np.ones(frame.shape, dtype=bool)
         if self.what == "rim":
             width = max(1, round(RIM * min(frame.shape)))
             counted[width:-width, width:-width] = False
         level = float(frame[counted].mean())
         require(level > 0, f"{self._path} has a projection whose rim is dark; normalise by its mean.")
-        return frame / level
+        return self._divided(frame, np.array(level), level)
+
+    def _divided(self, frame: np.ndarray, by: np.ndarray, level: float) -> np.ndarray:
+        self.divided = (min(self.divided[0], level), max(self.divided[1], level))
+        return frame / by
 
 
 class _Corrected(Frames):

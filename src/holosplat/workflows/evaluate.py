@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 from ..backends import resolve
 from ..checks import require
 from ..fit.residuals import Prediction
+from ..geometry import Grid, Views
 from ..matter import DeltaBeta
 from ..metrics import ImageScores, VolumeScores, image_scores, intensity_range, volume_scores
 from ..metrics.images import json_number
@@ -23,6 +25,8 @@ from .reconstruct import Reconstruction
 from .run_light import light_of
 from .verdict import Verdict, judge
 
+OTHER_FIELD = 8.0
+"""A truth so many times larger or smaller than the frames is of another field."""
 MOST_VOXELS = 8_000_000
 """Voxels of the volume on which the material is read off, at most."""
 
@@ -159,6 +163,25 @@ def evaluate(reconstruction: Reconstruction, scan: Scan | None, truth: Volume | 
     material = replace(material_found(found), delta_told=reconstruction.delta_told)
     said = held_out_verdict(reconstruction, scan, lit) if scan is not None else None
     return Evaluation(scores.test, scores.train, scores.volume, scores.predicted, material, said, lit)
+
+
+def require_same_field(grid: Grid, views: Views, path: Path) -> None:
+    """`InputError` if a volume at `path` on `grid` is too large or too small for the truth of frames of `views`."""
+    field, edges = max(views.width, views.height), [n * size for n, size in zip(grid.shape[::-1], grid.voxel_size)]
+    require(
+        field / OTHER_FIELD < max(edges) < field * OTHER_FIELD,
+        f"{path} must be the truth of the scan, whose frames are {1e6 * field:.4g} µm wide, but it is "
+        f"{1e6 * max(edges):.4g} µm; name the truth of this scan.",
+    )
+
+
+def require_overlap(scores: VolumeScores, path: Path) -> None:
+    """`InputError` if a run has no matter where the truth at `path` has some, and is no nearer to it than nothing."""
+    require(
+        scores.dice > 0 or scores.relative_error_delta < 1,
+        f"{path} has no matter where the run has some: it is of another scan, or the run found nothing; name the truth "
+        "of this scan.",
+    )
 
 
 def held_out_verdict(reconstruction: Reconstruction, scan: Scan, lit: Light | None = None) -> Verdict | None:

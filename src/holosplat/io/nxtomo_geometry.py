@@ -1,0 +1,114 @@
+"""What NXtomo files of the ESRF's library say of the geometry beside ours: axis, source and transformations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import h5py
+import numpy as np
+
+from ..checks import InputError, in_range, note, require
+from ..geometry import Views
+from ..units import ANGLE_UNITS, LENGTH_UNITS, unit_factor
+from .hdf5 import Fields, attribute_text
+
+FLIPS = ("instrument/detector/y_flipped", "instrument/detector/x_flipped")
+SHIFT = "instrument/detector/shift"
+AXIS = ("instrument/detector/x_rotation_axis_pixel_position", "instrument/detector/estimated_cor_from_motor")
+"""Columns from the middle of a frame, as it is stored, to the axis."""
+SOURCES = ("instrument/source/distance", "sample/source_distance", "source/distance")
+TRANSFORMATIONS = "instrument/detector/transformations"
+COORDINATES = "NeXus_Coordinate_System"
+FARTHEST_M = 1e4
+PARALLEL = 1.001
+"""A smaller magnification is that of a parallel beam."""
+WIDEST = 0.02
+"""Tangent of half the angle of a cone of rays, at most, that is taken for parallel at the object."""
+
+
+def flips_of(fields: Fields) -> tuple[bool, bool]:
+    """Whether the stored frames are upside down, and mirrored: by their flags, or by half turns of the detector.
+
+    A half turn about the vertical mirrors, one about the horizontal turns upside down, one about the beam does both;
+    the vertical is z, and the beam x, unless the file has McStas' axes. Errors: `InputError` for other turns.
+    """
+    flags = [bool(fields.numbers(name).any()) if fields.find(name) else False for name in FLIPS]
+    group = fields.group.get(TRANSFORMATIONS)
+    turns = np.zeros(3, dtype=bool)
+    for name, item in group.items() if isinstance(group, h5py.Group) else ():
+        if not isinstance(item, h5py.Dataset) or attribute_text(item.attrs.get("transformation_type")) != "rotation":
+            continue
+        label, unit = fields.label(f"{TRANSFORMATIONS}/{name}"), attribute_text(item.attrs.get("units")) or "deg"
+        angle = np.rad2deg(np.asarray(item, dtype=np.float64).reshape(-1) * unit_factor(label, unit, ANGLE_UNITS))
+        axis = np.abs(np.asarray(item.attrs.get("vector", np.zeros(3)), dtype=np.float64).reshape(-1)) > 0.5
+        half = np.isclose(angle % 360, 180)
+        known = bool(np.isclose(angle % 180, 0).all() and (half.all() or not half.any())) and axis.sum() == 1
+        require(
+            known and len(axis) == 3,
+            f"{label} turns the detector by {angle[0]:.4g} degrees, but only half turns about its axes are read; turn "
+            "the frames upright, and take it out.",
+        )
+        turns ^= axis & bool(half.all())
+    mcstas = (attribute_text(fields.group.attrs.get(COORDINATES)) or "").lower() == "mcstas"
+    across, up, along = turns if mcstas else turns[[1, 2, 0]]
+    return bool(flags[0] ^ across ^ along), bool(flags[1] ^ up ^ along)
+
+
+def about_axis(fields: Fields, views: Views) -> Views:
+    """The views about the axis that the file says, if it does. Errors: `InputError` for one beyond the frames."""
+    name = fields.find(*AXIS)
+    if name is None or not np.isfinite(values := fields.numbers(name)).all() or not values.any():
+        return views
+    require(
+        values.size == 1 or bool(np.ptp(values) == 0),
+        f"{fields.label(name)} must be one number, but it differs from frame to frame; write one, or {SHIFT} of each.",
+    )
+    width, mirrored = views.shape[1], flips_of(fields)[1]
+    off = float(values.reshape(-1)[0]) * (-1 if mirrored else 1)
+    column = 0.5 * (width - 1) + off
+    require(
+        -0.5 <= column <= width - 0.5,
+        f"{fields.label(name)} must count columns from the middle of {width}, within {width / 2:g} of it, but it is "
+        f"{values.reshape(-1)[0]:g}; correct it, or take it out and say where the axis is by --axis-column.",
+    )
+    note(f"{fields.label(name)}: the axis is at column {column:g} of {width}; --axis-column says otherwise")
+    return views.about_column(column)
+
+
+def magnification(fields: Fields, per_frame: Callable[[str], np.ndarray], detector: str) -> np.ndarray | float:
+    """(R + z) / R of a source R before the sample, and the detector z behind it, [n] or one number.
+
+    Errors: `InputError` for a cone of rays too wide for parallel ones, and for a distance that cannot be.
+    """
+    name = fields.find(*SOURCES)
+    if name is None or not fields.find(detector):
+        return 1.0
+    source = np.abs(fields.numbers(name).reshape(-1)) * fields.unit(name, LENGTH_UNITS, "m")
+    if not (np.isfinite(source).all() and source.any()):
+        return 1.0
+    before = in_range(fields.label(name), float(source[0]), 1e-6, FARTHEST_M, unit="metres")
+    found = (before + np.abs(per_frame(detector)) * fields.unit(detector, LENGTH_UNITS, "m")) / before
+    if found.max() < PARALLEL:
+        return 1.0
+    _require_narrow(fields, name, float(found.min()), before)
+    note(
+        f"{fields.label(name)}: the source is {before:.4g} m before the sample; pixels and distance are divided by the "
+        f"magnification of {found[0]:.4g} where the file has those at the detector; --pixel-size and --distance say "
+        "otherwise"
+    )
+    return found
+
+
+def _require_narrow(fields: Fields, name: str, magnified: float, before: float) -> None:
+    """`InputError` for a cone of rays that is no parallel beam at the object."""
+    data, size = fields.find("instrument/detector/data", "data/data"), fields.find("instrument/detector/x_pixel_size")
+    if data is None or size is None:
+        return
+    pixel = float(fields.numbers(size).reshape(-1)[0]) * fields.unit(size, LENGTH_UNITS, "m")
+    tangent = 0.5 * max(fields.dataset(data).shape[1:]) * pixel / (before * magnified)
+    if tangent > WIDEST:
+        raise InputError(
+            f"{fields.label(name)}: a source {before:.4g} m before the sample makes a cone of rays, tangent of half "
+            f"its angle {tangent:.2g}, but beams are parallel here (up to {WIDEST}); crop the frames, or leave it out "
+            "if the beam is parallel."
+        )

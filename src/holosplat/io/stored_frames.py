@@ -1,0 +1,167 @@
+"""Projections of raw files, flat-field corrected and mended when they are read."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from ..checks import InputError, note, require, warn
+from ..frames import Frames
+from ..preprocess.flat_field import relative_intensity, unlit
+from ..preprocess.pixels import MOST_DEFECTS, PixelRepair
+from ..scan import Scan
+from .hdf5 import open_hdf5
+from .kept_frames import with_fields
+from .raw_file import DARK, FLAT, PROJECTION, Opens, ScanFile, Stack, rows_of
+
+FILLED = "are filled from their neighbours, and count as measured"
+"""What is said of pixels that have no value of their own."""
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where a dataset is: in the file that was opened, or in one to which it links, where that is allowed."""
+
+    file: Path
+    name: str
+
+    @classmethod
+    def of(cls, dataset: h5py.Dataset) -> _Place:
+        path = Path(dataset.file.filename).resolve()
+        return cls(path, str(dataset.name))
+
+
+@dataclass(frozen=True)
+class StoredFrames(Frames):
+    """The projections of a file, flat-field corrected when they are read.
+
+    stacks: of the file; a dataset of HDF5 by its place.
+    numbers: [N] of the projections among the file's frames.
+    dark, light: [H, W] mean dark field and mean flat field less that, light None where the file is corrected already.
+    mask: [H, W] bool of the pixels that are marked as defective. These, and values that are not finite, are filled from
+    their neighbours, and their number is said.
+    stamp: of the file when it was opened.
+
+    The file is opened anew for each reading. Errors: `InputError` for a file that is gone or changed, or of which more
+    than a part `MOST_DEFECTS` of a frame is to be filled.
+    """
+
+    path: Path
+    label: str
+    stacks: tuple[Stack | _Place, ...]
+    flips: tuple[bool, bool]
+    numbers: np.ndarray
+    dark: np.ndarray
+    light: np.ndarray | None
+    mask: np.ndarray
+    shape: tuple[int, int, int]
+    stamp: tuple[int, ...]
+
+    @classmethod
+    def of(cls, file: ScanFile) -> StoredFrames:
+        """Those of an open file, whose dark and flat frames are read for their means."""
+        numbers, path = file.numbers(PROJECTION), file.path.resolve()
+        dark, light = _fields_of_light(file)
+        stacks = tuple(_Place.of(stack) if isinstance(stack, h5py.Dataset) else stack for stack in file.stacks)
+        whole, mask = (len(numbers), *file.exposures.views.shape), file.mask()
+        if mask.any():
+            note(f"{file.label}: the {int(mask.sum())} pixels that the file marks as defective {FILLED}")
+        return cls(path, file.label, stacks, file.flips, numbers, dark, light, mask, whole, _stamp(path))
+
+    def read(self, numbers: np.ndarray) -> np.ndarray:
+        """See `Frames.read`."""
+        gone = f"{self.path} must be the file that was opened, but it is gone; put it back, or open another."
+        require(self.path.exists(), gone)
+        changed = f"{self.path} must be the file that was opened, but it has changed since; open it again."
+        require(_stamp(self.path) == self.stamp, changed)
+        frames = np.empty((len(numbers), *self.shape[1:]), dtype=np.float32)
+        files = {stack.file for stack in self.stacks if isinstance(stack, _Place)}
+        with ExitStack() as opened:
+            file = {path: opened.enter_context(open_hdf5(path)) for path in files}
+            stacks: list[Any] = [
+                file[stack.file][stack.name] if isinstance(stack, _Place) else stack for stack in self.stacks
+            ]
+            for i, n in enumerate(self.numbers[numbers]):  # one by one: raw frames are wider, and there may be many
+                raw = rows_of(stacks, int(n), slice(0, self.shape[1]), self.flips)
+                frames[i] = raw if self.light is None else relative_intensity(raw, self.dark, self.light)
+        return filled(self.label, frames, ~np.isfinite(frames), self.mask)
+
+
+def filled(label: str, frames: np.ndarray, bad: np.ndarray, mask: np.ndarray) -> np.ndarray:
+    """Frames [K, H, W] whose `bad` pixels [K, H, W], and those of the `mask` [H, W], are filled from their neighbours.
+
+    The number of bad ones is said. Errors: `InputError` for a frame with more than a part `MOST_DEFECTS` of them.
+    """
+    found = bad & ~mask
+    if found.any():
+        worst, count = float(found.mean(axis=(1, 2)).max()), int(found.any(axis=(1, 2)).sum())
+        require(
+            worst <= MOST_DEFECTS,
+            f"{label} must hold relative intensities, finite and above 0, but {worst:.0%} of a frame are not; correct "
+            "the frames by their flats and darks, or crop them.",
+        )
+        which = f"{int(found.sum())} pixels in {count} of {len(frames)} frames"
+        warn(f"{label}: {which} are not above 0, or no numbers; they {FILLED}")
+    whole = PixelRepair(mask)
+    for i, each in enumerate(found):
+        if each.any() or mask.any():
+            frames[i] = (PixelRepair(each | mask) if each.any() else whole)(frames[i])
+    return frames
+
+
+class Mended(Frames):
+    """Frames whose pixels that are not above 0, which no light can be, are filled from their neighbours."""
+
+    def __init__(self, frames: np.ndarray | Frames) -> None:
+        self._frames = frames
+        self.shape = (frames.shape[0], frames.shape[1], frames.shape[2])
+
+    def read(self, numbers: np.ndarray) -> np.ndarray:
+        """See `Frames.read`."""
+        frames = np.array(self._frames[numbers])
+        return filled("the scan", frames, frames <= 0, np.zeros(self.shape[1:], dtype=bool))
+
+
+def reader(opens: Opens) -> Callable[[Path, Mapping[str, Any]], Scan]:
+    """What reads the projections of a file that `opens` opens, flat-field corrected, and how they were taken.
+
+    Frames marked flat and dark correct the others: (frame - mean dark) / (mean flat - mean dark); frames marked
+    invalid are dropped. The projections are read when they are asked for (`StoredFrames`).
+    """
+
+    def read(path: Path, given: Mapping[str, Any]) -> Scan:
+        with opens(path, given) as opened:
+            file = with_fields(opened, given)
+            return Scan.of(StoredFrames.of(file), file.exposures, file.is_test, file.provenance(), file.divided)
+
+    return read
+
+
+def _stamp(path: Path) -> tuple[int, ...]:
+    """What changes when a file is written anew."""
+    found = path.stat()
+    return found.st_mtime_ns, found.st_size, found.st_ino
+
+
+def _fields_of_light(file: ScanFile) -> tuple[np.ndarray, np.ndarray | None]:
+    """The mean dark field [H, W], and the mean flat field less that, None where the file has no flats."""
+    flats, darks = file.numbers(FLAT), file.numbers(DARK)
+    if len(darks) and not len(flats):
+        raise InputError(f"{file.kinds_label} must mark flats (1) beside the dark ones (2), but it marks none.")
+    dark = file.mean(DARK)
+    if not len(flats):
+        return dark, None
+    light = file.mean(FLAT) - dark
+    bad = int(unlit(light).sum())
+    require(
+        bad == 0,
+        f"{file.label} must have flat frames brighter than dark ones everywhere, but in {bad} of {light.size} pixels "
+        "they are not; `holosplat correct` repairs such pixels.",
+    )
+    return dark, light

@@ -1,0 +1,241 @@
+"""Odd files that real users have: read right, or refused by name, and never silently taken for what they are not."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import tifffile
+
+from helpers.odd_files import ANGLES, FRAMES, SHAPE, N, a_scan, images, numbered, said
+from holosplat.checks import InputError, MissingError
+from holosplat.geometry import rotation_y
+from holosplat.io.angles import read_angles
+from holosplat.io.file_order import in_order
+from holosplat.io.formats import read_as
+from holosplat.io.hdf5_filters import filters_missing_in
+from holosplat.io.nxtomo import read_scan, write_scan
+from holosplat.io.reading import Reading, Told
+from holosplat.io.stacks import stack_of
+
+# --- the order of frames ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["a_1.tif", "a_2.tif", "a_10.tif"],
+        ["p_-10.tif", "p_-2.tif", "p_0.tif", "p_5.tif"],
+        ["p-10.tif", "p-1.tif", "p0.tif", "p1.tif"],
+        ["scan-001.tif", "scan-002.tif", "scan-010.tif"],
+        ["s_10.5_0.tif", "s_3.25_1.tif", "s_100.125_2.tif"],
+        ["s_111_0.tif", "s_42_1.tif", "s_153_2.tif"],
+        ["s_111.25_0.tif", "s_42.5_2.tif", "s_153.75_7.tif"],
+        ["v1.2.tif", "v1.9.tif", "v1.10.tif"],
+        ["r1_c2.tif", "r1_c10.tif", "r2_c1.tif", "r2_c2.tif"],
+        ["x_1_20240101T100000.tif", "x_2_20240101T100009.tif"],
+    ],
+)
+def test_frames_follow_the_running_number(names):
+    files = [Path("folder") / name for name in names]
+    assert in_order(files[::-1]) == files
+
+
+def test_two_numbers_that_count_differently_are_refused():
+    with pytest.raises(InputError, match=r"several numbers in s_0_0\.tif and the others run differently"):
+        in_order([Path("folder") / name for name in ("s_0_0.tif", "s_2_1.tif", "s_1_2.tif")])
+
+
+def test_a_golden_scan_gets_each_frame_its_own_angle(tmp_path, caplog):
+    caplog.set_level("INFO")
+    angles = np.arange(N) * 111.246 % 180
+    names = [f"GR_{angle:g}_{n:03d}.tif" for n, angle in enumerate(angles)]
+    images(tmp_path / "scan", names, FRAMES)
+    (tmp_path / "scan" / "Angles.csv").write_text("\n".join(map(str, angles)))
+    scan = read_as(tmp_path / "scan", said())
+    np.testing.assert_array_equal(scan.frames, FRAMES)
+    assert f"first {names[0]} at 0°, last {names[-1]} at {angles[-1]:.6g}°" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "names", [("projections", "flats", "darks"), ("Proj", "FLAT_before", "Dark"), ("Tomo", "White", "DARKS")]
+)
+def test_a_tree_of_folders_with_angles_is_a_scan(tmp_path, names):
+    projections, flats, darks = (tmp_path / "scan" / name for name in names)
+    images(projections, numbered(N), FRAMES)
+    images(flats, numbered(2), np.full((2, *SHAPE), 5010, np.uint16))
+    images(darks, numbered(2), np.full((2, *SHAPE), 10, np.uint16))
+    (tmp_path / "scan" / "angles.txt").write_text("\n".join(map(str, ANGLES)))
+    scan = read_as(tmp_path / "scan", said())
+    np.testing.assert_allclose(scan.frames, (FRAMES - 10.0) / 5000, rtol=1e-6)
+    np.testing.assert_allclose(scan.views.rotations, rotation_y(ANGLES), atol=1e-12)
+
+
+def test_two_folders_of_projections_are_refused(tmp_path):
+    for name in ("one", "two", "flats"):
+        images(tmp_path / name, numbered(2), FRAMES)
+    with pytest.raises(InputError, match="several folders of images: one, two"):
+        read_as(tmp_path, said())
+
+
+# --- angles -------------------------------------------------------------------------------------------------------
+
+PLAIN = [f"{angle:g}" for angle in ANGLES]
+LOG = "TIME STAMP,IMAGE TYPE,COUNTER\n" + "\n".join(
+    ["Sun Feb 10 2019,Flat,0,counts: 5", *(f"Sun Feb 10 2019,Projection,{n},angle: {a}" for n, a in enumerate(PLAIN))]
+)
+READ = {
+    "a byte order mark": "\ufeff" + "\n".join(PLAIN),
+    "a header": "angle (deg)\n" + "\n".join(PLAIN),
+    "a table": "index,angle\n" + "\n".join(f"{n},{angle}" for n, angle in enumerate(PLAIN)),
+    "a table with spaces": "n theta\n" + "\n".join(f"{n} {angle}" for n, angle in enumerate(PLAIN)),
+    "a log": LOG,
+    "a list": "[" + ", ".join(PLAIN) + "]",
+    "semicolons": ";\n".join(PLAIN),
+    "radians that say so": "# rad\n" + "\n".join(f"{angle:.8f}" for angle in np.deg2rad(ANGLES)),
+}
+
+
+@pytest.mark.parametrize("kind", READ)
+def test_angles_are_read(tmp_path, kind):
+    (tmp_path / "angles.txt").write_text(READ[kind], encoding="utf-8")
+    np.testing.assert_allclose(read_angles(tmp_path / "angles.txt"), ANGLES, atol=1e-5)
+
+
+def test_angles_in_utf16_are_read(tmp_path):
+    (tmp_path / "angles.txt").write_text("\n".join(PLAIN), encoding="utf-16")
+    np.testing.assert_allclose(read_angles(tmp_path / "angles.txt"), ANGLES)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("\n".join(f"{angle:.6f}" for angle in np.deg2rad(ANGLES)), "look like radians"),
+        ("\n".join(angle.replace(".", ",") for angle in ("0.0", "22.5")), "with a point before the decimals"),
+        ("\n".join(f"{n} {angle}" for n, angle in enumerate(PLAIN)), "a line holds 2 numbers"),
+    ],
+)
+def test_angles_that_may_mean_something_else_are_refused(tmp_path, text, words):
+    (tmp_path / "angles.txt").write_text(text)
+    with pytest.raises(InputError, match=words):
+        read_angles(tmp_path / "angles.txt")
+
+
+@pytest.mark.parametrize(
+    ("angles", "axis", "words"),
+    [
+        (np.zeros(N), None, "all 8 frames look from one side"),
+        (np.deg2rad(ANGLES), None, "span 2.749 degrees only"),
+        (2 * ANGLES, 3.5, "axis is at column 3.5 of 24.*matter beyond it is cut off"),
+        (ANGLES, None, ""),
+        (2 * ANGLES, 11.0, ""),
+    ],
+)
+def test_views_that_can_hardly_be_meant_are_warned_of(tmp_path, caplog, angles, axis, words):
+    write_scan(tmp_path / "scan.nxs", a_scan(angles))
+    read_as(tmp_path / "scan.nxs", Reading(Told(axis_column=axis)))
+    assert bool(caplog.records) == bool(words)
+    assert re.search(words, caplog.text)
+
+
+# --- TIFF ---------------------------------------------------------------------------------------------------------
+
+
+def test_all_planes_behind_one_page_are_read(tmp_path):
+    tifffile.imwrite(tmp_path / "all.tif", FRAMES, imagej=True)
+    content = (tmp_path / "all.tif").read_bytes()
+    with tifffile.TiffFile(tmp_path / "all.tif") as opened:
+        assert opened.is_imagej
+        first, count = opened.pages[0], len(opened.pages)
+        place = first.offset + 2 + 12 * len(first.tags)
+    if count > 1:  # large stacks of ImageJ have one page: cut the chain there
+        content = content[:place] + b"\0\0\0\0" + content[place + 4 :]
+        (tmp_path / "all.tif").write_bytes(content)
+    stack = stack_of(tmp_path / "all.tif")
+    assert stack.shape == (N, *SHAPE)
+    np.testing.assert_array_equal([stack[n, slice(0, SHAPE[0])] for n in range(N)], FRAMES)
+
+
+TURNED = {
+    1: lambda image: image,
+    2: lambda image: image[:, ::-1],
+    3: lambda image: image[::-1, ::-1],
+    4: lambda image: image[::-1],
+    5: lambda image: image.T,
+    6: lambda image: np.rot90(image, 1),
+    7: lambda image: image[::-1, ::-1].T,
+    8: lambda image: np.rot90(image, -1),
+}
+"""How an image that is seen upright is stored, by its orientation (TIFF 6.0)."""
+
+
+@pytest.mark.parametrize("orientation", TURNED)
+def test_images_are_turned_upright(tmp_path, orientation):
+    stored = np.ascontiguousarray(TURNED[orientation](FRAMES[0]))
+    tifffile.imwrite(tmp_path / "a.tif", stored, extratags=[(274, "H", 1, orientation, True)])
+    np.testing.assert_array_equal(stack_of(tmp_path / "a.tif")[0, slice(0, 99)], FRAMES[0])
+
+
+def test_white_that_is_zero_becomes_the_greatest_number(tmp_path, caplog):
+    caplog.set_level("INFO")
+    tifffile.imwrite(tmp_path / "a.tif", FRAMES[0], photometric="miniswhite")
+    np.testing.assert_array_equal(stack_of(tmp_path / "a.tif")[0, slice(0, 99)], 65535 - FRAMES[0])
+    assert "have 0 as white" in caplog.text
+    tifffile.imwrite(tmp_path / "b.tif", FRAMES[0].astype(np.float32), photometric="miniswhite")
+    with pytest.raises(InputError, match="0 is white, which has no meaning for float32"):
+        stack_of(tmp_path / "b.tif")
+
+
+def test_the_package_for_compressed_images_is_named(tmp_path, monkeypatch):
+    tifffile.imwrite(tmp_path / "a.tif", FRAMES[0], compression="zlib")
+
+    def missing(*_: object, **__: object) -> None:
+        raise ValueError("<COMPRESSION.LZW: 5> requires the 'imagecodecs' package")
+
+    monkeypatch.setattr(tifffile.TiffPage, "asarray", missing)
+    with pytest.raises(MissingError, match=r"holosplat\[codecs\]"):
+        stack_of(tmp_path / "a.tif")
+
+
+# --- HDF5 ---------------------------------------------------------------------------------------------------------
+
+
+def virtual(path: Path, layout: h5py.VirtualLayout) -> Path:
+    write_scan(path, a_scan())
+    with h5py.File(path, "a") as file:
+        del file["entry/instrument/detector/data"], file["entry/data/data"]
+        file.create_virtual_dataset("entry/instrument/detector/data", layout)
+    return path
+
+
+@pytest.mark.parametrize(("held", "mapped", "empty"), [(N, N, 0), (N, 5, 3), (5, N, 3), (0, N, N)])
+def test_virtual_frames_without_data_are_refused(tmp_path, held, mapped, empty):
+    with h5py.File(tmp_path / "raw.h5", "w") as file:
+        file["data" if held else "other"] = a_scan().frames[: held or N]
+    layout = h5py.VirtualLayout((N, *SHAPE), np.float32)
+    layout[:mapped] = h5py.VirtualSource("raw.h5", "data", (N, *SHAPE))[:mapped]
+    path = virtual(tmp_path / "scan.nxs", layout)
+    told = Told(allow_external=True)
+    if not empty:
+        np.testing.assert_array_equal(read_as(path, Reading(told)).frames, a_scan().frames)
+        return
+    with pytest.raises(InputError, match=f"for {empty} of {N} it has none"):
+        read_as(path, Reading(told))
+    if empty < N:
+        left = read_as(path, Reading(Told(allow_external=True, leave_out="5:8")))
+        np.testing.assert_array_equal(left.frames, a_scan().frames[:5])
+
+
+def test_filters_that_are_plugins_are_named(tmp_path, monkeypatch):
+    path = tmp_path / "scan.nxs"
+    write_scan(path, a_scan())
+    monkeypatch.setitem(sys.modules, "hdf5plugin", None)
+    monkeypatch.setattr("holosplat.io.hdf5_filters.h5z.filter_avail", lambda code: False)
+    assert "fletcher32 (number 3)" in filters_missing_in(path)
+    monkeypatch.setattr(h5py.Dataset, "__getitem__", lambda *_: (_ for _ in ()).throw(OSError("no filter")))
+    with pytest.raises(MissingError, match=r"filters that HDF5 does not have here: fletcher32 .*holosplat\[codecs\]"):
+        _ = read_scan(path).frames
