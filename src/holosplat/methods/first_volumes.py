@@ -22,6 +22,7 @@ from ..optics.noise import noise_levels
 from ..progress import Progress
 from ..representations import VoxelGrid
 from ..scan import Scan
+from ..volume import Object
 from .assumed import assumed_material
 from .cross_validation import predicted_frames
 
@@ -134,6 +135,6 @@ def score_of(measured: Tensor, predicted: Tensor) -> Score:
     return Score.of(measured.double() - predicted.double())
 
 
-def predictions(volume: VoxelGrid, scan: Scan) -> Tensor:
-    """Frames [V, H, W] of a volume in even light."""
-    return predicted_frames(scan.exposures, volume)
+def predictions(found: Object, scan: Scan) -> Tensor:
+    """Frames [V, H, W] of an object in even light."""
+    return predicted_frames(scan.exposures, found)

@@ -16,7 +16,7 @@ from ..tables import to_table
 from .auto import Auto
 from .gaussians import Gaussians
 from .illumination import prepared
-from .levels import CONTINUOUS, NAME, decide_matter
+from .levels import LEVELS, NAME, decide_matter, kind_of
 from .method import Method, Task, solve_stages
 from .uncertain import Determined, Uncertain, determine, likeliest_ratio, placed, told
 
@@ -67,8 +67,8 @@ def settled(
 ) -> Settled:
     """The method to run for `task`, the kind of its matter (`matter`, or what the frames say), and what is `uncertain`.
 
-    Of continuous matter of which nothing is known, δ/β is uncertain, too. Errors: `InputError` for continuous matter of
-    two materials, and those of `determine`.
+    Of continuous matter and of one level δ/β is uncertain, too, where nothing is known. Errors: `InputError` for
+    continuous matter of two materials, and those of `determine`.
     """
     require(
         not (matter == "continuous" and isinstance(task.prior, KnownTwo)),
@@ -81,13 +81,14 @@ def settled(
     if matter:
         decision = Decision(NAME, matter, "told")
     elif getattr(method, "wants_levels", True):
-        decision = decide_matter(task)
+        decision = decide_matter(task, method.kinds if isinstance(method, Auto) else None)
     else:
         decision = Decision(NAME, "levels", "no matter to the method")
-    kind: MatterKind = "continuous" if decision.choice == CONTINUOUS else "levels"
+    kind = kind_of(decision.choice)
     if isinstance(method, Auto):
         method = method.suited(kind)
-    if kind == "continuous" and not task.prior.fixes_ratio:
+    one = kind == "continuous" or (decision.choice == LEVELS[0] and decision.compared)
+    if one and not task.prior.fixes_ratio:
         constants = (*constants, likeliest_ratio(task))
     return Settled(method, kind, decision, constants)
 

@@ -8,7 +8,6 @@ from typing import Any
 
 from ..inference import Decision
 from ..matter import MatterKind
-from ..methods.auto import VolumeWhereUnexplained
 from ..units import in_percent
 
 
@@ -49,6 +48,4 @@ class Choice:
         if self.kept and len(self.judged) > 1:
             shares = ", ".join(f"{name} {in_percent(share)}" for name, share in self.judged.items())
             lines.append(f"kept: {self.kept} (matter that training frames leave unexplained: {shares})")
-        if self.matter == "levels" and self.kept == VolumeWhereUnexplained.name and "fit" in self.judged:
-            lines.append("bodies of one level explain these frames badly: there may be several levels, or none")
         return lines
