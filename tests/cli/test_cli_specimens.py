@@ -106,10 +106,10 @@ def test_light_is_in_the_frames_and_in_the_file(tmp_path):
         (["--specimen", "tissue", "--light-drift-px", 3], "light_drift_px moves the pattern"),
         (["a.vtk", "--voxel-size", "1e-6"], "of TIFF images, not of meshes"),
         (["a.vtk", "b.h5"], "meshes or a volume, but there are both"),
-        (["a.tif"], "give --voxel-size"),
+        (["a.tif"], "a.tif"),
         (["a.tif", "--value-delta", "1e-7"], "--value-delta needs --voxel-size"),
         (["a.tif", "--voxel-size", "1e-6", "--value-delta-beta", 100], "--value-delta-beta needs --value-delta"),
-        (["a.h5", "--voxel-size", "1e-6"], "says its voxel size, δ and β itself"),
+        (["a.h5", "--voxel-size", "1e-6"], "are of TIFF images, but a.h5 is none"),
     ],
 )
 def test_requests_that_cannot_be_are_refused(arguments, said, tmp_path):

@@ -113,8 +113,11 @@ def test_nrrd_opens_in_pynrrd_and_vtk(tmp_path):
         assert header["space units"] == ["um"] * 3
         np.testing.assert_allclose(header["space directions"], np.diag([1, 2.5, 3]))
         np.testing.assert_allclose(header["space origin"], [-30, 1, 4])
-    image = by_vtk(vtkNrrdReader(), tmp_path / "v.nrrd")
-    assert image.GetScalarComponentAsDouble(3, 4, 2, 0) == true.delta[2, 4, 3]
+    wide = replace(GRID, shape=(5, 7, 12))  # it takes few columns for components
+    write_volume_file(tmp_path / "w.nrrd", voxels(), wide)
+    image = by_vtk(vtkNrrdReader(), tmp_path / "w.nrrd")
+    assert image.GetScalarComponentAsDouble(2, 4, 3, 0) == voxels().voxelise(wide).delta[3, 4, 2] > 0
+    assert image.GetSpacing() == pytest.approx((1, 2.5, 3))
 
 
 def test_nrrd_that_another_program_packed_is_read(tmp_path):

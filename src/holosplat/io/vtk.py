@@ -40,13 +40,13 @@ SOLIDS = {
 TRIANGLE, STRIP = 5, 6
 FLAT_CELLS = (TRIANGLE, STRIP, 7, 9)
 """VTK's numbers of flat cells whose corners run around the rim or along the strip: triangle to quad."""
-BODY, BODY_NAMES = "body", "names"
-"""Cell and field data of a file of several bodies: the number of each triangle's body, and the names of all."""
+BODY = "body"
+"""Cell data of a file of several bodies: the number of each triangle's body."""
 
 
 def read_meshes(paths: str | Path | Iterable[str | Path], length_unit: str) -> list[TriangleMesh]:
     """One mesh [m] a file, named by its file name, with duplicate vertices merged and their order kept; of a file of
-    `write_vtu`, one a body, named as there.
+    `write_vtu`, one a body, named body000 and so on.
 
     paths: a file, a folder (its .vtk, .vtu, .vtp files, cell2 before cell10), or several of either;
     length_unit: of the files' coordinates ("um", "m", …), which VTK files do not record.
@@ -143,13 +143,11 @@ def _read_file(path: Path, factor: float) -> list[TriangleMesh]:
 
 def _bodies(data: Any, faces: np.ndarray) -> dict[str, np.ndarray]:
     """The triangles of each body of a file of `write_vtu` by its name; empty for other files."""
-    numbers, names = data.GetCellData().GetArray(BODY), data.GetFieldData().GetAbstractArray(BODY_NAMES)
-    if numbers is None or names is None or numbers.GetNumberOfValues() != len(faces):
+    numbers = data.GetCellData().GetArray(BODY)
+    if numbers is None or numbers.GetNumberOfValues() != len(faces):
         return {}
-    of, called = _array(numbers), [str(names.GetVariantValue(k).ToString()) for k in range(names.GetNumberOfValues())]
-    if len(set(called)) != len(called) or not np.array_equal(np.unique(of), np.arange(len(called))):
-        return {}
-    return {name: faces[of == number] for number, name in enumerate(called)}
+    of = _array(numbers)
+    return {f"{BODY}{number:03.0f}": faces[of == number] for number in np.unique(of)}
 
 
 def _used(mesh: TriangleMesh) -> TriangleMesh:

@@ -1,7 +1,7 @@
 """All bodies of one time in one file of VTK's unstructured grids (.vtu): triangles in µm, with data of their bodies.
 
 Cell data: `body`, its number from 0 on; `delta`, `beta` of its matter; `volume_m3`, what it encloses. Field data:
-`length_unit`, and `names` of the bodies.
+`length_unit_m`, a number: some readers take no texts.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from ..matter import Matter
 from ..mesh import TriangleMesh
 from ..units import LENGTH_UNITS
 from .plain_values import LENGTH_UNIT
-from .vtk import BODY, BODY_NAMES, TRIANGLE, save
+from .vtk import BODY, TRIANGLE, save
 
 
 def write_vtu(path: Path, bodies: Sequence[TriangleMesh], matter: Matter) -> None:
     """Write `bodies`, all of `matter`; `read_meshes` takes them apart again."""
     from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
-    from vtkmodules.vtkCommonCore import vtkPoints, vtkStringArray
+    from vtkmodules.vtkCommonCore import vtkPoints
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
@@ -45,10 +45,7 @@ def write_vtu(path: Path, bodies: Sequence[TriangleMesh], matter: Matter) -> Non
         array = numpy_to_vtk(values, deep=True)
         array.SetName(name)
         grid.GetCellData().AddArray(array)
-    for name, texts in (("length_unit", [LENGTH_UNIT]), (BODY_NAMES, [body.name for body in bodies])):
-        array = vtkStringArray()
-        array.SetName(name)
-        for text in texts:
-            array.InsertNextValue(text)
-        grid.GetFieldData().AddArray(array)
+    unit = numpy_to_vtk(np.array([LENGTH_UNITS[LENGTH_UNIT]]), deep=True)
+    unit.SetName("length_unit_m")
+    grid.GetFieldData().AddArray(unit)
     save(path, vtkXMLUnstructuredGridWriter(), grid)
