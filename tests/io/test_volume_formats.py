@@ -246,6 +246,7 @@ def packed(content: bytes) -> bytes:
         ("v.nrrd", lambda c: c.replace(b"type: float", b"type: block"), "lacks or garbles 'block'"),
         ("v.nrrd", lambda c: c.replace(b"(1.0,0.0,0.0)", b"(nan,0.0,0.0)"), "not turned"),
         ("v.nrrd", packed, "unpack to the 560 bytes"),
+        ("v.tif", lambda c: c.replace(b'SizeX="4"', b'SizeX="5"'), "images of the size that it declares"),
         ("v.mrc", many, "as its header declares"),
         ("v.mrc", lambda c: c[:12] + b"\1" + c[13:], "mode 1"),
         ("v.mrc", lambda c: c[:208] + b"none" + c[212:], "must be an MRC2014 file"),

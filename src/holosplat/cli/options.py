@@ -277,9 +277,8 @@ class TruthOptions:
         require(self.truth is not None or not self.truth_frames, "--truth-frames needs --truth.")
         if self.truth is not None:
             volume_format(self.truth, "--truth")
-        for path in (out, self.truth, self.true_exposures):
-            if path is not None:
-                require_writable(path)
+        for path in filter(None, (out, self.truth, self.true_exposures)):
+            require_writable(path)
 
     def volumes(self, times: int) -> list[tuple[Path, int]]:
         """Each volume file to write, and the number of its time, one of `times`."""
@@ -287,11 +286,8 @@ class TruthOptions:
 
         if self.truth is None:
             return []
-        for frame in self.truth_frames:
-            require(
-                0 <= frame < times,
-                f"--truth-frames counts the scan's {times} times from 0 to {times - 1}, but {frame} is asked for.",
-            )
+        for n in self.truth_frames:
+            require(0 <= n < times, f"--truth-frames counts the scan's {times} times from 0, but {n} is asked for.")
         named = [(of_time(self.truth, frame), frame) for frame in self.truth_frames]
         return named or [(self.truth, 0)]
 

@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ..checks import InputError, finite
+from ..checks import InputError, finite, require
 from ..geometry import Grid
 from ..volume import Volume
 from .atomic import atomic_path
@@ -33,7 +33,10 @@ def read_ome_tiff(path: Path) -> Volume:
             f"{path} must be a volume of δ and β, HDF5 or an OME-TIFF of `holosplat export`, but it is another TIFF "
             "file, which does not say what its numbers are; of a specimen, --voxel-size says it."
         )
-    values = finite(f"{path}", np.stack(all_images(path)).astype(np.float32)).reshape(2, *grid.shape)
+    pages = all_images(path)
+    sizes = {page.shape for page in pages}
+    require(sizes == {grid.shape[1:]}, f"{path} must hold images of the size that it declares, but they are {sizes}.")
+    values = finite(f"{path}", np.stack(pages).astype(np.float32)).reshape(2, *grid.shape)
     return Volume(values[0], values[1], grid)
 
 
