@@ -119,6 +119,19 @@ def test_requests_that_cannot_be_are_refused(arguments, said, tmp_path):
     assert not (tmp_path / "s.nxs").exists()
 
 
+@pytest.mark.parametrize("suffix", [".vti", ".mrc"])
+def test_the_truth_in_other_formats_is_imaged_again(suffix, tmp_path):
+    truth, field = tmp_path / f"t{suffix}", ["--detector", 12, 15, "--pixel-size", "2e-6", "--views", 1]
+    ran("simulate", "--specimen", "round-cell", *field, "--out", tmp_path / "s.nxs", "--truth", truth)
+    ran("simulate", truth, *field, "--out", tmp_path / "again.nxs")
+    first, again = (read_scan(tmp_path / name).frames for name in ("s.nxs", "again.nxs"))
+    assert np.corrcoef(first.ravel(), again.ravel())[0, 1] > 0.9
+    outcome = holosplat("simulate", "--specimen", "round-cell", *field, "--out", tmp_path / "x.nxs", "--truth", "t.raw")
+    assert outcome.code == 2
+    assert "truth must be a file whose name ends with .h5" in outcome.said
+    assert not (tmp_path / "x.nxs").exists()
+
+
 @pytest.mark.parametrize(("kind", "goes"), [("stirred-blob", 90), ("collapsing-foam", 0.3)])
 def test_specimens_that_move_give_series(kind, goes, tmp_path):
     out, truth = tmp_path / "series.nxs", tmp_path / "truth.h5"
