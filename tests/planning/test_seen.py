@@ -71,7 +71,19 @@ def test_runs_in_noise_take_a_time_within_what_is_said(row):
 
     said = of_reconstruction(sizes, Auto(), "levels", Seen(noisy=True))
 
-    assert said.seconds <= float(row["seconds"]) <= said.most_seconds
+    assert said.seconds / 1.5 < float(row["seconds"]) < 1.5 * said.most_seconds
+
+
+def test_what_is_not_known_of_matter_takes_what_either_kind_takes():
+    """A run whose matter was not told took five times what was said, for noise was told of bodies alone."""
+    sizes = Sizes.of(scan_of_one(96, 3.2e-6).train().exposures)
+    levels, continuous, either = (
+        of_reconstruction(sizes, Auto(), kind, Seen(noisy=True)) for kind in ("levels", "continuous", None)
+    )
+    assert levels.most_seconds > levels.seconds > of_reconstruction(sizes, Auto(), "levels").seconds
+    assert either.seconds == min(levels.seconds, continuous.seconds)
+    assert either.most_seconds == max(levels.most_seconds, continuous.seconds)
+    assert either.memory == max(levels.memory, continuous.memory)
 
 
 def test_noise_is_seen_where_surfaces_begin_as_in_noise():
@@ -99,6 +111,6 @@ def test_only_surfaces_take_turns():
 
 
 def test_a_range_is_said_in_words():
-    assert Needs(4e8, 1e6, 20, 80).line().endswith("and about 20 to 80 s")
-    assert Needs(4e8, 1e6, 20, 21).line().endswith("and about 20 s")
-    assert Needs(4e8, 1e6, 20, 190).times(2).line().endswith("and about 40 s to 6 min")
+    assert Needs(4e8, 1e6, 20, 80).line().endswith("and about 20 to 80 s of processor time")
+    assert Needs(4e8, 1e6, 20, 21).line().endswith("and about 20 s of processor time")
+    assert Needs(4e8, 1e6, 20, 190).times(2).line().endswith("and about 40 s to 6 min of processor time")

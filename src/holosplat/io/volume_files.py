@@ -81,6 +81,12 @@ def read_truth(path: Path) -> Volume:
     return read_ome_tiff(path) if path.suffix.lower() in TIFF_SUFFIXES else read_volume(path)
 
 
+def ome_grid(path: Path) -> Grid | None:
+    """The grid of an OME-TIFF of δ and β; None for another TIFF file."""
+    with open_tiff(path) as opened:
+        return _grid_of_ome(opened.ome_metadata or "")
+
+
 def read_ome_tiff(path: Path) -> Volume:
     """δ and β of an OME-TIFF as `write_ome_tiff` writes it, about the origin if it does not say where it lies.
 
