@@ -154,7 +154,7 @@ def test_a_loader_is_one_file_and_one_line(tmp_path, monkeypatch):
     monkeypatch.setattr(formats, "LOADERS", (*formats.LOADERS, archive.LOADER))
     found = io.read(path, {"energy_kev": 20.0, "distance": 0.1, "pixel_size": 1e-6})
     np.testing.assert_array_equal(found.frames, scan.frames)
-    with pytest.raises(InputError, match="does not say the photon energy; say it by --energy-kev"):
+    with pytest.raises(InputError, match="energy_kev must be given too"):
         io.read(path)
     with pytest.raises(InputError, match=r"a NumPy archive \(\.npz\) \(archive\)"):
         io.read(tmp_path)

@@ -139,7 +139,7 @@ def test_words_of_sizes_and_times():
         Needs(4e8, 1e3, 600).line()
         == "takes about 400 MB of memory, 1 MB on the disk, and about 10 min of processor time"
     )
-    assert Needs(4e8, 1e6, 7200).line().endswith("about 2.0 h")
+    assert Needs(4e8, 1e6, 7200).line().endswith("about 2.0 h of processor time")
     assert Needs(4e8, 1e6).line().endswith("on the disk")
 
 

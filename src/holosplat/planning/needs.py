@@ -79,7 +79,7 @@ class Costs:
     """The report and the tables of a run."""
     judged: float = 75.0
     """A wave sample of whole frames, by which surfaces that were fitted in windows are judged."""
-    judging: float = 1e-6
+    judging: float = 1.6e-6
     """Seconds that it takes."""
     turns: float = 2.5
     """Times what a fit of Gaussians takes: that, and the turns of surfaces and volume that may follow in noise."""
@@ -147,8 +147,8 @@ def on_larger_pixels(exposures: Exposures, binning: int) -> Exposures:
 
 @dataclass(frozen=True)
 class Needs:
-    """What a job takes at its peak: memory and disk [bytes], time of one free core [s]; most_seconds: the time where
-    what is found in the frames may make it longer (0: it cannot)."""
+    """What a job takes at its peak: memory and disk [bytes], processor time of all cores together [s];
+    most_seconds: the same where what is found in the frames may make it longer (0: it cannot)."""
 
     memory: float
     disk: float
@@ -282,7 +282,7 @@ def _bodies(sizes: Sizes, how: Gaussians, edges: bool) -> tuple[float, float, fl
     fine = _fine(sizes, how.volume)[0]
     memory, numbers = max(begun, waves + Costs.gaussian * count), 14 * count
     seconds, finer = _gaussian_seconds(fine, edges), sizes.waves(1)
-    near = 10 + 5.6e-6 * finer  # surfaces from coarse pixels on, where they show bodies
+    near = 12 + 1.07e-5 * finer  # surfaces from coarse pixels on, where they show bodies
     if how.start != "phase" or how.coarse.columns == 0:
         return memory, seconds, numbers
     if edges:
