@@ -65,6 +65,7 @@ def test_all_that_is_missing_is_said_at_once_with_its_options(shop, tmp_path):
     assert "closed bodies" not in found
     assert "--pixel-size …" in found["next"][0]
     assert "--angles …" in found["next"][0]
+    assert holosplat("info", path).err == ""  # nothing is said of values that stand in
     angles = tmp_path / "angles.txt"
     angles.write_text("\n".join(str(22.5 * n) for n in range(8)))
     told = rows(path, "--energy-kev", 20, "--distance", 0.1, "--pixel-size", 3.2e-6, "--angles", angles)

@@ -5,6 +5,7 @@ A few frames, flats and darks are read, and no more, so that a scan of a terabyt
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -65,7 +66,8 @@ def facts_of_scan(path: Path, reading: Reading) -> ScanFacts:
     reading.told.vouch(path)
     while True:
         try:
-            with _opened(loader, path, stand_ins | reading.told.given(loader.takes)) as opened:
+            given = stand_ins | reading.told.given(loader.takes)
+            with _silent(bool(stand_ins)), _opened(loader, path, given) as opened:
                 return _facts(path, reading, loader, opened, unsaid)
         except UnsaidError as error:
             new = {name: value for name, value in error.stand_ins.items() if name not in stand_ins}
@@ -73,6 +75,18 @@ def facts_of_scan(path: Path, reading: Reading) -> ScanFacts:
                 raise
             stand_ins |= new
             unsaid |= dict.fromkeys(new, str(error))
+
+
+@contextmanager
+def _silent(silent: bool) -> Iterator[None]:
+    """Without the notes of readers, which would be on stand-ins."""
+    logger = logging.getLogger("holosplat")
+    before = logger.disabled
+    logger.disabled = before or silent
+    try:
+        yield
+    finally:
+        logger.disabled = before
 
 
 @contextmanager
@@ -116,7 +130,7 @@ def _facts(path: Path, reading: Reading, loader: Loader, opened: Opened, unsaid:
             f"{path} holds counts (level {look.level:.4g}) that nothing divides; divide them by --flats and --darks."
         )
     words = ["holosplat reconstruct", str(path), *(f"--{OPTIONS.get(name, name)} …" for name in unsaid)]
-    more = " ".join([*words, "--out run"])
+    more = " ".join([*words, *(["--time-frame each"] if scan.is_series else []), "--out run"])
     matter = "not in the file; --material NAME or --delta-beta RATIO says it, else δ/β is estimated"
     return ScanFacts(Facts(rows | {"material": matter}, tuple(missing), (more,)), scan, look, numbers, tuple(unsaid))
 
