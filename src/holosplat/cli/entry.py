@@ -112,6 +112,14 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "bench",
         "Compare methods on cases, under one physics and one set of scores (run, report); rerun the thesis' study.",
     ),
+    "info": (
+        "info",
+        "Say what a file or a run is: shape, beam, angles, air, noise, fringes, what is missing, and what it takes.",
+    ),
+    "doctor": (
+        "doctor",
+        "Look at the installation: versions, kernels, threads, memory, disk, and a small run with its error.",
+    ),
     "backends": ("commands", "Say which backends can be used here, and what each of them offers."),
 }
 """Name → (module of this package that has a function of that name, first paragraph of the function's docstring)."""

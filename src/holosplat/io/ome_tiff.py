@@ -20,6 +20,12 @@ TIFF_SUFFIXES = (".tif", ".tiff")
 UNITS_M = {"µm": 1e-6, "nm": 1e-9, "mm": 1e-3, "m": 1.0}
 
 
+def ome_grid(path: Path) -> Grid | None:
+    """The grid of an OME-TIFF of δ and β; None for another TIFF file."""
+    with open_tiff(path) as opened:
+        return _grid_of_ome(opened.ome_metadata or "")
+
+
 def read_ome_tiff(path: Path) -> Volume:
     """δ and β of an OME-TIFF as `write_ome_tiff` writes it, about the origin if it does not say where it lies.
 
