@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from holosplat.units import in_percent, two_digits
+from holosplat.units import in_percent, plain, two_digits
 
 SOURCE = Path(__file__).resolve().parents[1] / "src"
 
@@ -33,3 +33,18 @@ def test_no_share_is_written_with_an_exponent():
     """`:.2g` writes 100 as 1e+02: shares go through `in_percent`."""
     texts = {path: path.read_text(encoding="utf-8") for path in SOURCE.rglob("*.py")}
     assert [path.name for path, text in texts.items() if re.search(r":\.\dg\} ?%", text)] == []
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        (3430.0, "3430"),
+        (999.6, "1000"),
+        (1234567.0, "1234567"),
+        (-0.0, "0"),
+        (0.12345, "0.123"),
+        (-2.5e-5, "-0.000025"),
+    ],
+)
+def test_numbers_have_three_digits_and_no_exponent(value, said):
+    assert plain(value) == said

@@ -138,6 +138,9 @@ def test_a_smooth_volume_takes_over_where_no_bodies_of_that_level_explain_the_fr
 def test_old_summaries_say_nothing():
     assert Choice.read({}) == Choice()
     assert Choice().lines() == []
+    worse = Choice(judged={"start": 0.13, "fit": 0.2, "smooth volume": 0.29}, kept="smooth volume")
+    assert worse.lines()[0].endswith("smooth volume 29 %); what start and fit explain beyond it may be noise")
+    assert Choice(judged={"start": 0.13, "fit": 0.1}, kept="fit").lines()[-1].endswith("start 13 %, fit 10 %)")
 
 
 @pytest.mark.parametrize("other", ["continuous", None], ids=["told", "found"])
