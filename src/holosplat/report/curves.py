@@ -32,8 +32,14 @@ SCORE_NAMES = {"ssim": "SSIM", "frcm": "FRCM", "dice": "Dice", "psnr": "PSNR", "
 
 
 @styled
-def correlation_figure(images: ImageScores | None, volume: VolumeScores | None, pixel_size: float) -> Figure:
-    """FRC of the test views (mean, least, greatest) and FSC of δ, with thresholds; pixel_size [m]."""
+def correlation_figure(
+    images: ImageScores | None,
+    volume: VolumeScores | None,
+    pixel_size: float,
+    named: str = "Volume against the truth",
+) -> Figure:
+    """FRC of the test views (mean, least, greatest) and FSC of δ, with thresholds; pixel_size [m]; named: what the FSC
+    is of."""
     panels = [scores for scores in (images, volume) if scores is not None]
     figure = new_figure(WIDTH if len(panels) > 1 else 0.55 * WIDTH, 2.55)
     axes = list(np.atleast_1d(figure.subplots(1, max(len(panels), 1))))
@@ -42,7 +48,7 @@ def correlation_figure(images: ImageScores | None, volume: VolumeScores | None, 
         letter(axes[0], 0, "Held-out views", lift=20)
     if volume is not None:
         _shell_panel(axes[-1], volume)
-        letter(axes[-1], len(panels) - 1, "Volume against the truth", lift=20)
+        letter(axes[-1], len(panels) - 1, named, lift=20)
     return figure
 
 

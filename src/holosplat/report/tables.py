@@ -200,13 +200,6 @@ def _volume_table(content: ReportContent) -> Table | None:
     scores, shown = content.volume_scores, content.quantity
     if scores is None:
         return None
-    sampling = 2 * scores.pitch
-
-    def resolved(length: float | None) -> str:
-        if length is None:
-            return f"≤ {format_length(sampling)} (sampling limit)"
-        return "not resolved" if length == float("inf") else format_length(length)
-
     rows = [
         (f"mean {shown.symbol} in the matter", shown.text(scores.mean_delta), shown.text(scores.true_mean_delta)),
         ("mean β in the matter", scientific(scores.mean_beta), scientific(scores.true_mean_beta)),
@@ -214,8 +207,8 @@ def _volume_table(content: ReportContent) -> Table | None:
         (f"relative error of {shown.symbol}", scientific(scores.relative_error_delta), ""),
         ("relative error of β", scientific(scores.relative_error_beta), ""),
         ("Dice coefficient", f"{scores.dice:.4f}", ""),
-        ("resolution, ½-bit", resolved(scores.resolution_half_bit), ""),
-        ("resolution, FSC 0.143", resolved(scores.resolution_fixed), ""),
+        ("resolution, ½-bit", resolved(scores.resolution_half_bit, scores.pitch), ""),
+        ("resolution, FSC 0.143", resolved(scores.resolution_fixed, scores.pitch), ""),
     ]
     if not content.delta_told:  # δ stands for β: the same numbers would be told twice
         rows = [row for row in rows if "δ" not in row[0] and not row[0].startswith(("mean β", "relative error of β"))]
@@ -266,6 +259,13 @@ def _geometry_table(content: ReportContent) -> Table | None:
         rows.append((name, *(n.replace("-", "−") for n in numbers), percent(change[5]), percent(change[6]), left))
     names = ("shift x (px)", "shift y (px)", "turn x (°)", "turn y (°)", "roll (°)", "distance", "magnification")
     return Table("Geometry beside the plan", rows, ("frame", *names, "unexplained"))
+
+
+def resolved(length: float | None, pitch: float) -> str:
+    """A resolution in words; None: not before the sampling limit of voxels of `pitch` [m]."""
+    if length is None:
+        return f"≤ {format_length(2 * pitch)} (sampling limit)"
+    return "not resolved" if length == float("inf") else format_length(length)
 
 
 def percent(value: float | None) -> str:
