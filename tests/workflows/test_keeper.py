@@ -109,6 +109,9 @@ def test_steps_of_a_method_and_other_kinds_are_no_rivals(scan):
 def test_old_summaries_say_nothing():
     assert Choice.read({}) == Choice()
     assert Choice().lines() == []
+    worse = Choice(judged={"start": 0.13, "fit": 0.2, "smooth volume": 0.29}, kept="smooth volume")
+    assert worse.lines()[0].endswith("smooth volume 29 %); what start and fit explain beyond it may be noise")
+    assert Choice(judged={"start": 0.13, "fit": 0.1}, kept="fit").lines()[-1].endswith("start 13 %, fit 10 %)")
 
 
 @pytest.mark.parametrize("other", ["continuous", None], ids=["told", "found"])

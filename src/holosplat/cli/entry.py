@@ -94,6 +94,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "commands",
         "Score a run on held-out frames and against the true volume, which then joins its report.",
     ),
+    "compare": (
+        "compare",
+        "Compare two runs side by side: what was asked, decided and found, and where their volumes differ.",
+    ),
     "check": (
         "check",
         "Say whether a run folder or an HDF5 file is as it was written, by manifest and checksums.",
