@@ -152,21 +152,25 @@ def others(default: Row) -> list[Choice]:
     return [one for one in dict.fromkeys(found) if one != (default.light, default.matter)]
 
 
+def _tried(default: Row, alone: bool) -> list[Choice]:
+    return [one for one in others(default) if one == NULLS or not alone]
+
+
 def rows_of(path: Path) -> list[Row]:
     """The rows that are there."""
     kinds = {field.name: {"int": int, "float": float}.get(str(field.type), str) for field in fields(Row)}
     return [Row(**{name: kinds[name](value) for name, value in each.items()}) for each in read(path)]
 
 
-def make(name: str, seed: int, data: Path | None, made_on: Sequence[str], path: Path, most: int | None) -> None:
-    """Rows of a scene that are not there yet, each written as soon as it is made; most: that are told."""
+def make(name: str, seed: int, data: Path | None, made_on: Sequence[str], path: Path, alone: bool) -> None:
+    """Rows of a scene that are not there yet, each written as soon as it is made; alone: of the default and the null alone."""
 
     def there() -> Iterator[Row]:
         return (row for row in rows_of(path) if (row.family, row.seed) == (name, seed))
 
     default = next((row for row in there() if row.told == "no"), None)
     known = {(row.light, row.matter) for row in there()}
-    if default is not None and known.issuperset(others(default)[:most]):
+    if default is not None and known.issuperset(_tried(default, alone)):
         return
     made = scene(name, seed, data)
     if isinstance(made, str):
@@ -176,7 +180,7 @@ def make(name: str, seed: int, data: Path | None, made_on: Sequence[str], path: 
         default = run(name, seed, made, None, made_on)
         replaced(path, default, 4)
         shown(default)
-    for choice in others(default)[:most]:
+    for choice in _tried(default, alone):
         if choice not in known:
             row = run(name, seed, made, choice, made_on)
             replaced(path, row, 4)
@@ -277,9 +281,9 @@ def main() -> None:
     torch.set_num_threads(1)
     importlib.import_module("holosplat.methods.sharp_level").EDGE = LEVEL_EDGE
     for seed in () if options.summary else options.seeds:
-        for most in (1, None):  # all families beside the null first, then beside the rest
+        for alone in (True, False):  # all families beside the null first, then beside the rest
             for name in options.family:
-                make(name, seed, options.data, options.made_on, options.out, most)
+                make(name, seed, options.data, options.made_on, options.out, alone)
     rows = rows_of(options.out)
     printed(RULES, table_of_rules(rows))
     print()

@@ -387,13 +387,13 @@ RED_CELLS |= {"Hypertonic_RBC": (67e-6, 1.347, 0.626), "M_protocystis": (72e-6, 
 
 
 def _optical(seed: int, data: Path) -> Scene:
-    """An optical hologram of one cell, on pixels 2 × 2 times larger."""
+    """An optical hologram of one cell, on pixels 2 × 2 times larger; lengths are scaled to 8 keV, as in `_hl60`."""
     name = list(RED_CELLS)[seed % len(RED_CELLS)]
     distance, index, published = RED_CELLS[name]
     frame = tifffile.imread(data / "rbc_holograms" / f"{name}.tif").astype(np.float32) / 127.5
     frame = frame.reshape(64, 2, 64, 2).mean((1, 3))
-    energy = wavelength(1.0) / (0.532e-6 / index)
-    exposures = Exposures.of(Views.from_angles([0.0], frame.shape, 1e-6), energy, distance)
+    scaled = distance * 0.532e-6 / index / wavelength(8.0)
+    exposures = Exposures.of(Views.from_angles([0.0], frame.shape, 1e-6), 8.0, scaled)
     scan = Scan(frame[None], exposures, np.zeros(1, dtype=bool))
     return Scene(scan, hs.MaterialPrior.of_ratio(1e4), partial(_peak, scan, published), f"{name}, ratio told")
 

@@ -97,10 +97,10 @@ def test_rows_that_are_there_are_not_made_again(families, tmp_path, monkeypatch)
     monkeypatch.setattr(families, "run", run)
     monkeypatch.setattr(families, "scene", lambda *given: object())
     path = tmp_path / "rows.csv"
-    families.make("foam", 1, None, (), path, 1)
+    families.make("foam", 1, None, (), path, True)
     assert made == [None, ("uneven light", "levels")]
-    families.make("foam", 1, None, (), path, None)
-    families.make("foam", 1, None, (), path, None)
+    families.make("foam", 1, None, (), path, False)
+    families.make("foam", 1, None, (), path, False)
     assert made == [None, ("uneven light", "levels"), ("as measured", "continuous")]
     assert len(families.rows_of(path)) == 3
 
