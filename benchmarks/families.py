@@ -39,7 +39,7 @@ from rows import machine, read, replaced, shown
 
 import holosplat as hs
 from holosplat.matter import MatterKind
-from holosplat.methods import Auto
+from holosplat.methods import Auto, sharp_level
 from holosplat.methods.illumination import NULL, STAGE, prepared
 from holosplat.methods.levels import CONTINUOUS, NAME
 
@@ -163,7 +163,7 @@ def rows_of(path: Path) -> list[Row]:
 
 
 def make(name: str, seed: int, data: Path | None, made_on: Sequence[str], path: Path, alone: bool) -> None:
-    """Rows of a scene that are not there yet, each written as soon as it is made; alone: of the default and the null alone."""
+    """Rows of a scene that are not there yet, each written as soon as it is made; alone: default and null alone."""
 
     def there() -> Iterator[Row]:
         return (row for row in rows_of(path) if (row.family, row.seed) == (name, seed))
@@ -279,7 +279,7 @@ def main() -> None:
     parser.add_argument("--summary", action="store_true", help="print the tables, and make no rows")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    importlib.import_module("holosplat.methods.sharp_level").EDGE = LEVEL_EDGE
+    sharp_level.EDGE = LEVEL_EDGE
     for seed in () if options.summary else options.seeds:
         for alone in (True, False):  # all families beside the null first, then beside the rest
             for name in options.family:

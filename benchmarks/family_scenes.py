@@ -101,7 +101,7 @@ class Family:
         told, grid = str(rng.choice(self.told)), Grid.of_views(exposures.views)
         known = {"known": hs.MaterialPrior.known(material), "ratio": hs.MaterialPrior.of_ratio(ratio)}
         prior, true = known.get(told, hs.MaterialPrior.unknown()), truth.voxelise(grid)
-        facts = f"Fresnel number {fresnel:.2f}, {phase:.2f} rad, {_shown(photons)} photons, {told} told"
+        facts = f"Fresnel number {fresnel:.2f}, {phase:.2f} rad, {_shown(photons)}, {told} told"
         facts += "".join(f", {key.removeprefix('light_')} {value:.2g}" for key, value in light.items())
         facts += f", pattern {pattern.std():.3f}" if self.pattern else ""
         return Scene(
@@ -127,7 +127,7 @@ def _log(rng: Draw, least: float, most: float) -> float:
 
 
 def _shown(photons: float | None) -> str:
-    return "no noise of" if photons is None else f"{photons:.0f}"
+    return "no photon noise" if photons is None else f"{photons:.0f} photons"
 
 
 def drawn(kind: str) -> Callable[[Draw, Room], Matter]:
@@ -333,7 +333,7 @@ def _hl60(
         found = wavenumber(8.0) * np.asarray(done.object.project(views)[1].detach(), dtype=np.float64)
         return float(np.linalg.norm(found.reshape(phase.shape) - phase) / np.linalg.norm(phase))
 
-    facts = f"λz {distance / 4:.1f} pixels squared, {_shown(light or None)} photons, ratio told"
+    facts = f"λz {distance / 4:.1f} pixels squared, {_shown(light or None)}, ratio told"
     return Scene(scan, hs.MaterialPrior.of_ratio(1e5), error, facts)
 
 
