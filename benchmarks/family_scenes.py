@@ -101,7 +101,8 @@ class Family:
         told, grid = str(rng.choice(self.told)), Grid.of_views(exposures.views)
         known = {"known": hs.MaterialPrior.known(material), "ratio": hs.MaterialPrior.of_ratio(ratio)}
         prior, true = known.get(told, hs.MaterialPrior.unknown()), truth.voxelise(grid)
-        facts = f"Fresnel number {fresnel:.2f}, {phase:.2f} rad, {_shown(photons)}, {told} told"
+        facts = f"{matter.args[0].kind}, " if isinstance(matter, partial) else ""
+        facts += f"Fresnel number {fresnel:.2f}, {phase:.2f} rad, {_shown(photons)}, {told} told"
         facts += "".join(f", {key.removeprefix('light_')} {value:.2g}" for key, value in light.items())
         facts += f", pattern {pattern.std():.3f}" if self.pattern else ""
         return Scene(
