@@ -189,11 +189,14 @@ def make(name: str, seed: int, data: Path | None, made_on: Sequence[str], path: 
 
 @dataclass(frozen=True)
 class Regret:
-    """Of a scene: errors of the default and the null, the least and what it was told, and the default's row."""
+    """Of a scene: errors of the default and the null, the least and what it was told, and the default's row; made,
+    wanted: how many runs there are, and with hindsight complete."""
 
     default: Row
     null: float
     best: Row
+    made: int
+    wanted: int
 
     @property
     def regret(self) -> float:
@@ -220,7 +223,8 @@ def regrets(rows: Sequence[Row]) -> list[Regret]:
         default = next((row for row in own if row.told == "no"), None)
         null = next((row for row in own if (row.light, row.matter) == NULLS), None)
         if default is not None and null is not None:
-            found.append(Regret(default, null.error, min(own, key=lambda row: (row.error, row.told))))
+            best, wanted = min(own, key=lambda row: (row.error, row.told)), 1 + len(others(default))
+            found.append(Regret(default, null.error, best, len(own), wanted))
     return found
 
 
@@ -233,32 +237,35 @@ def table_of_scenes(rows: Sequence[Row]) -> list[list[str]]:
         errors = [f"{value:.4g}" for value in (row.error, one.null, one.best.error)]
         lines.append(
             [row.family, str(row.seed), row.made_on, row.frames, f"{row.light}, {row.matter}", *errors]
-            + [best, f"{one.regret:+.1%}", f"{one.against_null:+.1%}"]
+            + [best, f"{one.made} of {one.wanted}", f"{one.regret:+.1%}", f"{one.against_null:+.1%}"]
         )
     return lines
 
 
 def table_of_rules(rows: Sequence[Row]) -> list[list[str]]:
-    """Families that the rules were made on beside all others: a line a number."""
+    """Families that the rules were made on beside all others: a line a number; regrets of scenes with all runs."""
     sides = [[one for one in regrets(rows) if one.default.made_on == side] for side in ("yes", "no")]
-    numbers: dict[str, list[str]] = {"families": [], "scenes": [], **{name: [] for name in WANTED}, "missed": []}
+    numbers: dict[str, list[str]] = {name: [] for name in ("families", "scenes", "whole", *WANTED, "missed")}
     for side in sides:
-        regret, against = ([getattr(one, name) for one in side] for name in ("regret", "against_null"))
+        regret = [one.regret for one in side if one.made == one.wanted]
+        against = [one.against_null for one in side]
         families = {one.default.family for one in side}
         failing = {one.default.family for one in side if one.against_null > WANTED["worst against null"]}
         numbers["families"].append(str(len(families)))
         numbers["scenes"].append(str(len(side)))
-        numbers["median regret"].append(f"{statistics.median(regret):.1%}" if side else "–")
-        numbers["worst regret"].append(f"{max(regret):.1%}" if side else "–")
+        numbers["whole"].append(str(len(regret)))
+        numbers["median regret"].append(f"{statistics.median(regret):.1%}" if regret else "–")
+        numbers["worst regret"].append(f"{max(regret):.1%}" if regret else "–")
         numbers["worst against null"].append(f"{max(against):+.1%}" if side else "–")
         numbers["missed"].append(str(len(failing)))
     wanted = {name: f"under {value:.0%}" for name, value in WANTED.items()} | {"missed": "0"}
-    called = {"missed": "families that lose more than 10 % to the null"}
+    called = {"missed": "families that lose more than 10 % to the null", "whole": "scenes with all runs"}
     return [[called.get(name, name), *cells, wanted.get(name, "–")] for name, cells in numbers.items()]
 
 
 RULES = ("", "families it was made on", "all others", "wanted")
-SCENES = ("family", "seed", "made on", "frames", "decided", "error", "null", "least", "least by", "regret", "to null")
+SCENES = ("family", "seed", "made on", "frames", "decided", "error", "null", "least", "least by", "runs")
+SCENES += ("regret", "to null")
 
 
 def printed(head: Sequence[str], lines: Sequence[Sequence[str]]) -> None:

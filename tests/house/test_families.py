@@ -92,29 +92,32 @@ def test_rows_that_are_there_are_not_made_again(families, tmp_path, monkeypatch)
 
     def run(name, seed, scene, told, made_on):
         made.append(told)
-        light, matter = told or families.NULLS
+        light, matter = told or ("uneven light", "levels")
         return row(families, light, matter, told="yes" if told else "no", others="uneven light; continuous")
 
     monkeypatch.setattr(families, "run", run)
     monkeypatch.setattr(families, "scene", lambda *given: object())
     path = tmp_path / "rows.csv"
     families.make("foam", 1, None, (), path, True)
-    assert made == [None, ("uneven light", "levels")]
+    assert made == [None, families.NULLS]
     families.make("foam", 1, None, (), path, False)
     families.make("foam", 1, None, (), path, False)
-    assert made == [None, ("uneven light", "levels"), ("as measured", "continuous")]
+    assert made == [None, families.NULLS, ("uneven light", "continuous")]
     assert len(families.rows_of(path)) == 3
 
 
 def test_regret_is_against_the_null_and_hindsight(families):
-    default = row(families, "uneven light", error=0.3, others="uneven light")
+    default = row(families, "uneven light", error=0.3, others="uneven light; grain")
     null, best = row(families, error=0.2, told="yes"), row(families, "grain", error=0.1, told="yes")
-    other = [replace(one, family="HL60", made_on="yes") for one in (replace(default, error=0.1), null)]
-    lines = {line[0]: line[1:] for line in families.table_of_rules([default, null, best, *other])}
+    other = [replace(one, family="HL60", made_on="yes") for one in (replace(default, error=0.1, others=""), null)]
+    lacking = [replace(one, family="star", made_on="yes", others="grain") for one in other]
+    lines = {line[0]: line[1:] for line in families.table_of_rules([default, null, best, *other, *lacking])}
+    assert lines["scenes with all runs"] == ["1", "1", "–"]
     assert lines["worst regret"] == ["0.0%", "200.0%", "under 50%"]
     assert lines["worst against null"] == ["-50.0%", "+50.0%", "under 10%"]
     assert lines["families that lose more than 10 % to the null"] == ["0", "1", "0"]
     scenes = families.table_of_scenes([default, null, best, *other])
     assert [line[0] for line in scenes] == ["foam", "HL60"]
     refused = [replace(default, light=families.REFUSED, error=float("inf")), null]
-    assert families.table_of_rules(refused)[3][2] == "inf%"
+    refusals = {line[0]: line[1:] for line in families.table_of_rules(refused)}
+    assert refusals["worst regret"][1] == "inf%"
