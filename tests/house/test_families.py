@@ -32,7 +32,7 @@ def scenes(families) -> ModuleType:
 
 
 def row(families, light="as measured", matter="levels", error=0.1, told="no", **more):
-    known = {"family": "foam", "seed": 1, "use": "development", "made_on": "no", "result": "", "others": ""}
+    known = {"family": "foam", "seed": 1, "use": "development", "result": "", "others": ""}
     known |= {"decisions": "", "frames": "", "facts": "", "machine": "", "commit": "", "seconds": 0.0}
     return families.Row(
         **(known | {"light": light, "matter": matter, "error": error, "told": told, "decision_seconds": 0.0} | more)
@@ -67,12 +67,12 @@ def test_a_family_without_its_data_is_skipped_with_a_sentence(scenes, tmp_path):
 def test_what_is_told_is_not_decided(families, scenes, monkeypatch):
     monkeypatch.setattr(families, "METHOD", METHODS["holographic-tv"].options)
     made = scenes.scene("soft cells, few views", 1, None)
-    done = families.run("soft cells, few views", 1, made, ("fixed pattern", "levels"), ())
-    assert (done.light, done.told, done.made_on, done.use) == ("fixed pattern", "yes", "no", "development")
+    done = families.run("soft cells, few views", 1, made, ("fixed pattern", "levels"))
+    assert (done.light, done.told, done.use) == ("fixed pattern", "yes", "development")
     assert "light and noise" not in done.decisions
-    plain = families.run("soft cells, few views", 101, made, families.NULLS, ("soft cells, few views",))
+    plain = families.run("soft cells, few views", 101, made, families.NULLS)
     assert plain.error != done.error
-    assert (plain.made_on, plain.use) == ("yes", "reporting")
+    assert plain.use == "reporting"
 
 
 def test_one_decision_is_changed_at_a_time(families):
@@ -90,7 +90,7 @@ def test_one_decision_is_changed_at_a_time(families):
 def test_rows_that_are_there_are_not_made_again(families, tmp_path, monkeypatch):
     made = []
 
-    def run(name, seed, scene, told, made_on):
+    def run(name, seed, scene, told):
         made.append(told)
         light, matter = told or ("uneven light", "levels")
         return row(families, light, matter, told="yes" if told else "no", others="uneven light; continuous")
@@ -98,10 +98,10 @@ def test_rows_that_are_there_are_not_made_again(families, tmp_path, monkeypatch)
     monkeypatch.setattr(families, "run", run)
     monkeypatch.setattr(families, "scene", lambda *given: object())
     path = tmp_path / "rows.csv"
-    families.make("foam", 1, None, (), path, True)
+    families.make("foam", 1, None, path, True)
     assert made == [None, families.NULLS]
-    families.make("foam", 1, None, (), path, False)
-    families.make("foam", 1, None, (), path, False)
+    families.make("foam", 1, None, path, False)
+    families.make("foam", 1, None, path, False)
     assert made == [None, families.NULLS, ("uneven light", "continuous")]
     assert len(families.rows_of(path)) == 3
 
@@ -109,8 +109,8 @@ def test_rows_that_are_there_are_not_made_again(families, tmp_path, monkeypatch)
 def test_regret_is_against_the_null_and_hindsight(families):
     default = row(families, "uneven light", error=0.3, others="uneven light; grain")
     null, best = row(families, error=0.2, told="yes"), row(families, "grain", error=0.1, told="yes")
-    other = [replace(one, family="HL60", made_on="yes") for one in (replace(default, error=0.1, others=""), null)]
-    lacking = [replace(one, family="star", made_on="yes", others="grain") for one in other]
+    other = [replace(one, family="HL60") for one in (replace(default, error=0.1, others=""), null)]
+    lacking = [replace(one, family="red cells", others="grain") for one in other]
     lines = {line[0]: line[1:] for line in families.table_of_rules([default, null, best, *other, *lacking])}
     assert lines["scenes with all runs"] == ["1", "1", "–"]
     assert lines["worst regret"] == ["0.0%", "200.0%", "under 50%"]
