@@ -240,7 +240,8 @@ def table_of_scenes(rows: Sequence[Row], made_on: Sequence[str] = MADE_ON) -> li
         errors = [f"{value:.4g}" for value in (row.error, one.null, one.best.error)]
         lines.append(
             [row.family, str(row.seed), "yes" if row.family in made_on else "no", row.frames]
-            + [f"{row.light}, {row.matter}", *errors, best, f"{one.made} of {one.wanted}", f"{one.regret:+.1%}", f"{one.against_null:+.1%}"]
+            + [f"{row.light}, {row.matter}", *errors, best, f"{one.made} of {one.wanted}"]
+            + [f"{one.regret:+.1%}", f"{one.against_null:+.1%}"]
         )
     return lines
 
