@@ -287,7 +287,7 @@ class TruthOptions:
         if self.truth is None:
             return []
         for n in self.truth_frames:
-            require(0 <= n < times, f"--truth-frames counts the scan's {times} times from 0, but {n} is asked for.")
+            require(0 <= n < times, f"--truth-frames must be times of the scan, 0 to {times - 1}, but {n} is none.")
         named = [(of_time(self.truth, frame), frame) for frame in self.truth_frames]
         return named or [(self.truth, 0)]
 

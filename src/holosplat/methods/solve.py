@@ -67,8 +67,8 @@ def settled(
 ) -> Settled:
     """The method to run for `task`, the kind of its matter (`matter`, or what the frames say), and what is `uncertain`.
 
-    Of continuous matter and of one level δ/β is uncertain, too, where nothing is known. Errors: `InputError` for
-    continuous matter of two materials, and those of `determine`.
+    Where nothing is known, δ/β of continuous matter is uncertain, too; for `Auto` that of one level. Errors:
+    `InputError` for continuous matter of two materials, and those of `determine`.
     """
     require(
         not (matter == "continuous" and isinstance(task.prior, KnownTwo)),
@@ -85,9 +85,10 @@ def settled(
     else:
         decision = Decision(NAME, "levels", "no matter to the method")
     kind = kind_of(decision.choice)
+    one = kind == "continuous"
     if isinstance(method, Auto):
+        one = one or (decision.choice == LEVELS[0] and len(decision.compared) > 0)
         method = method.suited(kind)
-    one = kind == "continuous" or (decision.choice == LEVELS[0] and decision.compared)
     if one and not task.prior.fixes_ratio:
         constants = (*constants, likeliest_ratio(task))
     return Settled(method, kind, decision, constants)
