@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..backends import resolve
 from ..baselines import HolographicTV, holographic_tv
 from ..inference import Score
 from ..matter import DeltaBeta, MaterialPrior, Matter
@@ -110,7 +111,7 @@ class FirstVolumes:
         frames = torch.from_numpy(seen.frames)
         even = seen if light is None else replace(seen, frames=light.evened(frames).numpy())
         values, grid = holographic_tv(even, self.material, self.options, self.on_progress, light)
-        return VoxelGrid(values[None], grid, Matter.one(*self.material))
+        return VoxelGrid(values[None], grid, Matter.one(*self.material)).on(resolve(self.options.backend))
 
 
 def lit_by_halves(measured: Tensor, predicted: Tensor, known: Background) -> Tensor:

@@ -84,8 +84,10 @@ class _FlatVolumes:
         trial = accepted(self._task, self._first, fold)
         grid, seen = trial.volume.grid, trial.seen
         pixel = max(1, round(seen.views.finest / grid.voxel_size[0]))
-        made = [VoxelGrid(one[None], grid, trial.volume.matter) for one in flattened(trial.volume.values[0], pixel)]
-        return trial, made
+        flat = (
+            VoxelGrid(one[None], grid, trial.volume.matter) for one in flattened(trial.volume.values[0].cpu(), pixel)
+        )
+        return trial, [one.on(trial.volume.backend) for one in flat]
 
 
 class _Fits:
