@@ -15,11 +15,12 @@ from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import Task
 from holosplat.methods.first_volumes import BY_FISSION, Folds
 from holosplat.methods.illumination import prepared
-from holosplat.optics.background import LightOptions
+from holosplat.optics.background import Background, LightOptions
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
 from holosplat.specimens.soft_matter import soft_cells
+from holosplat.workflows.run_light import EVEN, found_in
 
 MATTER = DeltaBeta(4e-7, 4e-7 / 1500)
 PIXEL, SHAPE, VIEWS = 1e-6, (45, 52), 8
@@ -73,6 +74,34 @@ def test_uneven_light_is_found(family, request):
     if family == "sharp":  # soft matter leaves next to no air, so that the light is known badly, and still is better
         off = task.lit.factor().numpy() / uneven()  # type: ignore[union-attr]
         assert float(off.std()) < 0.2 * float(uneven().std())
+
+
+@pytest.mark.parametrize("family", ["soft", "sharp"])
+def test_unequal_flux_is_found(family, request):
+    """Of .4 %, which passes for absorption of matter all over the field."""
+    flux = 1 + 0.004 * np.random.default_rng(4).normal(size=(VIEWS, 1, 1))
+    task = prepared(Task(lit(request.getfixturevalue(family), flux), PRIOR))
+    assert task.uneven is not None
+    assert task.lit is not None
+    off = (task.lit.factor().numpy() / flux).mean(axis=(1, 2))
+    assert float(off.std()) < 0.3 * float(flux.std())
+    if family == "sharp":  # in soft matter, light by air alone tells the flux better still
+        assert found_in(task) == EVEN
+
+
+def test_flux_is_told_from_noise_of_means():
+    """On rectangular frames of odd sides."""
+    draw = torch.Generator().manual_seed(2)
+    true = 1 + 0.3 * torch.rand(7, 31, 45, generator=draw)
+    noise = 0.01 * torch.randn(7, 31, 45, generator=draw)
+    flux = torch.tensor([0.99, 1.0, 1.01, 1.02, 0.98, 1.0, 1.0])[:, None, None]
+    found = Background.of_flux(flux * true + noise, true)
+    assert found.is_flux
+    assert float((found.factor() / flux).std()) < 1e-3
+    assert float(found.variances[0]) ** 0.5 == pytest.approx(float(flux.log().std()), rel=0.1)
+    assert found.size_of_doubt == pytest.approx(float(flux.log().std()) / 7**0.5, rel=0.1)
+    assert bool((Background.of_flux(true, true).factor() == 1).all())
+    assert bool((Background.of_flux(true[:1], 1.1 * true[:1]).factor() == 1).all())
 
 
 @pytest.mark.parametrize("family", ["soft", "sharp"])

@@ -1,4 +1,4 @@
-"""Uneven light, a fixed pattern and correlated noise: hypotheses beside the null, frames as they were measured.
+"""Unequal flux, uneven light, a fixed pattern and correlated noise: hypotheses beside the null, frames as measured.
 
 Each is carried as far as a volume, and taken only where this predicts unseen measured frames better (`inference`).
 """
@@ -17,7 +17,7 @@ from ..baselines import HolographicTV, holographic_tv
 from ..checks import InputError
 from ..inference import MARGIN, Decision, Score, select
 from ..matter import MaterialPrior, Matter
-from ..optics.background import Light, LightOptions
+from ..optics.background import FLUX, Background, Light, LightOptions
 from ..optics.noise_model import NoiseModel
 from ..optics.still_light import fixed_pattern
 from ..progress import Progress
@@ -30,10 +30,11 @@ from .method import Method, Task
 
 STAGE = "light and noise"
 NULL = "as measured"
-HYPOTHESES = ("fixed pattern", "uneven light", "correlated noise")
+UNEVEN = "uneven light"
+HYPOTHESES = ("fixed pattern", FLUX, UNEVEN, "correlated noise")
 """What may be added to the null, in this order where several predict alike."""
-FREE = " with free light of unseen frames"
-"""Beside uneven light: the volume before it, whose prediction is allowed the same light."""
+FREE = "; of unseen frames free: "
+"""Beside light of each frame's own: the volume before it, whose prediction is allowed the same light."""
 
 Hypothesis = tuple[str, ...]
 """What is added to the null, in the order in which it was taken."""
@@ -100,12 +101,12 @@ class Trials:
 
     def score(self, name: str, fold: int) -> Score:
         """That of a hypothesis by its name."""
-        plain = name.removesuffix(FREE)
+        plain, _, free = name.partition(FREE)
         parts = () if plain == NULL else tuple(plain.split(" and "))
         tried = self.tried(parts, fold)
-        if plain == name:
+        if not free:
             return tried.score(tried.light)
-        known = self._light((*parts, "uneven light"), fold)
+        known = self._light((*parts, free), fold)
         assert known is not None  # it was proposed
         return tried.score(known)
 
@@ -156,6 +157,9 @@ def with_more(light: Light, hypothesis: str, seen: Scan, predicted: Tensor, opti
         return replace(light, still=fixed_pattern(light.evened(frames), predicted)) if len(seen) > 1 else None
     if hypothesis == "correlated noise":
         return replace(light, noise=NoiseModel.of_residuals(light.evened(frames), predicted))
+    if hypothesis == FLUX:
+        known = light.background is not None  # then it holds the flux
+        return None if known else replace(light, background=Background.of_flux(light.evened(frames), predicted))
     try:
         found = Light.of(
             frames if light.still is None else (frames / light.still).float(), replace(options, kind="smooth")
@@ -175,7 +179,7 @@ def decided(
     while left := [one for one in hypotheses if one not in taken and trials.proposed((*taken, one))]:
         null = " and ".join(taken) or NULL
         names = [" and ".join((*taken, one)) for one in left]
-        beside = {name: (null + FREE,) for name in names if name.endswith("uneven light")}
+        beside = {name: (null + FREE + one,) for name, one in zip(names, left) if one in (FLUX, UNEVEN)}
         decision = select(STAGE, (null, *names), trials.score, first.folds.count, by=first.folds.by, beside=beside)
         made.append(decision)
         if decision.choice == null:
@@ -201,12 +205,13 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
         one
         for one, free in (
             ("fixed pattern", options.still == "auto" and options.kind != "even" and not still_order(method)),
-            ("uneven light", options.kind == "auto"),
+            (FLUX, options.kind == "auto"),
+            (UNEVEN, options.kind == "auto"),
             ("correlated noise", options.noise == "auto"),
         )
         if free
     ]
-    told = tuple(["uneven light"] * (options.kind == "smooth"))
+    told = tuple([UNEVEN] * (options.kind == "smooth"))
     first = first_of_task(task, _volume_of(method).backend)
     if before is None:
         task.on_progress(STAGE, 0.0)
@@ -229,10 +234,10 @@ def _applied(task: Task, light: Light, taken: Hypothesis) -> tuple[Scan, Light]:
 
     for one in order:
         predicted = frames
-        if one != "uneven light" and not task.scan.is_series:
+        if one != UNEVEN and not task.scan.is_series:
             how = HolographicTV(upper=0.0)
             predicted = predicted_first(evened(), task.prior, how, task.on_progress, light)
-        elif one != "uneven light":
+        elif one != UNEVEN:
             continue  # several times have no one volume
         found = with_more(light, one, task.scan, predicted, task.light)
         if found is None:

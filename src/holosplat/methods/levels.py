@@ -2,7 +2,8 @@
 
 The inside of a first volume without any bound is flattened, to one level or to two, with its rims left as they are. Of
 matter with levels the flat volume predicts unseen views better, for the differences were errors; of continuous matter
-it predicts them worse. Where neither is sure, the methods for either kind are fitted to the coarse frames.
+it predicts them worse. Where neither is sure, or a known material would be called continuous, the methods for either
+kind are fitted to the coarse frames.
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ CONTINUOUS = "continuous"
 def decide_matter(task: Task, methods: Mapping[MatterKind, Method] | None = None) -> Decision:
     """Whether the training frames of `task` show levels, `LEVELS`, or continuous matter.
 
-    A known material has one level, two have two: that is the null. Where less is known and there are `methods` for
-    either kind, the null is continuous matter, which bounds nothing; where flat volumes predict neither better nor
-    worse, these are fitted. One ratio δ/β holds one level. Of views that are too few to set some aside, levels are
-    taken.
+    A known material has one level, two have two: that is the null, which flat volumes may keep, but fits of `methods`
+    for either kind alone overturn. Where less is known and there are such methods, the null is continuous matter, which
+    bounds nothing; where flat volumes predict neither better nor worse, these are fitted. One ratio δ/β holds one
+    level. Of views that are too few to set some aside, levels are taken.
     """
     if isinstance(task.prior, KnownTwo):
         return Decision(NAME, LEVELS[1], "two materials are known")
@@ -48,13 +49,14 @@ def decide_matter(task: Task, methods: Mapping[MatterKind, Method] | None = None
     levels = LEVELS[: flat.most]
     if not levels:
         return Decision(NAME, LEVELS[0], "nothing in a first volume lies more than a pixel inside matter")
-    if methods is None or task.prior.materials:
-        return select(NAME, (*levels, CONTINUOUS), flat.score, first.folds.count, by=first.folds.by)
-    found = select(NAME, (CONTINUOUS, *levels), flat.score, first.folds.count, by=first.folds.by)
-    if found.choice != CONTINUOUS or all(each.loses for each in found.compared):
+    known = methods is None or bool(task.prior.materials)
+    candidates = (*levels, CONTINUOUS) if known else (CONTINUOUS, *levels)
+    found = select(NAME, candidates, flat.score, first.folds.count, by=first.folds.by)
+    sure = found.choice != CONTINUOUS or (not known and all(each.loses for each in found.compared))
+    if methods is None or sure:
         return found
     fits = _Fits(task, first, methods)
-    return select(NAME, (CONTINUOUS, *LEVELS[: flat.most]), fits.score, by=f"{first.folds.by}, by fits")
+    return select(NAME, candidates, fits.score, by=f"{first.folds.by}, by fits")
 
 
 class _FlatVolumes:

@@ -76,7 +76,7 @@ class SolvedLight:
         self._modes, self._measured = modes.to(on), measured
         self._air = torch.zeros_like(measured, dtype=torch.bool) if air is None else air.to(on)
         self._gain = (gain / background.powers[:, None, None]).float().to(on)
-        pull = background.coefficients / background.variances
+        pull = background.coefficients / background.variances.clamp_min(torch.finfo(torch.float64).tiny)
         self._before = torch.einsum("vkl,vl->vk", gain, pull).float().to(on)
 
     def __len__(self) -> int:

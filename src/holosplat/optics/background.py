@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -35,6 +36,8 @@ OUTER = 0.1
 """Part of the columns at either side in which light must be uneven, too."""
 DARKEST = 0.05
 """Relative intensity below which frames say nothing of the light."""
+FLUX = "unequal flux"
+"""What light is called that differs between frames by a factor alone."""
 
 
 Kind = Literal["auto", "even", "smooth"]
@@ -108,6 +111,8 @@ class Light:
         said = []
         if self.background is not None and self.background.is_handed:
             said.append(f"divided out before, {self.background.size_of_doubt:.2%} of it in doubt")
+        elif self.background is not None and self.background.is_flux:
+            said.append(f"{FLUX} of frames, by {_deviation(self.background.factor()):.2%}")
         elif self.background is not None:
             said.append(f"uneven by {_deviation(self.background.factor()):.2%}")
         if self.still is not None:
@@ -204,6 +209,24 @@ class Background:
         return cls(mean, covariance, variances, powers, shape)
 
     @classmethod
+    def of_flux(cls, frames: Tensor, predicted: Tensor) -> Background:
+        """Light that differs between frames [V, H, W] by a factor alone, by their means beside those `predicted` by a
+        volume, which have one flux; even where these differ no more than by noise.
+
+        What they have in common, a volume takes for absorption: the mean flux is as unsure as V draws leave it.
+        """
+        shape, count = (frames.shape[-2], frames.shape[-1]), len(frames)
+        ratio = frames.double().mean(dim=(1, 2)) / predicted.double().mean(dim=(1, 2))
+        rest = frames.double() / ratio[:, None, None] - predicted.double()
+        powers = rest.square().mean(dim=(1, 2)).clamp_min(FAINTEST**2)
+        flux = ratio.log() - ratio.log().mean()
+        variance = max(0.0, float(flux.square().sum() / max(count - 1, 1) - powers.mean() / math.prod(shape)))
+        level = torch.zeros((ORDER + 1) ** 2, dtype=torch.float64)
+        level[0] = 1.0
+        doubt = torch.diag(level * variance / count).expand(count, -1, -1)
+        return cls(flux[:, None] * level * (variance > 0), doubt, level * variance, powers, shape)
+
+    @classmethod
     def handed(cls, known: DividedLight, shape: tuple[int, int]) -> Background:
         """What may be left of light that frames of `shape` (H, W) were divided by: no more, as far as is known."""
         size, corner = known.binning, known.corner
@@ -222,6 +245,11 @@ class Background:
     def is_handed(self) -> bool:
         """Whether the frames were divided by all light that is known of, before it was looked for."""
         return not bool(self.coefficients.any())
+
+    @property
+    def is_flux(self) -> bool:
+        """Whether frames differ by a factor alone."""
+        return not bool(self.variances[..., 1:].any())
 
     @property
     def size_of_doubt(self) -> float:

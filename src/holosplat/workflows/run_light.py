@@ -12,7 +12,7 @@ import torch
 from ..methods import Method, Task
 from ..methods.cross_validation import predicted_frames
 from ..methods.illumination import still_order
-from ..optics.background import Light, LightOptions
+from ..optics.background import FLUX, Light, LightOptions
 from ..optics.still_light import mean_light
 from ..representations import Stored
 from ..scan import Scan
@@ -23,14 +23,16 @@ EVEN = LightOptions("even")
 
 
 def found_in(task: Task) -> LightOptions:
-    """What a run assumes of other frames of its scan: smooth light if that of the training frames is uneven."""
-    return EVEN if task.uneven is None else replace(task.light, kind="smooth")
+    """What a run assumes of other frames of its scan: smooth light if that of the training frames is uneven; other
+    frames are taken to have the mean flux."""
+    known = task.uneven and task.uneven.background
+    return EVEN if known is None or known.is_flux else replace(task.light, kind="smooth")
 
 
 def read_light_options(config: Mapping[str, Any], summary: Mapping[str, Any]) -> LightOptions:
     """The same of a run folder; older ones say nothing of light, which is then even."""
     said = str(summary.get("light", "even"))
-    if said == "even" or said.startswith("the same"):
+    if said == "even" or said.startswith(("the same", FLUX)):
         return EVEN
     return replace(from_table(LightOptions, config.get("light", {}), "light"), kind="smooth")
 
