@@ -97,13 +97,11 @@ def _ending(path: Path, ending: str) -> Path:
 
 def _export_compact(folder: RunFolder, out: Path, step_px: float, together: tuple[Path, ...]) -> None:
     from ..io.compact import steps_of
-    from ..io.folder import require_new
     from ..io.objects import write_compact
     from ..io.series import names_of, write_series
     from ..workflows.run_folder import RunFolder
 
     steps, folders = steps_of(step_px), [folder, *map(RunFolder, together)]
-    require_new(out)
     for each in folders:
         each.require_run()
     if together:
@@ -118,7 +116,6 @@ def _export_compact(folder: RunFolder, out: Path, step_px: float, together: tupl
 
 def _export_motion(folder: RunFolder, out: Path) -> bool:
     """Write a run of track as bodies that move; False, and nothing written, of any other."""
-    from ..io.folder import require_new
     from ..io.solids import write_moving_glb
     from ..representations import MovingSurfaces
     from ..workflows.moments import instants_of
@@ -127,27 +124,23 @@ def _export_motion(folder: RunFolder, out: Path) -> bool:
     found, times = load_reconstruction(folder).object, instants_of(folder)
     if not isinstance(found, MovingSurfaces):
         return False
-    require_new(out)
     write_moving_glb(out, found, times)
     _say(f"wrote {out}: {found.count} bodies in motion")
     return True
 
 
 def _export_splats(result: Reconstruction, out: Path) -> None:
-    from ..io.folder import require_new
     from ..io.splats import write_splats
     from ..representations import GaussianCloud
 
     found = result.object
     if not isinstance(found, GaussianCloud):
         raise InputError(f"--splats needs a run of Gaussians, but this one holds {found.described}; use --bodies.")
-    require_new(out)
     write_splats(out, found)
     _say(f"wrote {out}: {found.described}, whose opacity stands for thickness")
 
 
 def _export_bodies(one: Moment, out: Path) -> None:
-    from ..io.folder import require_new
     from ..io.solids import write_glb, write_stl
     from .surface import write_bodies
 
@@ -156,7 +149,6 @@ def _export_bodies(one: Moment, out: Path) -> None:
         raise InputError(
             f"--bodies needs a run of surfaces, but this one holds {found.described}; use holosplat surface."
         )
-    require_new(out)
     if out.suffix.lower() in (STL, GLB):
         write_stl(out, one.bodies) if out.suffix.lower() == STL else write_glb(out, one.bodies, found.matter)
     else:
@@ -172,7 +164,6 @@ def _export_volume(
     voxel_size: float | None,
 ) -> None:
     from ..geometry import Grid
-    from ..io.folder import require_new
     from ..io.json import read_json
     from ..io.ome_zarr import ZARR_SUFFIX, require_zarr, write_ome_zarr
     from ..io.volume_files import TIFF_SUFFIXES, VOLUME_SUFFIXES, write_ome_tiff
@@ -189,7 +180,6 @@ def _export_volume(
     )
     if volume.suffix.lower() == ZARR_SUFFIX:
         require_zarr()
-    require_new(volume)
     with as_written(folder.summary, "what reconstruct wrote"):
         detector = read_json(folder.summary)["detector"]
         rows, columns = int(detector["rows"]), int(detector["columns"])
