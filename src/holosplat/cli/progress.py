@@ -97,7 +97,8 @@ class ProgressBar:
 
 
 class _Lines:
-    """Progress of one stage as lines: the first one, one for each twentieth, at least every minute, and the last."""
+    """Progress of one stage as lines: its name, and a line for each twentieth and for its end, none of them within
+    seconds of another, but one every minute."""
 
     def __init__(self, stage: str, begun: float, clock: Callable[[], float], say: Callable[[str], None]) -> None:
         self._stage, self._begun, self._clock, self._say = stage, begun, clock, say
@@ -106,15 +107,15 @@ class _Lines:
 
     def show(self, fraction: float, said: str) -> None:
         """A line, if one is due."""
-        now = self._clock()
-        step, pause = fraction - self._shown, now - self._at
-        due = pause >= LONGEST_S or (step >= STEP and pause >= SHORTEST_S)
-        if self._shown >= 0 and not (due or (fraction == 1 and step > 0)):
+        now, step = self._clock(), fraction - self._shown
+        pause = now - self._at
+        is_step = step >= STEP or (fraction == 1 and step > 0)
+        if self._shown >= 0 and pause < (SHORTEST_S if is_step else LONGEST_S):
             return
         words = [f"{self._stage}: {fraction:.0%}", _spent(now - self._began)]
         if _tells(self._begun, fraction):
             words.append(f"{_spent((now - self._began) * (1 - fraction) / (fraction - self._begun))} left")
-        self._say(", ".join([*words, said] if said else words))
+        self._say(", ".join([*words, said] if said else words) if self._shown >= 0 else f"{self._stage} …")
         self._shown, self._at = fraction, now
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -40,14 +41,11 @@ def _again(name: str, run: Path) -> list[str]:
         bool(begun), f"--resume alone needs the command in {run / NAME}, but there is none, or it is damaged; {AGAIN}."
     )
     with as_written(run / NAME):
-        first = begun[0]
-        _, command, *words = shlex.split(first["command"])
-        folder, inputs = Path(from_home(first["folder"])), list(first["inputs"])
-        require(
-            command == name, f"{run} was begun by holosplat {command}; go on with holosplat {command} --resume {run}."
-        )
-        places = {Path(one["path"]): _place(run, folder, one) for one in inputs}
-    return _moved(_lasting(words), places, run)
+        _, command, *words = shlex.split(begun[0]["command"])
+        folder = Path(from_home(begun[0]["folder"]))
+        inputs = [(Path(one["path"]), dict(one)) for one in begun[0]["inputs"]]
+    require(command == name, f"{run} was begun by holosplat {command}; go on with holosplat {command} --resume {run}.")
+    return _moved(_lasting(words), {path: _place(run, folder, said) for path, said in inputs}, run)
 
 
 def _lasting(words: Sequence[str]) -> list[str]:
@@ -80,8 +78,8 @@ def _moved(words: Sequence[str], places: Mapping[Path, Path], run: Path) -> list
 
 def _place(run: Path, folder: Path, said: Mapping[str, Any]) -> Path:
     """Where an input of `run` is: beside it as it was, or where it was; `InputError` where it is gone, or another."""
-    beside = [run / said["relative"]] if "relative" in said else []
-    ways = [Path(way) for way in dict.fromkeys([*beside, folder / from_home(said["path"])])]
+    beside = [Path(os.path.normpath(run / said["relative"]))] if "relative" in said else []
+    ways = list(dict.fromkeys([*beside, folder / from_home(said["path"])]))
     there = [way for way in ways if way.exists()]
     looked = " and ".join(str(way) for way in ways)
     require(
