@@ -66,6 +66,7 @@ def test_the_whole_chain(shop, tmp_path):
         "checkpoint.pt",
         "checkpoint_before.pt",
         "manifest.json",
+        "provenance.json",
         "object.h5",
         "summary.json",
         "source.json",
