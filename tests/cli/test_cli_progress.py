@@ -118,7 +118,7 @@ def test_a_log_is_written_over_no_other_file(tmp_path):
     other.write_bytes(b"\x89HDF and so on")
     refused(
         holosplat("materials", "haemoglobin", "--log", other),
-        "--log must be a new file, or a log to go on with",
+        "--log must be a new file, or a log",
         str(other),
     )
     refused(holosplat("materials", "haemoglobin", "--log", tmp_path / "no" / "log"), "existing folder")

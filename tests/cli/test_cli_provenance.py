@@ -104,6 +104,7 @@ def test_a_long_command_line_fits_into_an_attribute(tmp_path, monkeypatch):
         assert len(provenance.attribute(tmp_path / "a.h5")) < 2 * provenance.MOST_TEXT
 
 
+SURVEY = ("--material", "red cell", "--medium", "plasma", "--energy-range", "10", "20", "--points", "2", "2")
 OVER = {
     "align": ("align", "scan.nxs", "--axis-only", "--out", "old"),
     "its geometry": ("align", "scan.nxs", "--axis-only", "--out", "new", "--geometry-out", "old"),
@@ -148,8 +149,7 @@ def test_files_are_replaced_with_force(place):
         Path(name).write_text("old")
     worked(holosplat("align", "scan.nxs", "--axis-only", "--out", "a.nxs", "--force"))
     assert attribute(Path("a.nxs"))["command"].endswith("--force")
-    survey = ("--material", "red cell", "--medium", "plasma", "--energy-range", "10", "20", "--points", "2", "2")
-    worked(holosplat("plan", *survey, "--out", "p.png", "--force"))
+    worked(holosplat("plan", *SURVEY, "--out", "p.png", "--force"))
     assert "old" not in Path("p.csv").read_text()
     assert Path("p.csv.provenance.json").is_file()
 
