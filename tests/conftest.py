@@ -41,6 +41,7 @@ LONG = (
     *TOGETHER,
     "tests/house/test_triton_compile.py",
     "tests/house/test_examples.py",
+    "tests/house/test_docs_blocks.py",
     "tests/bench",
     "tests/align",
     "tests/baselines",

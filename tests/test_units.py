@@ -15,6 +15,7 @@ from holosplat.units import (
     LENGTH_UNITS,
     TIME_UNITS,
     in_percent,
+    plain,
     two_digits,
     unit_factor,
 )
@@ -61,3 +62,18 @@ def test_units_may_be_words(unit, table, factor):
 def test_capitals_of_short_units_matter(unit, table):
     with pytest.raises(InputError, match="unknown unit"):
         unit_factor("length", unit, table)
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        (3430.0, "3430"),
+        (999.6, "1000"),
+        (1234567.0, "1234567"),
+        (-0.0, "0"),
+        (0.12345, "0.123"),
+        (-2.5e-5, "-0.000025"),
+    ],
+)
+def test_numbers_have_three_digits_and_no_exponent(value, said):
+    assert plain(value) == said

@@ -11,7 +11,7 @@ import math
 import os
 import re
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,17 @@ LONGEST = 200
 
 class InputError(ValueError):
     """The user's input cannot be used; the message says which field, why, and what to do."""
+
+
+class UnsaidError(InputError):
+    """Neither a file nor an option says what is needed; the message names the options.
+
+    stand_ins: for each of these, by the name of its option, a value with which the rest of the file can be read.
+    """
+
+    def __init__(self, message: str, stand_ins: Mapping[str, Any]) -> None:
+        super().__init__(message)
+        self.stand_ins = dict(stand_ins)
 
 
 class MissingError(InputError, RuntimeError):

@@ -65,10 +65,15 @@ def wavenumber(energy_kev: Energy) -> Energy:
     return 2 * math.pi / wavelength(energy_kev)
 
 
+def plain(value: float, digits: int = 3) -> str:
+    """`value` to so many digits, or to a whole number where that has more; without exponent, 0 without sign."""
+    rounded = np.rint(value) if abs(value) >= 10**digits - 0.5 else float(f"{value:.{digits}g}")
+    return np.format_float_positional(rounded + 0.0, trim="-")
+
+
 def two_digits(value: float) -> str:
     """`value` to two digits, or to a whole number from a hundred on; never with an exponent."""
-    rounded = np.rint(value) if abs(value) >= 99.5 else float(f"{value:.2g}")
-    return np.format_float_positional(rounded, trim="-")
+    return plain(value, 2)
 
 
 def in_percent(share: float) -> str:

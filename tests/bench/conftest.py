@@ -43,4 +43,4 @@ def decided(request) -> Iterator[None]:
     asking = [name for name in METHODS if name not in PHOTOGRAPHS]
     here = [item.name for item in request.session.items if item.path == request.path]
     asked = any(test.endswith(f"{name}]") for test in here for name in asking)
-    assert asked <= len(memory.made) < len(METHODS)
+    assert asked <= len(memory.made) < 2 * len(METHODS)  # fits that decide ask of fewer frames, too

@@ -106,7 +106,9 @@ def test_bad_truths_are_refused(shop, tmp_path):
     half = truncated(shop.truth, tmp_path)
     refused(holosplat("evaluate", shop.run, "--truth", half), "truth.h5", "truncated")
     refused(holosplat("evaluate", shop.run, "--truth", tmp_path / "none.h5"), "none.h5", "no such file")
-    refused(holosplat("evaluate", shop.run, "--truth", shop.scan), "/delta", "missing")
+    refused(holosplat("evaluate", shop.run, "--truth", shop.scan), "whose name ends with .h5")
+    other = shutil.copy(shop.scan, tmp_path / "scan.h5")
+    refused(holosplat("evaluate", shop.run, "--truth", other), "/delta", "missing")
 
 
 def drop_voxel_size(file: h5py.File) -> None:

@@ -147,10 +147,10 @@ def test_folders_of_others_need_what_they_do_not_say(scan, tmp_path):
         values = json.loads((folder / table).read_text())
         del values["holosplat"]
         (folder / table).write_text(json.dumps(values))
-        assert "give" in convert(folder, tmp_path / "back.nxs", "--to", "nxtomo").said
+        assert "by --" in convert(folder, tmp_path / "back.nxs", "--to", "nxtomo").said
         partly = convert(folder, tmp_path / "back.nxs", "--to", "nxtomo", "--energy-kev", 12)
         assert partly.code == 2
-        assert "give" in partly.said
+        assert "by --" in partly.said
         all_of_it = ["--energy-kev", 12, "--pixel-size", 1e-6]
         if to == "nerf-synthetic":
             all_of_it += ["--distance", 0.2, "--black", 0.5]

@@ -11,8 +11,9 @@ import tifffile
 
 from helpers.cli import holosplat, refused, worked
 from holosplat.io.objects import read_object
+from holosplat.io.ome_tiff import write_ome_tiff
 from holosplat.io.series import read_series
-from holosplat.io.volume_files import read_truth, write_ome_tiff
+from holosplat.io.volume_formats import read_volume_file
 from holosplat.io.volumes import read_volume, write_volume
 
 
@@ -53,9 +54,19 @@ def test_runs_of_a_series_share_a_compact_file(shop, tmp_path):
 
 
 def test_a_volume_is_named_by_its_format_and_nothing_is_written_over(shop, tmp_path):
-    for name in ("v.nrrd", "v", "v.vti", "v.npy"):
-        refused(holosplat("export", shop.run, "--volume", tmp_path / name), "--volume", ".h5", ".tif", ".zarr", name)
+    for name in ("v", "v.npy", "v.raw"):
+        refused(holosplat("export", shop.run, "--volume", tmp_path / name), "--volume", ".h5", ".vti", ".mrc", name)
+    for option, name, known in (
+        ("--compact", "c.nrrd", ".hdf5"),
+        ("--splats", "g.vti", ".ply"),
+        ("--bodies", "b.obj", ".vtu"),
+    ):
+        refused(
+            holosplat("export", shop.run, option, tmp_path / name, "--volume", tmp_path / "v.h5"), option, known, name
+        )
     assert not list(tmp_path.iterdir())
+    (tmp_path / "v.beta.mrc").write_text("mine")
+    refused(holosplat("export", shop.run, "--volume", tmp_path / "v.mrc"), "v.beta.mrc must be new or empty")
     for option, name in (("--volume", "v.h5"), ("--volume", "v.tif"), ("--compact", "c.h5"), ("--splats", "g.ply")):
         (tmp_path / name).write_text("mine")
         refused(holosplat("export", shop.run, option, tmp_path / name), "must be new or empty")
@@ -66,7 +77,7 @@ def test_the_truth_may_be_an_exported_tiff_of_the_same_field(shop, tmp_path):
     truth, report = tmp_path / "truth.ome.tif", shop.run / "report.html"
     before, volume = report.read_bytes(), read_volume(shop.truth)
     write_ome_tiff(truth, volume)
-    found = read_truth(truth)
+    found = read_volume_file(truth)
     np.testing.assert_allclose(found.grid.origin, volume.grid.origin, rtol=1e-9)
     np.testing.assert_allclose(found.grid.voxel_size, volume.grid.voxel_size, rtol=1e-9)
     np.testing.assert_array_equal(found.delta, volume.delta.astype(np.float32))

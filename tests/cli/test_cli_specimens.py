@@ -106,10 +106,10 @@ def test_light_is_in_the_frames_and_in_the_file(tmp_path):
         (["--specimen", "tissue", "--light-drift-px", 3], "light_drift_px moves the pattern"),
         (["a.vtk", "--voxel-size", "1e-6"], "of TIFF images, not of meshes"),
         (["a.vtk", "b.h5"], "meshes or a volume, but there are both"),
-        (["a.tif"], "give --voxel-size"),
+        (["a.tif"], "a.tif"),
         (["a.tif", "--value-delta", "1e-7"], "--value-delta needs --voxel-size"),
         (["a.tif", "--voxel-size", "1e-6", "--value-delta-beta", 100], "--value-delta-beta needs --value-delta"),
-        (["a.h5", "--voxel-size", "1e-6"], "says its voxel size, δ and β itself"),
+        (["a.h5", "--voxel-size", "1e-6"], "are of TIFF images, but a.h5 is none"),
     ],
 )
 def test_requests_that_cannot_be_are_refused(arguments, said, tmp_path):
@@ -117,6 +117,19 @@ def test_requests_that_cannot_be_are_refused(arguments, said, tmp_path):
     assert outcome.code == 2
     assert re.search(r"\W+".join(re.findall(r"\w+", said)), outcome.said)
     assert not (tmp_path / "s.nxs").exists()
+
+
+@pytest.mark.parametrize("suffix", [".vti", ".mrc"])
+def test_the_truth_in_other_formats_is_imaged_again(suffix, tmp_path):
+    truth, field = tmp_path / f"t{suffix}", ["--detector", 12, 15, "--pixel-size", "2e-6", "--views", 1]
+    ran("simulate", "--specimen", "round-cell", *field, "--out", tmp_path / "s.nxs", "--truth", truth)
+    ran("simulate", truth, *field, "--out", tmp_path / "again.nxs")
+    first, again = (read_scan(tmp_path / name).frames for name in ("s.nxs", "again.nxs"))
+    assert np.corrcoef(first.ravel(), again.ravel())[0, 1] > 0.9
+    outcome = holosplat("simulate", "--specimen", "round-cell", *field, "--out", tmp_path / "x.nxs", "--truth", "t.raw")
+    assert outcome.code == 2
+    assert "truth must be a file whose name ends with .h5" in outcome.said
+    assert not (tmp_path / "x.nxs").exists()
 
 
 @pytest.mark.parametrize(("kind", "goes"), [("stirred-blob", 90), ("collapsing-foam", 0.3)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 import subprocess
 import sys
 
@@ -75,3 +76,24 @@ def test_every_public_function_of_a_command_module_is_a_command():
             if inspect.isfunction(value) and value.__module__ == module.__name__ and not name.startswith("_")
         }
         assert functions - set(COMMANDS) <= inner, module.__name__
+
+
+def test_python_runs_the_package():
+    done = subprocess.run([sys.executable, "-m", "holosplat", "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout == worked(holosplat("--version")).out
+
+
+@pytest.mark.parametrize(
+    "broken",
+    ["raise ModuleNotFoundError('No module named torch', name='torch')", "raise ImportError('libc10.so: bad')"],
+)
+def test_without_torch_one_sentence_says_how_to_get_it(broken, tmp_path):
+    """Whether it is missing or fails to load."""
+    (tmp_path / "torch.py").write_text(broken + "\n")
+    command = [sys.executable, "-m", "holosplat", "materials"]
+    done = subprocess.run(command, env=os.environ | {"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr.startswith("holosplat: the package torch must be installed and load, but it does not")
+    assert "Compute Platform: CPU" in done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stderr.count("\n") == 1

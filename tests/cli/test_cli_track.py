@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 import shutil
 from pathlib import Path
 
@@ -122,6 +123,35 @@ def test_volumes_and_bodies_are_exported_at_times(folder):
             assert mesh.vertices == pytest.approx(own.vertices, abs=1e-3 * PIXEL)
     worked_by("export", folder / "run", "--volume", folder / "one.h5", "--time-frame", 3)
     assert np.array_equal(read_volume(folder / "one.h5").delta, read_volume(folder / "v_t0003.h5").delta)
+
+
+def test_all_times_open_in_paraview(folder):
+    """Beside HDF5 lies a .xdmf, beside .vti and .vtu a .pvd, which name them; bodies come back, and are simulated."""
+    out = folder / "paraview"
+    out.mkdir()
+    command = ["export", folder / "run", "--shape", 6, 5, 7, "--time-frame", "all"]
+    worked_by(*command, "--volume", out / "v.h5", "--bodies", out / "b.vtu")
+    worked_by(*command, "--volume", out / "v.vti")
+    found, times = read_object(folder / "run" / "object.h5"), [k * STEP for k in range(TIMES)]
+    assert isinstance(found, MovingSurfaces)
+    lines = (out / "v.xdmf").read_text(encoding="utf-8")
+    assert [float(time) for time in re.findall(r'<Time Value="(.*?)"/>', lines)] == pytest.approx(times)
+    assert re.findall(r">(v_t\d+\.h5):/beta<", lines) == [f"v_t{k:04d}.h5" for k in range(TIMES)]
+    for name in ("v", "b"):
+        steps = read_pvd(out / f"{name}.pvd")
+        assert [step.time for step in steps] == pytest.approx(times)
+    for step, time in zip(read_pvd(out / "b.pvd"), times):
+        for mesh, own in zip(read_meshes(step.files, "um"), found.bodies(time), strict=True):
+            assert mesh.name == own.name
+            assert mesh.vertices == pytest.approx(own.vertices, abs=1e-3 * PIXEL)
+    (out / "v_t0001.vti").unlink()
+    before = sorted(out.iterdir())
+    refused(holosplat(*command, "--volume", out / "v.vti"), "v_t0000.vti must be new or empty")
+    (out / "v_t0000.vti").unlink()
+    refused(holosplat(*command, "--volume", out / "v.vti"), f"v_t000{2 if TIMES > 2 else 0}.vti must be new or empty")
+    assert sorted(out.iterdir()) == [path for path in before if path.name != "v_t0000.vti"]
+    simulated = ["--frame-rate", 1 / STEP, "--detector", 10, 12, "--pixel-size", PIXEL, "--views", 2]
+    worked_by("simulate", out / "b.pvd", *simulated, "--out", out / "s.nxs")
 
 
 def test_bodies_move_in_one_file_for_viewers(folder):

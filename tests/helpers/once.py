@@ -70,11 +70,11 @@ def of(scan: Scan) -> Key:
 def once(memory: Once) -> Iterator[None]:
     """Within, runs take from `memory` what an earlier run on the same frames has found; uneven light is left alone."""
 
-    def decide(task: Task) -> Decision:
+    def decide(task: Task, *how: Any) -> Decision:
         if task.uneven is not None:
-            return decide_matter(task)
-        key = ("kind", *of(task.scan), task.prior)
-        return memory.answer(key, lambda told: decide_matter(replace(task, on_progress=told)), task.on_progress)
+            return decide_matter(task, *how)
+        key = ("kind", *of(task.scan), task.prior, repr(how))
+        return memory.answer(key, lambda told: decide_matter(replace(task, on_progress=told), *how), task.on_progress)
 
     def light(first: FirstVolumes, *how: Any) -> Any:
         key = ("light", *of(first.folds.scan), first.prior, *how)

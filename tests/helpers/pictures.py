@@ -20,7 +20,7 @@ COARSE = 24
 BLANK = "data:image/svg+xml;base64,PHN2ZyB4bWxucz0iaHR0cDovL3d3dy53My5vcmcvMjAwMC9zdmciLz4="
 
 
-def _blank(figure: Figure, kind: str) -> str:
+def _blank(figure: Figure, kind: str = "svg") -> str:
     assert figure.axes
     assert kind in ("svg", "png")
     return BLANK

@@ -22,11 +22,9 @@ PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "do
 STANDS_FOR = {
     r"\$\(holosplat data fetch [^)]*\)": "fetched.nxs",
     r"\{nxtomo, [^}]*\}": "nxtomo",
-    r"--pixel-size (\$p|P)\b": "--pixel-size 1e-6",
+    r"--pixel-size \$p\b": "--pixel-size 1e-6",
     r"\$[n1]\b": "1",
     r"\$geometry": "--detector 64 64 --pixel-size 1e-6",
-    r"[\[\]]": "",
-    "… ": "--detector 64 64 --pixel-size 1e-6 ",
 }
 """What a reader or a shell puts into commands, and an example of it."""
 

@@ -70,7 +70,7 @@ def missing_files(text: str) -> list[str]:
     named = {
         name for span in re.findall(r"`([^`\n]+)`", text) for name in re.findall(r"[\w./-]+\.(?:py|cpp|hpp)\b", span)
     }
-    rooms = ("src", "native", "tests", "docs", "examples", "benchmarks")
+    rooms = ("src", "native", "tests", "docs", "examples", "benchmarks", "packaging")
     there = [path.as_posix() for room in rooms for path in (ROOT / room).rglob("*.[ch]*")]
     there += [path.as_posix() for room in rooms for path in (ROOT / room).rglob("*.py")]
     made = set(re.findall(r"(?:This is all of|, say)\s+`([\w/.]+)`", text))  # by the reader

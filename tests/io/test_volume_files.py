@@ -44,15 +44,16 @@ def test_what_cannot_be_is_refused(tmp_path):
     tifffile.imwrite(tmp_path / "nan.tif", np.full((5, 4), np.nan, np.float32))
     (tmp_path / "broken.tif").write_bytes(b"II*\0 nothing")
     for names, meaning, match in (
-        (["a.tif"], None, "says no voxel size; give --voxel-size"),
+        (["a.tif"], None, "of a specimen, --voxel-size says it"),
         (["rgb.tif"], MEANING, "must hold grey images of one size"),
         (["nan.tif"], MEANING, "finite numbers"),
         (["broken.tif"], MEANING, "damaged or none|must hold grey images"),
         (["none.tif"], MEANING, "there is none"),
-        (["a.tif", "b.h5"], MEANING, "one HDF5 file or TIFF images"),
-        (["a.h5", "b.h5"], None, "one HDF5 file, but there are 2"),
-        (["a.h5"], MEANING, "says its voxel size, δ and β itself"),
-        (["a.png"], MEANING, "one HDF5 file or TIFF images"),
+        (["a.tif", "b.h5"], MEANING, r"are of TIFF images, but .*b\.h5 is none"),
+        (["a.h5", "b.h5"], None, "one file, but there are 2"),
+        (["a.h5"], MEANING, "leave them out where files say it"),
+        (["a.png"], MEANING, r"a\.png is none"),
+        (["a.png"], None, r"ends with \.h5, \.hdf5, .*\.mrc, by which its format is chosen"),
     ):
         with pytest.raises(InputError, match=match):
             read_specimen([tmp_path / name for name in names], meaning)

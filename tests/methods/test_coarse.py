@@ -17,12 +17,11 @@ from holosplat.geometry import Grid
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import MaterialPrior
 from holosplat.mesh import TriangleMesh
-from holosplat.methods import Gaussians, Near, SmoothVolume, SurfaceOptions, Surfaces, Task, begun
+from holosplat.methods import Gaussians, Near, SurfaceOptions, Surfaces, Task, begun
 from holosplat.methods.auto import Bodies
 from holosplat.methods.coarse import STAGE as COARSE
 from holosplat.methods.coarse import CoarseToFine, mean_chord, on_pixels, unexplained
 from holosplat.methods.coarse_cloud import cloud_of_surfaces
-from holosplat.methods.cross_validation import CrossValidation
 from holosplat.methods.first_surfaces import first_surfaces
 from holosplat.methods.gaussian_options import FitOptions
 from holosplat.methods.gaussians import GaussianStage, nearby
@@ -174,9 +173,7 @@ def test_a_fit_near_its_end_takes_fewer_and_shorter_steps():
 @pytest.fixture(scope="module")
 def near(scan):
     """What coarse pixels show, and the task then."""
-    return begun(
-        Bodies(quick(), SurfaceOptions(), SmoothVolume(), 0.12, CrossValidation()).stages()[0], task_of(scan), None
-    )
+    return begun(Bodies(quick(), SurfaceOptions()).stages()[0], task_of(scan), None)
 
 
 def test_surfaces_of_coarse_pixels_are_near_those_of_fine_ones(near):
@@ -188,7 +185,7 @@ def test_surfaces_of_coarse_pixels_are_near_those_of_fine_ones(near):
 
 
 def test_few_steps_on_fine_pixels_end_it(scan, near):
-    first, last, _ = Bodies(quick(), SurfaceOptions(), SmoothVolume(), 0.12, CrossValidation()).stages()
+    first, last = Bodies(quick(), SurfaceOptions()).stages()
     assert first.fit(near[1], near[0]) is None
     start, task = begun(last, near[1], near[0])
     assert task.near

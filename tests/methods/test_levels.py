@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from importlib import import_module
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -12,12 +13,12 @@ import torch
 from helpers.runs import KNOWN, SMALL
 from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
-from holosplat.geometry import Views
-from holosplat.matter import DeltaBeta, MaterialPrior
+from holosplat.geometry import Grid, Views
+from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import Auto, Gaussians, Task, settled
-from holosplat.methods.cross_validation import CrossValidation, MissingMatter
+from holosplat.methods.cross_validation import MissingMatter
 from holosplat.methods.levels import CONTINUOUS, LEVELS, decide_matter, flattened
-from holosplat.optics.noise_model import NoiseModel
+from holosplat.representations import Stored, VoxelGrid
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
@@ -77,6 +78,39 @@ def test_noise_that_hides_the_matter_leaves_the_null(soft, sharp):
         assert decide_matter(Task(hidden, RATIO)).choice == "one level"
 
 
+@dataclass(frozen=True)
+class Answer:
+    """A method that finds a given object, on whatever frames."""
+
+    kind: ClassVar[str] = "answer"
+    found: Stored
+
+    def stages(self):
+        return (self,)
+
+    name: ClassVar[str] = "answer"
+
+    def start(self, task, before):
+        return self.found
+
+    def fit(self, task, start):
+        return None
+
+
+def test_fits_decide_where_flat_volumes_do_not(sharp):
+    """The methods' own fits of the frames that are left: the one that predicts the others is right."""
+    rng = np.random.default_rng(0)
+    noisy = replace(sharp, frames=sharp.frames + rng.normal(0, 0.08, sharp.frames.shape).astype(np.float32))
+    grid = Grid.of_views(noisy.views)
+    true = MeshScene.of_one_material(random_cells(4, (40e-6, 38e-6, 40e-6), 5, 17e-6), MATERIAL).voxelise(grid)
+    filled = torch.from_numpy(np.asarray(true.delta, np.float32))[None] / MATERIAL.delta
+    right, wrong = (Answer(VoxelGrid(share * filled, grid, Matter.one(*MATERIAL))) for share in (1.0, 0.5))
+    trials = ((right, wrong, "one level"), (wrong, right, CONTINUOUS), (right, right, CONTINUOUS))
+    for levels, continuous, choice in trials:
+        found = decide_matter(Task(noisy, RATIO), {"levels": levels, "continuous": continuous})
+        assert (found.choice, found.by) == (choice, "views set aside, by fits")
+
+
 def test_too_few_views_are_said(sharp):
     assert "too few views" in decide_matter(Task(sharp[[0, 4]], RATIO)).by
 
@@ -92,19 +126,6 @@ def test_auto_takes_bodies_for_levels_and_a_volume_for_a_continuum(soft, sharp):
     auto = Auto()
     assert settled(auto, Task(soft, RATIO)).method is auto.volume
     assert settled(auto, Task(sharp, RATIO)).method.kind == "bodies"
-
-
-def test_views_set_aside_are_judged_by_their_own_noise(soft):
-    """Binned as they are, of a scan in which each view has noise of its own."""
-    white = torch.arange(1.0, len(soft) + 1).double()
-    noise = NoiseModel(white, torch.zeros(len(soft), soft.views.shape[0], soft.views.shape[1] // 2 + 1).double())
-    halved = CrossValidation(width=max(soft.views.shape) // 2)
-    left, aside = halved.split(soft)
-    exposures = soft.exposures.views.rotations
-    of = [int(np.abs(exposures - turn).sum((1, 2)).argmin()) for turn in aside.views.rotations]
-    assert len(left) + len(of) == len(soft)
-    factor = soft.views.shape[0] // aside.views.shape[0]
-    np.testing.assert_allclose(halved.noise_aside(soft, noise).white, white[of] / factor)
 
 
 def test_occupancies_are_bounded_where_matter_has_levels_only(sharp):
@@ -138,12 +159,6 @@ def test_flat_volumes_keep_their_rims_and_their_mass():
     assert torch.isclose(one.sum(), values.sum())
     assert one[inside].unique().numel() == 1
     assert list(flattened(torch.zeros(9, 9, 9).index_fill(0, torch.tensor([4]), 1.0), 1)) == []
-
-
-def test_views_set_aside_are_binned_and_never_among_those_seen(sharp):
-    seen, aside = CrossValidation(width=26).split(sharp)
-    assert (len(seen), len(aside), aside.views.shape) == (7, 2, (22, 26))
-    assert CrossValidation().split(sharp[[0, 1]]) is None
 
 
 def test_missing_matter_counts_what_is_absent(sharp):

@@ -3,121 +3,30 @@
 import base64
 import math
 import re
-from html.parser import HTMLParser
+from urllib.parse import unquote
 
 import matplotlib
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_laplace
 
 from helpers.pictures import undrawn
+from helpers.report_page import BARE, DELTA, PITCH, Page, ball, content, scene
 from holosplat.checks import InputError
-from holosplat.geometry import Grid, Views
-from holosplat.metrics import image_scores, intensity_range, volume_scores
+from holosplat.geometry import Grid
+from holosplat.metrics import volume_scores
 from holosplat.report import (
     HeldOutViews,
     ProjectedMaps,
-    ReportContent,
     hero_figure,
     render_page,
     render_surface,
-    view_labels,
     write_report,
 )
-from holosplat.report.content import flatten
 from holosplat.report.curves import histogram_figure
 from holosplat.report.figures import richest_planes, scene_figure, slices_figure
-from holosplat.report.style import data_uri, format_length, scientific
+from holosplat.report.style import GROUND, INK, data_uri
 from holosplat.report.surface import Deviation, camera
-from holosplat.report.tables import duration, percent
 from holosplat.volume import Volume
-
-DELTA, PITCH = 4e-7, 1e-7
-
-
-def ball(grid, radius, centre=(0.0, 0.0, 0.0)):
-    """Fill factor [Z, Y, X] of a ball, smooth over two voxels."""
-    x, y, z = (axis - c for axis, c in zip(grid.axes(), centre))
-    distance = np.sqrt(x[None, None] ** 2 + y[None, :, None] ** 2 + z[:, None, None] ** 2)
-    return np.clip(0.5 + 0.5 * (radius - distance) / max(grid.voxel_size), 0, 1)
-
-
-def scene(shape=(24, 20, 28)):
-    grid = Grid.centred(shape, PITCH)
-    fill = np.maximum(ball(grid, 5e-7, (4e-7, 0, 1e-7)), ball(grid, 4e-7, (-5e-7, 2e-7, -3e-7)))
-    truth = Volume(DELTA * fill, DELTA / 500 * fill, grid)
-    rng = np.random.default_rng(0)
-    noisy = fill * 0.97 + 0.02 * rng.standard_normal(grid.shape)
-    return truth, Volume(DELTA * noisy, DELTA / 480 * noisy, grid)
-
-
-def content(**changes):
-    """A full report of a small scene; `changes` replace fields."""
-    truth, found = scene()
-    views = Views.from_angles([10.0, 80.0], (20, 28), PITCH)
-    projected_delta = [np.stack([v.delta.sum(axis=0)] * 2) * PITCH for v in (found, truth)]
-    projected_beta = [np.stack([v.beta.sum(axis=0)] * 2) * PITCH for v in (found, truth)]
-    predicted, measured = (1 + 2e10 * np.stack([gaussian_laplace(d, 1.5) for d in maps]) for maps in projected_delta)
-    scores = image_scores(predicted, measured, intensity_range(measured))
-    labels = view_labels(views)
-    steps = np.arange(0, 100, 10)
-    fields = {
-        "title": "Two balls & a <test>",
-        "reconstruction": found,
-        "truth": truth,
-        "energy_kev": 11.0,
-        "pixel_size": PITCH,
-        "held_out": HeldOutViews(measured, predicted, labels, scores),
-        "projections": ProjectedMaps(
-            projected_beta[0], projected_delta[0], labels, projected_beta[1], projected_delta[1]
-        ),
-        "volume_scores": volume_scores(found, truth),
-        "history": {
-            "step": steps,
-            "loss": np.exp(-steps / 30),
-            "data": 0.5 * np.exp(-steps / 30),
-            "count": 10 + steps,
-            "val_ssim": np.where(steps % 20 == 0, steps / 100, np.nan),
-        },
-        "seconds": 61.0,
-        "settings": {"fit": {"steps": 100, "rate": 1e-3}, "seed": 0},
-        "versions": {"holosplat": "0"},
-        "input_hash": "abc123",
-    }
-    return ReportContent(**(fields | changes))
-
-
-BARE = {"truth": None, "held_out": None, "projections": None, "volume_scores": None, "history": {}}
-VOID = {"area", "base", "br", "col", "embed", "hr", "img", "input", "link", "meta", "source", "track", "wbr"}
-
-
-class Page(HTMLParser):
-    """Checks that tags are nested, and collects what the page refers to."""
-
-    def __init__(self, text):
-        super().__init__(convert_charrefs=True)
-        self.open, self.sources, self.words = [], [], []
-        self.feed(text)
-        self.close()
-        assert not self.open
-
-    def handle_starttag(self, tag, attributes):
-        names = [name for name, _ in attributes]
-        assert len(names) == len(set(names))
-        self.sources += [value for name, value in attributes if name in ("src", "href", "srcset", "data", "poster")]
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-    def handle_data(self, data):
-        if self.open[-1:] != ["style"]:
-            self.words.append(data)
-
-    @property
-    def text(self):
-        return " ".join(" ".join(self.words).split())
 
 
 @pytest.fixture(scope="module")
@@ -137,9 +46,10 @@ def test_full_report_holds_every_figure_and_nothing_external(full_page):
     page = Page(full_page)
     assert len(page.sources) == 7
     assert all(source.startswith("data:image/") for source in page.sources)
-    assert "http" not in re.sub(r'"data:[^"]*"', "", full_page)
+    plain = re.sub(r'"data:[^"]*"', "", full_page)
+    assert "http" not in plain
     assert "@import" not in full_page
-    assert "url(" not in full_page
+    assert "url(" not in plain
     assert "<script" not in full_page
     assert [f"Figure {k} |" in page.text for k in range(1, 9)] == [True] * 7 + [False]
     for words in (
@@ -158,13 +68,27 @@ def test_full_report_holds_every_figure_and_nothing_external(full_page):
 
 def test_images_are_decodable_and_svg_loads_nothing(full_page):
     for source in Page(full_page).sources:
-        kind, data = source.split(";base64,")
-        raw = base64.b64decode(data)
-        if kind.endswith("png"):
-            assert raw.startswith(b"\x89PNG")
+        kind, data = source.split(",", 1)
+        if kind.endswith("base64"):
+            assert base64.b64decode(data).startswith(b"\x89PNG")
         else:
-            links = re.findall(r'(?:href|src)="([^"]*)"', raw.decode())
-            assert all(link.startswith("#") for link in links)
+            links = re.findall(r'(?:href|src)="([^"]*)"', unquote(data))
+            assert all(link.startswith(("#", "data:image/png;base64,")) for link in links)
+
+
+def test_every_entry_of_the_contents_leads_to_a_section(full_page):
+    page = Page(full_page)
+    assert len(page.links) == 9  # seven figures, scores, record
+    assert set(page.links) <= set(page.ids)
+
+
+def test_figures_have_the_colours_of_dark_pages_and_images_keep_theirs():
+    figure = slices_figure(*scene()[::-1], richest_planes(scene()[0]))
+    drawn = unquote(data_uri(figure))
+    assert "prefers-color-scheme: dark" in drawn
+    assert not re.search(f": ({INK}|{GROUND})(?!;--|;}})", drawn.split("</style>", 1)[1])
+    assert drawn.count("data:image/png;base64,") >= 9
+    assert "#ffffff" in drawn  # a scale bar on a dark image
 
 
 def test_bare_report_says_what_is_absent(bare_page):
@@ -262,33 +186,6 @@ def test_banner_has_its_size(undrawn_reports):
     truth, found = scene()
     figure = hero_figure(content().held_out.measured[0], PITCH, found, truth)
     assert tuple(figure.get_size_inches() * figure.dpi) == pytest.approx((1600, 500))
-
-
-# --- words and numbers ---
-
-
-def test_labels_numbers_and_settings_read_well():
-    assert view_labels(Views.from_angles([0.0, 15.0, 359.99], (4, 4), PITCH)) == (
-        "θ = 0.0°",
-        "θ = 15.0°",
-        "θ = 0.0°",
-    )
-    assert view_labels(Views.from_rotations(camera()[None], (4, 4), PITCH)) == ("view 1",)
-    assert flatten({"a": {"b": 1, "c": {"d": 0.5}}, "e": (1, 2)}) == {
-        "a.b": "1",
-        "a.c.d": "0.5",
-        "e": "(1, 2)",
-    }
-    assert scientific(4.123e-7).replace("\u00a0", " ") == "4.12 × 10⁻⁷"
-    assert scientific(-9.999e-7, 2).replace("\u00a0", " ") == "−1.0 × 10⁻⁶"
-    assert scientific(None) == "–"
-    assert scientific(math.inf) == "∞"
-    assert scientific(1300.2, 4) == "1,300"
-    assert format_length(4.2e-7).replace("\u00a0", " ") == "420 nm"
-    assert format_length(9.999e-7).replace("\u00a0", " ") == "1 µm"
-    assert percent(-0.0123) == "−1.2 %"
-    assert percent(None) == "–"
-    assert [duration(t) for t in (1.25, 54.2, 600, 3700)] == ["1.2 s", "54 s", "10 min 00 s", "1 h 01 min"]
 
 
 # --- surfaces ---

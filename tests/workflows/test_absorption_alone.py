@@ -22,7 +22,8 @@ from holosplat.optics.retrieval.spectra import sensitivity
 from holosplat.optics.sampling import fringe_sampling, resolving_oversample
 from holosplat.scan import Exposures
 from holosplat.units import wavelength, wavenumber
-from holosplat.workflows.evaluate import evaluate
+from holosplat.volume import Volume
+from holosplat.workflows.evaluate import evaluate, of_absorption
 from holosplat.workflows.reconstruct import reconstruct
 from holosplat.workflows.run_folder import RunFolder
 
@@ -116,6 +117,13 @@ def test_beta_of_a_ball_in_contact(name, known, scan):
     assert volume.beta.sum() == pytest.approx(BETA * inside(volume.grid, BALL).sum(), rel=0.03)
     assert volume.delta.sum() / volume.beta.sum() == pytest.approx(1 if known == "nothing" else 500, rel=1e-3)
     assert found.delta_told == (known != "nothing")
+    beta = Volume(0 * volume.beta, volume.beta, volume.grid)
+    truth = Volume(500 * BETA * inside(volume.grid, BALL), BETA * inside(volume.grid, BALL), volume.grid)
+    scores = evaluate(found, None, truth)
+    assert scores.volume is not None
+    assert scores.volume.dice > 0.9
+    assert any("relative error of β" in line for line in scores.lines()) == (known == "nothing")
+    assert np.array_equal(of_absorption(beta).delta, beta.beta)
 
 
 @pytest.mark.parametrize("shape", [(1, 41), (2, 40)])

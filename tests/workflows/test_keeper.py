@@ -8,18 +8,15 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.runs import CELL, KNOWN, SMALL
+from helpers.runs import KNOWN, SMALL
 from helpers.soft import two_cells
 from holosplat.checks import InputError
 from holosplat.geometry import Grid
 from holosplat.io.json import read_json
-from holosplat.matter import DeltaBeta, MaterialPrior
-from holosplat.methods import Auto, GaussianRates, SmoothVolume, solve
-from holosplat.methods.auto import VolumeWhereUnexplained
-from holosplat.methods.cross_validation import CrossValidation
+from holosplat.matter import MaterialPrior
+from holosplat.methods import GaussianRates, SmoothVolume, solve
 from holosplat.methods.keeper import Keeper
 from holosplat.methods.method import Task
-from holosplat.methods.volume import SmoothStage
 from holosplat.representations import GaussianCloud, VoxelGrid
 from holosplat.workflows.choice import Choice
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
@@ -54,21 +51,6 @@ def test_stages_in_memory_keep_the_best_state_too(scan):
     assert isinstance(kept, GaussianCloud)
     assert torch.equal(found.centres, kept.centres)
     assert torch.equal(found.raw_amplitudes, kept.raw_amplitudes)
-
-
-def test_a_stage_may_go_on_from_the_best_state(scan):
-    """The latest of them is worse; where fits find where frames are, the best one may be of other places."""
-    train = scan.train()
-    good = solve(SMALL, Task(train, KNOWN), "levels")
-    assert isinstance(good, GaussianCloud)
-    bad = good.with_parameters({"raw_amplitudes": good.parameters()["raw_amplitudes"] - 0.7})
-    keeper, volume = Keeper(train, mixed=True), VolumeWhereUnexplained(SmoothVolume(), 0.12, SMALL, CrossValidation())
-    assert keeper.handed(volume, None, placed=False) is None
-    keeper.look("surfaces", good, 2)
-    keeper.look("other", bad, 2)
-    assert keeper.handed(volume, bad, placed=False) is good
-    assert keeper.handed(volume, bad, placed=True) is bad
-    assert keeper.handed(SmoothStage(SmoothVolume()), bad, placed=False) is bad
 
 
 def test_a_fit_that_does_well_is_kept(scan):
@@ -124,20 +106,12 @@ def test_steps_of_a_method_and_other_kinds_are_no_rivals(scan):
         assert keeper.judged["second"] > keeper.judged["first"]
 
 
-@pytest.mark.parametrize("denser", [1.0, 0.2])
-def test_a_smooth_volume_takes_over_where_no_bodies_of_that_level_explain_the_frames(scan, denser):
-    quick = SmoothVolume(coarser=(), rounds=1, iterations=6)
-    known = MaterialPrior.known(DeltaBeta(denser * CELL.delta, denser * CELL.beta))
-    method = replace(Auto(gaussians=SMALL, volume=quick).with_effort(0.1), volume=quick)
-    done = reconstruct(scan, known, method, matter="levels")
-    assert (done.choice.kept == "smooth volume") is (denser < 1)
-    assert ("smooth volume" in done.choice.judged) is (denser < 1)
-    assert any("bodies of one level explain these frames badly" in line for line in done.choice.lines()) is (denser < 1)
-
-
 def test_old_summaries_say_nothing():
     assert Choice.read({}) == Choice()
     assert Choice().lines() == []
+    worse = Choice(judged={"start": 0.13, "fit": 0.2, "smooth volume": 0.29}, kept="smooth volume")
+    assert worse.lines()[0].endswith("smooth volume 29 %); what start and fit explain beyond it may be noise")
+    assert Choice(judged={"start": 0.13, "fit": 0.1}, kept="fit").lines()[-1].endswith("start 13 %, fit 10 %)")
 
 
 @pytest.mark.parametrize("other", ["continuous", None], ids=["told", "found"])

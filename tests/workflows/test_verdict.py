@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 from dataclasses import replace
 
 import numpy as np
@@ -23,6 +24,7 @@ from holosplat.model import smooth_modes
 from holosplat.representations import VoxelGrid
 from holosplat.scan import Exposures, Scan
 from holosplat.workflows.evaluate import held_out_verdict
+from holosplat.workflows.next_step import STEPS, next_step
 from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
 from holosplat.workflows.verdict import Verdict, judge, verdict
@@ -78,6 +80,8 @@ def test_the_truth_is_good(photons):
     assert found.good, found.words
     assert ("within their noise" in found.words) == (photons is not None)
     assert found.reasons == ()
+    assert found.cause == ""
+    assert len(found.lines("training frames")) == 1
 
 
 def test_half_of_the_mass_gone_is_said_though_noise_is_as_large_as_the_contrast():
@@ -98,6 +102,9 @@ def test_uneven_light_is_said():
     assert not found.good
     assert "times the noise at periods" in found.words
     assert "uneven light in each frame" in found.reasons[0]
+    assert found.cause == "light"
+    command = "holosplat reconstruct SCAN --light smooth --out another_run"
+    assert found.lines("training frames")[-1] == f"  Next: find the uneven light of each frame: {command}"
 
 
 def test_a_wrong_distance_is_said_with_its_sign():
@@ -132,16 +139,34 @@ def test_a_model_that_follows_the_noise_is_said():
 def test_verdicts_survive_json_and_damage_is_refused():
     found = on(a_scan(soft(), 3000), soft(0.5))
     again = Verdict.from_dict(json.loads(json.dumps(found.as_dict(), allow_nan=False)))
-    assert (again.good, again.words, again.reasons, again.tested) == (
-        found.good,
-        found.words,
-        found.reasons,
-        found.tested,
-    )
+    for name in ("good", "words", "reasons", "tested", "cause"):
+        assert getattr(again, name) == getattr(found, name)
+    assert found.cause in STEPS
+    older = {name: value for name, value in found.as_dict().items() if name != "cause"}
+    assert len(Verdict.from_dict(older).lines("frames")) == len(found.lines("frames")) - 1
     np.testing.assert_allclose(again.residual, found.residual, rtol=1e-3)
     np.testing.assert_array_equal(again.periods, found.periods)
     with pytest.raises(InputError, match="a verdict must be what reconstruct wrote"):
         Verdict.from_dict({"good": True})
+
+
+def test_a_residual_far_above_the_contrast_is_a_factor_and_no_share():
+    nothing = a_scan(soft(1e-4))
+    found = on(nothing, soft())
+    assert "times the contrast at periods" in found.words
+    assert "% of the contrast" not in found.words
+
+
+@pytest.mark.parametrize("cause", STEPS)
+def test_the_next_command_is_one_that_there_is(cause):
+    """Its options are those of `holosplat COMMAND --help`; names with blanks are kept whole by the caller."""
+    step = next_step(cause, "'a scan.nxs'")
+    assert step is not None
+    program, act, *rest = shlex.split(step.command)
+    assert (program, rest[0]) == ("holosplat", "a scan.nxs")
+    help_text = holosplat(act, "--help").out
+    assert all(option in help_text for option in rest if option.startswith("--"))
+    assert next_step("blur") is None
 
 
 # --- runs -----------------------------------------------------------------------------------------------------

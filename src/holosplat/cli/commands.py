@@ -239,10 +239,10 @@ def evaluate(
     Args:
         run: Run folder.
         scan: Scan (default: the one that was reconstructed).
-        truth: Volume file of the truth, HDF5 or an OME-TIFF of export.
+        truth: Volume file of the truth, of any format that export --volume writes.
         as_json: Print JSON instead of a table.
     """
-    from ..io.volume_files import read_truth
+    from ..io.volume_formats import read_volume_file
     from ..report.run import report_run
     from ..workflows.evaluate import evaluate as score
     from ..workflows.evaluate import require_overlap, require_same_field
@@ -252,7 +252,7 @@ def evaluate(
     from .scans import run_and_scan
 
     folder = RunFolder(run)
-    (result, measured), true_volume = run_and_scan(folder, scan, reading), read_truth(truth) if truth else None
+    (result, measured), true_volume = run_and_scan(folder, scan, reading), read_volume_file(truth) if truth else None
     if truth is not None and true_volume is not None:
         require_same_field(true_volume.grid, measured.views, truth)
     evaluation = score(result, measured, true_volume)

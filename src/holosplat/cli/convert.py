@@ -19,7 +19,7 @@ from ..io.png import PngKind
 from ..io.r2_gaussian import R2Options, write_r2_gaussian
 from ..io.reading import Reading
 from ..io.tiff import TiffLayout, write_tiff
-from ..io.volumes import read_volume
+from ..io.volume_formats import read_volume_file
 from ..matter import KnownRatio, MaterialPrior
 from ..methods.method import STAND_IN_RATIO, shows_no_refraction
 from ..optics import retrieve_thickness
@@ -129,7 +129,7 @@ def convert(
     else:
         require(prior.fixes_ratio, "--to r2-gaussian needs --material or --delta-beta: it takes retrieved thickness.")
         if writing.truth:
-            said["truth"] = read_volume(writing.truth)
+            said["truth"] = read_volume_file(writing.truth)
         write_r2_gaussian(out, scan, *_retrieved(scan, prior), replace(R2Options(), **said))
     held_out = int(scan.is_test.sum())
     _say(f"wrote {out}: {to}, {len(scan)} frames of {scan.views.shape[0]} × {scan.views.shape[1]} pixels, "

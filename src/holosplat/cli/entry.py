@@ -97,6 +97,10 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "commands",
         "Score a run on held-out frames and against the true volume, which then joins its report.",
     ),
+    "compare": (
+        "compare",
+        "Compare two runs side by side: what was asked, decided and found, and where their volumes differ.",
+    ),
     "check": (
         "check",
         "Say whether a run folder or an HDF5 file is as it was written, by manifest and checksums.",
@@ -114,6 +118,14 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "bench": (
         "bench",
         "Compare methods on cases, under one physics and one set of scores (run, report); rerun the thesis' study.",
+    ),
+    "info": (
+        "info",
+        "Say what a file or a run is: shape, beam, angles, air, noise, fringes, what is missing, and what it takes.",
+    ),
+    "doctor": (
+        "doctor",
+        "Look at the installation: versions, kernels, threads, memory, disk, and a small run with its error.",
     ),
     "backends": ("commands", "Say which backends can be used here, and what each of them offers."),
 }

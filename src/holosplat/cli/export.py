@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -16,14 +16,17 @@ from ..ranges import Pixels, ranged
 from .places import Output
 
 if TYPE_CHECKING:
+    from ..geometry import Grid
     from ..workflows.reconstruct import Reconstruction
     from ..workflows.run_folder import RunFolder
     from .scans import Moment
 
 MOST_VOXELS = 2**31
 """The largest volume that `export` writes: 16 GB for δ and β."""
-STL, GLB = ".stl", ".glb"
-"""Endings of files that hold all bodies."""
+STL, GLB, VTU = ".stl", ".glb", ".vtu"
+"""Suffixes of files that hold all bodies."""
+SERIES = {".h5": ".xdmf", ".hdf5": ".xdmf", ".vti": ".pvd", VTU: ".pvd"}
+"""Suffixes of files of single times, and that of the file beside them which opens all of them in ParaView."""
 
 
 @dataclass(frozen=True)
@@ -55,16 +58,20 @@ def export(
 
     Args:
         run: Run folder.
-        volume: Volume to write, by its ending: .h5 or .hdf5, a file of HDF5; .ome.tif, .ome.tiff, .tif or .tiff, an
-            OME-TIFF; .ome.zarr or .zarr, a folder of OME-Zarr (extra zarr); each with the channels δ and β.
+        volume: Volume to write, by its suffix: .h5 or .hdf5, HDF5; .vti, for ParaView and PyVista; .nrrd, for 3D Slicer
+            and ITK; .mrc, for ChimeraX; .tif or .tiff, an OME-TIFF; .zarr, a folder of OME-Zarr (extra zarr). NRRD and
+            MRC hold δ alone, and β in NAME.beta.nrrd or NAME.beta.mrc.
         shape: Voxels along z, y, x (default: the scan's field of view, Z = X = W, Y = H).
         voxel_size: Edge of a voxel [m] (default: the pixel size).
         bodies: Of a run of surfaces: a folder to make, with one VTK file a body (µm), the largest first, or of a run
-            of track the same body under the same name at all times; or by its ending one file of all bodies, .stl (µm)
-            or .glb (glTF, m).
+            of track the same body under the same name at all times; or by its suffix one file of all bodies, .vtu
+            (VTK, µm), .stl (µm) or .glb (glTF, m).
         time_frame: Of a run of track: the time, counted from 0 (default: the first), or all, to files and folders whose
-            names end with _t0000 and so on, or to one .glb in which the bodies move.
+            names end with _t0000 and so on, or to one .glb in which the bodies move. Beside HDF5 a .xdmf, beside .vti
+            and .vtu a .pvd opens all times in ParaView.
     """
+    from ..io.volume_formats import of_time
+    from ..workflows.moments import instants_of
     from ..workflows.run_folder import RunFolder
     from .scans import moments_of
 
@@ -74,25 +81,77 @@ def export(
     )
     require(objects.compact is not None or not objects.together, "--together needs --compact; name its file.")
     folder = RunFolder(run)
+    _require_suffixes(volume, bodies, objects)
+    every = range(len(instants_of(folder))) if time_frame == "all" else ()
+    moving = bodies is not None and time_frame == "all" and bodies.suffix.lower() == GLB and _moves(folder)
+    timed = [path for path in (volume, None if moving else bodies, objects.splats) if path is not None]
+    _require_free(timed, every)
     if objects.compact is not None:
         _export_compact(folder, objects.compact, objects.step_px, objects.together)
-    if bodies is not None and time_frame == "all" and bodies.suffix.lower() == GLB and _export_motion(folder, bodies):
-        bodies = None
-    if not any((volume, bodies, objects.splats)):
+    if bodies is not None and moving:
+        _export_motion(folder, bodies)
+    steps: dict[Path, list[tuple[float, Path]]] = {path: [] for path in timed}
+    grid = None
+    for one in moments_of(folder, time_frame) if timed else ():
+        for path in timed:
+            out = path if one.frame is None else of_time(path, one.frame)
+            steps[path].append((one.time, out))
+            if path is bodies:
+                _export_bodies(one, out)
+            elif path is volume:
+                grid = _export_volume(one.result, folder, out, shape, voxel_size)
+            else:
+                _export_splats(one.result, out)
+    for path in timed if every else ():
+        _export_series(path, steps[path], grid)
+
+
+def _require_suffixes(volume: Path | None, bodies: Path | None, objects: ObjectFiles) -> None:
+    """`InputError` for a name of a file whose suffix is of no format, before anything is written."""
+    from ..io.volume_formats import HDF5_SUFFIXES, volume_format
+
+    if volume is not None:
+        volume_format(volume, "--volume")
+    for path, called, suffixes in (
+        (bodies, "--bodies must be a folder without a suffix, or a file", ("", VTU, STL, GLB)),
+        (objects.compact, "--compact must be a file", HDF5_SUFFIXES),
+        (objects.splats, "--splats must be a file", (".ply",)),
+    ):
+        require(
+            path is None or path.suffix.lower() in suffixes,
+            f"{called} whose name ends with {', '.join(filter(None, suffixes))}, but it is {path}; name another one.",
+        )
+
+
+def _require_free(timed: Sequence[Path], every: Sequence[int]) -> None:
+    """`InputError` where a file beside those that options name is there already: `timed` ones of `every` time."""
+    from ..io.provenance import require_free
+    from ..io.volume_formats import FORMATS, of_time
+
+    for path in timed:
+        for out in [of_time(path, frame) for frame in every] or [path]:
+            form = FORMATS.get(path.suffix.lower())
+            for file in form.files(out) if form else ():
+                require_free(file)
+        if every and (series := SERIES.get(path.suffix.lower())):
+            require_free(path.with_suffix(series))
+
+
+def _export_series(path: Path, steps: Sequence[tuple[float, Path]], grid: Grid | None) -> None:
+    """Write what opens files of all times, if their format has such."""
+    from ..io.pvd import TimeStep, write_pvd
+    from ..io.xdmf import write_xdmf
+
+    suffix = SERIES.get(path.suffix.lower())
+    if suffix is None:
         return
-    for one in moments_of(folder, time_frame):
-        if bodies is not None:
-            _export_bodies(one, bodies.with_stem(bodies.stem + one.ending))
-        if objects.splats is not None:
-            _export_splats(one.result, objects.splats.with_stem(objects.splats.stem + one.ending))
-        if volume is not None:
-            _export_volume(one.result, folder, _ending(volume, one.ending), shape, voxel_size)
-
-
-def _ending(path: Path, ending: str) -> Path:
-    """The path with `ending` before its suffixes, of which .ome.zarr and .ome.tif are two."""
-    stem, ome, _ = path.stem.partition(".ome")
-    return path.with_name(f"{stem}{ending}{ome}{path.suffix}")
+    out = path.with_suffix(suffix)
+    if suffix == ".pvd":
+        write_pvd(out, [TimeStep(time, (file,)) for time, file in steps])
+    else:
+        assert grid is not None
+        write_xdmf(out, grid, steps)
+    _say(f"wrote {out}: {len(steps)} times, for ParaView")
 
 
 def _export_compact(folder: RunFolder, out: Path, step_px: float, together: tuple[Path, ...]) -> None:
@@ -114,19 +173,24 @@ def _export_compact(folder: RunFolder, out: Path, step_px: float, together: tupl
     _say(f"wrote {out}: {after / 1e6:.3g} MB, {before / after:.1f} times smaller than {of}")
 
 
-def _export_motion(folder: RunFolder, out: Path) -> bool:
-    """Write a run of track as bodies that move; False, and nothing written, of any other."""
+def _moves(folder: RunFolder) -> bool:
+    """Whether a run holds bodies in motion."""
+    from ..representations import MovingSurfaces
+    from ..workflows.reconstruct import load_reconstruction
+
+    return isinstance(load_reconstruction(folder).object, MovingSurfaces)
+
+
+def _export_motion(folder: RunFolder, out: Path) -> None:
     from ..io.solids import write_moving_glb
     from ..representations import MovingSurfaces
     from ..workflows.moments import instants_of
     from ..workflows.reconstruct import load_reconstruction
 
-    found, times = load_reconstruction(folder).object, instants_of(folder)
-    if not isinstance(found, MovingSurfaces):
-        return False
-    write_moving_glb(out, found, times)
+    found = load_reconstruction(folder).object
+    assert isinstance(found, MovingSurfaces)
+    write_moving_glb(out, found, instants_of(folder))
     _say(f"wrote {out}: {found.count} bodies in motion")
-    return True
 
 
 def _export_splats(result: Reconstruction, out: Path) -> None:
@@ -142,6 +206,7 @@ def _export_splats(result: Reconstruction, out: Path) -> None:
 
 def _export_bodies(one: Moment, out: Path) -> None:
     from ..io.solids import write_glb, write_stl
+    from ..io.vtu import write_vtu
     from .surface import write_bodies
 
     found = one.result.object
@@ -149,10 +214,15 @@ def _export_bodies(one: Moment, out: Path) -> None:
         raise InputError(
             f"--bodies needs a run of surfaces, but this one holds {found.described}; use holosplat surface."
         )
-    if out.suffix.lower() in (STL, GLB):
-        write_stl(out, one.bodies) if out.suffix.lower() == STL else write_glb(out, one.bodies, found.matter)
+    suffix, matter = out.suffix.lower(), found.matter
+    if suffix == STL:
+        write_stl(out, one.bodies)
+    elif suffix == GLB:
+        write_glb(out, one.bodies, matter)
+    elif suffix == VTU:
+        write_vtu(out, one.bodies, matter)
     else:
-        write_bodies(out, one.bodies, found.matter, {})
+        write_bodies(out, one.bodies, matter, {})
     _say(f"wrote {out}: {len(one.bodies)} bodies")
 
 
@@ -162,24 +232,14 @@ def _export_volume(
     volume: Path,
     shape: tuple[int, int, int] | None,
     voxel_size: float | None,
-) -> None:
+) -> Grid:
     from ..geometry import Grid
     from ..io.json import read_json
-    from ..io.ome_zarr import ZARR_SUFFIX, require_zarr, write_ome_zarr
-    from ..io.volume_files import TIFF_SUFFIXES, VOLUME_SUFFIXES, write_ome_tiff
-    from ..io.volumes import write_voxels
+    from ..io.volume_formats import write_volume_file
     from ..planning.acts import of_export
     from ..scan import PIXEL_RANGE_M
     from .room import tell
 
-    known = (*VOLUME_SUFFIXES, ZARR_SUFFIX)
-    require(
-        volume.suffix.lower() in known,
-        f"--volume must be a file whose name ends with {', '.join(known)}, by which its format is chosen, but it is "
-        f"{volume}; name it so.",
-    )
-    if volume.suffix.lower() == ZARR_SUFFIX:
-        require_zarr()
     with as_written(folder.summary, "what reconstruct wrote"):
         detector = read_json(folder.summary)["detector"]
         rows, columns = int(detector["rows"]), int(detector["columns"])
@@ -191,13 +251,9 @@ def _export_volume(
     require(count <= MOST_VOXELS, f"shape must have at most {MOST_VOXELS:.0e} voxels, but it has {count:.0e}.")
     slabs = ((f"an HDF5 file{how}", of_export(shape, ".h5")) for how, shape in _smaller(grid.shape))
     tell("the volume", of_export(grid.shape, volume.suffix.lower()), volume, slabs)
-    if volume.suffix.lower() in TIFF_SUFFIXES:
-        write_ome_tiff(volume, result.object.voxelise(grid))
-    elif volume.suffix.lower() == ZARR_SUFFIX:
-        write_ome_zarr(volume, result.object, grid)
-    else:
-        write_voxels(volume, result.object, grid)
+    write_volume_file(volume, result.object, grid)
     _say(f"wrote {volume}: {' × '.join(map(str, grid.shape))} voxels of {1e6 * grid.voxel_size[0]:.4g} µm")
+    return grid
 
 
 def _smaller(shape: tuple[int, int, int]) -> Iterator[tuple[str, tuple[int, int, int]]]:

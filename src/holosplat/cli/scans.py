@@ -59,10 +59,11 @@ def run_and_scan(folder: RunFolder, scan: Path | None, reading: Reading) -> tupl
 
 @dataclass(frozen=True)
 class Moment:
-    """A run as it is at one time. ending: what names of its files add, such as _t0000, or nothing; bodies: closed
-    meshes [m], if it has them, of a run in motion in the order of their identities."""
+    """A run as it is at one time. frame: the time's number, which names of its files add, or None; time [s]; bodies:
+    closed meshes [m], if it has them, of a run in motion in the order of their identities."""
 
-    ending: str
+    frame: int | None
+    time: float
     result: Reconstruction
     bodies: list[TriangleMesh] | None
 
@@ -77,9 +78,8 @@ def moments_of(folder: RunFolder, time_frame: int | Literal["all"] | None) -> It
     found = result.object
     if not isinstance(found, MOVING):
         require(time_frame is None, f"{folder.path} is of one time; leave --time-frame.")
-        yield Moment("", result, found.bodies() if isinstance(found, SurfaceMesh) else None)
+        yield Moment(None, 0.0, result, found.bodies() if isinstance(found, SurfaceMesh) else None)
         return
     for k in chosen_frames(time_frame, times):
-        ending = f"_t{k:04d}" if time_frame == "all" else ""
         bodies = found.bodies(times[k]) if isinstance(found, MovingSurfaces) else None
-        yield Moment(ending, moment(result, times, k), bodies)
+        yield Moment(k if time_frame == "all" else None, times[k], moment(result, times, k), bodies)

@@ -88,7 +88,7 @@ def simulate(
     Args:
         files: VTK files (.vtk, .vtu, .vtp), one a cell; x, y, z are the object frame's, y is the rotation axis. With
             --frame-rate: numbered snapshots (cell00_000.vtk, cell00_001.vtk …), or one collection (.pvd). Or a volume:
-            one HDF5 file with /delta and /beta, or TIFF images. None with --specimen.
+            one file of any format of `export --volume`, or TIFF images. None with --specimen.
         out: Scan file to write (NXtomo).
     """
     import numpy as np
@@ -218,10 +218,10 @@ def _write_frames(
 
 def _write_truth(path: Path, matter: Still, views: Views) -> None:
     from ..geometry import Grid
-    from ..io.volumes import write_voxels
+    from ..io.volume_formats import write_volume_file
 
     with ProgressBar() as bar:
-        write_voxels(path, matter, Grid.of_views(views), partial(bar.show, "voxels", record={}))
+        write_volume_file(path, matter, Grid.of_views(views), partial(bar.show, "voxels", record={}))
 
 
 def _say(text: str) -> None:

@@ -28,7 +28,7 @@ CORED = ("coated-droplets", "body-with-absorber")
 @dataclass(frozen=True)
 @ranged
 class VolumeOptions:
-    """What the images of a TIFF stack show; an HDF5 volume says it itself."""
+    """What the images of a TIFF stack show; files of `export --volume` say it themselves."""
 
     voxel_size: Small | None = None
     """Edge of the cubic voxels [m]."""
@@ -162,9 +162,9 @@ class SpecimenOptions:
         self, paths: tuple[Path, ...], beamline: BeamlineOptions, filling: Filling, duration: float = 0.0
     ) -> ContinuousScene | CarriedScene | VoxelScene | None:
         """The specimen, unless `paths` are meshes; `InputError` for a mixture. duration: of its motion [s]."""
-        from ..io.volume_files import VOLUME_SUFFIXES
+        from ..io.volume_formats import FORMATS
 
-        of_volume = [path for path in paths if path.suffix.lower() in VOLUME_SUFFIXES]
+        of_volume = [path for path in paths if path.suffix.lower() in FORMATS]
         if self.generated.specimen is not None:
             require(not paths, "--specimen generates what is imaged; give it or files, not both.")
             return self.generated.scene(beamline, filling, duration)

@@ -9,6 +9,7 @@ import atexit
 import gc
 import re
 import sys
+from traceback import walk_tb
 
 from ..io.room import left_by_limits
 from .sentence import give_up
@@ -19,6 +20,10 @@ UNMAPPED = re.compile("failed to map segment|cannot allocate|cannot enable execu
 """What loaders of libraries say where there is no memory for one."""
 UNSAID = re.compile("returned NULL without setting an exception|error return without exception set")
 """What Python says where it has found no memory, for a module that it compiles or for anything else."""
+NO_TORCH = (
+    "the package torch must be installed and load, but it does not: install it by the command that the selector under "
+    "Get Started on PyTorch's site gives (Compute Platform: CPU where there is no NVIDIA GPU), then try again"
+)
 
 
 def main() -> None:
@@ -31,6 +36,8 @@ def main() -> None:
 
         run()
     except ImportError as error:
+        if _of_torch(error):
+            give_up(f"{NO_TORCH} ({str(error).splitlines()[0][:200]}).")
         if not UNMAPPED.search(str(error)):
             raise
         give_up(_too_little(f"a library finds no room ({str(error).splitlines()[0][:200]})"))
@@ -40,6 +47,12 @@ def main() -> None:
         if not UNSAID.search(str(error)):
             raise
         give_up(_too_little("Python finds no room to read a library"))
+
+
+def _of_torch(error: ImportError) -> bool:
+    """Whether torch is missing, or is installed but fails as it is loaded, for another reason than memory."""
+    inside = (frame.f_globals.get("__name__") == "torch" for frame, _ in walk_tb(error.__traceback__))
+    return error.name == "torch" or (any(inside) and not UNMAPPED.search(str(error)))
 
 
 def _require_room() -> None:

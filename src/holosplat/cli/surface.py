@@ -15,7 +15,7 @@ from ..checks import require
 from ..io.folder import atomic_folder
 from ..io.json import write_json
 from ..io.reading import Reading
-from ..io.volumes import read_volume
+from ..io.volume_formats import read_volume_file
 from ..io.vtk import write_mesh
 from ..matter import Matter
 from ..mesh import TriangleMesh
@@ -62,7 +62,7 @@ def surface(
         f"{run} holds bodies in motion, whose surfaces are fitted at one time; choose it with --time-frame 0 … "
         f"{len(times) - 1}, or write the bodies as they are with export --bodies.",
     )
-    (result, measured), volume = run_and_scan(folder, scan, reading), read_volume(truth) if truth else None
+    (result, measured), volume = run_and_scan(folder, scan, reading), read_volume_file(truth) if truth else None
     name = "Gaussians" if result.object.kind == "gaussians" else "run"
     if not times and not folder.is_of(scan_hash(measured)):
         _say("this is not the scan that was reconstructed: its held-out frames may have been fitted")

@@ -29,7 +29,16 @@ class Compared:
     @property
     def wins(self) -> bool:
         """Whether the gain is sure and of practical size."""
-        return self.gain > max(ERRORS * self.error, -math.log1p(-MARGIN))
+        return self.gain > self._sure
+
+    @property
+    def loses(self) -> bool:
+        """Whether a loss is."""
+        return self.gain < -self._sure
+
+    @property
+    def _sure(self) -> float:
+        return max(ERRORS * self.error, -math.log1p(-MARGIN))
 
 
 @dataclass(frozen=True)

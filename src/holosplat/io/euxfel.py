@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import InputError, MissingError, as_written, finite, positive, require, warn
+from ..checks import InputError, MissingError, UnsaidError, as_written, finite, positive, require, warn
 from ..frames import Frames
 from ..preprocess.flat_field import mean_frame, relative_intensity, unlit
 from ..scan import Exposures, Scan
@@ -177,10 +177,11 @@ def _times(stack: KeyStack, given: Mapping[str, Any]) -> np.ndarray:
     trains, pulses = np.array(stack.places).T
     several = len(np.unique(pulses)) > 1
     rate = given.get("frame_rate")
-    require(
-        not several or rate is not None,
-        f"{stack.path} does not say how often the camera takes a frame; say it by --frame-rate, such as 1.128e6.",
-    )
+    if several and rate is None:
+        raise UnsaidError(
+            f"{stack.path} does not say how often the camera takes a frame; say it by --frame-rate, such as 1.128e6.",
+            {"frame_rate": 1e6},
+        )
     period = 1 / positive("--frame-rate", rate, "Hz") if several else 0.0
     return TRAIN_INTERVAL_S * (trains - trains[0]) + period * (pulses - pulses[0])
 

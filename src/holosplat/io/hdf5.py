@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import h5py
 import numpy as np
 
-from ..checks import InputError, MissingError, require_regular, shaped
+from ..checks import InputError, MissingError, UnsaidError, require_regular, shaped
 from ..units import unit_factor
 from .guard import require_memory
 from .hdf5_filters import filters_missing_in
@@ -61,12 +62,16 @@ class Fields:
         """The first of `names` that exists, or None."""
         return next((name for name in names if name in self.group), None)
 
-    def need(self, *names: str, way_out: str = "add it") -> str:
-        """The first of `names` that exists; `InputError`, with the advice `way_out`, when none does."""
+    def need(self, *names: str, way_out: str = "add it", stand_in: Mapping[str, Any] = MappingProxyType({})) -> str:
+        """The first of `names` that exists; `InputError`, with the advice `way_out`, when none does.
+
+        stand_in: of an `UnsaidError`, where an option can say it.
+        """
         found = self.find(*names)
         if found is None:
             others = "".join(f" (or {self._below}/{name})" for name in names[1:])
-            raise InputError(f"{self.label(names[0])}{others} must be there, but it is missing; {way_out}.")
+            said = f"{self.label(names[0])}{others} must be there, but it is missing; {way_out}."
+            raise UnsaidError(said, stand_in) if stand_in else InputError(said)
         return found
 
     def dataset(self, name: str) -> h5py.Dataset:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import InputError, at_least, in_range, require
+from ..checks import InputError, UnsaidError, at_least, in_range, require
 from ..geometry import Views
 from ..ranges import Metres, Positive, Signed, Small, ranged
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan, checked_distance
@@ -24,6 +24,7 @@ from .json import write_json
 from .loader import Loader, folder_with
 from .ply import write_ply
 from .png import LEVELS, PngKind, read_png, write_png
+from .raw_file import require_said, stand_in
 from .seeds import hull_points, uniform_points
 from .table import Table
 
@@ -168,9 +169,10 @@ def read_nerf_synthetic(path: str | Path, given: GivenOptics | None = None) -> S
         require(given is None, f"{folder} says itself how it was taken; leave away what is given for others' folders.")
         return _own_scan(splits[0].table("holosplat"), content)
     if given is None:
-        raise InputError(
+        raise UnsaidError(
             f"{folder} must say how it was taken (the entry holosplat of {TRAIN}), but it is of another program; give "
-            "the photon energy, the propagation distance and the pixel size."
+            "the photon energy, the propagation distance and the pixel size (--energy-kev, --distance, --pixel-size).",
+            stand_in(*TAKES[:3]),
         )
     return _foreign_scan(folder, splits, content, given)
 
@@ -267,8 +269,7 @@ TAKES = ("energy_kev", "distance", "pixel_size", "black", "white")
 def _read(path: Path, given: Mapping[str, float]) -> Scan:
     if not given:
         return read_nerf_synthetic(path)
-    for name in TAKES[:3]:
-        require(name in given, f"{name} must be given too, for folders of other programs.")
+    require_said(str(path), [name for name in TAKES[:3] if name not in given])
     return read_nerf_synthetic(path, GivenOptics(**given))
 
 

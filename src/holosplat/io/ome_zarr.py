@@ -13,12 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import InputError
+from ..checks import LONGEST, InputError, finite, require
 from ..geometry import Grid
+from ..progress import Advance
+from ..units import LENGTH_UNITS, unit_factor
 from ..volume import Object, Volume
 from .folder import atomic_folder, require_new
+from .guard import require_memory
 from .hdf5_writing import require_room
-from .volumes import NAMES, SLAB_VOXELS, slabs_of
+from .volumes import NAMES, SLAB_VOXELS, grid_of, slabs_of
 
 ZARR_SUFFIX = ".zarr"
 CHUNK = 64
@@ -39,7 +42,7 @@ def require_zarr() -> Any:
     return zarr
 
 
-def write_ome_zarr(path: Path, obj: Object, grid: Grid) -> None:
+def write_ome_zarr(path: Path, obj: Object, grid: Grid, on_progress: Advance = lambda fraction: None) -> None:
     """Write δ and β of `obj` on `grid` as an OME-Zarr folder at `path`, which must be new; float32, lossless.
 
     Axes c, z, y, x; lengths in micrometres, with the places of voxel centres (`translation`). Each level has means over
@@ -54,12 +57,44 @@ def write_ome_zarr(path: Path, obj: Object, grid: Grid) -> None:
         group = zarr.open_group(store=str(temporary), mode="w", zarr_format=2)
         shapes, limits = levels_of(grid.shape), np.array([[np.inf, -np.inf]] * len(NAMES))
         arrays = [_array(group, str(k), shape) for k, shape in enumerate(shapes)]
-        _fill(arrays[0], slabs_of(obj, grid, rows), limits)
+        _fill(arrays[0], slabs_of(obj, grid, rows, on_progress), limits)
         for fine, coarse in pairwise(arrays):
             for start in range(0, coarse.shape[2], CHUNK):
                 stop = min(start + CHUNK, coarse.shape[2])
                 coarse[:, :, start:stop] = halved(fine[:, :, 2 * start : 2 * stop])
         group.attrs.update(metadata(grid, len(shapes), limits))
+
+
+def read_ome_zarr(path: Path) -> Volume:
+    """The volume of an OME-Zarr folder with the channels δ and β, as `write_ome_zarr` writes it, at its finest level.
+
+    Errors: `InputError` without the package zarr, and for other folders.
+    """
+    zarr = require_zarr()
+    require(path.is_dir(), f"{path} must be a folder of OME-Zarr, but there is none; check the path.")
+    try:
+        group = zarr.open_group(store=str(path), mode="r", zarr_format=2)
+        image = group.attrs["multiscales"][0]
+        channels = tuple(channel["label"] for channel in group.attrs["omero"]["channels"])
+        axes = [axis["name"] for axis in image["axes"]]
+        factors = [unit_factor(f"{path}: axes", axis["unit"], LENGTH_UNITS) for axis in image["axes"][1:]]
+        finest, array = image["datasets"][0], group[image["datasets"][0]["path"]]
+        scale, place = (np.array(step[step["type"]], dtype=float) for step in finest["coordinateTransformations"])
+        if channels != NAMES or axes != ["c", *"zyx"] or array.ndim != 4 or array.shape[0] != len(NAMES):
+            raise ValueError(f"it has the channels {channels} and the axes {axes}")
+        require_memory(str(path), 4 * math.prod(array.shape))
+        size, origin = ((values[1:] * factors)[::-1] for values in (scale, place))
+        delta, beta = np.asarray(array[:], dtype=np.float32)
+    except (InputError, MemoryError):
+        raise
+    except Exception as error:  # zarr and its codecs raise many kinds for damaged folders
+        said = " ".join(str(error).split())[:LONGEST] or type(error).__name__
+        raise InputError(
+            f"{path} must be an OME-Zarr of δ and β, as `holosplat export` writes it, but it is damaged or another "
+            f"one: {said}."
+        ) from None
+    grid = grid_of(path, delta.shape, size.tolist(), origin.tolist())
+    return Volume(finite(f"{path}", delta), finite(f"{path}", beta), grid)
 
 
 def levels_of(shape: tuple[int, int, int]) -> list[tuple[int, int, int]]:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import InputError, at_least, finite, in_range, positive, require, shaped
+from ..checks import InputError, UnsaidError, at_least, finite, in_range, positive, require, shaped
 from ..geometry import Grid, Views
 from ..ranges import ranged
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, Scan
@@ -26,6 +26,7 @@ from .folder import atomic_folder
 from .guard import read_array
 from .json import write_json
 from .loader import Loader, folder_with
+from .raw_file import stand_in
 from .seeds import hull_points
 from .table import Table
 
@@ -136,7 +137,8 @@ def read_r2_gaussian(path: str | Path, energy_kev: float | None = None, pixel_si
     if own:
         return _own_scan(meta, entries, lines, is_test)
     if energy_kev is None or pixel_size is None:
-        raise InputError(f"{path} does not say its photon energy and pixel size; give both.")
+        said = f"{path} does not say its photon energy and pixel size; give both, by --energy-kev and --pixel-size."
+        raise UnsaidError(said, stand_in(*TAKES))
     in_range("energy", energy_kev, *ENERGY_RANGE_KEV, unit="keV")
     in_range("pixel size", pixel_size, *PIXEL_RANGE_M, unit="metres")
     angles = [entry.number("angle") for entry in entries]

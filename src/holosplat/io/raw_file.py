@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ..checks import InputError, in_range, require
+from ..checks import UnsaidError, in_range, require
 from ..divided_light import DividedLight
 from ..geometry import Views, rotation_y
 from ..preprocess.flat_field import mean_frame
@@ -31,6 +31,7 @@ RANGES = {
 }
 
 
+STAND_INS = {"energy_kev": 20.0, "distance": 0.1, "pixel_size": 1e-6}
 NAMES = {"energy_kev": "photon energy", "distance": "propagation distance", "pixel_size": "pixel size"}
 
 
@@ -142,12 +143,18 @@ def said(given: Mapping[str, Any], name: str) -> float | None:
     return in_range(f"--{name.replace('_', '-')}", given[name], *bounds, unit=unit)
 
 
+def stand_in(*names: str) -> dict[str, float]:
+    """Values for `names` (of `STAND_INS`) with which a file that does not say them can be looked at."""
+    return {name: STAND_INS[name] for name in names}
+
+
 def require_said(label: str, missing: Sequence[str]) -> None:
-    """`InputError` that names the options for what neither a file nor the command says, all of it at once."""
+    """`UnsaidError` that names the options for what neither a file nor the command says, all of it at once."""
     if missing:
         options = [f"--{name.replace('_', '-')}" for name in missing]
         what, how = (_listed(words) for words in ([NAMES[name] for name in missing], options))
-        raise InputError(f"{label} does not say the {what}; say {'it' if len(missing) == 1 else 'them'} by {how}.")
+        said = f"{label} does not say the {what}; say {'it' if len(missing) == 1 else 'them'} by {how}."
+        raise UnsaidError(said, stand_in(*missing))
 
 
 def _listed(words: Sequence[str]) -> str:
@@ -179,7 +186,10 @@ def exposures_of(
     if angles is None and int(projections.sum()) == 1:
         angles = np.zeros(1)
     if angles is None:
-        raise InputError(f"{label} does not say the frames' angles; name a text file of them by --angles FILE.")
+        raise UnsaidError(
+            f"{label} does not say the frames' angles; name a text file of them by --angles FILE.",
+            {"angles_deg": np.zeros(int(projections.sum()))},
+        )
     turned = rotation_y(angles_of_projections(np.asarray(angles, dtype=np.float64).reshape(-1), projections))
     views = Views.from_rotations(turned, shape, values["pixel_size"])
     return Exposures.of(views, values["energy_kev"], values["distance"])

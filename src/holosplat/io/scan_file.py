@@ -14,7 +14,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ..checks import InputError, finite, in_range, require, shaped
+from ..checks import InputError, UnsaidError, finite, in_range, require, shaped
 from ..geometry import Views, rotation_y
 from ..scan import ENERGY_RANGE_KEV, PIXEL_RANGE_M, Exposures, checked_distance
 from ..units import ANGLE_UNITS, ENERGY_UNITS, LENGTH_UNITS, TIME_UNITS
@@ -22,7 +22,18 @@ from .divided_light import read_divided_light
 from .hdf5 import Fields, attribute_text, open_hdf5
 from .nxtomo_geometry import FLIPS as FLIPS
 from .nxtomo_geometry import SHIFT, about_axis, flips_of, magnification
-from .raw_file import DARK, FLAT, INVALID, NOTHING, PROJECTION, ScanFile, angles_of_projections, require_said, said
+from .raw_file import (
+    DARK,
+    FLAT,
+    INVALID,
+    NOTHING,
+    PROJECTION,
+    ScanFile,
+    angles_of_projections,
+    require_said,
+    said,
+    stand_in,
+)
 
 DATA = "instrument/detector/data"
 DATA_NAMES = (DATA, "data/data")
@@ -202,7 +213,8 @@ def _views(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> Views
 def _rotations_of_angles(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> np.ndarray:
     if given.get("angles_deg") is not None:
         return rotation_y(angles_of_projections(given["angles_deg"], kinds == PROJECTION))
-    name = fields.need(*ANGLES, way_out="say it by --angles FILE, or add it")
+    unsaid = {"angles_deg": np.zeros(int((kinds == PROJECTION).sum()))}
+    name = fields.need(*ANGLES, way_out="say it by --angles FILE, or add it", stand_in=unsaid)
     angles = _per_frame(fields, kinds, name)
     if "units" not in fields.dataset(name).attrs and np.abs(angles).max() > MOST_RADIANS:
         raise InputError(
@@ -236,7 +248,8 @@ def _pixel_sizes(fields: Fields, kinds: np.ndarray) -> float | np.ndarray:
             )
         return float(across[0]) if np.allclose(across, across[0], rtol=1e-6, atol=0) else across
     missing = fields.label(PIXEL_SIZES[-1].format("x"))
-    raise InputError(f"{missing} must be there, but it is missing; say it by --pixel-size, or add it.")
+    said = f"{missing} must be there, but it is missing; say it by --pixel-size, or add it."
+    raise UnsaidError(said, stand_in("pixel_size"))
 
 
 def _energies(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> np.ndarray:
@@ -244,7 +257,7 @@ def _energies(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> np
     told = said(given, "energy_kev")
     if told is not None:
         return np.full(int((kinds == PROJECTION).sum()), told)
-    name = fields.need(*ENERGIES, way_out="say it by --energy-kev, or add it")
+    name = fields.need(*ENERGIES, way_out="say it by --energy-kev, or add it", stand_in=stand_in("energy_kev"))
     energies = _per_frame(fields, kinds, name) * fields.unit(name, ENERGY_UNITS, "keV")
     for energy in (energies.min(), energies.max()):
         in_range(fields.label(name), float(energy), *ENERGY_RANGE_KEV, unit="keV")
@@ -263,7 +276,7 @@ def _distances(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> n
 
 
 def _distances_of_file(fields: Fields, kinds: np.ndarray) -> np.ndarray:
-    name = fields.need(*DISTANCES, way_out="say it by --distance, or add it")
+    name = fields.need(*DISTANCES, way_out="say it by --distance, or add it", stand_in=stand_in("distance"))
     return _per_frame(fields, kinds, name) * fields.unit(name, LENGTH_UNITS, "m")
 
 

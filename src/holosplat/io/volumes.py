@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,8 @@ from .hdf5_writing import new_hdf5, room_for
 
 NAMES = ("delta", "beta")
 VOXEL_RANGE_M = (1e-10, 1e-2)
+SAID = {"voxel_size_units": "m", "origin_units": "m", "axes": "z, y, x"}
+"""Attributes for people and other programs; lengths are (x, y, z)."""
 SLAB_VOXELS = 1 << 22
 """Voxels that `write_voxels` makes at once: meshes take about 250 MB for them."""
 
@@ -36,10 +38,17 @@ def read_volume(path: str | Path) -> Volume:
                 f"{arrays[1].shape}."
             )
         size = np.broadcast_to(_attribute(fields, "voxel_size", (1, 3)), (3,))
-        for number in size:
-            in_range(f"{path}: voxel_size", float(number), *VOXEL_RANGE_M, unit="metres")
-        origin = finite(f"{path}: origin", _attribute(fields, "origin", (3,)))
-    return Volume(arrays[0], arrays[1], Grid(arrays[0].shape, tuple(size), tuple(origin)))
+        origin = _attribute(fields, "origin", (3,))
+    return Volume(arrays[0], arrays[1], grid_of(Path(path), arrays[0].shape, size.tolist(), origin.tolist()))
+
+
+def grid_of(path: Path, shape: Sequence[int], size: Sequence[float], origin: Sequence[float]) -> Grid:
+    """The grid of the file `path` from its (Z, Y, X) voxels, their size and the first one's centre (x, y, z) [m]."""
+    for number in size:
+        in_range(f"{path}: voxel_size", float(number), *VOXEL_RANGE_M, unit="metres")
+    (z, y, x), (dx, dy, dz) = map(int, shape), map(float, size)
+    ox, oy, oz = map(float, finite(f"{path}: origin", np.asarray(origin)))
+    return Grid((z, y, x), (dx, dy, dz), (ox, oy, oz))
 
 
 def write_volume(path: str | Path, volume: Volume) -> None:
@@ -50,15 +59,17 @@ def write_volume(path: str | Path, volume: Volume) -> None:
 def write_slabs(path: str | Path, grid: Grid, slabs: Iterable[tuple[int, Volume]]) -> None:
     """Write the volume on `grid` from its parts `slabs`, each with the y index of its first slice.
 
-    The parts must cover the grid; `path` is replaced only once all are written.
+    Attributes say units and axes, too. The parts must cover the grid; `path` is replaced only once all are written.
     """
-    attributes = {"voxel_size": np.array(grid.voxel_size), "origin": np.array(grid.origin)}
+    attributes = {"voxel_size": np.array(grid.voxel_size), "origin": np.array(grid.origin), **SAID}
     with new_hdf5(path, 4 * len(NAMES) * math.prod(grid.shape)) as file:
         file.attrs.update(attributes)
         chunk = (grid.shape[0], 1, grid.shape[2])  # slabs are whole in z and x
         arrays = {name: room_for(file, name, grid.shape, np.float32, chunk=chunk) for name in NAMES}
         for array in arrays.values():
-            array.attrs.update(attributes)
+            array.attrs.update({**attributes, "units": "1"})
+            for dimension, axis in zip(array.dims, "zyx"):
+                dimension.label = axis
         for start, part in slabs:
             for name, array in arrays.items():
                 array[:, start : start + part.grid.shape[1]] = getattr(part, name)
@@ -70,8 +81,12 @@ def write_voxels(path: str | Path, obj: Object, grid: Grid, on_progress: Advance
 
     `on_progress(fraction)` is called after each slab.
     """
-    rows = max(1, SLAB_VOXELS // (grid.shape[0] * grid.shape[2]))
-    write_slabs(path, grid, slabs_of(obj, grid, rows, on_progress))
+    write_slabs(path, grid, slabs_of(obj, grid, slab_rows(grid), on_progress))
+
+
+def slab_rows(grid: Grid) -> int:
+    """Rows along y of `SLAB_VOXELS` voxels; at least one."""
+    return max(1, SLAB_VOXELS // (grid.shape[0] * grid.shape[2]))
 
 
 def slabs_of(

@@ -1,6 +1,6 @@
 """Triangle meshes from and to VTK files: legacy and XML, POLYDATA and UNSTRUCTURED_GRID, one body a file.
 
-STL, PLY and OBJ files are read by name, too.
+Files of `write_vtu` hold several, which come back apart. STL, PLY and OBJ files are read by name, too.
 
 VTK's readers return the readable part of a damaged file and complain on stderr; here their complaints are collected and
 become one `InputError`.
@@ -37,13 +37,16 @@ SOLIDS = {
     ".obj": ("vtkIOGeometry", "vtkOBJReader"),
 }
 """Formats of solid bodies beside VTK's own: their modules and readers in VTK."""
-STRIP = 6
-FLAT_CELLS = (5, STRIP, 7, 9)
+TRIANGLE, STRIP = 5, 6
+FLAT_CELLS = (TRIANGLE, STRIP, 7, 9)
 """VTK's numbers of flat cells whose corners run around the rim or along the strip: triangle to quad."""
+BODY = "body"
+"""Cell data of a file of several bodies: the number of each triangle's body."""
 
 
 def read_meshes(paths: str | Path | Iterable[str | Path], length_unit: str) -> list[TriangleMesh]:
-    """One mesh [m] a file, named by its file name, with duplicate vertices merged and their order kept.
+    """One mesh [m] a file, named by its file name, with duplicate vertices merged and their order kept; of a file of
+    `write_vtu`, one a body, named body000 and so on.
 
     paths: a file, a folder (its .vtk, .vtu, .vtp files, cell2 before cell10), or several of either;
     length_unit: of the files' coordinates ("um", "m", …), which VTK files do not record.
@@ -51,7 +54,7 @@ def read_meshes(paths: str | Path | Iterable[str | Path], length_unit: str) -> l
     names the file that is missing, damaged, truncated, no VTK file, or holds no triangles.
     """
     factor = unit_factor("length_unit", length_unit, LENGTH_UNITS)
-    return [_read_mesh(file, factor) for file in mesh_files(paths)]
+    return [mesh for file in mesh_files(paths) for mesh in _read_file(file, factor)]
 
 
 def mesh_files(paths: str | Path | Iterable[str | Path]) -> list[Path]:
@@ -81,15 +84,20 @@ def write_mesh(path: str | Path, mesh: TriangleMesh, length_unit: str = "um") ->
     cells.ImportLegacyFormat(numpy_to_vtkIdTypeArray(np.ascontiguousarray(rows.reshape(-1)), deep=True))
     data.SetPoints(points)
     data.SetPolys(cells)
-    with atomic_path(path) as temporary, _quiet() as complaints:
-        if Path(path).suffix.lower() == ".vtp":
-            writer = vtkXMLPolyDataWriter()
-        else:
-            writer = vtkPolyDataWriter()
-            writer.SetFileVersion(writer.VTK_LEGACY_READER_VERSION_4_2)
-            writer.SetFileTypeToBinary()
-            writer.SetHeader(f"{mesh.name[:200]} length_unit={length_unit}".replace("\n", " "))
-        writer.SetFileName(os.fsencode(temporary))  # pyright: ignore[reportArgumentType]  # which takes bytes, too
+    if Path(path).suffix.lower() == ".vtp":
+        writer = vtkXMLPolyDataWriter()
+    else:
+        writer = vtkPolyDataWriter()
+        writer.SetFileVersion(writer.VTK_LEGACY_READER_VERSION_4_2)
+        writer.SetFileTypeToBinary()
+        writer.SetHeader(f"{mesh.name[:200]} length_unit={length_unit}".replace("\n", " "))
+    save(path, writer, data)
+
+
+def save(path: str | Path, writer: Any, data: Any) -> None:
+    """Write `data` by a `writer` of VTK."""
+    with atomic_path(path) as temporary, quiet() as complaints:
+        writer.SetFileName(os.fsencode(temporary))
         writer.SetInputData(data)
         if not writer.Write() or complaints():
             raise InputError(f"{path} must be writable, but VTK could not write it: {complaints()}.")
@@ -109,13 +117,14 @@ def _natural_order(file: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", file.name)]
 
 
-def _read_mesh(path: Path, factor: float) -> TriangleMesh:
-    with _quiet() as complaints:
+def _read_file(path: Path, factor: float) -> list[TriangleMesh]:
+    with quiet() as complaints:
         data = _read_data(path)
         if complaints():
             raise _damaged(path, complaints())
         surface = _surface(path, data)
         points, faces = _checked_points(path, surface), _triangles(surface)
+        parts = _bodies(data, faces)
     if len(faces) == 0:
         raise InputError(f"{path} must hold triangles, strips or polygons, but its cells are points or lines.")
     extent, farthest = factor * float(np.linalg.norm(np.ptp(points, axis=0))), factor * float(np.abs(points).max())
@@ -124,10 +133,27 @@ def _read_mesh(path: Path, factor: float) -> TriangleMesh:
         f"{path} must hold a body of {SMALLEST:g} m or more, at most {FARTHEST:g} m from its origin, but it is of "
         f"{extent:.3g} m and reaches {farthest:.3g} m from it; correct its coordinates, or say their --length-unit.",
     )
-    mesh = TriangleMesh(points * factor, faces, _readable(path.name)).merged(MERGE_TOLERANCE * extent)
-    if _ends_within_a_line(path) and not _is_closed(mesh.faces):
+    named = parts or {_readable(path.name): faces}
+    whole = {name: TriangleMesh(points * factor, part, name) for name, part in named.items()}
+    meshes = [(_used(mesh) if parts else mesh).merged(MERGE_TOLERANCE * extent) for mesh in whole.values()]
+    if _ends_within_a_line(path) and not all(_is_closed(mesh.faces) for mesh in meshes):
         raise _damaged(path, "it ends in the middle of a line and its surface is not closed")
-    return mesh
+    return meshes
+
+
+def _bodies(data: Any, faces: np.ndarray) -> dict[str, np.ndarray]:
+    """The triangles of each body of a file of `write_vtu` by its name; empty for other files."""
+    numbers = data.GetCellData().GetArray(BODY)
+    if numbers is None or numbers.GetNumberOfValues() != len(faces):
+        return {}
+    of = _array(numbers)
+    return {f"{BODY}{number:03.0f}": faces[of == number] for number in np.unique(of)}
+
+
+def _used(mesh: TriangleMesh) -> TriangleMesh:
+    """The mesh without vertices of no triangle."""
+    used, faces = np.unique(mesh.faces, return_inverse=True)
+    return TriangleMesh(mesh.vertices[used], faces.reshape(-1, 3), mesh.name)
 
 
 def _readable(name: str) -> str:
@@ -268,7 +294,7 @@ def _is_closed(faces: np.ndarray) -> bool:
 
 
 @contextmanager
-def _quiet() -> Iterator[Callable[[], str]]:
+def quiet() -> Iterator[Callable[[], str]]:
     """VTK's messages kept off stderr; yields a function that tells the first error so far ("" if none)."""
     from vtkmodules.vtkCommonCore import vtkLogger, vtkOutputWindow, vtkStringOutputWindow
 

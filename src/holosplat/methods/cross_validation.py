@@ -1,66 +1,20 @@
-"""Views that are set aside for a moment: how well something foretells them decides what suits the matter."""
+"""Frames of objects, and what of the matter is missing from them."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ..baselines.holographic_tv import Correction
-from ..checks import at_least
 from ..matter import DeltaBeta
 from ..memory import memory_kept
 from ..model import Instrument, Model
-from ..optics.background import Light
-from ..optics.noise_model import NoiseModel
 from ..optics.sampling import alike, fringe_sampling
-from ..ranges import ranged
 from ..scan import Exposures, Scan
 from ..volume import Object
-
-
-@dataclass(frozen=True)
-@ranged
-class CrossValidation:
-    """How views are set aside."""
-
-    width: int = 80
-    """Frames are binned to about so many pixels at most, on which a trial takes seconds."""
-    views: int = 2
-    """Views set aside, of which the first third at most: what is left must still show the matter."""
-
-    def __post_init__(self) -> None:
-        at_least(self, 16, "width")
-        at_least(self, 1, "views")
-
-    def split(self, scan: Scan) -> tuple[Scan, Scan] | None:
-        """Binned frames of `scan` that are left, and those set aside; None with fewer than three frames."""
-        aside = self._aside(len(scan))
-        if not aside.any():
-            return None
-        coarse = scan.binned(self._factor(scan))
-        return coarse[np.flatnonzero(~aside)], coarse[np.flatnonzero(aside)]
-
-    def light(self, scan: Scan, light: Light | None) -> Light | None:
-        """The light of the frames of `scan` that are left, by that of all."""
-        left = torch.from_numpy(np.flatnonzero(~self._aside(len(scan))))
-        return None if light is None else light.part(left, self._factor(scan))
-
-    def noise_aside(self, scan: Scan, noise: NoiseModel) -> NoiseModel:
-        """The noise of the binned frames of `scan` that are set aside, by that of all."""
-        return noise.binned(self._factor(scan))[np.flatnonzero(self._aside(len(scan)))]
-
-    def _aside(self, count: int) -> np.ndarray:
-        """Which of `count` frames are set aside, [V] bool."""
-        some, aside = min(self.views, count // 3), np.zeros(count, dtype=bool)
-        aside[((np.arange(some) + 0.5) * count / max(some, 1)).astype(int)] = True
-        return aside
-
-    def _factor(self, scan: Scan) -> int:
-        return scan.largest_binning(math.ceil(max(scan.views.shape) / self.width))
 
 
 def predicted_frames(exposures: Exposures, obj: Object, oversample: int = 0) -> Tensor:

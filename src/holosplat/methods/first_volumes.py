@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..backends import resolve
 from ..baselines import HolographicTV, holographic_tv
 from ..inference import Score
 from ..matter import DeltaBeta, MaterialPrior, Matter
@@ -22,6 +23,7 @@ from ..optics.noise import noise_levels
 from ..progress import Progress
 from ..representations import VoxelGrid
 from ..scan import Scan
+from ..volume import Object
 from .assumed import assumed_material
 from .cross_validation import predicted_frames
 
@@ -109,7 +111,7 @@ class FirstVolumes:
         frames = torch.from_numpy(seen.frames)
         even = seen if light is None else replace(seen, frames=light.evened(frames).numpy())
         values, grid = holographic_tv(even, self.material, self.options, self.on_progress, light)
-        return VoxelGrid(values[None], grid, Matter.one(*self.material))
+        return VoxelGrid(values[None], grid, Matter.one(*self.material)).on(resolve(self.options.backend))
 
 
 def lit_by_halves(measured: Tensor, predicted: Tensor, known: Background) -> Tensor:
@@ -134,6 +136,6 @@ def score_of(measured: Tensor, predicted: Tensor) -> Score:
     return Score.of(measured.double() - predicted.double())
 
 
-def predictions(volume: VoxelGrid, scan: Scan) -> Tensor:
-    """Frames [V, H, W] of a volume in even light."""
-    return predicted_frames(scan.exposures, volume)
+def predictions(found: Object, scan: Scan) -> Tensor:
+    """Frames [V, H, W] of an object in even light."""
+    return predicted_frames(scan.exposures, found)

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..backends import Backend
+from ..backends import Backend, resolve
 from ..baselines import HolographicTV, holographic_tv
 from ..checks import InputError
 from ..inference import MARGIN, Decision, Score, select
@@ -262,4 +262,5 @@ def predicted_first(
     """Frames [V, H, W] of a first volume by those of `train`, which are in even light; light: what they were before."""
     material = assumed_material(train, prior, on_progress, options.backend)
     values, grid = holographic_tv(train, material, options, on_progress, light)
-    return predicted_frames(train.exposures, VoxelGrid(values[None], grid, Matter.one(*material)))
+    found = VoxelGrid(values[None], grid, Matter.one(*material)).on(resolve(options.backend))
+    return predicted_frames(train.exposures, found)

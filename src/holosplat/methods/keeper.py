@@ -59,39 +59,27 @@ class Keeper:
         if train.exposures is not self.train.exposures:
             self.train, self._judge = train, None
 
-    def handed(self, stage: object, latest: Stored | None, placed: bool) -> Stored | None:
-        """What a stage goes on from: the latest state; or the best one, for a stage that says so by `of_best`, unless
-        the frames are not where they were then. placed: whether fits find where they are."""
-        best = self.best
-        return best.object if best is not None and getattr(stage, "of_best", False) and not placed else latest
-
     def look_after(self, stage: object, name: str, found: Stored, oversample: int) -> None:
-        """Take in what the fit of a stage ended with; it may say `likelier` and `better` (see `look`)."""
-        fitted, better = not getattr(stage, "likelier", False), float(getattr(stage, "better", 0.0))
-        self.look(name, found, oversample, fitted, better)
+        """Take in what the fit of a stage ended with; it may say `likelier` (see `look`)."""
+        self.look(name, found, oversample, fitted=not getattr(stage, "likelier", False))
 
-    def look(self, name: str, found: Stored, oversample: int, fitted: bool = True, better: float = 0.0) -> None:
+    def look(self, name: str, found: Stored, oversample: int, fitted: bool = True) -> None:
         """Take in the latest state. What is not `fitted` is a step of the method, and takes the place of all others
-        unless it has lost the matter (`LOST`).
-
-        better: how many times less than the best of the others it must leave unexplained to be taken (0: `CLEARLY`).
-        """
+        unless it has lost the matter (`LOST`)."""
         if self._judge is None:
             self._judge = MissingMatter(self.train, _material(self.best.object if self.best else found))
         share, contrast = self._judge.shares(found, oversample)
         self.judged[name] = share
-        if self._wins(found, share, contrast, fitted, better):
+        if self._wins(found, share, contrast, fitted):
             self.best = State(name, found, oversample, share, contrast, self.train.exposures)
 
-    def _wins(self, found: Stored, share: float, contrast: float, fitted: bool, better: float) -> bool:
+    def _wins(self, found: Stored, share: float, contrast: float, fitted: bool) -> bool:
         best = self.best
         if best is None:
             return True
         same = best.object.kind == found.kind
         if not (fitted and (self.mixed or same)):
             return not (same and share > LOST and share > 2 * best.share)
-        if better > 0:
-            return better * share <= best.share
         return CLEARLY * share <= best.share or contrast < best.contrast
 
     def state_dict(self) -> dict[str, Any] | None:

@@ -225,7 +225,7 @@ def solve_stages(method: Method, task: Task) -> Stored:
     found: Stored | None = None
     keeper = Keeper(task.scan, mixes_kinds(method))
     for number, stage in enumerate(method.stages()):
-        before = keeper.handed(stage, found, task.freedom is not None)
+        before = found
         found, task = begun(stage, task, before)
         fit = stage.fit(task.in_windows(), found)
         if found is not before and (number == 0 or fit is None):

@@ -16,7 +16,7 @@ from ..tables import to_table
 from .auto import Auto
 from .gaussians import Gaussians
 from .illumination import prepared
-from .levels import CONTINUOUS, NAME, decide_matter
+from .levels import LEVELS, NAME, decide_matter, kind_of
 from .method import Method, Task, solve_stages
 from .uncertain import Determined, Uncertain, determine, likeliest_ratio, placed, told
 
@@ -67,8 +67,8 @@ def settled(
 ) -> Settled:
     """The method to run for `task`, the kind of its matter (`matter`, or what the frames say), and what is `uncertain`.
 
-    Of continuous matter of which nothing is known, δ/β is uncertain, too. Errors: `InputError` for continuous matter of
-    two materials, and those of `determine`.
+    Where nothing is known, δ/β of continuous matter is uncertain, too; for `Auto` that of one level. Errors:
+    `InputError` for continuous matter of two materials, and those of `determine`.
     """
     require(
         not (matter == "continuous" and isinstance(task.prior, KnownTwo)),
@@ -81,13 +81,15 @@ def settled(
     if matter:
         decision = Decision(NAME, matter, "told")
     elif getattr(method, "wants_levels", True):
-        decision = decide_matter(task)
+        decision = decide_matter(task, method.kinds if isinstance(method, Auto) else None)
     else:
         decision = Decision(NAME, "levels", "no matter to the method")
-    kind: MatterKind = "continuous" if decision.choice == CONTINUOUS else "levels"
+    kind = kind_of(decision.choice)
+    one = kind == "continuous"
     if isinstance(method, Auto):
+        one = one or (decision.choice == LEVELS[0] and len(decision.compared) > 0)
         method = method.suited(kind)
-    if kind == "continuous" and not task.prior.fixes_ratio:
+    if one and not task.prior.fixes_ratio:
         constants = (*constants, likeliest_ratio(task))
     return Settled(method, kind, decision, constants)
 

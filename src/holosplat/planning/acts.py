@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..io.ome_tiff import TIFF_SUFFIXES
 from ..io.ome_zarr import CHUNK, ZARR_SUFFIX
-from ..io.volume_files import TIFF_SUFFIXES
 from ..io.volumes import SLAB_VOXELS
 from .needs import KEPT, Costs, Needs, Sizes, of_fit, of_simulation, of_start, with_report
 

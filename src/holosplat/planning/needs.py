@@ -32,6 +32,9 @@ from ..optics.sampling import fringe_sampling, padding
 from ..scan import Exposures
 from ..units import two_digits
 
+KINDS: tuple[MatterKind, ...] = ("levels", "continuous")
+"""Of matter, of which the frames may decide."""
+
 
 class Costs:
     """Bytes of memory and seconds that the parts of a job take."""
@@ -76,10 +79,10 @@ class Costs:
     """The report and the tables of a run."""
     judged: float = 75.0
     """A wave sample of whole frames, by which surfaces that were fitted in windows are judged."""
-    judging: float = 1e-6
+    judging: float = 1.6e-6
     """Seconds that it takes."""
     turns: float = 2.5
-    """Times what a fit of Gaussians takes: that, and turns of surfaces and volume, in noise."""
+    """Times what a fit of Gaussians takes: that, and the turns of surfaces and volume that may follow in noise."""
 
 
 SAFETY = 1.1
@@ -144,8 +147,8 @@ def on_larger_pixels(exposures: Exposures, binning: int) -> Exposures:
 
 @dataclass(frozen=True)
 class Needs:
-    """What a job takes at its peak: memory and disk [bytes], time [s], the last to a factor of three; most_seconds: the
-    time where frames may ask for more than they mostly do (0: they do not)."""
+    """What a job takes at its peak: memory and disk [bytes], processor time of all cores together [s];
+    most_seconds: the same where what is found in the frames may make it longer (0: it cannot)."""
 
     memory: float
     disk: float
@@ -154,7 +157,7 @@ class Needs:
 
     def line(self) -> str:
         """In words."""
-        time = f", and about {_times(self.seconds, self.most_seconds)}" if self.seconds else ""
+        time = f", and about {_times(self.seconds, self.most_seconds)} of processor time" if self.seconds else ""
         return f"takes about {_size(self.memory)} of memory, {_size(self.disk)} on the disk{time}"
 
     def times(self, count: int) -> Needs:
@@ -183,16 +186,20 @@ def of_reconstruction(
 ) -> Needs | None:
     """What `reconstruct` takes for training frames of such sizes; None for a method of which nothing is known.
 
-    matter: its kind, where that is settled.
+    matter: its kind, where that is settled; else the frames decide, and it takes what either kind takes.
     """
+    if isinstance(method, Auto) and matter is None:
+        each = [one for kind in KINDS if (one := of_reconstruction(sizes, method, kind, seen)) is not None]
+        times = [time for one in each for time in (one.seconds, one.most_seconds or one.seconds)]
+        return replace(max(each, key=lambda one: one.memory), seconds=min(times), most_seconds=max(times))
     worked = seen.windows or sizes
     fit = of_fit(worked, method, matter)
     if fit is None:
         return None
     if seen.windows is not None:
         fit = _judged(fit, sizes)
-    if seen.noisy and (more := _turns(worked, method, matter)):
-        fit = replace(fit, most_seconds=fit.seconds + more)
+    if seen.noisy and (more := _in_noise(worked, method, matter)):
+        fit = replace(fit, seconds=more, most_seconds=fit.seconds + Costs.turns * more)
     return replace(fit, memory=with_report(sizes, fit.memory))
 
 
@@ -203,8 +210,9 @@ def _judged(fit: Needs, whole: Sizes) -> Needs:
     return Needs(memory, fit.disk + Costs.written * whole.pixels, fit.seconds + Costs.judging * finer)
 
 
-def _turns(sizes: Sizes, method: Method, matter: MatterKind | None) -> float:
-    """Seconds that noise may add to surfaces, on the pixels that they begin on; 0 where there are none."""
+def _in_noise(sizes: Sizes, method: Method, matter: MatterKind | None) -> float:
+    """Seconds of the Gaussians with which surfaces begin in noise, on the pixels that they begin on; 0 where there are
+    none."""
     how = (
         method.gaussians if isinstance(method, Surfaces) or (isinstance(method, Auto) and matter == "levels") else None
     )
@@ -212,18 +220,18 @@ def _turns(sizes: Sizes, method: Method, matter: MatterKind | None) -> float:
         return 0.0
     factor = how.coarse.factor((sizes.rows, sizes.columns))
     coarse = replace(sizes, rows=sizes.rows // factor, columns=sizes.columns // factor)
-    return Costs.turns * _gaussian_seconds(_fine(coarse, how.volume)[0], edges=True)
+    return _gaussian_seconds(_fine(coarse, how.volume)[0], edges=True)
 
 
 def _gaussian_seconds(fine: float, edges: bool) -> float:
     """Of a fit of Gaussians that begins with so many voxels, and of surfaces cut out of them, if there are `edges`."""
-    return (30 if edges else 12) + 2.3e-6 * fine
+    return (20 if edges else 12) + 2.3e-6 * fine
 
 
 def of_fit(sizes: Sizes, method: Method, matter: MatterKind | None = None) -> Needs | None:
     """The same without the report, which takes memory of its own."""
     if isinstance(method, Auto):
-        kinds: tuple[MatterKind, ...] = (matter,) if matter else ("levels", "continuous")
+        kinds = (matter,) if matter else KINDS
         each = [of_fit(sizes, method.suited(kind)) for kind in kinds]
         return max((one for one in each if one is not None), key=lambda one: one.memory)
     parts = _parts(sizes, method)
@@ -274,7 +282,7 @@ def _bodies(sizes: Sizes, how: Gaussians, edges: bool) -> tuple[float, float, fl
     fine = _fine(sizes, how.volume)[0]
     memory, numbers = max(begun, waves + Costs.gaussian * count), 14 * count
     seconds, finer = _gaussian_seconds(fine, edges), sizes.waves(1)
-    near = 10 + 5.6e-6 * finer  # surfaces from coarse pixels on, where they show bodies
+    near = 12 + 1.07e-5 * finer  # surfaces from coarse pixels on, where they show bodies
     if how.start != "phase" or how.coarse.columns == 0:
         return memory, seconds, numbers
     if edges:

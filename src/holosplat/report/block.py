@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 from markupsafe import Markup
@@ -27,12 +28,22 @@ class Block:
     live: Markup | None = None
 
     @property
+    def anchor(self) -> str:
+        """The heading as the page links to it."""
+        return re.sub(r"\W+", "-", self.heading.lower()).strip("-")
+
+    @property
+    def paper(self) -> bool:
+        """Whether the image is on white paper, also where the page is dark."""
+        return self.image is not None and not self.image.startswith("data:image/svg")
+
+    @property
     def drawn(self) -> bool:
         """Whether there is a figure."""
         return self.image is not None or self.live is not None
 
 
-def drawn_block(heading: str, caption: str, title: str, figure: Figure, kind: str) -> Block:
-    """`figure` as svg (curves) or png (images)."""
+def drawn_block(heading: str, caption: str, title: str, figure: Figure) -> Block:
+    """`figure` in its block."""
     width = round(100 * float(figure.get_figwidth()) / WIDTH)
-    return Block(heading, caption.strip(), title, data_uri(figure, kind), width)
+    return Block(heading, caption.strip(), title, data_uri(figure), width)

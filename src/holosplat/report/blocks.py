@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..metrics import VolumeScores
-from ..units import in_percent, wavenumber
+from ..units import in_percent, plain, wavenumber
 from .block import Block, drawn_block
 from .content import ReportContent
 from .curves import correlation_figure, histogram_figure, history_figure
@@ -26,7 +26,7 @@ from .forecast_shown import forecast_block
 from .guess import guess_block
 from .light import light_figure
 from .motion_blocks import motion_blocks
-from .style import format_length, scientific
+from .style import format_length, in_print, scientific
 from .view3d.view import html
 
 MOST_VIEWS = 4
@@ -61,12 +61,13 @@ def make_blocks(content: ReportContent) -> list[Block]:
 def _scene(content: ReportContent) -> Block:
     heading, material = "Scene and reconstruction", content.surface_material()
     if material is None:
-        return Block(heading, "The reconstruction holds no matter (its δ is zero everywhere), so no surface is drawn.")
-    grid = content.reconstruction.grid
+        nothing = f"The reconstruction holds no matter (its {content.quantity.symbol} is zero everywhere)"
+        return Block(heading, f"{nothing}, so no surface is drawn.")
+    grid, shown = content.reconstruction.grid, content.quantity
     figure = scene_figure(content.reconstruction, content.truth, material)
-    size = "\u00a0×\u00a0".join(f"{n * d * 1e6:.3g}" for n, d in zip(grid.shape[::-1], grid.voxel_size))
+    size = "\u00a0×\u00a0".join(plain(n * d * 1e6) for n, d in zip(grid.shape[::-1], grid.voxel_size))
     text = (
-        f"Surfaces where δ = {scientific(0.5 * material)}, half of the material's, seen from above. "
+        f"Surfaces where {shown.symbol} = {shown.text(0.5 * material)}, half of the material's, seen from above. "
         f"The box is the volume, {size}\u00a0µm (x\u00a0×\u00a0y\u00a0×\u00a0z). "
     )
     if content.truth is None:
@@ -77,7 +78,7 @@ def _scene(content: ReportContent) -> Block:
             "a, truth; b, reconstruction; c, the reconstruction coloured by distance from the true surface "
             f"along its own normals: red outside, blue inside of it; colours end at one voxel, {voxel}."
         )
-    return drawn_block(heading, text, "The scene and its reconstruction.", figure, "png")
+    return drawn_block(heading, text, "The scene and its reconstruction.", figure)
 
 
 def _turned(content: ReportContent) -> Block:
@@ -87,9 +88,14 @@ def _turned(content: ReportContent) -> Block:
     first, *others = view.parts
     kinds = {"volume": "a volume", "gaussians": "its Gaussians"}
     shown = kinds.get(view.parts[first].kind, "its surfaces")
+    shift = (
+        "Values are quantitative: the phase shift is −k∫δ dz"
+        if content.delta_told
+        else "Absorption is 2k∫β dz = ∫µ dz, the phase is not known"
+    )
     text = (
         f"Line integrals and the hologram that they would give, of the {first} by {shown}: drag the first picture, or "
-        "use the arrow keys on it, to turn the object. Values are quantitative: the phase shift is −k∫δ dz, and the "
+        f"use the arrow keys on it, to turn the object. {shift}, and the "
         "hologram that of an even beam over the distance of the first frame, one wave sample a raster pixel. "
     )
     if others:
@@ -115,7 +121,7 @@ def _held_out(content: ReportContent) -> Block:
         f"Scores use the range of the training frames, {views.scores.data_range[0]:.3f} to "
         f"{views.scores.data_range[1]:.3f}."
     )
-    return drawn_block(heading, text, "Prediction of held-out views.", figure, "png")
+    return drawn_block(heading, text, "Prediction of held-out views.", figure)
 
 
 def _explained(content: ReportContent) -> Block:
@@ -124,12 +130,12 @@ def _explained(content: ReportContent) -> Block:
         return Block(heading, "The training frames were not compared with the reconstruction.")
     figure = explained_figure(found)
     text = (
-        f"{' '.join((found.words, *found.reasons))} "
+        f"{in_print(' '.join((found.words, *found.reasons)))} "
         "a, root mean square of what the reconstruction leaves of the training frames, by the period of its Fourier "
         "coefficients, beside the noise, the contrast, and what a residual may have. b, the residual over what it may "
         "have, in each view: colours end at 3."
     )
-    return drawn_block(heading, text, "What is left of the training frames.", figure, "svg")
+    return drawn_block(heading, text, "What is left of the training frames.", figure)
 
 
 def _light(content: ReportContent) -> Block:
@@ -143,45 +149,46 @@ def _light(content: ReportContent) -> Block:
         f"light that they have beside what the reconstruction predicts (root mean square deviation from one: "
         f"{', '.join(size)}), and what light and reconstruction together leave."
     )
-    return drawn_block(heading, text, "Uneven light.", figure, "png")
+    return drawn_block(heading, text, "Uneven light.", figure)
 
 
 def _projections(content: ReportContent) -> Block:
-    heading, maps = "Projected phase and absorption", content.projections
+    told, maps = content.delta_told, content.projections
+    heading = "Projected phase and absorption" if told else "Projected absorption"
     if maps is None:
         return Block(heading, "No line integrals of the reconstruction were given.")
-    figure = projections_figure(maps, content.energy_kev, content.pixel_size)
-    text = (
-        f"Phase φ = −kD with D = ∫δ dz, and absorption 2kB with B = ∫β dz, at {content.energy_kev:g} keV, "
-        f"{' and '.join(maps.labels[:2])}. "
-    )
-    phase = -wavenumber(content.energy_kev) * np.asarray(maps.projected_delta[:2])
-    text += f"The reconstruction's phase runs from {phase.min():.3g} to {phase.max():.3g} rad. ".replace("-", "−")
+    figure = projections_figure(maps, content.energy_kev, content.pixel_size, told)
+    k, name = wavenumber(content.energy_kev), "phase" if told else "absorption"
+    text = "Phase φ = −kD with D = ∫δ dz, and absorption 2kB with B = ∫β dz" if told else "Absorption 2k∫β dz = ∫µ dz"
+    text += f", at {content.energy_kev:g} keV, {' and '.join(maps.labels[:2])}. "
+    values = -k * np.asarray(maps.projected_delta[:2]) if told else 2 * k * np.asarray(maps.projected_beta[:2])
+    low, high = scientific(float(values.min())), scientific(float(values.max()))
+    text += f"The reconstruction's {name} runs from {low} to {high}{' rad' * told}. "
     if maps.true_projected_delta is None:
         text += "The truth is not known."
     else:
         text += "Truth and reconstruction share one colour scale; differences are reconstruction − truth."
-    return drawn_block(heading, text, "Line integrals through the object.", figure, "png")
+    return drawn_block(heading, text, "Line integrals through the object.", figure)
 
 
 def _slices(content: ReportContent) -> Block:
-    truth, delta = content.truth, content.reconstruction.delta
+    truth, delta, shown = content.truth, content.reconstruction.delta, content.quantity
     planes = richest_planes(content.reconstruction if truth is None else truth)
-    figure = slices_figure(content.reconstruction, truth, planes)
-    low, high = scientific(float(delta.min())), scientific(float(delta.max()))
+    figure = slices_figure(content.reconstruction, truth, planes, shown)
+    low, high = shown.text(float(delta.min())), shown.text(float(delta.max()))
     text = (
-        "δ in the three orthogonal planes that hold most matter. "
-        f"Over the whole volume the reconstruction's δ runs from {low} to {high}"
+        f"{shown.symbol} in the three orthogonal planes that hold most matter. "
+        f"Over the whole volume the reconstruction's {shown.symbol} runs from {low} to {high}"
     )
     if truth is None:
         text += ". The truth is not known."
     else:
-        low, high = scientific(float(truth.delta.min())), scientific(float(truth.delta.max()))
+        low, high = shown.text(float(truth.delta.min())), shown.text(float(truth.delta.max()))
         text += (
             f", the truth's from {low} to {high}. "
             "Truth and reconstruction share one colour scale; differences are reconstruction − truth."
         )
-    return drawn_block("Slices", text, "Slices of δ.", figure, "png")
+    return drawn_block("Slices", text, f"Slices of {shown.symbol}.", figure)
 
 
 def _correlation(content: ReportContent) -> Block:
@@ -196,12 +203,12 @@ def _correlation(content: ReportContent) -> Block:
             text += "Their pixels differ: frequencies are those of the smallest, with as many periods a pixel. "
     if content.volume_scores is not None:
         crossings = _resolutions(content.volume_scores)
-        text += f"Fourier shell correlation of the reconstructed with the true δ, {crossings}. "
+        text += f"Fourier shell correlation of the reconstructed with the true {content.quantity.symbol}, {crossings}. "
     text += (
         "The upper scale is the full period. Both thresholds were made for two halves of one data set "
         "(van Heel & Schatz 2005; Rosenthal & Henderson 2003); against a noise-free truth they are lenient."
     )
-    return drawn_block(heading, text, "Correlation in Fourier space.", figure, "svg")
+    return drawn_block(heading, text, "Correlation in Fourier space.", figure)
 
 
 def _resolutions(scores: VolumeScores) -> str:
@@ -217,20 +224,28 @@ def _history(content: ReportContent) -> Block:
     heading, figure = "Course of the fit", history_figure(content.history)
     if figure is None:
         return Block(heading, "No course of the fit was recorded.")
-    text = "Recorded while fitting, over optimisation steps; the loss and its terms on a logarithmic scale."
-    return drawn_block(heading, text, "Course of the fit.", figure, "svg")
+    text = (
+        "Recorded while fitting, over the steps of the last fit; the loss and its terms on a logarithmic scale. They "
+        "are means over the pixels of that step: where frames pass to finer pixels or terms join, the loss jumps, and "
+        "only losses between two jumps compare."
+    )
+    return drawn_block(heading, text, "Course of the fit.", figure)
 
 
 def _histograms(content: ReportContent) -> Block:
     heading, material = "Quantitative values", content.surface_material()
     if material is None:
         return Block(heading, "The reconstruction holds no matter, so there are no values to show.")
-    figure, outside = histogram_figure(content.reconstruction, content.truth, material)
-    text = f"The material's δ is {scientific(material)}; matter is what exceeds half of it. "
-    if outside is None:
+    shown = content.quantity
+    figure, outside = histogram_figure(content.reconstruction, content.truth, material, shown)
+    text = f"The material's {shown.symbol} is {shown.text(material)}; matter is what exceeds half of it. "
+    if not content.delta_told:
+        text += "The frames show absorption alone: δ, and with it δ\u2060/\u2060β, is not known. "
+    elif outside is None:
         text += "β is zero in all matter, so δ\u2060/\u2060β is not defined. "
     else:
         text += f"{100 * outside:.1f} % of the mass lies outside of the range drawn for δ\u2060/\u2060β. "
         if content.truth is not None:
             text += "The truth's δ\u2060/\u2060β is the ratio of its mean δ to its mean β. "
-    return drawn_block(heading, text, "Distribution of δ\u2060/\u2060β and of δ.", figure, "svg")
+    title = "Distribution of δ\u2060/\u2060β and of δ." if content.delta_told else f"Distribution of {shown.symbol}."
+    return drawn_block(heading, text, title, figure)

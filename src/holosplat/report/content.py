@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -20,7 +19,11 @@ from ..workflows.verdict import Verdict
 from .forecast_shown import ForecastShown
 from .guess_shown import GuessShown
 from .moving import Moving
+from .quantity import DELTA, Quantity, attenuation
 from .view3d.view import View3D
+
+WIDER_GAP = 1.5
+"""How many times wider than the gap across 0° another gap between angles must be for angles to be counted from it."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +31,8 @@ class HeldOutViews:
     """Frames that the fit never saw, and what the reconstruction predicts for them.
 
     measured, predicted: [T, H, W] relative intensity; labels: T texts, from `view_labels`; scores: of these
-    frames; pixels: [T] their sizes [m], None where all are that of the report.
+    frames; pixels: [T] their sizes [m], None where all are that of the report; explained: the verdict on these frames,
+    None: not judged.
     """
 
     measured: np.ndarray
@@ -36,6 +40,7 @@ class HeldOutViews:
     labels: tuple[str, ...]
     scores: ImageScores
     pixels: np.ndarray | None = None
+    explained: Verdict | None = None
 
     def __post_init__(self) -> None:
         measured = shaped("measured frames", np.asarray(self.measured), (None, None, None))
@@ -108,7 +113,8 @@ class ReportContent:
     - material_delta: the material's δ, for surfaces and masks; None: the robust maximum of the truth, or else
       of the reconstruction
     - lit: training frames in uneven light; None: the light is even
-    - explained: the verdict on the training frames; None: not judged
+    - explained: the verdict on the training frames; None: not judged; scan: their name, as a command takes it
+    - delta_told: whether the frames say what δ is; else they show absorption alone, and β stands for δ in all volumes
     - total: the total δ by these frames; None: not told
     - moving: bodies in motion, whose volumes are those of one time; None: matter stands still
     - view: what can be turned; None: nothing
@@ -117,7 +123,7 @@ class ReportContent:
     - geometry: where the frames were found to be; None: as the scan says
     - history: columns of metrics.csv, each [S]: step, seconds, loss, the loss' terms, count, val_ssim …
     - seconds: time of the reconstruction [s]
-    - settings: the resolved configuration, nested or flat
+    - settings: the resolved configuration, nested or flat; usual: those of the method when nothing is told
     - decisions: between hypotheses, with the evidence
     - versions, machine, timing: tables of names and values; input_hash: of the scan; run: its name
     """
@@ -133,6 +139,7 @@ class ReportContent:
     volume_scores: VolumeScores | None = None
     material_delta: float | None = None
     explained: Verdict | None = None
+    delta_told: bool = True
     total: TotalMatter | None = None
     geometry: Geometry | None = None
     lit: LitViews | None = None
@@ -144,11 +151,13 @@ class ReportContent:
     history: Mapping[str, np.ndarray] = field(default_factory=dict)
     seconds: float | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
+    usual: Mapping[str, Any] = field(default_factory=dict)
     versions: Mapping[str, Any] = field(default_factory=dict)
     machine: Mapping[str, Any] = field(default_factory=dict)
     timing: Mapping[str, Any] = field(default_factory=dict)
     input_hash: str = ""
     run: str = ""
+    scan: str = "SCAN"
 
     def __post_init__(self) -> None:
         positive("energy", self.energy_kev, "keV")
@@ -157,6 +166,11 @@ class ReportContent:
             require_same_grid(self.reconstruction.grid, self.truth.grid)
         lengths = {name: len(column) for name, column in self.history.items()}
         require(len(set(lengths.values())) <= 1, f"history columns must have one length, but have {lengths}.")
+
+    @property
+    def quantity(self) -> Quantity:
+        """What is shown of the matter: δ, or µ where δ is not known."""
+        return DELTA if self.delta_told else attenuation(self.energy_kev)
 
     def surface_material(self) -> float | None:
         """The material's δ for surfaces and masks; None when there is no matter at all."""
@@ -182,8 +196,17 @@ def view_labels(views: Views) -> tuple[str, ...]:
         return tuple(f"view {k + 1}, pixels of {1e6 * p:.4g} µm" for k, p in enumerate(views.pixel_sizes))
     if not views.shares_axis:
         return tuple(f"view {k + 1}" for k in range(len(views)))
-    angles = np.degrees(np.arctan2(views.rotations[:, 0, 2], views.rotations[:, 0, 0])) % 360.0
-    return tuple(f"θ = {0.0 if math.isclose(angle, 360.0, abs_tol=0.05) else angle:.1f}°" for angle in angles)
+    angles = _along_one_arc(np.degrees(np.arctan2(views.rotations[:, 0, 2], views.rotations[:, 0, 0])) % 360.0)
+    return tuple(f"θ = {round(float(angle), 1) + 0.0:.1f}°".replace("-", "−") for angle in angles)
+
+
+def _along_one_arc(angles: np.ndarray) -> np.ndarray:
+    """Angles [°] from 0 to 360, or with those beyond a wide gap below 0, so that −88° does not become 272°."""
+    turned = np.sort(angles)
+    gaps = np.diff(turned)
+    if not len(gaps) or gaps.max() <= WIDER_GAP * (turned[0] + 360.0 - turned[-1]):
+        return angles
+    return np.where(angles > turned[gaps.argmax()], angles - 360.0, angles)
 
 
 def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, str]:

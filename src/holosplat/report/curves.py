@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from ..metrics import FIXED_THRESHOLD, ImageScores, VolumeScores, resolution
 from ..volume import Volume
+from .quantity import DELTA, Quantity
 from .style import (
     CYCLE,
     FAINT,
@@ -31,8 +32,14 @@ SCORE_NAMES = {"ssim": "SSIM", "frcm": "FRCM", "dice": "Dice", "psnr": "PSNR", "
 
 
 @styled
-def correlation_figure(images: ImageScores | None, volume: VolumeScores | None, pixel_size: float) -> Figure:
-    """FRC of the test views (mean, least, greatest) and FSC of δ, with thresholds; pixel_size [m]."""
+def correlation_figure(
+    images: ImageScores | None,
+    volume: VolumeScores | None,
+    pixel_size: float,
+    named: str = "Volume against the truth",
+) -> Figure:
+    """FRC of the test views (mean, least, greatest) and FSC of δ, with thresholds; pixel_size [m]; named: what the FSC
+    is of."""
     panels = [scores for scores in (images, volume) if scores is not None]
     figure = new_figure(WIDTH if len(panels) > 1 else 0.55 * WIDTH, 2.55)
     axes = list(np.atleast_1d(figure.subplots(1, max(len(panels), 1))))
@@ -41,7 +48,7 @@ def correlation_figure(images: ImageScores | None, volume: VolumeScores | None, 
         letter(axes[0], 0, "Held-out views", lift=20)
     if volume is not None:
         _shell_panel(axes[-1], volume)
-        letter(axes[-1], len(panels) - 1, "Volume of δ against the truth", lift=20)
+        letter(axes[-1], len(panels) - 1, named, lift=20)
     return figure
 
 
@@ -173,22 +180,24 @@ def _course(axes: Axes, step: np.ndarray, columns: Mapping[str, np.ndarray], sca
 
 
 @styled
-def histogram_figure(reconstruction: Volume, truth: Volume | None, material: float) -> tuple[Figure, float | None]:
-    """Histograms of δ/β over the matter, weighted by δ, and of δ over all voxels.
+def histogram_figure(
+    reconstruction: Volume, truth: Volume | None, material: float, quantity: Quantity = DELTA
+) -> tuple[Figure, float | None]:
+    """Histograms of δ/β over the matter, weighted by δ, and of δ over all voxels; of µ alone, over these.
 
     Matter is where δ exceeds half of the `material`'s. Returns the figure and the part of the mass whose δ/β
     falls outside of the drawn range, or None when no β is known (then only δ is drawn).
     """
     ratios = [_ratio_and_mass(v, material) for v in (reconstruction, truth) if v is not None]
-    has_ratio = ratios[0][0].size > 0
+    has_ratio = quantity == DELTA and ratios[0][0].size > 0
     figure = new_figure(WIDTH if has_ratio else 0.55 * WIDTH, 2.2)
     axes = list(np.atleast_1d(figure.subplots(1, 2 if has_ratio else 1)))
     outside = None
     if has_ratio:
         outside = _ratio_panel(axes[0], ratios)
         letter(axes[0], 0, "δ/β of the matter, weighted by δ")
-    _delta_panel(axes[-1], reconstruction, truth, material)
-    letter(axes[-1], len(axes) - 1, "δ of all voxels")
+    _delta_panel(axes[-1], reconstruction, truth, material, quantity)
+    letter(axes[-1], len(axes) - 1, f"{quantity.symbol} of all voxels")
     return figure, outside
 
 
@@ -229,11 +238,12 @@ def _ratio_panel(axes: Axes, ratios: list[tuple[np.ndarray, np.ndarray]]) -> flo
     return float(weights[(values < low) | (values > high)].sum()) / 100
 
 
-def _delta_panel(axes: Axes, reconstruction: Volume, truth: Volume | None, material: float) -> None:
+def _delta_panel(axes: Axes, reconstruction: Volume, truth: Volume | None, material: float, quantity: Quantity) -> None:
     drawn = [(reconstruction, RECONSTRUCTION, "reconstruction")]
     if truth is not None:
         drawn.insert(0, (truth, TRUTH, "truth"))
-    scale, power = decimal_scale(material)
+    scale, power = decimal_scale(quantity.factor * material)
+    scale /= quantity.factor
     ends = [np.quantile(v.delta, [0.0005, 0.9995]) for v, _, _ in drawn]
     reach = np.concatenate([*ends, [0.0, 1.15 * material]]) / scale
     edges = np.linspace(reach.min(), reach.max(), 90).tolist()
@@ -242,7 +252,9 @@ def _delta_panel(axes: Axes, reconstruction: Volume, truth: Volume | None, mater
         filled = "stepfilled" if name == "truth" else "step"
         alpha = 0.35 if name == "truth" else 1.0
         axes.hist(values, edges, color=colour, histtype=filled, alpha=alpha, lw=1.0, label=name)
-    axes.axvline(0.5 * material / scale, color=FAINT, lw=0.8, ls=(0, (1, 1.5)), label="half of the material's δ")
+    axes.axvline(
+        0.5 * material / scale, color=FAINT, lw=0.8, ls=(0, (1, 1.5)), label=f"half of the material's {quantity.symbol}"
+    )
     axes.set_yscale("log")
-    axes.set(xlabel=f"δ ({power})" if power else "δ", ylabel="voxels per bin", xlim=(edges[0], edges[-1]))
+    axes.set(xlabel=quantity.label(power), ylabel="voxels per bin", xlim=(edges[0], edges[-1]))
     axes.legend(loc="upper right")

@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ..units import plain
 from ..workflows.verdict import Verdict
 from .style import CYCLE, FAINT, INK, RECONSTRUCTION, WIDTH, colour_bar, letter, new_figure, styled
 
@@ -56,7 +57,7 @@ def _curves(axes: Axes, found: Verdict) -> None:
 
 
 def _labels(found: Verdict) -> list[str]:
-    return [f"{1e6 * shortest:.3g}" for shortest in found.periods[:, 0]]
+    return [plain(1e6 * shortest) for shortest in found.periods[:, 0]]
 
 
 def _views(count: int) -> tuple[list[int], list[str]]:

@@ -17,6 +17,7 @@ from ..metrics import robust_material_delta
 from ..units import wavenumber
 from ..volume import Volume
 from .content import HeldOutViews, ProjectedMaps, pixel_of
+from .quantity import DELTA, Quantity
 from .style import (
     BETA_MAP,
     DELTA_MAP,
@@ -157,21 +158,23 @@ def residual_limit(views: HeldOutViews) -> float:
 
 
 @styled
-def projections_figure(maps: ProjectedMaps, energy_kev: float, pixel_size: float) -> Figure:
+def projections_figure(maps: ProjectedMaps, energy_kev: float, pixel_size: float, with_phase: bool = True) -> Figure:
     """Phase φ = -kD [rad] and absorption 2kB of one or two views; truth and difference too where it is known.
 
-    energy_kev [keV]; pixel_size [m].
+    energy_kev [keV]; pixel_size [m]; with_phase: False where D is not known.
     """
     k, views = wavenumber(energy_kev), min(len(maps.labels), 2)
     height, width = maps.projected_delta.shape[1:]
-    pairs = [(phase, i) for i in range(views) for phase in (True, False)]
+    shown_of_each = (True, False) if with_phase else (False,)
+    pairs, count = [(phase, i) for i in range(views) for phase in shown_of_each], len(shown_of_each)
     if maps.true_projected_delta is None or maps.true_projected_beta is None:
-        panels = PanelGrid(views, [width] * 2, [height] * 2, (0, 1), 0.8 * WIDTH)
+        bars = tuple(range(count))
+        panels = PanelGrid(views, [width] * count, [height] * count, bars, (0.8 if count > 1 else 0.5) * WIDTH)
         for index, (phase, i) in enumerate(pairs):
             found = -k * maps.projected_delta[i] if phase else 2 * k * maps.projected_beta[i]
-            _projected(panels, divmod(index, 2), [found], phase, maps.labels[i], pixel_of(maps, i, pixel_size))
+            _projected(panels, divmod(index, count), [found], phase, maps.labels[i], pixel_of(maps, i, pixel_size))
         return panels.figure
-    panels = PanelGrid(2 * views, [width] * 3, [height] * 3, (1, 2))
+    panels = PanelGrid(len(pairs), [width] * 3, [height] * 3, (1, 2))
     for row, (phase, i) in enumerate(pairs):
         factor, true, found = (
             (-k, maps.true_projected_delta, maps.projected_delta)
@@ -222,17 +225,18 @@ def value_limits(images: list[np.ndarray]) -> tuple[float, float]:
 
 
 @styled
-def slices_figure(reconstruction: Volume, truth: Volume | None, positions: tuple[int, int, int]) -> Figure:
-    """δ in three orthogonal planes at voxel `positions` (z, y, x): truth, reconstruction and difference."""
-    volumes = (
-        [("Reconstruction", reconstruction.delta)]
-        if truth is None
-        else [
-            ("Truth", truth.delta),
-            ("Reconstruction", reconstruction.delta),
-        ]
-    )
-    scale, power = decimal_scale(max(float(np.abs(v).max()) for _, v in volumes))
+def slices_figure(
+    reconstruction: Volume,
+    truth: Volume | None,
+    positions: tuple[int, int, int],
+    quantity: Quantity = DELTA,
+    names: tuple[str, str] = ("Truth", "Reconstruction"),
+) -> Figure:
+    """δ, or what the frames tell of it, in three orthogonal planes at voxel `positions` (z, y, x): truth,
+    reconstruction and difference; names: of these two."""
+    volumes = [(name, v.delta) for name, v in zip(names, (truth, reconstruction)) if v is not None]
+    scale, power = decimal_scale(quantity.factor * max(float(np.abs(v).max()) for _, v in volumes))
+    scale /= quantity.factor
     limits = value_limits([v / scale for _, v in volumes])
     colours = from_dark(DELTA_MAP, limits)
     widths, heights = plane_sizes(reconstruction.grid)
@@ -240,7 +244,7 @@ def slices_figure(reconstruction: Volume, truth: Volume | None, positions: tuple
     for row, (name, values) in enumerate(volumes):
         drawn = slice_row(panels.axes[row], values / scale, reconstruction.grid, positions, colours, limits)
         slice_titles(panels.axes[row], 3 * row, name, reconstruction.grid, positions)
-    label = f"δ ({power})" if power else "δ"
+    label = quantity.label(power)
     panels.bar(drawn, 2, (0, len(volumes) - 1), label)
     if truth is not None:
         difference = (reconstruction.delta - truth.delta) / scale
@@ -283,7 +287,7 @@ def slice_row(
     for panel, (_, axis, (across, down)), width in zip(axes, PLANES, widths):
         plane = _slice(values, axis, positions[axis])
         drawn = image_panel(panel, plane, (edge[across], edge[down]), colours, limits)
-        scale_bar(panel, width, "white" if colours != SIGNED_MAP else INK)
+        scale_bar(panel, width, "white" if colours != SIGNED_MAP else "black")
     return drawn
 
 

@@ -51,7 +51,7 @@ def forecast_block(shown: ForecastShown) -> Block:
         else "b, the scan has no frames of these times."
     )
     text += f" Mechanics found of the {shown.flow}." if shown.flow else ""
-    return drawn_block(heading, text.strip(), "The forecast's error and scores.", forecast_figure(shown), "svg")
+    return drawn_block(heading, text.strip(), "The forecast's error and scores.", forecast_figure(shown))
 
 
 @styled

@@ -36,7 +36,7 @@ def guess_block(shown: GuessShown) -> Block:
             f"{in_percent(shown.unsure)} of its matter lies where guesses differ by more than {UNSURE:g}. There it may "
             "be a guess also after the fit, for other matter might explain the frames as well."
         )
-    return drawn_block("What was guessed", text, "A network's guess, and its spread.", guess_figure(shown), "png")
+    return drawn_block("What was guessed", text, "A network's guess, and its spread.", guess_figure(shown))
 
 
 @styled

@@ -40,7 +40,7 @@ def _film(moving: Moving) -> Block:
         f"frames; c, what the bodies predict of them; both on the grey scale {low:.3f} to {high:.3f}. d, their "
         f"difference, whose colours end at ±{residual_of(moving):.2g} and whose root mean square is {rms:.2g}."
     )
-    return drawn_block("Film strip", text, "Bodies and frames over time.", figure, "png")
+    return drawn_block("Film strip", text, "Bodies and frames over time.", figure)
 
 
 def _trajectories(moving: Moving) -> Block:
@@ -48,7 +48,7 @@ def _trajectories(moving: Moving) -> Block:
         "Ways of the bodies' centres, thick where the whole body is in the field of view (dashed), and outlines at the "
         f"first (light) and the last time, where dots and numbers are. {COLOURS}"
     )
-    return drawn_block("Ways", text, "Ways of the bodies.", trajectories_figure(moving), "svg")
+    return drawn_block("Ways", text, "Ways of the bodies.", trajectories_figure(moving))
 
 
 def _shapes(moving: Moving) -> Block:
@@ -59,4 +59,4 @@ def _shapes(moving: Moving) -> Block:
         "are made for these. "
     )
     text += "Bands are standard errors, from fits to halves of the frames." if known else "Errors were not estimated."
-    return drawn_block("Shapes", text, "Shapes over time.", shapes_figure(moving), "svg")
+    return drawn_block("Shapes", text, "Shapes over time.", shapes_figure(moving))

@@ -9,7 +9,7 @@ import jinja2
 from ..io.atomic import atomic_path
 from .blocks import make_blocks
 from .content import ReportContent
-from .tables import key_figures, record_tables, score_tables, verdict
+from .tables import headline, key_figures, record_tables, score_tables
 
 
 def write_report(content: ReportContent, path: str | Path) -> Path:
@@ -29,7 +29,7 @@ def render_page(content: ReportContent) -> str:
         title=content.title,
         run=content.run,
         summary=content.summary,
-        verdict=verdict(content),
+        headline=headline(content),
         key_figures=key_figures(content),
         blocks=make_blocks(content),
         scores=score_tables(content),

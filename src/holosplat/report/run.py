@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -14,14 +15,16 @@ from ..checks import as_written
 from ..geometry import Grid, Views
 from ..io.guess import read_guess
 from ..io.json import read_json
+from ..methods import METHODS
 from ..motion.measures import columns, measured
 from ..optics.background import Light
 from ..projectors.voxels import voxel_line_integrals
 from ..representations import MovingSurfaces, Stored
 from ..scan import Scan
+from ..tables import to_table
 from ..units import span
 from ..volume import Volume
-from ..workflows.evaluate import Evaluation, render
+from ..workflows.evaluate import Evaluation, of_absorption, render
 from ..workflows.forecast import NUMBERS, flow_in_words, read_band
 from ..workflows.reconstruct import Reconstruction
 from ..workflows.run_folder import RunFolder
@@ -60,18 +63,26 @@ def report_run(
         moving = moving_of(reconstruction, scan, evaluation.light, read_errors(folder))
         found = found.at(_middle(moving))
     grid = truth.grid if truth is not None else _drawn_grid(scan.views)
-    held_out = None
+    held_out, labels = None, np.array(view_labels(scan.views))
     if evaluation.test is not None and evaluation.predicted is not None:
         test = scan.test()
         held_out = HeldOutViews(
-            test.frames, evaluation.predicted, _labels(test), evaluation.test, test.views.pixel_sizes
+            test.frames,
+            evaluation.predicted,
+            _timed(labels[scan.is_test], test),
+            evaluation.test,
+            test.views.pixel_sizes,
+            evaluation.verdict,
         )
     volume = found.voxelise(grid)
+    if truth is not None and not reconstruction.delta_told:
+        truth = of_absorption(truth)
     with as_written(folder.config, "of a run that has begun"):
         own = config.get("method", config.get("settings", {}))
         said: dict[str, Any] = {
             "title": _title(config, reconstruction),
             "settings": {"seed": config["seed"], "prior": config["prior"], **own},
+            "usual": to_table(METHODS[own["kind"]]) if own.get("kind") in METHODS else {},
             "versions": dict(config["versions"]),
             "machine": dict(config["machine"]),
             "input_hash": str(config["scan_hash"]),
@@ -87,6 +98,7 @@ def report_run(
         volume_scores=evaluation.volume,
         material_delta=found.matter.delta if found.matter.single else None,
         explained=reconstruction.verdict,
+        delta_told=reconstruction.delta_told,
         total=reconstruction.total,
         geometry=reconstruction.geometry,
         lit=_lit(reconstruction, scan, evaluation),
@@ -94,11 +106,12 @@ def report_run(
         guess=_guess(folder, reconstruction),
         forecast=_forecast(folder),
         decisions=reconstruction.choice.decisions,
-        view=view_of(turned, volume, truth, scan),
+        view=view_of(turned, volume, truth, scan, reconstruction.delta_told),
         history=folder.history(),
         seconds=sum(reconstruction.timing.values()),
         timing={stage: f"{seconds:.1f} s" for stage, seconds in reconstruction.timing.items()},
         run=folder.name(),
+        scan=_scan_of(folder),
         **said,
     )
     return write_report(content, folder.report)
@@ -141,9 +154,17 @@ def _forecast(folder: RunFolder) -> ForecastShown | None:
     return ForecastShown(times, band, said["held_out"], flow_in_words(said["flow"]) if said.get("flow") else "")
 
 
+def _scan_of(folder: RunFolder) -> str:
+    """The scan of a run as a command takes it."""
+    told = str(read_json(folder.source).get("scan") or "") if folder.source.is_file() else ""
+    return shlex.quote(told) if told else "SCAN"
+
+
 def _title(config: Mapping[str, Any], reconstruction: Reconstruction) -> str:
     matter = reconstruction.object.matter
     count = "two materials" if matter.second else "one material" if matter.single else "δ and β free"
+    if not reconstruction.delta_told:
+        return f"{NAMES[reconstruction.object.kind]}, of absorption alone"
     said = {"known": ", known", "ratio": " of known δ/β", "free": ", found" if matter.occupancies else ""}
     return f"{NAMES[reconstruction.object.kind]}, {count}{said[config['prior']['kind']]}"
 
@@ -168,11 +189,11 @@ def _middle(moving: Moving) -> float:
     return float(moving.times[len(moving.times) // 2])
 
 
-def _labels(test: Scan) -> tuple[str, ...]:
-    """Those of views, with the time where there are several."""
-    labels, times = view_labels(test.views), test.exposures.time
+def _timed(labels: np.ndarray, test: Scan) -> tuple[str, ...]:
+    """The labels of views, with the time where there are several."""
+    times = test.exposures.time
     if len(np.unique(times)) < 2:
-        return labels
+        return tuple(labels)
     return tuple(f"{label}, {1e6 * time:.4g} µs" for label, time in zip(labels, times))
 
 
@@ -197,7 +218,7 @@ def _lit(reconstruction: Reconstruction, scan: Scan, evaluation: Evaluation) -> 
         shown.frames,
         part.factor().numpy(),
         predicted,
-        view_labels(shown.views),
+        tuple(np.array(view_labels(scan.views))[chosen]),
         light.in_words,
         shown.views.pixel_sizes,
     )
@@ -206,13 +227,14 @@ def _lit(reconstruction: Reconstruction, scan: Scan, evaluation: Evaluation) -> 
 def _projections(found: Stored, views: Views, truth: Volume | None) -> ProjectedMaps:
     """B and D of the first view and the one most at right angles to it, through the truth's voxels where known."""
     first, other = 0, int(abs(views.rotations[:, 2] @ views.rotations[0, 2]).argmin())
-    chosen = views[[first, other] if other != first else [first]]
+    indices = [first, other] if other != first else [first]
+    chosen, labels = views[indices], tuple(np.array(view_labels(views))[indices])
     with torch.no_grad():
         beta, delta = (line.numpy() for line in found.project(chosen))
         if truth is None:
-            return ProjectedMaps(beta, delta, view_labels(chosen), pixels=chosen.pixel_sizes)
+            return ProjectedMaps(beta, delta, labels, pixels=chosen.pixel_sizes)
         true_beta, true_delta = (line.numpy() for line in _project_volume(truth, chosen).unbind(1))
-    return ProjectedMaps(beta, delta, view_labels(chosen), true_beta, true_delta, chosen.pixel_sizes)
+    return ProjectedMaps(beta, delta, labels, true_beta, true_delta, chosen.pixel_sizes)
 
 
 def _project_volume(truth: Volume, views: Views) -> torch.Tensor:

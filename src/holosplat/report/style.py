@@ -10,8 +10,10 @@ import base64
 import functools
 import io
 import math
+import re
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
+from urllib.parse import quote
 
 import matplotlib
 import numpy as np
@@ -24,13 +26,22 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
 
+from ..units import plain
+
 WIDTH = 7.2  # inches: the full width of a journal page, 183 mm
 DPI = 160
-INK, FAINT = "#1b1f24", "#8b929b"
+INK, FAINT, GROUND = "#1b1f24", "#8b929b", "#fffffe"
 RECONSTRUCTION, TRUTH, TRUE_SURFACE = "#c2502f", "#5a626d", "#939ca8"
 CYCLE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5a626d")
 """Okabe & Ito's palette: told apart also by readers who do not see red and green as most do."""
+IN_THE_DARK = {GROUND: "#14171b", INK: "#e6e8eb", TRUTH: "#a0a8b2"}
+"""What stands for the colours of paper and ink, and of the truth's curves, where a page is dark (see `themed`)."""
 DELTA_MAP, BETA_MAP, HOLOGRAM_MAP, SIGNED_MAP = "magma", "cividis", "gray", "RdBu_r"
+
+PLAIN = " =:/,;+()!*?@"
+"""What stands for itself in a `data:` URI within quotes, beside letters, digits, _, ., - and ~."""
+POWER = re.compile(r"(-?\d(?:\.\d+)?)e([+-]\d+)")
+"""A number with an exponent."""
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -72,7 +83,8 @@ def settings() -> dict[str, object]:
         "legend.handlelength": 1.6,
         "figure.dpi": DPI,
         "savefig.dpi": DPI,
-        "figure.facecolor": "white",
+        "figure.facecolor": GROUND,
+        "axes.facecolor": GROUND,
         "svg.fonttype": "path",
         "svg.hashsalt": "holosplat",
     }
@@ -97,16 +109,26 @@ def new_figure(width: float, height: float, layout: str = "constrained") -> Figu
 
 
 @styled
-def data_uri(figure: Figure, kind: str) -> str:
-    """`figure` as a `data:` URI; kind: "svg" (curves) or "png" (images). Equal figures give equal text."""
+def data_uri(figure: Figure, kind: str = "svg") -> str:
+    """`figure` as a `data:` URI; kind: "svg" (images in it have `DPI`) or "png". Equal figures give equal text."""
     buffer = io.BytesIO()
     if kind == "svg":
         figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-        mime = "image/svg+xml"
-    else:
-        figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
-        mime = "image/png"
-    return f"data:{mime};base64,{base64.b64encode(buffer.getvalue()).decode()}"
+        # as text, for images in it are base64 already, and twice would be a third larger
+        return f"data:image/svg+xml,{quote(themed(buffer.getvalue().decode()), safe=PLAIN)}"
+    figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
+    return f"data:image/png;base64,{base64.b64encode(buffer.getvalue()).decode()}"
+
+
+def themed(svg: str) -> str:
+    """`svg` with the colours of `IN_THE_DARK` where its reader prefers dark pages; images in it stay as they are."""
+    names = {colour: f"--c{i}" for i, colour in enumerate(IN_THE_DARK)}
+    light = "".join(f"{name}: {colour};" for colour, name in names.items())
+    dark = "".join(f"{name}: {IN_THE_DARK[colour]};" for colour, name in names.items())
+    for colour, name in names.items():
+        svg = svg.replace(f": {colour}", f": var({name})")
+    rule = f"<style>:root {{{light}}} @media (prefers-color-scheme: dark) {{:root {{{dark}}}}}</style>"
+    return svg.replace("<defs>", f"{rule}<defs>", 1)
 
 
 def letter(axes: Axes, index: int, title: str = "", lift: float = 3.0) -> None:
@@ -133,7 +155,7 @@ def length_unit(extent: float) -> tuple[str, float]:
 def format_length(length: float, digits: int = 3) -> str:
     """`length` [m] with a suitable unit: 4.2e-7 → "420 nm"."""
     unit, factor = length_unit(abs(length))
-    return f"{length * factor:.{digits}g}\u00a0{unit}"
+    return f"{plain(length * factor, digits)}\u00a0{unit}"
 
 
 def scale_bar(axes: Axes, width: float, colour: str = "white", height: float = 0.055, beside: bool = False) -> None:
@@ -146,7 +168,7 @@ def scale_bar(axes: Axes, width: float, colour: str = "white", height: float = 0
     power = 10.0 ** math.floor(math.log10(target))
     length = max(step * power for step in (1, 2, 5) if step * power <= target)
     fraction = length / width
-    halo = "black" if colour == "white" else "white"
+    halo = {"white": "black", INK: GROUND}.get(colour, "white")
     x0, y0 = 0.05, height
     line = axes.plot([x0, x0 + fraction], [y0, y0], transform=axes.transAxes, color=colour, lw=1.8)[0]
     line.set_solid_capstyle("butt")
@@ -270,6 +292,10 @@ def scientific(value: float | None, digits: int = 3) -> str:
     if math.isinf(value):
         return "∞" if value > 0 else "−∞"
     if value == 0 or 1e-3 <= abs(value) < 1e5:
-        return f"{value:.{digits}g}".replace("-", "−") if abs(value) < 1000 else f"{value:,.0f}".replace("-", "−")
-    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
-    return f"{mantissa.replace('-', '−')}\u00a0×\u00a010{superscript(int(exponent))}"
+        return f"{value:,.0f}".replace("-", "−") if abs(value) >= 999.5 else plain(value, digits).replace("-", "−")
+    return in_print(f"{value:.{digits - 1}e}")
+
+
+def in_print(text: str) -> str:
+    """`text` whose numbers have their powers of ten as print has them: "9.1e-19 m³" → "9.1 × 10⁻¹⁹ m³"."""
+    return POWER.sub(lambda m: f"{m[1].replace('-', '−')}\u00a0×\u00a010{superscript(int(m[2]))}", text)

@@ -2,23 +2,58 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..units import in_percent
+from ..workflows.next_step import Step, next_step
 from .content import ReportContent, flatten
 from .moving import Moving
-from .style import format_length, scientific
+from .style import format_length, in_print, scientific
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table: caption, column heads (may be empty), and rows of texts whose first one names the row."""
+    """A table: caption, column heads (may be empty), and rows of texts whose first one names the row; folded: shown
+    when it is asked for."""
 
     caption: str
     rows: list[tuple[str, ...]]
     head: tuple[str, ...] = ()
+    folded: bool = False
+
+
+@dataclass(frozen=True)
+class Headline:
+    """What stands over the page. text: in one line; trusted: whether frames are explained, None where none were judged;
+    words: one sentence each: what was found, and why; step: what to try next, None where nothing is wrong."""
+
+    text: str
+    trusted: bool | None
+    words: tuple[str, ...]
+    step: Step | None = None
+
+
+def headline(content: ReportContent) -> Headline:
+    """The verdict on the training frames, or on the held-out ones where these alone are not explained; with the
+    scores."""
+    held_out, scores = content.held_out, verdict(content)
+    found, named = content.explained, "frames"
+    unseen = None if held_out is None else held_out.explained
+    if unseen is not None and not unseen.good and (found is None or found.good):
+        found, named = unseen, "held-out frames"
+    if found is None:
+        return Headline(content.title, None, (scores,))
+    words = in_print(found.words.replace("The frames", f"The {named}"))
+    text, _, rest = re.sub("[:;] ", "\n", words, count=1).partition("\n")
+    text, details = text.rstrip("."), tuple(filter(None, (rest[:1].upper() + rest[1:],)))
+    if found.good:
+        return Headline(text, True, (*details, scores))
+    text = f"Do not trust this volume: {text[0].lower()}{text[1:]}"
+    reasons = tuple(in_print(reason) for reason in found.reasons)
+    return Headline(text, False, (*details, *reasons, scores), next_step(found.cause, content.scan))
 
 
 def verdict(content: ReportContent) -> str:
@@ -29,11 +64,12 @@ def verdict(content: ReportContent) -> str:
         views = "one held-out view" if count == 1 else f"{count} held-out views"
         parts.append(f"predicts {views} with a mean SSIM of {mean['ssim']:.3f} and FRCM of {mean['frcm']:.3f}")
     if content.volume_scores is not None:
-        scores = content.volume_scores
+        scores, symbol = content.volume_scores, content.quantity.symbol
         size = percent(abs(scores.delta_deviation)).lstrip("+")
         side = "above" if scores.delta_deviation > 0 else "below"
         parts.append(
-            f"overlaps the truth with a Dice coefficient of {scores.dice:.3f}, its mean δ {size} {side} the true one"
+            f"overlaps the truth with a Dice coefficient of {scores.dice:.3f}, "
+            f"its mean {symbol} {size} {side} the true one"
         )
     if content.moving is not None:
         parts.insert(0, _followed(content.moving))
@@ -70,8 +106,8 @@ def key_figures(content: ReportContent) -> list[tuple[str, str, str]]:
         ]
     if content.volume_scores is not None:
         figures += [
-            ("Dice", f"{content.volume_scores.dice:.3f}", "at half of the δ"),
-            ("Mean δ", percent(content.volume_scores.delta_deviation), "against the truth"),
+            ("Dice", f"{content.volume_scores.dice:.3f}", f"at half of the {content.quantity.symbol}"),
+            (f"Mean {content.quantity.symbol}", percent(content.volume_scores.delta_deviation), "against the truth"),
         ]
     if content.seconds is not None:
         figures.append(("Time", duration(content.seconds), "of the reconstruction"))
@@ -105,9 +141,15 @@ def record_tables(content: ReportContent) -> list[Table]:
         ("input hash", content.input_hash or "not recorded"),
     ]
     named = {"Timing": content.timing, "Machine": content.machine, "Versions": content.versions}
-    named["Settings"] = content.settings
     tables = [Table("Input", data)]
     tables += [Table(name, list(flatten(entries).items())) for name, entries in named.items() if entries]
+    settings, usual = flatten(content.settings), flatten(content.usual)
+    told = [(name, value) for name, value in settings.items() if usual.get(name) != value]
+    tables += [Table("Settings other than the usual ones" if usual else "Settings", told)] if told else []
+    if usual and settings:
+        tables.append(
+            Table(f"All {len(settings)} settings, of stages that were not run, too", list(settings.items()), (), True)
+        )
     return tables
 
 
@@ -144,39 +186,35 @@ def _total_table(content: ReportContent) -> Table | None:
     if total is None:
         return None
     if total.value is None or total.error is None:
-        return Table("Total", [("by the frames", total.words)])
+        return Table("Total", [("by the frames", in_print(total.words))])
     rows = [
         (f"total {total.quantity} by the frames", f"{scientific(total.value)} m³"),
         ("its standard error", f"{scientific(total.error, 2)} m³"),
         ("what the volume holds", f"{scientific(total.held)} m³"),
-        ("in words", total.words),
+        ("in words", in_print(total.words)),
     ]
     return Table("Total", rows)
 
 
 def _volume_table(content: ReportContent) -> Table | None:
-    scores = content.volume_scores
+    scores, shown = content.volume_scores, content.quantity
     if scores is None:
         return None
-    sampling = 2 * scores.pitch
-
-    def resolved(length: float | None) -> str:
-        if length is None:
-            return f"≤ {format_length(sampling)} (sampling limit)"
-        return "not resolved" if length == float("inf") else format_length(length)
-
     rows = [
-        ("mean δ in the matter", scientific(scores.mean_delta), scientific(scores.true_mean_delta)),
+        (f"mean {shown.symbol} in the matter", shown.text(scores.mean_delta), shown.text(scores.true_mean_delta)),
         ("mean β in the matter", scientific(scores.mean_beta), scientific(scores.true_mean_beta)),
         ("mean δ / mean β", scientific(scores.ratio, 4), scientific(scores.true_ratio, 4)),
-        ("relative error of δ", scientific(scores.relative_error_delta), ""),
+        (f"relative error of {shown.symbol}", scientific(scores.relative_error_delta), ""),
         ("relative error of β", scientific(scores.relative_error_beta), ""),
         ("Dice coefficient", f"{scores.dice:.4f}", ""),
-        ("resolution, ½-bit", resolved(scores.resolution_half_bit), ""),
-        ("resolution, FSC 0.143", resolved(scores.resolution_fixed), ""),
+        ("resolution, ½-bit", resolved(scores.resolution_half_bit, scores.pitch), ""),
+        ("resolution, FSC 0.143", resolved(scores.resolution_fixed, scores.pitch), ""),
     ]
+    if not content.delta_told:  # δ stands for β: the same numbers would be told twice
+        rows = [row for row in rows if "δ" not in row[0] and not row[0].startswith(("mean β", "relative error of β"))]
     deviations = [scores.delta_deviation, scores.beta_deviation, scores.ratio_deviation]
-    last = [percent(d) for d in deviations] + [""] * (len(rows) - 3)
+    deviations = deviations if content.delta_told else deviations[:1]
+    last = [percent(d) for d in deviations] + [""] * (len(rows) - len(deviations))
     head = ("volume", "found", "truth", "deviation")
     return Table("Volume against the truth", [(*row, end) for row, end in zip(rows, last)], head)
 
@@ -221,6 +259,13 @@ def _geometry_table(content: ReportContent) -> Table | None:
         rows.append((name, *(n.replace("-", "−") for n in numbers), percent(change[5]), percent(change[6]), left))
     names = ("shift x (px)", "shift y (px)", "turn x (°)", "turn y (°)", "roll (°)", "distance", "magnification")
     return Table("Geometry beside the plan", rows, ("frame", *names, "unexplained"))
+
+
+def resolved(length: float | None, pitch: float) -> str:
+    """A resolution in words; None: not before the sampling limit of voxels of `pitch` [m]."""
+    if length is None:
+        return f"≤ {format_length(2 * pitch)} (sampling limit)"
+    return "not resolved" if length == float("inf") else format_length(length)
 
 
 def percent(value: float | None) -> str:

@@ -8,7 +8,6 @@ from typing import Any
 
 from ..inference import Decision
 from ..matter import MatterKind
-from ..methods.auto import VolumeWhereUnexplained
 from ..units import in_percent
 
 
@@ -48,7 +47,7 @@ class Choice:
         lines += [f"start: {self.begun}"] if self.begun else []
         if self.kept and len(self.judged) > 1:
             shares = ", ".join(f"{name} {in_percent(share)}" for name, share in self.judged.items())
-            lines.append(f"kept: {self.kept} (matter that training frames leave unexplained: {shares})")
-        if self.matter == "levels" and self.kept == VolumeWhereUnexplained.name and "fit" in self.judged:
-            lines.append("bodies of one level explain these frames badly: there may be several levels, or none")
+            less = [name for name, share in self.judged.items() if share < self.judged.get(self.kept, 0.0)]
+            why = f"; what {' and '.join(less)} explain{'s' * (len(less) == 1)} beyond it may be noise" if less else ""
+            lines.append(f"kept: {self.kept} (matter that training frames leave unexplained: {shares}){why}")
         return lines

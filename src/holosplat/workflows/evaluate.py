@@ -120,7 +120,7 @@ class Evaluation(Scores):
             said = [f"light: {self.light.in_words}; predictions are compared in it", *said]
         if not found.delta_told:
             beta = f"material: β {found.delta / found.ratio:.3e}; δ is not told: the frames show absorption alone"
-            return [*super().lines(), *said, beta]
+            return [*(line.replace("δ", "β") for line in super().lines()), *said, beta]
         kind = "one for all" if found.single_material else "found apart"
         if found.second is not None:
             kind = f"of two; the other: {_as_text(*found.second)}"
@@ -159,6 +159,7 @@ def evaluate(reconstruction: Reconstruction, scan: Scan | None, truth: Volume | 
     if scan is not None:
         _require_energy(reconstruction, scan.exposures)
         lit = light_of(scan, reconstruction.light, reconstruction.still)
+    truth = of_absorption(truth) if truth is not None and not reconstruction.delta_told else truth
     scores = score_object(found, scan, truth, reconstruction.oversample, found.backend, _factor(lit))
     material = replace(material_found(found), delta_told=reconstruction.delta_told)
     said = held_out_verdict(reconstruction, scan, lit) if scan is not None else None
@@ -197,6 +198,11 @@ def held_out_verdict(reconstruction: Reconstruction, scan: Scan, lit: Light | No
         whole = replace(scan, frames=lit.evened(torch.from_numpy(scan.frames)).numpy())
         test, noise = whole.test(), lit.doubt[np.flatnonzero(scan.is_test)]
     return judge(Prediction(found, test.exposures, reconstruction.oversample, backend=found.backend), test, noise)
+
+
+def of_absorption(volume: Volume) -> Volume:
+    """The volume with β in the place of δ, too, as in a run whose frames show absorption alone."""
+    return replace(volume, delta=volume.beta)
 
 
 def _where_it_is_judged(reconstruction: Reconstruction) -> Stored:

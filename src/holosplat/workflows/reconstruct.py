@@ -220,7 +220,7 @@ class _Run:
         last: Running | None = None
         for number in range(first, len(stages)):
             stage, saved = stages[number], self._saved if number == first else None
-            before = self._keeper.handed(stage, found, self.task.freedom is not None)
+            before = found
             start = self._start_again(saved) if saved else self._started(stage, before)
             fit = stage.fit(self.task.in_windows(), start)
             oversample = fit.oversample if fit else 0

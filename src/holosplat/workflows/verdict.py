@@ -21,7 +21,8 @@ from ..optics.noise import noise_levels
 from ..optics.noise_model import NoiseModel
 from ..representations import Stored
 from ..scan import Scan
-from ..units import in_percent, two_digits
+from ..units import in_percent, plain, two_digits
+from .next_step import STIFF, next_step
 
 TOO_MUCH = 1.15
 """Residual over what is allowed (rms) from which on a band counts as unexplained."""
@@ -39,6 +40,8 @@ BELOW = 0.8
 """Residual over noise (rms) below which a fit has followed the noise."""
 ODD = 1.5
 """Residual of a view over the median one (rms) from which on the view is named."""
+MANIFOLD = 2.0
+"""Residual over contrast from which on it is said as a factor, not in per cent."""
 NOISE_TOLD = 0.05
 """Share of the noise's power that its estimate may be wrong by."""
 POWERS = ("residual", "noise", "contrast", "allowed")
@@ -59,6 +62,7 @@ class Verdict:
         what a residual may have
     tested: each change of the frames that was tested by itself: its value (mean over views), error, significance and
         share of the excess
+    cause: the likeliest cause, a key of `next_step.STEPS`; empty where none is known
     """
 
     good: bool
@@ -70,17 +74,20 @@ class Verdict:
     contrast: np.ndarray
     allowed: np.ndarray
     tested: dict[str, dict[str, float]]
+    cause: str = ""
 
     def lines(self, frames: str) -> list[str]:
-        """The verdict on `frames`, such as "training frames", as lines of text."""
-        return [f"{frames}: {self.words}", *(f"  {reason}" for reason in self.reasons)]
+        """The verdict on `frames`, such as "training frames", as lines of text; the last is what to do next."""
+        step = next_step(self.cause)
+        last = [f"  Next: {step.why} {step.command}"] if step else []
+        return [f"{frames}: {self.words}", *(f"  {reason}" for reason in self.reasons), *last]
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON; `from_dict` reads them."""
         arrays = {name: _rounded(getattr(self, name)) for name in POWERS}
         periods = [[low, None if math.isinf(high) else high] for low, high in self.periods.tolist()]
         plain = {"good": self.good, "words": self.words, "reasons": list(self.reasons), "periods_m": periods}
-        return plain | arrays | {"tested": self.tested}
+        return plain | arrays | {"tested": self.tested, "cause": self.cause}
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> Verdict:
@@ -94,6 +101,7 @@ class Verdict:
                 periods=np.array(periods, dtype=np.float64),
                 **{name: np.array(values[name], dtype=np.float64) for name in POWERS},
                 tested=dict(values["tested"]),
+                cause=str(values.get("cause", "")),
             )
         except (KeyError, TypeError, ValueError) as error:
             raise InputError(f"a verdict must be what reconstruct wrote, but it lacks or garbles {error}.") from error
@@ -124,10 +132,10 @@ def judge(said: Prediction, frames: Scan, noise: NoiseModel | None = None) -> Ve
     if not bool(absorbing.any() or refracting.any()):
         return replace(found, good=False, words=NOTHING, reasons=(HELP, *found.reasons)) if found.good else found
     if _shows_nothing(left):
-        return replace(found, good=False, words=NOTHING, reasons=(OF_NOISE, HELP))
+        return replace(found, good=False, words=NOTHING, reasons=(OF_NOISE, HELP), cause="")
     if found.good or not _leaves_the_field(refracting):
         return found
-    return replace(found, reasons=(LEAVES, *found.reasons))
+    return replace(found, reasons=(LEAVES, *found.reasons), cause="")
 
 
 def _matter(said: Prediction) -> tuple[torch.Tensor, torch.Tensor]:
@@ -195,9 +203,10 @@ def verdict(found: Residuals) -> Verdict:
     limit = TOO_MUCH**2 * (1 + SCATTER * np.sqrt(2 / (counts * views)))
     bad, single = np.flatnonzero(over > limit), scores(found)
     faults = [name for name, size in LARGE.items() if _is_fault(single[name], size)]
-    good = not len(bad) and not faults
+    good, cause = not len(bad) and not faults, next(iter(faults), "")
     if len(bad):
         named = causes(found)
+        cause = named[0].name if named else STIFF
         reasons = _reasons(found, named, single)
         words = _unexplained(found, bad, over)
     elif faults:
@@ -211,7 +220,8 @@ def verdict(found: Residuals) -> Verdict:
         reasons=(*reasons, *_remarks(found, counts)),
         periods=np.array([found.rings.periods(b) for b in range(len(counts))]),
         **{name: np.sqrt(getattr(found, name)) for name in POWERS},
-        tested={name: _numbers(cause) for name, cause in single.items()},
+        tested={name: _numbers(each) for name, each in single.items()},
+        cause=cause,
     )
 
 
@@ -222,7 +232,10 @@ def _is_fault(cause: Cause, size: float) -> bool:
 def _explained(found: Residuals, counts: np.ndarray) -> str:
     residual, noise, contrast = (_rms(p, counts) for p in (found.residual, found.noise, found.contrast))
     if noise < NOISELESS * contrast:
-        return f"The frames, which show no noise, are explained to {in_percent(residual / contrast)} of their contrast."
+        return (
+            f"The frames are explained to {in_percent(residual / contrast)} of their contrast; their noise is below "
+            f"{in_percent(NOISELESS)} of it."
+        )
     return f"The frames are explained to within their noise: the residual is {two_digits(residual / noise)} of it."
 
 
@@ -238,13 +251,18 @@ def _unexplained(found: Residuals, bad: np.ndarray, over: np.ndarray) -> str:
     size = (
         f"{two_digits(residual / noise)} times the noise"
         if noisy
-        else f"{in_percent(residual / contrast)} of the contrast"
+        else _of_contrast(residual / max(contrast, np.finfo(float).tiny))
     )
     wide = _band(found.rings.periods(last)[0], found.rings.periods(first)[1])
     said = "" if first == last else f"; it is too large at all periods {wide}"
     return (
         f"The frames are not explained: the residual is {size} at periods {_band(*found.rings.periods(worst))}{said}."
     )
+
+
+def _of_contrast(share: float) -> str:
+    """A residual over the contrast, in words; beyond `MANIFOLD` no share of it."""
+    return f"{two_digits(share)} times the contrast" if share > MANIFOLD else f"{in_percent(share)} of the contrast"
 
 
 def _reasons(found: Residuals, named: list[Cause], single: Mapping[str, Cause]) -> tuple[str, ...]:
@@ -320,8 +338,8 @@ def _rms(power: np.ndarray, counts: np.ndarray) -> float:
 
 
 def _band(shortest: float, longest: float) -> str:
-    low = f"{1e6 * shortest:.3g}"
-    return f"above {low} µm" if math.isinf(longest) else f"of {low} to {1e6 * longest:.3g} µm"
+    low = plain(1e6 * shortest)
+    return f"above {low} µm" if math.isinf(longest) else f"of {low} to {plain(1e6 * longest)} µm"
 
 
 def _rounded(values: np.ndarray) -> list[list[float]]:

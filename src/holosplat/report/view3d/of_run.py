@@ -18,7 +18,7 @@ ENDS = (0.2, 99.8)
 """Percentiles of the frames between which the grey scale lies."""
 
 
-def view_of(obj: Stored, volume: Volume, truth: Volume | None, scan: Scan) -> View3D:
+def view_of(obj: Stored, volume: Volume, truth: Volume | None, scan: Scan, delta_told: bool = True) -> View3D:
     """What can be turned of `obj`, whose `volume` (and `truth`, where known) also gives the slices.
 
     volume, truth: of the middle time where something moves.
@@ -26,7 +26,7 @@ def view_of(obj: Stored, volume: Volume, truth: Volume | None, scan: Scan) -> Vi
     exposures = scan.exposures[np.array([0])]
     _, _, pixel = raster_of(*exposures.views.shape, exposures.views.pitch)
     times = np.unique(scan.exposures.time) if isinstance(obj, MovingSurfaces) else None
-    phase = first_phase(obj, scan)
+    shift = first_phase(obj, scan) * (1.0 if delta_told else 2.0)  # without δ, which is β then: the absorption 2k∫β
     shown = {"reconstruction": volume} | ({} if truth is None else {"truth": truth})
     parts = {"reconstruction": part_of(obj, volume, pixel, times)}
     if truth is not None and times is None:
@@ -39,8 +39,9 @@ def view_of(obj: Stored, volume: Volume, truth: Volume | None, scan: Scan) -> Vi
         views=scan.views,
         labels=view_labels(scan.views),
         grey=(float(low), float(max(high, low + 1e-6))),
-        phase=float(np.percentile(phase, ENDS[1])) or 1.0,
-        picture=still(phase),
+        top=float(np.percentile(shift, ENDS[1])) or 1.0,
+        picture=still(shift),
+        delta_told=delta_told,
     )
 
 

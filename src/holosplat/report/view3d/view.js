@@ -328,6 +328,33 @@ function shade(low, high, colours) {
   };
 }
 
+// A number as people write it: 1.2e-7 becomes 1.2 × 10⁻⁷.
+function text(value) {
+  if (!value) return "0";
+  const size = Math.abs(value);
+  if (size >= 1e-3 && size < 1e5) return String(Number(value.toPrecision(3))).replace("-", "−");
+  const [mantissa, power] = value.toExponential(1).split("e");
+  const digits = String(Number(power)).replace(/./g, (c) => "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"["-0123456789".indexOf(c)]);
+  return `${mantissa.replace("-", "−")} × 10${digits}`;
+}
+
+// A bar of colours from low to high beside the canvas `name`, whose numbers are `factor` times these.
+function bar(name, low, high, colour, unit = "", factor = 1) {
+  const canvas = pick(`${name}-colours`), values = Float32Array.from({ length: 64 }, (_, i) => high - (high - low) * i / 63);
+  paint(canvas, 1, 64, values, colour);
+  canvas.nextElementSibling.querySelector(".top").textContent = `${text(factor * high)} ${unit}`;
+  canvas.nextElementSibling.querySelector(".low").textContent = text(factor * low);
+}
+
+// A scale bar of a round length, up to a quarter of `width` [m], on the canvas `name`.
+function ruler(name, width) {
+  const power = 10 ** Math.floor(Math.log10(width / 4)), length = [5, 2, 1].find((n) => n * power <= width / 4) * power;
+  const [unit, factor] = length >= 0.9995e-3 ? ["mm", 1e3] : length >= 0.9995e-6 ? ["µm", 1e6] : ["nm", 1e9];
+  const mark = pick(name).nextElementSibling;
+  mark.style.width = `${100 * length / width}%`;
+  mark.textContent = `${Number((length * factor).toPrecision(3))} ${unit}`;
+}
+
 function turned(yaw, pitch, R) {
   const [c, s, d, t] = [Math.cos(yaw), Math.sin(yaw), Math.cos(pitch), Math.sin(pitch)];
   const M = [c, 0, s, t * s, d, -t * c, -d * s, t, d * c];  // about y, then about x
@@ -351,12 +378,15 @@ function start(buffer) {
   const names = Object.keys(drawers);
   const state = { part: names[0], R: facts.rotations[0], shift: facts.shifts[0], time: 0, plane: 2, depth: 0 };
   const lines = (name, R, time = 0, shift = [0, 0]) => drawers[name](R, time, shift);
-  const warm = shade(0, facts.phase, facts.colours), grey = shade(...facts.grey);
+  const told = facts.delta_told, [name, unit, factor] = told ? ["Phase shift −φ", "rad", facts.k] : ["Absorption 2k∫β dz", "", 2 * facts.k];
+  const lined = ({ delta, beta }) => (told ? delta : beta);
+  const [cutName, cutUnit, cutFactor] = told ? ["δ", "", 1] : ["µ", "m⁻¹", 2 * facts.k];
+  const warm = shade(0, facts.top, facts.colours), grey = shade(...facts.grey);
   let shown, pending = 0;
 
   function look() {
     shown = lines(state.part, state.R, state.time, state.shift);
-    paint(pick("phase"), columns, rows, shown.delta.map((d) => facts.k * d), warm);
+    paint(pick("phase"), columns, rows, lined(shown).map((d) => factor * d), warm);
     clearTimeout(pending);
     pending = setTimeout(() => paint(pick("hologram"), columns, rows, hologramOf(shown), grey), 0);
   }
@@ -367,8 +397,11 @@ function start(buffer) {
     pick("depth").max = count - 1;
     state.depth = Math.min(state.depth, count - 1);
     const { w, h, values } = sliceOf(part, arrays, state.plane, state.depth);
-    const top = part.low[0] + 255 * part.step[0];
-    paint(pick("slice"), w, h, values, shade(Math.min(0, part.low[0]), top || 1, facts.colours));
+    const low = part.low[0] < -1.5 * part.step[0] ? part.low[0] : 0, top = part.low[0] + 255 * part.step[0] || 1;
+    const colour = shade(low, top, facts.colours);
+    paint(pick("slice"), w, h, values, colour);
+    bar("slice", low, top, colour, cutUnit, cutFactor);
+    ruler("slice", w * facts.pixel * part.voxel[[2, 0, 0][state.plane]]);
     const axis = "xyz"[state.plane];
     const place = (state.depth + 0.5 - count / 2) * part.voxel[state.plane] + part.middle[state.plane];
     root.querySelector('output[name="depth"]').textContent = `${axis} = ${(1e6 * facts.pixel * place).toFixed(1)} µm`;
@@ -407,15 +440,18 @@ function start(buffer) {
       held = [e.clientX, e.clientY];
     }
     const j = Math.floor(e.offsetX / canvas.clientWidth * columns), i = Math.floor(e.offsetY / canvas.clientHeight * rows);
-    const value = facts.k * shown.delta[i * columns + j];
-    if (Number.isFinite(value)) pick("value").textContent = `· here ${value.toPrecision(3)}`;
+    const value = factor * lined(shown)[i * columns + j];
+    if (Number.isFinite(value)) pick("value").textContent = `· here ${text(value)} ${unit}`;
   };
   canvas.onkeydown = (e) => {
     const way = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] }[e.key];
     if (way) { e.preventDefault(); turn(way[0] * Math.PI / 36, way[1] * Math.PI / 36); }
   };
-  pick("top").textContent = facts.phase.toPrecision(3);
-  pick("grey").textContent = facts.grey.map((v) => v.toPrecision(3)).join(" to ");
+  pick("shown").textContent = name;
+  pick("slice-shown").textContent = `Slice of ${cutName}`;
+  bar("phase", 0, facts.top, warm, unit);
+  bar("hologram", ...facts.grey, grey);
+  for (const each of ["phase", "hologram"]) ruler(each, columns * facts.pixel);
   state.depth = Math.floor((Object.values(slices)[0]?.arrays.values.shape[1] ?? 1) / 2);
   root.querySelector('input[name="depth"]').max = 1e6;
   root.querySelector('input[name="depth"]').value = state.depth;

@@ -1,0 +1,213 @@
+"""What `holosplat info` says of a scan: how it was taken, what its frames show, and what its reconstruction takes.
+
+A few frames, flats and darks are read, and no more, so that a scan of a terabyte is described as soon as a small one.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..checks import InputError, UnsaidError
+from ..io.angles import angles_of
+from ..io.facts import Facts, keys_of
+from ..io.formats import loader_of
+from ..io.kept_frames import with_fields
+from ..io.loader import Loader
+from ..io.raw_file import DARK, FLAT, INVALID, NAMES, PROJECTION, ScanFile
+from ..io.reading import Reading
+from ..io.stored_frames import StoredFrames
+from ..matter import MatterKind
+from ..methods import Auto
+from ..optics.sampling import fringes
+from ..scan import Exposures, Scan
+from ..units import span
+from .acts import of_each_time
+from .look import LOOKED, Look, looked
+from .needs import Sizes, of_reconstruction, require_room, smaller
+from .seen import seen_of
+
+FIELDS = 3
+"""Flats, and darks, that are read."""
+GAP, MOST_GAPS = 1.5, 4
+"""Steps between neighbouring angles from which on there is a gap, and gaps that are named."""
+OPTIONS = {"energy_kev": "energy-kev", "distance": "distance", "pixel_size": "pixel-size", "angles_deg": "angles"}
+"""Names of what an option can say, and of the option."""
+OPTICS = ("energy_kev", "distance", "pixel_size")
+KINDS: dict[MatterKind, str] = {"levels": "closed bodies", "continuous": "continuous matter"}
+UNKNOWN = "not known"
+
+Opened = tuple[Scan, ScanFile | None]
+"""A scan, and the file that it is of; None for formats whose frames are corrected."""
+Unsaid = Mapping[str, str]
+"""What neither files nor options say, and the sentence about it."""
+
+
+@dataclass(frozen=True)
+class ScanFacts:
+    """What is said of a scan. scan: read with stand-ins for what is `unsaid`; look: at its frames `numbers`."""
+
+    facts: Facts
+    scan: Scan
+    look: Look
+    numbers: np.ndarray
+    unsaid: tuple[str, ...]
+
+
+def facts_of_scan(path: Path, reading: Reading) -> ScanFacts:
+    """What is said of the scan at `path`. Errors: `InputError` for what stops its reading, and no option can say."""
+    loader, stand_ins, unsaid = loader_of(path), dict[str, Any](), dict[str, str]()
+    reading.told.vouch(path)
+    while True:
+        try:
+            given = stand_ins | reading.told.given(loader.takes)
+            with _silent(bool(stand_ins)), _opened(loader, path, given) as opened:
+                return _facts(path, reading, loader, opened, unsaid)
+        except UnsaidError as error:
+            new = {name: value for name, value in error.stand_ins.items() if name not in stand_ins}
+            if not new:
+                raise
+            stand_ins |= new
+            unsaid |= dict.fromkeys(new, str(error))
+
+
+@contextmanager
+def _silent(silent: bool) -> Iterator[None]:
+    """Without the notes of readers, which would be on stand-ins."""
+    logger = logging.getLogger("holosplat")
+    before = logger.disabled
+    logger.disabled = before or silent
+    try:
+        yield
+    finally:
+        logger.disabled = before
+
+
+@contextmanager
+def _opened(loader: Loader, path: Path, given: Mapping[str, Any]) -> Iterator[Opened]:
+    """The scan with few flats and darks."""
+    if loader.opens is None:
+        yield loader.read(path, given), None
+        return
+    with loader.opens(path, given) as file:
+        few = with_fields(replace(file, kinds=_with_few_fields(file.kinds)), given)
+        yield Scan.of(StoredFrames.of(few), few.exposures, few.is_test, few.provenance(), few.divided), file
+
+
+def _with_few_fields(kinds: np.ndarray) -> np.ndarray:
+    """The kinds [N] of frames with at most `FIELDS` flats and darks, the others being invalid."""
+    kept = kinds.copy()
+    for kind in (FLAT, DARK):
+        numbers = np.flatnonzero(kinds == kind)
+        kept[np.setdiff1d(numbers, evenly(numbers, FIELDS))] = INVALID
+    return kept
+
+
+def evenly(numbers: np.ndarray, most: int) -> np.ndarray:
+    """At most so many of `numbers`, the first and the last among them."""
+    return numbers[np.unique(np.linspace(0, len(numbers) - 1, most).round().astype(int))] if len(numbers) else numbers
+
+
+def _facts(path: Path, reading: Reading, loader: Loader, opened: Opened, unsaid: Unsaid) -> ScanFacts:
+    scan, file = reading.applied(opened[0]), opened[1]
+    numbers = evenly(np.arange(len(scan)), LOOKED)
+    look = looked(np.asarray(scan.source[numbers]))
+    rows = {"what": f"a scan: {loader.mark} ({loader.name})"} | keys_of(path) | _frames(scan, file)
+    rows |= _beam(scan.exposures, unsaid) | _angles(scan, file, unsaid) | look.rows()
+    if unsaid.keys().isdisjoint(OPTICS):
+        rows["fringes"] = look.fringes(fringes(scan.exposures) / scan.views.pixel_sizes)
+    if not unsaid:
+        rows |= _needs(scan, numbers)
+    missing = list(dict.fromkeys(unsaid.values()))
+    if not look.is_relative:
+        missing.append(
+            f"{path} holds counts (level {look.level:.4g}) that nothing divides; divide them by --flats and --darks."
+        )
+    words = ["holosplat reconstruct", str(path), *(f"--{OPTIONS.get(name, name)} …" for name in unsaid)]
+    more = " ".join([*words, *(["--time-frame each"] if scan.is_series else []), "--out run"])
+    matter = "not in the file; --material NAME or --delta-beta RATIO says it, else δ/β is estimated"
+    return ScanFacts(Facts(rows | {"material": matter}, tuple(missing), (more,)), scan, look, numbers, tuple(unsaid))
+
+
+def _frames(scan: Scan, file: ScanFile | None) -> dict[str, str]:
+    h, w = scan.views.shape
+    counts = [f"{len(scan)} projections of {h} × {w} pixels (rows × columns)"]
+    if file is not None:
+        for kind, name in ((FLAT, "flats"), (DARK, "darks"), (INVALID, "left out")):
+            counts += [f"{len(file.numbers(kind))} {name}"] if len(file.numbers(kind)) else []
+    held_out = int(scan.is_test.sum())
+    counts += [f"{held_out} held out of the fit"] if held_out else []
+    rows = {"frames": ", ".join(counts)}
+    if file is not None and file.mask().any():
+        rows["defective pixels"] = f"{int(file.mask().sum())}, as the file marks them"
+    if scan.is_series:
+        times = scan.instants
+        rows["times"] = f"{len(times)} from {times[0]:.4g} to {times[-1]:.4g} s, {len(scan) // len(times)} frames each"
+    return rows
+
+
+def _beam(exposures: Exposures, unsaid: Unsaid) -> dict[str, str]:
+    values = {
+        "energy_kev": f"{span(exposures.energy_kev)} keV",
+        "distance": f"{span(exposures.distance)} m",
+        "pixel_size": f"{span(1e6 * exposures.views.pixel_sizes)} µm",
+    }
+    rows = {NAMES.get(name, name): UNKNOWN if name in unsaid else text for name, text in values.items()}
+    if exposures.psf_sigma_px.any():
+        rows["blur"] = f"standard deviation {span(exposures.psf_sigma_px)} pixels"
+    return rows
+
+
+def _angles(scan: Scan, file: ScanFile | None, unsaid: Unsaid) -> dict[str, str]:
+    """Range, steps and gaps of the angles, the files or frames of the first and the last, and the axis."""
+    angles = angles_of(scan.views)
+    if "angles_deg" in unsaid:
+        return {"angles": UNKNOWN}
+    if len(scan) == 1:
+        return {}
+    if angles is None:
+        return {"angles": f"{len(scan)} views that do not turn about one vertical axis"}
+    whole = file is not None and len(file.exposures) == len(scan)
+    names = [file.name(int(n)) for n in file.numbers(PROJECTION)[[0, -1]]] if whole and file else ["first", "last"]
+    turned = np.rad2deg(np.unwrap(np.deg2rad(angles)))
+    turned = turned if len(np.unique(np.sign(np.diff(turned)))) == 1 else angles  # of frames in another order
+    ends = f"{names[0]} at {turned[0]:.5g}°, {names[1]} at {turned[-1]:.5g}°"
+    rows = {"angles": f"{turned.min():.5g}° to {turned.max():.5g}°; {ends}"}
+    steps = np.diff(np.unique(turned.round(4)))
+    if len(steps):
+        step = float(np.median(steps))
+        places = np.flatnonzero(steps > GAP * step)
+        low = np.unique(turned.round(4))
+        gaps = ", ".join(f"{low[n]:.5g}° to {low[n + 1]:.5g}°" for n in places[:MOST_GAPS])
+        rows["steps"] = f"{step:.4g}°, {f'{len(places)} gaps: {gaps}' if len(places) else 'no gaps'}"
+    columns = 0.5 * (scan.views.shape[1] - 1) - scan.views.shifts[:, 0] / scan.views.pixel_sizes
+    rows["axis"] = f"column {span(columns)} of {scan.views.shape[1]} (--axis-column; holosplat align --axis-only)"
+    return rows
+
+
+def _needs(scan: Scan, numbers: np.ndarray) -> dict[str, str]:
+    """What `reconstruct` takes for closed bodies and for continuous matter, by the frames `numbers`."""
+    train = scan.train()
+    if scan.is_series:
+        needs = of_each_time(train.exposures, Auto(), None)
+        return {"each time": needs.line()} if needs else {}
+    few = scan.with_split(np.zeros(len(scan), dtype=bool))[numbers].in_memory()
+    seen = seen_of(few, Auto())
+    windows = seen.windows and replace(seen.windows, views=len(train))
+    rows = {}
+    for kind, name in KINDS.items():
+        needs = of_reconstruction(Sizes.of(train.exposures), Auto(), kind, replace(seen, windows=windows))
+        if needs is None:
+            continue
+        try:
+            require_room(needs, Path.cwd(), smaller(train.exposures, Auto(), kind))
+            rows[name] = needs.line()
+        except InputError as error:  # says what would fit
+            rows[name] = str(error)
+    return rows

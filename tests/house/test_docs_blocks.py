@@ -1,0 +1,76 @@
+"""Every block of code in the README and the guide runs as it stands, in an empty folder, on data that blocks make.
+
+A block that begins with a comment such as `# needs network` or `# takes hours` (`helpers.doc_blocks.EXCUSE`) is only
+parsed; tests/house/test_docs_commands.py holds the options of its commands to the command line.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from helpers.doc_blocks import Block, blocks, given, misparsed, run
+from holosplat.methods.presets import read_method
+
+ROOT = Path(__file__).resolve().parents[2]
+README = ROOT / "README.md"
+ELSEWHERE = ("adding.md",)
+"""Pages whose blocks are files of the package: tests/house/test_adding.py runs them."""
+TEXTS = {page: page.read_text(encoding="utf-8") for page in [README, *sorted((ROOT / "docs").glob("*.md"))]}
+GUIDE = [page for page, text in TEXTS.items() if page.name not in ELSEWHERE and blocks(text)]
+RUN = [page for page in GUIDE if page != README and any(block.runs for block in blocks(TEXTS[page]))]
+
+
+@pytest.fixture(scope="session")
+def readme(tmp_path_factory) -> Path:
+    """The folder in which all blocks of the README were run."""
+    folder = tmp_path_factory.mktemp("readme")
+    run(TEXTS[README], folder)
+    return folder
+
+
+@pytest.mark.slow
+def test_the_blocks_of_the_readme_run(readme):
+    assert {"scan.nxs", "truth.h5", "run", "moving"} <= {path.name for path in readme.iterdir()}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", RUN, ids=lambda page: page.name)
+def test_the_blocks_of_a_page_run(page, readme, tmp_path):
+    run(TEXTS[page], tmp_path, readme)
+
+
+@pytest.mark.parametrize("page", GUIDE, ids=lambda page: page.name)
+def test_blocks_are_well_formed(page):
+    """Their language is one that is run, parsed here, or output; shell and Python take their syntax."""
+    found = blocks(TEXTS[page])
+    assert {block.language for block in found} <= {"sh", "python", "toml", ""}
+    assert {block.text: misparsed(block) for block in found if misparsed(block)} == {}
+    scripts = [name for block in found for name in re.findall(r"^python ([\w/.]+\.py)", block.text, re.MULTILINE)]
+    assert [name for name in scripts if not (ROOT / name).is_file()] == []
+
+
+def test_settings_files_are_read(tmp_path):
+    found = [block.text for text in TEXTS.values() for block in blocks(text) if block.language == "toml"]
+    assert found
+    for text in found:
+        (tmp_path / "mine.toml").write_text(text, encoding="utf-8")
+        assert read_method(tmp_path / "mine.toml").kind == "gaussians"
+
+
+def test_there_are_pages_that_run():
+    assert len(RUN) >= 8
+    assert any(block.runs for block in blocks(TEXTS[README]))
+
+
+def test_what_fails_is_seen(tmp_path):
+    """In a shell at its first command and in a pipe, and in Python; what has an excuse is not run."""
+    for text in ("```sh\nfalse\ntrue\n```\n", "```sh\nfalse | cat\n```\n", "```python\nassert 0\n```\n"):
+        with pytest.raises(AssertionError):
+            run(text, tmp_path)
+    run("```sh\n# needs network: a file\nfalse\n```\n\n```\nfalse\n```\n", tmp_path)
+    assert given("`a.nxs` and\n`b.h5` are made\n[in the README](../README.md#your-own-cells).") == ["a.nxs", "b.h5"]
+    assert misparsed(Block("sh", "if true\n"))
+    assert misparsed(Block("python", "a =\n"))

@@ -1,0 +1,97 @@
+"""The words and numbers of a report: the verdict over it, µ where δ is not known, labels."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from helpers.report_page import PITCH, Page, content, scene
+from holosplat.geometry import Views
+from holosplat.metrics import robust_material_delta, volume_scores
+from holosplat.report import (
+    render_page,
+    view_labels,
+)
+from holosplat.report.content import flatten
+from holosplat.report.style import format_length, in_print, scientific
+from holosplat.report.surface import camera
+from holosplat.report.tables import duration, headline, percent
+from holosplat.units import wavelength
+from holosplat.volume import Volume
+from holosplat.workflows.verdict import Verdict
+
+# --- the verdict ---
+
+
+def judged(good, cause="", words="The frames are not explained: the residual is 3 times the noise."):
+    return Verdict(
+        good, words, ("Likely cause: light.",), np.array([[1e-6, np.inf]]), *[np.ones((3, 1))] * 4, {}, cause
+    )
+
+
+def test_the_verdict_is_the_headline_with_its_cause_and_the_next_command(undrawn_reports):
+    shown = headline(content(explained=judged(False, "shift_x"), scan="'my scan.nxs'"))
+    assert shown.trusted is False
+    assert shown.text == "Do not trust this volume: the frames are not explained"
+    assert shown.words[:2] == ("The residual is 3 times the noise.", "Likely cause: light.")
+    page = Page(render_page(content(explained=judged(False, "shift_x"), scan="'my scan.nxs'"))).text
+    assert "holosplat align 'my scan.nxs' --axis-only --out aligned.nxs" in page
+    assert page.index("Do not trust this volume") < page.index("Likely cause: light.") < page.index("mean SSIM")
+
+
+def test_a_good_verdict_is_the_headline_unless_held_out_frames_are_not_explained():
+    good = judged(True, words="The frames are explained to within their noise: the residual is 1 of it.")
+    assert headline(content(explained=good)).text == "The frames are explained to within their noise"
+    held_out = replace(content().held_out, explained=judged(False))
+    shown = headline(content(explained=good, held_out=held_out))
+    assert shown.text == "Do not trust this volume: the held-out frames are not explained"
+    assert headline(content()).trusted is None
+
+
+# --- absorption alone ---
+
+
+def test_absorption_alone_is_shown_as_attenuation_and_nothing_is_said_of_phase():
+    truth, found = (Volume(v.beta, v.beta, v.grid) for v in scene())
+    changes = {"reconstruction": found, "truth": truth, "volume_scores": volume_scores(found, truth)}
+    page = Page(render_page(content(**changes, delta_told=False))).text
+    mu = 4 * np.pi / wavelength(11.0) * robust_material_delta(truth)
+    assert f"The material's µ is {scientific(mu)}\u00a0m⁻¹".replace("\u00a0", " ") in page.replace("\u00a0", " ")
+    assert "Absorption 2k∫β dz = ∫µ dz" in page
+    for words in ("Phase", "phase", "Mean δ", "mean δ", "mean β", "where δ"):
+        assert words not in page
+    assert page.count("δ") == 2  # "δ, and with it δ/β, is not known"
+
+
+# --- words and numbers ---
+
+
+def test_labels_numbers_and_settings_read_well():
+    assert view_labels(Views.from_angles([0.0, 15.0, 359.99], (4, 4), PITCH)) == (
+        "θ = 0.0°",
+        "θ = 15.0°",
+        "θ = 0.0°",
+    )
+    assert view_labels(Views.from_rotations(camera()[None], (4, 4), PITCH)) == ("view 1",)
+    across = Views.from_angles([-88.2, 0.0, 45.0, 88.2], (4, 4), PITCH)
+    assert view_labels(across) == ("θ = −88.2°", "θ = 0.0°", "θ = 45.0°", "θ = 88.2°")
+    assert view_labels(Views.from_angles([0.0, 90.0, 180.0, 270.0], (4, 4), PITCH))[-1] == "θ = 270.0°"
+    assert flatten({"a": {"b": 1, "c": {"d": 0.5}}, "e": (1, 2)}) == {
+        "a.b": "1",
+        "a.c.d": "0.5",
+        "e": "(1, 2)",
+    }
+    assert scientific(4.123e-7).replace("\u00a0", " ") == "4.12 × 10⁻⁷"
+    assert scientific(-9.999e-7, 2).replace("\u00a0", " ") == "−1.0 × 10⁻⁶"
+    assert scientific(-0.0) == "0"
+    assert scientific(999.7) == "1,000"
+    assert format_length(3.43) == "3430\u00a0mm"
+    assert in_print("β 9.1e-19 m³, -2e+06").replace("\u00a0", " ") == "β 9.1 × 10⁻¹⁹ m³, −2 × 10⁶"
+    assert scientific(None) == "–"
+    assert scientific(math.inf) == "∞"
+    assert scientific(1300.2, 4) == "1,300"
+    assert format_length(4.2e-7).replace("\u00a0", " ") == "420 nm"
+    assert format_length(9.999e-7).replace("\u00a0", " ") == "1 µm"
+    assert percent(-0.0123) == "−1.2 %"
+    assert percent(None) == "–"
+    assert [duration(t) for t in (1.25, 54.2, 600, 3700)] == ["1.2 s", "54 s", "10 min 00 s", "1 h 01 min"]
