@@ -110,6 +110,9 @@ OVER = {
     "its geometry": ("align", "scan.nxs", "--axis-only", "--out", "new", "--geometry-out", "old"),
     "export": ("export", "{run}", "--volume", "old.h5"),
     "export of times": ("export", "{run}", "--volume", "timed.h5"),
+    "a file beside it": ("export", "{run}", "--volume", "new.mrc"),
+    "a comparison": ("compare", "{run}", "{run}", "--out", "old"),
+    "a picture": ("info", "scan.nxs", "--picture", "old.png"),
     "render": ("render", "{run}", "--scan", "scan.nxs", "--out", "old"),
     "join": ("join", "scan.nxs", "scan.nxs", "--out", "old"),
     "retrieve": ("retrieve", "scan.nxs", "--material", "haemoglobin", "--out", "old.h5"),
@@ -135,7 +138,7 @@ OVER = {
 
 @pytest.mark.parametrize("what", OVER)
 def test_nothing_is_replaced_without_force(shop, place, what):
-    for name in ("old", "old.h5", "old.png", "table.csv", "timed_t0003.h5", "kept/mine"):
+    for name in ("old", "old.h5", "old.png", "table.csv", "timed_t0003.h5", "new.beta.mrc", "kept/mine"):
         Path(name).parent.mkdir(exist_ok=True)
         Path(name).write_text("mine")
     said = holosplat(*(word.format(run=shop.run) for word in OVER[what]))
@@ -152,6 +155,19 @@ def test_files_are_replaced_with_force(place):
     worked(holosplat("plan", *SURVEY, "--out", "p.png", "--force"))
     assert "old" not in Path("p.csv").read_text()
     assert Path("p.csv.provenance.json").is_file()
+
+
+def test_files_of_other_programs_say_where_they_come_from(shop, place):
+    for name in ("v.vti", "v.nrrd", "v.mrc", "v.tif", "p.html", "p.png"):
+        Path(name).write_text("old")
+        command = {".html": ("compare", shop.run, shop.run, "--out"), ".png": ("info", "scan.nxs", "--picture")}
+        words = command.get(Path(name).suffix, ("export", shop.run, "--volume"))
+        worked(holosplat(*words, name, "--force"))
+        said = json.loads(Path(f"{name}.provenance.json").read_text())
+        assert said["command"].endswith(f"{name} --force")
+        assert said["inputs"]
+        assert Path(name).read_bytes() != b"old"
+    assert Path("v.beta.mrc.provenance.json").is_file()
 
 
 def test_folders_of_ours_alone_are_replaced_with_force(place):
