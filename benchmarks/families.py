@@ -66,9 +66,8 @@ METHOD = replace(
     USUAL,
     gaussians=changed(USUAL.gaussians, {"turns": 0, "start_per_pixel": 0.3}),
     volume=replace(USUAL.volume, rounds=1),
-    trials=replace(USUAL.trials, width=32),
 )
-"""The default with a fifth of the steps and Gaussians, no turns, and trials on coarse pixels; it decides as usual."""
+"""The default with a fifth of the steps and Gaussians, no turns; it decides as usual."""
 LEVEL_EDGE = 32
 """Voxels along an edge of the volume by which a level is found, instead of 96: that would take most of the time."""
 WANTED = {"median regret": 0.05, "worst regret": 0.5, "worst against null": 0.1}

@@ -112,7 +112,7 @@ def test_steps_never_make_it_less_likely(drifting):
 
 def test_a_drift_is_found_and_all_times_are_better_than_each_by_itself():
     """In so few photons that single times hardly show the matter."""
-    scene, scan = series((4e-6, -2e-6, 3e-6), 250.0)
+    scene, scan = series((4e-6, -2e-6, 3e-6), 300.0)
     how = search(scan, iterations=10, final=24)
     found, grid = how.run(), Grid.of_views(scan.views)
     moments = range(len(TIMES))

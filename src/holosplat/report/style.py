@@ -113,7 +113,7 @@ def data_uri(figure: Figure, kind: str = "svg") -> str:
     """`figure` as a `data:` URI; kind: "svg" (images in it have `DPI`) or "png". Equal figures give equal text."""
     buffer = io.BytesIO()
     if kind == "svg":
-        figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+        figure.savefig(buffer, format="svg", metadata=dict.fromkeys(("Creator", "Date", "Format", "Type")))
         # as text, for images in it are base64 already, and twice would be a third larger
         return f"data:image/svg+xml,{quote(themed(buffer.getvalue().decode()), safe=PLAIN)}"
     figure.savefig(buffer, format="png", dpi=DPI, metadata={"Software": None})
