@@ -27,9 +27,9 @@ from holosplat.align import PoseOptions, Uncertain, align_views
 from holosplat.align.gauge import moved_onto
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.bench.case import Case, load_case
-from holosplat.bench.record import source_commit
 from holosplat.methods import Auto, Gaussians, Method
 from holosplat.metrics import volume_scores
+from holosplat.version import source_commit
 
 USUAL = Uncertain()
 MOMENTS = ("planned", "aligned", "refined", "true")

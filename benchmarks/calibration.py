@@ -24,9 +24,9 @@ from holosplat.align import calibrate
 from holosplat.align.changes import changes
 from holosplat.align.gauge import moved_onto
 from holosplat.beamline.misalignment import Misalignment
-from holosplat.bench.record import source_commit
 from holosplat.geometry import Views, rotation_tilted
 from holosplat.specimens.red_cells import icosphere
+from holosplat.version import source_commit
 
 TABLE = Path(__file__).resolve().parents[1] / "docs/data/calibration.csv"
 PIXEL, MATERIAL = 1e-6, hs.DeltaBeta(5e-7, 5e-10)

@@ -32,9 +32,9 @@ def killed(shop: Shop, writer: Writer, seconds: float, rng: random.Random, folde
     done = writer.again and (first.code == 0 or ((out / "grow.json").is_file() and snapshots(out) == 4))
     if done:
         return ""
-    at_once = writer.out == "out" and not writer.again and not writer.goes_on
-    if at_once and out.exists():  # a folder that is there is whole
-        return "" if first.code == 0 or reads(out) else "lost"
+    at_once = writer.out != "run" and not writer.again and not writer.goes_on
+    if at_once and out.exists():  # what is there is whole
+        return "" if first.code == 0 or out.is_file() or reads(out) else "lost"
     second = run([*command, *writer.again] if writer.again and begun else command, limit=limit)
     if second.verdict:
         return second.verdict

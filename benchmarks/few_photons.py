@@ -22,9 +22,9 @@ from rows import read, replaced, shown
 
 import holosplat as hs
 from holosplat.bench.case import load_case
-from holosplat.bench.record import source_commit
 from holosplat.methods import METHODS
 from holosplat.optics.noise import noise_share
+from holosplat.version import source_commit
 from holosplat.workflows.evaluate import volume_scores
 
 TABLE = Path(__file__).resolve().parents[1] / "docs/data/few_photons.csv"

@@ -22,8 +22,8 @@ import torch
 
 import holosplat as hs
 from holosplat.beamline.light import UnevenLight
-from holosplat.bench.record import source_commit
 from holosplat.units import wavenumber
+from holosplat.version import source_commit
 
 COMMIT = source_commit()
 """Before the table is written, which is part of the tree."""

@@ -23,10 +23,10 @@ from holosplat.align import Drift, PoseOptions, align_views
 from holosplat.align.gauge import moved_onto
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.beamline.poses import GEOMETRIES, Directions, Geometry
-from holosplat.bench.record import source_commit
 from holosplat.mesh import TriangleMesh
 from holosplat.metrics import volume_scores
 from holosplat.specimens.mesh_series import MeshSeries
+from holosplat.version import source_commit
 
 TIMES, SECONDS = 16, 1e-3
 SHAPE, PIXEL = (64, 72), 0.5e-6

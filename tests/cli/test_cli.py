@@ -66,6 +66,7 @@ def test_the_whole_chain(shop, tmp_path):
         "checkpoint.pt",
         "checkpoint_before.pt",
         "manifest.json",
+        "provenance.json",
         "object.h5",
         "summary.json",
         "source.json",
@@ -86,7 +87,7 @@ def test_the_demo_runs_the_chain_and_shows_its_commands(shop, tmp_path, monkeypa
     monkeypatch.setattr("holosplat.methods.presets.chosen_method", lambda *said: QUICK)
     outcome = worked(holosplat("demo", "--out", tmp_path / "demo"))
     found = {path.name for path in (tmp_path / "demo").iterdir()}
-    assert found == {"meshes", "scan.nxs", "truth.h5", "run"}
+    assert found == {"meshes", "scan.nxs", "truth.h5", "run", "provenance.json"}
     assert (tmp_path / "demo/run/report.html").is_file()
     for command in ("simulate", "reconstruct", "evaluate"):
         assert f"$ holosplat {command}" in outcome.err

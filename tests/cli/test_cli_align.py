@@ -136,7 +136,7 @@ def test_the_geometry_of_a_part_is_that_of_whole_frames(turning, tmp_path):
     worked(holosplat("align", path, "--axis-only", *part, "--geometry-out", geometry, "--out", tmp_path / "part.nxs"))
     worked(holosplat("convert", path, out, "--to", "nxtomo", "--exposures", geometry))
     np.testing.assert_allclose(read_scan(out).views.shifts, true.views.shifts, atol=0.1 * PIXEL)
-    few = ("--views", "0:36:2", "--geometry-out", geometry)
+    few = ("--views", "0:36:2", "--geometry-out", geometry, "--force")
     refused(holosplat("align", path, "--axis-only", *few, "--out", tmp_path / "few.nxs"), "--geometry-out", "--views")
 
 
@@ -154,10 +154,10 @@ def test_a_series_has_one_geometry_and_its_reversed_beam_is_turned_back(tmp_path
     found = read_scan(out)
     worked(holosplat("convert", path, tmp_path / "there.nxs", "--to", "nxtomo", "--exposures", geometry))
     np.testing.assert_allclose(read_scan(tmp_path / "there.nxs").views.shifts, found.views.shifts, atol=1e-15)
-    refused(holosplat("align", upside, *matter, "--geometry-out", geometry, "--out", out), "reversed")
+    refused(holosplat("align", upside, *matter, "--geometry-out", geometry, "--out", out, "--force"), "reversed")
     every = ("--time-frame", "all", "--refine", "shifts", "--out", tmp_path / "run")
     refused(holosplat("reconstruct", path, *matter, *every), "--refine", "--time-frame all", "holosplat align")
-    done = worked(holosplat("align", upside, *matter, "--out", out))
+    done = worked(holosplat("align", upside, *matter, "--out", out, "--force"))
     assert "beam 2 is reversed along y" in done.out
     np.testing.assert_array_equal(read_scan(out).frames, scan.frames)
 

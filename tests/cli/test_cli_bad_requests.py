@@ -157,9 +157,9 @@ def test_outputs_that_cannot_be_are_refused_before_any_work(shop, tmp_path):
         outcome = holosplat("reconstruct", shop.scan, "--out", out, *known(shop))
         refused(outcome, *words)
         assert "phase retrieval" not in outcome.err
-    for out in (tmp_path / "none/scan.nxs", tmp_path):
+    for out, words in ((tmp_path / "none/scan.nxs", "existing folder"), (tmp_path, "new or empty")):
         outcome = simulate(shop, "--views", 2, "--out", out)
-        refused(outcome, str(out), "folder")
+        refused(outcome, str(out), words)
         assert "simulating" not in outcome.err
     refused(holosplat("render", shop.run, "--scan", shop.scan, "--out", tmp_path / "none/p.nxs"), "existing folder")
     refused(holosplat("export", shop.run, "--volume", tmp_path / "none/v.h5"), "existing folder")

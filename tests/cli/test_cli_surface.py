@@ -78,7 +78,7 @@ def test_a_run_becomes_bodies_that_explain_the_frames_better(shop, tmp_path):
     assert done.out.count("held-out frames: SSIM") == 2
     assert done.out.count("volume: Dice") == 2
     assert "2 bodies of" in done.err
-    assert {path.name for path in out.iterdir()} == {"body000.vtk", "body001.vtk", "summary.json"}
+    assert {path.name for path in out.iterdir()} == {"body000.vtk", "body001.vtk", "summary.json", "provenance.json"}
     summary = read_json(out / "summary.json")
     assert summary["surfaces"]["ssim"] > summary["gaussians"]["ssim"]
     assert summary["surfaces"]["relative_error_delta"] < summary["gaussians"]["relative_error_delta"]

@@ -36,9 +36,9 @@ def test_each_time_begins_with_the_one_before(files, known, tmp_path):
     before = everything_in(tmp_path)
     refused(holosplat(*asked), "must be new or empty")
     refused(holosplat(*asked, "--resume", "--seed", 3), "of the same scan and options")
-    refused(holosplat(*asked, "--refine", "shifts"), "--refine is of one time")
-    refused(holosplat(*asked, "--strict"), "--strict are of one time")
-    refused(holosplat(*asked, "--delta-beta", "100:200"), "one number for each constant")
+    refused(holosplat(*asked, "--resume", "--refine", "shifts"), "--refine is of one time")
+    refused(holosplat(*asked, "--resume", "--strict"), "--strict are of one time")
+    refused(holosplat(*asked, "--resume", "--delta-beta", "100:200"), "one number for each constant")
     refused(
         holosplat("evaluate", folder.run(0, 0), "--scan", files.scan, "--time-frame", "each"), "each is of reconstruct"
     )

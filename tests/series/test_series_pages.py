@@ -179,7 +179,7 @@ def test_durations():
 
 
 def test_bad_input_of_the_command(files, done, tmp_path):
-    refused(holosplat("series", "plan", files.scan, "--out", done.path), "must be new or empty", "series run")
+    refused(holosplat("series", "plan", files.scan, "--out", done.path), "must be new or empty", "--force")
     refused(
         holosplat("series", "plan", files.scan, "--out", tmp_path / "a", "--rounds", 2), "--rounds goes with --track"
     )

@@ -293,7 +293,7 @@ def test_the_commands_do_what_they_say(shop, tmp_path):
     assert code == 0, said
     assert "4 projections, 20 flats and 20 darks, 10 bits, 0.2 counts a photon" in said
     assert "saturated; lower --gain" in said
-    code, said = holosplat("record", shop.clean, "--out", raw, "--flats", 20, "--components", 3)
+    code, said = holosplat("record", shop.clean, "--out", raw, "--flats", 20, "--components", 3, "--force")
     assert code == 0, said
     assert "warning" not in said
     code, said = holosplat("correct", raw, "--out", out, "--method", "dynamic")
@@ -329,5 +329,5 @@ def test_the_source_in_simulate(tmp_path):
         (["--source-distance", 1.0], "changes nothing"),
         (["--bandwidth", 0.9], "bandwidth must lie between"),
     ):
-        code, said = holosplat(*beam, *wrong)
+        code, said = holosplat(*beam, *wrong, "--force")
         assert (code, message in said) == (2, True), said

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -10,19 +9,6 @@ from pathlib import Path
 STATUS, CLEAR = Path("/proc/self/status"), Path("/proc/self/clear_refs")
 RESET_PEAK = "5"
 """What Linux takes to forget the peak of a process's memory (proc(5), clear_refs)."""
-
-
-def source_commit() -> str:
-    """The commit of this package's source tree, with `-dirty` if it was changed; empty outside a git checkout."""
-    root = Path(__file__).resolve().parents[3]
-    if not (root / ".git").exists():
-        return ""
-    command = ["git", "describe", "--always", "--dirty", "--abbrev=10", "--exclude=*"]
-    try:
-        shown = subprocess.run(command, capture_output=True, text=True, check=False, cwd=root)
-    except OSError:  # git is not installed
-        return ""
-    return shown.stdout.strip()
 
 
 @contextmanager

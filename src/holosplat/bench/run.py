@@ -16,6 +16,7 @@ from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..representations import Stored
 from ..scan import Scan
+from ..version import source_commit
 from ..volume import Object, Volume
 from ..workflows.evaluate import Scores, score_object
 from ..workflows.provenance import environment, scan_hash
@@ -27,7 +28,7 @@ from .method import Method
 from .moved import judged_with
 from .pictures import TRUTH, Arrays, method_picture, truth_picture
 from .prepare import prepared
-from .record import memory_growth, source_commit
+from .record import memory_growth
 from .references import Reference
 from .rows import REFERENCE, Row
 from .sizes import contrast_by_size

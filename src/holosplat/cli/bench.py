@@ -13,7 +13,7 @@ from tyro.conf import Positional, arg, subcommand
 
 from ..checks import require
 from ..ranges import Seed
-from .places import Output, with_checked_arguments
+from .places import Kept, with_checked_arguments
 from .progress import INTERRUPTED, ProgressBar
 from .room import tell
 from .thesis import thesis
@@ -41,7 +41,7 @@ def run(
     cases: tuple[str, ...] = (),
     methods: tuple[str, ...] = (),
     seeds: tuple[Seed, ...] = (FIRST_SEED,),
-    out: Output = Path("bench"),
+    out: Kept = Path("bench"),
     folders: Folders = Folders(),
     retry: bool = False,
     list_only: Annotated[bool, arg(name="list")] = False,
@@ -112,7 +112,7 @@ def report(folder: Positional[Path] = Path("bench")) -> None:
 def bench(
     act: Annotated[
         Annotated[None, subcommand("run", constructor=with_checked_arguments(run))]
-        | Annotated[None, subcommand("report", constructor=report)]
+        | Annotated[None, subcommand("report", constructor=with_checked_arguments(report))]
         | Annotated[None, subcommand("thesis", constructor=with_checked_arguments(thesis))],
         arg(name=""),
     ],

@@ -93,7 +93,7 @@ def reconstruct(
         scan: Scan: a file (NXtomo), or a folder (tiff, nerf-synthetic, r2-gaussian, or another run's).
         out: Run folder to make.
         seed: Seed of everything random.
-        resume: Go on with an interrupted run.
+        resume: Go on with an interrupted run; --resume RUN alone, with its scan and options.
         strict: Exit with 3 where the frames are not explained to within their noise; without it, that is a warning.
     """
     from ..io.formats import read_frames
@@ -278,10 +278,8 @@ def demo(out: Output = Path("demo")) -> None:
         out: Folder to make.
     """
     from ..workflows.demo import DETECTOR, write_demo_meshes
-    from ..workflows.run_folder import RunFolder
     from .simulate import simulate
 
-    RunFolder(out).require_new()
     meshes, scan, truth, run = out / "meshes", out / "scan.nxs", out / "truth.h5", out / "run"
     meshes.mkdir(parents=True)
     paths = write_demo_meshes(meshes)

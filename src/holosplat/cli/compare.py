@@ -23,10 +23,8 @@ def compare(a: Positional[Path], b: Positional[Path], out: Output = Path("compar
         b: Another one.
         out: Page to write (HTML), with slices of both volumes and their difference.
     """
-    from ..io.folder import require_new
     from ..report.compare import Comparison, in_columns, write_comparison
 
-    require_new(out)
     comparison = Comparison(_side(a), _side(b))
     for table in (*comparison.found(), *comparison.asked()):
         print("\n".join(in_columns(table)))

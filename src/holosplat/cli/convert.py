@@ -12,7 +12,6 @@ import torch
 from tyro.conf import Positional, arg
 
 from ..checks import InputError, require
-from ..io.folder import require_new
 from ..io.formats import ScanFormat, loader_of, read_as
 from ..io.nerf_synthetic import NerfOptions, grey_range, write_nerf_synthetic
 from ..io.nxtomo import write_scan
@@ -111,7 +110,6 @@ def convert(
         out: File (nxtomo) or folder to make.
         to: Format to write; r2-gaussian needs a material or δ/β, for which its line integrals are retrieved.
     """
-    require_new(out)
     said = writing.for_format(to)
     scan = _read(source, reading)
     prior = matter.prior(scan.exposures.reference_energy)

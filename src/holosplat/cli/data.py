@@ -9,6 +9,8 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg, subcommand
 
+from .places import with_checked_arguments
+
 
 def _list() -> None:
     """List the sample data: name, what it is, source, licence, and what is known of it."""
@@ -44,8 +46,8 @@ def _again(name: str, folder: Path | None) -> str:
 
 def data(
     act: Annotated[
-        Annotated[None, subcommand("list", constructor=_list)]
-        | Annotated[None, subcommand("fetch", constructor=_fetch)],
+        Annotated[None, subcommand("list", constructor=with_checked_arguments(_list))]
+        | Annotated[None, subcommand("fetch", constructor=with_checked_arguments(_fetch))],
         arg(name=""),
     ],
 ) -> None:

@@ -9,7 +9,7 @@ from tyro.conf import OmitArgPrefixes, arg
 
 from ..ranges import Jobs, Seed, Within
 from ..training.ranges import Ranges
-from .places import Output
+from .places import Kept
 from .progress import INTERRUPTED, ProgressBar
 from .room import tell
 
@@ -23,7 +23,7 @@ DRAWN = Ranges()
 
 
 def dataset(
-    out: Output,
+    out: Kept,
     count: Annotated[int, Within(1, 10**6)] = 1000,
     drawn: Annotated[Ranges, OmitArgPrefixes] = DRAWN,
     seed: Seed = 0,

@@ -10,6 +10,7 @@ import os
 import re
 import sys
 from collections.abc import Callable
+from contextlib import ExitStack
 from importlib import import_module
 from io import TextIOWrapper
 
@@ -19,8 +20,10 @@ from tyro.conf import OmitArgPrefixes
 from ..checks import OUT_OF_MEMORY, InputError
 from ..ranges import checked_later
 from ..version import __version__
+from .log import logged
 from .places import with_checked_arguments
 from .progress import INTERRUPTED, say_notes
+from .resume import resumed
 from .sentence import give_up
 from .signals import end_as_on_interrupt
 
@@ -141,13 +144,22 @@ def main() -> None:
     if sys.argv[1:] == ["--version"]:
         print(f"holosplat {__version__}")
         return
+    with ExitStack() as log:
+        _carry_out(log)
+
+
+def _carry_out(log: ExitStack) -> None:
+    """Run the command of the arguments; what it says until `log` ends is in the file of --log."""
     try:
         _require_no_empty(sys.argv[1:])
+        arguments = resumed(sys.argv[1:])
+        log.enter_context(logged(arguments))
         with checked_later():
             tyro.extras.subcommand_cli_from_dict(
-                _functions(sys.argv[1:]),
+                _functions(arguments),
                 prog="holosplat",
                 description="Quantitative 3D maps from a handful of X-ray phase-contrast images.",
+                args=arguments,
                 config=(OmitArgPrefixes,),
             )
     except InputError as error:

@@ -84,9 +84,8 @@ def export(
     _require_suffixes(volume, bodies, objects)
     every = range(len(instants_of(folder))) if time_frame == "all" else ()
     moving = bodies is not None and time_frame == "all" and bodies.suffix.lower() == GLB and _moves(folder)
-    whole = [path for path in (objects.compact, bodies if moving else None) if path is not None]
     timed = [path for path in (volume, None if moving else bodies, objects.splats) if path is not None]
-    _require_free(whole, timed, every)
+    _require_free(timed, every)
     if objects.compact is not None:
         _export_compact(folder, objects.compact, objects.step_px, objects.together)
     if bodies is not None and moving:
@@ -124,20 +123,18 @@ def _require_suffixes(volume: Path | None, bodies: Path | None, objects: ObjectF
         )
 
 
-def _require_free(whole: Sequence[Path], timed: Sequence[Path], every: Sequence[int]) -> None:
-    """`InputError` where any file to write is there already: `whole` ones, and `timed` ones of `every` time."""
-    from ..io.folder import require_new
+def _require_free(timed: Sequence[Path], every: Sequence[int]) -> None:
+    """`InputError` where a file beside those that options name is there already: `timed` ones of `every` time."""
+    from ..io.provenance import require_free
     from ..io.volume_formats import FORMATS, of_time
 
-    for path in whole:
-        require_new(path)
     for path in timed:
         for out in [of_time(path, frame) for frame in every] or [path]:
             form = FORMATS.get(path.suffix.lower())
-            for file in form.files(out) if form else (out,):
-                require_new(file)
+            for file in form.files(out) if form else ():
+                require_free(file)
         if every and (series := SERIES.get(path.suffix.lower())):
-            require_new(path.with_suffix(series))
+            require_free(path.with_suffix(series))
 
 
 def _export_series(path: Path, steps: Sequence[tuple[float, Path]], grid: Grid | None) -> None:

@@ -119,7 +119,6 @@ def forecast(run: Positional[Path], out: Output, how: ForecastFlags = ForecastFl
         seed: Seed of the fits to half-sets.
     """
     options, folder, new = how.options(), RunFolder(run), RunFolder(out)
-    new.require_new()
     tracked = load_reconstruction(folder)
     tracked_bodies(tracked)
     times = np.array(instants_of(folder))

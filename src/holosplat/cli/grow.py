@@ -22,7 +22,7 @@ def grow(out: Output, what: Growth, resume: bool = False) -> None:
 
     Args:
         out: Folder to make: rbcCC_TTT.vtp for cell CC at snapshot TTT, and cells.pvd, which ParaView opens.
-        resume: Go on with an interrupted run, or to more snapshots.
+        resume: Go on with an interrupted run, or to more snapshots; --resume FOLDER alone, with its options.
     """
     what.check()
     coarser = ((f"--frequency {f}", _needs(replace(what, frequency=f))) for f in range(what.frequency - 1, 2, -1))

@@ -10,7 +10,6 @@ from tyro.conf import Positional
 
 from ..beamline.record import RecordingOptions
 from ..beamline.record import record as record_file
-from ..io.folder import require_new
 from ..io.reading import Part, Reading
 from ..optics.camera import Camera
 from ..optics.illumination import Illumination
@@ -69,7 +68,6 @@ def correct(raw: Positional[Path], out: Output, how: CorrectionOptions, reading:
         raw: File of raw counts (NXtomo with image_key).
         out: Scan file to write (NXtomo).
     """
-    require_new(out)
     with ProgressBar() as bar:
         done = correct_file(raw, out, how, lambda fraction: bar.show("correcting frames", fraction, {}), reading)
     flat = f"flat fields of {done.components} components" if done.method == "dynamic" else "the mean flat field"

@@ -1,6 +1,7 @@
-"""Where commands write: no file that the same command reads, none twice, and none among the files of a run.
+"""Where commands write: no file that the same command reads, none twice, none among the files of a run, and
+none that is there already, unless --force says so.
 
-An option that names what is written has the type `Output`; all other paths are read.
+An option that names what is written has the type `Output`, or `Kept`; all other paths are read.
 """
 
 from __future__ import annotations
@@ -8,30 +9,41 @@ from __future__ import annotations
 import inspect
 import os
 import re
+import shutil
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, is_dataclass
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any, ParamSpec, TypeVar, get_args, get_origin
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from ..checks import require
+from ..io.folder import is_taken, require_new, require_parent
 from ..io.leftovers import LOCK
+from ..io.provenance import NAME, Command, carried_out, records
 from ..ranges import flag, hints_of, with_checked_numbers
 from ..workflows.manifest import MANIFEST
 
 WRITTEN = "written"
 Output = Annotated[Path, WRITTEN]
-"""A path of a command that is written."""
+"""A path of a command that is written, and must be new."""
+GOES_ON = "goes on"
+Kept = Annotated[Path, WRITTEN, GOES_ON]
+"""A folder that the same command goes on with."""
 POSITIONAL = get_args(Positional[Path])[1]
 """What marks an argument that has no flag."""
 CONFIG = "config.json"
 OF_A_RUN = (MANIFEST, LOCK, "object.h5", "gaussians.h5", "checkpoint.pt", "metrics.csv")
 """Beside config.json: what tells the folder of a run from others."""
-TIME = re.compile(r"_t\d{4,}$")
-"""What the names of files of single times end with."""
+TIME = re.compile(r"_t\d{4,}(?=\.|$)")
+"""What the names of files of single times have before their suffixes."""
+REPLACED = ".replaced"
+"""What the name of a folder ends with while another one takes its place."""
+Force = Annotated[bool, arg(help="Replace what is there already.")]
+LogFile = Annotated[Path | None, arg(help="Write what the terminal shows, with the time of each line, to a file, too.")]
 Given = ParamSpec("Given")
 Returned = TypeVar("Returned")
 
@@ -43,6 +55,7 @@ class Place:
     flag: str
     path: Path
     written: bool
+    kept: bool = False
 
     def is_there(self) -> bool:
         """Whether something is there; False for texts that no path can be."""
@@ -57,17 +70,38 @@ class Place:
         return os.path.realpath(self.path) == os.path.realpath(other.path)
 
 
-def with_checked_arguments(function: Callable[Given, Returned]) -> Callable[Given, Returned]:
-    """A command, or an act of one, that refuses numbers out of their ranges and outputs that would damage its input."""
+def with_checked_arguments(function: Callable[Given, Returned]) -> Callable[..., Returned]:
+    """A command, or an act of one, that refuses numbers out of their ranges and outputs that would damage its input or
+    replace what is there; with the options --log and, where it writes, --force. What it writes says where it comes
+    from."""
+    signature, hints = inspect.signature(function), hints_of(function)
+    writes = any(map(is_written, _leaves(hints)))
 
     @wraps(function)
-    def apart(*args: Given.args, **kwargs: Given.kwargs) -> Returned:
-        bound = inspect.signature(function).bind(*args, **kwargs)
+    def apart(*args: Any, log: Path | None = None, force: bool = False, **kwargs: Any) -> Returned:
+        bound = signature.bind(*args, **kwargs)
         bound.apply_defaults()
-        require_apart(list(_places(bound.arguments, hints_of(function))))
-        return function(*args, **kwargs)
+        places = list(_places(bound.arguments, hints))
+        require_apart([*places, *([Place("--log", log, True, True)] if log else [])])
+        resume = bound.arguments.get("resume")
+        require(not (force and resume), "--force begins anew, and --resume goes on; give one of them.")
+        outputs = [one for one in places if one.written]
+        for out in outputs:
+            _require_free(out, places, force, resume)
+        read = [(one.flag, one.path) for one in places if not one.written and one.is_there()]
+        command = Command(sys.argv[1:], read, [out.path for out in outputs], force)
+        with carried_out(command), _set_aside(command.outputs if force else []):
+            return function(*args, **kwargs)
 
-    return with_checked_numbers(apart)
+    added = {"log": LogFile} | ({"force": Force} if writes else {})
+    keyword, usual = inspect.Parameter.KEYWORD_ONLY, {"log": None, "force": False}
+    options = [inspect.Parameter(name, keyword, default=usual[name], annotation=kind) for name, kind in added.items()]
+    setattr(apart, "__signature__", signature.replace(parameters=[*signature.parameters.values(), *options]))  # noqa: B010
+    checked = with_checked_numbers(apart)
+    checked.__annotations__ = hints | added
+    del checked.__wrapped__  # the parser looks for types there, beyond the options that are added
+    setattr(checked, "__signature__", inspect.signature(apart))  # noqa: B010
+    return checked
 
 
 def require_apart(places: Sequence[Place]) -> None:
@@ -89,6 +123,64 @@ def require_apart(places: Sequence[Place]) -> None:
             )
         for source in read:
             _require_kept(out, source)
+
+
+def _require_free(out: Place, places: Sequence[Place], force: bool, resume: bool | None) -> None:
+    """`InputError` where something is at `out` that may not be replaced, or gone on with."""
+    if resume or (out.kept and not force):
+        return
+    if not force:
+        way_out = f"choose another {out.flag}, or add --force to replace it"
+        for path in (out.path, *of_times(out.path)):
+            require_new(path, way_out if resume is None else f"{way_out}, or --resume to go on with it")
+        return
+    require_parent(out.path)
+    if not (is_taken(out.path) and out.path.is_dir()):
+        return
+    require(
+        is_run(out.path) or bool(records(out.path)),
+        f"--force replaces folders that holosplat made, but {out.path} has no {NAME} of it; remove it yourself, or "
+        f"choose another {out.flag}.",
+    )
+    for source in places:
+        require(
+            source.written or not source.is_there() or not _is_in(source.path, out.path),
+            f"--force must not remove what the command reads, but {source.path} is in {out.path}; choose another "
+            f"{out.flag}.",
+        )
+    aside = _aside(out.path)
+    require(
+        not os.path.lexists(aside), f"{aside} is what an earlier --force was to replace; rename it back, or remove it."
+    )
+
+
+def _aside(folder: Path) -> Path:
+    return folder.with_name(folder.name + REPLACED)
+
+
+@contextmanager
+def _set_aside(paths: Sequence[Path]) -> Iterator[None]:
+    """In the block, folders among `paths` have another name; they go when something has taken their place, and come
+    back otherwise."""
+    folders = [path.absolute() for path in paths if path.is_dir() and is_taken(path)]
+    try:
+        for folder in folders:
+            os.rename(folder, _aside(folder))
+        yield
+    finally:
+        for folder in folders:
+            if is_taken(folder):
+                shutil.rmtree(_aside(folder), ignore_errors=True)
+            elif _aside(folder).is_dir():
+                shutil.rmtree(folder, ignore_errors=True)
+                os.rename(_aside(folder), folder)
+
+
+def of_times(path: Path) -> list[Path]:
+    """What is there of files of single times, which have the name `path` but for their time."""
+    with suppress(OSError):
+        return sorted(one for one in path.parent.iterdir() if TIME.sub("", one.name, count=1) == path.name != one.name)
+    return []
 
 
 def is_run(folder: Path) -> bool:
@@ -116,7 +208,7 @@ def _is_in(path: Path, folder: Path) -> bool:
 
 def _of_one_series(one: Path, other: Path) -> bool:
     """Whether files of single times of the one may have the name of the other, or of its files."""
-    names = [(path.parent.resolve(), TIME.sub("", path.stem), path.suffix) for path in (one, other)]
+    names = [(path.parent.resolve(), TIME.sub("", path.name)) for path in (one, other)]
     return names[0] == names[1]
 
 
@@ -127,7 +219,8 @@ def _places(values: Mapping[str, Any], hints: Mapping[str, Any]) -> Iterator[Pla
             if is_dataclass(one) and not isinstance(one, type):
                 yield from _places(vars(one), hints_of(type(one)))
             elif isinstance(one, Path):
-                yield Place(_called(name, hints.get(name)), one, is_written(hints.get(name)))
+                hint = hints.get(name)
+                yield Place(_called(name, hint), one, is_written(hint), is_written(hint, GOES_ON))
             elif isinstance(one, str) and one:
                 texts = {one, one.partition("=")[2], one.rpartition(":")[0]} - {""}
                 files = (Place(flag(name), Path(text), False) for text in texts if "\0" not in text)
@@ -139,8 +232,18 @@ def _called(name: str, hint: Any) -> str:
     return name.upper() if POSITIONAL in getattr(hint, "__metadata__", ()) else flag(name)
 
 
-def is_written(hint: Any) -> bool:
+def is_written(hint: Any, mark: str = WRITTEN) -> bool:
     """Whether a type is, or has within it, that of outputs."""
-    if get_origin(hint) is Annotated and WRITTEN in hint.__metadata__:
+    if get_origin(hint) is Annotated and mark in hint.__metadata__:
         return True
-    return any(is_written(inner) for inner in get_args(hint))
+    return any(is_written(inner, mark) for inner in get_args(hint))
+
+
+def _leaves(hints: Mapping[str, Any]) -> Iterator[Any]:
+    """Types of arguments, those of the fields of dataclasses in their place."""
+    for hint in hints.values():
+        kind = next((one for one in (hint, *get_args(hint)) if isinstance(one, type) and is_dataclass(one)), None)
+        if kind is None:
+            yield hint
+        else:
+            yield from _leaves(hints_of(kind))

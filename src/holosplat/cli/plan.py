@@ -163,6 +163,7 @@ class RangeOptions:
     def check(self) -> None:
         """`InputError` unless ranges and files go together."""
         from ..io.atomic import require_writable
+        from ..io.provenance import require_free
         from ..scan import DISTANCE_RANGE_M, ENERGY_RANGE_KEV
 
         if not self.wanted:
@@ -182,6 +183,7 @@ class RangeOptions:
             require(self.out.suffix.lower() == ".png", f"--out must name a .png file, but it is {self.out}; rename it.")
             require_writable(self.out)
             require_writable(self.out.with_suffix(".csv"))
+            require_free(self.out.with_suffix(".csv"))
 
     def run(self, subject: Subject, setup: Setup, photons: float, on_progress: Advance) -> Survey:
         """The survey of the ranges: distances in equal ratios, energies in equal steps."""

@@ -1,11 +1,15 @@
-"""What commands say while they work: notes on the input, the progress bar, and the exit code of an interrupted one."""
+"""What commands say while they work: notes on the input, progress, and the exit code of an interrupted one."""
 
 from __future__ import annotations
 
 import logging
 import sys
+import time
+from collections.abc import Callable
 from types import TracebackType
 from typing import TYPE_CHECKING
+
+from .log import log_of
 
 if TYPE_CHECKING:
     from tqdm import tqdm
@@ -14,6 +18,8 @@ INTERRUPTED = 130
 """Exit code after Ctrl-C, as shells have it."""
 TOLD = 0.03
 """Share of what was left at first that must be done before the time left is said."""
+STEP, SHORTEST_S, LONGEST_S = 0.05, 2.0, 60.0
+"""Of lines in place of a bar: the share from one to the next, and their shortest and longest pause [s]."""
 
 
 class _Notes(logging.Handler):
@@ -44,11 +50,14 @@ def say_notes() -> None:
 
 
 class ProgressBar:
-    """One bar for one stage after another, on standard error."""
+    """Progress of one stage after another, on standard error: a bar on a terminal, else and in a log a line now and
+    then. clock: the time [s]."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._bar: tqdm | None = None
-        self._stage = ""
+        self._stage, self._lines, self._clock = "", None, clock
+
+    _lines: _Lines | None
 
     def __enter__(self) -> ProgressBar:
         return self
@@ -62,32 +71,81 @@ class ProgressBar:
         The time left goes by the mean speed since the stage was first shown, from where it then was: what is resumed
         does not begin with nothing.
         """
-        from tqdm import tqdm
-
+        fraction = max(0.0, min(1.0, fraction))
         if stage != self._stage:
             self._close()
             self._stage = stage
-            begun = max(0.0, min(1.0, fraction))
-            self._bar = tqdm(
-                total=1.0, initial=begun, desc=stage, bar_format=_FORMAT, file=sys.stderr, mininterval=0.2, smoothing=0
-            )
-        assert self._bar is not None
-        if record:
-            self._bar.set_postfix_str(_described(record), refresh=False)
-        self._bar.bar_format = _WITH_LEFT if self._tells(fraction) else _FORMAT
-        self._bar.update(max(0.0, min(1.0, fraction) - self._bar.n))
-
-    def _tells(self, fraction: float) -> bool:
-        """Whether enough is done, and not all, to say how long the rest takes."""
-        assert self._bar is not None
-        return self._bar.initial + TOLD * (1 - self._bar.initial) <= fraction < 1
+            self._bar, self._lines = _bar(stage, fraction), _lines(stage, fraction, self._clock)
+        said = _described(record) if record else ""
+        if self._lines is not None:
+            self._lines.show(fraction, said)
+        if self._bar is not None:
+            if said:
+                self._bar.set_postfix_str(said, refresh=False)
+            self._bar.bar_format = _WITH_LEFT if _tells(self._bar.initial, fraction) else _FORMAT
+            self._bar.update(max(0.0, fraction - self._bar.n))
 
     def _close(self) -> None:
+        whole = sys.exc_info()[0] is None
         if self._bar is not None:
             self._bar.bar_format = _FORMAT
-            self._bar.update(max(0.0, 1.0 - self._bar.n) if sys.exc_info()[0] is None else 0.0)
+            self._bar.update(max(0.0, 1.0 - self._bar.n) if whole else 0.0)
             self._bar.close()
-        self._bar = None
+        if self._lines is not None and whole:
+            self._lines.show(1.0, "")
+        self._bar, self._lines, self._stage = None, None, ""
+
+
+class _Lines:
+    """Progress of one stage as lines: its name, and a line for each twentieth and for its end, none of them within
+    seconds of another, but one every minute."""
+
+    def __init__(self, stage: str, begun: float, clock: Callable[[], float], say: Callable[[str], None]) -> None:
+        self._stage, self._begun, self._clock, self._say = stage, begun, clock, say
+        self._began = clock()
+        self._shown, self._at = -1.0, self._began
+
+    def show(self, fraction: float, said: str) -> None:
+        """A line, if one is due."""
+        now, step = self._clock(), fraction - self._shown
+        pause = now - self._at
+        is_step = step >= STEP or (fraction == 1 and step > 0)
+        if self._shown >= 0 and pause < (SHORTEST_S if is_step else LONGEST_S):
+            return
+        words = [f"{self._stage}: {fraction:.0%}", _spent(now - self._began)]
+        if _tells(self._begun, fraction):
+            words.append(f"{_spent((now - self._began) * (1 - fraction) / (fraction - self._begun))} left")
+        self._say(", ".join([*words, said] if said else words) if self._shown >= 0 else f"{self._stage} …")
+        self._shown, self._at = fraction, now
+
+
+def _bar(stage: str, begun: float) -> tqdm | None:
+    """The bar of a stage, on a terminal."""
+    if not sys.stderr.isatty():
+        return None
+    from tqdm import tqdm
+
+    return tqdm(total=1.0, initial=begun, desc=stage, bar_format=_FORMAT, file=sys.stderr, mininterval=0.2, smoothing=0)
+
+
+def _lines(stage: str, begun: float, clock: Callable[[], float]) -> _Lines | None:
+    """The lines of a stage: on standard error, or, where that is a terminal, in the log alone."""
+    log = log_of(sys.stderr)
+    if not sys.stderr.isatty():
+        return _Lines(stage, begun, clock, lambda line: print(line, file=sys.stderr, flush=True))
+    return None if log is None else _Lines(stage, begun, clock, log.say)
+
+
+def _tells(begun: float, fraction: float) -> bool:
+    """Whether enough is done, and not all, to say how long the rest takes."""
+    return begun + TOLD * (1 - begun) <= fraction < 1 and fraction > begun
+
+
+def _spent(seconds: float) -> str:
+    """A time as one reads it."""
+    minutes, seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{seconds:02d}" if hours else f"{minutes}:{seconds:02d}"
 
 
 _FORMAT = "{desc:28s} {percentage:3.0f}%|{bar:24}| {elapsed}{postfix}"

@@ -12,7 +12,7 @@ from tyro.conf import Positional
 
 from ..checks import require
 from ..io.atomic import atomic_path
-from ..io.phase_maps import PhaseMaps, is_file, require_place, write_phase_maps
+from ..io.phase_maps import PhaseMaps, is_file, write_phase_maps
 from ..io.reading import Reading
 from ..matter import DeltaBeta, KnownRatio
 from ..ranges import Grams, Signed, ranged
@@ -77,7 +77,6 @@ def retrieve(
     from ..baselines.retrieve import retrieve as act
     from ..io.formats import read_frames
 
-    require_place(out)
     measured = read_frames(scan, reading).in_memory()
     material, level = matter.at(measured.exposures.reference_energy)
     with ProgressBar() as bar:

@@ -12,7 +12,7 @@ from typing import Any
 from tyro.conf import Positional
 
 from ..checks import require
-from ..io.folder import atomic_folder, require_new
+from ..io.folder import atomic_folder
 from ..io.json import write_json
 from ..io.reading import Reading
 from ..io.volume_formats import read_volume_file
@@ -54,7 +54,6 @@ def surface(
         scan: Scan (default: the one that was reconstructed).
         truth: Volume file of the truth, to score both against.
     """
-    require_new(out)
     folder = RunFolder(run)
     folder.require_run()
     times = instants_of(folder)

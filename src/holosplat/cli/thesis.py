@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from ..ranges import Seed
-from .places import Output
+from .places import Kept
 from .progress import INTERRUPTED, ProgressBar
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def thesis(
-    out: Output = Path("thesis_study"),
+    out: Kept = Path("thesis_study"),
     schedule: Literal["full", "third", "short"] = "short",
     configurations: tuple[str, ...] = (),
     case: Literal["thesis16", "thesis8"] = "thesis16",

@@ -54,15 +54,13 @@ def track(
         out: Run folder to make: bodies.pvd with one VTK file a body and time (µm), tracks.csv, and what reconstruct
             writes.
         seed: Seed of everything random.
-        resume: Go on with an interrupted run.
+        resume: Go on with an interrupted run; --resume RUN alone, with its scan and options.
     """
     require(
         reading.part.time_frame is None,
         f"bodies are followed through all times, but --time-frame is {reading.part.time_frame}; leave it.",
     )
     options, folder = replace(how.options(), body=known.known()), RunFolder(out)
-    if not resume:
-        folder.require_new(advise_resume=True)
     measured = read_frames(scan, reading)
     tell_frames("track", measured.exposures[~measured.is_test], out, lambda seen: of_track(seen, options))
     measured = measured.in_memory()

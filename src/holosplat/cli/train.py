@@ -27,7 +27,7 @@ def train(
     Args:
         data: Folder of scenes.
         out: Folder to make.
-        resume: Go on with an interrupted training.
+        resume: Go on with an interrupted training; --resume FOLDER alone, with its scenes and options.
     """
     from ..planning.acts import of_training
     from ..report.learning import training_curves

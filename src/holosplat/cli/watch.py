@@ -16,7 +16,7 @@ from ..series.watch_folder import WatchFolder
 from ..tables import to_table
 from .light import RunLightFlags
 from .options import MethodOptions, PriorOptions
-from .places import Output
+from .places import Kept
 from .progress import INTERRUPTED
 from .series import Act, EachTime
 
@@ -26,7 +26,7 @@ HOW, EACH, LIGHT = Watching(), EachTime(), RunLightFlags()
 
 def watch(
     folder: Positional[Path],
-    out: Output,
+    out: Kept,
     how: Watching = HOW,
     each: EachTime = EACH,
     matter: PriorOptions = PriorOptions(),

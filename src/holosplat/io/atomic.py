@@ -11,6 +11,7 @@ from ..checks import InputError, require
 from .durable import flushed
 from .folder import require_parent
 from .leftovers import clear_leftovers, temporary_name
+from .provenance import leave_record, require_free
 
 
 def require_writable(path: str | Path) -> None:
@@ -31,10 +32,12 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
 
     Its bytes are on the disk before it does (fsync), and so is its name afterwards. If the block raises, the temporary
     file goes and `path` stays as it was; a failure of the file system itself (no such folder, no permission, disk full)
-    becomes an `InputError`. What a killed process left of the same file goes, too.
+    becomes an `InputError`. What a killed process left of the same file goes, too. Commands replace no file without
+    --force, and say where each comes from (`provenance`).
     """
     target = Path(os.path.realpath(path))  # of a link, what it points to is replaced
     require_writable(path)
+    require_free(target)
     clear_leftovers(target)
     temporary = temporary_name(target)
     try:
@@ -42,6 +45,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         flushed(temporary)
         os.replace(temporary, target)
         flushed(target.parent)
+        leave_record(target)
     except OSError as error:
         raise InputError(f"{path} must be writable, but writing it failed: {error}.") from error
     finally:

@@ -11,6 +11,7 @@ from pathlib import Path
 from ..checks import InputError, require
 from .durable import flushed, flushed_tree
 from .leftovers import clear_leftovers, is_left, temporary_name
+from .provenance import leave_record
 
 
 def is_taken(path: str | Path) -> bool:
@@ -50,6 +51,7 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
             shutil.rmtree(target)
         os.rename(temporary, target)
         flushed(target.parent)
+        leave_record(target)
     except OSError as error:
         raise InputError(f"{path} must be writable, but writing it failed: {error}.") from error
     finally:

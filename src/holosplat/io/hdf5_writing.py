@@ -15,6 +15,7 @@ import numpy as np
 
 from ..checks import require
 from .atomic import atomic_path
+from .provenance import ATTRIBUTE, attribute
 from .seal import seal, summed
 
 LARGE = 1 << 20
@@ -36,6 +37,7 @@ def new_hdf5(path: str | Path, size: int = 0) -> Iterator[h5py.File]:
             sink = _Sink(raw)
             with h5py.File(sink, "w") as file:
                 yield file
+                file.attrs[ATTRIBUTE] = attribute(Path(os.path.realpath(path)))
                 ranges = summed(file)
             sink.settle()
             seal(raw, ranges)

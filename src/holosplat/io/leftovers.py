@@ -8,6 +8,7 @@ import secrets
 import shutil
 import socket
 import zlib
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -40,6 +41,13 @@ def temporary_name(target: Path) -> Path:
 def is_hidden(path: Path) -> bool:
     """Whether a file or folder has a name that readers of folders pass over: it begins with a dot."""
     return path.name.startswith(".")
+
+
+def files_in(folder: Path) -> Iterator[Path]:
+    """The files below `folder`, but for hidden ones, in order."""
+    for above, folders, names in os.walk(folder):
+        folders.sort()
+        yield from (path for name in sorted(names) if not is_hidden(path := Path(above, name)) and path.is_file())
 
 
 def is_left(path: Path) -> bool:

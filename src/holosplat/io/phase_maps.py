@@ -10,9 +10,8 @@ import numpy as np
 
 from ..checks import require, shaped
 from ..scan import Exposures
-from .atomic import require_writable
 from .exposure_tables import exposure_table
-from .folder import atomic_folder, require_new
+from .folder import atomic_folder
 from .hdf5_writing import new_hdf5, put
 from .json import write_json
 
@@ -43,13 +42,6 @@ class PhaseMaps:
 def is_file(path: Path) -> bool:
     """Whether phase maps at `path` are one HDF5 file, by its name, and not a folder."""
     return path.suffix.lower() in HDF5
-
-
-def require_place(path: Path) -> None:
-    """`InputError` unless phase maps can be written to `path`: a file in an existing folder, or a new folder."""
-    if is_file(path):
-        require_writable(path)
-    require_new(path)
 
 
 def write_phase_maps(path: Path, found: PhaseMaps) -> None:

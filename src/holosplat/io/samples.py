@@ -77,8 +77,9 @@ def fetched(wanted: Sample, folder: Path | None = None) -> tuple[Path, list[str]
     if wanted.angles:
         angles = cache() / f"{wanted.sha256[:8]}-angles.txt"
         angles.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_path(angles) as temporary:
-            temporary.write_text("".join(f"{angle:g}\n" for angle in wanted.angles), encoding="utf-8")
+        if not angles.is_file():
+            with atomic_path(angles) as temporary:
+                temporary.write_text("".join(f"{angle:g}\n" for angle in wanted.angles), encoding="utf-8")
         options += ["--angles", str(angles)]
     return (_unpacked(found, wanted.inner, wanted.sha256) if wanted.inner else found), options
 

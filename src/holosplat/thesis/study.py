@@ -11,7 +11,6 @@ import numpy as np
 import torch
 
 from ..backends import resolve
-from ..bench.record import source_commit
 from ..fit.loop import DivergedError, Fit
 from ..geometry import Grid, Views
 from ..materials import WATER
@@ -20,6 +19,7 @@ from ..methods.gaussians import gaussian_plan
 from ..progress import FitProgress
 from ..representations.gaussians import raw_of
 from ..scan import Scan
+from ..version import source_commit
 from ..workflows.provenance import environment, scan_hash
 from . import looks
 from .cloud import DenseCloud

@@ -7,6 +7,7 @@ from multiprocessing import get_context
 
 import torch
 
+from ..io.provenance import command_now, take_up
 from ..progress import Advance
 from .datasheet import write_datasheet
 from .folder import Dataset
@@ -27,7 +28,7 @@ def make(dataset: Dataset, jobs: int, on_progress: Advance) -> int:
             dataset.make(shard, lambda part, before=before: on_progress((before + part) / whole))
             done += 1
         return len(missing)
-    pool = ProcessPoolExecutor(jobs, get_context("spawn"))
+    pool = ProcessPoolExecutor(jobs, get_context("spawn"), take_up, (command_now(),))
     try:
         for future in as_completed([pool.submit(_made, dataset, shard) for shard in missing]):
             future.result()

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from ..checks import InputError
 from ..io.json import read_json, write_json
-from ..io.leftovers import is_hidden
+from ..io.leftovers import files_in
+from ..io.provenance import sha256
 
 MANIFEST = "manifest.json"
-BLOCK = 1 << 20
 
 
 def write_manifest(folder: Path, run: str) -> None:
@@ -43,21 +41,8 @@ def faults(folder: Path, run: str) -> list[str]:
     return wrong
 
 
-def sha256(path: Path) -> str:
-    """The SHA-256 of a file's bytes, as hexadecimal digits."""
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(BLOCK):
-            digest.update(block)
-    return digest.hexdigest()
-
-
 def _files(folder: Path) -> Iterator[tuple[str, Path]]:
     """Names below `folder` and paths of its files, but for hidden ones and the manifest, in order."""
-    for above, folders, names in os.walk(folder):
-        folders.sort()
-        for name in sorted(names):
-            path = Path(above, name)
-            relative = str(path.relative_to(folder))
-            if relative != MANIFEST and not is_hidden(path) and path.is_file():
-                yield relative, path
+    for path in files_in(folder):
+        if (relative := str(path.relative_to(folder))) != MANIFEST:
+            yield relative, path

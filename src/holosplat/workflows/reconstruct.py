@@ -47,7 +47,7 @@ from .refine import (
     with_held_out,
 )
 from .rest_file import read_rest
-from .resume import decided_before, decisions_of, goes_on, require_alike
+from .resume import decided_before, decisions_of, goes_on, is_complete, require_alike
 from .run_folder import RunFolder, claimed
 from .run_light import found_in, read_light_options, still_in
 from .run_record import config_of, summary_of
@@ -100,6 +100,8 @@ def reconstruct(
         on_progress(stage, part, {})
 
     with claimed(folder):
+        if folder is not None and resume and refine is None and is_complete(folder, config):
+            return load_reconstruction(folder)
         geometry = None
         if refine is not None:
             require_compatible(ranges)
@@ -266,11 +268,9 @@ class _Run:
     def placed(self) -> dict[str, Any]:
         """Where the frames are at the beginning of a stage, as a checkpoint holds it."""
         freedom = self.task.freedom
-        return (
-            {}
-            if freedom is None
-            else {"placed": where(self.task.scan.exposures), "so_far": torch.from_numpy(freedom.so_far)}
-        )
+        if freedom is None:
+            return {}
+        return {"placed": where(self.task.scan.exposures), "so_far": torch.from_numpy(freedom.so_far)}
 
     def kept(self) -> dict[str, Any] | None:
         """The best of the states so far, as a checkpoint holds it."""

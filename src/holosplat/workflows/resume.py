@@ -11,6 +11,7 @@ import torch
 
 from ..checks import as_written, require
 from ..inference import Decision
+from ..io.provenance import sha256
 from ..methods import Task
 from ..methods.illumination import STAGE, Prepared
 from ..methods.presets import SCHEMA
@@ -18,7 +19,7 @@ from ..methods.uncertain import Uncertain
 from ..optics.background import LightOptions
 from ..tables import shown, to_table
 from .binding import RESUMED_WITH
-from .run_folder import RunFolder
+from .run_folder import OBJECT_SUM, RunFolder
 
 
 def goes_on(folder: RunFolder | None, config: dict[str, Any], resume: bool) -> bool:
@@ -30,6 +31,15 @@ def goes_on(folder: RunFolder | None, config: dict[str, Any], resume: bool) -> b
         return True
     folder.require_new(advise_resume=not resume)
     return False
+
+
+def is_complete(folder: RunFolder, config: dict[str, Any]) -> bool:
+    """Whether the run of this `config` in `folder` has ended and its object is whole, so that nothing is left to do.
+    `InputError` for a folder that does not fit."""
+    if not (goes_on(folder, config, True) and folder.summary.is_file() and folder.object.is_file()):
+        return False
+    summary = folder.read_summary()
+    return summary.get("finished") is True and summary.get(OBJECT_SUM) == sha256(folder.object)
 
 
 def require_same(folder: RunFolder, config: dict[str, Any]) -> None:

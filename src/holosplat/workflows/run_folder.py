@@ -24,10 +24,11 @@ from ..io.json import read_json, write_json
 from ..io.lock import sole_writer
 from ..io.marks import read_marks
 from ..io.objects import read_object
+from ..io.provenance import sha256
 from ..ranges import require_plausible
 from ..representations import Stored
 from .binding import CONFIG_SUM, RUN, config_sum, require_bound
-from .manifest import sha256, write_manifest
+from .manifest import write_manifest
 
 OBJECT_SUM = "object_sha256"
 """The entry of summary.json that says what the object's file was."""
