@@ -1,4 +1,4 @@
-"""What plain and dynamic flat-fielding leave of raw frames: the tables of docs/imaging_chain.md.
+"""What plain and dynamic flat-fielding leave of raw frames: the tables of docs/notebook/imaging_chain.md.
 
     python benchmarks/flat_fields.py [--seeds 101 102 103] [--side 128] [--views 8]
 

@@ -1,4 +1,4 @@
-"""A packed bed in a quartz tube, of 8, 4 and 2 measured views, against its segmentation (docs/real_data.md).
+"""A packed bed in a quartz tube, of 8, 4 and 2 measured views, against its segmentation (docs/notebook/real_data.md).
 
     python benchmarks/packed_bed.py --data FOLDER --work FOLDER
 

@@ -1,4 +1,4 @@
-"""Errors and times of phase retrieval, method by method: the table of docs/phase_retrieval.md.
+"""Errors and times of phase retrieval, method by method: the table of docs/notebook/phase_retrieval.md.
 
     python benchmarks/phase_retrieval.py [--views 4] [--seeds 1 2]
 

@@ -1,4 +1,4 @@
-"""Measured data of other groups, from raw files to volumes: docs/real_data.md with its numbers and pictures.
+"""Measured data of other groups, from raw files to volumes: docs/notebook/real_data.md with its numbers and pictures.
 
     python benchmarks/real_data.py --data FOLDER [--cases NAME …] [--methods NAME …]
 

@@ -5,7 +5,7 @@
 
 Settings were chosen on seed 1. `--runs` keeps scans, truths and runs by Gaussians in a folder, and uses those that are
 there. Seconds are CPU time of the step alone, all threads together, so that they do not depend on who else uses the
-machine; those of the Gaussians are in docs/results.md.
+machine; those of the Gaussians are in docs/notebook/results.md.
 """
 
 from __future__ import annotations

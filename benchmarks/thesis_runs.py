@@ -1,4 +1,4 @@
-"""All runs of docs/thesis_study.md, two at a time, and what they leave: docs/data/thesis_study.
+"""All runs of docs/notebook/thesis_study.md, two at a time, and what they leave: docs/data/thesis_study.
 
     python benchmarks/thesis_runs.py run RUNS --snapshots DIR [--jobs 2] [--minutes 600]
     python benchmarks/thesis_runs.py list RUNS

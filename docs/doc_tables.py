@@ -36,7 +36,7 @@ OVERVIEW_METHODS = {
     "surfaces": "surfaces, from Gaussians",
     "learned": "`auto --start learned`",
 }
-"""What docs/overview.md shows: cases, numbers, and methods as it calls them."""
+"""What docs/notebook/overview.md shows: cases, numbers, and methods as it calls them."""
 OURS = ("gaussians", "surfaces")
 STANDING = {"ssim": 1, "frcm": 1, "dice": 1, "relative_error_delta": -1}
 """The scores in which methods are compared, and whether more of it is better."""

@@ -1,4 +1,4 @@
-"""The tables of thesis_study.md, from docs/data/thesis_study, which `python benchmarks/thesis_runs.py` makes."""
+"""The tables of notebook/thesis_study.md, from docs/data/thesis_study, by `python benchmarks/thesis_runs.py`."""
 
 from __future__ import annotations
 

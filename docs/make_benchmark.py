@@ -1,6 +1,6 @@
 """The benchmark's pages, after `holosplat bench run --out bench` and `report`: `python docs/make_benchmark.py bench`.
 
-Writes docs/benchmark_tables.md (the report's Markdown with the pictures of a few cases), docs/images/benchmark/,
+Writes docs/notebook/benchmark_tables.md (the report's Markdown with pictures of a few cases), docs/images/benchmark/,
 docs/data/benchmark.csv (a line for each row), and the tables of the pages that come from it (docs/figures.py).
 `python docs/make_benchmark.py bench FILE.csv` writes the rows of a benchmark into that file, and nothing else.
 """
@@ -36,7 +36,7 @@ def main(bench: Path) -> None:
     folder.require_bench()
     rows = [read_row(path) for path in sorted(folder.rows.glob("*.json"))]
     write_table(rows, DOCS / "data" / "benchmark.csv")
-    write_page(folder, DOCS / "benchmark_tables.md")
+    write_page(folder, DOCS / "notebook" / "benchmark_tables.md")
     for page, text in changed().items():
         page.write_text(text, encoding="utf-8")
 
@@ -68,7 +68,7 @@ def write_page(folder: BenchFolder, path: Path) -> None:
             skipping = picture[1] not in PICTURES
             if not skipping:
                 in_few_colours(folder.images / f"{picture[1]}.png", images / f"{picture[1]}.png", COLOURS, WIDTH)
-                block = block.replace("(report/", "(images/benchmark/")
+                block = block.replace("(report/", "(../images/benchmark/")
         elif block.startswith("**Figure"):
             if skipping:
                 continue

@@ -1,4 +1,4 @@
-"""The picture of formats.md, "Compact", from docs/data/compact.csv: `python docs/make_compact.py`."""
+"""The picture of export.md, "Compact", from docs/data/compact.csv: `python docs/make_compact.py`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The pictures of thesis_study.md, from docs/data/thesis_study: `python docs/figures.py thesis`."""
+"""The pictures of notebook/thesis_study.md, from docs/data/thesis_study: `python docs/figures.py thesis`."""
 
 from __future__ import annotations
 

@@ -12,8 +12,8 @@ from mkdocs.structure.files import File
 
 def on_config(config: Any) -> Any:
     """Puts the pages of whole sections into the navigation."""
-    sections = {"Notebooks": pages.notebook_pages(), "Gallery": pages.gallery_pages(), "API": pages.api_pages()}
-    sections["Design"] = pages.design_pages()
+    sections = {"Tutorials": pages.notebook_pages(), "Gallery": pages.gallery_pages(), "API": pages.api_pages()}
+    sections |= {"Design": pages.folder_pages("design"), "Lab notebook": pages.folder_pages("notebook")}
     for title, made in sections.items():
         entry = next(entry for entry in config.nav if title in entry)
         first = entry[title]

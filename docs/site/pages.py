@@ -67,9 +67,9 @@ def root_pages() -> Pages:
     return {site: (ROOT / path).read_text(encoding="utf-8") for path, site in FROM_ROOT.items()}
 
 
-def design_pages() -> list[str]:
-    """Paths on the site of the pages in docs/design."""
-    return [f"design/{path.name}" for path in sorted((ROOT / "docs" / "design").glob("*.md"))]
+def folder_pages(folder: str) -> list[str]:
+    """Paths on the site of the pages in a folder of docs/."""
+    return [f"{folder}/{path.name}" for path in sorted((ROOT / "docs" / folder).glob("*.md"))]
 
 
 # --- the API reference --------------------------------------------------------------------------------------
@@ -150,7 +150,7 @@ def notebook_pages(folder: Path = NOTEBOOKS) -> Pages:
     said = (
         "Jupyter notebooks, run when the site was built. Each page leads to its notebook, which needs no other files."
     )
-    return _listed("notebooks", folder, "# Notebooks", said)
+    return _listed("notebooks", folder, "# Tutorials", said)
 
 
 def notebook_pictures(folder: Path = NOTEBOOKS) -> Iterator[Path]:

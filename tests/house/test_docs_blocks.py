@@ -1,5 +1,7 @@
 """Every block of code in the README and the guide runs as it stands, in an empty folder, on data that blocks make.
 
+Blocks of the lab notebook (docs/notebook) are parsed only: they show how numbers were made.
+
 A block that begins with a comment such as `# needs network` or `# takes hours` (`helpers.doc_blocks.EXCUSE`) is only
 parsed; tests/house/test_docs_commands.py holds the options of its commands to the command line.
 """
@@ -18,9 +20,18 @@ ROOT = Path(__file__).resolve().parents[2]
 README = ROOT / "README.md"
 ELSEWHERE = ("adding.md",)
 """Pages whose blocks are files of the package: tests/house/test_adding.py runs them."""
-TEXTS = {page: page.read_text(encoding="utf-8") for page in [README, *sorted((ROOT / "docs").glob("*.md"))]}
-GUIDE = [page for page, text in TEXTS.items() if page.name not in ELSEWHERE and blocks(text)]
-RUN = [page for page in GUIDE if page != README and any(block.runs for block in blocks(TEXTS[page]))]
+DOCS = ROOT / "docs"
+NOTEBOOK = DOCS / "notebook"
+PAGES = [README, *sorted([*DOCS.glob("*.md"), *(DOCS / "howto").glob("*.md"), *NOTEBOOK.glob("*.md")])]
+TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
+WITH_BLOCKS = [page for page, text in TEXTS.items() if page.name not in ELSEWHERE and blocks(text)]
+RUN = [page for page in WITH_BLOCKS if page != README and any(block.runs for block in blocks(TEXTS[page]))]
+RUN = [page for page in RUN if page.parent != NOTEBOOK]
+
+
+def name_of(page: Path) -> str:
+    """Where a page lies in the repository."""
+    return page.relative_to(ROOT).as_posix()
 
 
 @pytest.fixture(scope="session")
@@ -37,12 +48,12 @@ def test_the_blocks_of_the_readme_run(readme):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", RUN, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", RUN, ids=name_of)
 def test_the_blocks_of_a_page_run(page, readme, tmp_path):
     run(TEXTS[page], tmp_path, readme)
 
 
-@pytest.mark.parametrize("page", GUIDE, ids=lambda page: page.name)
+@pytest.mark.parametrize("page", WITH_BLOCKS, ids=name_of)
 def test_blocks_are_well_formed(page):
     """Their language is one that is run, parsed here, or output; shell and Python take their syntax."""
     found = blocks(TEXTS[page])

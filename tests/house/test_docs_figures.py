@@ -51,7 +51,7 @@ def test_new_rows_of_motion_appear_by_rule(figures, monkeypatch):
 
 
 def test_a_number_that_drifts_is_seen(figures):
-    page = (DOCS / "verdict.md").read_text(encoding="utf-8")
+    page = (DOCS / "notebook" / "verdict.md").read_text(encoding="utf-8")
     assert figures.filled(page) == page
     assert figures.filled(page.replace("| 0.0757 |", "| 0.0751 |")) == page
     assert page.count("| 0.0757 |") == 1
@@ -66,9 +66,9 @@ def test_an_empty_table_takes_nothing_with_it(figures):
 
 
 TABLE = re.compile(r"^\|.*\n\| ---.*\n((?:\|.*\n)+)", re.MULTILINE)
-DECLARED = {"docs/simulation.md": "| option | views |", "docs/thesis_study.md": "| the thesis | here |"}
+DECLARED = {"docs/simulation.md": "| option | views |", "docs/notebook/thesis_study.md": "| the thesis | here |"}
 """Tables of settings, which nobody measured."""
-WHOLE = "docs/benchmark_tables.md"
+WHOLE = "docs/notebook/benchmark_tables.md"
 """The page that make_benchmark.py writes from docs/data as a whole."""
 
 
@@ -116,7 +116,7 @@ def test_every_data_file_is_named(figures):
 def test_what_is_listed(figures):
     text = "\n".join(figures.listing())
     assert "nowhere" not in text
-    assert "standing (docs/benchmark.md), docs/data/benchmark.csv: holosplat bench run" in text
+    assert "standing (docs/notebook/benchmark.md), docs/data/benchmark.csv: holosplat bench run" in text
     assert "cells FOLDER: cells.png, after holosplat grow" in text
 
 

@@ -115,7 +115,7 @@ def test_every_notebook_is_in_the_navigation(tmp_path):
     """By the list of the pages that are made of them."""
     text = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
     nav = yaml.safe_load(text[text.index("\nnav:") :])["nav"]
-    assert {"Notebooks": "notebooks/index.md"} in nav
+    assert {"Tutorials": "notebooks/index.md"} in nav
     for path in NOTEBOOKS:
         (tmp_path / f"{path.stem}.md").write_text("# A title\n\nWords.\n\n![png](x_files/a.png)\n", encoding="utf-8")
     made = loaded("pages").notebook_pages(tmp_path)

@@ -51,7 +51,7 @@ class Shadows:
         how = Tikhonov(prior=FIXED)  # bodies are cut by the frames' edges
         thickness = tikhonov(frames, exposures, *material, options=how).double() / pitch
         noise = noise_level(thickness.float())
-        if np.ptp(exposures.time) == 0:  # a search of several times found fewer bodies so (docs/motion.md)
+        if np.ptp(exposures.time) == 0:  # a search of several times found fewer bodies so (docs/notebook/motion.md)
             thickness = _without_halos(thickness, exposures, noise)
         per_pixel = 2 * wavenumber(exposures.energy_kev) * exposures.refraction(*material)[0] * pitch
         return cls(

@@ -42,7 +42,7 @@ class ObjectFiles:
     together: tuple[Path, ...] = ()
     """More runs of a series, in order, for the same file of --compact, which stores once what they have in common."""
     splats: Output | None = None
-    """PLY file of splat viewers (µm), of a run of Gaussians; their opacity is no phase (docs/formats.md)."""
+    """PLY file of splat viewers (µm), of a run of Gaussians; their opacity is no phase (docs/export.md)."""
 
 
 def export(

@@ -186,7 +186,7 @@ class Beams:
 
     def text(self) -> str:
         """The file's content."""
-        lines = ["# Where beams look from (docs/formats.md); lengths in metres.", f'format = "{FORMAT}"']
+        lines = ["# Where beams look from (docs/geometry_files.md); lengths in metres.", f'format = "{FORMAT}"']
         if self.made_by:
             lines += ["", "[made_by]", *(f"{name} = {_quoted(text)}" for name, text in self.made_by.items())]
         for v, each in enumerate(self.view):

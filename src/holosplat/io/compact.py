@@ -1,4 +1,4 @@
-"""Objects in few bytes: whole numbers of a step, differences from row to row, compressed (docs/formats.md, "Compact").
+"""Objects in few bytes: whole numbers of a step, differences from row to row, compressed (docs/export.md, "Compact").
 
 What a tensor's numbers mean decides how fine they must be: places to a share of a pixel, logarithms of deviations to a
 share of the deviation, quaternions to an angle, values to a share of their range. Gaussians stand in the order of a

@@ -1,4 +1,4 @@
-"""What is not known of light that frames were divided by, in NXtomo files (docs/conventions.md)."""
+"""What is not known of light that frames were divided by, in NXtomo files (docs/scan_files.md)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Scans from and to the NeRF-synthetic layout (Mildenhall et al. 2020, "Blender"): PNG images and camera poses.
 
 The layout has grey values and pinhole cameras. Entries called `holosplat` hold the rest (exact parallel geometry,
-intensities, optics, times); other programs ignore them. docs/formats.md has the table.
+intensities, optics, times); other programs ignore them. docs/converting.md has the table.
 """
 
 from __future__ import annotations

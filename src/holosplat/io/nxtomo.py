@@ -1,4 +1,4 @@
-"""Scans from and to NeXus NXtomo files (HDF5): the table in docs/conventions.md, and nothing else."""
+"""Scans from and to NeXus NXtomo files (HDF5): the table in docs/scan_files.md, and nothing else."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def read_scan(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Scan:
 
 
 def write_scan(path: str | Path, scan: Scan) -> None:
-    """Write `scan` as NXtomo (docs/conventions.md), replacing `path` only once all is written."""
+    """Write `scan` as NXtomo (docs/scan_files.md), replacing `path` only once all is written."""
     with scan_writer(path, scan.exposures, scan.is_test, scan.provenance, light=scan.light) as add:
         for block in scan.blocks():
             for frame in block:

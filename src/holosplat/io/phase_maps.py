@@ -1,4 +1,4 @@
-"""Phase and thickness of single frames, to an HDF5 file or a folder of TIFF files (docs/formats.md)."""
+"""Phase and thickness of single frames, to an HDF5 file or a folder of TIFF files (docs/export.md)."""
 
 from __future__ import annotations
 

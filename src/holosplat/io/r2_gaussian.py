@@ -2,7 +2,7 @@
 
 That program does absorption tomography, so its images are line integrals and no holograms: the written line integrals
 are retrieved from the frames, and line integrals that are read become the transmission of an absorber in contact with
-the detector. Only the layout and the conventions of its files are used here, in parallel beam; docs/formats.md has
+the detector. Only the layout and the conventions of its files are used here, in parallel beam; docs/converting.md has
 them.
 """
 

@@ -1,6 +1,6 @@
 """NXtomo files, opened for reading: the kind and the exposure of each frame, and the frames one by one.
 
-The names are those of docs/conventions.md, and of the dialects of Diamond (`entry1/tomo_entry`) and the ESRF
+The names are those of docs/scan_files.md, and of the dialects of Diamond (`entry1/tomo_entry`) and the ESRF
 (`entry0000`, nxtomo): where one quantity has several names, the first that a file has is read.
 """
 

@@ -1,4 +1,4 @@
-"""Compact files of several objects of a series, which share what does not change (docs/formats.md, "Compact").
+"""Compact files of several objects of a series, which share what does not change (docs/export.md, "Compact").
 
 The first object stands as in a compact file. Of each later one a tensor is left out where it is the first's, stored as
 the difference from the first's whole numbers where that takes less, and else by itself.

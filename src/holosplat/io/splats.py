@@ -2,7 +2,7 @@
 
 Those viewers blend opacities from back to front, `C = Σ c_i α_i Π (1 - α_j)`; our Gaussians add up. With one colour
 blending gives `1 - Π (1 - α_i)`, whatever the order, and with `α_i = 1 - exp(-τ_i)` that is `1 - exp(-Σ τ_i)`: the
-look of a body that absorbs, of an optical depth in proportion to the thickness. So τ is chosen; docs/formats.md says
+look of a body that absorbs, of an optical depth in proportion to the thickness. So τ is chosen; docs/export.md says
 what is lost.
 """
 

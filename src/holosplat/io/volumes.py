@@ -1,4 +1,4 @@
-"""Volumes of δ and β from and to HDF5 (docs/conventions.md)."""
+"""Volumes of δ and β from and to HDF5 (docs/scan_files.md)."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from .propagation import fresnel_reach_px
 
 FRINGE_SAMPLES = 1.5
 """Wave samples on the first fringe's width √(λz) in reconstructions, and where they are judged: with fewer, the fringes
-at the edges of cells are lost (docs/method.md); more cost memory and time as their square."""
+at the edges of cells are lost (docs/notebook/method.md); more cost memory and time as their square."""
 NARROWEST_FRINGE = 1 / 16
 """Pixels on a first fringe below which it needs no samples of its own: light moves by less than a thousandth of a pixel
 where the phase changes by one radian a pixel (λz/2πp²)."""

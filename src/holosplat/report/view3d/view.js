@@ -1,4 +1,4 @@
-// Phase shift and hologram of the objects of a report from any side (docs/formats.md has the layout of the data).
+// Phase shift and hologram of the objects of a report from any side (docs/run_files.md has the layout of the data).
 // Line integrals are added up in WebGL2, in 32-bit floats; waves are computed here, by Fourier transforms.
 "use strict";
 (async () => {

@@ -19,7 +19,7 @@ from .rest import RestShape
 class Elasticity:
     """Elastic moduli of a membrane; a modulus of 0 leaves the energy out.
 
-    With the defaults a cell in optical tweezers behaves as measured (docs/cells.md).
+    With the defaults a cell in optical tweezers behaves as measured (docs/notebook/cells.md).
     """
 
     skalak_shear: float = 2.9e-6
