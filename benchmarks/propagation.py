@@ -1,7 +1,7 @@
 """The benchmark's frames beside those of other programs: does what simulates them compute what it says?
 
     python benchmarks/propagation.py --snapshots DIR --csv docs/data/propagation.csv   # minutes; rows are kept
-    python benchmarks/propagation.py --summary docs/data/propagation.csv               # the table of docs/notebook/benchmark.md
+    python benchmarks/propagation.py --summary docs/data/propagation.csv  # the table of docs/notebook/benchmark.md
 
 Of every case of the suite (seed 101) two noise-free frames, the first for training and the first held out, are compared
 with three others, each as the root mean square of the difference over that of the frame's contrast:

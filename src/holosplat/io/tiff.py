@@ -1,4 +1,4 @@
-"""Scans from and to TIFF files (float32) beside a `scan.json` that says how each frame was taken (docs/converting.md)."""
+"""Scans from and to TIFF files (float32) beside a `scan.json` of how each frame was taken (docs/converting.md)."""
 
 from __future__ import annotations
 

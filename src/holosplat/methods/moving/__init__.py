@@ -1,4 +1,4 @@
-"""Other ways to reconstruct all times of a scan, beside which ours are measured: docs/notebook/motion.md describes them."""
+"""Other ways to reconstruct all times of a scan, beside which ours are measured (docs/notebook/motion.md)."""
 
 from __future__ import annotations
 
