@@ -17,7 +17,7 @@ from ..volume import Object, Volume
 from .atomic import atomic_path
 from .guard import require_memory
 from .hdf5_writing import require_room
-from .volumes import MU, NAMES, REFRACTION, Contents, slab_rows, slabs_of
+from .volumes import NAMES, REFRACTION, Contents, slab_rows, slabs_of
 
 MICROMETRES = 1e6
 LENGTH_UNIT = "um"
@@ -81,7 +81,7 @@ def write_both(
     head: from the name of the array and its least and greatest value, mean and standard deviation [4]; of one length.
     """
     unknown = np.zeros(4)
-    require_room(path, len(NAMES) * (len(head(MU, unknown)) + 4 * math.prod(grid.shape)))
+    require_room(path, len(NAMES) * (len(head(next(iter(of.units)), unknown)) + 4 * math.prod(grid.shape)))
     with ExitStack() as stack:
         temporary = [stack.enter_context(atomic_path(one)) for one in both(path)]
         files = [stack.enter_context(one.open("wb")) for one in temporary]

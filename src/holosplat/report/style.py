@@ -158,15 +158,20 @@ def format_length(length: float, digits: int = 3) -> str:
     return f"{plain(length * factor, digits)}\u00a0{unit}"
 
 
+def bar_length(width: float) -> float:
+    """A round length of up to a quarter of `width` [m], for a scale bar."""
+    target = 0.28 * width
+    power = 10.0 ** math.floor(math.log10(target))
+    return max(step * power for step in (1, 2, 5) if step * power <= target)
+
+
 def scale_bar(axes: Axes, width: float, colour: str = "white", height: float = 0.055, beside: bool = False) -> None:
     """A scale bar of a round length, up to a quarter of `width` [m] of the field, in the lower left corner.
 
     height: of the bar above the lower edge, as a part of the axes; the length stands above the bar, or `beside` it,
     where panels are small.
     """
-    target = 0.28 * width
-    power = 10.0 ** math.floor(math.log10(target))
-    length = max(step * power for step in (1, 2, 5) if step * power <= target)
+    length = bar_length(width)
     fraction = length / width
     halo = {"white": "black", INK: GROUND}.get(colour, "white")
     x0, y0 = 0.05, height
