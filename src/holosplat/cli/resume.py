@@ -33,6 +33,24 @@ def resumed(arguments: Sequence[str]) -> list[str]:
     return [name, *_again(name, run), "--resume", *rest]
 
 
+def is_made_by(record: Mapping[str, Any], words: Sequence[str]) -> bool:
+    """Whether a `record` of provenance is of the command with these `words`, and its inputs are what they were.
+
+    Arguments of more files than are named one by one are taken to be.
+    """
+    try:
+        said, folder = shlex.split(record["command"])[1:], Path(from_home(record["folder"]))
+        inputs = [dict(one) for one in record["inputs"] if "files" not in one]
+        is_same = [from_home(word) for word in _lasting(said)] == list(words)
+        return is_same and all(fingerprint(folder / from_home(one["path"])) == _hashes(one) for one in inputs)
+    except (KeyError, TypeError, ValueError):
+        return False
+
+
+def _hashes(said: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: value for key, value in said.items() if key in ("bytes", "sha256", "sha256_of_ends")}
+
+
 def _again(name: str, run: Path) -> list[str]:
     """The words behind `name` that began `run`, with its own place, and with its inputs where they are now."""
     require(run.is_dir(), f"--resume must name a run folder, but {run} is none; check the path.")
@@ -85,9 +103,8 @@ def _place(run: Path, folder: Path, said: Mapping[str, Any]) -> Path:
     require(
         bool(there), f"{run} was begun with {said['path']}, but it is gone from {looked}; bring it back, or {AGAIN}."
     )
-    hashed = {key: value for key, value in said.items() if key in ("bytes", "sha256", "sha256_of_ends")}
     for way in there:
-        if fingerprint(way) == hashed:
+        if fingerprint(way) == _hashes(said):
             return way
     raise InputError(
         f"{run} was begun with another {said['path']} than {there[0]}, which has changed since; bring back what "
