@@ -16,7 +16,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from ..checks import InputError, require
-from ..io.provenance import is_hdf5, origin
+from ..io.provenance import is_hdf5
 from ..ranges import checked_later, with_checked_numbers
 from ..tables import read_table, shown
 from .entry import command
@@ -59,7 +59,7 @@ class Stage:
         there = [path for out in self.outputs() for path in ([out.path] if out.is_there() else of_times(out.path))]
         if not there:
             return "new"
-        if not all(is_made_by(origin(path), self.words) for path in there):
+        if not all(is_made_by(path, self.words) for path in there):
             return "other"
         return "done" if all(map(self._is_whole, self.outputs())) else "begun"
 

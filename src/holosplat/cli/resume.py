@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from ..checks import InputError, as_written, require
-from ..io.provenance import NAME, fingerprint, from_home, records
+from ..io.provenance import NAME, fingerprint, from_home, origin, records
 
 AGAIN = "give the scan, the options and --out again, with --resume"
 OF_ONE_CALL = ("--log", "--force", "--resume")
@@ -33,22 +34,17 @@ def resumed(arguments: Sequence[str]) -> list[str]:
     return [name, *_again(name, run), "--resume", *rest]
 
 
-def is_made_by(record: Mapping[str, Any], words: Sequence[str]) -> bool:
-    """Whether a `record` of provenance is of the command with these `words`, and its inputs are what they were.
-
-    Arguments of more files than are named one by one are taken to be.
-    """
-    try:
+def is_made_by(path: Path, words: Sequence[str]) -> bool:
+    """Whether the file or folder `path` says that the command with these `words` made it, from inputs which are what
+    they were; of arguments that are too many files to be named one by one, this is not known, and taken to be so."""
+    record = origin(path)
+    with suppress(InputError, KeyError, TypeError, ValueError):
         said, folder = shlex.split(record["command"])[1:], Path(from_home(record["folder"]))
-        inputs = [dict(one) for one in record["inputs"] if "files" not in one]
-        is_same = [from_home(word) for word in _lasting(said)] == list(words)
-        return is_same and all(fingerprint(folder / from_home(one["path"])) == _hashes(one) for one in inputs)
-    except (KeyError, TypeError, ValueError):
-        return False
-
-
-def _hashes(said: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in said.items() if key in ("bytes", "sha256", "sha256_of_ends")}
+        for one in record["inputs"]:
+            if "files" not in one:
+                _place(path if path.is_dir() else path.parent, folder, one)
+        return [from_home(word) for word in _lasting(said)] == list(words)
+    return False
 
 
 def _again(name: str, run: Path) -> list[str]:
@@ -103,8 +99,9 @@ def _place(run: Path, folder: Path, said: Mapping[str, Any]) -> Path:
     require(
         bool(there), f"{run} was begun with {said['path']}, but it is gone from {looked}; bring it back, or {AGAIN}."
     )
+    hashed = {key: value for key, value in said.items() if key in ("bytes", "sha256", "sha256_of_ends")}
     for way in there:
-        if fingerprint(way) == _hashes(said):
+        if fingerprint(way) == hashed:
             return way
     raise InputError(
         f"{run} was begun with another {said['path']} than {there[0]}, which has changed since; bring back what "
