@@ -7,11 +7,14 @@ pixel `(i, j)` has its centre at `x = (j + ½ - W/2) p + sx`, `y = (i + ½ - H/2
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from .checks import InputError, finite, positive, require, shaped
+
+if TYPE_CHECKING:
+    import torch
 
 FARTHEST_PX = 1e6
 """Pixels beyond which no detector lies beside its place."""
@@ -260,6 +263,8 @@ class Poses:
     @classmethod
     def of(cls, views: Views, device: torch.device | str = "cpu") -> Poses:
         """The poses of `views` on `device`."""
+        import torch
+
         arrays = (np.ascontiguousarray(a) for a in (views.rotations, views.shifts, views.relative))
         rotations, shifts, scales = (torch.from_numpy(a).to(device) for a in arrays)
         alike = bool((views.relative == 1).all())

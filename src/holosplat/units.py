@@ -85,3 +85,24 @@ def span(values: np.ndarray) -> str:
     """The least and the greatest of `values` in words, to four digits; one number where these are the same."""
     low, high = (f"{value:.4g}" for value in (values.min(), values.max()))
     return low if low == high else f"{low} to {high}"
+
+
+def length_unit(extent: float) -> tuple[str, float]:
+    """A unit that suits lengths up to `extent` [m], and how many of it one metre holds."""
+    for name, factor in (("mm", 1e3), ("µm", 1e6)):
+        if extent * factor >= 0.9995:
+            return name, factor
+    return "nm", 1e9
+
+
+def format_length(length: float, digits: int = 3) -> str:
+    """`length` [m] with a suitable unit: 4.2e-7 → "420 nm"."""
+    unit, factor = length_unit(abs(length))
+    return f"{plain(length * factor, digits)}\u00a0{unit}"
+
+
+def bar_length(width: float) -> float:
+    """A round length of up to a quarter of `width` [m], for a scale bar."""
+    target = 0.28 * width
+    power = 10.0 ** math.floor(math.log10(target))
+    return max(step * power for step in (1, 2, 5) if step * power <= target)

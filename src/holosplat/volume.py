@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
-import torch
 
 from .checks import finite, shaped
 from .display import of_volume
 from .geometry import Grid, Poses, Views
+
+if TYPE_CHECKING:
+    import torch
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,8 @@ class LineIntegrals:
     @classmethod
     def of(cls, B: torch.Tensor, D: torch.Tensor) -> LineIntegrals:
         """From the integrals of β and δ themselves, each [V, H, W] in metres."""
+        import torch
+
         return cls(torch.stack((D, B), dim=1), ((1.0, 0.0), (0.0, 1.0)))
 
     @classmethod
@@ -58,7 +62,7 @@ class LineIntegrals:
             raise IndexError(index)
         factors = [material[1 - index] for material in self.materials]
         total = sum(f * channel for f, channel in zip(factors, self.channels.unbind(1)) if f != 0)
-        return total if isinstance(total, torch.Tensor) else torch.zeros_like(self.channels[:, 0])
+        return self.channels.new_zeros(self.channels[:, 0].shape) if isinstance(total, int) else total
 
 
 @runtime_checkable

@@ -59,15 +59,15 @@ def test_the_table_says_what_the_docstring_says(name):
 
 
 def test_the_overview_names_every_command():
-    said = " ".join(worked(holosplat("--help")).out.replace("│", " ").split())
+    said = " ".join(worked(holosplat("--help")).out.split())
     for name, (_, summary) in COMMANDS.items():
-        assert f"• {name} {summary}" in said
+        assert f" {name} {summary}" in said
 
 
 def test_every_public_function_of_a_command_module_is_a_command():
     """A new command that is not in the table would be unreachable."""
     modules = {inspect.getmodule(command(name)) for name in COMMANDS}
-    inner = {"run", "report", "write_bodies"}  # of `bench`; of `surface`
+    inner = {"report", "write_bodies"}  # of `bench`; of `surface`
     inner |= {"status", "collect"}  # of `series`
     for module in filter(None, modules):
         functions = {

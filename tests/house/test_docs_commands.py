@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 import tyro
-from tyro.conf import OmitArgPrefixes
 
 from holosplat.cli import entry
+from holosplat.cli.help import CONFIG
 
 ROOT = Path(__file__).resolve().parents[2]
 OPTION = re.compile(r"(?<!\S)(--[a-z][a-z-]*)")
@@ -40,7 +40,7 @@ def commands(page: Path) -> list[str]:
         for shown, meant in STANDS_FOR.items():
             line = re.sub(shown, meant, line)
         found += fetched
-        found += re.findall(r"(?:^|[;&] ?(?:do )?)\s*(holosplat .+?)(?= [#|&]|[;)]|$)", line)
+        found += re.findall(r"(?:^|[;&] ?(?:do )?)\s*(holosplat .+?)(?= [#|&>]|[;)]|$)", line)
     return list(dict.fromkeys(command.strip() for command in found))
 
 
@@ -78,7 +78,7 @@ def parsed(name: str, words: list[str]) -> tuple[object, str]:
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
         try:
-            tyro.cli(silent(name), args=words, prog=name, config=(OmitArgPrefixes,))
+            tyro.cli(silent(name), args=words, prog=name, config=CONFIG)
         except SystemExit as end:
             return end.code, said.getvalue()
     return 0, said.getvalue()

@@ -19,9 +19,11 @@ from holosplat.geometry import Grid
 from holosplat.io import volumes
 from holosplat.io.mrc import HEADER
 from holosplat.io.volume_formats import FORMATS, of_time, read_volume_file, write_volume_file
+from holosplat.io.volumes import Contents
 from holosplat.io.xdmf import write_xdmf
 from holosplat.matter import DeltaBeta, Matter
 from holosplat.representations import VoxelGrid
+from holosplat.units import wavelength
 from holosplat.volume import Volume
 
 GRID = Grid((5, 7, 4), (1e-6, 2.5e-6, 3e-6), (-3e-5, 1e-6, 4e-6))
@@ -53,6 +55,21 @@ def test_what_is_written_is_read(suffix, tmp_path, monkeypatch):
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(
         p.name for p in FORMATS[suffix].files(tmp_path / f"v{suffix}")
     )
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_where_delta_is_not_known_mu_stands_in_its_place(suffix, tmp_path):
+    """µ = 4πβ/λ under its own name; what asks for δ is refused, for µ is none."""
+    obj, path = voxels(), tmp_path / f"v{suffix}"
+    of = Contents.of(False, 20.0)
+    mu = of.of_volume(obj.voxelise(GRID))["mu_per_m"]
+    np.testing.assert_allclose(mu, 4 * np.pi * obj.voxelise(GRID).beta / wavelength(20.0), rtol=1e-6)
+    write_volume_file(path, obj, GRID, of=of)
+    held = b"".join(one.read_bytes() for one in tmp_path.rglob("*") if one.is_file())
+    assert b"mu_per_m" in held
+    assert b"delta" not in held
+    with pytest.raises(InputError, match="must hold δ, but it holds the attenuation coefficient µ"):
+        read_volume_file(path)
 
 
 def test_names_of_times_keep_both_suffixes():

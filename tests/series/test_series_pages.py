@@ -8,6 +8,7 @@ import json
 import os
 import re
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +18,12 @@ from helpers.cli import holosplat, refused, worked
 from helpers.moving_ellipsoids import TIMES, true_paths
 from helpers.moving_ellipsoids import scan as ellipsoids
 from holosplat.io.nxtomo import write_scan
+from holosplat.report.tables import Headline
 from holosplat.representations import MovingSurfaces
 from holosplat.series.collect import collect, same_bodies
 from holosplat.series.folder import SeriesFolder
 from holosplat.series.pages.charts import Point, chart, labels
-from holosplat.series.pages.page import SeriesPage, render_page
+from holosplat.series.pages.page import Frame, SeriesPage, headline, render_page
 from holosplat.series.run import run_left, states
 from holosplat.series.time import PHASE
 from holosplat.series.words import duration, table_of, time_left
@@ -169,7 +171,7 @@ def test_charts_have_round_labels_and_stay_on_their_sheet():
 
 
 def test_a_page_of_nothing_says_so():
-    page = render_page(SeriesPage("A <series>", "No scan has come yet.", "", (), refresh=2.0))
+    page = render_page(SeriesPage("A <series>", Headline("No scan has come yet.", None, ()), "", (), refresh=2.0))
     assert "A &lt;series&gt;" in page
     assert "const refresh = 2000;" in page
 
@@ -192,3 +194,34 @@ def test_bad_input_of_the_command(files, done, tmp_path):
     refused(holosplat("series", "run", done.path, 1, "--jobs", 2), "give one of a task's number")
     refused(holosplat("series", "run", done.path, 7), "from 0 to 2, but 7 is asked for")
     assert not (tmp_path / "a").exists()
+
+
+def test_the_verdict_is_the_headline_with_cause_and_command(done, tmp_path):
+    """Of a series of which one time is not explained; a scale bar, a colour bar and a list of contents are there."""
+    folder = SeriesFolder(shutil.copytree(done.path, tmp_path / "series"))
+    run = folder.run(0, 0)
+    summary = json.loads((run / "summary.json").read_text())
+    summary["verdict"] |= {"good": False, "cause": "distance", "reasons": ["a distance 4 % longer explains more"]}
+    (run / "summary.json").write_text(json.dumps(summary))
+    row = replace(folder.rows(folder.plan().windows()[0])[0], good=False, words="The frames are not explained.")
+    frame = Frame(row, 0.0, run / PHASE, "run")
+    said = headline("All times are done.", [frame])
+    assert (said.text, said.trusted) == ("Do not trust 1 of 1 times: their frames are not explained", False)
+    assert said.step is not None
+    assert said.step.command.startswith(f"holosplat reconstruct {row.scan} --distance LOW:HIGH")
+    page = render_page(SeriesPage("A series", said, "", (frame,)))
+    assert f"<h1>{said.text}</h1>" in page
+    assert "a distance 4 % longer explains more" in page
+    assert re.search(r'class="ruler" style="width: [0-9.]+%">\d+\xa0[nµ]?m<', page)
+    links, ids = re.findall('href="#([^"]+)"', page), re.findall(' id="([^"]+)"', page)
+    assert {"map", "charts", "times"} <= set(links) <= set(ids)
+    absorbing = replace(frame, row=replace(row, quantity="β"))
+    page = render_page(SeriesPage("A series", said, "", (absorbing,)))
+    assert "Absorption in the first view" in page
+    assert "rad" not in page.partition("<main>")[2].partition("<script>")[0].replace("gradient", "")
+
+
+def test_labels_of_an_axis_are_told_apart():
+    page = chart([Point(k, 0.98 + 1e-6 * k) for k in range(9)], "SSIM")
+    ticks = re.findall('text-anchor="end">([^<]+)<', page)
+    assert len(set(ticks)) == len(ticks) > 1

@@ -18,6 +18,7 @@ from helpers.splats import cloud
 from holosplat.checks import InputError
 from holosplat.matter import DeltaBeta, Matter
 from holosplat.mesh import TriangleMesh
+from holosplat.report.style import format_length
 from holosplat.representations import GaussianCloud, MovingSurfaces, SurfaceMesh, TimeBasis
 from holosplat.representations.gaussians import raw_of
 from holosplat.show import server
@@ -158,6 +159,19 @@ def test_the_scene_has_ten_units_to_each_side_and_cuts_leave_the_far_part():
     assert half.vertices[half.faces].mean(axis=1)[:, 2].min() > -1e-6
     assert cut(part, 2, 0.0) is part
     assert len(cut(shown(gaussians()), 2, 1.0).centres) >= 1
+
+
+def test_the_view_has_a_legend_and_a_scale(page):
+    """Bars of a round length along three axes; colours by what they mean, in a unit."""
+    for obj, words in ((gaussians(), "opacity: thickness"), (ball(), "surface of the matter, z from")):
+        page.frame = Frame.around(obj.enclosing_grid(10**6))
+        page.show(shown(obj))
+        assert words in page._legend.content
+        assert "µm" in page._legend.content
+        names = page._server.scene._handle_from_node_name
+        assert {"/scale", "/scale/x", "/scale/y", "/scale/z"} <= set(names)
+        assert names["/scale/x"].text == f"x, {format_length(page.frame.bar)}"
+        assert 0.1 < page.frame.bar * page.frame.scale / 20 <= 0.28
 
 
 def test_a_moving_object_is_shown_at_the_times_of_its_frames():

@@ -5,11 +5,12 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 import torch
 
-from helpers.cli import holosplat
+from helpers.cli import holosplat, refused, worked
 from helpers.contact import ENERGY, PIXEL, contact_scan, inside, mean_beta, turned
 from holosplat.checks import InputError
 from holosplat.geometry import Grid
@@ -166,6 +167,16 @@ def test_the_commands_run_in_contact_on_one_row(tmp_path):
     holosplat("render", run, "--scan", tmp_path / "scan.nxs", "--out", tmp_path / "rendered.nxs", "--split", "all")
     rendered = read_scan(tmp_path / "rendered.nxs").frames
     assert np.abs(rendered - scan.frames).mean() < 0.02
+    said = worked(holosplat("export", run, "--volume", tmp_path / "v.h5"))
+    assert "δ is not told, for the frames show absorption alone" in said.err
+    with h5py.File(tmp_path / "v.h5") as file:
+        assert sorted(file) == ["beta", "mu_per_m"]
+        mu, beta = (np.asarray(file[name]) for name in ("mu_per_m", "beta"))
+        assert file["mu_per_m"].attrs["units"] == "1/m"
+    np.testing.assert_allclose(mu, 2 * wavenumber(ENERGY) * beta, rtol=1e-6)
+    facts = worked(holosplat("info", tmp_path / "v.h5")).out
+    assert "a volume of µ and β" in facts
+    refused(holosplat("export", run, "--compact", tmp_path / "c.h5"), "δ, which", "absorption alone")
 
 
 def test_a_plan_in_contact():

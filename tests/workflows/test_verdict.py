@@ -159,12 +159,12 @@ def test_a_residual_far_above_the_contrast_is_a_factor_and_no_share():
 
 @pytest.mark.parametrize("cause", STEPS)
 def test_the_next_command_is_one_that_there_is(cause):
-    """Its options are those of `holosplat COMMAND --help`; names with blanks are kept whole by the caller."""
+    """Its options are those of `holosplat COMMAND --help-all`; names with blanks are kept whole by the caller."""
     step = next_step(cause, "'a scan.nxs'")
     assert step is not None
     program, act, *rest = shlex.split(step.command)
     assert (program, rest[0]) == ("holosplat", "a scan.nxs")
-    help_text = holosplat(act, "--help").out
+    help_text = holosplat(act, "--help-all").out
     assert all(option in help_text for option in rest if option.startswith("--"))
     assert next_step("blur") is None
 

@@ -1,6 +1,6 @@
 """The commands by name, and `main`, which loads the module of one command only: the others need torch, VTK or figures.
 
-The overview (`holosplat --help`) comes from the table alone. A command's module imports what its options need, and
+The overview (`holosplat --help`) comes from the tables alone. A command's module imports what its options need, and
 each function imports its work where it starts, so that `holosplat COMMAND --help` is fast, too.
 """
 
@@ -15,11 +15,11 @@ from importlib import import_module
 from io import TextIOWrapper
 
 import tyro
-from tyro.conf import OmitArgPrefixes
 
 from ..checks import OUT_OF_MEMORY, InputError
 from ..ranges import checked_later
 from ..version import __version__
+from .help import ALL, CONFIG, HELP, acts_of, overview, page, parser_of
 from .log import logged
 from .places import with_checked_arguments
 from .progress import INTERRUPTED, say_notes
@@ -62,6 +62,14 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "reconstruct": (
         "commands",
         "Reconstruct a scan, by what suits its matter or by a method of your choice, into a run folder.",
+    ),
+    "init": (
+        "pipeline",
+        "Print a pipeline file with comments, which you change and run (holosplat init > run.toml).",
+    ),
+    "run": (
+        "pipeline",
+        "Run the stages of a pipeline file (correct, align, reconstruct, export) in order; finished ones are skipped.",
     ),
     "track": (
         "track",
@@ -131,6 +139,18 @@ COMMANDS: dict[str, tuple[str, str]] = {
 }
 """Name → (module of this package that has a function of that name, first paragraph of the function's docstring)."""
 
+GROUPS: dict[str, tuple[str, ...]] = {
+    "Data": ("info", "convert", "correct", "join", "data", "materials", "check"),
+    "Simulate": ("plan", "grow", "simulate", "record"),
+    "Reconstruct": ("init", "run", "calibrate", "align", "retrieve", "reconstruct", "track", "surface"),
+    "Look": ("evaluate", "view", "export", "render", "compare"),
+    "Series": ("series", "watch", "forecast"),
+    "Learn": ("dataset", "train"),
+    "Benchmark and installation": ("bench", "demo", "doctor", "backends"),
+}
+"""Heading of the overview → its commands; every command is in one group."""
+DESCRIPTION = "Quantitative 3D maps from a handful of X-ray phase-contrast images."
+
 
 def main() -> None:
     """Run a command; bad input, and a machine that cannot do it, print one sentence and exit with 2.
@@ -152,15 +172,17 @@ def _carry_out(log: ExitStack) -> None:
     """Run the command of the arguments; what it says until `log` ends is in the file of --log."""
     try:
         _require_no_empty(sys.argv[1:])
+        if _explained(sys.argv[1:]):
+            return
         arguments = resumed(sys.argv[1:])
         log.enter_context(logged(arguments))
         with checked_later():
             tyro.extras.subcommand_cli_from_dict(
                 _functions(arguments),
                 prog="holosplat",
-                description="Quantitative 3D maps from a handful of X-ray phase-contrast images.",
+                description=DESCRIPTION,
                 args=arguments,
-                config=(OmitArgPrefixes,),
+                config=CONFIG,
             )
     except InputError as error:
         give_up(str(error))
@@ -182,6 +204,21 @@ def _carry_out(log: ExitStack) -> None:
         if not OUT_OF_MEMORY.search(str(error)):
             raise
         give_up(f"the memory of this machine is not enough{_said(error)}; take larger pixels (--bin) or fewer rows.")
+
+
+def _explained(arguments: list[str]) -> bool:
+    """Whether the arguments ask for help, which is then printed: that of the program, a command or an act of one."""
+    if not {*HELP, ALL}.intersection(arguments):
+        return False
+    first = arguments[0]
+    if first in COMMANDS:
+        parser, act = parser_of(command(first), first), arguments[1]
+        acts = acts_of(parser)
+        print(page(f"{first} {act}" if act in acts else first, acts.get(act, parser), ALL in arguments))
+    elif first.startswith("-"):
+        groups = {heading: [(name, COMMANDS[name][1]) for name in names] for heading, names in GROUPS.items()}
+        print(overview(groups, DESCRIPTION))
+    return first in COMMANDS or first.startswith("-")
 
 
 def _require_no_empty(arguments: list[str]) -> None:

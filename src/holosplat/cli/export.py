@@ -17,6 +17,7 @@ from .places import Output
 
 if TYPE_CHECKING:
     from ..geometry import Grid
+    from ..io.volumes import Contents
     from ..workflows.reconstruct import Reconstruction
     from ..workflows.run_folder import RunFolder
     from .scans import Moment
@@ -60,7 +61,7 @@ def export(
         run: Run folder.
         volume: Volume to write, by its suffix: .h5 or .hdf5, HDF5; .vti, for ParaView and PyVista; .nrrd, for 3D Slicer
             and ITK; .mrc, for ChimeraX; .tif or .tiff, an OME-TIFF; .zarr, a folder of OME-Zarr (extra zarr). NRRD and
-            MRC hold δ alone, and β in NAME.beta.nrrd or NAME.beta.mrc.
+            MRC hold δ alone, and β in NAME.beta.nrrd or NAME.beta.mrc. Of absorption alone µ [1/m] stands in δ's place.
         shape: Voxels along z, y, x (default: the scan's field of view, Z = X = W, Y = H).
         voxel_size: Edge of a voxel [m] (default: the pixel size).
         bodies: Of a run of surfaces: a folder to make, with one VTK file a body (µm), the largest first, or of a run
@@ -71,6 +72,7 @@ def export(
             and .vtu a .pvd opens all times in ParaView.
     """
     from ..io.volume_formats import of_time
+    from ..io.volumes import REFRACTION
     from ..workflows.moments import instants_of
     from ..workflows.run_folder import RunFolder
     from .scans import moments_of
@@ -91,8 +93,9 @@ def export(
     if bodies is not None and moving:
         _export_motion(folder, bodies)
     steps: dict[Path, list[tuple[float, Path]]] = {path: [] for path in timed}
-    grid = None
+    grid, contents = None, REFRACTION
     for one in moments_of(folder, time_frame) if timed else ():
+        contents = one.result.contents
         for path in timed:
             out = path if one.frame is None else of_time(path, one.frame)
             steps[path].append((one.time, out))
@@ -103,7 +106,9 @@ def export(
             else:
                 _export_splats(one.result, out)
     for path in timed if every else ():
-        _export_series(path, steps[path], grid)
+        _export_series(path, steps[path], grid, contents)
+    if contents.mu_per_beta is not None:
+        _say("δ is not told, for the frames show absorption alone: the attenuation coefficient µ stands in its place")
 
 
 def _require_suffixes(volume: Path | None, bodies: Path | None, objects: ObjectFiles) -> None:
@@ -137,7 +142,7 @@ def _require_free(timed: Sequence[Path], every: Sequence[int]) -> None:
             require_free(path.with_suffix(series))
 
 
-def _export_series(path: Path, steps: Sequence[tuple[float, Path]], grid: Grid | None) -> None:
+def _export_series(path: Path, steps: Sequence[tuple[float, Path]], grid: Grid | None, of: Contents) -> None:
     """Write what opens files of all times, if their format has such."""
     from ..io.pvd import TimeStep, write_pvd
     from ..io.xdmf import write_xdmf
@@ -150,7 +155,7 @@ def _export_series(path: Path, steps: Sequence[tuple[float, Path]], grid: Grid |
         write_pvd(out, [TimeStep(time, (file,)) for time, file in steps])
     else:
         assert grid is not None
-        write_xdmf(out, grid, steps)
+        write_xdmf(out, grid, steps, of)
     _say(f"wrote {out}: {len(steps)} times, for ParaView")
 
 
@@ -158,11 +163,15 @@ def _export_compact(folder: RunFolder, out: Path, step_px: float, together: tupl
     from ..io.compact import steps_of
     from ..io.objects import write_compact
     from ..io.series import names_of, write_series
+    from ..workflows.reconstruct import load_reconstruction
     from ..workflows.run_folder import RunFolder
 
     steps, folders = steps_of(step_px), [folder, *map(RunFolder, together)]
     for each in folders:
-        each.require_run()
+        require(
+            load_reconstruction(each).delta_told,
+            f"--compact stores δ, which {each.path} does not know: its frames show absorption alone; use --volume.",
+        )
     if together:
         names = names_of([each.path for each in folders])
         write_series(out, {name: each.read_result() for name, each in zip(names, folders)}, steps)
@@ -187,9 +196,10 @@ def _export_motion(folder: RunFolder, out: Path) -> None:
     from ..workflows.moments import instants_of
     from ..workflows.reconstruct import load_reconstruction
 
-    found = load_reconstruction(folder).object
+    result = load_reconstruction(folder)
+    found = result.object
     assert isinstance(found, MovingSurfaces)
-    write_moving_glb(out, found, instants_of(folder))
+    write_moving_glb(out, found, instants_of(folder), result.contents)
     _say(f"wrote {out}: {found.count} bodies in motion")
 
 
@@ -214,15 +224,15 @@ def _export_bodies(one: Moment, out: Path) -> None:
         raise InputError(
             f"--bodies needs a run of surfaces, but this one holds {found.described}; use holosplat surface."
         )
-    suffix, matter = out.suffix.lower(), found.matter
+    suffix, matter, of = out.suffix.lower(), found.matter, one.result.contents
     if suffix == STL:
         write_stl(out, one.bodies)
     elif suffix == GLB:
-        write_glb(out, one.bodies, matter)
+        write_glb(out, one.bodies, matter, of)
     elif suffix == VTU:
-        write_vtu(out, one.bodies, matter)
+        write_vtu(out, one.bodies, matter, of)
     else:
-        write_bodies(out, one.bodies, matter, {})
+        write_bodies(out, one.bodies, of.of_matter(matter), {})
     _say(f"wrote {out}: {len(one.bodies)} bodies")
 
 
@@ -251,7 +261,7 @@ def _export_volume(
     require(count <= MOST_VOXELS, f"shape must have at most {MOST_VOXELS:.0e} voxels, but it has {count:.0e}.")
     slabs = ((f"an HDF5 file{how}", of_export(shape, ".h5")) for how, shape in _smaller(grid.shape))
     tell("the volume", of_export(grid.shape, volume.suffix.lower()), volume, slabs)
-    write_volume_file(volume, result.object, grid)
+    write_volume_file(volume, result.object, grid, of=result.contents)
     _say(f"wrote {volume}: {' × '.join(map(str, grid.shape))} voxels of {1e6 * grid.voxel_size[0]:.4g} µm")
     return grid
 

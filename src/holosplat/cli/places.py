@@ -104,6 +104,11 @@ def with_checked_arguments(function: Callable[Given, Returned]) -> Callable[...,
     return checked
 
 
+def places_of(function: Callable[..., Any], values: Mapping[str, Any]) -> list[Place]:
+    """The places that arguments of a checked command name; `values` are its arguments by name."""
+    return list(_places(values, hints_of(function)))
+
+
 def require_apart(places: Sequence[Place]) -> None:
     """`InputError` that names the first output which is an input, another output, or within a run or an input."""
     read = [one for one in places if not one.written and one.is_there()]

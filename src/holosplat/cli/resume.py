@@ -5,11 +5,12 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from ..checks import InputError, as_written, require
-from ..io.provenance import NAME, fingerprint, from_home, records
+from ..io.provenance import NAME, fingerprint, from_home, origin, records
 
 AGAIN = "give the scan, the options and --out again, with --resume"
 OF_ONE_CALL = ("--log", "--force", "--resume")
@@ -31,6 +32,19 @@ def resumed(arguments: Sequence[str]) -> list[str]:
         return list(arguments)
     run, rest = Path(value), words[:at] + words[at + (1 if joined else 2) :]
     return [name, *_again(name, run), "--resume", *rest]
+
+
+def is_made_by(path: Path, words: Sequence[str]) -> bool:
+    """Whether the file or folder `path` says that the command with these `words` made it, from inputs which are what
+    they were; of arguments that are too many files to be named one by one, this is not known, and taken to be so."""
+    record = origin(path)
+    with suppress(InputError, KeyError, TypeError, ValueError):
+        said, folder = shlex.split(record["command"])[1:], Path(from_home(record["folder"]))
+        for one in record["inputs"]:
+            if "files" not in one:
+                _place(path if path.is_dir() else path.parent, folder, one)
+        return [from_home(word) for word in _lasting(said)] == list(words)
+    return False
 
 
 def _again(name: str, run: Path) -> list[str]:

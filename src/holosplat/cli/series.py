@@ -226,8 +226,8 @@ def collect(folder: Positional[Path]) -> None:
         folder: Folder of the series.
     """
     from ..series.collect import collect as join
-    from ..series.collect import some
     from ..series.folder import SeriesFolder
+    from ..series.words import some
 
     found = join(series := SeriesFolder(folder))
     for path in (series.table, series.bodies, series.page):

@@ -17,7 +17,6 @@ from ..io.json import write_json
 from ..io.reading import Reading
 from ..io.volume_formats import read_volume_file
 from ..io.vtk import write_mesh
-from ..matter import Matter
 from ..mesh import TriangleMesh
 from ..methods.surface_fit import SurfaceOptions, oversampling
 from ..methods.surfaces import refine_surfaces
@@ -67,7 +66,8 @@ def surface(
     if not times and not folder.is_of(scan_hash(measured)):
         _say("this is not the scan that was reconstructed: its held-out frames may have been fitted")
     if folder.read_config().get("prior", {}).get("kind") == "free":
-        _say("nothing was known of the matter: δ and β of the surfaces are what the run estimated")
+        known = "δ and β" if result.delta_told else "β"
+        _say(f"nothing was known of the matter: {known} of the surfaces are what the run estimated")
     train = measured.exposures[~measured.is_test]
     tell_frames("surface", train, out, lambda seen: of_surfaces(seen, how))
     before = score(result, measured, volume)
@@ -79,21 +79,24 @@ def surface(
     said = {"seconds": seconds, "settings": asdict(how), name.lower(): before.as_dict(), "surfaces": after.as_dict()}
     whole = load_reconstruction(folder).object
     bodies = whole.parted(found.vertices.detach().cpu()) if isinstance(whole, MovingSurfaces) else found.bodies()
-    write_bodies(out, bodies, found.matter, said)
+    write_bodies(out, bodies, result.contents.of_matter(found.matter), said)
     for of, scores in ((name, before), ("surfaces", after)):
         print(f"{of}:", *scores.lines(), sep="\n  ")
     _say(f"wrote {out}: {len(bodies)} bodies of {len(found.faces)} triangles, {seconds:.1f} s")
 
 
-def write_bodies(out: Path, bodies: Sequence[TriangleMesh], matter: Matter, said: Mapping[str, Any]) -> None:
-    """Write one VTK file a body (µm), and summary.json with what is `said` beside their sizes and `matter`."""
+def write_bodies(
+    out: Path, bodies: Sequence[TriangleMesh], constants: Mapping[str, float], said: Mapping[str, Any]
+) -> None:
+    """Write one VTK file a body (µm), and summary.json with what is `said` beside their sizes and the `constants` of
+    their matter."""
     with atomic_folder(out) as temporary:
         for body in bodies:
             write_mesh(temporary / f"{body.name}.vtk", body, LENGTH_UNIT)
         about = {
             "bodies": {body.name: {"triangles": len(body.faces), "volume_m3": body.volume} for body in bodies},
             "length_unit": LENGTH_UNIT,
-            "material": {"delta": matter.delta, "beta": matter.beta},
+            "material": dict(constants),
         }
         write_json(temporary / "summary.json", {**about, **said})
 

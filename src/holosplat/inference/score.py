@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
-from torch import Tensor
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 BLOCK = 32
 """Edge of the blocks [pixels], at most, whose scatter gives the standard error within a frame: on frames of some 80
@@ -35,6 +37,8 @@ class Score:
         The wavelets of a block lie within it, so that blocks share nothing. Small frames have smaller blocks; what
         remains of rows and columns is left out at both sides.
         """
+        import torch
+
         edge = BLOCK
         while edge > 2 and min(residual.shape[1:]) < 2 * edge:
             edge //= 2
@@ -42,7 +46,8 @@ class Score:
             edge = 1
         rows, columns = (slice((n % edge) // 2, (n % edge) // 2 + n // edge * edge) for n in residual.shape[1:])
         level = residual.detach().cpu().double()[:, rows, columns]
-        bands, size = list[Tensor](), edge
+        bands: list[Tensor] = []
+        size = edge
         while size > 1:
             quads = level.unflatten(2, (-1, 2)).unflatten(1, (-1, 2))
             mean = quads.mean(dim=(2, 4))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import zipfile
 from collections import Counter
 from collections.abc import Mapping
@@ -14,22 +15,19 @@ import numpy as np
 
 from ..checks import InputError
 from ..geometry import Grid
-from ..representations import KINDS
-from .compact import FORMAT as COMPACT
-from .compact import SERIES
-from .gaussians import FORMAT as GAUSSIANS
 from .hdf5 import Fields, attribute_numbers, attribute_text, open_hdf5
 from .json import read_json
-from .objects import FORMAT as OBJECT
 from .ome_tiff import TIFF_SUFFIXES, ome_grid
 from .ome_zarr import ZARR_SUFFIX
 from .volume_formats import FORMATS, HDF5_SUFFIXES, read_volume_file
-from .volumes import NAMES
+from .volumes import ABSORPTION, MU, REFRACTION, Contents
 from .vtk import SUFFIXES as MESHES
 from .vtk import mesh_files, read_meshes
 
 MOST_KEYS = 16
 """Datasets, or kinds of files, that are named."""
+OBJECT = re.compile("holosplat (object|compact|compact series|Gaussians) 1")
+SYMBOLS = {"delta": "δ", "beta": "β", MU: "µ"}
 WIDTH = 22
 """Of the names of rows."""
 VOXEL = "voxel_size"
@@ -67,10 +65,11 @@ def facts_of_matter(path: Path) -> Facts | None:
         return None
     with open_hdf5(path) as file:
         form = attribute_text(file.attrs.get("format")) or ""
-        if form in (OBJECT, COMPACT, SERIES, GAUSSIANS):
+        if OBJECT.fullmatch(form):
             return _of_object(path, file, form)
-        if all(isinstance(file.get(name), h5py.Dataset) for name in NAMES):
-            return _of_volume(path, file)
+        for of in (REFRACTION, ABSORPTION):
+            if all(isinstance(file.get(name), h5py.Dataset) for name in of.units):
+                return _of_volume(path, file, of)
     return None
 
 
@@ -102,15 +101,16 @@ def keys_of(path: Path) -> dict[str, str]:
     return rows | {"datasets": ("\n" + " " * WIDTH).join([*found[:MOST_KEYS], *more]) or "none"}
 
 
-def _of_volume(path: Path, file: h5py.File) -> Facts:
-    """δ and β on voxels; of their values those of the middle slice."""
+def _of_volume(path: Path, file: h5py.File, of: Contents) -> Facts:
+    """δ and β, or µ and β, on voxels; of their values those of the middle slice."""
     fields = Fields(path, file)
-    arrays = [fields.dataset(name) for name in NAMES]
-    rows = {"what": "a volume of δ and β (HDF5)"}
+    arrays = [fields.dataset(name) for name in of.units]
+    rows = {"what": f"a volume of {' and '.join(SYMBOLS[name] for name in of.units)} (HDF5)"}
     rows["shape"] = " × ".join(map(str, arrays[0].shape)) + " voxels (z, y, x)"
-    for array, symbol in zip(arrays, "δβ"):
+    for array, (name, unit) in zip(arrays, of.units.items()):
         values = np.asarray(array[array.shape[0] // 2]) if array.ndim == 3 and 0 not in array.shape else np.zeros(1)
-        rows[symbol] = f"{values.min():.3g} to {values.max():.3g} in the slice in the middle of z"
+        shown = f"{values.min():.3g} to {values.max():.3g} {'m⁻¹ ' * (unit != '1')}"
+        rows[SYMBOLS[name]] = f"{shown}in the slice in the middle of z"
     sizes = [place.attrs[VOXEL] for place in (file, arrays[0]) if VOXEL in place.attrs]
     for size in sizes[:1]:
         edges = attribute_numbers(f"{path}: @{VOXEL}", size, (1, 3))
@@ -121,6 +121,8 @@ def _of_volume(path: Path, file: h5py.File) -> Facts:
 
 
 def _of_object(path: Path, file: h5py.File, form: str) -> Facts:
+    from ..representations import KINDS
+
     kind = attribute_text(file.attrs.get("kind")) or "gaussians"
     known = KINDS[kind].__name__ if kind in KINDS else kind
     rows = {"what": f"an object ({form}): {known}"}

@@ -15,7 +15,7 @@ from ..progress import Advance
 from ..version import __version__
 from ..volume import Object, Volume
 from .plain_values import read_both, values_at, write_both
-from .volumes import grid_of
+from .volumes import REFRACTION, Contents, grid_of, require_refraction
 
 ANGSTROM = 1e-10
 FLOATS, VOLUME, VERSION = 2, 1, 20140
@@ -49,7 +49,9 @@ STAMPS = {b"DD": "<", b"DA": "<", b"\x11\x11": ">"}
 """Byte order by the first two bytes of the stamp."""
 
 
-def write_mrc(path: Path, obj: Object, grid: Grid, on_progress: Advance = lambda fraction: None) -> None:
+def write_mrc(
+    path: Path, obj: Object, grid: Grid, on_progress: Advance = lambda fraction: None, of: Contents = REFRACTION
+) -> None:
     """Write δ and β of `obj` on `grid` into two files, slab by slab."""
 
     def head(name: str, statistics: np.ndarray) -> bytes:
@@ -60,10 +62,10 @@ def write_mrc(path: Path, obj: Object, grid: Grid, on_progress: Advance = lambda
         found["mode"], found["space_group"], found["version"], found["label_count"] = FLOATS, VOLUME, VERSION, 1
         found["angles"], found["axes"], found["map"], found["stamp"] = 90, (1, 2, 3), b"MAP ", b"DD"
         found["limits"], found["deviation"] = statistics[:3], statistics[3]
-        found["labels"][0] = f"holosplat {__version__}: {name}, no unit".encode("ascii")
+        found["labels"][0] = f"holosplat {__version__}: {name}, unit {of.units[name]}".encode("ascii")
         return found.tobytes()
 
-    write_both(path, head, obj, grid, on_progress)
+    write_both(path, head, obj, grid, on_progress, of)
 
 
 def read_mrc(path: Path) -> Volume:
@@ -83,6 +85,7 @@ def _read_one(path: Path) -> tuple[np.ndarray, Grid]:
         bytes(head["map"]).rstrip() == b"MAP" and order is not None,
         f"{path} must be an MRC2014 file, but its header is not that of one.",
     )
+    require_refraction(path, bytes(head["labels"][0]).decode("latin-1"))
     head = np.frombuffer(raw, HEADER.newbyteorder("<" if order == "<" else ">"))[0]
     columns, rows, pages = (int(n) for n in head["n"])
     fits = int(head["mode"]) == FLOATS and head["axes"].tolist() == [1, 2, 3] and (head["n"] == head["m"]).all()

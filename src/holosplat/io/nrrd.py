@@ -20,7 +20,7 @@ from ..version import __version__
 from ..volume import Object, Volume
 from .guard import require_declared, require_memory
 from .plain_values import LENGTH_UNIT, micrometres, read_both, values_at, write_both
-from .volumes import grid_of
+from .volumes import REFRACTION, Contents, grid_of, require_refraction
 
 TYPES = {"float": "f4", "double": "f8"}
 ORDERS = {"little": "<", "big": ">"}
@@ -30,7 +30,9 @@ FIELD = re.compile(r"([^:#]+): (.*)")
 """A field of a header; comments begin with #, keys of other programs stand before :=."""
 
 
-def write_nrrd(path: Path, obj: Object, grid: Grid, on_progress: Advance = lambda fraction: None) -> None:
+def write_nrrd(
+    path: Path, obj: Object, grid: Grid, on_progress: Advance = lambda fraction: None, of: Contents = REFRACTION
+) -> None:
     """Write δ and β of `obj` on `grid` into two files, slab by slab."""
     size, origin = micrometres(grid)
     steps = [[size[axis] if axis == k else 0.0 for k in range(3)] for axis in range(3)]
@@ -49,9 +51,8 @@ def write_nrrd(path: Path, obj: Object, grid: Grid, on_progress: Advance = lambd
         "endian: little",
         "encoding: raw",
     )
-    write_both(
-        path, lambda name, _: "\n".join((*lines, f"content: {name}", "", "")).encode("ascii"), obj, grid, on_progress
-    )
+    head = "\n".join((*lines, "content: "))
+    write_both(path, lambda name, _: f"{head}{name}\n\n".encode("ascii"), obj, grid, on_progress, of)
 
 
 def _vector(numbers: list[float]) -> str:
@@ -74,6 +75,7 @@ def _read_one(path: Path) -> tuple[np.ndarray, Grid]:
     )
     lines = head.decode("latin-1").split("\n")
     fields = {match[1]: match[2] for line in lines if (match := FIELD.fullmatch(line))}
+    require_refraction(path, fields.get("content", ""))
     for name in ("data file", "datafile", "line skip", "byte skip"):
         require(name not in fields, f"{path} must hold its values itself, but its header has {name!r}; save it whole.")
     with as_written(path, "an NRRD file of three axes, with sizes, space directions, units and origin"):

@@ -14,14 +14,14 @@ from ..volume import Volume
 from .atomic import atomic_path
 from .hdf5_writing import require_room
 from .tiff_guard import all_images, image_count, open_tiff
-from .volumes import NAMES
+from .volumes import ABSORPTION, REFRACTION, Contents, require_refraction
 
 TIFF_SUFFIXES = (".tif", ".tiff")
 UNITS_M = {"µm": 1e-6, "nm": 1e-9, "mm": 1e-3, "m": 1.0}
 
 
 def ome_grid(path: Path) -> Grid | None:
-    """The grid of an OME-TIFF of δ and β; None for another TIFF file."""
+    """The grid of an OME-TIFF of δ (or µ) and β; None for another TIFF file."""
     with open_tiff(path) as opened:
         return _grid_of_ome(opened.ome_metadata or "")
 
@@ -33,6 +33,7 @@ def read_ome_tiff(path: Path) -> Volume:
     """
     with open_tiff(path) as opened:
         text, count = opened.ome_metadata, image_count(opened, path)
+    require_refraction(path, text or "")
     grid = _grid_of_ome(text or "")
     if grid is None or count != 2 * grid.shape[0]:
         raise InputError(
@@ -47,7 +48,7 @@ def read_ome_tiff(path: Path) -> Volume:
 
 
 def _grid_of_ome(text: str) -> Grid | None:
-    """The grid that the metadata of an OME-TIFF with the channels δ and β says; None for other metadata."""
+    """The grid that the metadata of an OME-TIFF with the channels δ (or µ) and β says; None for other metadata."""
     try:
         elements = list(ElementTree.fromstring(text).iter())
         (pixels,) = [each.attrib for each in elements if each.tag.endswith("Pixels")]
@@ -60,19 +61,19 @@ def _grid_of_ome(text: str) -> Grid | None:
         place = [1e-6 * float(planes[0][f"Position{axis}"]) for axis in "XYZ"] if planes else grid.origin
     except (KeyError, ValueError, ElementTree.ParseError):
         return None
-    if named != list(NAMES):
+    if named not in (list(REFRACTION.units), list(ABSORPTION.units)):
         return None
     return replace(grid, voxel_size=(edges[0], edges[1], edges[2]), origin=(place[0], place[1], place[2]))
 
 
-def write_ome_tiff(path: Path, volume: Volume) -> None:
-    """Write δ and β as the two channels of an OME-TIFF, float32, pages along z, with the voxels' size [µm] in it.
+def write_ome_tiff(path: Path, volume: Volume, of: Contents = REFRACTION) -> None:
+    """Write δ (or µ) and β as the channels of an OME-TIFF, float32, pages along z, with the voxels' size [µm] in it.
 
     The place of the first voxel is that of the planes; many programs take it for 0.
     """
     import tifffile
 
-    values = np.stack([volume.delta, volume.beta]).astype(np.float32)
+    values = np.stack(list(of.of_volume(volume).values())).astype(np.float32)
     require_room(path, values.nbytes)
     sizes = {f"PhysicalSize{axis}": 1e6 * size for axis, size in zip("XYZ", volume.grid.voxel_size)}
     units = {f"PhysicalSize{axis}Unit": "µm" for axis in "XYZ"}
@@ -80,7 +81,7 @@ def write_ome_tiff(path: Path, volume: Volume) -> None:
     depths = [z + 1e6 * k * volume.grid.voxel_size[2] for k in range(volume.grid.shape[0])]
     places = {"PositionX": [x] * 2 * len(depths), "PositionY": [y] * 2 * len(depths), "PositionZ": depths * 2}
     in_um = {f"{name}Unit": ["µm"] * 2 * len(depths) for name in places}
-    named = {"Channel": {"Name": list(NAMES)}, "Plane": {**places, **in_um}}
+    named = {"Channel": {"Name": list(of.units)}, "Plane": {**places, **in_um}}
     described = {"axes": "CZYX", **named, **sizes, **units}
     with atomic_path(path) as temporary:
         tifffile.imwrite(temporary, values, ome=True, metadata=described, compression="zlib", photometric="minisblack")

@@ -21,7 +21,7 @@ from ..volume import Object, Volume
 from .folder import atomic_folder, require_new
 from .guard import require_memory
 from .hdf5_writing import require_room
-from .volumes import NAMES, SLAB_VOXELS, grid_of, slabs_of
+from .volumes import NAMES, REFRACTION, SLAB_VOXELS, Contents, grid_of, require_refraction, slabs_of
 
 ZARR_SUFFIX = ".zarr"
 CHUNK = 64
@@ -42,7 +42,9 @@ def require_zarr() -> Any:
     return zarr
 
 
-def write_ome_zarr(path: Path, obj: Object, grid: Grid, on_progress: Advance = lambda fraction: None) -> None:
+def write_ome_zarr(
+    path: Path, obj: Object, grid: Grid, on_progress: Advance = lambda fraction: None, of: Contents = REFRACTION
+) -> None:
     """Write δ and β of `obj` on `grid` as an OME-Zarr folder at `path`, which must be new; float32, lossless.
 
     Axes c, z, y, x; lengths in micrometres, with the places of voxel centres (`translation`). Each level has means over
@@ -57,12 +59,12 @@ def write_ome_zarr(path: Path, obj: Object, grid: Grid, on_progress: Advance = l
         group = zarr.open_group(store=str(temporary), mode="w", zarr_format=2)
         shapes, limits = levels_of(grid.shape), np.array([[np.inf, -np.inf]] * len(NAMES))
         arrays = [_array(group, str(k), shape) for k, shape in enumerate(shapes)]
-        _fill(arrays[0], slabs_of(obj, grid, rows, on_progress), limits)
+        _fill(arrays[0], slabs_of(obj, grid, rows, on_progress), limits, of)
         for fine, coarse in pairwise(arrays):
             for start in range(0, coarse.shape[2], CHUNK):
                 stop = min(start + CHUNK, coarse.shape[2])
                 coarse[:, :, start:stop] = halved(fine[:, :, 2 * start : 2 * stop])
-        group.attrs.update(metadata(grid, len(shapes), limits))
+        group.attrs.update(metadata(grid, len(shapes), limits, of))
 
 
 def read_ome_zarr(path: Path) -> Volume:
@@ -80,6 +82,7 @@ def read_ome_zarr(path: Path) -> Volume:
         factors = [unit_factor(f"{path}: axes", axis["unit"], LENGTH_UNITS) for axis in image["axes"][1:]]
         finest, array = image["datasets"][0], group[image["datasets"][0]["path"]]
         scale, place = (np.array(step[step["type"]], dtype=float) for step in finest["coordinateTransformations"])
+        require_refraction(path, " ".join(channels))
         if channels != NAMES or axes != ["c", *"zyx"] or array.ndim != 4 or array.shape[0] != len(NAMES):
             raise ValueError(f"it has the channels {channels} and the axes {axes}")
         require_memory(str(path), 4 * math.prod(array.shape))
@@ -113,7 +116,7 @@ def halved(values: np.ndarray) -> np.ndarray:
     return values.reshape(c, z // 2, 2, y // 2, 2, x // 2, 2).mean(axis=(2, 4, 6), dtype=np.float32)
 
 
-def metadata(grid: Grid, levels: int, limits: np.ndarray) -> dict[str, Any]:
+def metadata(grid: Grid, levels: int, limits: np.ndarray, of: Contents = REFRACTION) -> dict[str, Any]:
     """What OME-Zarr says of the levels: axes, units, scales, places, and how to show the channels.
 
     limits: least and greatest value of each channel, [2, 2].
@@ -129,8 +132,8 @@ def metadata(grid: Grid, levels: int, limits: np.ndarray) -> dict[str, Any]:
         datasets.append({"path": str(level), "coordinateTransformations": [scale, place]})
     image = {"version": "0.4", "name": "refractive index", "axes": axes, "datasets": datasets, "type": "mean"}
     channels = [
-        {"label": name, "color": colour, "active": name == "delta", "window": _window(low, high)}
-        for name, colour, (low, high) in zip(NAMES, COLOURS, limits.tolist())
+        {"label": name, "color": colour, "active": name != "beta", "window": _window(low, high)}
+        for name, colour, (low, high) in zip(of.units, COLOURS, limits.tolist())
     ]
     return {"multiscales": [image], "omero": {"version": "0.4", "channels": channels}}
 
@@ -155,10 +158,10 @@ def _array(group: Any, name: str, shape: tuple[int, int, int]) -> Any:
     )
 
 
-def _fill(array: Any, slabs: Iterable[tuple[int, Volume]], limits: np.ndarray) -> None:
+def _fill(array: Any, slabs: Iterable[tuple[int, Volume]], limits: np.ndarray, of: Contents) -> None:
     """Write slabs, and keep their least and greatest values in `limits` [2, 2]."""
     for start, part in slabs:
-        values = np.stack([part.delta, part.beta])
+        values = np.stack(list(of.of_volume(part).values()))
         array[:, :, start : start + values.shape[2]] = values
         flat = values.reshape(len(NAMES), -1)
         limits[:, 0] = np.minimum(limits[:, 0], flat.min(axis=1))

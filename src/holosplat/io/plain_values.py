@@ -1,4 +1,4 @@
-"""δ and β as plain float32 numbers, x fastest, as files of VTK, NRRD and MRC hold them: written slab by slab."""
+"""δ (or µ) and β as plain float32 numbers, x fastest, as files of VTK, NRRD and MRC hold them: written slab by slab."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ..volume import Object, Volume
 from .atomic import atomic_path
 from .guard import require_memory
 from .hdf5_writing import require_room
-from .volumes import NAMES, slab_rows, slabs_of
+from .volumes import NAMES, REFRACTION, Contents, slab_rows, slabs_of
 
 MICROMETRES = 1e6
 LENGTH_UNIT = "um"
@@ -25,17 +25,22 @@ LENGTH_UNIT = "um"
 
 
 def fill(
-    places: Sequence[tuple[BinaryIO, int]], obj: Object, grid: Grid, on_progress: Advance = lambda fraction: None
+    places: Sequence[tuple[BinaryIO, int]],
+    obj: Object,
+    grid: Grid,
+    on_progress: Advance = lambda fraction: None,
+    of: Contents = REFRACTION,
 ) -> np.ndarray:
-    """Write δ and β of `obj` on `grid` at `places`, for each an open file and the byte where its values begin.
+    """Write δ and β of `obj` on `grid`, or what else is `of` it, at `places`: for each an open file and the byte where
+    its values begin.
 
     Returns their least and greatest values, means and standard deviations [2, 4].
     """
     _, y, x = grid.shape
     found = np.array([[np.inf, -np.inf, 0.0, 0.0]] * len(NAMES))
     for start, part in slabs_of(obj, grid, slab_rows(grid), on_progress):
-        for (file, begin), name, row in zip(places, NAMES, found):
-            values = getattr(part, name).astype("<f4")
+        for (file, begin), array, row in zip(places, of.of_volume(part).values(), found):
+            values = array.astype("<f4")
             for z, page in enumerate(values):
                 file.seek(begin + 4 * x * (z * y + start))
                 file.write(page.tobytes())
@@ -69,19 +74,19 @@ def both(path: Path) -> tuple[Path, Path]:
 
 
 def write_both(
-    path: Path, head: Callable[[str, np.ndarray], bytes], obj: Object, grid: Grid, on_progress: Advance
+    path: Path, head: Callable[[str, np.ndarray], bytes], obj: Object, grid: Grid, on_progress: Advance, of: Contents
 ) -> None:
     """Write δ and β of `obj` on `grid` into two files (`both`), of which each begins with `head`.
 
     head: from the name of the array and its least and greatest value, mean and standard deviation [4]; of one length.
     """
     unknown = np.zeros(4)
-    require_room(path, len(NAMES) * (len(head(NAMES[0], unknown)) + 4 * math.prod(grid.shape)))
+    require_room(path, len(NAMES) * (len(head(next(iter(of.units)), unknown)) + 4 * math.prod(grid.shape)))
     with ExitStack() as stack:
         temporary = [stack.enter_context(atomic_path(one)) for one in both(path)]
         files = [stack.enter_context(one.open("wb")) for one in temporary]
-        begins = [file.write(head(name, unknown)) for file, name in zip(files, NAMES)]
-        for file, name, row in zip(files, NAMES, fill(list(zip(files, begins)), obj, grid, on_progress)):
+        begins = [file.write(head(name, unknown)) for file, name in zip(files, of.units)]
+        for file, name, row in zip(files, of.units, fill(list(zip(files, begins)), obj, grid, on_progress, of)):
             file.seek(0)
             file.write(head(name, row))
 

@@ -127,7 +127,7 @@ def leave_record(path: Path) -> None:
         return
     command.done.add(path)
     folder = _folder_of(path, command) or (path if path.is_dir() else None)
-    if folder is None and not _is_hdf5(path):
+    if folder is None and not is_hdf5(path):
         _write(path.with_name(f"{path.name}.{NAME}"), command.record(path.parent))
     elif folder is not None and folder / NAME not in command.done:
         command.done.add(folder / NAME)
@@ -141,6 +141,20 @@ def records(folder: Path) -> list[dict[str, Any]]:
         found = json.loads((folder / NAME).read_text(encoding="utf-8"))[RECORDS]
         return [dict(each) for each in found]
     return []
+
+
+def origin(path: Path) -> dict[str, Any]:
+    """The record of the command that made a file or folder, or began it; empty where none says so."""
+    if path.is_dir():
+        return next(iter(records(path)), {})
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        if not is_hdf5(path):
+            return dict(json.loads(path.with_name(f"{path.name}.{NAME}").read_text(encoding="utf-8")))
+        import h5py
+
+        with h5py.File(path) as file:
+            return dict(json.loads(str(file.attrs[ATTRIBUTE])))
+    return {}
 
 
 def fingerprint(*paths: Path) -> dict[str, Any]:
@@ -225,7 +239,10 @@ def _folder_of(path: Path, command: Command) -> Path | None:
     return None
 
 
-def _is_hdf5(path: Path) -> bool:
+def is_hdf5(path: Path) -> bool:
+    """Whether `path` is a file in HDF5. Errors: `OSError` for what cannot be read."""
+    if not path.is_file():
+        return False
     with path.open("rb") as file:
         return file.read(len(HDF5)) == HDF5
 

@@ -21,6 +21,7 @@ from ..mesh import TriangleMesh
 from ..representations import MovingSurfaces
 from ..version import __version__
 from .atomic import atomic_path
+from .volumes import REFRACTION, Contents
 
 MICROMETRES = 1e6
 PLAY_S = 4.0
@@ -48,22 +49,22 @@ def write_stl(path: Path, bodies: Sequence[TriangleMesh]) -> None:
         file.write(facets.tobytes())
 
 
-def write_glb(path: Path, bodies: Sequence[TriangleMesh], matter: Matter) -> None:
-    """Write still bodies as a GLB file, one node a body, with δ and β of `matter` in its extras."""
+def write_glb(path: Path, bodies: Sequence[TriangleMesh], matter: Matter, of: Contents = REFRACTION) -> None:
+    """Write still bodies as a GLB file, one node a body, with δ and β (or µ and β) of `matter` in its extras."""
     require(len(bodies) > 0, "a GLB file needs at least one body.")
-    file = _Glb(matter)
+    file = _Glb(of.of_matter(matter))
     for body in bodies:
         file.add(body.name, body.vertices, body.faces)
     file.write(path)
 
 
-def write_moving_glb(path: Path, moving: MovingSurfaces, times: Sequence[float]) -> None:
+def write_moving_glb(path: Path, moving: MovingSurfaces, times: Sequence[float], of: Contents = REFRACTION) -> None:
     """Write moving bodies as a GLB file with an animation of `PLAY_S` from the first of `times` [T] [s] to the last.
 
     Weights of B-splines add up to one, so that a path Σ w_k c_k is c_0 + Σ w_k (c_k - c_0): the differences are morph
     targets, and the animation gives their weights.
     """
-    file = _Glb(moving.matter)
+    file = _Glb(of.of_matter(moving.matter))
     shown = np.linspace(times[0], times[-1], FINE * (len(times) - 1) + 1)
     weights = moving.basis.weights(shown)[:, 1:]
     paths = moving.coefficients.detach().double().numpy() * moving.unit_length
@@ -80,7 +81,7 @@ def write_moving_glb(path: Path, moving: MovingSurfaces, times: Sequence[float])
 class _Glb:
     """A glTF document as it grows, and its bytes."""
 
-    matter: Matter
+    constants: dict[str, float]
     blob: bytearray = field(default_factory=bytearray)
     views: list[dict[str, Any]] = field(default_factory=list)
     accessors: list[dict[str, Any]] = field(default_factory=list)
@@ -111,7 +112,9 @@ class _Glb:
         values = self._stored(weights.reshape(-1).astype("<f4"), "SCALAR", FLOAT, None)
         channels = [{"sampler": 0, "target": {"node": 1 + mesh, "path": "weights"}} for mesh in range(len(self.meshes))]
         sampler = {"input": times, "output": values, "interpolation": "LINEAR"}
-        self.animations.append({"name": "motion", "channels": channels, "samplers": [sampler], "extras": extras})
+        self.animations.append(
+            {"name": "motion", "channels": channels, "samplers": [sampler], "extras": self.constants}
+        )
 
     def write(self, path: Path) -> None:
         """The document and its bytes as one file."""
@@ -134,14 +137,13 @@ class _Glb:
         }
         nodes = [first, *({"name": mesh["name"], "mesh": k} for k, mesh in enumerate(self.meshes))]
         colour = {"baseColorFactor": [0.75, 0.2, 0.15, 1.0], "metallicFactor": 0.0, "roughnessFactor": 0.6}
-        extras = {"delta": self.matter.delta, "beta": self.matter.beta}
         return {
             "asset": {"version": "2.0", "generator": f"holosplat {__version__}", "extras": {"note": note}},
             "scene": 0,
             "scenes": [{"nodes": [0]}],
             "nodes": nodes,
             "meshes": self.meshes,
-            "materials": [{"name": "matter", "pbrMetallicRoughness": colour, "extras": extras}],
+            "materials": [{"name": "matter", "pbrMetallicRoughness": colour, "extras": self.constants}],
             **({"animations": self.animations} if self.animations else {}),
             "accessors": self.accessors,
             "bufferViews": self.views,

@@ -16,7 +16,7 @@ from .nrrd import read_nrrd, write_nrrd
 from .ome_tiff import TIFF_SUFFIXES, read_ome_tiff, write_ome_tiff
 from .ome_zarr import ZARR_SUFFIX, read_ome_zarr, require_zarr, write_ome_zarr
 from .plain_values import both
-from .volumes import read_volume, write_voxels
+from .volumes import REFRACTION, Contents, read_volume, write_voxels
 from .vti import read_vti, write_vti
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
@@ -31,14 +31,14 @@ class VolumeFormat:
     """A format of volumes of δ and β. write: an object on a grid; files: all that it makes; needs: a package, which it
     asks for."""
 
-    write: Callable[[Path, Object, Grid, Advance], None]
+    write: Callable[[Path, Object, Grid, Advance, Contents], None]
     read: Callable[[Path], Volume]
     files: Callable[[Path], tuple[Path, ...]] = _alone
     needs: Callable[[], Any] = lambda: None
 
 
-def _write_tiff(path: Path, obj: Object, grid: Grid, on_progress: Advance) -> None:
-    write_ome_tiff(path, obj.voxelise(grid))
+def _write_tiff(path: Path, obj: Object, grid: Grid, on_progress: Advance, of: Contents) -> None:
+    write_ome_tiff(path, obj.voxelise(grid), of)
     on_progress(1.0)
 
 
@@ -68,9 +68,11 @@ def volume_format(path: Path, called: str = "a volume") -> VolumeFormat:
     return found
 
 
-def write_volume_file(path: Path, obj: Object, grid: Grid, on_progress: Advance = lambda fraction: None) -> None:
-    """Write δ and β of `obj` on `grid` in the format that the suffix of `path` names."""
-    volume_format(path).write(path, obj, grid, on_progress)
+def write_volume_file(
+    path: Path, obj: Object, grid: Grid, on_progress: Advance = lambda fraction: None, of: Contents = REFRACTION
+) -> None:
+    """Write δ and β (or what arrays are `of`) of `obj` on `grid` in the format that the suffix of `path` names."""
+    volume_format(path).write(path, obj, grid, on_progress, of)
 
 
 def of_time(path: Path, frame: int) -> Path:

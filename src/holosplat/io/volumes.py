@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from ..checks import InputError, finite, in_range
+from ..checks import InputError, finite, in_range, require
 from ..geometry import Grid
+from ..matter import Matter
 from ..progress import Advance
+from ..units import wavenumber
 from ..volume import Object, Volume
 from .hdf5 import Fields, attribute_numbers, open_hdf5
 from .hdf5_writing import new_hdf5, room_for
@@ -19,8 +22,48 @@ NAMES = ("delta", "beta")
 VOXEL_RANGE_M = (1e-10, 1e-2)
 SAID = {"voxel_size_units": "m", "origin_units": "m", "axes": "z, y, x"}
 """Attributes for people and other programs; lengths are (x, y, z)."""
+MU = "mu_per_m"
+"""The attenuation coefficient, which stands in place of δ where that is not known."""
 SLAB_VOXELS = 1 << 22
 """Voxels that `write_voxels` makes at once: meshes take about 250 MB for them."""
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What the two arrays of a volume file are: δ and β, or, where δ is not known, µ and β. mu_per_beta: µ/β [1/m]."""
+
+    mu_per_beta: float | None = None
+
+    @classmethod
+    def of(cls, delta_told: bool, energy_kev: float) -> Contents:
+        """δ and β where δ is told; else β, and the attenuation coefficient µ = 2kβ at `energy_kev` [keV]."""
+        return cls() if delta_told else cls(2 * float(wavenumber(energy_kev)))
+
+    @property
+    def units(self) -> dict[str, str]:
+        """Names of the arrays, with their units."""
+        return dict.fromkeys(NAMES, "1") if self.mu_per_beta is None else {MU: "1/m", NAMES[1]: "1"}
+
+    def of_volume(self, volume: Volume) -> dict[str, np.ndarray]:
+        """The arrays [Z, Y, X] float32 by name."""
+        first = volume.delta if self.mu_per_beta is None else volume.beta * np.float32(self.mu_per_beta)
+        return dict(zip(self.units, (first, volume.beta)))
+
+    def of_matter(self, matter: Matter) -> dict[str, float]:
+        """The constants of one material by name."""
+        first = matter.delta if self.mu_per_beta is None else matter.beta * self.mu_per_beta
+        return dict(zip(self.units, (first, matter.beta)))
+
+
+REFRACTION, ABSORPTION = Contents(), Contents.of(False, 1.0)
+"""The latter at any energy, for its names and units."""
+
+
+def require_refraction(path: str | Path, said: str) -> None:
+    """`InputError` for a file that says that its numbers are µ."""
+    require(
+        MU not in said, f"{path} must hold δ, but it holds the attenuation coefficient µ; take a volume of δ and β."
+    )
 
 
 def read_volume(path: str | Path) -> Volume:
@@ -30,6 +73,7 @@ def read_volume(path: str | Path) -> Volume:
     is one number or three, `(dx, dy, dz)`. `InputError` names the file and the field at fault.
     """
     with open_hdf5(path) as file:
+        require_refraction(path, " ".join(file))
         fields = Fields(Path(path), file)
         arrays = [_array(fields, name) for name in NAMES]
         if arrays[0].shape != arrays[1].shape:
@@ -56,7 +100,7 @@ def write_volume(path: str | Path, volume: Volume) -> None:
     write_slabs(path, volume.grid, [(0, volume)])
 
 
-def write_slabs(path: str | Path, grid: Grid, slabs: Iterable[tuple[int, Volume]]) -> None:
+def write_slabs(path: str | Path, grid: Grid, slabs: Iterable[tuple[int, Volume]], of: Contents = REFRACTION) -> None:
     """Write the volume on `grid` from its parts `slabs`, each with the y index of its first slice.
 
     Attributes say units and axes, too. The parts must cover the grid; `path` is replaced only once all are written.
@@ -65,23 +109,29 @@ def write_slabs(path: str | Path, grid: Grid, slabs: Iterable[tuple[int, Volume]
     with new_hdf5(path, 4 * len(NAMES) * math.prod(grid.shape)) as file:
         file.attrs.update(attributes)
         chunk = (grid.shape[0], 1, grid.shape[2])  # slabs are whole in z and x
-        arrays = {name: room_for(file, name, grid.shape, np.float32, chunk=chunk) for name in NAMES}
-        for array in arrays.values():
-            array.attrs.update({**attributes, "units": "1"})
+        arrays = {name: room_for(file, name, grid.shape, np.float32, chunk=chunk) for name in of.units}
+        for name, array in arrays.items():
+            array.attrs.update({**attributes, "units": of.units[name]})
             for dimension, axis in zip(array.dims, "zyx"):
                 dimension.label = axis
         for start, part in slabs:
-            for name, array in arrays.items():
-                array[:, start : start + part.grid.shape[1]] = getattr(part, name)
+            for name, values in of.of_volume(part).items():
+                arrays[name][:, start : start + part.grid.shape[1]] = values
 
 
-def write_voxels(path: str | Path, obj: Object, grid: Grid, on_progress: Advance = lambda fraction: None) -> None:
+def write_voxels(
+    path: str | Path,
+    obj: Object,
+    grid: Grid,
+    on_progress: Advance = lambda fraction: None,
+    of: Contents = REFRACTION,
+) -> None:
     """Write `obj` voxelised on `grid`, slab by slab; at most `SLAB_VOXELS` voxels are in memory, however large the
     grid.
 
     `on_progress(fraction)` is called after each slab.
     """
-    write_slabs(path, grid, slabs_of(obj, grid, slab_rows(grid), on_progress))
+    write_slabs(path, grid, slabs_of(obj, grid, slab_rows(grid), on_progress), of)
 
 
 def slab_rows(grid: Grid) -> int:

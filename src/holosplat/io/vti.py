@@ -23,7 +23,7 @@ from .atomic import atomic_path
 from .guard import require_declared, require_memory, xml_fault
 from .hdf5_writing import require_room
 from .plain_values import LENGTH_UNIT, fill, micrometres
-from .volumes import NAMES, grid_of
+from .volumes import NAMES, REFRACTION, Contents, grid_of, require_refraction
 from .vtk import quiet
 from .vtk_guard import blocks_fault
 
@@ -34,9 +34,11 @@ COMPONENTS = re.compile(rb"\bNumberOfComponents\s*=\s*[\"']\s*(\d{1,4})\s*[\"']"
 END = b"\n</AppendedData>\n</VTKFile>\n"
 
 
-def write_vti(path: Path, obj: Object, grid: Grid, on_progress: Advance = lambda fraction: None) -> None:
+def write_vti(
+    path: Path, obj: Object, grid: Grid, on_progress: Advance = lambda fraction: None, of: Contents = REFRACTION
+) -> None:
     """Write δ and β of `obj` on `grid`, slab by slab."""
-    head, bytes_each = _head(grid), 4 * math.prod(grid.shape)
+    head, bytes_each = _head(grid, of), 4 * math.prod(grid.shape)
     starts = [len(head) + 8 + k * (8 + bytes_each) for k in range(len(NAMES))]
     require_room(path, starts[-1] + bytes_each)
     with atomic_path(path) as temporary, temporary.open("wb") as file:
@@ -44,19 +46,19 @@ def write_vti(path: Path, obj: Object, grid: Grid, on_progress: Advance = lambda
         for start in starts:
             file.seek(start - 8)
             file.write(struct.pack("<Q", bytes_each))
-        fill([(file, start) for start in starts], obj, grid, on_progress)
+        fill([(file, start) for start in starts], obj, grid, on_progress, of)
         file.seek(starts[-1] + bytes_each)
         file.write(END)
 
 
-def _head(grid: Grid) -> bytes:
+def _head(grid: Grid, of: Contents) -> bytes:
     """The XML before the values."""
     extent = " ".join(f"0 {n - 1}" for n in reversed(grid.shape))
     size, origin = (" ".join(map(repr, lengths)) for lengths in micrometres(grid))
     offsets = [k * (8 + 4 * math.prod(grid.shape)) for k in range(len(NAMES))]
     arrays = "".join(
         f'<DataArray type="Float32" Name="{name}" format="appended" offset="{offset}"/>\n'
-        for name, offset in zip(NAMES, offsets)
+        for name, offset in zip(of.units, offsets)
     )
     unit = " ".join(str(code) for code in (*LENGTH_UNIT.encode(), 0))
     return (
@@ -64,8 +66,8 @@ def _head(grid: Grid) -> bytes:
         '<VTKFile type="ImageData" version="1.0" byte_order="LittleEndian" header_type="UInt64">\n'
         f'<ImageData WholeExtent="{extent}" Origin="{origin}" Spacing="{size}">\n'
         f'<FieldData><DataArray type="String" Name="{UNIT}" NumberOfTuples="1" format="ascii">{unit}</DataArray>'
-        f'</FieldData>\n<Piece Extent="{extent}">\n<PointData Scalars="{NAMES[0]}">\n{arrays}</PointData>\n</Piece>\n'
-        '</ImageData>\n<AppendedData encoding="raw">\n_'
+        f'</FieldData>\n<Piece Extent="{extent}">\n<PointData Scalars="{next(iter(of.units))}">\n{arrays}'
+        '</PointData>\n</Piece>\n</ImageData>\n<AppendedData encoding="raw">\n_'
     ).encode()
 
 
@@ -85,6 +87,7 @@ def read_vti(path: Path) -> Volume:
         require(not complaints(), f"{path} must be a complete .vti file, but it is damaged: {complaints()}.")
     data, unit = image.GetPointData(), image.GetFieldData().GetAbstractArray(UNIT)
     arrays = [data.GetArray(name) for name in NAMES]
+    require_refraction(path, _names(data))
     if unit is None or unit.GetNumberOfValues() != 1 or any(_is_none(one, image) for one in arrays):
         raise InputError(
             f"{path} must have the point data delta and beta, a number a point, and the field data {UNIT}, as "

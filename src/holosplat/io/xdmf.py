@@ -12,10 +12,10 @@ from xml.sax.saxutils import escape
 from ..geometry import Grid
 from .atomic import atomic_path
 from .plain_values import micrometres
-from .volumes import NAMES
+from .volumes import REFRACTION, Contents
 
 
-def write_xdmf(path: Path, grid: Grid, steps: Sequence[tuple[float, Path]]) -> None:
+def write_xdmf(path: Path, grid: Grid, steps: Sequence[tuple[float, Path]], of: Contents = REFRACTION) -> None:
     """Write the series of the volumes `steps`, each with its time [s], all on `grid`, in the folder of `path`."""
     size, origin = (" ".join(map(repr, reversed(lengths))) for lengths in micrometres(grid))
     shape = " ".join(map(str, grid.shape))
@@ -29,7 +29,7 @@ def write_xdmf(path: Path, grid: Grid, steps: Sequence[tuple[float, Path]]) -> N
             *(f'<DataItem Format="XML" Dimensions="3">{lengths}</DataItem>' for lengths in (origin, size)),
             "</Geometry>",
         ]
-        for name in NAMES:
+        for name in of.units:
             values = f'<DataItem Format="HDF" Dimensions="{shape}" NumberType="Float" Precision="4">'
             lines.append(
                 f'<Attribute Name="{name}" AttributeType="Scalar" Center="Node">{values}{escape(file.name)}:/{name}'

@@ -14,7 +14,7 @@ from matplotlib.image import AxesImage
 
 from ..geometry import Grid
 from ..metrics import robust_material_delta
-from ..units import wavenumber
+from ..units import length_unit, wavenumber
 from ..volume import Volume
 from .content import HeldOutViews, ProjectedMaps, pixel_of
 from .quantity import DELTA, Quantity
@@ -32,7 +32,6 @@ from .style import (
     decimal_scale,
     from_dark,
     image_panel,
-    length_unit,
     letter,
     new_figure,
     scale_bar,

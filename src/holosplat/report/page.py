@@ -47,4 +47,5 @@ def template(name: str, package: str = "") -> jinja2.Template:
         lstrip_blocks=True,
         undefined=jinja2.StrictUndefined,
     )
+    environment.filters["zip"] = zip
     return environment.get_template(name)

@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 from matplotlib.image import AxesImage
 from matplotlib.ticker import MaxNLocator
 
-from ..units import plain
+from ..units import bar_length, format_length, plain
 
 WIDTH = 7.2  # inches: the full width of a journal page, 183 mm
 DPI = 160
@@ -144,29 +144,13 @@ def letter(axes: Axes, index: int, title: str = "", lift: float = 3.0) -> None:
         axes.annotate(title, (0, 1), (10, lift), fontsize=7, **style)
 
 
-def length_unit(extent: float) -> tuple[str, float]:
-    """A unit that suits lengths up to `extent` [m], and how many of it one metre holds."""
-    for name, factor in (("mm", 1e3), ("µm", 1e6)):
-        if extent * factor >= 0.9995:
-            return name, factor
-    return "nm", 1e9
-
-
-def format_length(length: float, digits: int = 3) -> str:
-    """`length` [m] with a suitable unit: 4.2e-7 → "420 nm"."""
-    unit, factor = length_unit(abs(length))
-    return f"{plain(length * factor, digits)}\u00a0{unit}"
-
-
 def scale_bar(axes: Axes, width: float, colour: str = "white", height: float = 0.055, beside: bool = False) -> None:
     """A scale bar of a round length, up to a quarter of `width` [m] of the field, in the lower left corner.
 
     height: of the bar above the lower edge, as a part of the axes; the length stands above the bar, or `beside` it,
     where panels are small.
     """
-    target = 0.28 * width
-    power = 10.0 ** math.floor(math.log10(target))
-    length = max(step * power for step in (1, 2, 5) if step * power <= target)
+    length = bar_length(width)
     fraction = length / width
     halo = {"white": "black", INK: GROUND}.get(colour, "white")
     x0, y0 = 0.05, height

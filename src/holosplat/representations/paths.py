@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.interpolate import BSpline
 from torch import Tensor
 
 from ..checks import InputError, require
@@ -61,6 +60,8 @@ class TimeBasis:
             return np.zeros((len(t), self.count))
         if self.degree == 0 and self.pieces == 1:
             return np.ones((len(t), 1))
+        from scipy.interpolate import BSpline  # which takes a second to load
+
         found = BSpline(self._knots(), np.eye(self.count), self.degree)((t - self.first) / self.span, derivative)
         return np.asarray(found) / self.span**derivative
 

@@ -178,7 +178,7 @@ def _number(value: object) -> str:
 
 def page_of(folder: SeriesFolder, found: Collected) -> SeriesPage:
     """What series.html shows."""
-    from .pages.page import Frame, SeriesPage
+    from .pages.page import Frame, SeriesPage, headline
 
     frames = []
     for moment, row, run, names in zip(found.moments, found.rows, found.runs, found.bodies):
@@ -189,18 +189,11 @@ def page_of(folder: SeriesFolder, found: Collected) -> SeriesPage:
     failed = {f"task {s.number}": plain(s.reason) for s in found.states if s.state == "failed"}
     missing = len(found.missing)
     verdict = "All times are done." if not missing else f"{missing} of {len(found.moments)} times are missing."
-    unexplained = [frame.row.number for frame in frames if frame.row.good is False]
-    if unexplained:
-        verdict += f" The frames of {len(unexplained)} are not explained: {some(unexplained)}."
     notes = [
         f"task {task}: bodies are {1e6 * apart:.3g} µm from where the task before has them"
         for task, apart in found.agreement.items()
         if apart == apart
     ]
-    return SeriesPage("A series", verdict, f"{time_left(found.states)}.", tuple(frames), failed, tuple(notes))
-
-
-def some(numbers: Sequence[int], most: int = 12) -> str:
-    """The first of some numbers."""
-    shown = ", ".join(str(number) for number in numbers[:most])
-    return shown if len(numbers) <= most else f"{shown} …"
+    return SeriesPage(
+        "A series", headline(verdict, frames), f"{time_left(found.states)}.", tuple(frames), failed, tuple(notes)
+    )

@@ -203,7 +203,7 @@ class Watch:
 
     def _show(self, state: str, refresh: float) -> None:
         """Bring the page and the table up to date."""
-        from .pages.page import Frame, SeriesPage, write_page  # which need matplotlib
+        from .pages.page import Frame, SeriesPage, headline, write_page  # which need matplotlib
 
         self._said = self.clock()
         with atomic_path(self.folder.table) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
@@ -216,11 +216,11 @@ class Watch:
         failed |= {plain(key[0]): plain(one.reason) for key, one in self._failures.items()}
         when = time.strftime("%Y-%m-%d %H:%M:%S")
         verdict = f"{len(frames)} times are done." if frames else "No scan has come yet."
-        unexplained = sum(frame.row.good is False for frame in frames)
-        if unexplained:
-            verdict += f" The frames of {unexplained} are not explained."
         title = f"Scans of {plain(self.source.resolve().name)}"
-        write_page(self.folder.page, SeriesPage(title, verdict, f"{state} {when}", frames, failed, (), refresh))
+        write_page(
+            self.folder.page,
+            SeriesPage(title, headline(verdict, frames), f"{state} {when}", frames, failed, (), refresh),
+        )
 
     def _relative(self, run: Path) -> str:
         return run.relative_to(self.folder.path).as_posix()

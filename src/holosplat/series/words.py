@@ -58,3 +58,9 @@ def line_of(row: Row) -> str:
     """How a time went, in a line."""
     said = f"{row.begun}, {row.size}, {row.seconds:.1f} s" if row.done else f"failed: {row.reason}"
     return f"time {row.number}: {said}"
+
+
+def some(numbers: Sequence[int], most: int = 12) -> str:
+    """The first of some numbers."""
+    shown = ", ".join(str(number) for number in numbers[:most])
+    return shown if len(numbers) <= most else f"{shown} …"

@@ -13,6 +13,7 @@ from ..geometry import Grid
 from ..io.splats import opacities
 from ..mesh import TriangleMesh
 from ..representations import MOVING, GaussianCloud, MovingGaussians, Stored, SurfaceMesh, isosurface
+from ..units import bar_length, format_length
 
 HALF_EDGE = 10.0
 """Units of the scene from its middle to its farthest side, which suits the cameras of viewers."""
@@ -23,6 +24,8 @@ DEPTH = 40.0
 pixel's, which at depths that can be seen through are all of them."""
 NEAR, FAR = (0.95, 0.85, 0.70), (0.25, 0.40, 0.65)
 """Colours of Gaussians at the near end of the object, and at the far one: all of one colour would be a silhouette."""
+COLOUR = (205, 80, 60)
+"""Of surfaces."""
 LEVEL = 0.5
 """Share of the largest |δ| at which that is."""
 TIMES = 48
@@ -55,6 +58,11 @@ class Frame:
         half = 0.5 * float((np.array(grid.shape[::-1]) * np.array(grid.voxel_size)).max())
         return cls(grid.centre, HALF_EDGE / half)
 
+    @property
+    def bar(self) -> float:
+        """The length [m] of the scale bars: a round one, up to a quarter of the scene."""
+        return bar_length(2 * HALF_EDGE / self.scale)
+
     def places(self, points: np.ndarray) -> np.ndarray:
         """Points [N, 3] [m] in units of the scene, float32."""
         return ((points - self.middle) * self.scale).astype(np.float32)
@@ -84,6 +92,16 @@ def at_times(obj: Stored, times: Sequence[float]) -> dict[str, Stored]:
     chosen = np.array(times) if len(times) else np.linspace(basis.first, basis.last, TIMES)
     chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, min(TIMES, len(chosen))).astype(int))]
     return {f"{1e6 * t:.6g} µs": obj.at(float(t)) for t in chosen}
+
+
+def legend(part: Shown) -> tuple[str, str]:
+    """What the colours of a part mean, and these as CSS has them, from the near end to the far one."""
+    places = part.centres if isinstance(part, Splats) else part.vertices[part.faces]
+    low, high = (format_length(float(end)) for end in (places[..., 2].min(), places[..., 2].max()))
+    if isinstance(part, TriangleMesh):
+        return f"surface of the matter, z from {low} to {high}", f"rgb{COLOUR}, rgb{COLOUR}"
+    ends = ", ".join(f"rgb{tuple(round(255 * c) for c in colour)}" for colour in (NEAR, FAR))
+    return f"depth z from {low} to {high}; opacity: thickness", ends
 
 
 def cut(part: Shown, axis: int, share: float) -> Shown:

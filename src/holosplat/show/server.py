@@ -13,11 +13,9 @@ import numpy as np
 
 from ..checks import InputError, require
 from ..mesh import TriangleMesh
+from ..units import format_length
 from .guard import HOST, REFUSED, Guard
-from .parts import Frame, Shown, Splats
-
-COLOUR = (205, 80, 60)
-"""Of surfaces."""
+from .parts import COLOUR, HALF_EDGE, Frame, Shown, Splats, legend
 
 
 def require_viser() -> Any:
@@ -27,6 +25,13 @@ def require_viser() -> Any:
     except ImportError:
         raise InputError('The live view needs viser; install it by pip install "holosplat[view]".') from None
     return viser
+
+
+LEGEND = (
+    '<div style="margin: 0 1em; font-size: 0.85em"><div style="height: 0.8em; background: linear-gradient(to right, '
+    '{colours})"></div>{said}</div>'
+)
+"""A bar of the colours of what is shown, and what they mean."""
 
 
 class LiveView:
@@ -53,7 +58,9 @@ class LiveView:
         self._server.initial_camera.position = (0.0, -6.0, -24.0)
         self._server.initial_camera.look_at = (0.0, 0.0, 0.0)
         self._words = self._server.gui.add_markdown(_escaped(title))
+        self._legend = self._server.gui.add_html("")
         self._title, self._part = title, None
+        self._scaled: Frame | None = None
         self.frame: Frame | None = None
 
     @property
@@ -88,6 +95,21 @@ class LiveView:
         if self._part is not None and self._part is not type(part):
             scene.remove_by_name("/splats" if self._part is Splats else "/object")
         self._part = type(part)
+        said, colours = legend(part)
+        self._legend.content = LEGEND.format(colours=colours, said=said)
+        if self._scaled is not self.frame:
+            self._show_scale()
+
+    def _show_scale(self) -> None:
+        """Three bars of one length along x, y and z, at the near lower left corner."""
+        assert self.frame is not None
+        self._scaled, edge = self.frame, HALF_EDGE
+        corner, length = np.array([-edge, edge, -edge]), self.frame.bar * self.frame.scale
+        ends = corner + length * np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]])
+        bars = np.stack([np.broadcast_to(corner, (3, 3)), ends], axis=1)
+        self._server.scene.add_line_segments("/scale", bars.astype(np.float32), (255, 255, 255), thickness=0.08)
+        for axis, said, end in zip("xyz", (f"x, {format_length(self.frame.bar)}", "−y", "z"), ends):
+            self._server.scene.add_label(f"/scale/{axis}", said, position=end)
 
     def _show_splats(self, part: Splats) -> None:
         assert self.frame is not None

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..align.geometry import Geometry
 from ..display import card, of_object
+from ..io.volumes import Contents
 from ..methods.uncertain import Determined, placed
 from ..motion.elastic import Rest
 from ..optics.background import LightOptions
@@ -55,6 +56,11 @@ class Reconstruction:
     geometry: Geometry | None = None
     still: np.ndarray | None = None
     rest: Rest | None = None
+
+    @property
+    def contents(self) -> Contents:
+        """What files of its volume hold: δ only where it is told."""
+        return Contents.of(self.delta_told, self.energy_kev)
 
     def _repr_html_(self) -> str:
         """What Jupyter shows: what was decided and found, and the object."""

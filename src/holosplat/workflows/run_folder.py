@@ -11,10 +11,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from ..checks import as_written, require, require_regular
 from ..display import card, of_object
@@ -23,12 +22,13 @@ from ..io.folder import require_new, require_parent
 from ..io.json import read_json, write_json
 from ..io.lock import sole_writer
 from ..io.marks import read_marks
-from ..io.objects import read_object
 from ..io.provenance import sha256
 from ..ranges import require_plausible
-from ..representations import Stored
 from .binding import CONFIG_SUM, RUN, config_sum, require_bound
 from .manifest import write_manifest
+
+if TYPE_CHECKING:
+    from ..representations import Stored
 
 OBJECT_SUM = "object_sha256"
 """The entry of summary.json that says what the object's file was."""
@@ -59,6 +59,8 @@ class RunFolder:
             return card("RunFolder", rows | {"state": "begun" if self.config.is_file() else "empty"})
         summary = self.read_summary()
         rows |= {name: str(summary[name]) for name in ("method", "kind", "finished") if name in summary}
+        from ..io.objects import read_object
+
         return card("RunFolder", rows | {"report": str(self.report)}) + "<br/>" + of_object(read_object(self.result()))
 
     def require_new(self, advise_resume: bool = False) -> None:
@@ -93,6 +95,8 @@ class RunFolder:
 
     def read_result(self) -> Stored:
         """The object; `InputError` if it is not that of summary.json, which is written after it."""
+        from ..io.objects import read_object
+
         found, said = read_object(self.result()), self.read_summary().get(OBJECT_SUM)
         require(
             said is None or not self.object.is_file() or said == sha256(self.object),
@@ -179,6 +183,8 @@ class RunFolder:
 
     def save_checkpoint(self, state: dict[str, Any]) -> None:
         """Replace checkpoint.pt; the one before is kept beside it."""
+        import torch
+
         content = io.BytesIO()
         torch.save(self.marks() | {"state": _in_main_memory(state)}, content)
         with atomic_path(self.checkpoint) as temporary:
@@ -251,6 +257,8 @@ def _with_tables(path: Path, names: tuple[str, ...]) -> dict[str, Any]:
 
 def checkpoint_state(path: Path) -> dict[str, Any] | None:
     """What a checkpoint holds; None if it is damaged, by the checksums of its parts or else."""
+    import torch
+
     try:
         with zipfile.ZipFile(path) as archive:
             if archive.testzip() is not None:
@@ -273,6 +281,8 @@ def _is_whole(row: dict[str, Any]) -> bool:
 
 def _in_main_memory(state: Any) -> Any:
     """The same dictionaries, lists and tuples with tensors in main memory, for machines without the device."""
+    import torch
+
     if isinstance(state, torch.Tensor):
         return state.cpu()
     if isinstance(state, dict):

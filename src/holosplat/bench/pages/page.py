@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import base64
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from ...report.page import template
+from ...report.tables import Headline
 
 SPECIAL = re.compile(r"([\\`*_<>|\[\]~])")
 """Characters that Markdown would not leave as they are."""
@@ -33,16 +33,12 @@ class ScoreTable:
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture beside the page: its PNG file, title and caption."""
+    """A picture: its PNG file beside the page, title and caption, and itself as a `data:` URI."""
 
     path: Path
     title: str
     caption: str
-
-    @property
-    def data_uri(self) -> str:
-        """The file as a `data:` URI."""
-        return f"data:image/png;base64,{base64.b64encode(self.path.read_bytes()).decode()}"
+    image: str
 
 
 @dataclass(frozen=True)
@@ -62,20 +58,24 @@ class Page:
     """The whole page."""
 
     title: str
-    verdict: str
+    headline: Headline
     summary: str
     sheets: Sequence[Sheet]
 
 
 def as_html(page: Page) -> str:
     """The page as one self-contained file."""
-    values = {"title": page.title, "verdict": page.verdict, "summary": page.summary, "sheets": page.sheets}
+    values = {"title": page.title, "headline": page.headline, "summary": page.summary, "sheets": page.sheets}
     return template("bench.html", __package__ or "").render(key_figures=(), blocks=(), scores=(), records=(), **values)
 
 
 def as_markdown(page: Page, root: Path) -> str:
     """The page as Markdown, with links to its pictures relative to the folder `root`."""
-    parts = [f"# {escaped(page.title)}", escaped(page.verdict), escaped(page.summary)]
+    parts = [
+        f"# {escaped(page.title)}",
+        *map(escaped, (page.headline.text, *page.headline.words)),
+        escaped(page.summary),
+    ]
     number = 0
     for sheet in page.sheets:
         parts.append(f"## {escaped(sheet.heading)}")

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from ...checks import require
 from ...io.atomic import atomic_path
-from ...report.style import DPI, styled
+from ...report.style import DPI, data_uri, styled
 from ..folder import BenchFolder
 from ..pictures import TRUTH
 from ..rows import Row
@@ -18,7 +18,7 @@ from .page import Page, Picture, Sheet, as_html, as_markdown
 from .pictures import Shown, holograms_figure, slices_figure
 from .plots import SMALLEST, Marks, curves_figure, overview_figure, sizes_figure, tradeoff_figure
 from .results import HEADLINE, CaseResult, MethodResult, read_results
-from .text import beaten_table, case_facts, case_table, failures, protocol_sheet, summary_table, verdict, wins_table
+from .text import beaten_table, case_facts, case_table, failures, headline, protocol_sheet, summary_table, wins_table
 
 DOWN = "All axes are logarithmic, and better is further down and to the left."
 
@@ -33,7 +33,7 @@ def write_bench_report(folder: BenchFolder) -> tuple[Path, Path]:
     rows = [row for case in cases for method in (*case.references, *case.methods) for row in method.rows.values()]
     sheets = [_summary_sheet(folder, cases, marks)]
     sheets += [_case_sheet(folder, case, marks) for case in cases]
-    page = Page("Benchmark", verdict(cases), _said(rows), [*sheets, protocol_sheet(cases, rows)])
+    page = Page("Benchmark", headline(cases), _said(rows), [*sheets, protocol_sheet(cases, rows)])
     for path, text in ((folder.html, as_html(page)), (folder.markdown, as_markdown(page, folder.path))):
         with atomic_path(path) as temporary:
             temporary.write_text(text, encoding="utf-8")
@@ -149,4 +149,4 @@ def _saved(folder: BenchFolder, name: str, figure: Figure, title: str, caption: 
     path = folder.images / f"{name}.png"
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=DPI, metadata={"Software": None})
-    return Picture(path, title, caption)
+    return Picture(path, title, caption, data_uri(figure))

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from ...report.style import format_length, scientific
-from ...report.tables import duration
+from ...report.tables import Headline, duration
 from ..rows import Row
 from .page import Entry, ScoreTable, Sheet
 from .results import HEADLINE, MEASURES, OURS, Beaten, CaseResult, Measure, MethodResult, beaten
@@ -31,6 +31,16 @@ PROTOCOL = (
     "from thickness without any error of retrieval.",
 )
 """How the numbers came about, in two paragraphs."""
+
+
+def headline(cases: Sequence[CaseResult]) -> Headline:
+    """How often ours is behind, in one line, with the sentences that carry it."""
+    shared = [case for case in cases if case.method(OURS) is not None]
+    lost = sum(bool(beaten(case, measure)) for case in shared for measure in HEADLINE)
+    text = (
+        f"{OURS} is ahead or equal in {len(shared) * len(HEADLINE) - lost} of {len(shared) * len(HEADLINE)} comparisons"
+    )
+    return Headline(text if shared else f"A comparison without {OURS}", None, (verdict(cases),))
 
 
 def verdict(cases: Sequence[CaseResult]) -> str:

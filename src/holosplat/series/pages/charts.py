@@ -9,8 +9,11 @@ from html import escape
 
 from markupsafe import Markup
 
+from ...report.style import superscript
+from ...units import plain
+
 WIDTH, HEIGHT = 460, 190
-LEFT, RIGHT, TOP, BOTTOM = 62, 10, 12, 26
+LEFT, RIGHT, TOP, BOTTOM = 76, 10, 12, 26
 """The sheet, and what labels take of it [px]."""
 MOST_LABELS = 5
 
@@ -39,9 +42,11 @@ def chart(points: Sequence[Point], title: str, floor: float | None = None) -> Ma
     across = _scale(seen[0].x, max(seen[-1].x, seen[0].x + 1), LEFT, WIDTH - RIGHT)
     up = _scale(low, high, HEIGHT - BOTTOM, TOP)
     parts = [f'<line class="grid" x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{up(y):.1f}" y2="{up(y):.1f}"/>' for y in ys]
-    parts += [f'<text x="{LEFT - 6}" y="{up(y) + 4:.1f}" text-anchor="end">{_text(y)}</text>' for y in ys]
     parts += [
-        f'<text x="{across(x):.1f}" y="{HEIGHT - 8}" text-anchor="middle">{_text(x)}</text>'
+        f'<text x="{LEFT - 6}" y="{up(y) + 4:.1f}" text-anchor="end">{text}</text>' for y, text in zip(ys, _texts(ys))
+    ]
+    parts += [
+        f'<text x="{across(x):.1f}" y="{HEIGHT - 8}" text-anchor="middle">{_texts([x])[0]}</text>'
         for x in xs
         if x == round(x)
     ]
@@ -78,10 +83,18 @@ def _scale(low: float, high: float, first: float, last: float) -> Callable[[floa
     return lambda value: first + (last - first) * (value - low) / (high - low)
 
 
-def _text(value: float) -> str:
-    """A number of an axis: 5.8e-22 → 5.8 × 10⁻²²."""
+def _texts(values: Sequence[float]) -> list[str]:
+    """The numbers of an axis, with as many digits as tell them apart."""
+    for digits in range(4, 16):
+        texts = [_text(value, digits) for value in values]
+        if len(set(texts)) == len(set(values)):
+            break
+    return texts
+
+
+def _text(value: float, digits: int) -> str:
+    """A number of an axis: 5.8e-22 → 5.8·10⁻²²."""
     if value == 0 or 1e-3 <= abs(value) < 1e5:
-        return f"{value:.4g}".replace("-", "−")
-    mantissa, exponent = f"{value:.3e}".split("e")
-    mantissa = f"{float(mantissa):g}"
-    return f"{mantissa}e{int(exponent)}".replace("-", "−")
+        return plain(value, digits).replace("-", "−")
+    mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
+    return f"{float(mantissa):.{digits}g}·10{superscript(int(exponent))}".replace("-", "−")

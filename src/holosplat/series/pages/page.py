@@ -7,6 +7,7 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from markupsafe import Markup
@@ -16,9 +17,14 @@ from ...checks import InputError, require, require_regular
 from ...io.atomic import atomic_path
 from ...io.guard import read_array
 from ...report.page import template
-from ...report.style import scientific
+from ...report.style import bar_length, format_length, in_print, scientific
+from ...report.tables import Headline
 from ...units import in_percent, two_digits
+from ...workflows.next_step import next_step
+from ...workflows.run_folder import RunFolder
+from ...workflows.verdict import Verdict
 from ..rows import Row
+from ..words import plain, some
 from .charts import Point, chart
 
 MOST_PICTURES = 160
@@ -45,7 +51,7 @@ class SeriesPage:
     never."""
 
     title: str
-    verdict: str
+    headline: Headline
     summary: str
     frames: tuple[Frame, ...]
     failed: Mapping[str, str] = field(default_factory=dict)
@@ -64,7 +70,10 @@ def render_page(page: SeriesPage) -> str:
     """The page as HTML."""
     shown = [page.frames[i] for i in _evenly(len(page.frames))]
     kept, unread = _maps(shown)
+    told = not any(frame.row.quantity == "β" for frame in shown)
+    kept = kept if told else [(frame, -2 * phase) for frame, phase in kept]  # -k∫β, which stands for the phase then
     low, high = _limits([phase for _, phase in kept])
+    ends = [f"{value + 0.0:.3g}{' rad' * told}".replace("-", "−") for value in (low, high)]  # −0 is 0
     pictures = [
         {
             "number": frame.row.number,
@@ -73,21 +82,56 @@ def render_page(page: SeriesPage) -> str:
         }
         for frame, phase in kept
     ]
-    return template(
-        "series.html", __package__ or ""
-    ).render(
+    return template("series.html", __package__ or "").render(
         title=page.title,
-        verdict=page.verdict,
+        headline=page.headline,
         summary=page.summary,
         key_figures=key_figures(page.frames),
         pictures=pictures,
-        limits=f"{low + 0.0:.3g} to {high + 0.0:.3g} rad".replace("-", "−"),  # −0 is 0
+        told=told,
+        ends=ends if abs(high) > abs(low) else ends[::-1],
+        colours=[f"rgb{anchor}" for anchor in ANCHORS],
+        bar=_scale_bar(kept[-1][0]) if kept else None,
         charts=_charts(page.frames),
         rows=[_cells(frame) for frame in page.frames[-MOST_ROWS:]],
         failed=page.failed,
         notes=(*page.notes, *unread),
         refresh=int(1000 * page.refresh),
     )
+
+
+def headline(state: str, frames: Sequence[Frame]) -> Headline:
+    """Whether the frames of all times are explained, and else why not and what to try next; `state`: what is done."""
+    bad = [frame for frame in frames if frame.row.good is False]
+    if not bad:
+        return Headline(state, True if any(frame.row.good for frame in frames) else None, ())
+    numbers = some([frame.row.number for frame in bad])
+    said = f"The frames of {len(bad)} are not explained: {numbers}."
+    text = f"Do not trust {len(bad)} of {len(frames)} times: their frames are not explained"
+    verdict = _summary(bad[0]).get("verdict")
+    first = f"Time {bad[0].row.number}: {in_print(bad[0].row.words)}"
+    if not verdict:
+        return Headline(text, False, (state, said, first))
+    found = Verdict.from_dict(verdict)
+    why = tuple(in_print(reason) for reason in found.reasons)
+    return Headline(text, False, (state, said, first, *why), next_step(found.cause, plain(bad[0].row.scan)))
+
+
+def _summary(frame: Frame) -> dict[str, Any]:
+    """What summary.json of the run of a time says; empty where there is none."""
+    try:
+        return RunFolder(frame.phase.parent).read_summary()
+    except (InputError, OSError):
+        return {}
+
+
+def _scale_bar(frame: Frame) -> tuple[float, str] | None:
+    """Per cent of the width of a picture, and the length that it stands for."""
+    detector = _summary(frame).get("detector")
+    if not detector:
+        return None
+    width = detector["columns"] * detector["pixel_size_m"]
+    return 100 * bar_length(width) / width, format_length(bar_length(width))
 
 
 def key_figures(frames: Sequence[Frame]) -> list[tuple[str, str, str]]:
