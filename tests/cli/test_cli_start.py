@@ -90,7 +90,7 @@ def test_python_runs_the_package():
 def test_without_torch_one_sentence_says_how_to_get_it(broken, tmp_path):
     """Whether it is missing or fails to load."""
     (tmp_path / "torch.py").write_text(broken + "\n")
-    command = [sys.executable, "-m", "holosplat", "materials"]
+    command = [sys.executable, "-m", "holosplat", "backends"]
     done = subprocess.run(command, env=os.environ | {"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True)
     assert done.returncode == 2
     assert done.stderr.startswith("holosplat: the package torch must be installed and load, but it does not")
