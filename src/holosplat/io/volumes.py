@@ -32,12 +32,12 @@ SLAB_VOXELS = 1 << 22
 class Contents:
     """What the two arrays of a volume file are: δ and β, or, where δ is not known, µ and β. mu_per_beta: µ/β [1/m]."""
 
-    mu_per_beta: float | None = None
+    mu_per_beta: float | None
 
     @classmethod
     def of(cls, delta_told: bool, energy_kev: float) -> Contents:
         """δ and β where δ is told; else β, and the attenuation coefficient µ = 2kβ at `energy_kev` [keV]."""
-        return cls() if delta_told else cls(2 * float(wavenumber(energy_kev)))
+        return cls(None) if delta_told else cls(2 * float(wavenumber(energy_kev)))
 
     @property
     def units(self) -> dict[str, str]:
@@ -55,7 +55,7 @@ class Contents:
         return dict(zip(self.units, (first, matter.beta)))
 
 
-REFRACTION, ABSORPTION = Contents(), Contents.of(False, 1.0)
+REFRACTION, ABSORPTION = Contents(None), Contents.of(False, 1.0)
 """The latter at any energy, for its names and units."""
 
 
