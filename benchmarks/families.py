@@ -39,7 +39,7 @@ from rows import machine, read, replaced, shown
 
 import holosplat as hs
 from holosplat.matter import MatterKind
-from holosplat.methods import Auto, sharp_level
+from holosplat.methods import Auto
 from holosplat.methods.illumination import NULL, STAGE, prepared
 from holosplat.methods.levels import CONTINUOUS, NAME
 
@@ -68,8 +68,6 @@ METHOD = replace(
     volume=replace(USUAL.volume, rounds=1),
 )
 """The default with a fifth of the steps and Gaussians, no turns; it decides as usual."""
-LEVEL_EDGE = 32
-"""Voxels along an edge of the volume by which a level is found, instead of 96: that would take most of the time."""
 WANTED = {"median regret": 0.05, "worst regret": 0.5, "worst against null": 0.1}
 
 
@@ -289,7 +287,6 @@ def main() -> None:
     parser.add_argument("--summary", action="store_true", help="print the tables, and make no rows")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    sharp_level.EDGE = LEVEL_EDGE
     for seed in () if options.summary else options.seeds:
         for alone in (True, False):  # all families beside the null first, then beside the rest
             for name in options.family:
