@@ -100,6 +100,8 @@ def test_flux_is_told_from_noise_of_means():
     assert float((found.factor() / flux).std()) < 1e-3
     assert float(found.variances[0]) ** 0.5 == pytest.approx(float(flux.log().std()), rel=0.1)
     assert found.size_of_doubt == pytest.approx(float(flux.log().std()) / 7**0.5, rel=0.1)
+    draws = (Background.of_flux(true + 0.01 * torch.randn(true.shape, generator=draw), true) for _ in range(40))
+    assert 10 < sum(bool((one.factor() == 1).all()) for one in draws) < 30  # of equal flux, half of all draws
     assert bool((Background.of_flux(true, true).factor() == 1).all())
     assert bool((Background.of_flux(true[:1], 1.1 * true[:1]).factor() == 1).all())
 

@@ -111,6 +111,18 @@ def test_fits_decide_where_flat_volumes_do_not(sharp):
         assert (found.choice, found.by) == (choice, "views set aside, by fits")
 
 
+def test_fits_alone_overturn_a_known_material(soft):
+    """Of a soft cell, flat volumes say that it is continuous; where fits of both kinds are alike, its levels stand."""
+    task = Task(soft, MaterialPrior.known(MATERIAL))
+    assert decide_matter(task).choice == CONTINUOUS
+    grid = Grid.of_views(soft.views)
+    ones = torch.ones((1, *grid.shape))
+    near, far = (Answer(VoxelGrid(share * ones, grid, Matter.one(*MATERIAL))) for share in (0.0, 1.0))
+    for levels, continuous, choice in ((near, near, "one level"), (far, near, CONTINUOUS), (near, far, "one level")):
+        found = decide_matter(task, {"levels": levels, "continuous": continuous})
+        assert (found.choice, found.by) == (choice, "views set aside, by fits")
+
+
 def test_too_few_views_are_said(sharp):
     assert "too few views" in decide_matter(Task(sharp[[0, 4]], RATIO)).by
 

@@ -205,7 +205,7 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
         one
         for one, free in (
             ("fixed pattern", options.still == "auto" and options.kind != "even" and not still_order(method)),
-            (FLUX, options.kind == "auto"),
+            (FLUX, options.kind == "auto" and not task.scan.is_series),  # several times have no one volume
             (UNEVEN, options.kind == "auto"),
             ("correlated noise", options.noise == "auto"),
         )
