@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from decimal import ROUND_HALF_UP, Decimal
 from pathlib import Path
 
-from holosplat.bench.case import case_names
-from holosplat.bench.references import REFERENCES
+from holosplat_bench.suite.case import case_names
+from holosplat_bench.suite.references import REFERENCES
 
 DATA = Path(__file__).parent / "data"
 Row = dict[str, str]

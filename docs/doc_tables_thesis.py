@@ -12,10 +12,10 @@ import numpy as np
 from doc_tables_runs import script
 
 from holosplat.report.style import scientific
-from holosplat.thesis.configurations import EVERY, PACES, THESIS_TABLE
-from holosplat.thesis.findings import findings
-from holosplat.thesis.folder import CURVES, Study
-from holosplat.thesis.pages.page import markdown_table
+from holosplat_bench.thesis.configurations import EVERY, PACES, THESIS_TABLE
+from holosplat_bench.thesis.findings import findings
+from holosplat_bench.thesis.folder import CURVES, Study
+from holosplat_bench.thesis.pages.page import markdown_table
 
 DATA = Path(__file__).resolve().parent / "data" / "thesis_study"
 SCHEDULES = {"short": "3 000 steps", "third": "10 000 steps", "full": "30 000 steps"}

@@ -15,8 +15,8 @@ from pathlib import Path
 from drawing import in_few_colours
 from figures import changed
 
-from holosplat.bench.folder import BenchFolder
-from holosplat.bench.rows import Row, read_row
+from holosplat_bench.suite.folder import BenchFolder
+from holosplat_bench.suite.rows import Row, read_row
 
 DOCS = Path(__file__).parent
 PICTURES = {

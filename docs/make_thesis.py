@@ -9,7 +9,7 @@ from doc_tables_thesis import DATA, SCHEDULES, read_rows, studies
 from matplotlib.figure import Figure
 
 from holosplat.report.style import CYCLE, FAINT, WIDTH, letter, new_figure, styled
-from holosplat.thesis.pages.figures import pictures, save
+from holosplat_bench.thesis.pages.figures import pictures, save
 
 IMAGES = Path(__file__).resolve().parent / "images"
 CELL_PX = 7.8

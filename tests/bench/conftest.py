@@ -11,7 +11,7 @@ import holosplat as hs
 from helpers.bench_shop import Recorder
 from helpers.contract import PHOTOGRAPHS, two_balls
 from helpers.once import Once, once
-from holosplat.bench.methods import METHODS
+from holosplat_bench.suite.methods import METHODS
 
 
 @pytest.fixture

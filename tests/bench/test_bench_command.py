@@ -11,9 +11,9 @@ import holosplat as hs
 from helpers.bench_shop import SHAPES, Recorder, fail, make_case, suite
 from helpers.cli import holosplat as run_command
 from holosplat import version
-from holosplat.bench.folder import BenchFolder
-from holosplat.bench.measured import MEASURED
-from holosplat.bench.run import chosen, run_suite
+from holosplat_bench.suite.folder import BenchFolder
+from holosplat_bench.suite.measured import MEASURED
+from holosplat_bench.suite.run import chosen, run_suite
 
 pytestmark = pytest.mark.usefixtures("unjudged_runs")
 

@@ -13,15 +13,15 @@ from scipy.spatial.transform import Rotation
 import holosplat as hs
 from helpers.bench_shop import MATERIAL, PITCH
 from holosplat.align.gauge import moved_onto
+from holosplat.beamline.declared.case import Case
 from holosplat.beamline.misalignment import Misalignment
-from holosplat.bench.aligners import by_mass, by_reprojection
-from holosplat.bench.case import Case
-from holosplat.bench.methods import ALIGNED, METHODS
-from holosplat.bench.moved import Move, judged_with
-from holosplat.bench.prepare import described, fingerprint
 from holosplat.matter import Matter
 from holosplat.representations.voxels import VoxelGrid
 from holosplat.specimens.red_cells import icosphere
+from holosplat_bench.suite.aligners import by_mass, by_reprojection
+from holosplat_bench.suite.methods import ALIGNED, METHODS
+from holosplat_bench.suite.moved import Move, judged_with
+from holosplat_bench.suite.prepare import described, fingerprint
 
 pytestmark = pytest.mark.usefixtures("unjudged_runs")
 

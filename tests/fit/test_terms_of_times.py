@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from holosplat.checks import InputError
-from holosplat.fit.terms.times import DrawnTimes, one_after_another, space_time_variation
+from holosplat_bench.opponents.moving.times import DrawnTimes, one_after_another, space_time_variation
 
 
 def random(*shape: int) -> torch.Tensor:

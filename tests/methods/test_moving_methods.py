@@ -14,13 +14,20 @@ from helpers.unjudged import unjudged
 from holosplat.baselines import HolographicTV
 from holosplat.checks import InputError
 from holosplat.fit.schedule import Schedule
-from holosplat.fit.terms.times import DrawnTimes
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.mesh import TriangleMesh
 from holosplat.methods import HolographicVoxels, Method, Pinn, Task, VoxelFit, Voxels, solve
 from holosplat.methods.ground import ground
-from holosplat.methods.moving import (
+from holosplat.representations import VoxelGrid
+from holosplat.scan import Exposures, Scan
+from holosplat.specimens.mesh_series import MeshSeries
+from holosplat.specimens.red_cells import icosphere
+from holosplat.specimens.scene import MeshScene
+from holosplat.volume import Object
+from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
+from holosplat.workflows.run_folder import RunFolder
+from holosplat_bench.opponents.moving import (
     Deformed,
     EachTime,
     HexPlane,
@@ -30,15 +37,11 @@ from holosplat.methods.moving import (
     TimesFit,
     each_time,
 )
-from holosplat.methods.moving.through_waves import spectral_objective, weight_of
-from holosplat.representations import Deformation, HexPlanes, OnVoxels, VoxelGrid
-from holosplat.scan import Exposures, Scan
-from holosplat.specimens.mesh_series import MeshSeries
-from holosplat.specimens.red_cells import icosphere
-from holosplat.specimens.scene import MeshScene
-from holosplat.volume import Object
-from holosplat.workflows.reconstruct import load_reconstruction, reconstruct
-from holosplat.workflows.run_folder import RunFolder
+from holosplat_bench.opponents.moving.deformed_voxels import Deformation
+from holosplat_bench.opponents.moving.hexplane_field import HexPlanes
+from holosplat_bench.opponents.moving.moving_voxels import OnVoxels
+from holosplat_bench.opponents.moving.through_waves import spectral_objective, weight_of
+from holosplat_bench.opponents.moving.times import DrawnTimes
 
 PIXEL, SHAPE = 1e-6, (21, 17)
 MATTER = DeltaBeta(8e-7, 8e-10)

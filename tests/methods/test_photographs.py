@@ -14,9 +14,9 @@ from holosplat.fit.causes import scores
 from holosplat.fit.residuals import Prediction, residuals
 from holosplat.matter import Matter
 from holosplat.methods import Task
-from holosplat.methods.photographs import AlphaRates, AlphaSplats, ReadDelta
 from holosplat.optics.retrieval import paganin
-from holosplat.representations import AlphaCloud
+from holosplat_bench.opponents.photographed import AlphaCloud
+from holosplat_bench.opponents.photographs import AlphaRates, AlphaSplats, ReadDelta
 
 
 @pytest.fixture(scope="module")

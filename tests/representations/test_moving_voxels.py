@@ -12,18 +12,9 @@ from torch import Tensor
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.matter import Matter
-from holosplat.representations import (
-    Deformation,
-    DeformedVoxels,
-    HexPlaneField,
-    HexPlanes,
-    LowRankVoxels,
-    OnVoxels,
-    VoxelSeries,
-)
-from holosplat.representations.deformed_voxels import NETWORK
-from holosplat.representations.hexplane import PAIRS, TIME_PLANES, hats
-from holosplat.representations.moving_voxels import held, shares
+from holosplat_bench.opponents.moving.deformed_voxels import NETWORK, Deformation, DeformedVoxels
+from holosplat_bench.opponents.moving.hexplane_field import PAIRS, TIME_PLANES, HexPlaneField, HexPlanes, hats
+from holosplat_bench.opponents.moving.moving_voxels import LowRankVoxels, OnVoxels, VoxelSeries, held, shares
 
 PITCH = 2e-6
 GRID = Grid((5, 7, 4), (PITCH, PITCH, PITCH), (-3e-6, -6e-6, -4e-6))

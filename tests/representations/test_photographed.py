@@ -14,9 +14,10 @@ from holosplat.geometry import Grid, Poses, Views
 from holosplat.io.objects import read_object, write_object
 from holosplat.matter import Matter
 from holosplat.model import Instrument, Model
-from holosplat.representations import AlphaCloud, Encoding, GaussianCloud, Network, RadianceField
+from holosplat.representations import Encoding, GaussianCloud, Network
 from holosplat.scan import Exposures
 from holosplat.volume import Photographed
+from holosplat_bench.opponents.photographed import AlphaCloud, RadianceField
 
 PIXEL, SHAPE = 2e-6, (7, 11)
 VIEWS = Views.from_angles([0.0, 50.0, 130.0], SHAPE, PIXEL)

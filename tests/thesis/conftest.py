@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from holosplat.bench.case import Case
+from holosplat.beamline.declared.case import Case
 from holosplat.geometry import Views
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import MaterialPrior
@@ -15,8 +15,8 @@ from holosplat.mesh import TriangleMesh
 from holosplat.scan import Exposures, interleaved_split
 from holosplat.specimens.red_cells import icosphere
 from holosplat.specimens.scene import MeshScene
-from holosplat.thesis.configurations import THESIS_TABLE, Configuration
-from holosplat.thesis.measured import Measured
+from holosplat_bench.thesis.configurations import THESIS_TABLE, Configuration
+from holosplat_bench.thesis.measured import Measured
 
 
 @pytest.fixture(scope="session")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from holosplat.thesis.configurations import THESIS_TABLE
-from holosplat.thesis.findings import (
+from holosplat_bench.thesis.configurations import THESIS_TABLE
+from holosplat_bench.thesis.findings import (
     counts_follow_views,
     early_stop_helps,
     findings,
@@ -15,7 +15,7 @@ from holosplat.thesis.findings import (
     more_gaussians_hurt,
     psnr_misleads,
 )
-from holosplat.thesis.folder import CURVES, Study
+from holosplat_bench.thesis.folder import CURVES, Study
 
 LOOKS = 20
 

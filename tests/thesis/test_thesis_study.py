@@ -9,20 +9,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from holosplat.bench import case as bench_case
 from holosplat.checks import InputError
-from holosplat.cli import thesis as command
 from holosplat.fit.loop import Fit
 from holosplat.materials import HAEMOGLOBIN
-from holosplat.thesis import study as thesis_study
-from holosplat.thesis.configurations import EVERY, PACES, THESIS_TABLE, Pace
-from holosplat.thesis.findings import findings
-from holosplat.thesis.folder import CURVES, StudyFolder, load_study
-from holosplat.thesis.measured import Measured
-from holosplat.thesis.pages import page as report
-from holosplat.thesis.pages.figures import LINES, PICTURES, pictures
-from holosplat.thesis.pages.page import study_markdown, write_study
-from holosplat.thesis.study import run_study
+from holosplat_bench.cli import thesis as command
+from holosplat_bench.suite import case as bench_case
+from holosplat_bench.thesis import study as thesis_study
+from holosplat_bench.thesis.configurations import EVERY, PACES, THESIS_TABLE, Pace
+from holosplat_bench.thesis.findings import findings
+from holosplat_bench.thesis.folder import CURVES, StudyFolder, load_study
+from holosplat_bench.thesis.measured import Measured
+from holosplat_bench.thesis.pages import page as report
+from holosplat_bench.thesis.pages.figures import LINES, PICTURES, pictures
+from holosplat_bench.thesis.pages.page import study_markdown, write_study
+from holosplat_bench.thesis.study import run_study
 
 SMALL = replace(THESIS_TABLE[1], count=60, threshold=1.0, amplitude_rate=0.1)
 """Fast amplitudes, and no growth, so that 12 steps fit something."""

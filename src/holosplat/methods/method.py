@@ -18,7 +18,7 @@ from ..optics.background import Light, LightOptions
 from ..optics.noise_model import NoiseModel
 from ..optics.retrieval import absorption_alone
 from ..progress import Advance, Progress
-from ..representations import KINDS, Stored
+from ..representations import Stored
 from ..scan import Scan
 from .beginning import Beginning
 from .first_volumes import FirstVolumes
@@ -207,7 +207,7 @@ def begun(stage: Stage, task: Task, before: Stored | None) -> tuple[Stored, Task
 def finished(fit: Running) -> Stored:
     """The object that a fit ended with, where it was fitted."""
     found = fit.result().object
-    assert isinstance(found, tuple(KINDS.values()))
+    assert isinstance(found, Stored)
     return found.on(fit.backend)
 
 
