@@ -23,7 +23,7 @@ def recorder() -> Recorder:
 def _no_search_for_garbage() -> Iterator[None]:
     """The benchmark looks for garbage before each method, for its memory; here that is a third of a row."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("holosplat.bench.run.gc", SimpleNamespace(collect=lambda: None))
+        patch.setattr("holosplat_bench.suite.run.gc", SimpleNamespace(collect=lambda: None))
         yield
 
 

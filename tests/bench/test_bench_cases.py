@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from holosplat.beamline.declared.case import Case
 from holosplat.beamline.declared.declaration import declared_names
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
@@ -20,7 +19,7 @@ from holosplat.specimens.continuous import ContinuousScene
 from holosplat.specimens.phantoms import Ball
 from holosplat.specimens.scene import MeshScene
 from holosplat.tables import merged
-from holosplat_bench.suite.case import FOLDER, case_names, load_case
+from holosplat_bench.suite.case import FOLDER, Case, case_names, load_case
 
 SLOW = ("crowded12",)
 """Scenes that take seconds to make: that they follow their seed is tested on smaller ones (test_specimens_phantoms)."""

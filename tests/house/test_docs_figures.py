@@ -123,10 +123,10 @@ def test_what_is_listed(figures):
 # --- the plan of the code -----------------------------------------------------------------------------------
 
 
-def shown_rooms() -> set[str]:
-    """What the tree in docs/design/architecture.md shows of src/holosplat."""
+def shown_rooms(package: str) -> set[str]:
+    """What the tree in docs/design/architecture.md shows of a package in src."""
     text = (DOCS / "design" / "architecture.md").read_text(encoding="utf-8")
-    tree = text.split("src/holosplat/\n")[1].split("tests/")[0]
+    tree = re.split(r"^\S", text.split(f"src/{package}/")[1], flags=re.MULTILINE)[0]
     lines = [line for line in tree.splitlines() if re.match(r"  \S", line)]
     inside = [line for line in tree.splitlines() if re.match(r"    \S", line)]
     names = re.compile(r"\b([a-z_]+(?:\.py|\.toml|/))(?=\s|$)")
@@ -134,12 +134,12 @@ def shown_rooms() -> set[str]:
     return top | {f"projectors/{name}" for line in inside for name in names.findall(line)[:1]}
 
 
-def test_the_plan_shows_the_rooms_that_are_there():
-    package = ROOT / "src" / "holosplat"
+@pytest.mark.parametrize("package", [ROOT / "src" / "holosplat", ROOT / "src" / "holosplat_bench"])
+def test_the_plan_shows_the_rooms_that_are_there(package):
     there = {f"{p.name}/" for p in package.iterdir() if p.is_dir() and p.name != "__pycache__"}
     there |= {p.name for p in package.iterdir() if p.suffix in (".py", ".toml") and p.name != "__init__.py"}
-    there |= {f"projectors/{p.name}/" for p in (package / "projectors").iterdir() if (p / "__init__.py").exists()}
-    assert shown_rooms() == there
+    there |= {f"projectors/{path.parent.name}/" for path in package.glob("projectors/*/__init__.py")}
+    assert shown_rooms(package.name) == there
 
 
 def test_runs_of_a_seed_that_differ_by_a_scan_s_rounding_begin_alike():

@@ -29,7 +29,7 @@ def case_names() -> list[str]:
 def load_case(name: str | Path, seed: int = 0, snapshots: Path | None = None) -> Case:
     """The case called `name` with the scene and the noise of `seed`.
 
-    name: of the suite (`case_names`), or a TOML file like those in `bench/cases`, with `:variant` behind
+    name: of the suite (`case_names`), or a TOML file like those in `suite/cases`, with `:variant` behind
     it where it declares several; snapshots: folder of simulated red cells, `*_000.vtk` … (µm), which cases that have
     `[with_snapshots]` then show; the others are what they are without. `InputError` says what is wrong with a file, and
     where the scene is larger than the field of view.

@@ -177,7 +177,7 @@ def test_without_maps_there_are_fewer_pictures(study_of_all):
 
 def test_the_command_runs_and_reports(measured, tmp_path, monkeypatch, few, capsys):
     asked, reported = [], []
-    monkeypatch.setattr("holosplat.thesis.configurations.EVERY", few)
+    monkeypatch.setattr("holosplat_bench.thesis.configurations.EVERY", few)
     monkeypatch.setattr(bench_case, "load_case", lambda *wanted: asked.append(wanted) or measured, raising=False)
     monkeypatch.setattr(Measured, "of", lambda case, physics: asked.append(physics) or case)
     monkeypatch.setattr(report, "write_study", lambda study, path: reported.append(list(study.rows)) or [path])
@@ -190,7 +190,7 @@ def test_the_command_runs_and_reports(measured, tmp_path, monkeypatch, few, caps
     def interrupt(*wanted):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("holosplat.thesis.study.run_study", interrupt)
+    monkeypatch.setattr("holosplat_bench.thesis.study.run_study", interrupt)
     with pytest.raises(SystemExit) as left:
         command.thesis(tmp_path / "study", seed=5)
     assert left.value.code == 130
