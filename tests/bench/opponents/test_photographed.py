@@ -14,9 +14,8 @@ from holosplat.geometry import Grid, Poses, Views
 from holosplat.io.objects import read_object, write_object
 from holosplat.matter import Matter
 from holosplat.model import Instrument, Model
-from holosplat.representations import Encoding, GaussianCloud, Network
+from holosplat.representations import Encoding, Network, random_cloud
 from holosplat.scan import Exposures
-from holosplat.volume import Photographed
 from holosplat_bench.opponents.photographed import AlphaCloud, RadianceField
 
 PIXEL, SHAPE = 2e-6, (7, 11)
@@ -66,15 +65,15 @@ def test_files_hold_them(make, tmp_path: Path):
 def test_frames_of_a_model_are_photographs(make):
     """Wherever the detector is and whatever it blurs; on pixels of another size, those of the same lengths."""
     seen = make()
-    assert isinstance(seen, Photographed)
     far = Exposures.of(VIEWS, 20.0, 0.3)
     index = torch.tensor([2, 0])
-    frames = Model(seen, Instrument(replace(far, psf_sigma_px=far.psf_sigma_px + 1), 2)).frames(index)
-    assert torch.equal(frames, seen.photographs(VIEWS[[2, 0]]))
+    model = Model(seen, Instrument(replace(far, psf_sigma_px=far.psf_sigma_px + 1), 2))
+    assert not model.by_waves
+    assert torch.equal(model.frames(index), seen.photographs(VIEWS[[2, 0]]))
     coarse = Views.of_pixels(VIEWS.rotations[:1], VIEWS.shifts[:1], (3, 5), 2 * PIXEL)
     uneven = Views.of_pixels(VIEWS.rotations[:2], VIEWS.shifts[:2], (3, 5), PIXEL * torch.tensor([2.0, 1.0]).numpy())
     assert torch.allclose(seen.photographs(uneven)[0], seen.photographs(coarse)[0], atol=1e-5)
-    assert not hasattr(GaussianCloud, "photographs")
+    assert replace(model, object=random_cloud(5, VIEWS, MATTER, 0.1, 0)).by_waves
 
 
 def test_an_even_field_is_an_even_slab():
