@@ -5,13 +5,13 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from doc_tables_thesis import DATA, SCHEDULES, read_rows, studies
 from matplotlib.figure import Figure
+from tables.thesis import DATA, SCHEDULES, read_rows, studies
 
 from holosplat.report.style import CYCLE, FAINT, WIDTH, letter, new_figure, styled
 from holosplat_bench.thesis.pages.figures import pictures, save
 
-IMAGES = Path(__file__).resolve().parent / "images"
+IMAGES = Path(__file__).resolve().parents[1] / "images"
 CELL_PX = 7.8
 """Width of a cell of the case [pixels]."""
 
@@ -51,7 +51,3 @@ def main() -> None:
             name = picture.file.replace("thesis_", f"thesis_{schedule}_")
             assert study is not None
             save(picture.draw(study), IMAGES / name)
-
-
-if __name__ == "__main__":
-    main()

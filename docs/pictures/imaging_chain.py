@@ -1,4 +1,4 @@
-"""The pictures and the table of docs/imaging_chain.md: `python docs/make_imaging_chain.py WORK [--preset default]`.
+"""The pictures and the table of docs/imaging_chain.md: `python docs/figures.py imaging-chain WORK`.
 
 8 generated red cells of 8 µm, 64 × 64 pixels of 0.5 µm, 20 keV, 10 cm, 16 views, 4 of them held out (seed 2). Each case
 spoils the scan in one way, reconstructs it with the haemoglobin known, and is judged on the noise-free held-out frames
@@ -7,7 +7,6 @@ and on the true volume. What is reconstructed already lies in WORK and is not do
 
 from __future__ import annotations
 
-import argparse
 import csv
 import json
 import time
@@ -33,7 +32,7 @@ from holosplat.optics.illumination import Illumination
 from holosplat.report.style import PanelGrid, image_panel, letter, scale_bar, styled
 from holosplat.workflows.correct import CorrectionOptions, correct
 
-DOCS = Path(__file__).parent
+DOCS = Path(__file__).parents[1]
 SIDE, PIXEL, ENERGY, DISTANCE, PSF, VIEWS, SEED = 64, 0.5e-6, 20.0, 0.1, 0.3, 16, 2
 SOURCE = 200e-6, 30.0
 """Standard deviation of the source [m], and its distance [m]: it blurs by 1.3 pixels."""
@@ -256,11 +255,3 @@ def main(work: Path, preset: str = "default") -> None:
             table.writerow((name, preset, *(f"{scores[score]:.4f}" for score in SCORES)))
             print(f"| {name} |", " | ".join(f"{scores[score]:.3f}" for score in SCORES), "|", flush=True)
     slices_picture(work, preset)
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser()
-    parser.add_argument("work", type=Path)
-    parser.add_argument("--preset", default="default")
-    options = parser.parse_args()
-    main(options.work, options.preset)

@@ -10,7 +10,7 @@ import csv
 from collections.abc import Callable
 from functools import partial
 
-from doc_tables import DATA, markdown
+from .benchmark import DATA, markdown
 
 TUNE = "python benchmarks/tune_tomography.py"
 FIELDS = "python benchmarks/tune_fields.py --options noise_weight"

@@ -5,15 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import doc_tables as benchmark
-import doc_tables_alignment as alignment
-import doc_tables_learning as learning
-import doc_tables_measured as measured
-import doc_tables_motion as motion
-import doc_tables_moving as moving
-import doc_tables_printed as printed
-import doc_tables_runs as runs
-import doc_tables_thesis as thesis
+from . import alignment, benchmark, learning, measured, motion, moving, printed, runs, thesis
 
 
 @dataclass(frozen=True)
@@ -26,7 +18,7 @@ class Table:
     takes: str
 
 
-BENCH = "holosplat bench run --out bench --snapshots DIR --seeds 101 102, then python docs/make_benchmark.py bench"
+BENCH = "holosplat bench run --out bench --snapshots DIR --seeds 101 102, then python docs/figures.py benchmark bench"
 TABLES = {
     "standing": Table(benchmark.standing, ("benchmark.csv",), BENCH, "a day"),
     "overview": Table(
@@ -58,7 +50,7 @@ TABLES = {
         benchmark.photographs,
         ("photographs.csv", "benchmark.csv"),
         "holosplat bench run --cases cells12 cells4 --methods alpha-3dgs nerf --seeds 101 --snapshots DIR --out bench, "
-        "then python docs/make_benchmark.py bench docs/data/photographs.csv",
+        "then python docs/figures.py benchmark-rows bench docs/data/photographs.csv",
         "ten minutes",
     ),
     "misaligned": Table(
@@ -86,10 +78,10 @@ TABLES = {
     ),
     "verdicts": Table(runs.verdicts, ("verdicts.csv",), "python benchmarks/verdicts.py", "ten minutes"),
     "imaging-chain": Table(
-        runs.imaging_chain, ("imaging_chain.csv",), "python docs/make_imaging_chain.py WORK", "ten minutes"
+        runs.imaging_chain, ("imaging_chain.csv",), "python docs/figures.py imaging-chain WORK", "ten minutes"
     ),
     "imperfections": Table(
-        runs.imperfections, ("simulation_imperfections.csv",), "python docs/make_simulation.py", "minutes"
+        runs.imperfections, ("simulation_imperfections.csv",), "python docs/figures.py simulation", "minutes"
     ),
     "few-photons": Table(runs.few_photons, ("few_photons.csv",), "python benchmarks/few_photons.py", "half an hour"),
     "series": Table(runs.series, ("series.csv",), "python benchmarks/series.py --csv docs/data/series.csv", "an hour"),

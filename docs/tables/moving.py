@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from doc_tables import Row, markdown, read, rounded
+from .benchmark import Row, markdown, read, rounded
 
 WAYS = {
     "each-tv": "each time by itself, total variation",

@@ -1,4 +1,4 @@
-"""The picture of export.md, "Compact", from docs/data/compact.csv: `python docs/make_compact.py`."""
+"""The picture of export.md, "Compact", from docs/data/compact.csv: `python docs/figures.py compact`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from holosplat.report.style import CYCLE, WIDTH, letter, new_figure, styled
 
-DOCS = Path(__file__).resolve().parent
+DOCS = Path(__file__).resolve().parents[1]
 KINDS = {"gaussians": "Gaussians", "surfaces": "surfaces"}
 FILES = {
     "object": ("s", "none", "as it is"),
@@ -37,7 +37,3 @@ def main() -> None:
         letter(axes, index, "")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), fontsize=6, loc="outside lower center", ncols=4)
     figure.savefig(DOCS / "images" / "compact.png", dpi=160, metadata={"Software": None})
-
-
-if __name__ == "__main__":
-    main()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from decimal import Decimal
 
-from doc_tables import Row, markdown, read, rounded
+from .benchmark import Row, markdown, read, rounded
 
 BEAMS = {"flow4": "4 over 180°", "flow3": "3 at 0°, 30°, 48°", "flow2": "2 at 0°, 90°", "flow2n": "2 at 0°, 23.8°"}
 """The cases of benchmarks/motion.py, without what their names say of the bodies, in the order of the table."""

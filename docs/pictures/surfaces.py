@@ -1,11 +1,10 @@
-"""The picture of docs/surfaces.md: `python docs/make_surfaces.py RUN TRUTH`.
+"""The picture of docs/surfaces.md: `python docs/figures.py surfaces RUN TRUTH`.
 
 RUN: run folder of the case main4, seed 101; TRUTH: its true volume (`benchmarks/surfaces.py --runs` keeps both).
 """
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import matplotlib
@@ -13,13 +12,14 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
-from drawing import in_few_colours
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 
 import holosplat as hs
 from holosplat.report.style import SIGNED_MAP
 from holosplat.report.surface import Deviation, render_surface
+
+from .drawing import in_few_colours
 
 
 def main(run: Path, truth: Path) -> None:
@@ -45,10 +45,6 @@ def main(run: Path, truth: Path) -> None:
     end = 1e6 * limit
     bar = figure.colorbar(ScalarMappable(Normalize(-end, end), SIGNED_MAP), ax=axes, shrink=0.7, pad=0.01)
     bar.set_label("outside the true surface by / µm", fontsize=9)
-    target = Path(__file__).parent / "images" / "surfaces.png"
+    target = Path(__file__).parents[1] / "images" / "surfaces.png"
     figure.savefig(target, dpi=110)
     in_few_colours(target, target, 160)
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]), Path(sys.argv[2]))

@@ -5,12 +5,10 @@ holosplat grow --cells 16 --box 80e-6 34e-6 26e-6 --flow 0.058 --snapshots 50 --
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import matplotlib
 import numpy as np
-from drawing import in_few_colours
 from matplotlib.collections import PolyCollection
 
 from holosplat.io.atomic import atomic_path
@@ -18,6 +16,8 @@ from holosplat.io.pvd import read_pvd
 from holosplat.io.vtk import read_meshes
 from holosplat.mesh import TriangleMesh
 from holosplat.report.surface import camera
+
+from .drawing import in_few_colours
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
@@ -55,10 +55,6 @@ def main(folder: Path) -> None:
     left, bottom = axes[0].get_xlim()[0] + 3, axes[0].get_ylim()[0] - 3
     axes[0].plot([left, left + BAR], [bottom, bottom], "k", lw=2, solid_capstyle="butt")
     axes[0].text(left + BAR / 2, bottom - 1, f"{BAR} µm", ha="center", va="bottom", fontsize=8)
-    with atomic_path(Path(__file__).parent / "images" / "cells.png") as temporary:
+    with atomic_path(Path(__file__).parents[1] / "images" / "cells.png") as temporary:
         figure.savefig(temporary, dpi=DPI, metadata={"Software": None})
         in_few_colours(temporary, temporary, COLOURS)
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]))

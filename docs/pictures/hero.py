@@ -1,8 +1,7 @@
-"""The pictures of README and docs, after `holosplat demo --out demo`: `python docs/make_pictures.py demo`."""
+"""The pictures of README and docs, after `holosplat demo --out demo`: `python docs/figures.py hero demo`."""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import holosplat as hs
@@ -17,10 +16,6 @@ def main(demo: Path) -> None:
     figure = hero_figure(
         held_out.frames[0], scan.views.pixel_size, found.voxelise(truth.grid), truth=truth, material=found.matter.delta
     )
-    images = Path(__file__).parent / "images"
+    images = Path(__file__).parents[1] / "images"
     images.mkdir(exist_ok=True)
     figure.savefig(images / "hero.png", dpi=160)
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from doc_tables import Row, markdown, read, rounded
+from .benchmark import Row, markdown, read, rounded
 
 STARTS = {"The run began with the": "guess", "The run began with phase": "phase", "The frames contradict": "refused"}
 STARTS |= {"The run began with red cells": "red cells"}

@@ -9,11 +9,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from doc_tables import DATA, Row, markdown, read, rounded
+from .benchmark import DATA, Row, markdown, read, rounded
 
 BEFORE_TURNS = "755086a0cc"
 """The commit of the rows of few_photons.csv to compare with."""
-BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
+BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 
 
 def script(name: str) -> ModuleType:

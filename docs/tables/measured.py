@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from doc_tables import markdown, read, rounded
+from .benchmark import markdown, read, rounded
 
 Values = dict[tuple[str, str, str], str]
 """(case, method, measure) → value; the last row of a file counts."""

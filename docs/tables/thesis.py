@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from doc_tables_runs import script
 
 from holosplat.report.style import scientific
 from holosplat_bench.thesis.configurations import EVERY, PACES, THESIS_TABLE
@@ -17,7 +16,9 @@ from holosplat_bench.thesis.findings import findings
 from holosplat_bench.thesis.folder import CURVES, Study
 from holosplat_bench.thesis.pages.page import markdown_table
 
-DATA = Path(__file__).resolve().parent / "data" / "thesis_study"
+from .runs import script
+
+DATA = Path(__file__).resolve().parents[1] / "data" / "thesis_study"
 SCHEDULES = {"short": "3 000 steps", "third": "10 000 steps", "full": "30 000 steps"}
 PLAIN, MAIN = ("thesis16", "declared"), "8k-v4"
 HEAD = ("configuration", "seeds", "SSIM", "FRCM", "best FRCM (at)", "PSNR (dB)", "Dice")

@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from drawing import COMMIT
 
 import holosplat as hs
 from holosplat.beamline.misalignment import Misalignment
@@ -19,8 +18,10 @@ from holosplat.beamline.simulate import Shutter
 from holosplat.report.style import PanelGrid, image_panel, letter, scale_bar, styled
 from holosplat.specimens.mesh_series import MeshSeries
 
-IMAGES = Path(__file__).parent / "images"
-TABLE = Path(__file__).parent / "data" / "simulation_imperfections.csv"
+from .drawing import COMMIT
+
+IMAGES = Path(__file__).parents[1] / "images"
+TABLE = Path(__file__).parents[1] / "data" / "simulation_imperfections.csv"
 SCORES = ("ssim", "dice", "relative_error_delta")
 SEED, PIXEL, SHAPE = 3, 0.5e-6, (72, 72)
 SPEED = 0.05
@@ -117,7 +118,3 @@ def main() -> None:
     """Both pictures, and the table."""
     time_series()
     imperfections()
-
-
-if __name__ == "__main__":
-    main()

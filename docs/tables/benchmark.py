@@ -11,7 +11,7 @@ from pathlib import Path
 from holosplat_bench.suite.case import case_names
 from holosplat_bench.suite.references import REFERENCES
 
-DATA = Path(__file__).parent / "data"
+DATA = Path(__file__).parents[1] / "data"
 Row = dict[str, str]
 Means = dict[tuple[str, str], dict[str, float]]
 """(case, method) → numbers, means over the seeds that are done."""

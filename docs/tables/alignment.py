@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from doc_tables import markdown, read
+from .benchmark import markdown, read
 
 Row = dict[str, str]
 ERRORS = {

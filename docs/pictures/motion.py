@@ -1,9 +1,8 @@
-"""The pictures of motion.md, of a run of track: `python docs/make_motion.py RUN`. Those that stand there are of four
+"""The pictures of motion.md, of a run of track: `python docs/figures.py motion RUN`. Those that stand there are of four
 beams as benchmarks/motion.py simulates them (128 × 96 pixels)."""
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import holosplat as hs
@@ -14,7 +13,7 @@ from holosplat.report.moving_figures import shapes_figure
 from holosplat.report.run import moving_of
 from holosplat.workflows.track import read_errors
 
-IMAGES = Path(__file__).parent / "images"
+IMAGES = Path(__file__).parents[1] / "images"
 
 
 def main(path: Path) -> None:
@@ -26,7 +25,3 @@ def main(path: Path) -> None:
     assert picture is not None, "Pillow has no WebP here"
     (IMAGES / "motion.webp").write_bytes(picture)
     shapes_figure(moving).savefig(IMAGES / "motion_shapes.png", dpi=130)
-
-
-if __name__ == "__main__":
-    main(Path(sys.argv[1]))
