@@ -33,8 +33,7 @@ geometry frames divided_light scan volume mesh matter
 ← workflows planning
 ← report show training
 ← series
-← cli
-← __main__
+← cli ← __main__
 ← holosplat_bench/opponents
 ← holosplat_bench/suite
 ← holosplat_bench/thesis

@@ -88,11 +88,16 @@ class InMotion(Stored, Protocol):
         ...
 
 
-_OWN: tuple[type[Stored], ...] = (
-    *(GaussianCloud, VoxelGrid, SurfaceMesh, MovingSurfaces, MovingGaussians, NeuralField),
-    *(SpaceTimeField, PixelAlignedField),
+KINDS: Extended[type[Stored]] = Extended(
+    {
+        kind.kind: kind
+        for kind in (
+            *(GaussianCloud, VoxelGrid, SurfaceMesh, MovingSurfaces, MovingGaussians, NeuralField),
+            *(SpaceTimeField, PixelAlignedField),
+        )
+    },
+    "holosplat.kinds",
 )
-KINDS = Extended({kind.kind: kind for kind in _OWN}, "holosplat.kinds")
 """Every kind of Object that files hold, by name; other packages add theirs (docs/adding.md)."""
 
 __all__ = [
