@@ -301,8 +301,9 @@ class _Run:
 
     def _result(self, found: Stored, fit: Running | None, complete: bool) -> Reconstruction:
         exposures, best = self.task.scan.exposures, self._keeper.best if complete else None
-        samples = best.oversample if best else fit.oversample if fit else 0
-        oversample, kept = samples or fringe_sampling(exposures), best.name if best else ""
+        samples, kept = best.oversample if best else fit.oversample if fit else 0, best.name if best else ""
+        oversample = samples or fringe_sampling(exposures)
+        decisions = (*self.task.decisions, *self.start, *(self._keeper.decisions if best else ()))
         done = Reconstruction(
             found.on(in_main_memory(found.backend)),
             self.asked,
@@ -310,7 +311,7 @@ class _Run:
             oversample,
             dict(self.timing),
             complete,
-            Choice(self.task.matter, dict(self._keeper.judged), kept, decisions=(*self.task.decisions, *self.start)),
+            Choice(self.task.matter, dict(self._keeper.judged), kept, decisions=decisions),
             self.task.delta_told,
             judge_run(found, fit, self.task, oversample),
             self._total(found, fit, oversample),
