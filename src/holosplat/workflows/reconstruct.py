@@ -75,12 +75,12 @@ def reconstruct(
 ) -> Reconstruction:
     """The Object that `method` makes of the training frames of `scan`: the best of its states by these frames.
 
-    matter: whether it has levels or is continuous; None: what the frames say.
-    light: what is assumed of the light (default: even, unless air says otherwise; see `Task.evened`).
-    uncertain: distance, energy or δ/β that are known to a range (default: nothing); `constants` of the result then says
-    what the frames say of them, and `Reconstruction.placed` gives the scan that the result belongs to.
-    refine: where frames are is found, too, those for training before the matter, held-out ones beside the finished
-    matter (default: they are where the scan says); `geometry` of the result, and again `placed`.
+    matter: whether it has levels or is continuous; None: decided by the frames.
+    light: what is assumed of the light (default: what the frames show; see `illumination.prepared`).
+    uncertain: distance, energy or δ/β that are known to a range (default: nothing); `constants` of the result then has
+    their estimates, and `Reconstruction.placed` gives the scan that the result belongs to.
+    refine: fit the poses of frames, too, of held-out ones beside the finished matter (default: those of the scan);
+    `geometry` of the result, and again `placed`.
     With a `folder`, everything is written there, and a later call with `resume=True` goes on from the last
     checkpoint, with the same result as if nothing had happened. Ctrl-C (KeyboardInterrupt) ends a fit with what it has
     reached (`finished` is False); during a start there is nothing yet, and it is passed on. Errors: `InputError` for
@@ -203,8 +203,8 @@ class _Run:
         else:
             found = settled(self.method, self.task, matter, uncertain)
             self.timing["decision"] = self.timing.get("decision", 0.0) + time.perf_counter() - began
-        if isinstance(self.method, Auto) and self.method.gaussians.start == "learned" and found.matter == "continuous":
-            self.start = (learned.NOT_ASKED,)
+        asked = isinstance(self.method, Auto) and self.method.gaussians.start == "learned"
+        self.start = (learned.NOT_ASKED,) if asked and found.matter == "continuous" else self.start
         self.method, self.constants = found.method, found.constants
         self.task = found.task(self.task)
         self._keeper.train = self.task.scan
@@ -232,8 +232,7 @@ class _Run:
                 found = start
                 continue
             last = fit
-            journal = _Journal(fit, number, start, self)
-            complete = journal.run(saved["fit"] if saved else None)
+            complete = _Journal(fit, number, start, self).run(saved["fit"] if saved else None)
             self.timing[stage.name] = fit.seconds
             found = cast(Stored, finished(fit))
             self.task = replace(self.task.moved(fit.result()), near=False)
