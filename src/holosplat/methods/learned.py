@@ -94,10 +94,11 @@ def guessed_start(task: Task, options: GaussianOptions, fitted: Fitted, plain: P
     material = material_of_levels(task, options.volume.backend, options.estimate)
     how, trained = options.learned, options.learned.network
     found = guessed(task.scan, material, trained.network, task.on_progress)
-    starts = {PLAIN: plain(), GUESS: cloud_of(found.values, found.grid, material, task, options)}
+    starts: dict[str, Start] = {PLAIN: plain()}
     if how.cells and task.bounded and trained.card.of_red_cells:
         cells = red_cells(task, found, material, trained.card.dice(len(task.scan)))
-        starts |= {} if cells is None else {CELLS: cells}
+        starts |= {} if cells is None else {CELLS: cells}  # a shape at rest is simpler than any shape
+    starts[GUESS] = cloud_of(found.values, found.grid, material, task, options)
     decision = select(NAME, tuple(starts), _Fits(task, options, fitted, starts).score, by=BY_FISSION)
     task.on_start(decision, GuessedMatter.of(found, material, trained.network))
     return None if decision.choice == PLAIN else starts[decision.choice]
