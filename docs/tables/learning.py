@@ -8,7 +8,10 @@ from .benchmark import Row, markdown, read, rounded
 
 STARTS = {"The run began with the": "guess", "The run began with phase": "phase", "The frames contradict": "refused"}
 STARTS |= {"The run began with red cells": "red cells"}
-"""What a run says of its start, by its first words, and what the table says."""
+STARTS |= {"start: network": "guess", "start: phase": "phase", "start: red cells": "red cells"}
+"""What a run of this or an earlier version says of its start, by its first words, and what the table says."""
+TAKEN = tuple(first for first, word in STARTS.items() if word in ("guess", "red cells"))
+"""First words of runs that began with the guess, or with cells of its size."""
 SCORES = ("dice", "ssim", "frcm")
 """Scores of which more is better."""
 
@@ -64,9 +67,7 @@ def learned_change() -> str:
     for case, each in found.items():
         changes = [[float(r["learned"][name]) - float(r["phase"][name]) for r in each] for name in (*SCORES, "error")]
         spans = [f"{min(values):+.3f} to {max(values):+.3f}".replace("-", "−") for values in changes]
-        taken = sum(
-            r["learned"]["begun"].startswith(("The run began with the", "The run began with red")) for r in each
-        )
+        taken = sum(r["learned"]["begun"].startswith(TAKEN) for r in each)
         lines.append([case, str(len(each)), str(taken), *spans])
     columns = ("bodies", "runs", "began with the guess, or cells of its size", "Dice", "SSIM", "FRCM", "error of δ")
     return markdown(columns, lines)

@@ -12,6 +12,7 @@ from ..baselines.material import MaterialEstimate
 from ..fit.freedom import Freedom, moved
 from ..fit.running import Running
 from ..inference import Decision
+from ..learning.start import GuessedMatter
 from ..matter import MaterialPrior, MatterKind
 from ..model import Model
 from ..optics.background import Light, LightOptions
@@ -20,7 +21,6 @@ from ..optics.retrieval import absorption_alone
 from ..progress import Advance, Progress
 from ..representations import Stored
 from ..scan import Scan
-from .beginning import Beginning
 from .first_volumes import FirstVolumes
 from .keeper import Keeper
 from .window import windows_of
@@ -30,8 +30,8 @@ def quiet(stage: str, fraction: float) -> None:
     """Progress that nobody looks at."""
 
 
-def unheard(beginning: Beginning) -> None:
-    """What was begun with, which nobody asks."""
+def unheard(decision: Decision, guess: GuessedMatter | None) -> None:
+    """What a fit starts from, which nobody asks."""
 
 
 STAND_IN_RATIO = 1.0
@@ -60,7 +60,7 @@ class Task:
     delta_told: whether prior or frames say what δ is
     freedom: of where the frames are, which fits then find, too; None: they are where the scan says
     near: whether what the next fit starts from is near to where it ends (see `Near`)
-    on_beginning: called with what Gaussians begin with, where a network was asked
+    on_start: called with the decision about where a fit starts, and the guess, where a network was asked
     """
 
     scan: Scan
@@ -73,7 +73,7 @@ class Task:
     delta_told: bool = True
     freedom: Freedom | None = None
     near: bool = False
-    on_beginning: Callable[[Beginning], None] = unheard
+    on_start: Callable[[Decision, GuessedMatter | None], None] = unheard
     decisions: tuple[Decision, ...] = ()
     first: FirstVolumes | None = None
 

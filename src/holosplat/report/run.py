@@ -15,7 +15,7 @@ from ..checks import as_written
 from ..geometry import Grid, Views
 from ..io.guess import read_guess
 from ..io.json import read_json
-from ..methods import METHODS
+from ..methods import METHODS, learned
 from ..motion.measures import columns, measured
 from ..optics.background import Light
 from ..projectors.voxels import voxel_line_integrals
@@ -138,7 +138,9 @@ def _guess(folder: RunFolder, reconstruction: Reconstruction) -> GuessShown | No
     delta = float(np.abs(volume.delta).max()) or 1.0
     unit = reconstruction.object.matter.delta if reconstruction.object.matter.single else delta
     found = reconstruction.object.voxelise(volume.grid).delta / unit
-    return GuessShown(volume.delta / unit, found, spread, volume.grid, reconstruction.choice.begun, of_copies)
+    said = [each.line for each in reconstruction.choice.decisions if each.name == learned.NAME]
+    why = ". ".join(said) or reconstruction.choice.begun
+    return GuessShown(volume.delta / unit, found, spread, volume.grid, why, of_copies)
 
 
 def _forecast(folder: RunFolder) -> ForecastShown | None:

@@ -14,14 +14,14 @@ from ..align.poses import PoseOptions
 from ..backends import in_main_memory, resolve
 from ..checks import as_written, positive, require
 from ..fit.running import Record, Running
+from ..inference import Decision
 from ..io.guess import write_guess
 from ..io.json import write_json
 from ..io.light import read_still_light, write_light
 from ..io.objects import write_object
 from ..learning.start import GuessedMatter
 from ..matter import MaterialPrior, MatterKind
-from ..methods import Auto, Gaussians, Method, Settled, Stage, Task, begun, finished, settled
-from ..methods.beginning import Beginning
+from ..methods import Auto, Gaussians, Method, Settled, Stage, Task, begun, finished, learned, settled
 from ..methods.illumination import prepared
 from ..methods.keeper import Keeper, placed_at, where
 from ..methods.method import mixes_kinds, require_files, takes_series
@@ -75,12 +75,12 @@ def reconstruct(
 ) -> Reconstruction:
     """The Object that `method` makes of the training frames of `scan`: the best of its states by these frames.
 
-    matter: whether it has levels or is continuous; None: what the frames say.
-    light: what is assumed of the light (default: even, unless air says otherwise; see `Task.evened`).
-    uncertain: distance, energy or δ/β that are known to a range (default: nothing); `constants` of the result then says
-    what the frames say of them, and `Reconstruction.placed` gives the scan that the result belongs to.
-    refine: where frames are is found, too, those for training before the matter, held-out ones beside the finished
-    matter (default: they are where the scan says); `geometry` of the result, and again `placed`.
+    matter: whether it has levels or is continuous; None: decided by the frames.
+    light: what is assumed of the light (default: what the frames show; see `illumination.prepared`).
+    uncertain: distance, energy or δ/β that are known to a range (default: nothing); `constants` of the result then has
+    their estimates, and `Reconstruction.placed` gives the scan that the result belongs to.
+    refine: fit the poses of frames, too, of held-out ones beside the finished matter (default: those of the scan);
+    `geometry` of the result, and again `placed`.
     With a `folder`, everything is written there, and a later call with `resume=True` goes on from the last
     checkpoint, with the same result as if nothing had happened. Ctrl-C (KeyboardInterrupt) ends a fit with what it has
     reached (`finished` is False); during a start there is nothing yet, and it is passed on. Errors: `InputError` for
@@ -161,7 +161,7 @@ class _Run:
     timing: dict[str, float] = field(default_factory=dict)
     asked: str = ""
     constants: tuple[Determined, ...] = ()
-    begun: str = ""
+    start: tuple[Decision, ...] = ()
     _keeper: Keeper = field(init=False)
     _saved: dict[str, Any] | None = None
     _config: dict[str, Any] = field(default_factory=dict)
@@ -170,7 +170,7 @@ class _Run:
     def begin(self, config: dict[str, Any], resume: bool) -> None:
         """Look at the folder, and at what of the run is there already; writes nothing."""
         self._config, self.asked = config, self.method.kind
-        self.task = replace(self.task, on_beginning=self._told_beginning)
+        self.task = replace(self.task, on_start=self._note_start)
         self._keeper = Keeper(self.task.scan, mixed=mixes_kinds(self.method))
         if self.folder is None or not goes_on(self.folder, config, resume):
             return
@@ -178,7 +178,7 @@ class _Run:
         if self._saved:
             with self.as_written():
                 self.timing |= {str(name): float(seconds) for name, seconds in self._saved["timing"].items()}
-                self.begun = str(self._saved.get("begun", ""))
+                self.start = tuple(Decision.from_dict(each) for each in self._saved.get("decided", ()))
                 self._keeper.load(self._saved["kept"])
 
     def prepare(self) -> None:
@@ -203,8 +203,8 @@ class _Run:
         else:
             found = settled(self.method, self.task, matter, uncertain)
             self.timing["decision"] = self.timing.get("decision", 0.0) + time.perf_counter() - began
-        if isinstance(self.method, Auto) and self.method.gaussians.start == "learned" and found.matter == "continuous":
-            self.begun = "The matter is continuous, and the network guesses bodies: it was not asked."
+        asked = isinstance(self.method, Auto) and self.method.gaussians.start == "learned"
+        self.start = (learned.NOT_ASKED,) if asked and found.matter == "continuous" else self.start
         self.method, self.constants = found.method, found.constants
         self.task = found.task(self.task)
         self._keeper.train = self.task.scan
@@ -232,8 +232,7 @@ class _Run:
                 found = start
                 continue
             last = fit
-            journal = _Journal(fit, number, start, self)
-            complete = journal.run(saved["fit"] if saved else None)
+            complete = _Journal(fit, number, start, self).run(saved["fit"] if saved else None)
             self.timing[stage.name] = fit.seconds
             found = cast(Stored, finished(fit))
             self.task = replace(self.task.moved(fit.result()), near=False)
@@ -282,8 +281,8 @@ class _Run:
         self.timing["start"] = self.timing.get("start", 0.0) + time.perf_counter() - began
         return start
 
-    def _told_beginning(self, beginning: Beginning) -> None:
-        self.begun, self._guess = beginning.why, beginning.guess
+    def _note_start(self, decision: Decision, guess: GuessedMatter | None) -> None:
+        self.start, self._guess = (decision,), guess
 
     def make_folder(self, backend: str) -> None:
         """Make the folder, once there is something to put in it."""
@@ -301,8 +300,9 @@ class _Run:
 
     def _result(self, found: Stored, fit: Running | None, complete: bool) -> Reconstruction:
         exposures, best = self.task.scan.exposures, self._keeper.best if complete else None
-        samples = best.oversample if best else fit.oversample if fit else 0
-        oversample, kept = samples or fringe_sampling(exposures), best.name if best else ""
+        samples, kept = best.oversample if best else fit.oversample if fit else 0, best.name if best else ""
+        oversample = samples or fringe_sampling(exposures)
+        decisions = (*self.task.decisions, *self.start, *(self._keeper.decisions if best else ()))
         done = Reconstruction(
             found.on(in_main_memory(found.backend)),
             self.asked,
@@ -310,7 +310,7 @@ class _Run:
             oversample,
             dict(self.timing),
             complete,
-            Choice(self.task.matter, dict(self._keeper.judged), kept, self.begun, self.task.decisions),
+            Choice(self.task.matter, dict(self._keeper.judged), kept, decisions=decisions),
             self.task.delta_told,
             judge_run(found, fit, self.task, oversample),
             self._total(found, fit, oversample),
@@ -393,7 +393,7 @@ class _Journal:
             "timing": self._run.timing,
             "kept": self._run.kept(),
             "near": self._run.task.near,
-            "begun": self._run.begun,
+            "decided": [each.as_dict() for each in self._run.start],
             **self._run.placed(),
         }
         folder.save_checkpoint(state)
