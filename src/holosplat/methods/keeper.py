@@ -67,10 +67,6 @@ class Keeper:
         if train.exposures is not self.train.exposures:
             self.train, self._judge = train, None
 
-    def look_after(self, stage: object, name: str, found: Stored, oversample: int) -> None:
-        """Take in what the fit of a stage ended with; it may say `likelier` (see `look`)."""
-        self.look(name, found, oversample, fitted=not getattr(stage, "likelier", False))
-
     def look(self, name: str, found: Stored, oversample: int, fitted: bool = True) -> None:
         """Take in the latest state. What is not `fitted` is a step of the method, and takes the place of all others
         unless it has lost the matter."""

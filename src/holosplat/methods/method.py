@@ -164,36 +164,32 @@ class Stage(Protocol):
         ...
 
 
-def takes_series(method: Method) -> bool:
-    """Whether `method` takes all times of a scan at once."""
-    return bool(getattr(method, "of_series", False))
-
-
-def mixes_kinds(method: Method) -> bool:
-    """Whether states of different kinds of Objects compete for the result of `method`."""
-    return bool(getattr(method, "mixes_kinds", False))
-
-
-def require_files(method: Method) -> None:
-    """Read the files that `method` names in a `require_files` of its own, so that one that is missing or damaged is
-    refused before any work. Errors: those of reading."""
-    read = getattr(method, "require_files", None)
-    if read is not None:
-        read()
-
-
 @runtime_checkable
 class Method(Protocol):
     """Options of a method, as a frozen dataclass; `kind` is its name in tables, files and on the command line.
 
-    One that takes all times of a scan at once says so by `of_series`; all others take frames of one time.
+    of_series: whether it takes all times of a scan at once; all others take frames of one time
+    mixes_kinds: whether states of different kinds of Objects compete for its result
+    likelier: whether fits are likelier than their starts by noise and prior; frames alone prefer what fits their noise
     """
 
     kind: ClassVar[str]
+    of_series: ClassVar[bool] = False
+    mixes_kinds: ClassVar[bool] = False
+    likelier: ClassVar[bool] = False
+
+    @property
+    def wants_levels(self) -> bool:
+        """Whether it matters to the method whether matter has levels."""
+        return not self.of_series
 
     def stages(self) -> Sequence[Stage]:
         """The stages, in their order; each resumes by itself."""
         ...
+
+    def require_files(self) -> None:
+        """Read the files that the method names, so that one that is missing or damaged is refused before any work.
+        Errors: those of reading."""
 
 
 def begun(stage: Stage, task: Task, before: Stored | None) -> tuple[Stored, Task]:
@@ -223,7 +219,7 @@ def solve_stages(method: Method, task: Task) -> Stored:
     Ctrl-C is passed on.
     """
     found: Stored | None = None
-    keeper = Keeper(task.scan, mixes_kinds(method))
+    keeper = Keeper(task.scan, method.mixes_kinds)
     for number, stage in enumerate(method.stages()):
         before = found
         found, task = begun(stage, task, before)
@@ -234,6 +230,6 @@ def solve_stages(method: Method, task: Task) -> Stored:
             found = run_quietly(fit, task.report(stage.name))
             task = replace(task.moved(fit.result()), near=False)
             keeper.moved(task.scan)
-            keeper.look_after(stage, stage.name, found, fit.oversample)
+            keeper.look(stage.name, found, fit.oversample, fitted=not method.likelier)
     assert keeper.best is not None
     return keeper.best.object

@@ -24,14 +24,14 @@ from .first_surfaces import is_noisy, surfaces_of_volume
 from .first_volumes import score_of
 from .gaussians import Gaussians, GaussianStage
 from .keeper import BY
-from .method import Near, Stage, Task, quiet, run_quietly
+from .method import Method, Near, Stage, Task, quiet, run_quietly
 from .surface_fit import SurfaceOptions, extract_surfaces, oversampling, surface_fit
 
 STAGE = "surfaces"
 
 
 @dataclass(frozen=True)
-class Surfaces(SurfaceOptions):
+class Surfaces(SurfaceOptions, Method):
     """Closed surfaces cut out of Gaussians, and fitted to the frames."""
 
     kind: ClassVar[str] = "surfaces"

@@ -24,7 +24,6 @@ from ..matter import MaterialPrior, MatterKind
 from ..methods import Auto, Gaussians, Method, Settled, Stage, Task, begun, finished, learned, settled
 from ..methods.illumination import prepared
 from ..methods.keeper import Keeper, placed_at, where
-from ..methods.method import mixes_kinds, require_files, takes_series
 from ..methods.uncertain import Determined, Uncertain
 from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling
@@ -87,11 +86,11 @@ def reconstruct(
     scans without training frames or matter, or of several times (`Scan.is_series`) where `method` takes one, for
     folders that do not fit, and for what the method cannot do.
     """
-    if not takes_series(method):
+    if not method.of_series:
         require_one_time(scan)
     check_frames(scan.train())
     if not resume:  # a run that goes on may be past them
-        require_files(method)
+        method.require_files()
     assumed, ranges, planned = light or LightOptions(), uncertain or Uncertain(), scan
     said = {"light": to_table(assumed), "uncertain": to_table(ranges), "refine": refine and to_table(refine)}
     config = config_of(scan, prior, method, seed, matter) | said
@@ -171,7 +170,7 @@ class _Run:
         """Look at the folder, and at what of the run is there already; writes nothing."""
         self._config, self.asked = config, self.method.kind
         self.task = replace(self.task, on_start=self._note_start)
-        self._keeper = Keeper(self.task.scan, mixed=mixes_kinds(self.method))
+        self._keeper = Keeper(self.task.scan, mixed=self.method.mixes_kinds)
         if self.folder is None or not goes_on(self.folder, config, resume):
             return
         self._saved = self.folder.load_checkpoint()
@@ -239,7 +238,7 @@ class _Run:
             self._keeper.moved(self.task.scan)
             if not complete:
                 return self._result(found, fit, False)
-            self._keeper.look_after(stage, stage.name, found, oversample)
+            self._keeper.look(stage.name, found, oversample, fitted=not self.method.likelier)
         assert self._keeper.best is not None
         self.task = replace(self.task, scan=replace(self.task.scan, exposures=self._keeper.best.exposures))
         return self._result(self._keeper.best.object, last, True)
@@ -326,14 +325,14 @@ class _Run:
             background = self.task.uneven and self.task.uneven.background
             if background is not None or done.still is not None:
                 write_light(self.folder.light, background, done.still, self.folder.marks())
-            said = {"times_s": self.task.scan.instants.tolist()} if takes_series(self.method) else {}
+            said = {"times_s": self.task.scan.instants.tolist()} if self.method.of_series else {}
             said |= {"light": self.task.light_in_words}
             self.folder.write_summary(summary_of(done, fit, self.task.scan) | said)
         return done
 
     def _total(self, found: Stored, fit: Running | None, oversample: int) -> TotalMatter | None:
         """The total of the matter; None of several times, at which it may differ."""
-        if takes_series(self.method):
+        if self.method.of_series:
             return None
         return total_of_run(*said_of_run(found, fit, self.task, oversample), self.task, self.constants)
 

@@ -28,7 +28,7 @@ from holosplat.matter import Matter
 from holosplat.methods.assumed import assumed_material
 from holosplat.methods.gaussian_options import GaussianRates
 from holosplat.methods.ground import ground
-from holosplat.methods.method import Stage, Task
+from holosplat.methods.method import Method, Stage, Task
 from holosplat.model import Instrument, Model
 from holosplat.optics.retrieval import paganin
 from holosplat.ranges import Rate, Share, ranged
@@ -61,7 +61,7 @@ def _density() -> DensityControl:
 
 @dataclass(frozen=True)
 @ranged
-class AlphaSplats:
+class AlphaSplats(Method):
     """3D Gaussian splatting (Kerbl et al. 2023): random Gaussians, cloned, split and pruned, each with a grey value.
 
     Left out are grey values that depend on the direction of view, and the resets of opacities.
@@ -88,7 +88,10 @@ class AlphaSplats:
     def __post_init__(self) -> None:
         require(self.start_per_pixel > 0, f"start_per_pixel must be positive, but it is {self.start_per_pixel:g}.")
 
-    wants_levels: ClassVar[bool] = False
+    @property
+    def wants_levels(self) -> bool:
+        """It does not matter."""
+        return False
 
     def stages(self) -> Sequence[Stage]:
         """The fit, and δ."""
@@ -153,7 +156,7 @@ def _network() -> Network:
 
 @dataclass(frozen=True)
 @ranged
-class RadianceFields:
+class RadianceFields(Method):
     """A plain NeRF (Mildenhall et al. 2020): positional encoding, a perceptron, and emission and absorption on rays.
 
     Left out are grey values that depend on the direction of view, and the second, finer network.
@@ -173,7 +176,10 @@ class RadianceFields:
     def __post_init__(self) -> None:
         at_least(self, 1, "rays")
 
-    wants_levels: ClassVar[bool] = False
+    @property
+    def wants_levels(self) -> bool:
+        """It does not matter."""
+        return False
 
     def stages(self) -> Sequence[Stage]:
         """The fit, and δ."""

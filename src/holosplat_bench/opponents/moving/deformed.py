@@ -13,7 +13,7 @@ from holosplat.baselines import HolographicTV, holographic_tv
 from holosplat.fit.loop import Fit
 from holosplat.matter import Matter
 from holosplat.methods.assumed import assumed_material
-from holosplat.methods.method import Stage, Task, quiet
+from holosplat.methods.method import Method, Stage, Task, quiet
 from holosplat.ranges import Rate, Weight, ranged
 from holosplat.representations import Stored, VoxelGrid
 
@@ -29,12 +29,12 @@ def _fit() -> TimesFit:
 
 @dataclass(frozen=True)
 @ranged
-class Deformed:
+class Deformed(Method):
     """Options of canonical matter and its deformation."""
 
     kind: ClassVar[str] = "deformed"
-    wants_levels: ClassVar[bool] = False
     of_series: ClassVar[bool] = True
+    likelier: ClassVar[bool] = True
 
     volume: HolographicTV = field(default_factory=usual_start)
     """The start: the time in the middle by itself."""
@@ -61,7 +61,6 @@ class DeformedStage:
 
     options: Deformed
     name: str = "deformed voxels through the waves"
-    likelier: bool = True
 
     def start(self, task: Task, before: Stored | None) -> DeformedVoxels:
         """The matter of the time in the middle at all times; `InputError` for a scan of one time."""

@@ -13,7 +13,7 @@ from holosplat.checks import InputError, require
 from holosplat.matter import MaterialPrior, Matter, MatterKind
 from holosplat.methods.assumed import assumed_material
 from holosplat.methods.illumination import prepared
-from holosplat.methods.method import Method, Stage, Task, finished, quiet, solve_stages, takes_series
+from holosplat.methods.method import Method, Stage, Task, finished, quiet, solve_stages
 from holosplat.methods.pinn import FEWEST_TIMES
 from holosplat.methods.solve import settled
 from holosplat.progress import Progress
@@ -56,7 +56,7 @@ def each_time(
     fits nothing, and those of the method.
     """
     require(
-        not takes_series(method),
+        not method.of_series,
         f"each time by itself needs a method that takes one time, but {method.kind} takes several; choose another.",
     )
     train = scan.train()
@@ -124,11 +124,10 @@ class EachTimeStage:
 
 
 @dataclass(frozen=True)
-class EachTime:
+class EachTime(Method):
     """Each time by itself, by phase retrieval and total variation, as one series of voxels."""
 
     kind: ClassVar[str] = "each-time"
-    wants_levels: ClassVar[bool] = False
     of_series: ClassVar[bool] = True
 
     volume: HolographicTV = field(default_factory=usual_start)

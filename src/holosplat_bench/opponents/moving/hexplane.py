@@ -13,7 +13,7 @@ from holosplat.fit.loop import Fit
 from holosplat.geometry import Grid
 from holosplat.matter import Matter
 from holosplat.methods.assumed import assumed_material
-from holosplat.methods.method import Stage, Task
+from holosplat.methods.method import Method, Stage, Task
 from holosplat.ranges import Rate, Weight, ranged
 from holosplat.representations import Stored, VoxelGrid
 
@@ -25,12 +25,12 @@ from .times import Cost
 
 @dataclass(frozen=True)
 @ranged
-class HexPlane:
+class HexPlane(Method):
     """Options of a field of six planes: its start is random, as published."""
 
     kind: ClassVar[str] = "hexplane"
-    wants_levels: ClassVar[bool] = False
     of_series: ClassVar[bool] = True
+    likelier: ClassVar[bool] = True
 
     planes: HexPlanes = field(default_factory=HexPlanes)
     """The planes and the decoder."""
@@ -56,7 +56,6 @@ class HexPlaneStage:
 
     options: HexPlane
     name: str = "six planes through the waves"
-    likelier: bool = True
 
     def start(self, task: Task, before: Stored | None) -> HexPlaneField:
         """The random field; `InputError` for a scan of one time."""

@@ -9,7 +9,7 @@ from typing import ClassVar
 from holosplat.baselines import HolographicTV
 from holosplat.checks import at_least
 from holosplat.fit.loop import Fit
-from holosplat.methods.method import Stage, Task
+from holosplat.methods.method import Method, Stage, Task
 from holosplat.ranges import Rate, ranged
 from holosplat.representations import Stored
 
@@ -20,12 +20,12 @@ from .through_waves import TimesFit, times_fit
 
 @dataclass(frozen=True)
 @ranged
-class LowRank:
+class LowRank(Method):
     """Options of voxels of low rank, and of their start."""
 
     kind: ClassVar[str] = "low-rank"
-    wants_levels: ClassVar[bool] = False
     of_series: ClassVar[bool] = True
+    likelier: ClassVar[bool] = True
 
     volume: HolographicTV = field(default_factory=usual_start)
     """The start: each time by itself, of which the nearest matter of low rank is taken."""
@@ -52,7 +52,6 @@ class LowRankStage:
 
     options: LowRank
     name: str = "voxels of low rank through the waves"
-    likelier: bool = True
 
     def start(self, task: Task, before: Stored | None) -> LowRankVoxels:
         """The nearest matter of low rank to the volumes of the times."""

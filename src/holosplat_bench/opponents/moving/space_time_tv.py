@@ -14,7 +14,7 @@ from holosplat.fit.projected_gradient import ProjectedGradient
 from holosplat.fit.schedule import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.methods.ground import ground
-from holosplat.methods.method import Stage, Task
+from holosplat.methods.method import Method, Stage, Task
 from holosplat.ranges import Weight, ranged
 from holosplat.representations import Stored
 
@@ -50,12 +50,12 @@ class SpaceTimeFit:
 
 
 @dataclass(frozen=True)
-class SpaceTimeTV:
+class SpaceTimeTV(Method):
     """Voxels of all times through the waves, with total variation in space and time."""
 
     kind: ClassVar[str] = "space-time-tv"
-    wants_levels: ClassVar[bool] = False
     of_series: ClassVar[bool] = True
+    likelier: ClassVar[bool] = True
 
     volume: HolographicTV = field(default_factory=usual_start)
     fit: SpaceTimeFit = field(default_factory=SpaceTimeFit)
@@ -71,7 +71,6 @@ class SpaceTimeStage:
 
     options: SpaceTimeFit
     name: str = "voxels of all times through the waves"
-    likelier: bool = True
 
     def start(self, task: Task, before: Stored | None) -> Stored:
         """What came before."""
