@@ -193,6 +193,6 @@ MOVING: Sequence[tuple[str, str, Chosen, str, str]] = (
     ("4 cells in a channel: one field of space and time", "pinn.csv", _pinn("none"), "dice", "error"),
     ("4 cells in a channel: `pinn`, with equations of flow", "pinn.csv", _pinn("curl"), "dice", "error"),
     ("stirred continuous matter: each time by itself", "moving_matter.csv", _flow("each time by itself"), "", "error"),
-    ("the same: `reconstruct --time-frame all`", "moving_matter.csv", _flow("all times in one"), "", "error"),
+    ("the same: `reconstruct --motion flow`", "moving_matter.csv", _flow("all times in one"), "", "error"),
 )
 """What is shown of motion: label, file, which rows, and the columns of Dice (empty: not measured) and error of δ."""

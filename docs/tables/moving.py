@@ -46,7 +46,7 @@ def moving_methods() -> str:
 
 
 def _ours() -> list[Row]:
-    """`track` for bodies, `reconstruct --time-frame all` for other matter."""
+    """`track` for bodies, `reconstruct --motion flow` for other matter."""
     bodies = [
         r | {"case": r["case"].removesuffix(KNOWN), "method": f"ours{KNOWN * r['case'].endswith(KNOWN)}", "worst": ""}
         for r in read("motion.csv")

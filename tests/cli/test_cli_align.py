@@ -156,7 +156,7 @@ def test_a_series_has_one_geometry_and_its_reversed_beam_is_turned_back(tmp_path
     np.testing.assert_allclose(read_scan(tmp_path / "there.nxs").views.shifts, found.views.shifts, atol=1e-15)
     refused(holosplat("align", upside, *matter, "--geometry-out", geometry, "--out", out, "--force"), "reversed")
     every = ("--time-frame", "all", "--refine", "shifts", "--out", tmp_path / "run")
-    refused(holosplat("reconstruct", path, *matter, *every), "--refine", "--time-frame all", "holosplat align")
+    refused(holosplat("reconstruct", path, *matter, *every), "--refine", "--motion flow", "holosplat align")
     done = worked(holosplat("align", upside, *matter, "--out", out, "--force"))
     assert "beam 2 is reversed along y" in done.out
     np.testing.assert_array_equal(read_scan(out).frames, scan.frames)

@@ -104,7 +104,7 @@ def test_one_time_of_a_series_is_reconstructed_and_judged(folder, tmp_path, monk
         holosplat("reconstruct", tmp_path / "s.nxs", "--out", tmp_path / "run", *known),
         "of 4, from 0 to 6e-06 s",
         "--time-frame 0 … 3",
-        "--time-frame all",
+        "--motion flow",
     )
     refused(
         holosplat("reconstruct", tmp_path / "s.nxs", "--out", tmp_path / "run", *known, "--time-frame", 4),

@@ -92,7 +92,7 @@ def test_without_equations_nothing_flows(scan):
 
 
 def test_one_time_is_refused(scan):
-    with pytest.raises(InputError, match=r"training frames of 2 times or more.*--time-frame all"):
+    with pytest.raises(InputError, match=r"training frames of 2 times or more.*--motion flow"):
         solve(quick(), Task(scan.at_instant(1), KNOWN), "levels")
 
 

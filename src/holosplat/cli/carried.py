@@ -1,9 +1,9 @@
-"""The options of matter in motion that is no body: what it may do in time."""
+"""The options of matter in motion: how it changes between times."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
 
 from ..checks import require
 from ..io.reading import Reading
@@ -16,11 +16,26 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 @ranged
 class CarriedFlags:
-    """What matter in motion may do, with --time-frame all."""
+    """How matter changes between the times of a scan."""
 
+    motion: Literal["still", "each", "flow", "bodies"] | None = None
+    """still: one object for all times; each: every time by itself, as a series; flow: one object that a flow carries,
+    if the frames show motion; bodies: closed bodies on smooth paths, as `holosplat track` with its usual options
+    (default: the one time of the scan, or that of --time-frame)."""
     fading: Weight = 0.0
     """Standard deviation expected of what the logarithm of δ changes by over all times, where matter fades or grows
     denser (0: it does not). About a third is a change by a third."""
+
+    def applied(self, reading: Reading) -> Reading:
+        """`reading` of the times that --motion needs. Errors: `InputError` where --time-frame is given, too."""
+        if self.motion is None:
+            return reading
+        require(
+            reading.part.time_frame is None,
+            f"--motion {self.motion} takes all times, but --time-frame is {reading.part.time_frame}; leave one.",
+        )
+        taken = {"still": "still", "each": "each", "flow": "all", "bodies": None}[self.motion]
+        return replace(reading, part=replace(reading.part, time_frame=taken))
 
     def options(self) -> CarriedOptions:
         """The options of the method."""
@@ -32,5 +47,5 @@ class CarriedFlags:
         """`InputError` where something of it is asked of one time."""
         require(
             self.fading == 0 or reading.part.time_frame == "all",
-            "--fading is of matter in motion; say --time-frame all, too, or leave it.",
+            "--fading is of matter that a flow carries; add --motion flow, or leave it.",
         )

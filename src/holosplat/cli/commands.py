@@ -53,9 +53,18 @@ class Asked:
 
         require(self.geometry.options() is None, "--refine is of one time; find the one geometry by holosplat align.")
         ranges = [*self.matter.ranges(), *reading.told.ranges()]
-        require(not ranges, "--time-frame each needs one number for each constant; find it by reconstruct of one time.")
+        require(not ranges, "--motion each needs one number for each constant; find it by reconstruct of one time.")
         shared = {"light": self.illumination.options(), "seed": seed}
         return Settings("reconstruct", method, self.how.kind_of_matter(), **shared)
+
+    def require_bodies(self, method: Method, watched: bool) -> None:
+        """`InputError` for what --motion bodies cannot be asked."""
+        from ..methods import Auto
+
+        stray = {"--view and --strict": watched, "--refine": self.geometry.options() is not None}
+        stray |= {"--method": not isinstance(method, Auto), "--matter": self.how.kind_of_matter() is not None}
+        for name, given in stray.items():
+            require(not given, f"--motion bodies follows closed bodies through all times; leave {name}.")
 
     def ways(self, reading: Reading) -> dict[str, Any]:
         """What `workflows.reconstruct` takes by name; `InputError` for what does not go together."""
@@ -64,7 +73,7 @@ class Asked:
         refine = self.geometry.options()
         require(
             refine is None or reading.part.time_frame not in ("all", "still"),
-            "--refine finds each frame by itself, but --time-frame all has the same beams many times; find their one "
+            "--refine finds each frame by itself, but --motion flow has the same beams many times; find their one "
             "geometry with holosplat align, and reconstruct the file that it writes without --refine.",
         )
         uncertain = Uncertain(**reading.told.ranges(), **self.matter.ranges())
@@ -105,8 +114,14 @@ def reconstruct(
     from ..workflows.run_folder import RunFolder, claimed
     from .motion import asks_for_motion, may_go_on, reconstruct_in_motion
 
-    method = asked.how.chosen()
+    method, reading = asked.how.chosen(), asked.motion.applied(reading)
     asked.motion.require_all(reading)
+    if asked.motion.motion == "bodies":
+        from .track import track
+
+        asked.require_bodies(method, live.view or strict)
+        track(scan, out, asked.matter, seed=seed, resume=resume, reading=reading, illumination=asked.illumination)
+        return
     if reading.part.time_frame == "each":
         from .each_time import reconstruct_each
 

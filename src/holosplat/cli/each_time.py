@@ -1,4 +1,4 @@
-"""`holosplat reconstruct --time-frame each`: every time by itself, begun with what the one before ended with."""
+"""`holosplat reconstruct --motion each`: every time by itself, begun with what the one before ended with."""
 
 from __future__ import annotations
 

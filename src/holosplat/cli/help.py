@@ -49,7 +49,7 @@ ESSENTIAL: dict[str, tuple[str, ...]] = {
         *READ,
     ),
     "retrieve": ("method", *MATTER, *READ),
-    "reconstruct": (*MATTER, *METHOD, "refine", "seed", "resume", "strict", *READ, "test_views"),
+    "reconstruct": (*MATTER, *METHOD, "motion", "refine", "seed", "resume", "strict", *READ, "test_views"),
     "track": (*MATTER, "learned", "cells", "intervals", "seed", "resume", *READ),
     "watch": (*MATTER, *METHOD, "pattern", "seed", *READ),
     "surface": ("scan", "level", "spacing", "smoothing", "steps", "truth", *READ),

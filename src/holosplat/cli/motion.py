@@ -1,4 +1,4 @@
-"""`holosplat reconstruct --time-frame all`: matter in motion, where the frames say that something moves."""
+"""`holosplat reconstruct --motion flow`: matter in motion, where the frames say that something moves."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ FEWEST_TIMES = 3
 
 
 def asks_for_motion(reading: Reading, method: Method, matter: MatterKind | None, plain: bool) -> bool:
-    """Whether --time-frame all is to find motion: where the method is left to the program, matter is not said to have
+    """Whether --motion flow is to find motion: where the method is left to the program, matter is not said to have
     levels, and nothing else is asked for (`plain`)."""
     return reading.part.time_frame == "all" and isinstance(method, Auto) and matter != "levels" and plain
 

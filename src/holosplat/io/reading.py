@@ -143,9 +143,8 @@ class Part:
     """Which part of a scan is taken."""
 
     time_frame: int | Literal["all", "still", "each"] | None = None
-    """Of a time-resolved scan: the time to take, counted from 0; still: all, as if nothing moved; all: likewise, but
-    `reconstruct` asks the frames whether something does, and then finds how; each: `reconstruct` makes a series, each
-    time begun with what the one before ended with."""
+    """Of a time-resolved scan: the time to take, counted from 0; still, each, all: older names of --motion still, each
+    and flow of `reconstruct`."""
     time_frames: str | None = None
     """Times to take of a time-resolved scan, counted from 0, as --views, such as 0:24; --time-frame counts these."""
     views: str | None = None
@@ -235,7 +234,7 @@ def at_time(scan: Scan, time_frame: int | str | None) -> Scan:
     """The frames of the instant `time_frame`, of "all" or "still" as if nothing moved, or (None) the scan as it is."""
     if time_frame is None:
         return scan
-    require(time_frame != "each", "--time-frame each is of reconstruct; give the number of a time.")
+    require(time_frame != "each", "--time-frame each is of reconstruct (--motion each); give the number of a time.")
     return scan.at_instant(time_frame) if isinstance(time_frame, int) else scan.as_static()
 
 

@@ -114,7 +114,7 @@ class EachTime:
         require(
             len(times) >= FEWEST_TIMES,
             f"pinn needs training frames of {FEWEST_TIMES} times or more, but theirs are of one; give a scan of "
-            "several times, with --time-frame all, or choose another method.",
+            "several times, with --motion flow, or choose another method.",
         )
         middle = task.scan.at_instant(len(times) // 2)
         material = assumed_material(middle, task.prior, task.on_progress, self.volume.backend)

@@ -131,7 +131,7 @@ def of_alignment(exposures: Exposures, how: PoseOptions) -> Needs:
 
 
 def of_motion(exposures: Exposures, how: CarriedOptions) -> Needs:
-    """What `reconstruct --time-frame all` takes where something moves: a volume that a flow carries to every time."""
+    """What `reconstruct --motion flow` takes where something moves: a volume that a flow carries to every time."""
     one, times = Sizes.of(one_time(exposures)), times_of(exposures)
     alone = of_fit(one, how.volume)
     assert alone is not None

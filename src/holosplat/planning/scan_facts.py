@@ -130,7 +130,7 @@ def _facts(path: Path, reading: Reading, loader: Loader, opened: Opened, unsaid:
             f"{path} holds counts (level {look.level:.4g}) that nothing divides; divide them by --flats and --darks."
         )
     words = ["holosplat reconstruct", str(path), *(f"--{OPTIONS.get(name, name)} …" for name in unsaid)]
-    more = " ".join([*words, *(["--time-frame each"] if scan.is_series else []), "--out run"])
+    more = " ".join([*words, *(["--motion each"] if scan.is_series else []), "--out run"])
     matter = "not in the file; --material NAME or --delta-beta RATIO says it, else δ/β is estimated"
     return ScanFacts(Facts(rows | {"material": matter}, tuple(missing), (more,)), scan, look, numbers, tuple(unsaid))
 

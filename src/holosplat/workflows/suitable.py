@@ -22,7 +22,7 @@ def require_one_time(scan: Scan) -> None:
         not scan.is_series,
         f"the scan must show one time, but its frames are of {len(times)}, from {times[0]:g} to {times[-1]:g} s, and "
         f"the reconstruction stands still; choose a time with --time-frame 0 … {len(times) - 1} (Scan.at_instant), or "
-        "--time-frame all, which finds out whether anything moves (Scan.as_static: nothing does).",
+        "--motion flow, which finds out whether anything moves (Scan.as_static: nothing does).",
     )
 
 
