@@ -19,9 +19,8 @@ class CarriedFlags:
     """How matter changes between the times of a scan."""
 
     motion: Literal["still", "each", "flow", "bodies"] | None = None
-    """still: one object for all times; each: every time by itself, as a series; flow: one object that a flow carries,
-    if the frames show motion; bodies: closed bodies on smooth paths, as `holosplat track` with its usual options
-    (default: the one time of the scan, or that of --time-frame)."""
+    """still: one object for all times; each: a run for each time; flow: one object that a flow carries; bodies: closed
+    bodies on paths, as `track` (default: one time)."""
     fading: Weight = 0.0
     """Standard deviation expected of what the logarithm of δ changes by over all times, where matter fades or grows
     denser (0: it does not). About a third is a change by a third."""

@@ -143,8 +143,7 @@ class Part:
     """Which part of a scan is taken."""
 
     time_frame: int | Literal["all", "still", "each"] | None = None
-    """Of a time-resolved scan: the time to take, counted from 0; still, each, all: older names of --motion still, each
-    and flow of `reconstruct`."""
+    """Of a time-resolved scan: the time to take, counted from 0 (still, each, all: older names of --motion)."""
     time_frames: str | None = None
     """Times to take of a time-resolved scan, counted from 0, as --views, such as 0:24; --time-frame counts these."""
     views: str | None = None
