@@ -55,7 +55,7 @@ class AxisOptions:
 
 @dataclass(frozen=True)
 class Axis:
-    """Where the axis of a turning object is.
+    """The axis of a rotating object.
 
     offset: from where the scan said it is, at the middle of the object frame, along the columns [pixels]
     lean: of the axis in the image, columns a row; positive: further right further down; None: too few rows
@@ -91,7 +91,7 @@ class Axis:
         return replace(exposures, views=replace(views, rotations=rotations, shifts=shifts))
 
     def lines(self) -> list[str]:
-        """What was found, in words."""
+        """The result in words."""
         moved = f"{self.offset.value:+.3f} from the scan's"
         said = [] if self.turn is None else [self.turn.line()]
         said.append(f"axis at column {self.column:.3f} ± {self.offset.error:.3f} ({moved})")

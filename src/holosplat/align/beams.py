@@ -40,7 +40,7 @@ DEGREES = np.array([1, 1, *[np.pi / 180] * 3, 1, 1])
 
 @dataclass(frozen=True)
 class Found:
-    """What was found of B beams.
+    """The estimated geometry of B beams.
 
     numbers, rates: [B, 8] of `NUMBERS` at the middle of the series, and how much more at its end
     errors, rate_errors: [B, 5] of those of the pose
@@ -61,7 +61,7 @@ class Found:
 
 @dataclass(frozen=True, kw_only=True)
 class AlignedBeams(AlignedViews):
-    """Where the frames of a series are: arrays as in `AlignedViews`, of all N frames; before and after are those of the
+    """Poses of the frames of a series: arrays as in `AlignedViews`, of all N frames; before and after are those of the
     frame's beam.
 
     sides: [N] which mirror image each frame is, and was turned back from, or ""
@@ -99,7 +99,7 @@ class AlignedBeams(AlignedViews):
         return np.arange(count)
 
     def lines(self) -> list[str]:
-        """What was found, in words, and a table of the beams."""
+        """The result in words, and a table of the beams."""
         first = np.unique(self.of_frame, return_index=True)[1]
         before, after = (np.sqrt(np.mean(part[first] ** 2)) for part in (self.before, self.after))
         said = [
@@ -198,7 +198,7 @@ def _turned_back(moment: Moment, sides: tuple[str, ...]) -> Moment:
 def _rows(
     moments: Sequence[Moment], count: int, material: DeltaBeta, options: PoseOptions, few: bool, pixels: int
 ) -> Begun | None:
-    """What rows say of the beams, by times that have all of them, on pixels so many times larger."""
+    """Estimate the beams from rows, at times that have all of them, on pixels so many times larger."""
     whole = [moment for moment in moments if len(moment.beams) == count]
     if not whole:
         return None

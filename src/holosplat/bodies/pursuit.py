@@ -29,7 +29,7 @@ def searched(every: Explained, search: Search, begun: list[Pose]) -> list[Pose]:
 
 
 def explaining(every: Explained, found: Sequence[Pose]) -> list[Pose]:
-    """Those that explain enough of what the others leave."""
+    """The bodies that explain enough of the residual of the others."""
     return [pose for pose, share in zip(found, every.shares(found)) if share >= LEAST]
 
 
@@ -98,8 +98,7 @@ def level_pairs(every: Explained, found: Sequence[Pose]) -> list[tuple[int, int]
 
 
 def swapped(every: Explained, search: Search, found: Sequence[Pose], i: int, j: int) -> list[Pose]:
-    """Two others in the place of bodies `i` and `j`: each where the one is in the first of two beams and the other in
-    the second."""
+    """Exchange the shadows of bodies `i` and `j` in the second of two beams."""
     first, second = (every.seen.rotations[n, :2].numpy() for n in _directions(every))
     left = every.without([pose for k, pose in enumerate(found) if k not in (i, j)])
     both, others = np.concatenate([first, second]), list[Pose]()

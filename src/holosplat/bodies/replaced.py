@@ -87,7 +87,7 @@ class Replaced:
 
         tried: other bodies that may be among the best.
 
-        What is little worse than the best is gone on from, too (record-to-record travel: Dueck 1993, J. Comput. Phys.
+        Slightly worse states are accepted, too (record-to-record travel: Dueck 1993, J. Comput. Phys.
         104, 86): of bodies that stand for each other's shadows all must change before anything is better. Each round
         ends with the best choice among all bodies that were tried so far.
         """
@@ -123,8 +123,7 @@ class Replaced:
         return other
 
     def _replaced(self, found: list[Pose]) -> list[Pose]:
-        """Others in the place of a body, the rather the more is unexplained about it, and of some that share its
-        shadows."""
+        """Replace a body, and some that share its shadows; more likely one with a larger residual about it."""
         gone = self._gone(found)
         kept, new = [pose for k, pose in enumerate(found) if k not in gone], list[Pose]()
         beside = left = self.every.without(kept)
@@ -138,7 +137,7 @@ class Replaced:
         return [*kept, *beside.improved(new, LAST_STEPS)]
 
     def _gone(self, found: list[Pose]) -> list[int]:
-        """Numbers of a body and of up to `MOST_OTHERS` others, the rather the more of a shadow they have in common."""
+        """Draw a body and up to `MOST_OTHERS` others, more likely those with a larger common shadow; indices."""
         doubts = self.every.doubts(found) + LEAST_DOUBT
         first = int(self._draws.choice(len(found), p=doubts**2 / (doubts**2).sum()))
         each = self.every.each(found)
@@ -151,7 +150,7 @@ class Replaced:
         return [first, *map(int, others)]
 
     def _chosen(self, tried: list[tuple[float, Pose]]) -> Pose:
-        """One of those that were tried, the rather the more it explains."""
+        """Draw one of the bodies that were tried, more likely one that explains more."""
         likely = np.exp([(share - tried[0][0]) / CHOICE for share, _ in tried])
         return tried[int(self._draws.choice(len(tried), p=likely / likely.sum()))][1]
 

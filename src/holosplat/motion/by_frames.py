@@ -47,7 +47,7 @@ def carry_by_frames(window: Window, train: Scan, oversample: int) -> tuple[Forec
 
 
 def _told(found: Assimilated, options: Assimilation, cells: int) -> dict[str, float]:
-    """Plain numbers: peak and modulus, how well they are told, and how many unknowns there are where nobody asked."""
+    """Plain numbers: peak and modulus, their relative standard errors, and the number of chosen unknowns."""
     said = {"peak_m_s": float(found.unknowns.peak), "shear_n_m": float(found.unknowns.shear)}
     said |= {f"{name}_told": value for name, value in found.told.items()}
     said |= {"loss_before": found.losses[0], "loss_after": found.losses[1]}

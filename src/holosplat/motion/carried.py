@@ -1,7 +1,7 @@
-"""Matter that is no body, in motion: one volume for all times that a flow carries, begun around the middle time.
+"""Flow reconstruction: one volume for all times, carried by a flow, which starts around the middle time.
 
-Whether anything moves is asked first: where a flow beside the mean of all times explains frames, and hardly does so
-with the times in another order, it does. The flow begins steady, between the times next to the middle one, on voxels of
+First it tests for motion: there is motion if a flow explains frames better than the mean of all times does, and hardly
+with the times in another order. The flow begins steady, between the times next to the middle one, on voxels of
 two pixels. Then the window grows to all times, and the flow gets a higher degree in time and more cells, as long as
 frames that are held out for a moment are predicted better. At last the volume is fitted on voxels of a pixel, and
 Gaussians stand for it.
@@ -66,7 +66,7 @@ class CarriedOptions:
     cells: int = 4
     """Cells of the flow along the longest edge of the field, at first."""
     most_cells: int = 6
-    """At most, where held-out frames ask for more."""
+    """Upper limit, where held-out frames support more."""
     most_degree: int = 2
     """Highest degree of the flow in time."""
     steps: int = 6
@@ -102,7 +102,7 @@ class CarriedOptions:
 
 @dataclass(frozen=True)
 class Carried:
-    """What was found. object: the matter in motion; volume: of the reference time, on voxels; misfit: [T] χ² a pixel at
+    """The result. object: the matter in motion; volume: of the reference time, on voxels; misfit: [T] χ² a pixel at
     each time; history: what was tried, in words; timing: seconds by stage."""
 
     object: MovingGaussians
@@ -173,7 +173,7 @@ class Search:
         return gain > SURE**2 + AGAIN * chance
 
     def _still(self, u: Tensor) -> _State:
-        """Nothing moves, nothing fades."""
+        """The state without motion and fading."""
         flow = self.steady(self.options.cells)
         return _State(flow, u, Fading.none(flow.lattice) if self.options.fading > 0 else None)
 
@@ -269,7 +269,7 @@ class Search:
         return self.finished(self.freer(state))
 
     def _stepped(self, name: str, make: Callable[[], _State]) -> _State:
-        """What `make` finds, in the time of stage `name`; of steps that are done already, what the last one found."""
+        """Run `make` and add its time to stage `name`; for finished steps, return the last result."""
         done, self._step = self._saved.get("steps", 0), self._step + 1
         if self._step <= done:
             return self._saved_state()
@@ -301,7 +301,7 @@ class Search:
         return self.by_itself(merged(self.task.scan), "mean of all times")
 
     def freer(self, state: _State) -> _State:
-        """The state with the flow as free in time and space as held-out frames ask for."""
+        """The state with as much freedom of the flow in time and space as held-out frames support."""
         count, keep, how = len(self.times), self._kept(), self.options
         for change in freer_flows(self._extents, (how.cells, how.most_cells), min(how.most_degree, count - 2)):
             state = self._stepped("flow", lambda s=state, c=change: self._changed(s, c, keep))

@@ -95,7 +95,7 @@ class ChannelFrame:
 
 @dataclass(frozen=True)
 class Fitted:
-    """What a window says of the model.
+    """The model fitted to a window of times.
 
     unknowns: peak and modulus; told: standard errors of their logarithms over those before, by name (near 1: the window
     says nothing); wrong: velocity [C, 3] [m/s] and gradient [C, 3, 3] [1/s] of a flow beside; left: [C] m, along the
@@ -153,7 +153,7 @@ class CellModel:
         unknowns: Unknowns,
         wrong: tuple[Tensor, Tensor] | None = None,
     ) -> list[np.ndarray]:
-        """Of each of the surfaces `meshes` at `times[0]` the places [T, Q, 3] [m] at `times` [T] s.
+        """Run the model from the surfaces `meshes` at `times[0]`: places [T, Q, 3] [m] at `times` [T] s.
 
         wrong: velocity [C, 3] and gradient [C, 3, 3] of a flow beside, about each cell.
         """
@@ -252,7 +252,7 @@ class CellModel:
 
 @dataclass(frozen=True)
 class _Compared:
-    """What a cell's surface says of the model: missed [T, Q] [m] along normals, root weights [Q], and what a velocity
+    """A cell's surface compared with the model: missed [T, Q] [m] along normals, root weights [Q], and what a velocity
     and a gradient beside would change [T, Q, 12] [m per m/s, per 1/s]."""
 
     said: np.ndarray

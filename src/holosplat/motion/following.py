@@ -45,10 +45,10 @@ AFTER_SOFT = {"soft": "twins", "soft again": "halves"}
 
 @dataclass(frozen=True)
 class Followed:
-    """What was found. bodies: on their paths; records: of the steps of all fits; oversample: wave samples a pixel
+    """The tracked bodies. bodies: on their paths; records: of the steps of all fits; oversample: wave samples a pixel
     in these; timing: seconds of each stage; found: how many bodies each time shows by itself; halves: the bodies by
     halves of the frames, two and two, empty without intervals; rest: their shape at rest [m], if that is known; begun:
-    what showed the bodies of single times, in words; body: what is known of their shape, told or found."""
+    the detection method at single times, in words; body: their known shape, given or found."""
 
     bodies: MovingSurfaces
     records: list[Record]
@@ -63,7 +63,7 @@ class Followed:
 
 @dataclass
 class Following:
-    """What has been done so far, and what is next: sightings, then stiff fits and looks beside their bodies in turn,
+    """Tracking stage by stage: sightings, then stiff fits and looks beside their bodies in turn,
     then paths, the soft fit, and fits to halves of the frames."""
 
     train: Scan
@@ -136,7 +136,7 @@ class Following:
             self.advance()
 
     def followed(self, said: str = "") -> Followed:
-        """What was found; said: of what the bodies are, beside what showed them."""
+        """The tracked bodies; said: a sentence on their kind."""
         assert self.bodies is not None
         told = self.records, self.oversample, self.timing, tuple(self.counts), tuple(self.halves)
         return Followed(self.bodies, *told, self.shape_at_rest(), self.guess + said, self.options.body)
@@ -209,7 +209,7 @@ class Following:
         self.timing[name] = self.timing.get(name, 0.0) + time.perf_counter() - began
 
     def network(self) -> Guess | None:
-        """What guesses the volumes of single times: asked at the time in the middle."""
+        """The network that guesses the volumes of single times, tested at the middle time."""
         if self.options.learned is None:
             return None
         at = self.train.at_instant(len(self.train.instants) // 2)
@@ -262,7 +262,7 @@ class Following:
 
     @property
     def rest(self) -> Rest | None:
-        """What is known of the bodies' shape."""
+        """The known shape of the bodies."""
         body = self.options.body
         return None if body is None else at_rest(body, self.train.views.finest, self.size)
 
@@ -323,7 +323,7 @@ class Following:
             return chosen_twins(bodies, trials, lambda share: self.on_progress("twins", share, {}))
 
     def on_chosen_paths(self, bodies: MovingSurfaces) -> MovingSurfaces:
-        """`bodies` on paths of as many pieces as frames ask for."""
+        """`bodies` on paths of as many pieces as the frames support."""
         how = (self.options.paths, self.options.stiff, self.seed, self.light, self.rest)
         self.on_progress("paths", 0.0, {})
         with self._timed("paths"):

@@ -43,7 +43,7 @@ def network_for(
 
 
 def left_by_bodies(values: Tensor, found: Guessed, level: float) -> float:
-    """What full bodies leave unexplained of the thickness that the network saw, as a share.
+    """Relative residual of the thickness that the network saw, with full bodies.
 
     values: [Z, Y, X] on the voxels of `found`, of which what is above `level` is full
     """

@@ -40,7 +40,7 @@ class Seen:
 @dataclass(frozen=True)
 @ranged
 class LinkOptions:
-    """What two sightings of one body have in common."""
+    """Options for linking detections into tracks."""
 
     gate: float = 0.8
     """A body is looked for within so many radii of where its velocity leads."""
@@ -188,7 +188,7 @@ def _holds(track: Track, number: int, seen: Sequence[Seen], times: np.ndarray, f
 
 
 def place_at(track: Track, time: int, seen: Sequence[Seen], times: np.ndarray, flow: np.ndarray) -> np.ndarray:
-    """Where a track is [3] [m] at a time: between its sightings on straight lines, beyond by its last velocity."""
+    """Place [3] [m] of a track at a time: between its detections on straight lines, beyond by its last velocity."""
     own = [seen[k] for k in track]
     if time > own[-1].time:
         return own[-1].centre + velocity(track, seen, times, flow, True) * (times[time] - times[own[-1].time])
