@@ -122,11 +122,11 @@ class Simulation:
 
 
 def simulated_frames(obj: Object, exposures: Exposures, how: Simulation = Simulation()) -> Iterator[np.ndarray]:
-    """Frames [H, W] float32 of `obj`, one after another; only one is in memory.
+    """Simulate frames [H, W] float32 of `obj`, one by one, without keeping them.
 
     Plain torch (the `reference` of the optics, which fits use with that backend alone), on a GPU if the backend is
     `cuda`, on a fine raster in single precision, less than 1e-5 of the contrast from double precision. A frame is the
-    mean of the intensities at its pulses, with the light and the noise that are asked for.
+    average of the intensities at its pulses, with the light and the noise of `how`.
     """
     fine, detect, backend = how.samples(exposures), how.detector(exposures), resolve(how.backend)
     obj = obj.on(backend) if isinstance(obj, (MeshScene, MeshSeries)) else obj

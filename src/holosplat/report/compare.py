@@ -53,7 +53,7 @@ class Side:
     evaluation: Evaluation | None
 
     def score(self, part: str, name: str) -> str:
-        """A score of its `part`, "test" or "train", in the mean over frames."""
+        """A score of its `part`, "test" or "train", averaged over frames."""
         found = getattr(self.evaluation, part, None)
         return "–" if found is None else scientific(found.mean[name], 4)
 
@@ -114,7 +114,7 @@ class Comparison:
         return volume_scores(second, first) if np.any(first.delta) and np.any(second.delta) else None
 
     def found(self) -> list[Table]:
-        """What both runs found, and how their volumes differ."""
+        """Tables of the results of both runs, and of the differences of their volumes."""
         return [table for table in (self._found(), self._apart()) if table.rows]
 
     def asked(self) -> list[Table]:
@@ -178,7 +178,7 @@ class Comparison:
         return Table("Decisions that differ", differing(*made), HEAD)
 
     def _settings(self) -> Table:
-        """What was asked; of a setting that the other method does not have, only what is not the usual."""
+        """Settings that differ; of those of one method alone, only values other than the defaults."""
         (first, usual), (second, other) = (_asked(side) for side in self.sides)
         known = {name: value for name, value in (usual | other).items() if (name in first) != (name in second)}
         rows = [row for row in differing(first, second) if known.get(row[0]) not in row[1:]]

@@ -1,4 +1,4 @@
-"""All tasks of a series in one table, one list of bodies, and one page; what is missing is said."""
+"""All tasks of a series in one table, one list of bodies, and one page, with the missing ones named."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ BODY_COLUMNS = ("number", "time_s", "body", "x_m", "y_m", "z_m", "volume_m3")
 
 @dataclass(frozen=True)
 class Collected:
-    """A series with what is known of it. rows: of each time, None where it is missing; task: that it is of; runs: its
+    """A series and its results so far. rows: of each time, None where it is missing; task: that it is of; runs: its
     run folder; agreement: mean distance [m] of bodies at times that two tasks have done, by the later task."""
 
     plan: SeriesPlan
@@ -177,7 +177,7 @@ def _number(value: object) -> str:
 
 
 def page_of(folder: SeriesFolder, found: Collected) -> SeriesPage:
-    """What series.html shows."""
+    """The content of series.html."""
     from .pages.page import Frame, SeriesPage, headline
 
     frames = []
