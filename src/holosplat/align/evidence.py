@@ -52,7 +52,7 @@ def weighed(
     """
     units = np.tile(expected, len(found))
     kept = beside(motions / units[:, None])
-    scaled = _without(units[:, None] * information * units, motions / units[:, None])
+    scaled = _project_out(units[:, None] * information * units, motions / units[:, None])
     told, values = kept.T @ scaled @ kept, kept.T @ (found.reshape(-1) / units)
     shares = np.zeros((len(kinds), found.size))
     for row, places in zip(shares.reshape(len(kinds), *found.shape), kinds):
@@ -83,7 +83,7 @@ def _evidence(told: np.ndarray, values: np.ndarray, spread: np.ndarray) -> float
     return float(-0.5 * np.linalg.slogdet(both)[1] - 0.5 * values @ np.linalg.solve(both, told @ values))
 
 
-def _without(information: np.ndarray, motions: np.ndarray) -> np.ndarray:
+def _project_out(information: np.ndarray, motions: np.ndarray) -> np.ndarray:
     """Information of what is left when the best of all `motions` is taken out."""
     across = information @ motions
     return information - across @ np.linalg.pinv(motions.T @ across, rcond=1e-9, hermitian=True) @ across.T

@@ -134,7 +134,7 @@ def align_still(
     expected = options.uncertain.deviations()
     expected[DISTANCE] = options.uncertain.distance if sharp else 0.0
     words += hardly_told(search.covariances, expected)
-    words += _kept(search, scan.exposures, pixels, sharp, doubted)
+    words += _keep_planned(search, scan.exposures, pixels, sharp, doubted)
     found = search.exposures(scan.exposures)
     found = replace(found, views=moved_onto(found.views, scan.views))
     of = max(pixels, 2 if min(scan.views.shape) >= 2 * options.least_side else 1)
@@ -203,7 +203,7 @@ def by_edges(search: PoseSearch, pixels: int, on_progress: Progress) -> SurfaceM
     return found.surfaces
 
 
-def _kept(search: PoseSearch, planned: Exposures, pixels: int, sharp: bool, others: Sequence[str]) -> list[str]:
+def _keep_planned(search: PoseSearch, planned: Exposures, pixels: int, sharp: bool, others: Sequence[str]) -> list[str]:
     """Puts kinds of numbers, beside `others`, that differ from the plan by no more than they are known back to it; says
     which."""
     accuracy = SHARP_ACCURACY if sharp else ACCURACY

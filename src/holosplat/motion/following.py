@@ -198,7 +198,7 @@ class Following:
             self.stage = "done"
 
     @contextmanager
-    def _timed(self, name: str) -> Iterator[None]:
+    def _record_time(self, name: str) -> Iterator[None]:
         """Of what is done in steps; they are kept where Ctrl-C comes between."""
         began = time.perf_counter()
         try:
@@ -214,7 +214,7 @@ class Following:
             return None
         at = self.train.at_instant(len(self.train.instants) // 2)
         how = (self.options.sightings, self.options.learned)
-        with self._timed("sightings"):
+        with self._record_time("sightings"):
             found, self.guess = network_for(at, self.material, *how, lambda stage, part: None)
         return found
 
@@ -225,7 +225,7 @@ class Following:
         """
         how = replace(self.options.sightings, level=level * self.options.sightings.level)
         times, found = frames.instants, list[list[Sighting]]()
-        with self._timed("sightings"):
+        with self._record_time("sightings"):
             for t in range(len(times)):
                 self.on_progress("bodies at each time", t / len(times), {})
                 found += to_sightings([self._steps.of(lambda t=t: self._look_at(frames.at_instant(t), how, network))])
@@ -242,20 +242,20 @@ class Following:
         if options.body is not None:
             begun = None
             with suppress(InputError):  # no track
-                begun = self._sighted(basis)
-            posed = self._posed(options.body, basis, begun=begun)
+                begun = self._detect(basis)
+            posed = self._search_poses(options.body, basis, begun=begun)
             if posed is None:
                 raise InputError(
                     f"no body of the shape {options.body.shape} was found in the frames; check its size, the material "
                     "and the pixel size, or leave --body."
                 )
             return posed
-        found = self._sighted(basis)
+        found = self._detect(basis)
         assert found is not None
         sure = sure_ones(found, self.train.views, times)
         return found if options.rounds == 0 or len(sure) == found.count else only(found, sure)
 
-    def _sighted(self, basis: TimeBasis) -> MovingSurfaces | None:
+    def _detect(self, basis: TimeBasis) -> MovingSurfaces | None:
         """The bodies of single times on first paths; None where none were looked for."""
         times, pixel = self.train.instants, self.train.views.finest
         return first_paths(self.seen, times, basis, pixel, self.material, self.options.links) if self.seen else None
@@ -273,7 +273,7 @@ class Following:
         mesh = rest.elastic.membrane.mesh
         return TriangleMesh(self.train.views.finest * mesh.vertices, mesh.faces, "rest")
 
-    def _posed(
+    def _search_poses(
         self,
         body: KnownBody,
         basis: TimeBasis,
@@ -281,7 +281,7 @@ class Following:
         begun: MovingSurfaces | None = None,
     ) -> MovingSurfaces | None:
         """Bodies of known shape beside `known` ones, on first paths; a search may begin with `begun` ones."""
-        with self._timed("poses"):
+        with self._record_time("poses"):
             self._search = self._search or KnownBodies(self.train, self.material, body, self.size)
             found = self._search.bodies(
                 basis, known, begun, self.seed, lambda share: self.on_progress("poses", share, {}), self._steps
@@ -297,7 +297,7 @@ class Following:
         """`bodies`, and those that frames show beside them; None where there are none."""
         times = self.train.instants
         if self.options.body is not None:
-            new = self._posed(self.options.body, bodies.basis, bodies)
+            new = self._search_poses(self.options.body, bodies.basis, bodies)
             own = [] if new is None else apart(new, bodies, times)
             return joined(bodies, only(new, own)) if new is not None and own else None
         found = self.look(beside(self.train, bodies, self.oversample), self.options.fainter)
@@ -319,14 +319,14 @@ class Following:
             return bodies
         how = (self.options.stiff, self.options.soft, self.oversample, self.seed, self.light, self._steps)
         trials = Trials(self.train, self.rest, *how)
-        with self._timed("twins"):
+        with self._record_time("twins"):
             return chosen_twins(bodies, trials, lambda share: self.on_progress("twins", share, {}))
 
     def on_chosen_paths(self, bodies: MovingSurfaces) -> MovingSurfaces:
         """`bodies` on paths of as many pieces as the frames support."""
         how = (self.options.paths, self.options.stiff, self.seed, self.light, self.rest)
         self.on_progress("paths", 0.0, {})
-        with self._timed("paths"):
+        with self._record_time("paths"):
             return chosen_paths(self.train, bodies, *how, steps=self._steps)
 
     def fitted(

@@ -122,13 +122,13 @@ def drift(seen: Shadows) -> np.ndarray:
         pause = float(np.median(np.diff(seen.times[own])))
         pairs = [(i, j) for i, j in pairwise(own) if abs(seen.times[j] - seen.times[i] - pause) < 0.2 * pause]
         rows.append(seen.rotations[own[0], :2].numpy())
-        moves.append(_moved(seen, pairs) / pause)
+        moves.append(_displacements(seen, pairs) / pause)
     if not rows:
         return np.zeros(3)
     return np.linalg.lstsq(np.concatenate(rows), np.concatenate(moves), rcond=1e-6)[0]
 
 
-def _moved(seen: Shadows, pairs: Sequence[tuple[int, int]]) -> np.ndarray:
+def _displacements(seen: Shadows, pairs: Sequence[tuple[int, int]]) -> np.ndarray:
     """Displacement (x, y) [pixels] from the first to the second frame of each pair."""
     size = tuple(2 * n for n in seen.shape)
     total = np.zeros(size)

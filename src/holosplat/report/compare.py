@@ -179,7 +179,7 @@ class Comparison:
 
     def _settings(self) -> Table:
         """Settings that differ; of those of one method alone, only values other than the defaults."""
-        (first, usual), (second, other) = (_asked(side) for side in self.sides)
+        (first, usual), (second, other) = (_request(side) for side in self.sides)
         known = {name: value for name, value in (usual | other).items() if (name in first) != (name in second)}
         rows = [row for row in differing(first, second) if known.get(row[0]) not in row[1:]]
         return Table("Settings and input that differ", rows, HEAD)
@@ -223,7 +223,7 @@ def _side_of(folder: RunFolder, scan: Scan | None) -> Side:
     return Side(folder, result, None if scan is None else evaluate(result, scan, None))
 
 
-def _asked(side: Side) -> tuple[dict[str, str], dict[str, str]]:
+def _request(side: Side) -> tuple[dict[str, str], dict[str, str]]:
     """What a run was asked, by dotted names, and the usual settings of its method."""
     told = side.folder.read_config()
     kind = told.get("method", {}).get("kind")
