@@ -26,10 +26,11 @@ import numpy as np
 from machine import commit
 
 import holosplat as hs
-from holosplat.bench.case import Case, case_names, load_case
+from holosplat.beamline.declared.case import Case
 from holosplat.methods import Task, finished
 from holosplat.methods.gaussians import GaussianStage
 from holosplat.workflows.evaluate import score_object
+from holosplat_bench.suite.case import case_names, load_case
 
 AS_IT_IS = "as it is"
 Row = dict[str, Any]

@@ -25,11 +25,12 @@ from scipy.spatial.transform import Rotation
 import holosplat as hs
 from holosplat.align import PoseOptions, Uncertain, align_views
 from holosplat.align.gauge import moved_onto
+from holosplat.beamline.declared.case import Case
 from holosplat.beamline.misalignment import Misalignment
-from holosplat.bench.case import Case, load_case
 from holosplat.methods import Auto, Gaussians, Method
 from holosplat.metrics import volume_scores
 from holosplat.version import source_commit
+from holosplat_bench.suite.case import load_case
 
 USUAL = Uncertain()
 MOMENTS = ("planned", "aligned", "refined", "true")

@@ -25,11 +25,12 @@ from machine import commit
 from rows import written
 
 import holosplat as hs
-from holosplat.bench.case import Case, load_case
+from holosplat.beamline.declared.case import Case
 from holosplat.methods import smooth_fit
 from holosplat.methods.illumination import prepared
 from holosplat.methods.method import Task, begun, run_quietly
 from holosplat.methods.volume import SmoothStage
+from holosplat_bench.suite.case import load_case
 
 SCENES: tuple[tuple[str, int, float | None], ...] = (
     ("soft12", 11, None),

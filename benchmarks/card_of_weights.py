@@ -19,6 +19,8 @@ from holosplat.training.limits import limits
 from holosplat.training.ranges import Ranges
 
 RUNS = Path(__file__).resolve().parents[1] / "docs" / "data" / "learned.csv"
+TAKEN = ("The run began with the", "start: network", "start: red cells")
+"""First words of runs that began with the guess."""
 NOISY, UNTOLD = "-noise", "-unknown"
 """Ends of the names of cases with photon noise, and of such whose material is not told."""
 
@@ -34,7 +36,7 @@ def in_runs(rows: Sequence[dict[str, str]]) -> str:
     """Where whole runs gain nothing by the guess, lose by it, or refuse it."""
     found = {(row["case"], row["scene"], row["views"], row["start"]): row for row in rows}
     with_it = {key[:3]: row for key, row in found.items() if key[3] == "learned"}
-    begun = {key for key, row in with_it.items() if row["begun"].startswith("The run began with the")}
+    begun = {key for key, row in with_it.items() if row["begun"].startswith(TAKEN)}
     refused = [key for key, row in with_it.items() if row["begun"].startswith("The frames contradict")]
     lost = [key for key in with_it if float(with_it[key]["dice"]) < float(found[(*key, "phase")]["dice"]) - 1e-3]
     noisy, untold = (_taken(with_it, begun, end) for end in (NOISY, UNTOLD))

@@ -16,7 +16,7 @@ from machine import commit
 from scipy.ndimage import binary_erosion, binary_fill_holes
 
 import holosplat as hs
-from holosplat.bench.case import load_case
+from holosplat_bench.suite.case import load_case
 
 
 def main() -> None:

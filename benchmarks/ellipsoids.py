@@ -32,11 +32,11 @@ from machine import commit
 from rows import read, write
 
 import holosplat as hs
-from holosplat.bench.methods import METHODS
 from holosplat.geometry import Grid
 from holosplat.metrics.images import image_scores, intensity_range, structural_similarity
 from holosplat.model import Instrument, Model
 from holosplat.units import wavenumber
+from holosplat_bench.suite.methods import METHODS
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "ellipsoids.csv"
 SIDE = 64

@@ -22,10 +22,9 @@ import torch
 from random_scenes import KINDS, Draw, Room
 
 import holosplat as hs
+from holosplat.beamline.declared.soft_specimens import Continuous
+from holosplat.beamline.declared.specimens import RedCells, Specimen
 from holosplat.beamline.light import UnevenLight
-from holosplat.bench.measured import MEASURED
-from holosplat.bench.soft_specimens import Continuous
-from holosplat.bench.specimens import RedCells, Specimen
 from holosplat.geometry import Grid, Views
 from holosplat.metrics import volume_scores
 from holosplat.model import measure
@@ -35,6 +34,7 @@ from holosplat.specimens.continuous import Bump, ContinuousScene, Element, Soft,
 from holosplat.specimens.phantoms import packed_balls
 from holosplat.specimens.scene import MeshScene
 from holosplat.units import wavelength, wavenumber
+from holosplat_bench.suite.measured import MEASURED
 
 PIXEL, ENERGY = 1e-6, 20.0
 REFERENCE = 1e-7

@@ -21,8 +21,8 @@ from machine import commit
 from rows import read, write
 
 import holosplat as hs
-from holosplat.bench.methods import METHODS
 from holosplat.geometry import Grid
+from holosplat_bench.suite.methods import METHODS
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "few_families.csv"
 TRIED = (

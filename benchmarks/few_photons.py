@@ -21,11 +21,11 @@ import torch
 from rows import read, replaced, shown
 
 import holosplat as hs
-from holosplat.bench.case import load_case
 from holosplat.methods import METHODS
 from holosplat.optics.noise import noise_share
 from holosplat.version import source_commit
 from holosplat.workflows.evaluate import volume_scores
+from holosplat_bench.suite.case import load_case
 
 TABLE = Path(__file__).resolve().parents[1] / "docs/data/few_photons.csv"
 MAIN = tuple(f"main12@{photons}" for photons in (2000, 1000, 500, 250))

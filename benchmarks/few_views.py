@@ -24,8 +24,8 @@ import holosplat as hs
 from holosplat.align import align_views
 from holosplat.beamline.light import UnevenLight
 from holosplat.beamline.misalignment import AS_PLANNED, Misalignment
-from holosplat.bench.case import load_case
 from holosplat.version import source_commit
+from holosplat_bench.suite.case import load_case
 
 TABLE = Path(__file__).resolve().parents[1] / "docs/data/few_views.csv"
 ANGLES, TILTS = (0.0, 40.0, 85.0, 130.0, 20.0, 110.0), (0.0, 8.0, -6.0, 4.0, -9.0, 7.0)

@@ -31,6 +31,7 @@ import holosplat as hs
 from holosplat.geometry import Grid
 from holosplat.learning.start import LearnedStart, guessed
 from holosplat.methods import Auto, Task
+from holosplat.methods.learned import NAME
 from holosplat.methods.sharp_level import material_of_levels
 from holosplat.metrics import volume_scores
 from holosplat.specimens.continuous import ContinuousScene
@@ -149,7 +150,7 @@ def rows(given: Setting, weights: str, starts: Sequence[str]) -> list[tuple[str,
         assert scored.test is not None
         said = {"dice": scored.volume.dice, "error": scored.volume.relative_error_delta}
         said |= {name: scored.test.mean[name] for name in ("ssim", "frcm")}
-        begun = result.choice.begun if result.choice.matter == "levels" else "continuous: no Gaussians"
+        begun = next((each.line for each in result.choice.decisions if each.name == NAME), "")
         table.append((start, said | {"begun": begun, "seconds": seconds}))
     return table
 

@@ -19,12 +19,12 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 from machine import commit
 
-from holosplat.bench.case import case_names, load_case
 from holosplat.inference import Compared
 from holosplat.matter import Known, MaterialPrior
 from holosplat.methods import Task
 from holosplat.methods.illumination import prepared
 from holosplat.methods.levels import decide_matter
+from holosplat_bench.suite.case import case_names, load_case
 
 COLUMNS = ("case", "seed", "prior", "gain", "error", "choice", "light", "seconds", "commit")
 

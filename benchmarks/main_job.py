@@ -30,7 +30,7 @@ from rows import read, write
 from scipy.spatial.transform import Rotation
 
 import holosplat as hs
-from holosplat.bench.declaration import Between
+from holosplat.beamline.declared.declaration import Between
 from holosplat.methods import METHODS
 from holosplat.methods.surface_fit import oversampling
 from holosplat.workflows.evaluate import Scores, score_object

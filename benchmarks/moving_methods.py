@@ -34,8 +34,8 @@ from holosplat.baselines import HolographicTV
 from holosplat.geometry import Grid
 from holosplat.matter import MatterKind
 from holosplat.methods import HolographicVoxels, Method, SmoothVolume, Surfaces, VoxelFit, Voxels
-from holosplat.methods.moving import Deformed, HexPlane, LowRank, Snapshots, SpaceTimeTV, each_time
 from holosplat.metrics import volume_scores
+from holosplat_bench.opponents.moving import Deformed, HexPlane, LowRank, Snapshots, SpaceTimeTV, each_time
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "moving_methods.csv"
 VOLUME = HolographicTV(refine=1)

@@ -25,8 +25,6 @@ from rows import read, write
 
 from holosplat.align import PoseOptions
 from holosplat.beamline.simulate import Simulation
-from holosplat.bench.case import planned_frames
-from holosplat.bench.methods import METHODS as BENCH_METHODS
 from holosplat.cli.dataset import _needs
 from holosplat.geometry import Views
 from holosplat.io.vtk import write_mesh
@@ -43,6 +41,8 @@ from holosplat.scan import Exposures
 from holosplat.specimens.membrane.resting import nodes_of
 from holosplat.specimens.red_cells import random_cells
 from holosplat.training.ranges import Ranges
+from holosplat_bench.suite.case import planned_frames
+from holosplat_bench.suite.methods import METHODS as BENCH_METHODS
 
 PIXEL, STEP = 3.2e-6, 1e-4
 """Of frames [m], and between two times [s]."""

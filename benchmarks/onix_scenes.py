@@ -26,7 +26,7 @@ from machine import commit
 from rows import read, write
 
 import holosplat as hs
-from holosplat.bench.case import Case
+from holosplat.beamline.declared.case import Case
 from holosplat.geometry import Grid
 from holosplat.methods import Onix
 from holosplat.training.aligned import AlignedTraining, AlignedValidation

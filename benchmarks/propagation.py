@@ -37,12 +37,13 @@ from machine import commit
 from rows import read, write
 from scipy import fft
 
+from holosplat.beamline.declared.case import Case
 from holosplat.beamline.simulate import Simulation, simulated_frames
-from holosplat.bench.case import Case, case_names, load_case
 from holosplat.model import Instrument
 from holosplat.scan import Exposures
 from holosplat.specimens.continuous import ContinuousScene
 from holosplat.specimens.scene import MeshScene
+from holosplat_bench.suite.case import case_names, load_case
 
 SEED, SLABS = 101, 8
 FRINGE_SAMPLES, LEAST_SAMPLES, MOST_SAMPLES = 12, 8, 20

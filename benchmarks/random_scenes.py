@@ -27,11 +27,18 @@ from machine import commit
 from rows import read, write
 
 import holosplat as hs
+from holosplat.beamline.declared.case import Case, case_of
+from holosplat.beamline.declared.declaration import Beam, Declaration, Detector, Listed, Matter, Substance
+from holosplat.beamline.declared.soft_specimens import (
+    BodyWithAbsorber,
+    CoatedDroplets,
+    RoundCell,
+    SheppLogan,
+    SoftCells,
+    Tissue,
+)
+from holosplat.beamline.declared.specimens import BallStar, Capsules, CrowdedCells, FoamDrop, RedCells, Specimen
 from holosplat.beamline.light import UnevenLight
-from holosplat.bench.case import Case, case_of
-from holosplat.bench.declaration import Beam, Declaration, Detector, Listed, Matter, Substance
-from holosplat.bench.soft_specimens import BodyWithAbsorber, CoatedDroplets, RoundCell, SheppLogan, SoftCells, Tissue
-from holosplat.bench.specimens import BallStar, Capsules, CrowdedCells, FoamDrop, RedCells, Specimen
 from holosplat.geometry import Grid
 from holosplat.metrics import volume_scores
 from holosplat.units import wavelength

@@ -30,14 +30,14 @@ import numpy as np
 import tifffile
 
 import holosplat as hs
-from holosplat.bench.measured import MEASURED, agreement, back_projected
-from holosplat.bench.methods import METHODS
 from holosplat.io.reading import Part
 from holosplat.metrics import image_scores, intensity_range
 from holosplat.model import measure
 from holosplat.optics.background import LightOptions
 from holosplat.projectors.voxels import voxel_line_integrals
 from holosplat.version import source_commit
+from holosplat_bench.suite.measured import MEASURED, agreement, back_projected
+from holosplat_bench.suite.methods import METHODS
 
 ROOT = Path(__file__).resolve().parents[1]
 TABLE, PICTURES = ROOT / "docs/data/real_data.csv", ROOT / "docs/images/real_data"

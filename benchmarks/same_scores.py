@@ -11,8 +11,8 @@ import argparse
 import csv
 from pathlib import Path
 
-from holosplat.bench.folder import BenchFolder
-from holosplat.bench.rows import read_row
+from holosplat_bench.suite.folder import BenchFolder
+from holosplat_bench.suite.rows import read_row
 
 COMMITTED = Path(__file__).parents[1] / "docs" / "data" / "benchmark.csv"
 SCORES = ("ssim", "frcm", "dice", "relative_error_delta")

@@ -24,9 +24,10 @@ from torch import Tensor
 
 import holosplat as hs
 from holosplat.bodies.touching import parted
-from holosplat.learning.start import Guessed, LearnedStart, guessed
+from holosplat.inference import Compared
+from holosplat.learning.start import Guessed, LearnedStart, guessed, unexplained
 from holosplat.matter import Matter
-from holosplat.motion.guesses import CLEARLY, left_by_bodies
+from holosplat.motion.guesses import NETWORK, missed_by_bodies
 from holosplat.motion.sightings import SightingOptions, occupancy
 from holosplat.representations import VoxelGrid
 from motion import MATERIAL, cells_in_flow, imaged
@@ -90,14 +91,16 @@ def judged(
     numbers, level, both = truth(cells, guess.grid), options.level, (tomography, guess.values)
     masks = [volume.numpy() > level for volume in both]
     dice = [2 * (mask & (numbers > 0)).sum() / (mask.sum() + (numbers > 0).sum()) for mask in masks]
-    left = [left_by_bodies(volume, guess, level) for volume in both]
+    left = [unexplained((volume > level).float(), guess.images, guess.taps) for volume in both]
+    missed = [missed_by_bodies(volume, guess, level) for volume in both]
+    taken = Compared(NETWORK, *missed[1].gain_over(missed[0])).wins
     counts = list[int]()
     for volume in both:
         whole = volume.numpy()
         counts += [own(whole, numbers, level), own(parted(whole, level, options.least_volume), numbers, level)]
     there = int((np.bincount(numbers.ravel())[1:] >= SEEN).sum())
     said = [f"{value:.3f}" for value in (*dice, *left)]
-    return [*said, str(left[1] < CLEARLY * left[0]), *(str(count) for count in (there, *counts)), commit()]
+    return [*said, str(taken), *(str(count) for count in (there, *counts)), commit()]
 
 
 def main() -> None:

@@ -25,13 +25,13 @@ from changes import changed
 from machine import commit
 
 import holosplat as hs
-from holosplat.bench.case import load_case
 from holosplat.io.json import write_json
 from holosplat.methods import Extraction, SurfaceFit, SurfaceOptions, finished
 from holosplat.methods.surface_fit import extract_surfaces, oversampling, surface_fit
 from holosplat.representations import GaussianCloud, SurfaceMesh
 from holosplat.workflows.evaluate import Scores, score_object
 from holosplat.workflows.provenance import environment
+from holosplat_bench.suite.case import load_case
 
 CASES = ("main12", "main4", "noise12-2000", "shells8")
 VARIANTS: dict[str, dict[str, Any]] = {

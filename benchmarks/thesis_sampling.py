@@ -17,10 +17,11 @@ from pathlib import Path
 import numpy as np
 from machine import commit
 
-from holosplat.bench.case import Case, load_case
+from holosplat.beamline.declared.case import Case
 from holosplat.io.atomic import atomic_path
 from holosplat.model import Instrument
-from holosplat.thesis.measured import PHYSICS
+from holosplat_bench.suite.case import load_case
+from holosplat_bench.thesis.measured import PHYSICS
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "data" / "thesis_study" / "sampling.csv"
 SAMPLES, FINEST = (1, 2, 3, 4, 6, 8), 12

@@ -29,7 +29,6 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 import holosplat as hs
-from holosplat.bench.case import load_case
 from holosplat.fit.batch import Batch
 from holosplat.fit.density import _pair
 from holosplat.fit.fidelity import Target
@@ -46,6 +45,7 @@ from holosplat.model import Model
 from holosplat.optics.noise import sure_noise
 from holosplat.representations.gaussians import GaussianCloud
 from holosplat.workflows.evaluate import score_object
+from holosplat_bench.suite.case import load_case
 
 CASES, SEEDS = ["cells8", "noise12-2000", "thesis16", "foam12"], [12]
 """Narrow fringes, noise, coarse pixels, much surface."""

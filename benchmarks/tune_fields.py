@@ -27,13 +27,14 @@ import torch
 from changes import changed
 from machine import commit
 
-from holosplat.bench.case import Case, load_case
+from holosplat.beamline.declared.case import Case
 from holosplat.methods import Method, NeuralFields, NeuralFit, Task, VoxelFit, Voxels, finished
 from holosplat.methods.presets import preset
 from holosplat.methods.voxels import HolographicStage
 from holosplat.optics.sampling import fringe_sampling
 from holosplat.representations import Encoding, Network, Stored, VoxelGrid
 from holosplat.workflows.evaluate import score_object
+from holosplat_bench.suite.case import load_case
 
 CASES, SEEDS = ["cells8", "noise12-2000", "thesis16"], [11]
 """Narrow fringes, noise, and coarse pixels, all of known material."""

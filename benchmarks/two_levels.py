@@ -20,10 +20,11 @@ from machine import commit
 
 from holosplat.baselines import holographic_tv
 from holosplat.baselines.two_materials import Levels, best_levels
-from holosplat.bench.case import Case, case_names, load_case
+from holosplat.beamline.declared.case import Case
 from holosplat.matter import MaterialPrior
 from holosplat.methods.assumed import assumed_material
 from holosplat.methods.presets import preset
+from holosplat_bench.suite.case import case_names, load_case
 
 
 def levels_of(case: Case) -> Levels:

@@ -16,7 +16,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from doc_tables_all import TABLES
+from tables import TABLES
 
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
@@ -26,7 +26,7 @@ MARKED = re.compile(r"(<!-- table: ([\w-]+) -->\n)(?:(?!<!--).)*(<!-- end -->)",
 
 @dataclass(frozen=True)
 class Figure:
-    """Pictures below docs/images: the module of docs/ that draws them, what it is given, and what makes that."""
+    """Pictures below docs/images: the module of docs/pictures with its `main`, what it is given, what makes that."""
 
     pictures: tuple[str, ...]
     module: str
@@ -36,27 +36,27 @@ class Figure:
 
 
 FIGURES = {
-    "hero": Figure(("hero.png",), "make_pictures", ("DEMO",), "holosplat demo --out DEMO", "two minutes"),
+    "hero": Figure(("hero.png",), "hero", ("DEMO",), "holosplat demo --out DEMO", "two minutes"),
     "cells": Figure(
         ("cells.png",),
-        "make_cells",
+        "cells",
         ("FOLDER",),
         "holosplat grow --cells 16 --box 80e-6 34e-6 26e-6 --flow 0.058 --snapshots 50 --out FOLDER",
         "three minutes",
     ),
     "surfaces": Figure(
-        ("surfaces.png",), "make_surfaces", ("RUN", "TRUTH"), "python benchmarks/surfaces.py --runs FOLDER", "an hour"
+        ("surfaces.png",), "surfaces", ("RUN", "TRUTH"), "python benchmarks/surfaces.py --runs FOLDER", "an hour"
     ),
-    "simulation": Figure(("simulation_imperfections.png", "simulation_series.png"), "make_simulation", takes="minutes"),
+    "simulation": Figure(("simulation_imperfections.png", "simulation_series.png"), "simulation", takes="minutes"),
     "imaging-chain": Figure(
         ("imaging_chain/light.png", "imaging_chain/flat_fields.png", "imaging_chain/slices.png"),
-        "make_imaging_chain",
+        "imaging_chain",
         ("WORK",),
         takes="ten minutes",
     ),
     "motion": Figure(
         ("motion.webp", "motion_shapes.png"),
-        "make_motion",
+        "motion",
         ("RUN",),
         "holosplat track SCAN --material haemoglobin --out RUN, of a scan as benchmarks/motion.py simulates it",
         "an hour",
@@ -70,16 +70,17 @@ FIGURES = {
                 for n in ("curves", "psnr", "lines", "geometry")
             ),
         ),
-        "make_thesis",
+        "thesis",
     ),
-    "compact": Figure(("compact.png",), "make_compact"),
+    "compact": Figure(("compact.png",), "compact"),
+    "benchmark-rows": Figure((), "benchmark_rows", ("BENCH", "FILE.csv"), "holosplat bench run --out BENCH", "hours"),
     "benchmark": Figure(
         tuple(
             f"benchmark/{name}.png"
             for name in ("overview", "main12-slices", "main12-holograms", "main12-cost", "cells8-slices", "cells8-cost")
         )
         + tuple(f"benchmark/{n}.png" for n in ("noise12-2000-slices", "two_materials8-slices", "resolution-curves")),
-        "make_benchmark",
+        "benchmark",
         ("BENCH",),
         "holosplat bench run --out BENCH --snapshots DIR --seeds 101 102, then holosplat bench report BENCH",
         "a day",
@@ -148,7 +149,7 @@ def main() -> None:
         figure = FIGURES[options.figure]
         if len(options.given) != len(figure.given):
             parser.error(f"{options.figure} needs {' '.join(figure.given) or 'nothing'}; make it by: {figure.before}")
-        importlib.import_module(figure.module).main(*map(Path, options.given))
+        importlib.import_module(f"pictures.{figure.module}").main(*map(Path, options.given))
     else:
         differing = changed()
         for path, text in differing.items():

@@ -26,6 +26,7 @@ SMOKE = (
     " --out scan.nxs",
     "-m holosplat reconstruct scan.nxs --material water --method holographic-tv --out run",
     "-m holosplat export run --volume volume.h5",
+    "-m holosplat bench run --list",
 )
 """What must work in an environment that has the wheel alone."""
 

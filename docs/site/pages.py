@@ -14,6 +14,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCE = ROOT / "src" / "holosplat"
+BENCH = ROOT / "src" / "holosplat_bench"
 GALLERY = ROOT / "build" / "gallery"
 NOTEBOOKS = ROOT / "build" / "notebooks"
 FROM_ROOT = {"README.md": "index.md", "CONTRIBUTING.md": "contributing.md", "CHANGELOG.md": "changelog.md"}
@@ -90,7 +91,7 @@ def modules(source: Path) -> dict[str, list[str]]:
         room = parts[0] if len(parts) > 1 else "holosplat"
         if parts == ("__init__",):
             continue
-        dotted = ".".join(["holosplat", *(p for p in parts if p != "__init__")])
+        dotted = ".".join([source.name, *(p for p in parts if p != "__init__")])
         rooms.setdefault(room, []).append(dotted)
     return rooms
 
@@ -104,14 +105,16 @@ def _summary(source: Path, dotted: str) -> str:
 
 
 def api_pages(source: Path = SOURCE) -> Pages:
-    """A page a room, with everything public in it, and the list of rooms."""
+    """A page a room, with everything public in it, one of the benchmark, and the list of them."""
     pages = {}
     rows = ["# API reference", "", "Everything public, room by room. `import holosplat as hs` gives:", ""]
     rows += [f"- {line}" for line in _top_level()]
     rows += ["", "| room | what is in it |", "| --- | --- |"]
-    for room, names in sorted(modules(source).items()):
-        title = "holosplat" if room == "holosplat" else f"holosplat.{room}"
-        summary = "The nouns, and what every room uses." if room == "holosplat" else _summary(source, names[0])
+    bench = [name for names in modules(BENCH).values() for name in names]
+    for room, names in sorted({**modules(source), BENCH.name: [BENCH.name, *bench]}.items()):
+        title = room if room in ("holosplat", BENCH.name) else f"holosplat.{room}"
+        where = BENCH if room == BENCH.name else source
+        summary = "The nouns, and what every room uses." if room == "holosplat" else _summary(where, names[0])
         rows.append(f"| [{title}]({room}.md) | {summary} |")
         blocks = [f"# {title}", summary, *(f"::: {name}" for name in names)]
         pages[f"api/{room}.md"] = "\n\n".join(blocks) + "\n"

@@ -100,15 +100,6 @@ class Object(Protocol):
 
 
 @runtime_checkable
-class Photographed(Object, Protocol):
-    """An Object that says itself what frames show of it, as no line integrals and no waves could: as photographs."""
-
-    def photographs(self, views: Views | Poses, /) -> torch.Tensor:
-        """Frames [V, H, W] on the pixels of `views`, relative to the flat field."""
-        ...
-
-
-@runtime_checkable
 class Component(Protocol):
     """A part of a model whose numbers can be fitted: they have names, and other ones can take their place."""
 

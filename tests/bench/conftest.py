@@ -11,7 +11,7 @@ import holosplat as hs
 from helpers.bench_shop import Recorder
 from helpers.contract import PHOTOGRAPHS, two_balls
 from helpers.once import Once, once
-from holosplat.bench.methods import METHODS
+from holosplat_bench.suite.methods import METHODS
 
 
 @pytest.fixture
@@ -23,7 +23,7 @@ def recorder() -> Recorder:
 def _no_search_for_garbage() -> Iterator[None]:
     """The benchmark looks for garbage before each method, for its memory; here that is a third of a row."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("holosplat.bench.run.gc", SimpleNamespace(collect=lambda: None))
+        patch.setattr("holosplat_bench.suite.run.gc", SimpleNamespace(collect=lambda: None))
         yield
 
 

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from holosplat.bench.case import FOLDER, Case, case_names, load_case
-from holosplat.bench.declaration import declared_names
+from holosplat.beamline.declared.declaration import declared_names
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.materials import DeltaBeta, parse_material
@@ -20,6 +19,7 @@ from holosplat.specimens.continuous import ContinuousScene
 from holosplat.specimens.phantoms import Ball
 from holosplat.specimens.scene import MeshScene
 from holosplat.tables import merged
+from holosplat_bench.suite.case import FOLDER, Case, case_names, load_case
 
 SLOW = ("crowded12",)
 """Scenes that take seconds to make: that they follow their seed is tested on smaller ones (test_specimens_phantoms)."""

@@ -11,9 +11,9 @@ import holosplat as hs
 from helpers.bench_shop import SHAPES, Recorder, fail, make_case, suite
 from helpers.cli import holosplat as run_command
 from holosplat import version
-from holosplat.bench.folder import BenchFolder
-from holosplat.bench.measured import MEASURED
-from holosplat.bench.run import chosen, run_suite
+from holosplat_bench.suite.folder import BenchFolder
+from holosplat_bench.suite.measured import MEASURED
+from holosplat_bench.suite.run import chosen, run_suite
 
 pytestmark = pytest.mark.usefixtures("unjudged_runs")
 
@@ -80,10 +80,10 @@ def holosplat(*arguments: object) -> tuple[int, str, str]:
 def shop(recorder, monkeypatch) -> Recorder:
     """The command line with two small cases and two fast methods."""
     methods = {name: recorder.method(name) for name in ("one", "two")}
-    monkeypatch.setattr("holosplat.bench.methods.METHODS", methods)
-    monkeypatch.setattr("holosplat.bench.methods.ALIGNED", {})
-    monkeypatch.setattr("holosplat.bench.references.REFERENCES", {})
-    monkeypatch.setattr("holosplat.bench.case.case_names", lambda: list(SHAPES))
+    monkeypatch.setattr("holosplat_bench.suite.methods.METHODS", methods)
+    monkeypatch.setattr("holosplat_bench.suite.methods.ALIGNED", {})
+    monkeypatch.setattr("holosplat_bench.suite.references.REFERENCES", {})
+    monkeypatch.setattr("holosplat_bench.suite.case.case_names", lambda: list(SHAPES))
 
     def load(name, seed, snapshots):
         return replace(make_case("round", seed), name="mine") if name.endswith(".toml") else make_case(name, seed)
@@ -92,8 +92,8 @@ def shop(recorder, monkeypatch) -> Recorder:
         case = load(source, 0, snapshots)
         return case.exposures, case.is_test
 
-    monkeypatch.setattr("holosplat.bench.case.load_case", load)
-    monkeypatch.setattr("holosplat.bench.case.planned_frames", planned)
+    monkeypatch.setattr("holosplat_bench.suite.case.load_case", load)
+    monkeypatch.setattr("holosplat_bench.suite.case.planned_frames", planned)
     return recorder
 
 
@@ -144,7 +144,7 @@ def test_bad_requests_are_refused_in_one_line(shop, tmp_path, arguments, words):
 
 def test_a_case_whose_name_can_be_no_files_is_refused_before_there_is_a_folder(shop, tmp_path, monkeypatch):
     case = replace(make_case("round", 3), name="my case")
-    monkeypatch.setattr("holosplat.bench.case.load_case", lambda name, seed, snapshots: case)
+    monkeypatch.setattr("holosplat_bench.suite.case.load_case", lambda name, seed, snapshots: case)
     code, _, err = holosplat("bench", "run", "--cases", "my case.toml", "--out", tmp_path / "bench")
     assert code == 2
     assert "names of cases and methods must be of letters, digits, '-', '_' and '+', but one is 'my case'" in err
@@ -153,7 +153,7 @@ def test_a_case_whose_name_can_be_no_files_is_refused_before_there_is_a_folder(s
 
 def test_ctrl_c_says_how_to_go_on(shop, tmp_path, monkeypatch):
     stopped = {"one": shop.method("one"), "two": shop.method("two", fail(KeyboardInterrupt()))}
-    monkeypatch.setattr("holosplat.bench.methods.METHODS", stopped)
+    monkeypatch.setattr("holosplat_bench.suite.methods.METHODS", stopped)
     code, _, err = holosplat("bench", "run", "--cases", "round", "--out", tmp_path / "bench")
     assert code == 130
     assert "the same command goes on" in err

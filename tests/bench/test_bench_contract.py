@@ -10,9 +10,9 @@ import torch
 
 import holosplat as hs
 from helpers.contract import MATERIAL, PHOTOGRAPHS, PITCH, QUICK, SCENE, SHAPE, run, usable
-from holosplat.bench.method import Method
-from holosplat.bench.methods import METHODS
 from holosplat.model import Instrument, Model
+from holosplat_bench.suite.method import Method
+from holosplat_bench.suite.methods import METHODS
 
 pytestmark = pytest.mark.usefixtures("decided")
 

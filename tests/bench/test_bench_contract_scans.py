@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 import holosplat as hs
 from helpers.contract import MATERIAL, PITCH, QUICK, QUICKER, SCENE, SHAPE, run, usable
-from holosplat.bench.method import Method
-from holosplat.bench.methods import METHODS
+from holosplat_bench.suite.method import Method
+from holosplat_bench.suite.methods import METHODS
 
 pytestmark = pytest.mark.usefixtures("decided")
 

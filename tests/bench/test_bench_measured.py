@@ -10,15 +10,15 @@ import pytest
 import torch
 
 from helpers.cli import holosplat
-from holosplat.bench import measured
-from holosplat.bench.folder import BenchFolder
-from holosplat.bench.measured import MEASURED, agreement, missing_data
-from holosplat.bench.methods import METHODS
-from holosplat.bench.run import Suite, run_suite
 from holosplat.geometry import Grid, Views
 from holosplat.projectors.voxels import SliceProjector
 from holosplat.units import wavenumber
 from holosplat.volume import Volume
+from holosplat_bench.suite import measured
+from holosplat_bench.suite.folder import BenchFolder
+from holosplat_bench.suite.measured import MEASURED, agreement, missing_data
+from holosplat_bench.suite.methods import METHODS
+from holosplat_bench.suite.run import Suite, run_suite
 
 pytestmark = pytest.mark.usefixtures("unjudged_runs")
 

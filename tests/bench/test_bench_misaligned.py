@@ -13,15 +13,15 @@ from scipy.spatial.transform import Rotation
 import holosplat as hs
 from helpers.bench_shop import MATERIAL, PITCH
 from holosplat.align.gauge import moved_onto
+from holosplat.beamline.declared.case import Case
 from holosplat.beamline.misalignment import Misalignment
-from holosplat.bench.aligners import by_mass, by_reprojection
-from holosplat.bench.case import Case
-from holosplat.bench.methods import ALIGNED, METHODS
-from holosplat.bench.moved import Move, judged_with
-from holosplat.bench.prepare import described, fingerprint
 from holosplat.matter import Matter
 from holosplat.representations.voxels import VoxelGrid
 from holosplat.specimens.red_cells import icosphere
+from holosplat_bench.suite.aligners import by_mass, by_reprojection
+from holosplat_bench.suite.methods import ALIGNED, METHODS
+from holosplat_bench.suite.moved import Move, judged_with
+from holosplat_bench.suite.prepare import described, fingerprint
 
 pytestmark = pytest.mark.usefixtures("unjudged_runs")
 
@@ -75,7 +75,7 @@ def test_steps_of_a_move_follow_each_other(monkeypatch):
     """Each turns and moves what those before have moved."""
     turn, by, steps = Rotation.from_rotvec([0.3, -0.2, 0.4]).as_matrix(), np.array([2.0, -1.0, 0.5]), iter(range(99))
     still = (np.eye(3), np.zeros(3))
-    monkeypatch.setattr("holosplat.bench.moved._step", lambda *rest: (turn, by) if next(steps) < 2 else still)
+    monkeypatch.setattr("holosplat_bench.suite.moved._step", lambda *rest: (turn, by) if next(steps) < 2 else still)
     grid = hs.Grid.centred((9, 10, 11), PITCH, (0.0, 0.0, 0.0))
     truth = balls().voxelise(grid)
     found, point = Move.best(truth, truth), np.array([3.0, 4.0, -2.0])
@@ -132,7 +132,7 @@ def test_a_method_gets_the_aligned_views(case, scan, monkeypatch):
         given.append(train)
         return SimpleNamespace(object="found")
 
-    monkeypatch.setattr("holosplat.bench.method.reconstruct", reconstruct)
+    monkeypatch.setattr("holosplat_bench.suite.method.reconstruct", reconstruct)
     there = scan.train()[[0, 1]]
     method = replace(METHODS["gaussians"], aligner=lambda *_: there)
     assert method.run(scan.train(), case.prior, 0, lambda *_: None) == "found"

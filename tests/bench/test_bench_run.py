@@ -14,19 +14,19 @@ from scipy.ndimage import gaussian_filter
 
 import holosplat as hs
 from helpers.bench_shop import MATERIAL, PITCH, Recorder, fail, make_case, suite, voxels
-from holosplat.bench import record, references
-from holosplat.bench.case import Case
-from holosplat.bench.folder import BenchFolder
-from holosplat.bench.prepare import fingerprint, prepared
-from holosplat.bench.references import REFERENCES
-from holosplat.bench.rows import Row, read_row, write_row
-from holosplat.bench.run import Suite, run_suite
-from holosplat.bench.sizes import contrast_by_size
+from holosplat.beamline.declared.case import Case
 from holosplat.matter import Matter
 from holosplat.optics.sampling import fringe_sampling
 from holosplat.representations.voxels import VoxelGrid
 from holosplat.specimens.phantoms import star_of_balls
 from holosplat.workflows.evaluate import score_object
+from holosplat_bench.suite import record, references
+from holosplat_bench.suite.folder import BenchFolder
+from holosplat_bench.suite.prepare import fingerprint, prepared
+from holosplat_bench.suite.references import REFERENCES
+from holosplat_bench.suite.rows import Row, read_row, write_row
+from holosplat_bench.suite.run import Suite, run_suite
+from holosplat_bench.suite.sizes import contrast_by_size
 
 pytestmark = pytest.mark.usefixtures("unjudged_runs")
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from holosplat.beamline.light import EVEN_LIGHT
-from holosplat.bench.case import load_case
-from holosplat.bench.prepare import fingerprint
 from holosplat.materials import parse_material
 from holosplat.specimens.continuous import ContinuousScene
+from holosplat_bench.suite.case import load_case
+from holosplat_bench.suite.prepare import fingerprint
 
 
 def test_light_is_uneven_on_frames_for_training_alone(monkeypatch):

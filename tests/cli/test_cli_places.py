@@ -12,10 +12,11 @@ from typing import Any, get_args
 import pytest
 
 from helpers.cli import holosplat
-from holosplat.cli import bench, series
+from holosplat.cli import series
 from holosplat.cli.entry import COMMANDS, command
 from holosplat.cli.places import is_run, is_written
 from holosplat.ranges import hints_of
+from holosplat_bench.cli import bench
 
 BEAM = ["--detector", "8", "9", "--views", "2"]
 READS = "must not be what the command reads"

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from holosplat.bench.folder import BenchFolder
-from holosplat.bench.pages.results import read_results
-from holosplat.bench.rows import Row
+from holosplat_bench.suite.folder import BenchFolder
+from holosplat_bench.suite.pages.results import read_results
+from holosplat_bench.suite.rows import Row
 
 FAMILIES = {"fbp": "tomography", "sirt-nonneg": "tomography", "gaussians": "Gaussians", "neural-field": "neural"}
 

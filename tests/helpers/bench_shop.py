@@ -10,13 +10,13 @@ import numpy as np
 import torch
 
 import holosplat as hs
-from holosplat.bench.case import Case
-from holosplat.bench.method import Method
-from holosplat.bench.run import Suite
+from holosplat.beamline.declared.case import Case
 from holosplat.matter import Matter
 from holosplat.methods import Task
 from holosplat.representations.voxels import VoxelGrid
 from holosplat.specimens.red_cells import icosphere
+from holosplat_bench.suite.method import Method
+from holosplat_bench.suite.run import Suite
 
 MATERIAL = hs.DeltaBeta(2e-7, 2e-10)
 PITCH = 1e-6

@@ -11,14 +11,14 @@ import pytest
 import holosplat as hs
 from helpers.unjudged import unjudged
 from holosplat.baselines import HolographicTV
-from holosplat.bench.method import Method
-from holosplat.bench.methods import METHODS, methods
-from holosplat.bench.methods import PHOTOGRAPHS as PHOTOGRAPHIC
 from holosplat.fit.density import DensityControl
 from holosplat.methods import AlignedFit, Onix, PixelNerf, SmoothVolume
-from holosplat.methods.photographs import AlphaRates, AlphaSplats, RadianceFields
 from holosplat.representations import AlignedNetwork, Encoding, Network
 from holosplat.specimens.red_cells import icosphere
+from holosplat_bench.opponents.photographs import AlphaRates, AlphaSplats, RadianceFields
+from holosplat_bench.suite.method import Method
+from holosplat_bench.suite.methods import METHODS, methods
+from holosplat_bench.suite.methods import PHOTOGRAPHS as PHOTOGRAPHIC
 
 MATERIAL = hs.DeltaBeta(2e-7, 2e-10)
 PITCH = 1e-6

@@ -1,4 +1,4 @@
-"""The house rules of docs/design/architecture.md, read from the syntax trees of every file in src/holosplat.
+"""The house rules of docs/design/architecture.md, read from the syntax trees of every file in src.
 
 Each rule maps files to complaints. It is held on the real files, and on small bad examples, so that a rule
 that has gone blind fails too.
@@ -19,40 +19,28 @@ from pathlib import Path
 import pytest
 
 Files = dict[str, str]
-"""Path below src/holosplat → source text."""
+"""Path below src/holosplat, or `holosplat_bench/…` → source text."""
 
-TIERS = (
-    (
-        "units",
-        "version",
-        "checks",
-        "ranges",
-        "lazy",
-        "tables",
-        "native",
-        "launch",
-        "backends",
-        "memory",
-        "progress",
-        "display",
-    )
-    + ("geometry", "frames", "divided_light", "scan", "volume", "mesh", "matter"),
-    ("materials", "optics", "metrics", "projectors", "preprocess"),
-    ("specimens", "representations", "model", "inference"),
-    ("io",),
-    ("fit", "baselines", "learning"),
-    ("bodies",),
-    ("methods",),
-    ("align",),
-    ("motion",),
-    ("workflows", "beamline", "planning"),
-    ("report", "show"),
-    ("bench", "series"),
-    ("thesis", "training"),
-    ("cli",),
-    ("__main__",),
-)
-"""Rooms, lowest first. A room imports rooms of lower tiers."""
+PLAN = """
+units version checks ranges lazy tables native launch backends memory progress display plugins
+geometry frames divided_light scan volume mesh matter
+← materials optics metrics projectors preprocess inference
+← specimens representations model
+← io fit baselines
+← bodies learning beamline
+← methods
+← align motion
+← workflows planning
+← report show training
+← series
+← cli ← __main__
+← holosplat_bench/opponents
+← holosplat_bench/suite
+← holosplat_bench/thesis
+← holosplat_bench/cli
+"""
+TIERS = tuple(tuple(tier.split()) for tier in PLAN.split("←"))
+"""Rooms, lowest first, of the core and then of the benchmark. A room imports rooms of lower tiers."""
 
 SAME_TIER = dict.fromkeys(TIERS[0], TIERS[0])
 """Rooms of their own tier that a room may import (the nouns among themselves: without cycles)."""
@@ -62,17 +50,10 @@ BACKEND_IMPORTS = {"projectors/mesh/reference.py": ("geometry",), "optics/hologr
 """What a backend file may import of ours, beside its own folder and `native`."""
 
 HEAVY: dict[str, tuple[str, ...]] = {
-    "vtk": (),
-    "vtkmodules": (),
-    "trimesh": (),
-    "skimage": (),
-    "matplotlib": ("report", "bench/pages", "thesis/pages"),
+    **dict.fromkeys(("vtk", "vtkmodules", "trimesh", "skimage", "viser", "websockets", "zarr", "numcodecs"), ()),
+    "matplotlib": ("report", "holosplat_bench/suite/pages", "holosplat_bench/thesis/pages"),
     "jinja2": ("report",),
-    "viser": (),
-    "websockets": (),
-    "zarr": (),
-    "numcodecs": (),
-    "tyro": ("cli",),
+    "tyro": ("cli", "holosplat_bench/cli"),
 }
 """Packages slow to import, and the rooms or parts of rooms that do so at module level (others inside a function)."""
 
@@ -89,27 +70,36 @@ MANY_ARGUMENTS = {
 
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
-SOURCE = Path(__file__).resolve().parents[2] / "src" / "holosplat"
+SOURCE = Path(__file__).resolve().parents[2] / "src"
+BENCH = "holosplat_bench"
 TESTS = Path(__file__).resolve().parents[1]
-BESIDE_THE_ROOMS = ("house", "helpers")
-"""Folders of tests that are not of one room: the house as a whole, and what test files share."""
+BESIDE_THE_ROOMS = ("house", "helpers", "bench")
+"""Folders of tests that are not of one room: the house as a whole, what test files share, and all of the benchmark."""
 
 
 @pytest.fixture(scope="module")
 def files() -> Files:
-    """Every Python file of the package."""
-    found = {str(p.relative_to(SOURCE).as_posix()): p.read_text(encoding="utf-8") for p in SOURCE.rglob("*.py")}
-    assert len(found) > 20
-    return found
+    """Every Python file of both packages."""
+    texts = {p.relative_to(SOURCE).as_posix(): p.read_text(encoding="utf-8") for p in SOURCE.rglob("*.py")}
+    assert {path.split("/")[0] for path in texts} == {"holosplat", BENCH}
+    assert len(texts) > 20
+    return {path.removeprefix("holosplat/"): text for path, text in texts.items()}
 
 
 # --- reading ------------------------------------------------------------------------------------------------
 
 
 def _room(path: str) -> str:
-    """`optics/detector.py` → `optics`, `scan.py` → `scan`, the package's own `__init__.py` → empty."""
-    first = path.split("/")[0].removesuffix(".py")
-    return "" if first == "__init__" else first
+    """`optics/detector.py` → `optics`, `scan.py` → `scan`, a package's own `__init__.py` → empty; rooms of the
+    benchmark have its name before theirs."""
+    package = f"{BENCH}/" if path.startswith(f"{BENCH}/") else ""
+    first = path.removeprefix(package).split("/")[0].removesuffix(".py")
+    return "" if first == "__init__" else package + first
+
+
+def _dotted(path: str) -> str:
+    """A file's path with its package before it."""
+    return path if path.startswith(f"{BENCH}/") else "holosplat/" + path
 
 
 @cache
@@ -138,7 +128,7 @@ def _imports(files: Files, path: str) -> Iterator[tuple[str, str, bool]]:
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         else:
-            package = ("holosplat/" + path).split("/")[: -node.level] if node.level else []
+            package = _dotted(path).split("/")[: -node.level] if node.level else []
             base = ".".join([*package, *filter(None, [node.module])])
             names = [f"{base}.{alias.name}" for alias in node.names]
         for name in set(names):
@@ -148,14 +138,14 @@ def _imports(files: Files, path: str) -> Iterator[tuple[str, str, bool]]:
 def _file_of(files: Files, name: str) -> str:
     """The file that holds the dotted `name`: itself a module, or a name in one; empty if it is not ours."""
     parts = name.split(".")
-    if parts[0] != "holosplat":
+    if parts[0] not in ("holosplat", BENCH):
         return ""
     for depth in range(len(parts), 1, -1):
-        stem = "/".join(parts[1:depth])
+        stem = "/".join(parts[:depth]).removeprefix("holosplat/")
         for candidate in (f"{stem}.py", f"{stem}/__init__.py"):
             if candidate in files:
                 return candidate
-    return "__init__.py"
+    return f"{BENCH}/__init__.py" if parts[0] == BENCH else "__init__.py"
 
 
 def _public(files: Files) -> Iterator[tuple[str, ast.ClassDef | Function, bool]]:
@@ -198,6 +188,11 @@ def imports_run_downwards(files: Files) -> list[str]:
             if not lower and there not in SAME_TIER.get(room, ()):
                 complaints.append(f"{path} imports {name}")
     return complaints
+
+
+def the_core_does_not_name_the_benchmark(files: Files) -> list[str]:
+    """It finds what the benchmark adds by entry points (`plugins.Extended`)."""
+    return [path for path, text in files.items() if not path.startswith(f"{BENCH}/") and BENCH in text]
 
 
 def no_cycles(files: Files) -> list[str]:
@@ -264,6 +259,7 @@ def arguments_are_few(files: Files) -> list[str]:
 RULES: tuple[Callable[[Files], list[str]], ...] = (
     every_room_is_on_the_plan,
     imports_run_downwards,
+    the_core_does_not_name_the_benchmark,
     no_cycles,
     backends_stand_alone,
     heavy_packages_wait,
@@ -283,7 +279,7 @@ def test_the_tests_mirror_the_rooms_in_short_files(files):
     """A test file lies in the folder of its room (at the root for a room that is one file); names are unique."""
     found = {path.relative_to(TESTS).as_posix(): path.read_text(encoding="utf-8") for path in TESTS.rglob("*.py")}
     folders = {path.split("/")[0] for path in found if "/" in path}
-    assert folders <= {path.split("/")[0] for path in files if "/" in path} | set(BESIDE_THE_ROOMS)
+    assert folders <= {path.split("/")[0] for path in files if "/" in path} - {BENCH} | set(BESIDE_THE_ROOMS)
     names = [path.rsplit("/", 1)[-1] for path in found if "/test_" in path]
     assert sorted(set(names)) == sorted(names)
     assert not files_are_short(found)
@@ -324,6 +320,8 @@ GOOD: Files = {
     "io/__init__.py": '"""Files."""\nfrom ..version import __version__\nfrom ..optics import y\n',
     "report/__init__.py": '"""Pages."""\nimport matplotlib.pyplot\n',
     "cli.py": '"""Commands."""\nimport tyro\nfrom . import report\nfrom holosplat.optics.wave import y\n',
+    "holosplat_bench/suite/rows.py": '"""Rows."""\nfrom holosplat.report import page\nfrom ..opponents import a\n',
+    "holosplat_bench/opponents/__init__.py": '"""Opponents."""\n',
 }
 """A house that keeps every rule."""
 
@@ -340,6 +338,11 @@ BAD: tuple[tuple[Callable[[Files], list[str]], str, str], ...] = (
     (imports_run_downwards, "optics/wave.py", "def late():\n    from .. import io\n"),
     (imports_run_downwards, "report/__init__.py", "from ..cli import main\n"),
     (imports_run_downwards, "io/more.py", "from .. import other\n"),
+    (imports_run_downwards, "io/more.py", "from holosplat_bench.suite import rows\n"),
+    (imports_run_downwards, "io/more.py", "def late():\n    import holosplat_bench\n"),
+    (imports_run_downwards, "holosplat_bench/opponents/more.py", "from ..suite import rows\n"),
+    (every_room_is_on_the_plan, "holosplat_bench/attic/box.py", '"""A."""\n'),
+    (the_core_does_not_name_the_benchmark, "units.py", 'x = "holosplat_bench.suite"\n'),
     (no_cycles, "units.py", "from .geometry import Views\n"),
     (no_cycles, "optics/wave.py", "def late():\n    from . import y\n"),
     (backends_stand_alone, "projectors/splat/cpu.py", "from ...geometry import Views\n"),
@@ -381,20 +384,13 @@ def test_the_rule_refuses_a_bad_house(rule, path, text):
 @pytest.mark.parametrize("everything", [False, True], ids=["holosplat", "all but the readers"])
 def test_imports_are_light(everything, files):
     """No package of `HEAVY` is loaded by `import holosplat`, nor by what does not draw or talk; triton neither."""
-    readers = ("cli", "report/", "bench/pages/", "series/pages/", "thesis/pages", "__init__")
+    pages = (f"{BENCH}/suite/pages/", f"{BENCH}/thesis/pages/")
+    readers = ("cli", "report/", "series/pages/", "__init__", *pages, f"{BENCH}/cli/")
     low = [p for p in files if everything and not p.startswith(readers)]
     low = [p for p in low if not fnmatch(p, "*/cuda.py") and not fnmatch(p, "*/triton_*.py")]
-    modules = ["holosplat", *("holosplat." + p.removesuffix(".py").replace("/", ".") for p in low)]
+    modules = ["holosplat", *(_dotted(p).removesuffix(".py").replace("/", ".") for p in low)]
     code = f"import importlib, sys\nfor m in {modules}: importlib.import_module(m.removesuffix('.__init__'))\n"
     code += f"print(*(m for m in {[*HEAVY, 'triton']} if m in sys.modules))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == []
-
-
-def test_a_task_of_a_series_loads_no_table_of_atoms():
-    """Nor its database: δ and β are numbers in a plan."""
-    code = "import sys\nimport holosplat.series.run\nprint(*(m for m in ('xraydb', 'sqlalchemy') if m in sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split() == []

@@ -28,7 +28,7 @@ def test_tables_are_as_their_data(figures):
 
 def test_new_rows_of_motion_appear_by_rule(figures, monkeypatch):
     """Of cases that the tables know, at the times that a table is of; each case of a forecast has its own table."""
-    motion = importlib.import_module("doc_tables_motion")
+    motion = importlib.import_module("tables.motion")
     rows = {name: motion.read(f"{name}.csv") for name in ("motion", "motion_ablation", "forecast")}
     monkeypatch.setattr(motion, "read", lambda name: rows[name.removesuffix(".csv")])
     like = next(row for row in rows["motion"] if (row["case"], row["first"]) == ("flow2-body", "0"))
@@ -69,12 +69,12 @@ TABLE = re.compile(r"^\|.*\n\| ---.*\n((?:\|.*\n)+)", re.MULTILINE)
 DECLARED = {"docs/simulation.md": "| option | views |", "docs/notebook/thesis_study.md": "| the thesis | here |"}
 """Tables of settings, which nobody measured."""
 WHOLE = "docs/notebook/benchmark_tables.md"
-"""The page that make_benchmark.py writes from docs/data as a whole."""
+"""The page that docs/pictures/benchmark.py writes from docs/data as a whole."""
 
 
 def test_numbers_that_were_measured_stand_in_tables_that_a_script_makes(figures):
     """Tables of which a quarter of the cells have decimals or units, outside of marks."""
-    assert "benchmark_tables.md" in (DOCS / "make_benchmark.py").read_text("utf-8")
+    assert "benchmark_tables.md" in (DOCS / "pictures/benchmark.py").read_text("utf-8")
     found = []
     for page in figures.pages():
         name = page.relative_to(ROOT).as_posix()
@@ -101,7 +101,7 @@ def test_every_picture_is_made_by_something_and_there(figures):
     images = DOCS / "images"
     there = {path.relative_to(images).as_posix() for path in images.rglob("*.*")}
     assert made == there, "docs/figures.py must name every picture, in FIGURES or ELSEWHERE"
-    assert all("def main(" in (DOCS / f"{f.module}.py").read_text("utf-8") for f in figures.FIGURES.values())
+    assert all("def main(" in (DOCS / f"pictures/{f.module}.py").read_text("utf-8") for f in figures.FIGURES.values())
 
 
 def test_every_data_file_is_named(figures):
@@ -123,10 +123,10 @@ def test_what_is_listed(figures):
 # --- the plan of the code -----------------------------------------------------------------------------------
 
 
-def shown_rooms() -> set[str]:
-    """What the tree in docs/design/architecture.md shows of src/holosplat."""
+def shown_rooms(package: str) -> set[str]:
+    """What the tree in docs/design/architecture.md shows of a package in src."""
     text = (DOCS / "design" / "architecture.md").read_text(encoding="utf-8")
-    tree = text.split("src/holosplat/\n")[1].split("tests/")[0]
+    tree = re.split(r"^\S", text.split(f"src/{package}/")[1], flags=re.MULTILINE)[0]
     lines = [line for line in tree.splitlines() if re.match(r"  \S", line)]
     inside = [line for line in tree.splitlines() if re.match(r"    \S", line)]
     names = re.compile(r"\b([a-z_]+(?:\.py|\.toml|/))(?=\s|$)")
@@ -134,12 +134,12 @@ def shown_rooms() -> set[str]:
     return top | {f"projectors/{name}" for line in inside for name in names.findall(line)[:1]}
 
 
-def test_the_plan_shows_the_rooms_that_are_there():
-    package = ROOT / "src" / "holosplat"
+@pytest.mark.parametrize("package", [ROOT / "src" / "holosplat", ROOT / "src" / "holosplat_bench"])
+def test_the_plan_shows_the_rooms_that_are_there(package):
     there = {f"{p.name}/" for p in package.iterdir() if p.is_dir() and p.name != "__pycache__"}
     there |= {p.name for p in package.iterdir() if p.suffix in (".py", ".toml") and p.name != "__init__.py"}
-    there |= {f"projectors/{p.name}/" for p in (package / "projectors").iterdir() if (p / "__init__.py").exists()}
-    assert shown_rooms() == there
+    there |= {f"projectors/{path.parent.name}/" for path in package.glob("projectors/*/__init__.py")}
+    assert shown_rooms(package.name) == there
 
 
 def test_runs_of_a_seed_that_differ_by_a_scan_s_rounding_begin_alike():

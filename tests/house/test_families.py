@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import holosplat as hs
-from holosplat.bench.methods import METHODS
+from holosplat_bench.suite.methods import METHODS
 
 BENCHMARKS = Path(__file__).resolve().parents[2] / "benchmarks"
 MATERIAL = hs.DeltaBeta(1e-7, 1e-10)

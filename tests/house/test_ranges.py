@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 import holosplat
-from holosplat.bench import declaration, soft_specimens, specimens
+from holosplat.beamline.declared import declaration, soft_specimens, specimens
 from holosplat.checks import InputError
 from holosplat.cli.entry import COMMANDS, command
 from holosplat.materials import DeltaBeta

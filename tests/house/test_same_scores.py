@@ -10,8 +10,8 @@ from types import ModuleType
 
 import pytest
 
-from holosplat.bench.folder import BenchFolder
-from holosplat.bench.rows import Row
+from holosplat_bench.suite.folder import BenchFolder
+from holosplat_bench.suite.rows import Row
 
 TEST = {"ssim": 0.9, "frcm": 0.8}
 VOLUME = {"dice": 0.95, "relative_error_delta": 0.1}

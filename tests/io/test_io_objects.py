@@ -23,32 +23,28 @@ from holosplat.matter import Matter
 from holosplat.representations import (
     KINDS,
     AlignedNetwork,
-    AlphaCloud,
-    Deformation,
-    DeformedVoxels,
     Encoding,
     Flow,
     GaussianCloud,
-    HexPlaneField,
-    HexPlanes,
     Lattice,
-    LowRankVoxels,
     MovingGaussians,
     MovingSurfaces,
     Network,
     NeuralField,
     PixelAligned,
     PixelAlignedField,
-    RadianceField,
     SpaceTime,
     SpaceTimeField,
     Stored,
     SurfaceMesh,
     TimeBasis,
     VoxelGrid,
-    VoxelSeries,
 )
 from holosplat.specimens.red_cells import icosphere
+from holosplat_bench.opponents.moving.deformed_voxels import Deformation, DeformedVoxels
+from holosplat_bench.opponents.moving.hexplane_field import HexPlaneField, HexPlanes
+from holosplat_bench.opponents.moving.moving_voxels import LowRankVoxels, VoxelSeries
+from holosplat_bench.opponents.photographed import AlphaCloud, RadianceField
 
 PITCH = 2e-6
 GRID = Grid((7, 5, 9), (PITCH, PITCH, PITCH), (-8e-6, 1e-6, -5e-6))

@@ -11,20 +11,17 @@ from torch import Tensor, nn
 
 import holosplat as hs
 from holosplat.baselines import HolographicTV
+from holosplat.inference import Decision
 from holosplat.learning.lattice import Taps
-from holosplat.learning.start import LearnedStart
+from holosplat.learning.start import GuessedMatter, LearnedStart
 from holosplat.learning.weights import Card, Trained
 from holosplat.methods import Gaussians, Surfaces, Task
-from holosplat.methods.beginning import Beginning
 from holosplat.methods.coarse import CoarseToFine
-from holosplat.methods.cross_validation import MissingMatter
-from holosplat.methods.evidence import Evidence
 from holosplat.methods.gaussians import GaussianStage
 from holosplat.methods.illumination import prepared
-from holosplat.methods.learned import _Trial
+from holosplat.methods.learned import GUESS, PLAIN
 from holosplat.methods.method import solve_stages
 from holosplat.methods.start import starting_cloud
-from holosplat.optics.noise_model import NoiseModel
 from holosplat.representations import GaussianCloud, SurfaceMesh
 from holosplat.specimens import Ball
 
@@ -36,7 +33,7 @@ OPTIONS = Gaussians(
     start="learned",
     approximate_steps=10,
     volume=HolographicTV(retrieval=10, iterations=20, corrections=1, inner=5),
-    learned=LearnedStart(trial_steps=4, trial_surfaces=3, last_steps=6, last_surfaces=4),
+    learned=LearnedStart(steps=6, surface_steps=4),
 )
 
 
@@ -63,78 +60,51 @@ def scan() -> hs.Scan:
     return hs.simulate(ball, hs.Exposures.of(views, 12.0, 0.02), is_test=np.zeros(2, dtype=bool), oversample=4)
 
 
-def begun(scan: hs.Scan, monkeypatch, aside: float, typical: float, prior=KNOWN) -> tuple[Tensor, Tensor, Beginning]:
-    """Centres of the cloud that is begun with, of the ordinary one, and what was said."""
-    trained = Trained(Says(aside), Card(typical_misfit={"2": typical}))  # type: ignore[arg-type]
+def begun(
+    scan: hs.Scan, monkeypatch, aside: float, prior=KNOWN, options: Gaussians = OPTIONS
+) -> tuple[Tensor, Tensor, Decision, GuessedMatter | None]:
+    """Centres of the cloud that is begun with, of the ordinary one, the decision, and the guess."""
+    trained = Trained(Says(aside), Card())  # type: ignore[arg-type]
     monkeypatch.setattr(LearnedStart, "network", property(lambda self: trained))
-    told = list[Beginning]()
-    task = Task(scan, prior, on_beginning=told.append)
-    found = GaussianStage(OPTIONS).start(task, None)
+    said = list[tuple[Decision, GuessedMatter | None]]()
+    task = Task(scan, prior, on_start=lambda *each: said.append(each))
+    found = GaussianStage(options).start(task, None)
     assert isinstance(found, GaussianCloud)
-    assert len(told) == 1
-    return found.centres, starting_cloud(task, replace(OPTIONS, start="phase")).centres, told[0]
+    assert len(said) == 1
+    return found.centres, starting_cloud(task, replace(options, start="phase")).centres, *said[0]
 
 
 def test_a_right_guess_is_begun_with(scan, monkeypatch):
-    found, ordinary, told = begun(scan, monkeypatch, 0.0, 1.0)
+    found, ordinary, decision, guess = begun(scan, monkeypatch, 0.0)
 
-    assert told.taken == "learned"
-    assert "The run began with the network's guess: fitted for a while, it leaves " in told.why
+    assert decision.choice == GUESS
+    assert [each.name for each in decision.compared] == [GUESS]
+    assert decision.line.startswith("start: network's guess (data fission: network's guess +")
     assert found.shape != ordinary.shape or not torch.equal(found, ordinary)
-    assert told.guess is not None
-    assert told.guess.of_copies  # there are two views
-    assert told.guess.spread.shape == told.guess.volume.grid.shape
+    assert guess is not None
+    assert guess.of_copies  # there are two views
+    assert guess.spread.shape == guess.volume.grid.shape
 
 
-def test_a_guess_that_explains_less_changes_nothing(scan, monkeypatch):
-    found, ordinary, told = begun(scan, monkeypatch, 1.5e-6, 1.0)
+@pytest.mark.parametrize("aside", [1.5e-6, 4e-6])
+def test_a_guess_that_predicts_less_changes_nothing(scan, monkeypatch, aside):
+    found, ordinary, decision, _ = begun(scan, monkeypatch, aside)
 
-    assert told.taken == "phase"
-    assert "fitted for a while, the network's guess leaves " in told.why
+    assert decision.choice == PLAIN
+    assert decision.compared[0].gain < 0
     assert torch.equal(found, ordinary)
 
 
-def test_a_guess_that_frames_contradict_goes_on_with_phase_retrieval(scan, monkeypatch):
-    found, ordinary, told = begun(scan, monkeypatch, 4e-6, 0.1)
+def test_a_guess_is_not_taken_where_noise_hides_the_difference(scan, monkeypatch):
+    """Starts that nothing is fitted from are compared; with noise as large as the contrast, nothing is sure."""
+    contrast = float(np.sqrt(np.square(scan.frames - 1).mean()))
+    noise = np.random.default_rng(3).normal(0, 4 * contrast, scan.frames.shape).astype(np.float32)
+    noisy = replace(scan, frames=scan.frames + noise)
 
-    assert told.taken == "phase"
-    assert told.why.startswith("The frames contradict the network's guess (it leaves ")
-    assert told.why.endswith("at most 15 %): the run began with phase retrieval.")
+    found, ordinary, decision, _ = begun(noisy, monkeypatch, 0.0)
+
+    assert decision.choice == PLAIN
     assert torch.equal(found, ordinary)
-
-
-@pytest.mark.parametrize("after", [0.05, 0.19], ids=["better", "no better"])
-def test_a_guess_that_seems_better_is_taken_if_it_still_is_after_a_whole_fit(scan, monkeypatch, after):
-    frames = torch.from_numpy(scan.frames)
-    near = torch.cat([frames[:1], frames[1:] + 0.1])
-    left = iter([0.4, 0.1, 0.2, after])  # of phase retrieval and of the guess, in both rounds
-    steps = []
-
-    def of(task, cloud, evidence, how, fitted):
-        steps.append(how)
-        share = next(left)
-        return _Trial(share, near if len(steps) % 2 else frames, closed=True)
-
-    monkeypatch.setattr(_Trial, "of", of)
-    _, _, told = begun(scan, monkeypatch, 0.0, 1.0)
-
-    assert steps == [(4, 3), (4, 3), (6, 4), (6, 4)]
-    assert told.taken == ("learned" if after == 0.05 else "phase")
-    assert f"; fitted to the end, it leaves {100 * after:.2g} % of the frames unexplained, and phase" in told.why
-
-
-def test_a_guess_that_is_better_by_no_more_than_noise_is_not_taken(scan, monkeypatch):
-    contrast = float((torch.from_numpy(scan.frames) - 1).square().mean().sqrt())
-    noise = NoiseModel.white_only(torch.full((2,), 0.2 * contrast), scan.views.shape)
-    evidence = Evidence(MissingMatter(scan, MATERIAL), noise)
-    frames, closer = torch.from_numpy(scan.frames), LearnedStart()
-    plain, guess = _Trial(0.2, 1 + 0.99 * (frames - 1), closed=True), _Trial(0.1, frames, closed=True)
-    far = replace(plain, predicted=1 + 0.1 * (frames - 1))
-
-    assert not guess.clearly_better(plain, evidence, closer)
-    assert guess.clearly_better(far, evidence, closer)
-    assert not replace(guess, closed=False).clearly_better(far, evidence, closer)
-    assert not replace(guess, left=0.19).clearly_better(far, evidence, closer)
 
 
 def test_frames_that_validate_are_left_out_with_their_light(scan):
@@ -152,14 +122,14 @@ def test_frames_that_validate_are_left_out_with_their_light(scan):
 def test_a_network_of_one_material_is_not_asked_for_two(scan, monkeypatch):
     two = hs.MaterialPrior.known(MATERIAL, hs.DeltaBeta(4e-7, 8e-10))
 
-    _, _, told = begun(scan, monkeypatch, 0.0, 1.0, two)
+    _, _, decision, guess = begun(scan, monkeypatch, 0.0, two)
 
-    assert told.why == ("The network guesses one material, and two are known: the run began with phase retrieval.")
-    assert told.guess is None
+    assert decision.line == "start: phase retrieval (two materials are known, and the network guesses one)"
+    assert guess is None
 
 
 def test_a_run_with_a_guess_that_is_not_taken_is_that_without(scan, monkeypatch):
-    trained = Trained(Says(4e-6), Card(typical_misfit={"2": 0.1}))  # type: ignore[arg-type]
+    trained = Trained(Says(4e-6), Card())  # type: ignore[arg-type]
     monkeypatch.setattr(LearnedStart, "network", property(lambda self: trained))
     fit = replace(OPTIONS.fit, schedule=replace(OPTIONS.fit.schedule, steps=3))
     runs = [replace(OPTIONS, start=start, fit=fit) for start in ("learned", "phase")]
@@ -171,10 +141,9 @@ def test_a_run_with_a_guess_that_is_not_taken_is_that_without(scan, monkeypatch)
     )
 
 
-@pytest.mark.parametrize(("aside", "typical"), [(4e-6, 0.0), (4e-6, 1.0)], ids=["contradicted", "compared"])
 @pytest.mark.parametrize("rows", [24, 12], ids=["small frames", "large frames"])
-def test_surfaces_beside_a_guess_that_is_not_taken_are_those_without(monkeypatch, aside, typical, rows):
-    trained = Trained(Says(aside), Card(typical_misfit={"6": typical}))  # type: ignore[arg-type]
+def test_surfaces_beside_a_guess_that_is_not_taken_are_those_without(monkeypatch, rows):
+    trained = Trained(Says(4e-6), Card())  # type: ignore[arg-type]
     monkeypatch.setattr(LearnedStart, "network", property(lambda self: trained))
     monkeypatch.setattr("holosplat.methods.coarse.FEWEST_ROWS", rows // 2)
     views = hs.Views.evenly_spaced(6, (36, 38), PIXEL)
@@ -182,14 +151,15 @@ def test_surfaces_beside_a_guess_that_is_not_taken_are_those_without(monkeypatch
     scan = hs.simulate(ball, hs.Exposures.of(views, 12.0, 0.02), is_test=np.zeros(6, dtype=bool), oversample=4)
     short = replace(OPTIONS.fit, schedule=replace(OPTIONS.fit.schedule, steps=5))
     coarse = CoarseToFine(columns=18 if rows == 12 else 128, chord=2.0, coarse_steps=4, finer_steps=3, last_steps=3)
-    told, found = list[Beginning](), dict[str, SurfaceMesh]()
+    said, found = list[Decision](), dict[str, SurfaceMesh]()
 
     for start in ("phase", "learned"):
         gaussians = replace(OPTIONS, start=start, fit=short, coarse=coarse)
-        made = solve_stages(Surfaces(gaussians=gaussians).with_effort(0.1), Task(scan, KNOWN, on_beginning=told.append))
+        task = Task(scan, KNOWN, on_start=lambda decision, guess: said.append(decision))
+        made = solve_stages(Surfaces(gaussians=gaussians).with_effort(0.1), task)
         assert isinstance(made, SurfaceMesh)
         found[start] = made
 
-    assert [each.taken for each in told] == ["phase"]
+    assert [each.choice for each in said] == [PLAIN]
     assert torch.equal(found["learned"].vertices, found["phase"].vertices)
     assert torch.equal(found["learned"].faces, found["phase"].faces)

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 import holosplat as hs
 from holosplat.geometry import Grid
+from holosplat.inference import Decision, Score
 from holosplat.learning.lattice import Taps
 from holosplat.learning.start import Guessed, LearnedStart
 from holosplat.learning.weights import Card, Trained
@@ -21,7 +22,6 @@ from holosplat.mesh import TriangleMesh
 from holosplat.methods import Gaussians, Task
 from holosplat.methods import learned as methods_learned
 from holosplat.methods import posed as method
-from holosplat.methods.beginning import Beginning
 from holosplat.methods.method import Near
 from holosplat.methods.posed import red_cells
 from holosplat.methods.surfaces import BodiesStage
@@ -149,8 +149,7 @@ def test_cells_unlike_the_guess_are_left(short, monkeypatch):
 @pytest.mark.parametrize(("better", "of"), [(True, ["red-cells"]), (False, ["red-cells"]), (True, ["capsules"])])
 def test_cells_are_begun_with_where_they_do_better(monkeypatch, better, of):
     scan, _ = scanned()
-    card = Card(trained_on={"kinds": of}, typical_misfit={"2": 1e6})
-    trained = Trained(AllFull(), card)  # type: ignore[arg-type]
+    trained = Trained(AllFull(), Card(trained_on={"kinds": of}))  # type: ignore[arg-type]
     monkeypatch.setattr(LearnedStart, "network", property(lambda self: trained))
     parts = [(mesh.vertices / PIXEL, mesh.faces) for mesh in cells()]
     faces = np.concatenate([one + k * len(parts[0][0]) for k, (_, one) in enumerate(parts)])
@@ -158,14 +157,16 @@ def test_cells_are_begun_with_where_they_do_better(monkeypatch, better, of):
     made = SurfaceMesh(vertices, torch.from_numpy(faces), PIXEL, Matter.one(*MATERIAL))
     asked = []
     monkeypatch.setattr(methods_learned, "red_cells", lambda *given: asked.append(given) or made)
-    monkeypatch.setattr(methods_learned._Starts, "compared", lambda self, plain, cloud: (False, "Plain."))
-    monkeypatch.setattr(methods_learned._Trial, "clearly_better", lambda self, other, evidence, how: better)
-    told = list[Beginning]()
-    options = replace(Gaussians(start="learned").with_effort(0.05), learned=LearnedStart(last_steps=2, last_surfaces=2))
-    begun = BodiesStage(options).start(Task(scan, PRIOR, on_beginning=told.append), None)
+    powers = {methods_learned.CELLS: 0.5 if better else 2.0}
+
+    def left(self, name: str) -> Score:
+        return Score(powers.get(name, 1.0) * np.ones((8, 3)), 2)
+
+    monkeypatch.setattr(methods_learned._Fits, "_score", left)
+    told = list[Decision]()
+    task = Task(scan, PRIOR, on_start=lambda decision, guess: told.append(decision))
+    begun = BodiesStage(Gaussians(start="learned").with_effort(0.05)).start(task, None)
     taken = better and of == ["red-cells"]
     assert len(asked) == (of == ["red-cells"])
-    assert told[0].taken == ("cells" if taken else "phase")
+    assert told[0].choice == (methods_learned.CELLS if taken else methods_learned.PLAIN)
     assert (isinstance(begun, Near) and begun.object is made) == taken
-    if of == ["red-cells"]:
-        assert "by their shape at rest" in told[0].why

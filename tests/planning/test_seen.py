@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from holosplat.bench.case import load_case
 from holosplat.geometry import Views
 from holosplat.matter import Matter
 from holosplat.methods import METHODS, Auto
@@ -22,6 +21,7 @@ from holosplat.planning.seen import seen_of
 from holosplat.representations import SurfaceMesh
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import evans_fung_cell
+from holosplat_bench.suite.case import load_case
 
 DATA = Path(__file__).resolve().parents[2] / "docs/data"
 ONE_BODY = [

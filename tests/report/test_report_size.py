@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from holosplat.bench.case import load_case
 from holosplat.matter import Matter
 from holosplat.metrics import image_scores, intensity_range, volume_scores
 from holosplat.model import measure
@@ -16,6 +15,7 @@ from holosplat.representations import SurfaceMesh
 from holosplat.scan import Scan
 from holosplat.specimens.red_cells import place_cells
 from holosplat.workflows.demo import CELL_PX, CELLS, DETECTOR, PIXEL_SIZE, SEED
+from holosplat_bench.suite.case import load_case
 
 MOST = 3_000_000
 """Bytes: what a message still carries."""

@@ -6,6 +6,8 @@ import json
 import os
 import shutil
 import signal
+import subprocess
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -154,3 +156,11 @@ def test_a_scan_that_was_replaced_is_noticed(files, tmp_path):
 def test_warm_starts_need_a_method_that_takes_them():
     with pytest.raises(InputError, match="runs of auto, gaussians, surfaces and volume can be gone on from"):
         Settings(method=HolographicVoxels())
+
+
+def test_a_task_of_a_series_loads_no_table_of_atoms():
+    """Nor its database: δ and β are numbers in a plan."""
+    code = "import sys\nimport holosplat.series.run\nprint(*(m for m in ('xraydb', 'sqlalchemy') if m in sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == []

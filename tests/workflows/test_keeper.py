@@ -39,7 +39,8 @@ def test_a_fit_that_goes_astray_ends_with_its_start(scan, tmp_path):
     loaded = load_reconstruction(folder)
     assert loaded.choice == done.choice
     assert np.array_equal(loaded.object.parameters()["centres"], done.object.parameters()["centres"])
-    assert any("kept: start" in line for line in done.choice.lines())
+    assert done.choice.decisions[-1].name == "result"
+    assert done.choice.lines()[-1].startswith("result: start (training frames: start +")
 
 
 def test_stages_in_memory_keep_the_best_state_too(scan):
@@ -109,9 +110,9 @@ def test_steps_of_a_method_and_other_kinds_are_no_rivals(scan):
 def test_old_summaries_say_nothing():
     assert Choice.read({}) == Choice()
     assert Choice().lines() == []
-    worse = Choice(judged={"start": 0.13, "fit": 0.2, "smooth volume": 0.29}, kept="smooth volume")
-    assert worse.lines()[0].endswith("smooth volume 29 %); what start and fit explain beyond it may be noise")
-    assert Choice(judged={"start": 0.13, "fit": 0.1}, kept="fit").lines()[-1].endswith("start 13 %, fit 10 %)")
+    step = Choice(judged={"start": 0.13, "fit": 0.2, "smooth volume": 0.29}, kept="smooth volume")
+    assert step.lines() == ["result: smooth volume"]
+    assert Choice(kept="fit").lines() == []
 
 
 @pytest.mark.parametrize("other", ["continuous", None], ids=["told", "found"])

@@ -98,7 +98,6 @@ def reconstruct(
     """
     from ..io.formats import read_frames
     from ..methods import Pinn
-    from ..methods.method import takes_series
     from ..methods.uncertain import Uncertain
     from ..planning.acts import of_space_time
     from ..planning.seen import can_be_seen
@@ -115,7 +114,7 @@ def reconstruct(
         settings = asked.each_time(method, reading, seed)
         reconstruct_each(scan, out, settings, asked.matter.prior, reading, resume)
         return
-    if takes_series(method) and reading.part.time_frame == "all":
+    if method.of_series and reading.part.time_frame == "all":
         reading = replace(reading, part=replace(reading.part, time_frame=None))
     ways, folder = asked.ways(reading), RunFolder(out)
     measured = read_frames(scan, replace(reading, told=reading.told.at_middle()))

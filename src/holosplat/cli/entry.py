@@ -17,6 +17,7 @@ from io import TextIOWrapper
 import tyro
 
 from ..checks import OUT_OF_MEMORY, InputError
+from ..plugins import Extended
 from ..ranges import checked_later
 from ..version import __version__
 from .help import ALL, CONFIG, HELP, acts_of, overview, page, parser_of
@@ -33,7 +34,7 @@ LONGEST = 200
 EMPTY = re.compile("(--[^=]+)=")
 """An option to which nothing is given."""
 
-COMMANDS: dict[str, tuple[str, str]] = {
+_OWN: dict[str, tuple[str, str]] = {
     "plan": (
         "plan",
         "Say what an experiment would see, resolve and store, and where its best distance and energy lie.",
@@ -123,10 +124,6 @@ COMMANDS: dict[str, tuple[str, str]] = {
         "Train a network on scenes of `holosplat dataset`: weights with a card, and curves.",
     ),
     "demo": ("commands", "Run the whole chain on generated red cells: simulate, reconstruct, evaluate, report."),
-    "bench": (
-        "bench",
-        "Compare methods on cases, under one physics and one set of scores (run, report); rerun the thesis' study.",
-    ),
     "info": (
         "info",
         "Say what a file or a run is: shape, beam, angles, air, noise, fringes, what is missing, and what it takes.",
@@ -137,7 +134,11 @@ COMMANDS: dict[str, tuple[str, str]] = {
     ),
     "backends": ("commands", "Say which backends can be used here, and what each of them offers."),
 }
-"""Name → (module of this package that has a function of that name, first paragraph of the function's docstring)."""
+COMMANDS = Extended(_OWN, "holosplat.commands")
+"""Name → (module that has a function of that name, first paragraph of the function's docstring).
+
+Modules are of this package, or of another one that adds commands (docs/adding.md), by their whole names.
+"""
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "Data": ("info", "convert", "correct", "join", "data", "materials", "check"),
@@ -146,9 +147,9 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "Look": ("evaluate", "view", "export", "render", "compare"),
     "Series": ("series", "watch", "forecast"),
     "Learn": ("dataset", "train"),
-    "Benchmark and installation": ("bench", "demo", "doctor", "backends"),
+    "Benchmark and installation": ("demo", "doctor", "backends"),
 }
-"""Heading of the overview → its commands; every command is in one group."""
+"""Heading of the overview → its commands; what other packages add stands first under the last."""
 DESCRIPTION = "Quantitative 3D maps from a handful of X-ray phase-contrast images."
 
 
@@ -216,9 +217,16 @@ def _explained(arguments: list[str]) -> bool:
         acts = acts_of(parser)
         print(page(f"{first} {act}" if act in acts else first, acts.get(act, parser), ALL in arguments))
     elif first.startswith("-"):
-        groups = {heading: [(name, COMMANDS[name][1]) for name in names] for heading, names in GROUPS.items()}
-        print(overview(groups, DESCRIPTION))
+        print(overview(_groups(), DESCRIPTION))
     return first in COMMANDS or first.startswith("-")
+
+
+def _groups() -> dict[str, list[tuple[str, str]]]:
+    """The overview: heading → names of commands and what they do."""
+    added = [name for name in COMMANDS if name not in COMMANDS.own]
+    groups = {heading: [(name, COMMANDS[name][1]) for name in names] for heading, names in GROUPS.items()}
+    last = list(groups)[-1]
+    return {**groups, last: [*((name, COMMANDS[name][1]) for name in added), *groups[last]]}
 
 
 def _require_no_empty(arguments: list[str]) -> None:
@@ -238,14 +246,17 @@ def _said(error: BaseException) -> str:
 
 def command(name: str) -> Callable[..., None]:
     """The function of the command `name`, a key of `COMMANDS`, whose numbers are checked; imports its module."""
-    return with_checked_arguments(getattr(import_module(f".{COMMANDS[name][0]}", __package__), name))
+    module = COMMANDS[name][0]
+    found = import_module(f".{module}", __package__) if name in COMMANDS.own else import_module(module)
+    return with_checked_arguments(getattr(found, name))
 
 
 def _functions(arguments: list[str]) -> dict[str, Callable[..., None]]:
-    """A function for each command: the real one for that which the first argument names, summaries for the others."""
+    """A function for each command: the real one for that which the first argument names, summaries for the others.
+    Beside one of our own the parser needs no other packages."""
+    known = COMMANDS.own if arguments[:1] and arguments[0] in COMMANDS.own else COMMANDS
     return {
-        name: command(name) if arguments[:1] == [name] else _summarised(summary)
-        for name, (_, summary) in COMMANDS.items()
+        name: command(name) if arguments[:1] == [name] else _summarised(summary) for name, (_, summary) in known.items()
     }
 
 

@@ -12,7 +12,7 @@ from ..io.formats import read_frames
 from ..io.reading import Reading, at_time
 from ..io.run_scan import run_reading
 from ..mesh import TriangleMesh
-from ..representations import MOVING, MovingSurfaces, SurfaceMesh
+from ..representations import InMotion, MovingSurfaces, SurfaceMesh
 from ..scan import Scan
 from ..workflows.moments import chosen_frames, instants_of, moment
 from ..workflows.reconstruct import load_reconstruction
@@ -76,7 +76,7 @@ def moments_of(folder: RunFolder, time_frame: int | Literal["all"] | None) -> It
     """
     result, times = load_reconstruction(folder), instants_of(folder)
     found = result.object
-    if not isinstance(found, MOVING):
+    if not isinstance(found, InMotion):
         require(time_frame is None, f"{folder.path} is of one time; leave --time-frame.")
         yield Moment(None, 0.0, result, found.bodies() if isinstance(found, SurfaceMesh) else None)
         return

@@ -13,7 +13,7 @@ from ..memory import memory_kept
 from ..model import Alignment, Instrument, LightField, Model, smooth_modes
 from ..ranges import Weight, ranged
 from ..scan import Exposures
-from ..volume import LineIntegrals, Object, Photographed
+from ..volume import LineIntegrals, Object
 
 COMMON = ("mass", "absorption", "distance", "blur", "shift_x", "shift_y")
 """Changes that all views share, whose effect on frames is measured."""
@@ -215,8 +215,8 @@ def _changes(one: Model) -> Tensor:
     """[P, h, w//2 + 1] derivatives of one view's frame, transformed: by each of `COMMON`, and by modes of the light.
 
     Mass and absorption by a relative change of δ and β, and of β alone; distance by a relative change; blur by the
-    variance of the point-spread function [pixels²]; shifts of the detector [pixels]; light by a factor's modes. Of
-    photographs the first four explain nothing.
+    variance of the point-spread function [pixels²]; shifts of the detector [pixels]; light by a factor's modes. The
+    first four explain nothing of frames that waves do not make.
     """
     exposures, time, on = one.instrument.exposures, float(one.instrument.times[0]), one.instrument.device
     planned = one.alignment or Alignment()
@@ -237,17 +237,16 @@ def _changes(one: Model) -> Tensor:
         shifts = moved if planned.shifts is None else planned.shifts + moved
         return replace(one, alignment=replace(planned, shifts=shifts)).frames().double().cpu()
 
-    photographed = isinstance(one.object, Photographed)
-    here, more = one.frames().double().cpu() if photographed else seen(), 1 + STEP
+    here, more = seen() if one.by_waves else one.frames().double().cpu(), 1 + STEP
     waves = (
-        [here.new_zeros(here.shape)] * 4
-        if photographed
-        else [
+        [
             (seen(of(more, more)) - here) / STEP,
             (seen(of(1.0, more)) - here) / STEP,
             (seen(z=distance * more) - here) / STEP,
             (seen(s=(sigma.square() + STEP_BLUR).sqrt()) - here) / STEP_BLUR,
         ]
+        if one.by_waves
+        else [here.new_zeros(here.shape)] * 4
     )
     found = [
         *waves,

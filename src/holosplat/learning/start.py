@@ -16,14 +16,14 @@ from ..geometry import Grid, Views
 from ..matter import DeltaBeta
 from ..optics.noise import noise_levels
 from ..progress import Progress
-from ..ranges import Natural, Share, Weight, ranged
+from ..ranges import Natural, ranged
 from ..scan import Scan
 from ..volume import Volume
 from .copies import COPIES
 from .images import images, retrieved_thickness
 from .lattice import Taps
 from .network import FINE, Guess, coarse, thickness_of
-from .weights import Card, Trained, read_weights
+from .weights import Trained, read_weights
 
 STAGE = "learned start"
 MOST_COLUMNS = 128
@@ -43,25 +43,13 @@ class LearnedStart:
 
     weights: str = ""
     """File of the network's weights (default: those of the package, if it has any)."""
-    doubt: Weight = 1.5
-    """What a guess may leave unexplained of the retrieved thickness, in what 95 % of the scenes leave that the network
-    was trained for: where it leaves more, the bodies are others, and it is not taken."""
-    trial_steps: Natural = 100
-    """Steps of the fit of Gaussians from either start, before they are compared."""
-    trial_surfaces: Natural = 60
+    steps: Natural = 300
+    """Steps of the fit of Gaussians from every start, before they are compared: those of a whole fit."""
+    surface_steps: Natural = 100
     """Steps of the fit of surfaces that follow, where matter has one known level."""
-    last_steps: Natural = 300
-    """The same for a guess that then seems better: those of a whole fit."""
-    last_surfaces: Natural = 100
-    """The same of surfaces."""
-    clearly: Share = 0.9
-    """What the guess may leave unexplained after either, beyond noise, of what phase retrieval leaves: where it leaves
-    more, the run is the same as without the network."""
-    sure: Weight = 3.0
-    """Standard deviations of the noise by which the frames must speak for it."""
     cells: bool = True
     """Whether red cells, where the network knows these alone and beams are two, are also looked for by their shape at
-    rest: two views hardly determine shapes. They are the start where they are clearly better than the others."""
+    rest: two views hardly determine shapes. They are one more start to be compared."""
 
     @property
     def network(self) -> Trained:
@@ -106,18 +94,6 @@ def guessed(scan: Scan, material: DeltaBeta, network: Guess, on_progress: Progre
     return finer
 
 
-def contradicted(found: Guessed, how: LearnedStart, card: Card) -> str:
-    """Why the frames contradict a guess, as a part of a sentence; empty where they do not (`how.doubt`)."""
-    left, allowed = found.left(), how.doubt * card.typical(len(found.images))
-    if left <= allowed:
-        return ""
-    part = f"{100 * left:.0f} %" if left < 1 else "all"
-    return (
-        f"it leaves {part} of the retrieved thickness unexplained, and of bodies that it knows at most "
-        f"{100 * allowed:.0f} %"
-    )
-
-
 @dataclass(frozen=True)
 class GuessedMatter:
     """The guess of a network as matter, to be stored and shown.
@@ -152,12 +128,15 @@ def _on_pixels(scan: Scan, material: DeltaBeta, network: Guess) -> Guessed:
     return Guessed(values.clone(), grid.divided((FINE, FINE, FINE)), seen, taps)
 
 
-def unexplained(values: Tensor, seen: Tensor, taps: Taps, factor: int = 1) -> float:
-    """Root mean square of the thickness in images [V, 3, 2H, 2W] that occupancy [2Z, 2Y, 2X] does not explain, over
-    that of the thickness, on H × W pixels or such as are `factor` times larger."""
+def missing_thickness(values: Tensor, seen: Tensor, taps: Taps) -> tuple[Tensor, Tensor]:
+    """The thickness [V, H, W] in images [V, 3, 2H, 2W] that occupancy [2Z, 2Y, 2X] does not explain, and all of it."""
     thickness = avg_pool2d(seen[:, 1:2], FINE)[:, 0]
-    missing = thickness - thickness_of(coarse(values).flatten(), taps)
-    left, there = (float(avg_pool2d(part, factor).norm()) for part in (missing, thickness))
+    return thickness - thickness_of(coarse(values).flatten(), taps), thickness
+
+
+def unexplained(values: Tensor, seen: Tensor, taps: Taps, factor: int = 1) -> float:
+    """Root mean square of the missing thickness over that of all of it, on pixels `factor` times larger."""
+    left, there = (float(avg_pool2d(part, factor).norm()) for part in missing_thickness(values, seen, taps))
     return left / max(there, torch.finfo(torch.float32).tiny)
 
 

@@ -46,10 +46,6 @@ class Card:
         """Whether all scenes that were trained on are of red cells."""
         return set(self.trained_on.get("kinds", ())) in ({"red-cells"}, {"red-cells", "crowd"}, {"crowd"})
 
-    def typical(self, views: int) -> float:
-        """What guesses from so many views typically leave unexplained: by the next smaller number that was tried."""
-        return _nearest(self.typical_misfit, views, 1.0)
-
     def dice(self, views: int) -> float:
         """Mean Dice coefficient of guesses from so many views and the truth, likewise; 0 where it is not said."""
         return _nearest({count: said.get("dice", 0.0) for count, said in self.scores.items()}, views, 0.0)
@@ -115,7 +111,7 @@ def size_of(kind: type[Kind], said: Mapping[str, str], tensors: Mapping[str, Ten
 def card_of(said: Mapping[str, str]) -> Card:
     """The card in a file, whose entries can be looked up; raises what `as_written` takes for anything else."""
     card = from_table(Card, table_in(said["card"]))
-    asked = (card.of_red_cells, card.typical(2), card.dice(2))
+    asked = (card.of_red_cells, card.dice(2))
     require(all(number >= 0 for number in asked), "a number of the card is below zero.")
     return card
 

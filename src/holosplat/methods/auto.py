@@ -21,7 +21,7 @@ from .volume import SmoothVolume
 
 @dataclass(frozen=True)
 @ranged
-class Auto:
+class Auto(Method):
     """Matter with levels: Gaussians, and closed surfaces where there are bodies. Continuous matter: a smooth volume."""
 
     kind: ClassVar[str] = "auto"
@@ -72,7 +72,7 @@ class Auto:
 
 
 @dataclass(frozen=True)
-class Bodies:
+class Bodies(Method):
     """Gaussians, and surfaces where these enclose bodies of one material."""
 
     kind: ClassVar[str] = "bodies"

@@ -24,7 +24,6 @@ from ..representations import GaussianCloud, SurfaceMesh
 from ..representations.subdivision import edge_lengths, subdivided
 from ..scan import Scan
 from .cross_validation import MissingMatter, predicted_frames
-from .evidence import Evidence
 from .method import Task, run_quietly
 from .surface_fit import SurfaceFit, SurfaceOptions, oversampling, softened, surface_fit
 
@@ -240,10 +239,10 @@ def unexplained(mesh: SurfaceMesh, scan: Scan, surfaces: SurfaceOptions) -> floa
 
 def missing_matter(found: SurfaceMesh | GaussianCloud, task: Task, surfaces: SurfaceOptions) -> float:
     """Share of all matter in the frames of `task` that `found` leaves unexplained; 0 where noise may hide all of it
-    (`Evidence`)."""
+    (`MissingMatter.beyond_noise`)."""
     judge = MissingMatter(task.scan, DeltaBeta(found.matter.delta, found.matter.beta))
     there = found.on(resolve(surfaces.fit.backend))
-    return Evidence(judge, task.noise).missing(judge.predicted(there, oversampling(task.scan, surfaces.fit)))
+    return judge.beyond_noise(judge.predicted(there, oversampling(task.scan, surfaces.fit)), task.noise)
 
 
 def _finest(frames: Tensor) -> Tensor:

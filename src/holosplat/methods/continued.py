@@ -38,11 +38,10 @@ class Effort:
 
 
 @dataclass(frozen=True)
-class Continued:
+class Continued(Method):
     """The object of another run, fitted to these frames with few steps; no phase retrieval, no tomography."""
 
     kind: ClassVar[str] = "continued"
-    wants_levels: ClassVar[bool] = False
     """It was decided by the run that it goes on from."""
 
     begin: Path
@@ -67,6 +66,11 @@ class Continued:
             f"runs of auto, gaussians, surfaces and volume can be gone on from, but the method is {method.kind}; "
             "choose one of these."
         )
+
+    @property
+    def wants_levels(self) -> bool:
+        """It does not matter."""
+        return False
 
     def stages(self) -> Sequence[Stage]:
         """One: what the other run found, and the fit."""

@@ -12,9 +12,15 @@ from ..baselines.holographic_tv import Correction
 from ..matter import DeltaBeta
 from ..memory import memory_kept
 from ..model import Instrument, Model
+from ..optics.noise_model import NoiseModel
 from ..optics.sampling import alike, fringe_sampling
 from ..scan import Exposures, Scan
 from ..volume import Object
+
+DRAWS = 16
+"""Of the noise, for what it leaves of the matter: a standard deviation by so many is right to a sixth."""
+HIDDEN = 2.0
+"""Standard deviations of what noise leaves of the matter that it may hide."""
 
 
 def predicted_frames(exposures: Exposures, obj: Object, oversample: int = 0) -> Tensor:
@@ -71,6 +77,14 @@ class MissingMatter:
         """The same of matter, and of the contrast of the frames. oversample: as for `predicted`."""
         matter, contrast = self.squares(self.measured - self.predicted(obj, oversample))
         return math.sqrt(matter), math.sqrt(contrast)
+
+    def beyond_noise(self, predicted: Tensor, noise: NoiseModel) -> float:
+        """Root of the part of all matter that predicted frames [V, H, W] leave unexplained beyond `noise`; 0 where
+        that may hide all of it, by `HIDDEN` standard deviations."""
+        draws = torch.tensor([self.of(noise.drawn(seed)) for seed in range(DRAWS)], dtype=torch.float64)
+        left = (self.of(self.measured - predicted) - float(draws.mean())) / max(self.whole, np.finfo(float).tiny)
+        deviation = float(draws.std(correction=0)) / max(self.whole, np.finfo(float).tiny)
+        return math.sqrt(left) if left > HIDDEN * deviation else 0.0
 
     def squares(self, residual: Tensor) -> tuple[float, float]:
         """Squares of the parts of all matter, and of the contrast, that residuals [V, H, W] of intensity stand for."""

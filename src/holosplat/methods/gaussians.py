@@ -34,14 +34,14 @@ from .first_surfaces import first_surfaces
 from .gaussian_options import FitOptions, GaussianOptions, GaussianRates
 from .ground import Ground, ground
 from .learned import guessed_start, ways_of_guess
-from .method import Near, Stage, Task, run_quietly
+from .method import Method, Near, Stage, Task, run_quietly
 from .start import starting_cloud
 from .surface_fit import SurfaceFit, SurfaceOptions, oversampling
 
 
 @dataclass(frozen=True)
 @ranged
-class Gaussians(GaussianOptions):
+class Gaussians(GaussianOptions, Method):
     """The method that fits Gaussians to the frames; they start from phase retrieval and tomography, or at random.
 
     Examples:

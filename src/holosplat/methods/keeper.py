@@ -2,85 +2,92 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, cast
 
 import torch
 from torch import Tensor
 
+from ..inference import Compared, Decision, Score
 from ..matter import DeltaBeta
 from ..representations import KINDS, Stored
 from ..scan import Exposures, Scan
-from .cross_validation import MissingMatter
+from .cross_validation import MissingMatter, predicted_frames
 
-LOST = 0.5
-"""What takes the place of all others must not leave more than this share of all matter unexplained, and twice what the
-best of them does: then a prior has wiped out matter that the frames show."""
-CLEARLY = 0.95
-"""An earlier state is kept if it leaves less than this part of the matter that a later one leaves unexplained, and no
-more of the contrast: differences in fitted frames may also be noise."""
+NAME = "result"
+BY = "training frames"
 
 
 @dataclass(frozen=True)
 class State:
-    """name: of the stage that made it, or `start`; object: what it made; oversample: wave samples a pixel; share: of
-    all matter that it leaves unexplained in the training frames; contrast: the same of their contrast; exposures: where
-    these were."""
+    """name: of the stage that made it, or `start`; object: what it made; oversample: wave samples a pixel; exposures:
+    where the frames were; predicted: [V, H, W] frames of it there."""
 
     name: str
     object: Stored
     oversample: int
-    share: float
-    contrast: float
     exposures: Exposures
+    predicted: Tensor
+
+    @classmethod
+    def of(cls, name: str, found: Stored, oversample: int, exposures: Exposures) -> State:
+        """With the frames that `found` predicts."""
+        return cls(name, found, oversample, exposures, predicted_frames(exposures, found, oversample))
 
 
 @dataclass
 class Keeper:
-    """Looks at the states of a run on its training frames, and keeps the best one (see `MissingMatter`).
+    """Looks at the states of a run on its training frames, and keeps the best one.
 
     mixed: whether states of different kinds of Objects compete; else those of another kind than the latest are out, for
     who asks for surfaces wants surfaces
 
-    Shares are compared with the noise that is in them. Beyond it nothing could be compared: what is freer follows the
-    noise of the frames that it is fitted to, and a smooth volume leaves less than that of cells that it does not show.
+    The latest state is the null: an earlier one is kept if it explains the frames better by the policy of `Compared`.
     """
 
     train: Scan
     mixed: bool = False
     best: State | None = None
     judged: dict[str, float] = field(default_factory=dict)
-    """Share of all matter that each state leaves unexplained, by its name."""
+    """Share of all matter that each state leaves unexplained (`MissingMatter`), by its name."""
+    compared: list[Compared] = field(default_factory=list)
+    """Every earlier state beside the one that came after it."""
     _judge: MissingMatter | None = None
+
+    @property
+    def decisions(self) -> tuple[Decision, ...]:
+        """Which state was kept, where some competed."""
+        compared, best = tuple(self.compared), self.best
+        return (Decision(NAME, best.name, BY, compared),) if best and compared else ()
 
     def moved(self, train: Scan) -> None:
         """The training frames are elsewhere from now on."""
         if train.exposures is not self.train.exposures:
             self.train, self._judge = train, None
 
-    def look_after(self, stage: object, name: str, found: Stored, oversample: int) -> None:
-        """Take in what the fit of a stage ended with; it may say `likelier` (see `look`)."""
-        self.look(name, found, oversample, fitted=not getattr(stage, "likelier", False))
-
     def look(self, name: str, found: Stored, oversample: int, fitted: bool = True) -> None:
         """Take in the latest state. What is not `fitted` is a step of the method, and takes the place of all others
-        unless it has lost the matter (`LOST`)."""
+        unless it has lost the matter."""
         if self._judge is None:
             self._judge = MissingMatter(self.train, _material(self.best.object if self.best else found))
-        share, contrast = self._judge.shares(found, oversample)
-        self.judged[name] = share
-        if self._wins(found, share, contrast, fitted):
-            self.best = State(name, found, oversample, share, contrast, self.train.exposures)
+        state = State.of(name, found, oversample, self.train.exposures)
+        self.judged[name] = math.sqrt(self._judge.squares(self._judge.measured - state.predicted)[0])
+        if self._wins(state, fitted):
+            self.best = state
 
-    def _wins(self, found: Stored, share: float, contrast: float, fitted: bool) -> bool:
+    def _wins(self, latest: State, fitted: bool) -> bool:
         best = self.best
         if best is None:
             return True
-        same = best.object.kind == found.kind
+        same = best.object.kind == latest.object.kind
         if not (fitted and (self.mixed or same)):
-            return not (same and share > LOST and share > 2 * best.share)
-        return CLEARLY * share <= best.share or contrast < best.contrast
+            return not (same and _lost(latest.predicted, best.predicted))
+        measured = torch.from_numpy(self.train.frames)
+        earlier, later = (Score.of(measured - each.predicted) for each in (best, latest))
+        self.compared.append(Compared(best.name, *earlier.gain_over(later)))
+        return not self.compared[-1].wins
 
     def state_dict(self) -> dict[str, Any] | None:
         """What `load` needs; None before the first state."""
@@ -92,25 +99,19 @@ class Keeper:
             "kind": best.object.kind,
             "state": best.object.state(),
             "oversample": best.oversample,
-            "share": best.share,
-            "contrast": best.contrast,
             "placed": where(best.exposures),
             "judged": dict(self.judged),
+            "compared": [asdict(each) for each in self.compared],
         }
 
     def load(self, saved: dict[str, Any] | None) -> None:
         """Go back to a saved state."""
         if saved is not None:
-            found = KINDS[saved["kind"]].from_state(saved["state"])
-            self.best = State(
-                saved["name"],
-                cast(Stored, found),
-                saved["oversample"],
-                saved["share"],
-                saved["contrast"],
-                placed_at(self.train.exposures, saved.get("placed", where(self.train.exposures))),
-            )
+            found = cast(Stored, KINDS[saved["kind"]].from_state(saved["state"]))
+            exposures = placed_at(self.train.exposures, saved.get("placed", where(self.train.exposures)))
+            self.best = State.of(saved["name"], found, saved["oversample"], exposures)
             self.judged = dict(saved["judged"])
+            self.compared = [Compared(**each) for each in saved["compared"]]
 
 
 def where(exposures: Exposures) -> dict[str, Tensor]:
@@ -130,3 +131,9 @@ def placed_at(exposures: Exposures, saved: Mapping[str, Tensor]) -> Exposures:
 
 def _material(found: Stored) -> DeltaBeta:
     return DeltaBeta(found.matter.delta, found.matter.beta)
+
+
+def _lost(predicted: Tensor, before: Tensor) -> bool:
+    """Whether frames [V, H, W] are nearer to empty ones than to those that were predicted `before`: then a prior has
+    wiped out matter that the frames show."""
+    return float((predicted - 1).double().square().sum()) < float((predicted - before).double().square().sum())

@@ -12,15 +12,15 @@ from ..baselines.material import MaterialEstimate
 from ..fit.freedom import Freedom, moved
 from ..fit.running import Running
 from ..inference import Decision
+from ..learning.start import GuessedMatter
 from ..matter import MaterialPrior, MatterKind
 from ..model import Model
 from ..optics.background import Light, LightOptions
 from ..optics.noise_model import NoiseModel
 from ..optics.retrieval import absorption_alone
 from ..progress import Advance, Progress
-from ..representations import KINDS, Stored
+from ..representations import Stored
 from ..scan import Scan
-from .beginning import Beginning
 from .first_volumes import FirstVolumes
 from .keeper import Keeper
 from .window import windows_of
@@ -30,8 +30,8 @@ def quiet(stage: str, fraction: float) -> None:
     """Progress that nobody looks at."""
 
 
-def unheard(beginning: Beginning) -> None:
-    """What was begun with, which nobody asks."""
+def unheard(decision: Decision, guess: GuessedMatter | None) -> None:
+    """What a fit starts from, which nobody asks."""
 
 
 STAND_IN_RATIO = 1.0
@@ -60,7 +60,7 @@ class Task:
     delta_told: whether prior or frames say what δ is
     freedom: of where the frames are, which fits then find, too; None: they are where the scan says
     near: whether what the next fit starts from is near to where it ends (see `Near`)
-    on_beginning: called with what Gaussians begin with, where a network was asked
+    on_start: called with the decision about where a fit starts, and the guess, where a network was asked
     """
 
     scan: Scan
@@ -73,7 +73,7 @@ class Task:
     delta_told: bool = True
     freedom: Freedom | None = None
     near: bool = False
-    on_beginning: Callable[[Beginning], None] = unheard
+    on_start: Callable[[Decision, GuessedMatter | None], None] = unheard
     decisions: tuple[Decision, ...] = ()
     first: FirstVolumes | None = None
 
@@ -164,36 +164,32 @@ class Stage(Protocol):
         ...
 
 
-def takes_series(method: Method) -> bool:
-    """Whether `method` takes all times of a scan at once."""
-    return bool(getattr(method, "of_series", False))
-
-
-def mixes_kinds(method: Method) -> bool:
-    """Whether states of different kinds of Objects compete for the result of `method`."""
-    return bool(getattr(method, "mixes_kinds", False))
-
-
-def require_files(method: Method) -> None:
-    """Read the files that `method` names in a `require_files` of its own, so that one that is missing or damaged is
-    refused before any work. Errors: those of reading."""
-    read = getattr(method, "require_files", None)
-    if read is not None:
-        read()
-
-
 @runtime_checkable
 class Method(Protocol):
     """Options of a method, as a frozen dataclass; `kind` is its name in tables, files and on the command line.
 
-    One that takes all times of a scan at once says so by `of_series`; all others take frames of one time.
+    of_series: whether it takes all times of a scan at once; all others take frames of one time
+    mixes_kinds: whether states of different kinds of Objects compete for its result
+    likelier: whether fits are likelier than their starts by noise and prior; frames alone prefer what fits their noise
     """
 
     kind: ClassVar[str]
+    of_series: ClassVar[bool] = False
+    mixes_kinds: ClassVar[bool] = False
+    likelier: ClassVar[bool] = False
+
+    @property
+    def wants_levels(self) -> bool:
+        """Whether it matters to the method whether matter has levels."""
+        return not self.of_series
 
     def stages(self) -> Sequence[Stage]:
         """The stages, in their order; each resumes by itself."""
         ...
+
+    def require_files(self) -> None:
+        """Read the files that the method names, so that one that is missing or damaged is refused before any work.
+        Errors: those of reading."""
 
 
 def begun(stage: Stage, task: Task, before: Stored | None) -> tuple[Stored, Task]:
@@ -207,7 +203,7 @@ def begun(stage: Stage, task: Task, before: Stored | None) -> tuple[Stored, Task
 def finished(fit: Running) -> Stored:
     """The object that a fit ended with, where it was fitted."""
     found = fit.result().object
-    assert isinstance(found, tuple(KINDS.values()))
+    assert isinstance(found, Stored)
     return found.on(fit.backend)
 
 
@@ -223,7 +219,7 @@ def solve_stages(method: Method, task: Task) -> Stored:
     Ctrl-C is passed on.
     """
     found: Stored | None = None
-    keeper = Keeper(task.scan, mixes_kinds(method))
+    keeper = Keeper(task.scan, method.mixes_kinds)
     for number, stage in enumerate(method.stages()):
         before = found
         found, task = begun(stage, task, before)
@@ -234,6 +230,6 @@ def solve_stages(method: Method, task: Task) -> Stored:
             found = run_quietly(fit, task.report(stage.name))
             task = replace(task.moved(fit.result()), near=False)
             keeper.moved(task.scan)
-            keeper.look_after(stage, stage.name, found, fit.oversample)
+            keeper.look(stage.name, found, fit.oversample, fitted=not method.likelier)
     assert keeper.best is not None
     return keeper.best.object

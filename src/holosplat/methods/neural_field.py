@@ -32,7 +32,7 @@ from ..representations import NeuralField, Stored, VoxelGrid
 from ..representations.neural_field import Network, grown
 from ..scan import Scan
 from .ground import ExtraTerm, ground
-from .method import Stage, Task, run_quietly
+from .method import Method, Stage, Task, run_quietly
 from .voxels import HolographicStage
 
 WARM_UP, THROUGH_WAVES = "field for the retrieved thickness", "field through the waves"
@@ -98,7 +98,7 @@ class NeuralFit:
 
 
 @dataclass(frozen=True)
-class NeuralFields:
+class NeuralFields(Method):
     """A neural field that learns the line integrals of `HolographicTV`, and is then fitted to the frames."""
 
     kind: ClassVar[str] = "neural-field"

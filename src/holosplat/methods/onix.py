@@ -33,7 +33,7 @@ from ..representations.neural_field import grown
 from ..scan import Scan
 from .assumed import assumed_material
 from .ground import ExtraTerm, ground
-from .method import Stage, Task
+from .method import Method, Stage, Task
 from .neural_field import visual_hull
 from .volume import binning
 
@@ -103,7 +103,7 @@ class AlignedFit:
 
 
 @dataclass(frozen=True)
-class Onix:
+class Onix(Method):
     """ONIX (Zhang et al. 2023) with waves: a network of δ and β that is the same for all scenes, then fitted to one."""
 
     kind: ClassVar[str] = "onix"
@@ -124,7 +124,7 @@ class Onix:
 
 
 @dataclass(frozen=True)
-class PixelNerf:
+class PixelNerf(Method):
     """pixelNeRF (Yu et al. 2021) for line integrals of attenuation: as ONIX, but the fit knows no waves.
 
     It is fitted to what absorption alone would show, which phase retrieval makes of each frame by itself; frames in

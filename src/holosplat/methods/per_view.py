@@ -14,7 +14,7 @@ from ..matter import Matter
 from ..optics.retrieval import RETRIEVALS
 from ..representations import Stored, VoxelGrid
 from .assumed import assumed_material
-from .method import Stage, Task
+from .method import Method, Stage, Task
 from .svmbir import svmbir_volume
 
 SVMBIR = "svmbir"
@@ -22,7 +22,7 @@ SVMBIR = "svmbir"
 
 
 @dataclass(frozen=True)
-class PerView:
+class PerView(Method):
     """Phase retrieval of each view, then tomography, on voxels of one pixel; the occupancy of one material."""
 
     kind: ClassVar[str] = "per-view"

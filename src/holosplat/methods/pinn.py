@@ -23,7 +23,7 @@ from ..representations import SpaceTime, SpaceTimeField, Stored
 from ..representations.space_time import FLOW
 from .assumed import assumed_material
 from .ground import ExtraTerm, Ground, ground
-from .method import Stage, Task
+from .method import Method, Stage, Task
 
 EACH, FLOW_ALONE, THROUGH_WAVES = "each time by itself", "flow of these", "field through the waves"
 FEWEST_TIMES = 2
@@ -82,12 +82,12 @@ class PinnFit:
 
 
 @dataclass(frozen=True)
-class Pinn:
+class Pinn(Method):
     """All times of a scan as one field of matter and velocity, bound by continuity and the equations of slow flow."""
 
     kind: ClassVar[str] = "pinn"
-    wants_levels: ClassVar[bool] = False
     of_series: ClassVar[bool] = True
+    likelier: ClassVar[bool] = True
 
     volume: HolographicTV = field(default_factory=_start)
     fit: PinnFit = field(default_factory=PinnFit)
@@ -139,7 +139,6 @@ class GoesOn:
 
     options: PinnFit
     name: str
-    likelier: bool = True
 
     def start(self, task: Task, before: Stored | None) -> Stored:
         """What came before."""

@@ -80,7 +80,7 @@ def settled(
     task = told(task, constants)
     if matter:
         decision = Decision(NAME, matter, "told")
-    elif getattr(method, "wants_levels", True):
+    elif method.wants_levels:
         decision = decide_matter(task, method.kinds if isinstance(method, Auto) else None)
     else:
         decision = Decision(NAME, "levels", "no matter to the method")

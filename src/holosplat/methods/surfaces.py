@@ -8,25 +8,30 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import ClassVar
 
-from ..backends import Backend
+import torch
+
+from ..backends import Backend, resolve
 from ..checks import InputError, require
 from ..fit.loop import Fit
+from ..inference import Score, select
 from ..matter import MaterialPrior
 from ..progress import Progress
 from ..representations import GaussianCloud, Stored, SurfaceMesh
 from ..scan import Scan
 from .coarse import CoarseToFine, Way, begun_surfaces, coarse_surfaces, missing_matter, on_pixels, settled
+from .cross_validation import predicted_frames
 from .first_surfaces import is_noisy, surfaces_of_volume
+from .first_volumes import score_of
 from .gaussians import Gaussians, GaussianStage
-from .keeper import CLEARLY
-from .method import Near, Stage, Task, quiet, run_quietly
-from .surface_fit import SurfaceOptions, extract_surfaces, surface_fit
+from .keeper import BY
+from .method import Method, Near, Stage, Task, quiet, run_quietly
+from .surface_fit import SurfaceOptions, extract_surfaces, oversampling, surface_fit
 
 STAGE = "surfaces"
 
 
 @dataclass(frozen=True)
-class Surfaces(SurfaceOptions):
+class Surfaces(SurfaceOptions, Method):
     """The method that cuts closed surfaces out of Gaussians, and fits them to the frames.
 
     Examples:
@@ -88,7 +93,7 @@ class BodiesStage(GaussianStage):
 
     def best_cut(self, task: Task, cloud: GaussianCloud, cut: Callable[[], SurfaceMesh]) -> SurfaceMesh:
         """The surfaces that `cut` gets out of `cloud`; but of small noisy frames that this explains badly, such as
-        have taken turns with a volume, if they explain clearly more.
+        have taken turns with a volume, if they explain more by the policy of `select`.
 
         Errors: those of `cut`, where there are no others.
         """
@@ -104,7 +109,14 @@ class BodiesStage(GaussianStage):
             own = settled(seen, cut(), self.surfaces, how.of_views(len(seen.scan.train())))
         except InputError:  # Gaussians hold no surface
             return other
-        return other if self._missing(other, seen) < CLEARLY * self._missing(own, seen) else own
+        found = {"of Gaussians": own, "of a volume": other}
+        decision = select("surfaces", tuple(found), lambda name, _: self._score(found[name], seen), by=BY)
+        return found[decision.choice]
+
+    def _score(self, found: SurfaceMesh, task: Task) -> Score:
+        there = found.on(resolve(self.surfaces.fit.backend))
+        predicted = predicted_frames(task.scan.exposures, there, oversampling(task.scan, self.surfaces.fit))
+        return score_of(torch.from_numpy(task.scan.frames), predicted)
 
     def _missing(self, found: SurfaceMesh | GaussianCloud, task: Task) -> float:
         return missing_matter(found, task, self.surfaces)

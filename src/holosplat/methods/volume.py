@@ -21,7 +21,7 @@ from ..representations import Stored, VoxelGrid
 from ..scan import Scan
 from .assumed import assumed_material
 from .cross_validation import predicted_frames
-from .method import Stage, Task
+from .method import Method, Stage, Task
 from .smooth_fit import SmoothFit, SmoothPlan
 
 LEFT = 0.1
@@ -36,7 +36,7 @@ def _start() -> HolographicTV:
 
 @dataclass(frozen=True)
 @ranged
-class SmoothVolume:
+class SmoothVolume(Method):
     """Continuous matter on voxels: any value from zero up, no levels, no bound, as likely as frames and noise make it.
 
     Where the frames are of one material's ratio δ/β (known, or estimated where nothing is known), δ is free in every
@@ -44,6 +44,7 @@ class SmoothVolume:
     """
 
     kind: ClassVar[str] = "volume"
+    likelier: ClassVar[bool] = True
 
     volume: HolographicTV = field(default_factory=_start)
     """The start: phase retrieval, total variation, and agreement with the frames. With fewer rounds of agreement than
@@ -92,8 +93,6 @@ class SmoothStage:
 
     options: SmoothVolume
     name: str = "smooth volume"
-    likelier: ClassVar[bool] = True
-    """Its fit is likelier than its start, by what noise and prior say; frames alone prefer a start that fits noise."""
 
     def start(self, task: Task, before: Stored | None) -> VoxelGrid:
         """A first volume: δ in units of the known material's, or of the estimated one's."""

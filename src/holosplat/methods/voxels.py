@@ -28,7 +28,7 @@ from ..representations import Stored, VoxelGrid
 from ..scan import Scan
 from .assumed import assumed_material
 from .ground import ExtraTerm, ground
-from .method import Stage, Task
+from .method import Method, Stage, Task
 
 ABSORPTION_REACH = 10.0
 """How much longer than those of δ the steps of a free β are, in units of the material's. At equal lengths β would not
@@ -36,7 +36,7 @@ move, for it changes the frames a thousand times less; at lengths for equal chan
 
 
 @dataclass(frozen=True)
-class HolographicVoxels:
+class HolographicVoxels(Method):
     """Phase retrieval and total variation, made to agree with the holograms: the start of the Gaussians, by itself."""
 
     kind: ClassVar[str] = "holographic-tv"
@@ -112,7 +112,7 @@ class VoxelFit:
 
 
 @dataclass(frozen=True)
-class Voxels:
+class Voxels(Method):
     """The method that fits voxels to the frames with total variation; δ and β are free where the material is unknown.
 
     Examples:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import singledispatch
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from torch import Tensor
 from ..checks import require
 from ..geometry import Poses, Views
 from ..scan import Exposures
-from ..volume import Component, LineIntegrals, Object, Photographed, TrainableObject
+from ..volume import Component, LineIntegrals, Object, TrainableObject
 from .alignment import Alignment
 from .instrument import Instrument
 from .light import LightField, SolvedLight
@@ -85,23 +86,26 @@ class Model:
 
     def lines(self, time: float, index: Tensor | None = None) -> LineIntegrals:
         """Line integrals of the matter at `time` [s] on the instrument's raster, in the exposures `index`."""
-        return self._lines_of(self.object.at(float(time)), index)
+        return self.lines_of(self.object.at(float(time)), index)
 
-    def _lines_of(self, matter: Object, index: Tensor | None) -> LineIntegrals:
+    def lines_of(self, matter: Object, index: Tensor | None = None) -> LineIntegrals:
+        """Line integrals of `matter`, as it is, on the instrument's raster, in the exposures `index`."""
         if isinstance(matter, Component):  # it takes poses, which cost no time to make
             assert isinstance(matter, TrainableObject)
             return LineIntegrals.of_any(matter.project(self._poses(self.instrument.poses, index)))
         return LineIntegrals.of_any(matter.project(self._views(index)))
 
+    def pixels(self, index: Tensor | None = None) -> Poses:
+        """Places of the beams of the exposures `index` on the detector's pixels."""
+        return self._poses(self.instrument.detector, index)
+
+    @property
+    def by_waves(self) -> bool:
+        """Whether line integrals and waves make the frames (see `frames_of`)."""
+        return frames_of.dispatch(type(self.object)) is frames_of.dispatch(object)
+
     def _seen(self, time: float, index: Tensor | None) -> Tensor:
-        matter = self.object.at(time)
-        if isinstance(matter, Photographed):
-            return matter.photographs(self._poses(self.instrument.detector, index))
-        lines, planned, alignment = self._lines_of(matter, index), self.instrument.exposures, self.alignment
-        if alignment is None:
-            return self.instrument.frames(lines, index)
-        distance, sigma = alignment.optical_distance(planned, index), alignment.psf_sigma_px(planned, index)
-        return self.instrument.frames(lines, index, distance, sigma)
+        return frames_of(self.object.at(time), self, index)
 
     def _of_several_times(self, index: Tensor | None, delay: float) -> Tensor:
         every = np.arange(len(self.instrument.views))
@@ -121,6 +125,17 @@ class Model:
         if self.alignment is not None:
             return self._poses(self.instrument.poses, index).views()
         return self.instrument.views if index is None else self.instrument.views[index.cpu().numpy()]
+
+
+@singledispatch
+def frames_of(matter: Object, model: Model, index: Tensor | None) -> Tensor:
+    """Frames [K, h, w] of `matter`, as it is, in the exposures `index` of `model`, without its light: line integrals
+    through the waves. A kind of Object that frames show otherwise registers its own function."""
+    lines, planned, alignment = model.lines_of(matter, index), model.instrument.exposures, model.alignment
+    if alignment is None:
+        return model.instrument.frames(lines, index)
+    distance, sigma = alignment.optical_distance(planned, index), alignment.psf_sigma_px(planned, index)
+    return model.instrument.frames(lines, index, distance, sigma)
 
 
 def measure(obj: Object, exposures: Exposures, oversample: int = 1, dtype: torch.dtype = torch.float32) -> Tensor:

@@ -215,7 +215,8 @@ class Following:
         at = self.train.at_instant(len(self.train.instants) // 2)
         how = (self.options.sightings, self.options.learned)
         with self._record_time("sightings"):
-            found, self.guess = network_for(at, self.material, *how, lambda stage, part: None)
+            found, decision = network_for(at, self.material, *how, lambda stage, part: None)
+        self.guess = decision.line
         return found
 
     def look(self, frames: Scan, level: float = 1.0, network: Guess | None = None) -> list[list[Sighting]]:

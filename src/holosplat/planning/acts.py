@@ -7,7 +7,6 @@ Seconds and bytes on the disk are rough: they were measured once or twice, on a 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -16,7 +15,7 @@ import numpy as np
 from ..io.ome_tiff import TIFF_SUFFIXES
 from ..io.ome_zarr import CHUNK, ZARR_SUFFIX
 from ..io.volumes import SLAB_VOXELS
-from .needs import KEPT, Costs, Needs, Sizes, of_fit, of_simulation, of_start, with_report
+from .needs import KEPT, Costs, Needs, Sizes, of_fit, of_start, with_report
 
 if TYPE_CHECKING:
     from ..align import PoseOptions
@@ -73,8 +72,6 @@ class Parts:
     """A voxel of chunks of which larger voxels are made."""
     scene: float = 8.0
     """A voxel of a scene for learning, of which a file's are held."""
-    judged: float = 60.0
-    """A voxel of a case of the benchmark, whose truth and result are compared."""
 
 
 class Room:
@@ -218,19 +215,3 @@ def of_training(shape: tuple[int, int], views: int, network: str, size: Size, st
     else:
         memory = Parts.aligned_trainer + (Parts.aligned + Parts.aligned_view * views) * voxels
     return Needs(memory, 1e8, steps * (0.2 + 2e-5 * views * voxels))
-
-
-def of_methods(exposures: Exposures, is_test: np.ndarray, samples: int, methods: Sequence[Method]) -> Needs:
-    """What a case of the benchmark takes, with such frames, of which some are held out, and so many wave samples along
-    a pixel of its simulation."""
-    sizes, voxels = Sizes.of(exposures[~is_test]), Sizes.of(exposures).voxels
-    each = [needs for method in methods if (needs := of_fit(sizes, method)) is not None]
-    made = of_simulation(exposures, samples, len(exposures))
-    memory = max([made.memory, *(needs.memory for needs in each)]) + Parts.judged * voxels
-    disk = made.disk + 2 * Costs.written * voxels + 1e6 * len(each)
-    return Needs(memory, disk, 10 + sum(needs.seconds for needs in each))
-
-
-def of_benchmark(cases: Sequence[Needs]) -> Needs:
-    """Estimate resources of several cases, one after the other."""
-    return Needs(max(one.memory for one in cases), sum(one.disk for one in cases), sum(one.seconds for one in cases))

@@ -15,7 +15,7 @@ from ..checks import as_written
 from ..geometry import Grid, Views
 from ..io.guess import read_guess
 from ..io.json import read_json
-from ..methods import METHODS
+from ..methods import METHODS, learned
 from ..motion.measures import columns, measured
 from ..optics.background import Light
 from ..projectors.voxels import voxel_line_integrals
@@ -124,14 +124,10 @@ NAMES = {
     "moving-gaussians": "Reconstruction as Gaussians that a flow carries",
     "space-time-field": "Reconstruction as a field of space and time",
     "voxels": "Voxel reconstruction",
-    "voxel-series": "Reconstruction as voxels at several times",
-    "low-rank-voxels": "Reconstruction as voxels of low rank in time",
-    "hexplane-field": "Reconstruction as a field of six planes of space and time",
-    "deformed-voxels": "Reconstruction as voxels that a network displaces",
     "neural-field": "Reconstruction as a neural field",
     "pixel-aligned-field": "Reconstruction as a pixel-aligned field",
 }
-"""What a report is called, by the kind of object."""
+"""What a report is called, by the kind of object; others are called by what they say they are."""
 
 
 def _guess(folder: RunFolder, reconstruction: Reconstruction) -> GuessShown | None:
@@ -142,7 +138,9 @@ def _guess(folder: RunFolder, reconstruction: Reconstruction) -> GuessShown | No
     delta = float(np.abs(volume.delta).max()) or 1.0
     unit = reconstruction.object.matter.delta if reconstruction.object.matter.single else delta
     found = reconstruction.object.voxelise(volume.grid).delta / unit
-    return GuessShown(volume.delta / unit, found, spread, volume.grid, reconstruction.choice.begun, of_copies)
+    said = [each.line for each in reconstruction.choice.decisions if each.name == learned.NAME]
+    why = ". ".join(said) or reconstruction.choice.begun
+    return GuessShown(volume.delta / unit, found, spread, volume.grid, why, of_copies)
 
 
 def _forecast(folder: RunFolder) -> ForecastShown | None:
@@ -161,12 +159,13 @@ def _scan_of(folder: RunFolder) -> str:
 
 
 def _title(config: Mapping[str, Any], reconstruction: Reconstruction) -> str:
-    matter = reconstruction.object.matter
+    found = reconstruction.object
+    matter, name = found.matter, NAMES.get(found.kind, f"Reconstruction as {found.described}")
     count = "two materials" if matter.second else "one material" if matter.single else "δ and β free"
     if not reconstruction.delta_told:
-        return f"{NAMES[reconstruction.object.kind]}, of absorption alone"
+        return f"{name}, of absorption alone"
     said = {"known": ", known", "ratio": " of known δ/β", "free": ", found" if matter.occupancies else ""}
-    return f"{NAMES[reconstruction.object.kind]}, {count}{said[config['prior']['kind']]}"
+    return f"{name}, {count}{said[config['prior']['kind']]}"
 
 
 def _summary(reconstruction: Reconstruction, scan: Scan, moving: Moving | None) -> str:

@@ -3,28 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from torch import Tensor
 
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
+from ..plugins import Extended
 from ..volume import LineIntegrals, TrainableObject
 from .aligned_network import AlignedNetwork, PixelAligned
-from .deformed_voxels import Deformation, DeformedVoxels
 from .encodings import Encoding
 from .fading import Fading
 from .flow import Flow, Lattice
 from .gaussians import GaussianCloud
-from .hexplane import HexPlaneField, HexPlanes
 from .initialise import approximate, at_pitch, cloud_from_two, cloud_from_volume, freed, random_cloud
 from .isosurface import isosurface
 from .moving_gaussians import MovingGaussians
 from .moving_surfaces import MovingSurfaces
-from .moving_voxels import LowRankVoxels, OnVoxels, VoxelSeries
 from .neural_field import Network, NeuralField
 from .paths import TimeBasis
-from .photographed import AlphaCloud, RadianceField
 from .pixel_aligned import PixelAlignedField
 from .space_time import SpaceTime, SpaceTimeField
 from .surfaces import SurfaceMesh
@@ -32,6 +29,7 @@ from .voxel_lines import VoxelLines
 from .voxels import VoxelGrid
 
 
+@runtime_checkable
 class Stored(TrainableObject, Protocol):
     """An Object that can be fitted and stored: the result of a reconstruction."""
 
@@ -76,41 +74,47 @@ class Stored(TrainableObject, Protocol):
         ...
 
 
-KINDS: dict[str, type[Stored]] = {
-    kind.kind: kind
-    for kind in (
-        *(GaussianCloud, VoxelGrid, SurfaceMesh, MovingSurfaces, MovingGaussians, NeuralField),
-        *(SpaceTimeField, AlphaCloud, RadianceField, PixelAlignedField),
-        *(VoxelSeries, LowRankVoxels, HexPlaneField, DeformedVoxels),
-    )
-}
-"""Every kind of Object that files hold, by name."""
-MOVING = (MovingSurfaces, MovingGaussians, SpaceTimeField, VoxelSeries, LowRankVoxels, HexPlaneField, DeformedVoxels)
-"""Those that are of several times."""
+@runtime_checkable
+class InMotion(Stored, Protocol):
+    """One that is of several times."""
+
+    def at(self, time: float) -> Stored:
+        """The object as it is at `time` [s]."""
+        ...
+
+    @property
+    def basis(self) -> TimeBasis:
+        """Of its courses of time, from the first time to the last."""
+        ...
+
+
+KINDS: Extended[type[Stored]] = Extended(
+    {
+        kind.kind: kind
+        for kind in (
+            *(GaussianCloud, VoxelGrid, SurfaceMesh, MovingSurfaces, MovingGaussians, NeuralField),
+            *(SpaceTimeField, PixelAlignedField),
+        )
+    },
+    "holosplat.kinds",
+)
+"""Every kind of Object that files hold, by name; other packages add theirs (docs/adding.md)."""
 
 __all__ = [
     "KINDS",
-    "MOVING",
     "AlignedNetwork",
-    "AlphaCloud",
-    "Deformation",
-    "DeformedVoxels",
     "Encoding",
     "Fading",
     "Flow",
     "GaussianCloud",
-    "HexPlaneField",
-    "HexPlanes",
+    "InMotion",
     "Lattice",
-    "LowRankVoxels",
     "MovingGaussians",
     "MovingSurfaces",
     "Network",
     "NeuralField",
-    "OnVoxels",
     "PixelAligned",
     "PixelAlignedField",
-    "RadianceField",
     "SpaceTime",
     "SpaceTimeField",
     "Stored",
@@ -118,7 +122,6 @@ __all__ = [
     "TimeBasis",
     "VoxelGrid",
     "VoxelLines",
-    "VoxelSeries",
     "approximate",
     "at_pitch",
     "cloud_from_two",

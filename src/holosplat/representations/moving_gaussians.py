@@ -16,6 +16,7 @@ from ..projectors.splat.reference import rotation_matrices
 from ..volume import LineIntegrals, Volume
 from .flow import Flow
 from .gaussians import PARAMETERS, GaussianCloud
+from .paths import TimeBasis
 from .principal import principal_axes
 
 FLOW = "flow_"
@@ -49,6 +50,11 @@ class MovingGaussians:
     def unit_length(self) -> float:
         """The unit [m] of centres, scales and flow."""
         return self.cloud.unit_length
+
+    @property
+    def basis(self) -> TimeBasis:
+        """That of the flow."""
+        return self.flow.basis
 
     def __len__(self) -> int:
         return len(self.cloud)

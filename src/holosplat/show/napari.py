@@ -18,7 +18,7 @@ from ..io.gaussians import FORMAT as GAUSSIANS
 from ..io.hdf5 import open_hdf5
 from ..io.objects import FORMAT, read_object
 from ..io.volumes import NAMES, read_volume
-from ..representations import MOVING, Stored, SurfaceMesh
+from ..representations import InMotion, Stored, SurfaceMesh
 from ..volume import Volume
 from ..workflows.moments import instants_of
 from ..workflows.run_folder import RunFolder
@@ -67,7 +67,7 @@ def layers(path: str) -> list[Layer]:
         if volume:
             return _images(found.stem, [read_volume(found)], {})
         obj = read_object(found)
-    moving = isinstance(obj, MOVING)
+    moving = isinstance(obj, InMotion)
     about = {"kind": obj.kind, "described": obj.described} | ({"times_s": times} if moving and times else {})
     moments = list(at_times(obj, times).values())
     if all(isinstance(moment, SurfaceMesh) for moment in moments):

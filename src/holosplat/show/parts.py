@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from ..geometry import Grid
 from ..io.splats import opacities
 from ..mesh import TriangleMesh
-from ..representations import MOVING, GaussianCloud, MovingGaussians, Stored, SurfaceMesh, isosurface
+from ..representations import GaussianCloud, InMotion, Stored, SurfaceMesh, isosurface
 from ..units import bar_length, format_length
 
 HALF_EDGE = 10.0
@@ -86,9 +86,9 @@ def shown(obj: Stored) -> Shown:
 def at_times(obj: Stored, times: Sequence[float]) -> dict[str, Stored]:
     """What the slider of time leads through, by its label: a moving object at up to `TIMES` of `times` [s], or from the
     first of its basis to the last where there are none; any other object alone."""
-    if not isinstance(obj, MOVING):
+    if not isinstance(obj, InMotion):
         return {"": obj}
-    basis = obj.flow.basis if isinstance(obj, MovingGaussians) else obj.basis
+    basis = obj.basis
     chosen = np.array(times) if len(times) else np.linspace(basis.first, basis.last, TIMES)
     chosen = chosen[np.unique(np.linspace(0, len(chosen) - 1, min(TIMES, len(chosen))).astype(int))]
     return {f"{1e6 * t:.6g} µs": obj.at(float(t)) for t in chosen}

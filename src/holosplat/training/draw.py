@@ -9,11 +9,11 @@ from typing import Literal
 
 import numpy as np
 
+from ..beamline.declared.declaration import Beam, Declaration, Detector, Listed, Matter, Substance
+from ..beamline.declared.soft_specimens import SoftCells
+from ..beamline.declared.specimens import Capsules, CrowdedCells, FoamDrop, RedCells, Specimen
 from ..beamline.light import UnevenLight
 from ..beamline.misalignment import Misalignment
-from ..bench.declaration import Beam, Declaration, Detector, Listed, Matter, Substance
-from ..bench.soft_specimens import SoftCells
-from ..bench.specimens import Capsules, CrowdedCells, FoamDrop, RedCells, Specimen
 from ..matter import DeltaBeta
 from ..specimens.red_cells import DIAMETER, evans_fung_cell
 from ..units import wavelength

@@ -8,8 +8,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 import torch
 
-from ..bench.case import Case, case_of
-from ..bench.specimens import CrowdedCells, Specimen
+from ..beamline.declared.case import Case, case_of
+from ..beamline.declared.specimens import CrowdedCells, Specimen
 from ..checks import InputError
 from ..geometry import Grid
 from ..learning.images import retrieved_thickness

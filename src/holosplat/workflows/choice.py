@@ -8,7 +8,6 @@ from typing import Any
 
 from ..inference import Decision
 from ..matter import MatterKind
-from ..units import in_percent
 
 
 @dataclass(frozen=True)
@@ -45,9 +44,6 @@ class Choice:
         """The same as a few lines of text."""
         lines = [each.line for each in self.decisions]
         lines += [f"start: {self.begun}"] if self.begun else []
-        if self.kept and len(self.judged) > 1:
-            shares = ", ".join(f"{name} {in_percent(share)}" for name, share in self.judged.items())
-            less = [name for name, share in self.judged.items() if share < self.judged.get(self.kept, 0.0)]
-            why = f"; what {' and '.join(less)} explain{'s' * (len(less) == 1)} beyond it may be noise" if less else ""
-            lines.append(f"kept: {self.kept} (matter that training frames leave unexplained: {shares}){why}")
+        if len(self.judged) > 1 and self.kept and self.kept != next((d.choice for d in self.decisions[-1:]), ""):
+            lines.append(f"result: {self.kept}")
         return lines

@@ -7,7 +7,7 @@ from typing import Literal
 
 from ..checks import as_written, require
 from ..io.json import read_json
-from ..representations import MOVING
+from ..representations import InMotion
 from ..scan import Scan
 from .reconstruction import Reconstruction
 from .run_folder import RunFolder
@@ -35,7 +35,7 @@ def moment(done: Reconstruction, times: list[float], frame: int) -> Reconstructi
     Errors: `InputError` for an instant that there is not.
     """
     chosen_frames(frame, times)
-    assert isinstance(done.object, MOVING)
+    assert isinstance(done.object, InMotion)
     return replace(done, object=done.object.at(times[frame]))
 
 

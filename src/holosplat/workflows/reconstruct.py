@@ -14,17 +14,16 @@ from ..align.poses import PoseOptions
 from ..backends import in_main_memory, resolve
 from ..checks import as_written, positive, require
 from ..fit.running import Record, Running
+from ..inference import Decision
 from ..io.guess import write_guess
 from ..io.json import write_json
 from ..io.light import read_still_light, write_light
 from ..io.objects import write_object
 from ..learning.start import GuessedMatter
 from ..matter import MaterialPrior, MatterKind
-from ..methods import Auto, Gaussians, Method, Settled, Stage, Task, begun, finished, settled
-from ..methods.beginning import Beginning
+from ..methods import Auto, Gaussians, Method, Settled, Stage, Task, begun, finished, learned, settled
 from ..methods.illumination import prepared
 from ..methods.keeper import Keeper, placed_at, where
-from ..methods.method import mixes_kinds, require_files, takes_series
 from ..methods.uncertain import Determined, Uncertain
 from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling
@@ -75,7 +74,7 @@ def reconstruct(
 ) -> Reconstruction:
     """Reconstruct the object in the training frames of `scan`: the best state of `method` by these frames.
 
-    light: assumptions about the light (default: even, unless air shows otherwise; see `Task.evened`)
+    light: assumptions about the light (default: as the frames show; see `illumination.prepared`)
     matter: "levels", with sharp edges, or "continuous" (default: chosen from the data)
     uncertain: ranges of distance, energy or δ/β (default: exact), which the result estimates as `constants`
     refine: how to estimate poses, too (default: as in the scan); the result has them as `geometry`
@@ -101,11 +100,11 @@ def reconstruct(
         >>> bool(abs(error) < 0.05)
         True
     """
-    if not takes_series(method):
+    if not method.of_series:
         require_one_time(scan)
     check_frames(scan.train())
     if not resume:  # a run that goes on may be past them
-        require_files(method)
+        method.require_files()
     assumed, ranges, planned = light or LightOptions(), uncertain or Uncertain(), scan
     said = {"light": to_table(assumed), "uncertain": to_table(ranges), "refine": refine and to_table(refine)}
     config = config_of(scan, prior, method, seed, matter) | said
@@ -190,7 +189,7 @@ class _Run:
     timing: dict[str, float] = field(default_factory=dict)
     asked: str = ""
     constants: tuple[Determined, ...] = ()
-    begun: str = ""
+    start: tuple[Decision, ...] = ()
     _keeper: Keeper = field(init=False)
     _saved: dict[str, Any] | None = None
     _config: dict[str, Any] = field(default_factory=dict)
@@ -199,15 +198,15 @@ class _Run:
     def begin(self, config: dict[str, Any], resume: bool) -> None:
         """Look at the folder, and at what of the run is there already; writes nothing."""
         self._config, self.asked = config, self.method.kind
-        self.task = replace(self.task, on_beginning=self._told_beginning)
-        self._keeper = Keeper(self.task.scan, mixed=mixes_kinds(self.method))
+        self.task = replace(self.task, on_start=self._note_start)
+        self._keeper = Keeper(self.task.scan, mixed=self.method.mixes_kinds)
         if self.folder is None or not goes_on(self.folder, config, resume):
             return
         self._saved = self.folder.load_checkpoint()
         if self._saved:
             with self.as_written():
                 self.timing |= {str(name): float(seconds) for name, seconds in self._saved["timing"].items()}
-                self.begun = str(self._saved.get("begun", ""))
+                self.start = tuple(Decision.from_dict(each) for each in self._saved.get("decided", ()))
                 self._keeper.load(self._saved["kept"])
 
     def prepare(self) -> None:
@@ -232,8 +231,8 @@ class _Run:
         else:
             found = settled(self.method, self.task, matter, uncertain)
             self.timing["decision"] = self.timing.get("decision", 0.0) + time.perf_counter() - began
-        if isinstance(self.method, Auto) and self.method.gaussians.start == "learned" and found.matter == "continuous":
-            self.begun = "The matter is continuous, and the network guesses bodies: it was not asked."
+        asked = isinstance(self.method, Auto) and self.method.gaussians.start == "learned"
+        self.start = (learned.NOT_ASKED,) if asked and found.matter == "continuous" else self.start
         self.method, self.constants = found.method, found.constants
         self.task = found.task(self.task)
         self._keeper.train = self.task.scan
@@ -261,15 +260,14 @@ class _Run:
                 found = start
                 continue
             last = fit
-            journal = _Journal(fit, number, start, self)
-            complete = journal.run(saved["fit"] if saved else None)
+            complete = _Journal(fit, number, start, self).run(saved["fit"] if saved else None)
             self.timing[stage.name] = fit.seconds
             found = cast(Stored, finished(fit))
             self.task = replace(self.task.moved(fit.result()), near=False)
             self._keeper.moved(self.task.scan)
             if not complete:
                 return self._result(found, fit, False)
-            self._keeper.look_after(stage, stage.name, found, oversample)
+            self._keeper.look(stage.name, found, oversample, fitted=not self.method.likelier)
         assert self._keeper.best is not None
         self.task = replace(self.task, scan=replace(self.task.scan, exposures=self._keeper.best.exposures))
         return self._result(self._keeper.best.object, last, True)
@@ -311,8 +309,8 @@ class _Run:
         self.timing["start"] = self.timing.get("start", 0.0) + time.perf_counter() - began
         return start
 
-    def _told_beginning(self, beginning: Beginning) -> None:
-        self.begun, self._guess = beginning.why, beginning.guess
+    def _note_start(self, decision: Decision, guess: GuessedMatter | None) -> None:
+        self.start, self._guess = (decision,), guess
 
     def make_folder(self, backend: str) -> None:
         """Make the folder, once there is something to put in it."""
@@ -330,8 +328,9 @@ class _Run:
 
     def _result(self, found: Stored, fit: Running | None, complete: bool) -> Reconstruction:
         exposures, best = self.task.scan.exposures, self._keeper.best if complete else None
-        samples = best.oversample if best else fit.oversample if fit else 0
-        oversample, kept = samples or fringe_sampling(exposures), best.name if best else ""
+        samples, kept = best.oversample if best else fit.oversample if fit else 0, best.name if best else ""
+        oversample = samples or fringe_sampling(exposures)
+        decisions = (*self.task.decisions, *self.start, *(self._keeper.decisions if best else ()))
         done = Reconstruction(
             found.on(in_main_memory(found.backend)),
             self.asked,
@@ -339,7 +338,7 @@ class _Run:
             oversample,
             dict(self.timing),
             complete,
-            Choice(self.task.matter, dict(self._keeper.judged), kept, self.begun, self.task.decisions),
+            Choice(self.task.matter, dict(self._keeper.judged), kept, decisions=decisions),
             self.task.delta_told,
             judge_run(found, fit, self.task, oversample),
             self._total(found, fit, oversample),
@@ -355,14 +354,14 @@ class _Run:
             background = self.task.uneven and self.task.uneven.background
             if background is not None or done.still is not None:
                 write_light(self.folder.light, background, done.still, self.folder.marks())
-            said = {"times_s": self.task.scan.instants.tolist()} if takes_series(self.method) else {}
+            said = {"times_s": self.task.scan.instants.tolist()} if self.method.of_series else {}
             said |= {"light": self.task.light_in_words}
             self.folder.write_summary(summary_of(done, fit, self.task.scan) | said)
         return done
 
     def _total(self, found: Stored, fit: Running | None, oversample: int) -> TotalMatter | None:
         """The total of the matter; None of several times, at which it may differ."""
-        if takes_series(self.method):
+        if self.method.of_series:
             return None
         return total_of_run(*said_of_run(found, fit, self.task, oversample), self.task, self.constants)
 
@@ -422,7 +421,7 @@ class _Journal:
             "timing": self._run.timing,
             "kept": self._run.kept(),
             "near": self._run.task.near,
-            "begun": self._run.begun,
+            "decided": [each.as_dict() for each in self._run.start],
             **self._run.placed(),
         }
         folder.save_checkpoint(state)

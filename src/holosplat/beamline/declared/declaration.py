@@ -1,0 +1,258 @@
+"""A case as its TOML file declares it: what is measured, of what, how, and what the methods are told.
+
+A file is one case, or, with tables `[variants.NAME]`, as many cases that say what differs. `[with_snapshots]` says what
+differs where a folder of simulated cells is given. Lengths are in metres, angles in degrees, densities in g/cm³.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+
+from ...checks import InputError, in_range, require
+from ...geometry import Views, rotation_tilted, rotation_y
+from ...materials import DeltaBeta, parse_material
+from ...matter import MaterialPrior
+from ...optics.noise import PHOTON_RANGE
+from ...ranges import Grams, Many, ManyOrNone, Metres, Photons, Pixels, Positive, Signed, Small, ranged
+from ...scan import Exposures, interleaved_split
+from ...specimens.continuous import ContinuousScene
+from ...specimens.phantoms import Ball
+from ...specimens.scene import MeshScene
+from ...tables import from_table, merged, read_table
+from ..light import EVEN_LIGHT, UnevenLight
+from ..misalignment import AS_PLANNED, Misalignment
+from .soft_specimens import Continuous
+from .specimens import Specimen
+
+MOST_PIXELS = 4096
+
+
+@dataclass(frozen=True)
+@ranged
+class Substance:
+    """A preset's name ("plasma"), "vacuum", a formula with its density [g/cm³], or `delta` and `beta` themselves."""
+
+    shorthand: ClassVar[str] = "formula"
+    formula: str | None = None
+    density: Grams | None = None
+    delta: Signed | None = None
+    beta: Signed | None = None
+
+    def __post_init__(self) -> None:
+        numbers = self.delta is not None and self.beta is not None
+        neither = self.delta is None and self.beta is None
+        require(
+            (numbers and self.formula is None) or (neither and self.formula is not None),
+            "a substance must be given by its formula, or by both delta and beta; give one of the two.",
+        )
+        empty = self.formula in ("vacuum", None)
+        require(not empty or self.density is None, "vacuum, or delta and beta, have no density; remove it.")
+        if not empty:
+            parse_material(self.formula or "", self.density)
+
+    def delta_beta(self, energy_kev: float) -> DeltaBeta:
+        """δ and β at `energy_kev` [keV]; those that are given are taken as they are."""
+        if self.delta is not None and self.beta is not None:
+            return DeltaBeta(self.delta, self.beta)
+        if self.formula is None or self.formula == "vacuum":
+            return DeltaBeta(0.0, 0.0)
+        return parse_material(self.formula, self.density).delta_beta(energy_kev)
+
+
+@dataclass(frozen=True)
+class Matter:
+    """material: of the bodies; core: of what is inside them (cores of capsules, bubbles); medium: around them."""
+
+    material: Substance
+    core: Substance | None = None
+    medium: Substance = Substance("vacuum")
+
+
+@dataclass(frozen=True)
+@ranged
+class Beam:
+    """energy_kev: photon energy [keV]; distance: effective propagation distance [m]."""
+
+    energy_kev: Positive
+    distance: Metres
+
+
+@dataclass(frozen=True)
+@ranged
+class Detector:
+    """rows, columns: pixels; pixel_size: effective pitch [m]; psf_sigma_px: of its point-spread function [pixels]."""
+
+    rows: int
+    columns: int
+    pixel_size: Small
+    psf_sigma_px: Pixels = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("rows", "columns"):
+            count = getattr(self, name)
+            require(1 <= count <= MOST_PIXELS, f"{name} must lie between 1 and {MOST_PIXELS}, but it is {count}.")
+
+
+@dataclass(frozen=True)
+@ranged
+class Interleaved:
+    """`count` views evenly over 180° about the y axis, the last of every `hold_out_every` held out."""
+
+    kind: ClassVar[str] = "interleaved"
+    count: Many
+    hold_out_every: Many = 4
+
+    def __post_init__(self) -> None:
+        enough = 2 <= self.hold_out_every <= self.count
+        require(enough, f"hold_out_every must lie between 2 and count, {self.count}, but it is {self.hold_out_every}.")
+
+    def poses(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations [V, 3, 3], and which of them are held out [V] bool."""
+        angles = np.arange(self.count) * (180 / self.count)
+        return rotation_y(angles), interleaved_split(self.count, self.hold_out_every)
+
+
+@dataclass(frozen=True)
+@ranged
+class Between:
+    """`train` views evenly over 180° about the y axis, and `test` held-out ones, each in the middle of a gap."""
+
+    kind: ClassVar[str] = "between"
+    train: Many
+    test: ManyOrNone
+
+    def __post_init__(self) -> None:
+        require(
+            1 <= self.test <= self.train, f"test must lie between 1 and train, {self.train}, but it is {self.test}."
+        )
+
+    def poses(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations [V, 3, 3], those for training first, and which of them are held out [V] bool."""
+        gaps = np.floor((np.arange(self.test) + 0.5) * self.train / self.test)
+        angles = np.concatenate([np.arange(self.train), gaps + 0.5]) * (180 / self.train)
+        return rotation_y(angles), np.arange(len(angles)) >= self.train
+
+
+@dataclass(frozen=True)
+@ranged
+class Listed:
+    """Directions `[angle, tilt]` [degrees] (`geometry.rotation_tilted`) for training, and held out."""
+
+    kind: ClassVar[str] = "listed"
+    train: tuple[tuple[Signed, Signed], ...]
+    test: tuple[tuple[Signed, Signed], ...]
+
+    def __post_init__(self) -> None:
+        for name in ("train", "test"):
+            require(len(getattr(self, name)) > 0, f"{name} must list at least one direction.")
+
+    def poses(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rotations [V, 3, 3], those for training first, and which of them are held out [V] bool."""
+        angles, tilts = np.array(self.train + self.test).T
+        rotations = rotation_tilted(angles, tilts)
+        return rotations, np.arange(len(rotations)) >= len(self.train)
+
+
+@dataclass(frozen=True)
+@ranged
+class Declaration:
+    """A case without its seed. summary: one line about it; photons: mean counts a pixel of a frame for training, or
+    none for frames without noise; prior: what methods are told of `matter.material` against the medium; light: how it
+    differs from the flat field on frames for training; misalignment: how far beams are from where methods are told."""
+
+    summary: str
+    specimen: Specimen
+    matter: Matter
+    beam: Beam
+    detector: Detector
+    views: Interleaved | Between | Listed
+    prior: Literal["known", "ratio", "free"]
+    photons: Photons | None = None
+    light: UnevenLight = EVEN_LIGHT
+    misalignment: Misalignment = AS_PLANNED
+
+    def __post_init__(self) -> None:
+        core, wanted = self.matter.core is not None, self.specimen.has_core
+        require(
+            core or not wanted,
+            f"matter.core is missing, which fills the cores of the specimen, {self.specimen.kind}; add it.",
+        )
+        require(
+            wanted or not core,
+            f"matter.core must be absent, as the specimen, {self.specimen.kind}, has no cores; remove it.",
+        )
+        if self.photons is not None:
+            in_range("photons", self.photons, *PHOTON_RANGE)
+        self.exposures()
+        self.material_prior()
+
+    def exposures(self) -> tuple[Exposures, np.ndarray]:
+        """How the frames are taken, and which are held out [N] bool."""
+        rotations, is_test = self.views.poses()
+        raster = (self.detector.rows, self.detector.columns)
+        views = Views.from_rotations(rotations, raster, self.detector.pixel_size)
+        return Exposures.of(views, self.beam.energy_kev, self.beam.distance, self.detector.psf_sigma_px), is_test
+
+    def material_prior(self) -> MaterialPrior:
+        """The information that methods get."""
+        contrast = self._delta_beta(self.matter.material).against(self._delta_beta(self.matter.medium))
+        if self.prior == "known":
+            return MaterialPrior.known(contrast)
+        return MaterialPrior.of_ratio(contrast.ratio) if self.prior == "ratio" else MaterialPrior.unknown()
+
+    def scene(self, seed: int, snapshots: Path | None) -> tuple[MeshScene | ContinuousScene, str, tuple[Ball, ...]]:
+        """The matter that `seed` gives, what it is in words, and the balls of a phantom of balls.
+
+        The core of a mesh adds what it is filled with, less the material around it.
+        """
+        material, medium = self._delta_beta(self.matter.material), self._delta_beta(self.matter.medium)
+        if isinstance(self.specimen, Continuous):
+            cores = [self._delta_beta(self.matter.core).against(medium)] if self.matter.core else []
+            return *self.specimen.continuous(seed, [material.against(medium), *cores]), ()
+        bodies = self.specimen.bodies(seed, snapshots)
+        filling = [material.against(medium)] * len(bodies.outer)
+        if self.matter.core is not None:
+            filling += [self._delta_beta(self.matter.core).against(material)] * len(bodies.cores)
+        return MeshScene((*bodies.outer, *bodies.cores), tuple(filling)), bodies.text, bodies.balls
+
+    def _delta_beta(self, substance: Substance) -> DeltaBeta:
+        return substance.delta_beta(self.beam.energy_kev)
+
+
+def declared_names(path: Path) -> list[str]:
+    """The cases of a file: its variants, or, without any, one by the file's own name."""
+    return list(_variants(path, read_table(path))) or [path.stem]
+
+
+def read_declaration(path: Path, name: str, with_snapshots: bool = False) -> Declaration:
+    """The case `name` of a file, checked; `InputError` names the file and the entry at fault.
+
+    with_snapshots: whether simulated cells are at hand, such that the file's `[with_snapshots]` applies.
+    """
+    tables = read_table(path)
+    variants = _variants(path, tables)
+    known = ", ".join(variants) or path.stem
+    require(
+        name in variants or (not variants and name == path.stem),
+        f"the case must be one of those in {path}, {known}, but it is {name!r}.",
+    )
+    plain = {key: value for key, value in tables.items() if key not in ("variants", "with_snapshots")}
+    where_given = tables.get("with_snapshots", {})
+    require(isinstance(where_given, dict), f"{path}: with_snapshots must be a table, but it is {where_given!r}.")
+    if with_snapshots:
+        plain = merged(plain, where_given)
+    try:
+        return from_table(Declaration, merged(plain, variants.get(name, {})))
+    except InputError as error:
+        raise InputError(f"{path}, case {name}: {error}") from None
+
+
+def _variants(path: Path, tables: dict[str, Any]) -> dict[str, Any]:
+    variants = tables.get("variants", {})
+    good = isinstance(variants, dict) and all(isinstance(changes, dict) for changes in variants.values())
+    require(good, f"{path}: variants must be tables [variants.NAME], but it is {variants!r}.")
+    return variants

@@ -1,0 +1,179 @@
+"""What a case can be made of: kinds of specimens, as a case's file declares them, and the bodies they give."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from ...checks import InputError, in_range, require
+from ...io.vtk import SUFFIXES, read_meshes
+from ...mesh import TriangleMesh
+from ...ranges import Many, Seed, Share, Small, SomeShare, ranged
+from ...specimens.capsules import place_capsules
+from ...specimens.foam import random_foam
+from ...specimens.phantoms import Ball, star_of_balls
+from ...specimens.red_cells import crowded_cells, random_cells
+from ...specimens.repair import closed
+from .soft_specimens import Continuous
+
+Extents = tuple[Small, Small, Small]
+"""`(x, y, z)` [m]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bodies:
+    """Meshes about the rotation axis: `outer` are filled with the case's material, `cores` with its core's instead.
+
+    text: what they are, in words; balls: of a phantom of balls, in the order of `outer`.
+    """
+
+    text: str
+    outer: Sequence[TriangleMesh]
+    cores: Sequence[TriangleMesh] = ()
+    balls: tuple[Ball, ...] = ()
+
+
+@dataclass(frozen=True)
+@ranged
+class RedCells:
+    """`random_cells`: `count` cells of `diameter` [m] in the channel `box` [m], of the given `shape`, `deform` and
+    `stretch` (without it: as `deform`).
+
+    first_seed: what the case's seed is added to.
+    """
+
+    kind: ClassVar[str] = "red cells"
+    has_core: ClassVar[bool] = False
+    count: Many
+    diameter: Small
+    box: Extents
+    shape: Literal["cylinder", "box"] = "cylinder"
+    deform: Share = 0.03
+    first_seed: Seed = 0
+    stretch: Share | None = None
+
+    def bodies(self, seed: int, snapshots: Path | None) -> Bodies:
+        """The cells that `seed` gives."""
+        seed += self.first_seed
+        how = {"shape": self.shape, "stretch": self.stretch}
+        cells = random_cells(self.count, self.box, seed, self.diameter, self.deform, **how)
+        return Bodies(f"{self.count} generated red cells, seed {seed}", cells)
+
+
+@dataclass(frozen=True)
+@ranged
+class CrowdedCells:
+    """`crowded_cells`: cells of `diameter` [m] that fill the fraction `haematocrit` of a cylinder in `box` [m]."""
+
+    kind: ClassVar[str] = "crowded cells"
+    has_core: ClassVar[bool] = False
+    haematocrit: SomeShare
+    diameter: Small
+    box: Extents
+    deform: Share = 0.03
+
+    def bodies(self, seed: int, snapshots: Path | None) -> Bodies:
+        """The cells that `seed` gives."""
+        cells = crowded_cells(self.haematocrit, self.box, seed, self.diameter, self.deform)
+        text = f"{len(cells)} generated red cells, haematocrit {self.haematocrit:.3g}, seed {seed}"
+        return Bodies(text, [cell.mesh(name=f"cell{i:03d}") for i, cell in enumerate(cells)])
+
+
+@dataclass(frozen=True)
+@ranged
+class Snapshots:
+    """One snapshot of simulated cells, `*_000.vtk`, `*_001.vtk` … in a folder (µm), enlarged by `scale`.
+
+    The seed counts through the snapshots, and starts again after the last.
+    """
+
+    kind: ClassVar[str] = "snapshots"
+    has_core: ClassVar[bool] = False
+    scale: float = 1.0
+
+    def __post_init__(self) -> None:
+        in_range("scale", self.scale, 1e-3, 1e3)
+
+    def bodies(self, seed: int, snapshots: Path | None) -> Bodies:
+        """The cells of the snapshot that `seed` gives, closed, about the middle of their bounding box."""
+        if snapshots is None:
+            raise InputError("this specimen is read from VTK files, but no folder of snapshots is given; give one.")
+        require(snapshots.is_dir(), f"the folder of snapshots must exist, but {snapshots} does not.")
+        found = [(path, re.search(r"_(\d{3})$", path.stem)) for path in sorted(snapshots.iterdir())]
+        numbered = [(path, match[1]) for path, match in found if match and path.suffix.lower() in SUFFIXES]
+        numbers = sorted({number for _, number in numbered})
+        require(len(numbers) > 0, f"{snapshots} must hold snapshots named *_000.vtk, *_001.vtk …, but it holds none.")
+        number = numbers[seed % len(numbers)]
+        meshes = [closed(mesh) for mesh in read_meshes([p for p, of in numbered if of == number], "um")]
+        low, high = zip(*(mesh.bounds for mesh in meshes))
+        middle = 0.5 * (np.min(low, axis=0) + np.max(high, axis=0))
+        scaled = [m.transformed(self.scale * np.eye(3), -self.scale * middle) for m in meshes]
+        return Bodies(f"{len(meshes)} red cells, snapshot {number}", scaled)
+
+
+@dataclass(frozen=True)
+@ranged
+class Capsules:
+    """`place_capsules`: `count` of them, the smallest and largest of `diameters` [m], of the thickness `shell` [m]."""
+
+    kind: ClassVar[str] = "capsules"
+    has_core: ClassVar[bool] = True
+    count: Many
+    diameters: tuple[Small, Small]
+    shell: Small
+    box: Extents
+    flattening: Share = 0.2
+
+    def bodies(self, seed: int, snapshots: Path | None) -> Bodies:
+        """The capsules that `seed` gives."""
+        capsules = place_capsules(self.diameters, self.count, self.box, self.shell, seed, self.flattening)
+        outer = [capsule.outer(name=f"capsule{i:02d}") for i, capsule in enumerate(capsules)]
+        cores = [capsule.core(name=f"core{i:02d}") for i, capsule in enumerate(capsules)]
+        return Bodies(f"{self.count} capsules, seed {seed}", outer, cores)
+
+
+@dataclass(frozen=True)
+@ranged
+class FoamDrop:
+    """`random_foam`: a drop of diameter `drop` [m], `count` bubbles of log-normal diameters about `median` [m]."""
+
+    kind: ClassVar[str] = "foam"
+    has_core: ClassVar[bool] = True
+    drop: Small
+    count: Many
+    median: Small
+    spread: float = 0.4
+
+    def bodies(self, seed: int, snapshots: Path | None) -> Bodies:
+        """The foam that `seed` gives; its bubbles are cores."""
+        foam = random_foam(self.drop, self.count, self.median, self.spread, seed=seed)
+        cores = [bubble.mesh(4, f"bubble{i:03d}") for i, bubble in enumerate(foam.bubbles)]
+        return Bodies(f"a drop with {self.count} bubbles, seed {seed}", [foam.drop.mesh(5, "drop")], cores)
+
+
+@dataclass(frozen=True)
+@ranged
+class BallStar:
+    """`star_of_balls`: `2 · spokes` balls of each of the `diameters` [m], on rings that shrink as the balls do."""
+
+    kind: ClassVar[str] = "star of balls"
+    has_core: ClassVar[bool] = False
+    diameters: tuple[Small, ...]
+    spokes: Many = 8
+
+    def bodies(self, seed: int, snapshots: Path | None) -> Bodies:
+        """The star that `seed` gives, with its balls."""
+        balls = star_of_balls(np.array(self.diameters), seed, self.spokes)
+        meshes = [ball.mesh(name=f"ball{i:03d}") for i, ball in enumerate(balls)]
+        return Bodies(f"{len(balls)} balls of {len(self.diameters)} diameters, seed {seed}", meshes, balls=tuple(balls))
+
+
+Meshed = RedCells | CrowdedCells | Snapshots | Capsules | FoamDrop | BallStar
+"""Every kind of closed meshes."""
+Specimen = Meshed | Continuous
+"""Every kind that a case's file may declare."""

@@ -1,0 +1,1 @@
+"""The benchmark of holosplat: cases and scores, opponents that exist for its tables alone, the study of the thesis."""

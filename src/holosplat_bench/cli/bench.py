@@ -1,0 +1,201 @@
+"""`holosplat bench`: the suite of cases × methods × seeds and its report, and the thesis' study."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Annotated
+
+from tyro.conf import Positional, arg, subcommand
+
+from holosplat.checks import require
+from holosplat.cli.places import Kept, with_checked_arguments
+from holosplat.cli.progress import INTERRUPTED, ProgressBar
+from holosplat.cli.room import tell
+from holosplat.ranges import Seed
+
+from .thesis import thesis
+
+if TYPE_CHECKING:
+    from ..suite.method import Method
+    from ..suite.rows import Row
+    from ..suite.run import Suite
+
+FIRST_SEED = 101
+"""Options were tuned on scenes of seeds below 100."""
+
+
+@dataclass(frozen=True)
+class Folders:
+    """What cases need that is not generated."""
+
+    snapshots: Path | None = None
+    """Folder of simulated cells (VTK files) for the cases that have them; without, cells are generated."""
+    data: Path | None = None
+    """Folder of measured data, for the cases that need them (default: they are fetched)."""
+
+
+def run(
+    cases: tuple[str, ...] = (),
+    methods: tuple[str, ...] = (),
+    seeds: tuple[Seed, ...] = (FIRST_SEED,),
+    out: Kept = Path("bench"),
+    folders: Folders = Folders(),
+    retry: bool = False,
+    list_only: Annotated[bool, arg(name="list")] = False,
+) -> None:
+    """Run methods on cases; rows that are there already are kept, so an interrupted benchmark goes on.
+
+    Args:
+        cases: Names of cases, or TOML files of your own (FILE.toml, or FILE.toml:VARIANT) (default: all; measured ones
+            only with --data).
+        methods: Names of methods (default: all but those that align views first, such as tikhonov-tv+mass).
+        seeds: Seeds of scenes and noise; options were tuned on seeds below 100.
+        out: Folder of the benchmark, new or to go on with.
+        retry: Run again what failed.
+        list_only: Only list cases and methods.
+    """
+    from holosplat.beamline.declared.case import Case
+    from holosplat.io.lock import sole_writer
+
+    from ..suite.case import case_names, load_case
+    from ..suite.folder import BenchFolder
+    from ..suite.measured import MEASURED, MeasuredCase
+    from ..suite.methods import ALIGNED, METHODS
+    from ..suite.references import REFERENCES
+    from ..suite.run import Suite, chosen, run_suite
+
+    if list_only:
+        _list([*case_names(), *MEASURED], METHODS | ALIGNED)
+        return
+    table = METHODS | ALIGNED
+    wanted = {name: table[name] for name in chosen("--methods", methods or list(METHODS), list(table))}
+    files = [name for name in cases if ".toml" in name]
+    listed = [name for name in cases if name not in files]
+    known = [*case_names(), *(MEASURED if listed or folders.data else ())]
+    sources = {name: name for name in chosen("--cases", listed, known)} if listed or not files else {}
+    sources = _at_hand(sources, folders.data)
+    sources |= {load_case(file, min(seeds, default=0), folders.snapshots).name: file for file in files}
+    require(bool(sources), "none of the cases has its data at hand; give their folder by --data FOLDER.")
+
+    def load(name: str, seed: int) -> Case | MeasuredCase:
+        if name in MEASURED:
+            return replace(MEASURED[name], folder=folders.data, seed=seed)
+        return load_case(sources[name], seed, folders.snapshots)
+
+    suite = Suite(list(sources), sorted(set(seeds)), wanted, REFERENCES, load)
+    folder = BenchFolder(out)
+    folder.require_usable()
+    _tell({name: source for name, source in sources.items() if name not in MEASURED}, suite, folders, out)
+    try:
+        with sole_writer(out), _Screen() as screen:
+            run_suite(suite, folder, retry=retry, on_progress=screen.show, on_row=screen.tell)
+    except KeyboardInterrupt:
+        _say(f"interrupted; what {out} holds is whole, and the same command goes on from there")
+        raise SystemExit(INTERRUPTED) from None
+    _say(f"{out} holds all {len(suite)} rows; now: holosplat bench report {out}")
+
+
+def report(folder: Positional[Path] = Path("bench")) -> None:
+    """Write report.html, report.md and their pictures into the folder of a benchmark.
+
+    Args:
+        folder: Folder of the benchmark, which may be unfinished.
+    """
+    from ..suite.folder import BenchFolder
+    from ..suite.pages.report import write_bench_report
+
+    for path in write_bench_report(BenchFolder(folder)):
+        _say(f"wrote {path}")
+
+
+def bench(
+    act: Annotated[
+        Annotated[None, subcommand("run", constructor=with_checked_arguments(run))]
+        | Annotated[None, subcommand("report", constructor=with_checked_arguments(report))]
+        | Annotated[None, subcommand("thesis", constructor=with_checked_arguments(thesis))],
+        arg(name=""),
+    ],
+) -> None:
+    """Compare methods on cases, under one physics and one set of scores (run, report); rerun the thesis' study."""
+
+
+class _Screen:
+    """What a benchmark says on standard error: a bar on a terminal, and a line for each row."""
+
+    def __init__(self) -> None:
+        self._bar: ProgressBar | None = None
+
+    def __enter__(self) -> _Screen:
+        return self
+
+    def __exit__(self, kind: type | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        self._clear()
+
+    def show(self, stage: str, fraction: float) -> None:
+        """A stage is done to `fraction`; only a terminal shows it."""
+        if sys.stderr.isatty():
+            self._bar = self._bar or ProgressBar()
+            self._bar.show(stage, fraction, {})
+
+    def tell(self, row: Row, left: int) -> None:
+        """A row is written."""
+        self._clear()
+        _say(f"{row.case} {row.seed} {row.method}: {_outcome(row)} ({left} to go)")
+
+    def _clear(self) -> None:
+        if self._bar is not None:
+            self._bar.__exit__(None, None, None)
+        self._bar = None
+
+
+def _outcome(row: Row) -> str:
+    if not row.done:
+        return f"failed: {row.reason}"
+    return (
+        f"SSIM {row.test['ssim']:.4f}, FRCM {row.test['frcm']:.4f}, Dice {row.volume['dice']:.4f}, "
+        f"relative error of δ {row.volume['relative_error_delta']:.4f}, {row.seconds:.1f} s"
+    )
+
+
+def _at_hand(sources: dict[str, str], data: Path | None) -> dict[str, str]:
+    """The cases whose data are at hand; of the others it is said that they are skipped, and why."""
+    from ..suite.measured import MEASURED, missing_data
+
+    missing = missing_data(tuple(name for name in sources if name in MEASURED), data)
+    for name, why in missing.items():
+        _say(f"{name} is skipped, for its data are not at hand (--data FOLDER): {why}")
+    return {name: source for name, source in sources.items() if name not in missing}
+
+
+def _tell(sources: Mapping[str, str], suite: Suite, folders: Folders, out: Path) -> None:
+    """Say what the cases that are simulated take; `InputError` where there is less, with those that fit."""
+    from holosplat.beamline.simulate import Simulation
+
+    from ..suite.case import planned_frames
+    from ..suite.needs import of_benchmark, of_methods
+
+    methods, each = [method.options for method in suite.methods.values()], {}
+    for name, source in sources.items():
+        exposures, is_test = planned_frames(source, folders.snapshots)
+        samples = Simulation().samples(exposures)
+        each[name] = of_methods(exposures, is_test, samples, methods).times(len(suite.seeds))
+    if each:
+        smallest = sorted(each, key=lambda name: each[name].memory)
+        fewer = (smallest[:count] for count in range(len(smallest) - 1, 0, -1))
+        others = ((f"--cases {' '.join(kept)}", of_benchmark([each[name] for name in kept])) for kept in fewer)
+        tell("the benchmark", of_benchmark(list(each.values())), out, others)
+
+
+def _list(cases: list[str], methods: Mapping[str, Method]) -> None:
+    print("cases:", *cases, sep="\n  ")
+    print("methods:")
+    for name, method in methods.items():
+        print(f"  {name:24} {method.family}: {method.summary}")
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)

@@ -1,0 +1,172 @@
+"""The methods that the benchmark compares: one table. How to add one: docs/adding.md."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+from holosplat.methods import (
+    Auto,
+    Gaussians,
+    HolographicVoxels,
+    NeuralFields,
+    Onix,
+    PerView,
+    PixelNerf,
+    SmoothVolume,
+    Surfaces,
+    Voxels,
+)
+from holosplat.methods.per_view import SVMBIR
+from holosplat.methods.presets import preset
+
+from ..opponents.photographs import AlphaSplats, RadianceFields
+from .aligners import ALIGNERS
+from .method import Method
+
+PER_VIEW = "phase retrieval of each view, then tomography"
+VOXELS = "voxels through the waves"
+NEURAL = "neural field through the waves"
+GAUSSIANS = "Gaussians through the waves"
+SURFACES = "surfaces through the waves"
+ALIGNED_LINES = "phase retrieval of each view, then a network"
+PHOTOGRAPHS = "holograms taken for photographs, without waves"
+AUTO = "chosen by the frames"
+
+
+def methods(effort: float = 1.0) -> dict[str, Method]:
+    """Name → method. effort: share of the steps of those that fit in many steps (1: as published)."""
+    table = (*_as_photographs(effort), *_per_view(), *_through_waves(effort))
+    return {method.name: method for method in table}
+
+
+def _per_view() -> list[Method]:
+    """Paganin with every tomography, then every other phase retrieval with the best of them."""
+    plain = {
+        "fbp": "filtered back-projection",
+        "art": "ART (Kaczmarz, ray by ray)",
+        "sirt": "SIRT without bounds",
+        "sirt-nonneg": "SIRT without negative values",
+        SVMBIR: "model-based reconstruction (qGGMRF) by svmbir",
+    }
+    rows = [(f"paganin-{name}", f"Paganin, {what}", PerView("paganin", name, False)) for name, what in plain.items()]
+    rows += [
+        ("paganin-tv-nonneg", "Paganin, total variation without negative values", PerView("paganin", "tv", False)),
+        ("paganin-tv", "Paganin, total variation in [0, 1]", PerView("paganin", "tv")),
+    ]
+    others = {
+        "ctf": "contrast transfer function",
+        "tikhonov": "nonlinear Tikhonov with positivity",
+        "gerchberg-saxton": "Gerchberg–Saxton",
+        "hybrid-input-output": "hybrid input–output",
+        "admm": "ADMM",
+    }
+    rows += [(f"{name}-tv", f"{what}, total variation in [0, 1]", PerView(name, "tv")) for name, what in others.items()]
+    return [Method(name, PER_VIEW, summary, options) for name, summary, options in rows]
+
+
+def _as_photographs(effort: float) -> list[Method]:
+    """Both from a random start."""
+    splats, field = AlphaSplats().with_effort(effort), RadianceFields().with_effort(effort)
+    return [
+        Method(splats.kind, PHOTOGRAPHS, "opaque Gaussians laid over each other (Kerbl et al. 2023)", splats),
+        Method(field.kind, PHOTOGRAPHS, "radiance field with positional encoding (Mildenhall et al. 2020)", field),
+    ]
+
+
+def _through_waves(effort: float) -> list[Method]:
+    rows: list[tuple[str, str, str, Any]] = [
+        (
+            "holographic-tv",
+            VOXELS,
+            "total variation made to agree with the holograms: the start of the Gaussians",
+            HolographicVoxels(),
+        ),
+        (
+            "volume",
+            VOXELS,
+            "a smooth volume of continuous matter: reconstruct --method volume",
+            SmoothVolume(),
+        ),
+        (
+            "voxels-waves",
+            VOXELS,
+            "voxels from holographic-tv, fitted to the holograms, with total variation",
+            Voxels().with_effort(effort),
+        ),
+        (
+            "neural-field",
+            NEURAL,
+            "hash grid and small network, fitted to the projections of holographic-tv, then to the holograms",
+            NeuralFields().with_effort(effort),
+        ),
+        (
+            "onix",
+            NEURAL,
+            "pixel-aligned network (Zhang et al. 2023) that saw no other scene, fitted to the holograms",
+            Onix().with_effort(effort),
+        ),
+        (
+            "pixelnerf",
+            ALIGNED_LINES,
+            "the same (Yu et al. 2021), fitted to the thickness that phase retrieval finds in each view",
+            PixelNerf().with_effort(effort),
+        ),
+        (
+            "gaussians-random",
+            GAUSSIANS,
+            "from a random start: reconstruct --preset random",
+            preset("random").with_effort(effort),
+        ),
+        (
+            "gaussians",
+            GAUSSIANS,
+            "from phase retrieval and total variation: reconstruct --method gaussians",
+            Gaussians().with_effort(effort),
+        ),
+        (
+            "surfaces",
+            SURFACES,
+            "closed surfaces cut out of the Gaussians and fitted to the holograms: reconstruct --method surfaces",
+            Surfaces().with_effort(effort),
+        ),
+        (
+            "auto",
+            AUTO,
+            "what suits the matter, with the best state kept: what reconstruct does by default",
+            Auto().with_effort(effort),
+        ),
+        (
+            "learned",
+            AUTO,
+            "the same, begun with a network's guess where that explains the frames better: --start learned",
+            replace(Auto(), gaussians=replace(Auto().gaussians, start="learned")).with_effort(effort),
+        ),
+    ]
+    return [Method(*row) for row in rows]
+
+
+METHODS = methods()
+"""Name → method, in the order of the tables."""
+ON_ALIGNED = {
+    "paganin-tv": ("mass", "reprojection"),
+    "tikhonov-tv": ("mass", "reprojection", "align"),
+    **dict.fromkeys(("voxels-waves", "gaussians", "surfaces", "auto"), ("align",)),
+}
+"""The methods that also run on views which were aligned before, and how."""
+
+
+def aligned(table: Mapping[str, Method]) -> dict[str, Method]:
+    """Name → method of `ON_ALIGNED`, such as `tikhonov-tv+mass`."""
+    found = {}
+    for name, ways in ON_ALIGNED.items():
+        for way in ways:
+            said, aligner = ALIGNERS[way]
+            both, summary = f"{name}+{way}", f"{table[name].summary}; {said}"
+            found[both] = replace(table[name], name=both, summary=summary, aligner=aligner)
+    return found
+
+
+ALIGNED = aligned(METHODS)
+"""Methods that are run where they are named, for cases whose beams are not where they should be."""

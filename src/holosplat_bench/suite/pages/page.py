@@ -1,0 +1,111 @@
+"""The page of a benchmark as data, and how it is written: as one HTML file, and as Markdown beside its pictures."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from holosplat.report.page import template
+from holosplat.report.tables import Headline
+
+SPECIAL = re.compile(r"([\\`*_<>|\[\]~])")
+"""Characters that Markdown would not leave as they are."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A cell of a table; the best ones are bold."""
+
+    text: str
+    best: bool = False
+
+
+@dataclass(frozen=True)
+class ScoreTable:
+    """A table: heads of its columns, and rows whose first cell names the row."""
+
+    head: tuple[str, ...]
+    rows: list[tuple[Entry, ...]]
+    caption: str = ""
+
+
+@dataclass(frozen=True)
+class Picture:
+    """A picture: its PNG file beside the page, title and caption, and itself as a `data:` URI."""
+
+    path: Path
+    title: str
+    caption: str
+    image: str
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A section: its anchor and heading, paragraphs, tables, remarks below them, and pictures."""
+
+    anchor: str
+    heading: str
+    paragraphs: Sequence[str] = ()
+    tables: Sequence[ScoreTable] = ()
+    remarks: Sequence[str] = ()
+    pictures: Sequence[Picture] = ()
+
+
+@dataclass(frozen=True)
+class Page:
+    """The whole page."""
+
+    title: str
+    headline: Headline
+    summary: str
+    sheets: Sequence[Sheet]
+
+
+def as_html(page: Page) -> str:
+    """The page as one self-contained file."""
+    values = {"title": page.title, "headline": page.headline, "summary": page.summary, "sheets": page.sheets}
+    return template("bench.html", __package__ or "").render(key_figures=(), blocks=(), scores=(), records=(), **values)
+
+
+def as_markdown(page: Page, root: Path) -> str:
+    """The page as Markdown, with links to its pictures relative to the folder `root`."""
+    parts = [
+        f"# {escaped(page.title)}",
+        *map(escaped, (page.headline.text, *page.headline.words)),
+        escaped(page.summary),
+    ]
+    number = 0
+    for sheet in page.sheets:
+        parts.append(f"## {escaped(sheet.heading)}")
+        parts += [escaped(text) for text in sheet.paragraphs]
+        for table in sheet.tables:
+            parts += [f"**{escaped(table.caption)}**"] if table.caption else []
+            parts.append(_markdown_table(table))
+        parts += ["\n".join(f"- {escaped(text)}" for text in sheet.remarks)] if sheet.remarks else []
+        for picture in sheet.pictures:
+            number += 1
+            link = picture.path.relative_to(root).as_posix()
+            parts.append(f"![{escaped(picture.title)}]({link})")
+            parts.append(f"**Figure {number} | {escaped(picture.title)}** {escaped(picture.caption)}")
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _markdown_table(table: ScoreTable) -> str:
+    lines = ["| " + " | ".join(escaped(name) for name in table.head) + " |"]
+    lines.append("| --- |" + " ---: |" * (len(table.head) - 1) if _numeric(table) else "| --- " * len(table.head) + "|")
+    for row in table.rows:
+        cells = [f"**{escaped(e.text)}**" if e.best and e.text else escaped(e.text) for e in row]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def _numeric(table: ScoreTable) -> bool:
+    """Whether all cells but the first of each row look like numbers, which stand better to the right."""
+    return all(len(entry.text) < 18 for row in table.rows for entry in row[1:])
+
+
+def escaped(text: str) -> str:
+    """`text` as Markdown shows it unchanged, on one line, also inside a table."""
+    return SPECIAL.sub(r"\\\1", " ".join(text.split()))

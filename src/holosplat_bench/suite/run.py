@@ -1,0 +1,234 @@
+"""Cases × methods × seeds, one row each; what is there already is kept."""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
+from typing import Protocol, cast, runtime_checkable
+
+from holosplat.backends import resolve
+from holosplat.beamline.declared.case import Case
+from holosplat.checks import InputError, require
+from holosplat.metrics import resolution
+from holosplat.optics.sampling import fringe_sampling
+from holosplat.progress import Progress
+from holosplat.representations import Stored
+from holosplat.scan import Scan
+from holosplat.version import source_commit
+from holosplat.volume import Object, Volume
+from holosplat.workflows.evaluate import Scores, score_object
+from holosplat.workflows.provenance import environment, scan_hash
+
+from .aligners import Aligner
+from .folder import BenchFolder, good_name
+from .measured import MeasuredCase, agreement
+from .method import Method
+from .moved import judged_with
+from .pictures import TRUTH, Arrays, method_picture, truth_picture
+from .prepare import prepared
+from .record import memory_growth
+from .references import Reference
+from .rows import REFERENCE, Row
+from .sizes import contrast_by_size
+
+TRUTH_THRESHOLD = 0.5
+"""Shell correlation with a noise-free truth at which the resolution is read: 0.143 between two halves of the data
+corresponds to it (Rosenthal & Henderson 2003, J. Mol. Biol. 333, 721)."""
+
+
+@dataclass(frozen=True)
+class Suite:
+    """What is run: `load(case, seed)` for all `cases` and `seeds`, each with all `methods` and `references`."""
+
+    cases: Sequence[str]
+    seeds: Sequence[int]
+    methods: Mapping[str, Method]
+    references: Mapping[str, Reference]
+    load: Callable[[str, int], Case | MeasuredCase]
+
+    def __post_init__(self) -> None:
+        for what, chosen in (("cases", self.cases), ("methods", self.methods), ("seeds", self.seeds)):
+            require(len(chosen) > 0, f"a benchmark needs at least one of the {what}; name one.")
+        for name in (*self.cases, *self.names()):
+            good_name(name)
+        require(min(self.seeds) >= 0, f"seeds must be 0 or more, but one is {min(self.seeds)}.")
+
+    def names(self) -> list[str]:
+        """References and methods, in the order in which they run."""
+        return [*self.references, *self.methods]
+
+    def __len__(self) -> int:
+        """Number of rows."""
+        return len(self.cases) * len(self.seeds) * len(self.names())
+
+
+def chosen(what: str, wanted: Sequence[str], table: Sequence[str]) -> list[str]:
+    """The `wanted` names in the `table`'s order, all if none is wanted; `InputError` listing the table otherwise."""
+    unknown = [name for name in wanted if name not in table]
+    if unknown:
+        raise InputError(f"{what} must be among {', '.join(table)}, but {', '.join(unknown)} is not; correct it.")
+    return [name for name in table if name in wanted or not wanted]
+
+
+def run_suite(
+    suite: Suite,
+    folder: BenchFolder,
+    *,
+    retry: bool = False,
+    on_progress: Progress = lambda stage, fraction: None,
+    on_row: Callable[[Row, int], None] = lambda row, left: None,
+) -> None:
+    """Fill `folder` with the rows of `suite` that it lacks; with `retry`, failed ones are made again.
+
+    A method that fails gets a row that says why, and the others go on. Ctrl-C is passed on, and leaves whole rows only.
+    `on_row(row, left)` is called after each row, with the number of those to come.
+    """
+    folder.create()
+    missing = {
+        (case, seed): [name for name in suite.names() if not folder.has_row(case, seed, name, retry)]
+        for case in suite.cases
+        for seed in suite.seeds
+    }
+    left = sum(len(names) for names in missing.values())
+    for (name, seed), wanted in missing.items():
+        if not wanted:
+            continue
+        on_progress(f"{name} {seed}: scene and scan", 0.0)
+        bench = _Bench.of(suite.load(name, seed), folder, on_progress)
+        for job in _jobs(suite, bench, wanted):
+            row, picture = bench.attempt(job)
+            if picture:  # before the row, which marks both as done
+                folder.write_picture(row.case, row.seed, row.method, picture)
+            folder.write_row(row)
+            left -= 1
+            on_row(row, left)
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One row to be made."""
+
+    name: str
+    family: str
+    summary: str
+    place: int
+    produce: Callable[[Progress], Object]
+    aligner: Aligner | None = None
+
+
+@runtime_checkable
+class _Stored(Protocol):
+    @property
+    def stored_bytes(self) -> int: ...
+
+
+@dataclass(frozen=True)
+class _Bench:
+    """A case made ready: what methods are given, and what their results are held against."""
+
+    case: Case | MeasuredCase
+    scan: Scan
+    truth: Volume
+    picture: Arrays
+    blank: Row
+    on_progress: Progress
+    aligned: dict[Aligner, tuple[Scan, float]] = field(default_factory=dict)
+    """Training frames that an aligner has placed, and its seconds: methods that share it need it once."""
+
+    @classmethod
+    def of(cls, case: Case | MeasuredCase, folder: BenchFolder, on_progress: Progress) -> _Bench:
+        scan, truth = prepared(case, folder.case(case.name, case.seed))
+        picture = truth_picture(scan, truth)
+        folder.write_picture(case.name, case.seed, TRUTH, picture)
+        hashed, commit = scan_hash(scan), source_commit()
+        blank = Row(case.name, case.seed, "", "", "", 0, "failed", "", hashed, commit, "")
+        blank = replace(blank, **environment(_backend()))
+        return cls(case, scan, truth, picture, blank, on_progress)
+
+    def attempt(self, job: _Job) -> tuple[Row, Arrays | None]:
+        """The row of a job and, if it has a result, its picture."""
+        row = replace(self.blank, method=job.name, family=job.family, summary=job.summary, place=job.place)
+        picture = None
+        stage = f"{row.case} {row.seed} {job.name}: "
+        gc.collect()  # of the method before
+        try:
+            with memory_growth() as growth:
+                before = self.aligned[job.aligner][1] if job.aligner and job.aligner in self.aligned else 0.0
+                began = time.perf_counter() - before
+                found = job.produce(lambda what, fraction: self.on_progress(stage + what, fraction))
+                row = replace(row, seconds=time.perf_counter() - began, memory_bytes=growth())
+            self.on_progress(stage + "scores", 0.0)
+            scores, picture = self._judged(found, stage)
+            size = found.stored_bytes if isinstance(found, _Stored) else None
+            row = replace(row, status="done", stored_bytes=size, **_numbers(scores))
+            if isinstance(self.case, MeasuredCase):
+                row.volume.update(agreement(found.voxelise(self.truth.grid), self.truth))
+        except InputError as error:
+            row = replace(row, reason=str(error))
+        except Exception as error:  # one method's fault must not take the others' results
+            lines = str(error).strip().splitlines()
+            row = replace(row, reason=": ".join([type(error).__name__, *lines[-1:]]))
+        return replace(row, when=datetime.now(UTC).isoformat(timespec="seconds")), picture
+
+    def _judged(self, found: Object, stage: str) -> tuple[Scores, Arrays]:
+        oversample, scan, truth = fringe_sampling(self.scan.exposures), self.scan, self.truth
+        if isinstance(self.case, Case) and self.case.misalignment:
+            say = self.on_progress
+            told = lambda what, fraction: say(stage + what, fraction)  # noqa: E731
+            scan, truth = judged_with(self.case, cast(Stored, found), scan, truth, told)
+        scores = score_object(found, scan, truth, oversample)
+        volume = found.voxelise(self.truth.grid)
+        picture = method_picture(volume, scores, self.picture)
+        if self.case.balls:
+            picture["diameters"], picture["contrast"] = contrast_by_size(volume, self.truth, self.case.balls)
+        return scores, picture
+
+
+def _backend() -> str:
+    """What fits compute on where the choice is theirs."""
+    return resolve("auto")
+
+
+def _jobs(suite: Suite, bench: _Bench, wanted: Sequence[str]) -> Iterator[_Job]:
+    case, train = bench.case, bench.scan.train()
+    for place, (name, reference) in enumerate(suite.references.items()):
+        if name in wanted:
+            yield _Job(name, REFERENCE, reference.summary, place, _of_reference(reference, bench))
+    for place, (name, method) in enumerate(suite.methods.items()):
+        if name in wanted:
+            yield _Job(
+                name, method.family, method.summary, place, _of_method(method, train, case, bench), method.aligner
+            )
+
+
+def _of_reference(reference: Reference, bench: _Bench) -> Callable[[Progress], Object]:
+    return lambda on_progress: reference.run(bench.case, bench.truth, on_progress)
+
+
+def _of_method(method: Method, train: Scan, case: Case | MeasuredCase, bench: _Bench) -> Callable[[Progress], Object]:
+    def produce(on_progress: Progress) -> Object:
+        scan, aligner = train, method.aligner
+        if aligner is not None:
+            if aligner not in bench.aligned:
+                began = time.perf_counter()
+                found = aligner(train, case.prior, on_progress)
+                bench.aligned[aligner] = found, time.perf_counter() - began
+            scan = bench.aligned[aligner][0]
+        return replace(method, aligner=None).run(scan, case.prior, case.seed, on_progress)
+
+    return produce
+
+
+def _numbers(scores: Scores) -> dict[str, dict[str, float | None]]:
+    """The scores as a row has them."""
+    assert scores.test is not None
+    assert scores.train is not None
+    assert scores.volume is not None
+    volume = scores.volume
+    half = resolution(volume.frequency, volume.fsc, TRUTH_THRESHOLD, volume.pitch)
+    plain = {name: None if n is None else float(n) for name, n in volume.as_dict().items()}
+    plain["resolution_half"] = half
+    return {"test": dict(scores.test.mean), "train": dict(scores.train.mean), "volume": plain}
