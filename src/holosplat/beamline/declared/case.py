@@ -1,4 +1,4 @@
-"""A simulated experiment as a case: a true scene, how it is measured, and what methods are told."""
+"""A simulated experiment as a case: a true scene, how it is measured, and the information for methods."""
 
 from __future__ import annotations
 

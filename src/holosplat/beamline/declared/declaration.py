@@ -161,8 +161,8 @@ class Listed:
 @ranged
 class Declaration:
     """A case without its seed. summary: one line about it; photons: mean counts a pixel of a frame for training, or
-    none for frames without noise; prior: what methods are told of `matter.material` against the medium; light: how it
-    differs from the flat field on frames for training; misalignment: how far beams are from where methods are told."""
+    none for frames without noise; prior: for methods, of `matter.material` against the medium; light: how it
+    differs from the flat field on frames for training; misalignment: how far beams are from their places for methods."""
 
     summary: str
     specimen: Specimen
