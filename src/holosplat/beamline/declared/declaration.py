@@ -1,4 +1,4 @@
-"""A case as its TOML file declares it: what is measured, of what, how, and what the methods are told.
+"""A case as its TOML file declares it: what is measured, of what, how, and the information for methods.
 
 A file is one case, or, with tables `[variants.NAME]`, as many cases that say what differs. `[with_snapshots]` says what
 differs where a folder of simulated cells is given. Lengths are in metres, angles in degrees, densities in g/cm³.
@@ -162,7 +162,7 @@ class Listed:
 class Declaration:
     """A case without its seed. summary: one line about it; photons: mean counts a pixel of a frame for training, or
     none for frames without noise; prior: for methods, of `matter.material` against the medium; light: how it
-    differs from the flat field on frames for training; misalignment: how far beams are from their places for methods."""
+    differs from the flat field on frames for training; misalignment: errors of the geometry for methods."""
 
     summary: str
     specimen: Specimen
