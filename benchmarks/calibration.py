@@ -60,7 +60,7 @@ CASES = {
 }
 
 
-def bracket(edge: float) -> hs.TriangleMesh:
+def bracket(edge: float) -> hs.mesh.TriangleMesh:
     """The surface of cubes of `edge` [m] in the cells of `ARMS`: two triangles for each outer face."""
     corners, faces = list[list[float]](), list[tuple[int, int, int]]()
     for cell in ARMS:
@@ -78,7 +78,7 @@ def bracket(edge: float) -> hs.TriangleMesh:
                     corner[v] += edge * b
                     corners.append(corner)
                 faces += [(first, first + 1, first + 2), (first, first + 2, first + 3)]
-    return hs.TriangleMesh(np.array(corners), np.array(faces), "bracket").merged()
+    return hs.mesh.TriangleMesh(np.array(corners), np.array(faces), "bracket").merged()
 
 
 def beads(count: int, radius: float) -> hs.MeshScene:
@@ -89,7 +89,7 @@ def beads(count: int, radius: float) -> hs.MeshScene:
         place = rng.uniform(-17, 17, 3)
         if all(np.linalg.norm(place - other) > 2.2 * radius for other in places):
             places.append(place)
-    meshes = [hs.TriangleMesh(PIXEL * (radius * vertices + place), faces) for place in places]
+    meshes = [hs.mesh.TriangleMesh(PIXEL * (radius * vertices + place), faces) for place in places]
     return hs.MeshScene.of_one_material(meshes, MATERIAL)
 
 

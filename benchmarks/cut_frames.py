@@ -46,7 +46,7 @@ METHODS = {**hs.methods.METHODS, "in the field": replace(SMOOTH, volume=replace(
 """The program's, and a smooth volume that ends with the frames."""
 
 
-def body(name: str, material: hs.DeltaBeta) -> tuple[hs.Object, tuple[int, int]]:
+def body(name: str, material: hs.DeltaBeta) -> tuple[hs.volume.Object, tuple[int, int]]:
     """The body, and the frames that hold all of it."""
     if name == "tissue":
         return hs.specimens.tissue((80e-6, 200e-6, 80e-6), material, SEED), (220, 120)

@@ -164,7 +164,7 @@ def measured(scene: Ellipsoids, views: int) -> hs.Scan:
     return hs.Scan(frames_of(scene, geometry), hs.Exposures.of(geometry, ENERGY, 0.0), is_test)
 
 
-def scored(scan: hs.Scan, truth: np.ndarray, obj: hs.Object) -> tuple[float, float, float]:
+def scored(scan: hs.Scan, truth: np.ndarray, obj: hs.volume.Object) -> tuple[float, float, float]:
     """PSNR [dB] and SSIM of µ, and SSIM of held-out frames."""
     beta = obj.voxelise(Grid.of_views(scan.views)).beta
     found, peak = 2 * wavenumber(ENERGY) * beta.astype(np.float64), truth.max()

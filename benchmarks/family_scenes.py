@@ -46,7 +46,7 @@ LIGHT_ORDER = 2
 
 Matter = Callable[[hs.DeltaBeta], MeshScene | ContinuousScene]
 """The matter of a draw, of any δ and β."""
-Judge = Callable[[hs.Reconstruction], float]
+Judge = Callable[[hs.workflows.Reconstruction], float]
 
 
 @dataclass(frozen=True)
@@ -290,7 +290,7 @@ SIMULATED: Mapping[str, Family] = {
 # --- measured -----------------------------------------------------------------------------------------------
 
 
-def _beside_light(made: hs.Reconstruction, held_out: Scan) -> float:
+def _beside_light(made: hs.workflows.Reconstruction, held_out: Scan) -> float:
     """Relative error of the logarithm of held-out frames, each beside light of its own that changes smoothly."""
     predicted = measure(made.object, held_out.exposures, made.oversample).detach().double().clamp_min(1e-3).log()
     true = torch.from_numpy(held_out.frames).double().clamp_min(1e-3).log()
@@ -329,7 +329,7 @@ def _hl60(
     phase = truth["phase"].astype(np.float64)[int(truth["train"]) :]
     phase = phase.reshape(len(phase), 70, 2, 70, 2).mean((2, 4))[:, rows, columns]
 
-    def error(done: hs.Reconstruction) -> float:
+    def error(done: hs.workflows.Reconstruction) -> float:
         views = scan.test().views
         found = wavenumber(8.0) * np.asarray(done.object.project(views)[1].detach(), dtype=np.float64)
         return float(np.linalg.norm(found.reshape(phase.shape) - phase) / np.linalg.norm(phase))
@@ -365,7 +365,7 @@ def _bed(seed: int, data: Path) -> Scene:
     return Scene(scan, hs.MaterialPrior.of_ratio(300.0), lambda done: _beside_light(done, scan.test()), facts)
 
 
-def _peak(scan: Scan, published: float, done: hs.Reconstruction) -> float:
+def _peak(scan: Scan, published: float, done: hs.workflows.Reconstruction) -> float:
     """How far the peak phase is from what others found, of one view, for which nothing can be held out."""
     lines = np.asarray(done.object.project(scan.views)[1].detach(), dtype=np.float64)
     found = wavenumber(scan.exposures.reference_energy) * float(np.quantile(np.abs(lines), 0.999))

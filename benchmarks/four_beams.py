@@ -72,7 +72,7 @@ def reconstructed(case: str, variant: str, scan: str, options: str, work: Path, 
     add(case, variant, said(work / out, volume) | {"seconds": time.perf_counter() - began})
 
 
-def volume_of(meshes: list[hs.TriangleMesh]) -> float:
+def volume_of(meshes: list[hs.mesh.TriangleMesh]) -> float:
     """The volume [m³] of closed meshes, by their signed tetrahedra."""
     corners = [mesh.vertices[mesh.faces] for mesh in meshes]
     return abs(sum(float(np.einsum("fi,fi->", c[:, 0], np.cross(c[:, 1], c[:, 2]))) for c in corners)) / 6

@@ -130,7 +130,7 @@ def main() -> None:
     parser.add_argument("--write", action="store_true")
     given = parser.parse_args()
     scan = read_as(given.scan, Reading(part=Part(bin=given.bin))).in_memory()
-    material = hs.parse_material(given.material).delta_beta(scan.exposures.reference_energy)
+    material = hs.materials.parse_material(given.material).delta_beta(scan.exposures.reference_energy)
     who = "chromium" if given.chromium else "reader"
     rows, prior = [], hs.MaterialPrior.known(material)
     for run in range(2 * given.pairs):

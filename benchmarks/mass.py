@@ -41,7 +41,7 @@ SQUARE, WIDE = (64, 64), (49, 65)
 class Sample:
     """Matter, its `material` against the medium, the frames' shape, the distance [m], and what kind of matter it is."""
 
-    truth: hs.Object
+    truth: hs.volume.Object
     material: hs.DeltaBeta
     shape: tuple[int, int]
     distance: float

@@ -78,7 +78,9 @@ def imaged(scene: CarriedScene, times: np.ndarray, photons: float, seed: int) ->
     )
 
 
-def errors(found: Callable[[float], hs.Object], scene: CarriedScene, scan: Scan, times: np.ndarray) -> np.ndarray:
+def errors(
+    found: Callable[[float], hs.volume.Object], scene: CarriedScene, scan: Scan, times: np.ndarray
+) -> np.ndarray:
     """[T] of δ."""
     grid, wrong = Grid.of_views(scan.views), list[float]()
     for t in times:
@@ -87,7 +89,7 @@ def errors(found: Callable[[float], hs.Object], scene: CarriedScene, scan: Scan,
     return np.array(wrong)
 
 
-def by_itself(scan: Scan) -> hs.Object:
+def by_itself(scan: Scan) -> hs.volume.Object:
     """Frames of one time, by the method of continuous matter."""
     return hs.reconstruct(scan, PRIOR, SmoothVolume(), matter="continuous").object
 
@@ -102,7 +104,9 @@ class Case:
         self.scene = SCENES[name](scene)
         self.scan = imaged(self.scene, self.times, BURST_PHOTONS if burst else PHOTONS, seed)
 
-    def row(self, method: str, make: Callable[[], tuple[Callable[[float], hs.Object], str]], times: np.ndarray) -> Row:
+    def row(
+        self, method: str, make: Callable[[], tuple[Callable[[float], hs.volume.Object], str]], times: np.ndarray
+    ) -> Row:
         """What `make` gives, scored at `times`."""
         with rows.spent() as spent:
             found, said = make()
@@ -110,7 +114,7 @@ class Case:
         told = (float(wrong.mean()), float(wrong.max()), *spent.told(), rows.machine(), commit(), said)
         return Row(self.name, method, len(self.times), self.seed, *told)
 
-    def together(self, options: CarriedOptions) -> tuple[Callable[[float], hs.Object], str]:
+    def together(self, options: CarriedOptions) -> tuple[Callable[[float], hs.volume.Object], str]:
         """All times in one: `reconstruct --time-frame all`."""
         found = reconstruct_moving(self.scan, PRIOR, options)
         if found is None:
@@ -118,17 +122,17 @@ class Case:
             return (lambda t: still), "nothing moves"
         return found.reconstruction.object.at, "; ".join(found.history)
 
-    def each(self) -> tuple[Callable[[float], hs.Object], str]:
+    def each(self) -> tuple[Callable[[float], hs.volume.Object], str]:
         """Each time by itself."""
         found = {t: by_itself(self.scan.at_instant(k)) for k, t in enumerate(self.times)}
         return found.__getitem__, ""
 
-    def mean(self) -> tuple[Callable[[float], hs.Object], str]:
+    def mean(self) -> tuple[Callable[[float], hs.volume.Object], str]:
         """The mean of all times, as if nothing moved."""
         still = by_itself(merged(self.scan))
         return (lambda t: still), ""
 
-    def bright(self) -> tuple[Callable[[float], hs.Object], str]:
+    def bright(self) -> tuple[Callable[[float], hs.volume.Object], str]:
         """The time in the middle with the photons of all."""
         middle = self.times[[len(self.times) // 2]]
         found = by_itself(imaged(self.scene, middle, BURST_TIMES * BURST_PHOTONS, self.seed).as_static())

@@ -96,7 +96,7 @@ class Case:
             self.times, self.truth, self.scan, material = blob.times, blob.scene, blob.scan, moving_matter.MATERIAL
         self.prior = hs.MaterialPrior.known(material)
 
-    def found(self, method: str) -> Callable[[float], hs.Object]:
+    def found(self, method: str) -> Callable[[float], hs.volume.Object]:
         """What a method makes of it, at any time."""
         if method in TOGETHER:
             return hs.reconstruct(self.scan, self.prior, TOGETHER[method], self.seed, matter=self.matter).object.at

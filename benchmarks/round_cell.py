@@ -54,7 +54,7 @@ class Experiment:
     shape: tuple[int, int] = (64, 64)
     distance: float = 0.05
 
-    def scan(self, truth: hs.Object, seed: int) -> hs.Scan:
+    def scan(self, truth: hs.volume.Object, seed: int) -> hs.Scan:
         """Frames evenly over half a turn, those held out between two of the others and without noise."""
         train = np.arange(self.views) * 180.0 / self.views
         angles = np.concatenate([train, train[:: max(1, self.views // TEST)][:TEST] + 90.0 / self.views])

@@ -42,7 +42,7 @@ COLUMNS = (
 )
 
 
-def truth(cells: list[hs.TriangleMesh], grid: hs.Grid) -> np.ndarray:
+def truth(cells: list[hs.mesh.TriangleMesh], grid: hs.Grid) -> np.ndarray:
     """[Z, Y, X] the number of the cell that fills a voxel, from 1 on."""
     numbers = np.zeros(grid.shape, dtype=int)
     for k, mesh in enumerate(cells):
@@ -84,7 +84,9 @@ def rows(data: Path) -> Iterator[dict[str, str]]:
                 )
 
 
-def judged(tomography: Tensor, guess: Guessed, cells: list[hs.TriangleMesh], options: SightingOptions) -> list[str]:
+def judged(
+    tomography: Tensor, guess: Guessed, cells: list[hs.mesh.TriangleMesh], options: SightingOptions
+) -> list[str]:
     """What is said of one time."""
     numbers, level, both = truth(cells, guess.grid), options.level, (tomography, guess.values)
     masks = [volume.numpy() > level for volume in both]

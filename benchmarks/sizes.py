@@ -63,7 +63,7 @@ class Peak:
             self.gib = max(self.gib, pages * os.sysconf("SC_PAGE_SIZE") / 2**30)
 
 
-def volume_numbers(found: hs.Object, scene: hs.MeshScene, grid: hs.Grid) -> dict[str, float]:
+def volume_numbers(found: hs.volume.Object, scene: hs.MeshScene, grid: hs.Grid) -> dict[str, float]:
     """Dice and relative error of δ as `hs.evaluate` has them (docs/conventions.md), some rows of voxels at a time."""
     depth, height, width = grid.shape
     both = either = missed = whole = 0.0
@@ -77,7 +77,7 @@ def volume_numbers(found: hs.Object, scene: hs.MeshScene, grid: hs.Grid) -> dict
     return {"dice": both / either, "relative_error_delta": (missed / whole) ** 0.5}
 
 
-def part_of(obj: hs.Object, grid: hs.Grid) -> np.ndarray:
+def part_of(obj: hs.volume.Object, grid: hs.Grid) -> np.ndarray:
     """δ [Z, Y, X] float64 of some rows of voxels, of which surfaces are looked at that reach into them."""
     low = grid.origin[1] - grid.voxel_size[1]
     high = low + (grid.shape[1] + 1) * grid.voxel_size[1]

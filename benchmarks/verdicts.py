@@ -41,7 +41,7 @@ BOX = (SIZE * PIXEL, SIZE * PIXEL, SIZE * PIXEL)
 class Run:
     """A measurement, what is told of it, and the method."""
 
-    truth: hs.Object
+    truth: hs.volume.Object
     prior: hs.MaterialPrior
     method: str
     photons: float | None = None

@@ -18,7 +18,7 @@ for cell in hs.specimens.random_cells(5, (60e-6, 56e-6, 60e-6), 5, 26e-6):
     write_mesh(Path("cells") / f"{cell.name}.vtk", cell, "um")
 vertices, faces = icosphere(4)
 for n, place in enumerate([(9, -8, 3), (-10, 5, 7), (2, 12, -11), (-5, -13, -8), (14, 4, -3), (-3, 1, 13)]):
-    bead = hs.TriangleMesh(1e-6 * (3.5 * vertices + np.array(place)), faces)
+    bead = hs.mesh.TriangleMesh(1e-6 * (3.5 * vertices + np.array(place)), faces)
     write_mesh(Path("beads") / f"bead{n}.vtk", bead, "um")
 PYTHON
 

@@ -1,13 +1,19 @@
-"""Docstrings as Markdown: `[m]` is a unit and no link, `name: …` at the start of a line begins an item of a list."""
+"""Docstrings as Markdown: `[m]` is a unit and no link, `name: …` at the start of a line begins an item of a list.
+
+Examples, indented by four spaces, become blocks of Python.
+"""
 
 from __future__ import annotations
 
 import re
+import textwrap
 
 from griffe import Extension, Module, Object
 
 NAME = r"[a-z][a-z0-9_]*( \[[^\]]+\])?"
 ITEM = re.compile(rf"{NAME}(, {NAME})*: \S")
+EXAMPLES = re.compile(r"^    >>> .*\n?(?:^    .*\n?|^\n(?=    ))*", re.MULTILINE)
+"""A block of Python with its results."""
 KEPT = re.compile(r"(``.*?``|`[^`]*`|(?<![^\s(])\*\w[^*\n]*\w\*(?!\w))", re.DOTALL)
 """Code, and emphasis."""
 
@@ -16,7 +22,7 @@ def markdown(text: str) -> str:
     """The text of a docstring, Markdown's special signs escaped outside of code and emphasis, and its fields as a list.
 
     A field is a line `name: meaning`, or `name, name: meaning`, and the lines up to the next field or empty line.
-    Blocks indented by four spaces stay code.
+    Blocks indented by four spaces stay code; those that begin with `>>>` are coloured as Python.
     """
     lines: list[str] = []
     in_list = False
@@ -31,7 +37,12 @@ def markdown(text: str) -> str:
         else:
             in_list = False
             lines.append(line)
-    return "\n".join(lines).strip("\n")
+    return EXAMPLES.sub(lambda found: _python(found[0]), "\n".join(lines).strip("\n"))
+
+
+def _python(block: str) -> str:
+    """An indented block as a fenced one."""
+    return f"```pycon\n{textwrap.dedent(block).strip()}\n```\n"
 
 
 def _escaped(text: str) -> str:

@@ -25,7 +25,17 @@ LONGEST = 200
 
 
 class InputError(ValueError):
-    """The user's input cannot be used; the message says which field, why, and what to do."""
+    """The input cannot be used; the message names the field, what it must be, what it is, and what to do.
+
+    Examples:
+
+        >>> import holosplat as hs
+        >>> try:
+        ...     hs.Views.evenly_spaced(8, shape=(16, 16), pixel_size=-1e-6)
+        ... except hs.InputError as error:
+        ...     print(error)
+        pixel size must be a positive number of metres, but it is -1e-06; correct it.
+    """
 
 
 class UnsaidError(InputError):

@@ -49,16 +49,29 @@ def rotation_tilted(angles_deg: np.ndarray | list[float], tilts_deg: np.ndarray 
 
 @dataclass(frozen=True)
 class Views:
-    """V parallel-beam views on detectors of one shape.
+    """The poses of V parallel-beam views, and the raster of their detectors.
 
     rotations: [V, 3, 3], `x_lab = R x_obj`.
     shifts: [V, 2] detector shifts `(sx, sy)` [m].
     shape: `(H, W)` pixels.
-    pitch: `p` [m], the length of one for what is said in pixels; the pixel size where all views have the same.
+    pitch: `p` [m], the unit of lengths in pixels; the pixel size where all views have the same.
     scales: [V] pixel sizes of the views over `pitch` (None: all one). Pixels are square.
 
-    In units of its own pixel, a view of pixels `s p` is one of pixels `p` with the matrix `R / s` and the shift
-    `(sx, sy) / s`. `pixel_size` is for users that know one pixel size only: it refuses views of several.
+    In units of its own pixel, a view of pixels `s p` is one of pixels `p` with the matrix `R / s` and the shift `(sx,
+    sy) / s`. Errors: `InputError` for matrices that are no rotations, and for shapes, shifts or sizes out of range.
+
+    Examples:
+
+        >>> import holosplat as hs
+        >>> views = hs.Views.from_angles([0.0, 45.0, 90.0], shape=(48, 64), pixel_size=0.5e-6)
+        >>> len(views), views.shape, views.pixel_size
+        (3, (48, 64), 5e-07)
+        >>> views.rotations[2].round(3) + 0.0
+        array([[ 0.,  0.,  1.],
+               [ 0.,  1.,  0.],
+               [-1.,  0.,  0.]])
+        >>> f"{1e6 * views.width:.0f} µm × {1e6 * views.height:.0f} µm"
+        '32 µm × 24 µm'
     """
 
     rotations: np.ndarray
@@ -309,11 +322,24 @@ class Poses:
 
 @dataclass(frozen=True)
 class Grid:
-    """A volume's raster, indexed `[z, y, x]`.
+    """The raster of a volume, indexed `[z, y, x]`.
 
     shape: `(Z, Y, X)` voxels.
     voxel_size: `(dx, dy, dz)` [m].
     origin: centre `(x, y, z)` [m] of voxel [0, 0, 0].
+
+    Errors: `InputError` for other counts and lengths.
+
+    Examples:
+
+        >>> import holosplat as hs
+        >>> views = hs.Views.evenly_spaced(8, shape=(12, 16), pixel_size=1e-6)
+        >>> grid = hs.Grid.of_views(views)
+        >>> grid.shape
+        (16, 12, 16)
+        >>> x, y, z = grid.axes()
+        >>> f"{1e6 * x[0]:.1f} to {1e6 * x[-1]:.1f} µm"
+        '-7.5 to 7.5 µm'
     """
 
     shape: tuple[int, int, int]

@@ -24,7 +24,16 @@ RATIO_RANGE = (1.0, 1e6)
 
 
 class DeltaBeta(NamedTuple):
-    """Refractive index n = 1 - delta + i·beta, dimensionless; of a difference, either may be negative."""
+    """The refractive index n = 1 - delta + i·beta, dimensionless; either may be negative in a difference.
+
+    Examples:
+
+        >>> import holosplat as hs
+        >>> protein, water = hs.DeltaBeta(7.4e-7, 2.2e-10), hs.DeltaBeta(5.8e-7, 2.6e-10)
+        >>> added = protein.against(water)
+        >>> print(f"δ {added.delta:.1e}, β {added.beta:.1e}, δ/β {added.ratio:.0f}")
+        δ 1.6e-07, β -4.0e-11, δ/β -4000
+    """
 
     delta: float
     beta: float
@@ -131,9 +140,21 @@ class Matter:
 
 
 class MaterialPrior:
-    """What is known of the matter before a reconstruction: one of `Known`, `KnownTwo`, `KnownRatio` and `Unknown`.
+    """The knowledge of the material before a reconstruction: δ and β, their ratio, or nothing.
 
-    Made by `known`, `of_ratio` or `unknown`. Errors: `InputError` where it is made without saying which.
+    Made by `known`, `of_ratio` or `unknown`, which return `Known` or `KnownTwo`, `KnownRatio`, or `Unknown`. δ and β
+    are differences from the medium around the object. Errors: `InputError` for `MaterialPrior()` itself, for a δ that
+    is not above zero, and for a ratio whose size is not from 1 to 10⁶.
+
+    Examples:
+
+        >>> import holosplat as hs
+        >>> hs.MaterialPrior.known(hs.DeltaBeta(5.8e-7, 2.6e-10))
+        Known(material=DeltaBeta(delta=5.8e-07, beta=2.6e-10))
+        >>> hs.MaterialPrior.of_ratio(2200)
+        KnownRatio(ratio=2200.0)
+        >>> hs.MaterialPrior.unknown().fixes_ratio
+        False
     """
 
     kind = ""

@@ -24,7 +24,7 @@ MOST_BLUR_PX = 1000.0
 
 @dataclass(frozen=True)
 class Exposures:
-    """How each of N frames was taken: poses and raster (`views`), and the physics of its beam and detector.
+    """The conditions of N frames: poses and raster (`views`), photon energy, distance, blur and time.
 
     energy_kev: [N] photon energies [keV].
     distance: [N] effective propagation distances [m]; 0: in contact, where absorption alone is seen.
@@ -32,7 +32,18 @@ class Exposures:
     time: [N] seconds since the first frame.
     reference_kev: the energy [keV] for which δ and β of matter are given (None: the energy of the first frame).
 
-    A number stands for N equal ones.
+    A number stands for N equal ones. Errors: `InputError` for numbers out of range.
+
+    Examples:
+
+        >>> import holosplat as hs
+        >>> views = hs.Views.evenly_spaced(8, shape=(16, 16), pixel_size=1e-6)
+        >>> exposures = hs.Exposures.of(views, energy_kev=20.0, distance=0.05, psf_sigma_px=0.5)
+        >>> len(exposures), exposures.reference_energy
+        (8, 20.0)
+        >>> series = exposures.repeated([0.0, 1e-5, 2e-5])
+        >>> series.time[[0, 8, 16]]
+        array([0.e+00, 1.e-05, 2.e-05])
     """
 
     views: Views
@@ -162,13 +173,31 @@ class _FramesInMemory:
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Scan:
-    """Frames and how they were taken.
+    """The frames of a measurement, and the conditions under which they were taken.
 
     frames: [N, H, W] float32 intensity relative to the flat field; given as `Frames`, they are read into memory when
     `scan.frames` is first used. `scan.source`, `scan[index]`, `blocks` and scans made from them do not read all frames.
+    exposures: pose, photon energy, distance, blur and time of each frame.
     is_test: [N] bool, frames held out of the fit.
     provenance: origin of the scan, as flat text entries.
-    light: what is not known of smooth light that the frames were divided by; None: nothing is said of it.
+    light: the uncertainty of smooth light that the frames were divided by; None: unknown.
+
+    Errors: `InputError` where shapes disagree, and for frames that are not finite.
+
+    Examples:
+
+        >>> import numpy as np
+        >>> import holosplat as hs
+        >>> views = hs.Views.evenly_spaced(4, shape=(16, 20), pixel_size=1e-6)
+        >>> exposures = hs.Exposures.of(views, energy_kev=20.0, distance=0.05)
+        >>> frames = np.random.default_rng(0).poisson(1000, (4, 16, 20)) / 1000
+        >>> scan = hs.Scan(frames, exposures, is_test=[False, False, False, True])
+        >>> scan
+        Scan(4 frames of 16 × 20 pixels, 1 of them held out)
+        >>> scan.train().frames.shape
+        (3, 16, 20)
+        >>> scan.binned(2)
+        Scan(4 frames of 8 × 10 pixels, 1 of them held out)
     """
 
     if TYPE_CHECKING:

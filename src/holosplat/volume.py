@@ -18,7 +18,24 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Volume:
-    """δ and β on a grid: delta, beta [Z, Y, X] float32, dimensionless (n = 1 - δ + iβ)."""
+    """The refractive index n = 1 - δ + iβ on a grid.
+
+    delta, beta: [Z, Y, X] float32, dimensionless.
+    grid: voxel size and place.
+
+    Errors: `InputError` where the shapes are not that of the grid, and for values that are not finite.
+
+    Examples:
+
+        >>> import numpy as np
+        >>> import holosplat as hs
+        >>> grid = hs.Grid.centred((8, 8, 8), voxel_size=1e-6)
+        >>> delta = np.zeros(grid.shape)
+        >>> delta[2:6, 2:6, 2:6] = 5.8e-7
+        >>> volume = hs.Volume(delta, delta / 2200, grid)
+        >>> volume.delta.shape, volume.delta.dtype
+        ((8, 8, 8), dtype('float32'))
+    """
 
     delta: np.ndarray
     beta: np.ndarray

@@ -42,7 +42,7 @@ def frames_of(scene: hs.MeshScene, true: hs.Exposures, said: hs.Exposures) -> hs
 
 def beads(places: np.ndarray, radius: float = 4.0) -> hs.MeshScene:
     vertices, faces = icosphere(4)
-    meshes = [hs.TriangleMesh(PIXEL * (radius * vertices + place), faces) for place in places]
+    meshes = [hs.mesh.TriangleMesh(PIXEL * (radius * vertices + place), faces) for place in places]
     return hs.MeshScene.of_one_material(meshes, MATERIAL)
 
 

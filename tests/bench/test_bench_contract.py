@@ -21,7 +21,7 @@ pytestmark = pytest.mark.usefixtures("decided")
 class Made:
     """What a method made of the scan, and the progress that it told."""
 
-    object: hs.Object
+    object: hs.volume.Object
     told: list[tuple[str, float]]
 
 
@@ -48,7 +48,7 @@ def made(method, results, scan) -> Made:
 
 
 @pytest.fixture
-def result(made) -> hs.Object:
+def result(made) -> hs.volume.Object:
     """What the method makes of the scan."""
     return made.object
 
@@ -61,7 +61,7 @@ def test_every_method_is_described(method):
 
 
 def test_a_method_gives_an_object(result, scan):
-    assert isinstance(result, hs.Object)
+    assert isinstance(result, hs.volume.Object)
     assert result.stored_bytes > 0
     grid = hs.Grid.of_views(scan.views)
     volume = result.voxelise(grid)

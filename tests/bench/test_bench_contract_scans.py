@@ -21,7 +21,7 @@ def unequal() -> hs.Scan:
     return hs.simulate(SCENE, hs.Exposures.of(views, 20.0, 0.02), oversample=2, is_test=np.arange(5) == 4)
 
 
-def result_or_reason(method: Method, scan: hs.Scan, prior: hs.MaterialPrior | None = None) -> hs.Object | str:
+def result_or_reason(method: Method, scan: hs.Scan, prior: hs.MaterialPrior | None = None) -> hs.volume.Object | str:
     """What the method makes of the scan, or why it cannot."""
     try:
         return run(method, scan, prior=prior)

@@ -33,7 +33,7 @@ def balls() -> hs.MeshScene:
     """Three balls, so that every turn is seen."""
     vertices, faces = icosphere(2)
     places = ((5.0, [6, -5, 3]), (4.0, [-8, 4, 5]), (3.5, [1, 7, -9]))
-    meshes = [hs.TriangleMesh(PITCH * (radius * vertices + np.array(at)), faces) for radius, at in places]
+    meshes = [hs.mesh.TriangleMesh(PITCH * (radius * vertices + np.array(at)), faces) for radius, at in places]
     return hs.MeshScene.of_one_material(meshes, MATERIAL)
 
 

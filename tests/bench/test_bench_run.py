@@ -92,7 +92,7 @@ def test_the_size_of_a_result_is_what_it_says_or_unknown(recorder, tmp_path):
         return Sized(v.values, v.grid, v.matter)
 
     class Plain:
-        def __init__(self, obj: hs.Object) -> None:
+        def __init__(self, obj: hs.volume.Object) -> None:
             self.at, self.project, self.voxelise = obj.at, obj.project, obj.voxelise
 
     folder = BenchFolder(tmp_path / "bench")

@@ -27,7 +27,7 @@ def test_a_folder_holds_maps_with_their_units_and_a_picture(shop, tmp_path):
     assert len(table["frames"]) == 4
     assert table["facts"]["light"] == "even"
     scan = read_scan(shop.scan)[[0, 2, 4, 6]].cropped(slice(0, 24), slice(2, 27))
-    material = hs.parse_material(FORMULA, 1.335).delta_beta(20.0)
+    material = hs.materials.parse_material(FORMULA, 1.335).delta_beta(20.0)
     wanted = hs.retrieve(scan.frames, scan.exposures, material)
     np.testing.assert_array_equal(tifffile.imread(out / "phase.tif"), wanted.phase.numpy())
     np.testing.assert_array_equal(tifffile.imread(out / "thickness.tif"), wanted.thickness.numpy())

@@ -27,7 +27,7 @@ SHAPES = {"round": (24, 24), "wide": (21, 31)}
 def make_case(name: str, seed: int) -> Case:
     """A ball in four training frames and two held out; the seed moves it."""
     vertices, faces = icosphere(3)
-    ball = hs.TriangleMesh(PITCH * (RADIUS * vertices + [0.3 * (seed % 7), 1.0, -2.0]), faces)
+    ball = hs.mesh.TriangleMesh(PITCH * (RADIUS * vertices + [0.3 * (seed % 7), 1.0, -2.0]), faces)
     exposures = hs.Exposures.of(hs.Views.evenly_spaced(6, SHAPES[name], PITCH), 20.0, 0.02)
     scene = hs.MeshScene.of_one_material([ball], MATERIAL)
     return Case(name, seed, scene, exposures, np.arange(6) % 3 == 2, hs.MaterialPrior.known(MATERIAL))
@@ -46,7 +46,7 @@ def voxels(scan: hs.Scan, value: float = 1.0) -> VoxelGrid:
 class Fake:
     """Options of a method with one stage, without a fit."""
 
-    act: Callable[[Task], hs.Object]
+    act: Callable[[Task], hs.volume.Object]
     kind: ClassVar[str] = "fake"
     name: ClassVar[str] = "fake"
     wants_levels: ClassVar[bool] = False
@@ -54,10 +54,10 @@ class Fake:
     def stages(self) -> tuple[Fake]:
         return (self,)
 
-    def start(self, task: Task, before: object) -> hs.Object:
+    def start(self, task: Task, before: object) -> hs.volume.Object:
         return self.act(task)
 
-    def fit(self, task: Task, start: hs.Object) -> None:
+    def fit(self, task: Task, start: hs.volume.Object) -> None:
         """Nothing is fitted."""
 
 
@@ -67,8 +67,8 @@ class Recorder:
     def __init__(self) -> None:
         self.calls: list[tuple[str, hs.Scan, hs.MaterialPrior, int]] = []
 
-    def method(self, name: str, act: Callable[[hs.Scan], hs.Object] = voxels) -> Method:
-        def start(task: Task) -> hs.Object:
+    def method(self, name: str, act: Callable[[hs.Scan], hs.volume.Object] = voxels) -> Method:
+        def start(task: Task) -> hs.volume.Object:
             task.on_progress("thinking", 0.5)
             self.calls.append((name, task.scan, task.prior, task.seed))
             return act(task.scan)
@@ -84,7 +84,7 @@ def suite(methods: list[Method], cases=("round",), seeds=(3,), load=make_case) -
     return Suite(cases, seeds, {method.name: method for method in methods}, {}, load)
 
 
-def fail(error: BaseException) -> Callable[[hs.Scan], hs.Object]:
+def fail(error: BaseException) -> Callable[[hs.Scan], hs.volume.Object]:
     def act(scan):
         raise error
 

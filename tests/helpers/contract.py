@@ -50,10 +50,10 @@ NEEDS = {"paganin-svmbir": "svmbir"}
 """Methods that need a package of the extra `bench`."""
 
 
-def ball(centre: tuple[float, float, float], radius: float) -> hs.TriangleMesh:
+def ball(centre: tuple[float, float, float], radius: float) -> hs.mesh.TriangleMesh:
     """A ball [pixels]."""
     vertices, faces = icosphere(3)
-    return hs.TriangleMesh(PITCH * (radius * vertices + np.array(centre)), faces)
+    return hs.mesh.TriangleMesh(PITCH * (radius * vertices + np.array(centre)), faces)
 
 
 SCENE = hs.MeshScene.of_one_material([ball((-6, 2, 3), 5), ball((7, -3, -4), 4)], MATERIAL)
@@ -73,7 +73,7 @@ def usable(name: str, methods: dict[str, Method]) -> Method:
     return methods[name]
 
 
-def run(method: Method, scan: hs.Scan, seed: int = 0, prior: hs.MaterialPrior | None = None) -> hs.Object:
+def run(method: Method, scan: hs.Scan, seed: int = 0, prior: hs.MaterialPrior | None = None) -> hs.volume.Object:
     """What the method makes of the training frames; not judged, but for the first result of test_bench_contract.py."""
     known = hs.MaterialPrior.known(MATERIAL)
     with unjudged():

@@ -143,7 +143,10 @@ def test_the_api_lists_every_public_module_once():
 
 def test_the_api_describes_the_top_level_names():
     index = site.api_pages()["api/index.md"]
-    assert "[`Views`][holosplat.geometry.Views]: V parallel-beam views on detectors of one shape." in index
+    assert (
+        "[`Views`][holosplat.geometry.Views]: The poses of V parallel-beam views, and the raster of their detectors."
+        in index
+    )
     assert "[holosplat.optics](optics.md)" in index
 
 
@@ -162,9 +165,11 @@ def test_what_a_page_loads_from_elsewhere_is_seen(html, addresses):
 def test_docstrings_become_markdown():
     pytest.importorskip("griffe", reason="the extra `docs` is not installed")
     text = "Weights [N] [m], *not* a*b, `[x]`.\n\nfirst, second [px]: one;\n    goes on.\nthird: `a_b` a_b.\n\nEnd."
-    assert loaded("docstrings").markdown(text) == (
+    examples = "\n\nExamples:\n\n    >>> [a_b]\n    ... [*c]\n    1\n    >>> d"
+    assert loaded("docstrings").markdown(text + examples) == (
         "Weights \\[N\\] \\[m\\], *not* a\\*b, `[x]`.\n\n\n"
-        "- **first, second \\[px\\]**: one;\n    goes on.\n- **third**: `a_b` a\\_b.\n\nEnd."
+        "- **first, second \\[px\\]**: one;\n    goes on.\n- **third**: `a_b` a\\_b.\n\nEnd.\n\nExamples:\n\n"
+        "```pycon\n>>> [a_b]\n... [*c]\n1\n>>> d\n```\n"
     )
 
 

@@ -1,11 +1,14 @@
 """The words of the guide: how many, in sentences how long, and without the constructions that readers stumble over.
 
-The guide is the README, docs/*.md and docs/howto, without the lab notebook (docs/notebook) and the design.
+The guide is the README, docs/*.md and docs/howto, without the lab notebook (docs/notebook) and the design. The same
+rules hold for the docstrings of the rooms in `PLAIN_ROOMS`.
 """
 
 from __future__ import annotations
 
+import ast
 import re
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -54,6 +57,40 @@ BANNED = (
 )
 """Regular expressions, of constructions that were replaced; the list only grows."""
 
+SOURCE = ROOT / "src" / "holosplat"
+PLAIN_ROOMS = (
+    *("align", "beamline", "bodies", "learning", "metrics", "model", "motion", "optics", "planning", "preprocess"),
+    *("projectors", "report", "representations", "series", "show", "specimens", "training"),
+)
+"""Rooms whose docstrings have none of the constructions; the list only grows."""
+BANNED_FIRST = (
+    r"What (?:is|are|was|were) (?:said|told|known|found|left|asked|expected|assumed|minimised)\b",
+    r"What (?:\w+ ){0,2}(?:frames?|rows?|beams?|networks?|pages?) (?:\w+ )?(?:say|see|show|tell)",
+    r"What .* unless",
+    r"Where .* (?:is|are|lies?|lie)(?: really are)?[.:,]",
+    r"How .* unless",
+    r"Nothing\b",
+)
+"""First lines of docstrings that name no thing and no act; the list only grows."""
+MEAN_DOCSTRING_SENTENCE = 16.0
+
+
+def docstrings(text: str) -> Iterator[str]:
+    """The docstrings of a module, of what it defines, and of its constants and fields."""
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            yield node.value.value
+
+
+def awkward(docstring: str) -> list[str]:
+    """The banned constructions of a docstring."""
+    text = " ".join(docstring.split())
+    found = [at for rule in BANNED for at in re.finditer(rf"(?i)\b{rule}", text)]
+    first = docstring.strip().split("\n")[0]
+    return [text[max(0, at.start() - 40) : at.end() + 40] for at in found] + [
+        first for rule in BANNED_FIRST if re.match(rule, first)
+    ]
+
 
 def prose(text: str) -> str:
     """A page without code, tables, marks and headings."""
@@ -101,3 +138,32 @@ def test_sentences_are_counted():
         "# A b\n\nOne two. Three *four* five:\n\n- six `--seven 8` nine;\n- ten eleven\n\n| a | b |\n\n```\nx y\n```\n"
     )
     assert [len(sentence) for sentence in sentences(text)] == [2, 3, 3, 2]
+
+
+@pytest.mark.parametrize("room", PLAIN_ROOMS)
+def test_docstrings_of_plain_rooms_are_plain(room):
+    files = sorted((SOURCE / room).rglob("*.py"))
+    assert files
+    found = {
+        path.name: awkward(each) for path in files for each in docstrings(path.read_text("utf-8")) if awkward(each)
+    }
+    assert found == {}
+
+
+def test_sentences_of_docstrings_are_short():
+    texts = [each for path in SOURCE.rglob("*.py") for each in docstrings(path.read_text("utf-8"))]
+    found = [sentence for text in texts for sentence in sentences(text.partition("Examples:")[0])]
+    assert sum(map(len, found)) / len(found) <= MEAN_DOCSTRING_SENTENCE
+
+
+@pytest.mark.parametrize(
+    ("docstring", "count"),
+    [
+        ("What frames say of\n    the light.", 2),
+        ("What is known of it.", 2),
+        ("The options unless they are told.", 1),
+        ("Estimates of the light from frames.", 0),
+    ],
+)
+def test_awkward_docstrings_are_seen(docstring, count):
+    assert len(awkward(docstring)) == count

@@ -1,8 +1,13 @@
-"""The public names: few at the top, the rest in namespaces; all exist, and none costs anything before its use."""
+"""The public names: few at the top, the rest in namespaces; all exist, and none costs anything before its use.
+
+Each name at the top has runnable examples in its docstring, which run here as they stand, in an empty folder.
+"""
 
 from __future__ import annotations
 
 import ast
+import doctest
+import inspect
 import subprocess
 import sys
 from importlib import import_module
@@ -33,9 +38,35 @@ def stub_of(package: str) -> list[tuple[str, str]]:
     return found
 
 
-def test_there_are_about_thirty_names_at_the_top():
-    names = [name for name in holosplat.__all__ if not ismodule(getattr(holosplat, name))]
-    assert 25 <= len(names) <= 35
+def top_level() -> list[str]:
+    """The names at the top, without the namespaces and the version."""
+    return [name for source, name in stub_of("holosplat") if source != "holosplat" and name != "__version__"]
+
+
+def failures(name: str, docstring: str) -> list[str]:
+    """What differs from the results in the examples of a docstring; they must import what they use."""
+    test = doctest.DocTestParser().get_doctest(docstring, {}, name, None, 0)
+    reports: list[str] = []
+    runner = doctest.DocTestRunner(verbose=False)
+    runner.run(test, out=reports.append)
+    return reports
+
+
+def test_there_are_thirty_names_at_the_top():
+    assert len(top_level()) == 30
+
+
+@pytest.mark.parametrize("name", top_level())
+def test_a_name_at_the_top_has_examples_that_run(name, tmp_path, monkeypatch):
+    docstring = inspect.getdoc(getattr(holosplat, name)) or ""
+    assert "\n\nExamples:\n\n    >>> " in docstring
+    monkeypatch.chdir(tmp_path)
+    assert failures(name, docstring) == []
+
+
+@pytest.mark.parametrize("example", [">>> 1 + 1\n3", ">>> 1 + 1", ">>> holosplat\n1", ">>> x = 1 +"])
+def test_examples_that_fail_are_seen(example):
+    assert failures("bad", example) != []
 
 
 def test_the_namespaces_are_those_with_stubs_and_a_few_more():
@@ -62,9 +93,28 @@ def test_no_name_is_hidden_by_a_module_of_the_package(package):
     assert {name for source, name in stub_of(package) if source != package} & modules <= {"__init__"}
 
 
-def test_a_name_of_a_namespace_is_pointed_to():
-    with pytest.raises(AttributeError, match=r"no attribute 'random_cells'; it is holosplat\.specimens\.random_cells"):
-        _ = holosplat.random_cells  # pyright: ignore[reportAttributeAccessIssue]
+@pytest.mark.parametrize(
+    "home",
+    [
+        "specimens.random_cells",
+        "volume.Object",
+        "mesh.TriangleMesh",
+        "methods.METHODS",
+        "materials.parse_material",
+        "workflows.Reconstruction",
+        "beamline.grow.grow",
+        "workflows.join.join",
+    ],
+)
+def test_a_name_of_a_namespace_is_pointed_to(home):
+    name = home.split(".")[-1]
+    with pytest.raises(AttributeError, match=rf"no attribute '{name}'; it is holosplat\.{home}$"):
+        getattr(holosplat, name)
+    module, _, _ = home.rpartition(".")
+    assert hasattr(import_module(f"holosplat.{module}"), name)
+
+
+def test_a_name_of_nowhere_is_refused():
     with pytest.raises(AttributeError, match=r"has no attribute 'cats'$"):
         _ = holosplat.cats  # pyright: ignore[reportAttributeAccessIssue]
 

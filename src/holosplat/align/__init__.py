@@ -1,4 +1,4 @@
-"""Where beams really are, from the frames alone: the axis of turning objects, and the poses of single views."""
+"""Alignment from the frames: the axis of rotating objects, and the poses of single views."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ class AxisOptions:
 
 @dataclass(frozen=True)
 class Axis:
-    """Where the axis of a turning object is.
+    """The axis of a rotating object.
 
     offset: from where the scan said it is, at the middle of the object frame, along the columns [pixels]
     lean: of the axis in the image, columns a row; positive: further right further down; None: too few rows
@@ -91,7 +91,7 @@ class Axis:
         return replace(exposures, views=replace(views, rotations=rotations, shifts=shifts))
 
     def lines(self) -> list[str]:
-        """What was found, in words."""
+        """The result in words."""
         moved = f"{self.offset.value:+.3f} from the scan's"
         said = [] if self.turn is None else [self.turn.line()]
         said.append(f"axis at column {self.column:.3f} ± {self.offset.error:.3f} ({moved})")
@@ -122,19 +122,19 @@ def find_axis(
     `FEWEST_VIEWS`, and where no place within the field is better than those beside it.
     """
     sinograms = sinograms_of(scan, options, ratio, light)
-    found = _searched(scan, sinograms, options, on_progress)
+    found = _search_axis(scan, sinograms, options, on_progress)
     angles = np.unwrap(_angles(scan.views))
     if not may_be_half(angles):
         return found
-    ends = _banded(scan[ends_of(len(scan))], options, ratio, light)
+    ends = _sinograms(scan[ends_of(len(scan))], options, ratio, light)
     turn = half_turn(angles, ends, found.offset.value)
     if turn is None:
         return found
     turned = replace(sinograms, angles=turn.spread(np.unwrap(sinograms.angles)))
-    return replace(_searched(scan, turned, options, on_progress), turn=turn)
+    return replace(_search_axis(scan, turned, options, on_progress), turn=turn)
 
 
-def _searched(scan: Scan, sinograms: Sinograms, options: AxisOptions, on_progress: Advance) -> Axis:
+def _search_axis(scan: Scan, sinograms: Sinograms, options: AxisOptions, on_progress: Advance) -> Axis:
     """The axis of sinograms of `scan`."""
     width, columns = scan.views.shape[1], sinograms.values.shape[-1]
     factor, pitch = max(1, columns // 64), scan.views.shape[1] / columns
@@ -162,10 +162,10 @@ def sinograms_of(scan: Scan, options: AxisOptions, ratio: float | None, light: L
         len(chosen) >= FEWEST_VIEWS,
         f"an axis needs {FEWEST_VIEWS} views at least, but there are {len(chosen)}; align without --axis-only.",
     )
-    return _banded(scan[chosen], options, ratio, light)
+    return _sinograms(scan[chosen], options, ratio, light)
 
 
-def _banded(scan: Scan, options: AxisOptions, ratio: float | None, light: LightOptions) -> Sinograms:
+def _sinograms(scan: Scan, options: AxisOptions, ratio: float | None, light: LightOptions) -> Sinograms:
     """Sinograms of all frames of `scan`."""
     views = scan.views
     (h, w), p = views.shape, views.pixel_size

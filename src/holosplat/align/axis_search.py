@@ -1,4 +1,4 @@
-"""Where the axis of sinograms is, and how it leans: the likelihood of places, order by order of the moments."""
+"""Search for the axis of sinograms and its tilt: likelihood of places, order by order of the moments."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LEANS = 24
 
 @dataclass(frozen=True)
 class Search:
-    """What is unexplained with the axis at each of T offsets.
+    """Residuals with the axis at each of T offsets.
 
     offsets: [T], evenly spaced [pixels]
     unexplained: [T, N, B] sums of squares of each order, in each slice

@@ -40,7 +40,7 @@ DEGREES = np.array([1, 1, *[np.pi / 180] * 3, 1, 1])
 
 @dataclass(frozen=True)
 class Found:
-    """What was found of B beams.
+    """The estimated geometry of B beams.
 
     numbers, rates: [B, 8] of `NUMBERS` at the middle of the series, and how much more at its end
     errors, rate_errors: [B, 5] of those of the pose
@@ -61,7 +61,7 @@ class Found:
 
 @dataclass(frozen=True, kw_only=True)
 class AlignedBeams(AlignedViews):
-    """Where the frames of a series are: arrays as in `AlignedViews`, of all N frames; before and after are those of the
+    """Poses of the frames of a series: arrays as in `AlignedViews`, of all N frames; before and after are those of the
     frame's beam.
 
     sides: [N] which mirror image each frame is, and was turned back from, or ""
@@ -99,7 +99,7 @@ class AlignedBeams(AlignedViews):
         return np.arange(count)
 
     def lines(self) -> list[str]:
-        """What was found, in words, and a table of the beams."""
+        """The result in words, and a table of the beams."""
         first = np.unique(self.of_frame, return_index=True)[1]
         before, after = (np.sqrt(np.mean(part[first] ** 2)) for part in (self.before, self.after))
         said = [
@@ -141,7 +141,7 @@ def align_beams(
     """
     beams, held = Beams.of(scan), options.uncertain.distance > 0 or options.uncertain.magnification > 0
     options = replace(options, uncertain=replace(options.uncertain, distance=0.0, magnification=0.0))
-    moments = [_evened(moment, light) for moment in chosen_moments(scan, beams, options.times, FEWEST)]
+    moments = [_divide_light(moment, light) for moment in chosen_moments(scan, beams, options.times, FEWEST)]
     times = np.array([moment.time for moment in moments])
     material = assumed_material(moments[len(moments) // 2].scan.train(), prior, on_progress)
     count = int((~moments[0].scan.is_test).sum())
@@ -172,15 +172,15 @@ def align_beams(
         found.words.extend(f"beam {b} is reversed along {side}: its frames were turned back" for b, side in reversed_)
     if held:
         found.words.append(DISTANCES)
-    found = _kept(_without_doubtful_drift(found, options), beams.planned, options)
+    found = _keep_planned(_without_doubtful_drift(found, options), beams.planned, options)
     telling = by_rows or count >= options.few_views  # volumes of few frames agree with any poses
     if telling and (found.numbers.any() or found.rates.any()) and np.mean(found.after**2) > np.mean(found.before**2):
         found = replace(found, numbers=0 * found.numbers, rates=0 * found.rates, after=found.before)
         found.words.append("all is as planned: what was found explains the frames no better")
-    return _placed(scan, beams, found, times, start.sides if start else ("",) * len(beams))
+    return _place_frames(scan, beams, found, times, start.sides if start else ("",) * len(beams))
 
 
-def _evened(moment: Moment, light: LightOptions) -> Moment:
+def _divide_light(moment: Moment, light: LightOptions) -> Moment:
     """The same in even light."""
     frames = torch.from_numpy(moment.scan.frames)
     return replace(moment, scan=replace(moment.scan, frames=Light.of(frames, light).evened(frames).numpy()))
@@ -198,7 +198,7 @@ def _turned_back(moment: Moment, sides: tuple[str, ...]) -> Moment:
 def _rows(
     moments: Sequence[Moment], count: int, material: DeltaBeta, options: PoseOptions, few: bool, pixels: int
 ) -> Begun | None:
-    """What rows say of the beams, by times that have all of them, on pixels so many times larger."""
+    """Estimate the beams from rows, at times that have all of them, on pixels so many times larger."""
     whole = [moment for moment in moments if len(moment.beams) == count]
     if not whole:
         return None
@@ -261,12 +261,12 @@ def _by_volumes(
     )
     on_progress("alignment, before and after", 0.0)
     still = replace(found, numbers=0 * numbers, rates=0 * rates)
-    before, after = (_judged(search, planned, each) for each in (still, found))
+    before, after = (_residuals(search, planned, each) for each in (still, found))
     on_progress("alignment, before and after", 1.0)
     return replace(found, before=before, after=after)
 
 
-def _judged(search: SeriesSearch, planned: Exposures, found: Found) -> np.ndarray:
+def _residuals(search: SeriesSearch, planned: Exposures, found: Found) -> np.ndarray:
     """[B] rms of what volumes of some times leave of the frames of each beam, as a share of their contrast."""
     some = np.unique(np.linspace(0, len(search.moments) - 1, min(JUDGED, len(search.moments))).round().astype(int))
     sums, counts = np.zeros(len(planned)), np.zeros(len(planned))
@@ -297,7 +297,7 @@ def _without_doubtful_drift(found: Found, options: PoseOptions) -> Found:
     return replace(found, rates=0 * found.rates)
 
 
-def _kept(found: Found, planned: Exposures, options: PoseOptions) -> Found:
+def _keep_planned(found: Found, planned: Exposures, options: PoseOptions) -> Found:
     """The same with those kinds of numbers as planned that differ from it by no more than can be known."""
     numbers = found.numbers.copy()
     here = _exposures(numbers, planned)
@@ -311,9 +311,9 @@ def _kept(found: Found, planned: Exposures, options: PoseOptions) -> Found:
     return replace(found, numbers=numbers)
 
 
-def _placed(scan: Scan, beams: Beams, found: Found, times: np.ndarray, sides: tuple[str, ...]) -> AlignedBeams:
+def _place_frames(scan: Scan, beams: Beams, found: Found, times: np.ndarray, sides: tuple[str, ...]) -> AlignedBeams:
     """All frames where their beams are at their times: mean turn and mean shift of the beams are those planned."""
-    middle, start, end = (_moved(found.numbers + when * found.rates, beams.planned) for when in (0.0, -1.0, 1.0))
+    middle, start, end = (_changes(found.numbers + when * found.rates, beams.planned) for when in (0.0, -1.0, 1.0))
     drift, which = (end - start)[:, :5], beams.of_frame
     of_frames = middle[which]
     of_frames[:, :5] += 0.5 * whens(scan.exposures.time)[:, None] * drift[which]
@@ -338,7 +338,7 @@ def _placed(scan: Scan, beams: Beams, found: Found, times: np.ndarray, sides: tu
     )
 
 
-def _moved(numbers: np.ndarray, planned: Exposures) -> np.ndarray:
+def _changes(numbers: np.ndarray, planned: Exposures) -> np.ndarray:
     """Changes [B, 7] of the plan, all beams moved together as near to it as can be."""
     found = _exposures(numbers, planned)
     return changes(replace(found, views=moved_onto(found.views, planned.views)), planned)

@@ -1,4 +1,4 @@
-"""What retrieved thickness tells before there is a volume: beams that are reversed, and their numbers by rows."""
+"""Initial geometry from retrieved thickness: reversed beams, and their parameters by rows."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .row_sums import FACTOR, RowEstimate, RowPrior, by_rows, plane_angles
 from .untold import Told
 
 REVERSED = 0.5
-"""A beam is said to be reversed if rows then disagree by less than this part of what they do as the frames are."""
+"""A beam counts as reversed if the disagreement of its rows then falls below this part."""
 SMALL = 0.03
 """Disagreement of rows, as a share of their moments, below which nothing is looked for that is reversed."""
 EDGE, PASSING = 1 / 16, 0.25
@@ -33,7 +33,7 @@ ANGLE = 3
 
 @dataclass(frozen=True)
 class Begun:
-    """What rows say of V views, lengths in pixels of the images.
+    """Estimates of V views from rows, lengths in pixels of the images.
 
     numbers, rates: [V, 5] shifts and turns [rad] at the middle of the times, and how much more at their end
     errors, rate_errors: [V, 5] of them
@@ -85,15 +85,15 @@ class Images:
         return replace(self, values=values)
 
     def estimate(self, prior: RowPrior, index: np.ndarray) -> RowEstimate:
-        """By the rows of the views `index`, of which `prior` is."""
+        """Estimate from the rows of the views `index`, which have `prior`."""
         return by_rows(self.values[:, index], self.views[index], prior, self.when)
 
 
 def begun(images: Images, expected: np.ndarray, drifts: np.ndarray, few: bool) -> Begun | None:
-    """What rows say; None for beams that do not lie in one plane.
+    """Estimate poses from rows; None for beams that do not lie in one plane.
 
     expected: [5] standard deviations of shifts [pixels of the images] and turns [rad]; drifts: [5], as in `RowPrior`;
-    few: the angles between beams stay as planned unless they are told.
+    few: keep the planned angles between beams unless the rows determine them.
     """
     if plane_angles(images.views) is None:
         return None

@@ -1,4 +1,4 @@
-"""Where frames are beside matter of any kind that stays as it is: its own projections, moved by small steps."""
+"""Poses of frames with fixed matter of any kind, from its own projections and small steps."""
 
 from __future__ import annotations
 

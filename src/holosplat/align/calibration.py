@@ -90,12 +90,12 @@ DEFAULT = CalibrationOptions()
 
 @dataclass(frozen=True)
 class Calibrated:
-    """Where V views are.
+    """The calibrated poses of V views.
 
     exposures: those of the scan, corrected; changes, errors: [V, 7] of the plan, as in `AlignedViews`
     pixel_size: [m], and its standard error as a share of it, 0 where it was known
     phantom: where its bodies are, in the object frame
-    left: [V] rms of what is unexplained of each frame, as a share of its contrast; words: what was not told
+    left: [V] rms of what is unexplained of each frame, as a share of its contrast; words: what was not determined
     """
 
     exposures: Exposures
@@ -107,7 +107,7 @@ class Calibrated:
     words: tuple[str, ...]
 
     def lines(self) -> list[str]:
-        """What was found, in words, and a table of the views."""
+        """The result in words, and a table of the views."""
         size, doubt = self.pixel_size
         pixel = f"pixel {1e6 * size:.5g} µm ± {doubt:.2%}; " if doubt else ""
         return [
@@ -131,7 +131,7 @@ def calibrate(
     light: LightOptions = EVEN_OR_NOT,
     on_progress: Progress = lambda stage, fraction: None,
 ) -> Calibrated:
-    """Where the views of `scan`, frames of one time, really are, by a phantom of known shape and material.
+    """Calibrate the poses of the views of `scan`, of one time, by a phantom of known shape and material.
 
     body: the phantom's closed mesh [m], in any pose, or the radius [m] of beads, however many there are and wherever
     they lie. All of it is in every field. A motion of the whole phantom changes no frame; it is chosen so that the mean
@@ -263,7 +263,7 @@ class _Search:
         self.take(then)
 
     def found(self) -> Calibrated:
-        """What was found, and what was not told."""
+        """The estimates in words, and those that the frames do not determine."""
         exposures = self.exposures(self.scan.exposures)
         words = list[str]()
         if len(self.phantom) == 1 and self.phantom.free:

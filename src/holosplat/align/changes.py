@@ -1,4 +1,4 @@
-"""What was found of views beside their plan: as numbers, and as the words and tables that say them."""
+"""Changes of views from their plan: as numbers, in words and in tables."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def changes(found: Exposures, planned: Exposures) -> np.ndarray:
 
 
 def in_words(of_views: np.ndarray) -> str:
-    """Root mean squares of `changes` [V, 7], but for the magnification's."""
+    """Root mean squares of `changes` [V, 7], without the magnification's."""
     root = np.sqrt(np.square(of_views).mean(0))
     across = np.hypot(root[[0, 2]], root[[1, 3]]) / np.sqrt(2)
     return (

@@ -1,4 +1,4 @@
-"""What single frames say before there is a volume: shifts by centres of mass, and mirrored detectors."""
+"""Initial geometry from single frames: shifts by centres of mass, and mirrored detectors."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 from ..geometry import Views
 
 MIRRORED = 0.85
-"""A view is said to be mirrored if its mirror image leaves less than this part unexplained of what it leaves itself."""
+"""A view counts as mirrored if its mirror image has less than this part of its own residual."""
 SIDES = {"x": (-1,), "y": (-2,), "xy": (-1, -2)}
 """Names of mirror images, and the axes that are reversed."""
 
@@ -36,7 +36,7 @@ def centres_of_mass(images: np.ndarray) -> np.ndarray:
 
 
 def mirrored(frames: Tensor, predicted: Tensor) -> list[str]:
-    """What each of frames [V, H, W] looks like beside those of a volume [V, H, W]: "" or the mirror image that fits.
+    """Compare frames [V, H, W] with those of a volume [V, H, W]: "" or the mirror image that fits, for each.
 
     One of "x" (columns are reversed), "y" (rows are), "xy".
     """

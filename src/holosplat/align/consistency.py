@@ -1,8 +1,8 @@
-"""What projections of one turning body have in common: their moments are trigonometric polynomials of the angle.
+"""Consistency of projections of one rotating body: their moments are trigonometric polynomials of the angle.
 
 For a slice of the body with projections p(θ, s), `∫ p(θ, s) U_n(s) ds` is a trigonometric polynomial in θ, of degree n
 and of n's parity (Helgason 1980, *The Radon Transform*; Ludwig 1966, "The Radon transform on Euclidean space"). So
-nothing needs to be reconstructed to see whether the axis of some projections is where it is said to be.
+no reconstruction is needed to test the place of the rotation axis.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Sinograms:
 
     values: [V, B, W] float64, of B slices
     angles: [V] [rad]
-    positions: [V, W] or [1, W] of the columns' centres, from where the axis is said to be [pixels]
+    positions: [V, W] or [1, W] of the columns' centres, from the nominal axis [pixels]
     heights: [B] of the slices along the axis [pixels]
     """
 

@@ -1,4 +1,4 @@
-"""What frames hardly tell of where they are, in words: the widest directions of the covariances, beside the prior."""
+"""Poorly determined directions of pose space in words: the widest of the covariances, relative to the prior."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ SHARES = 0.35
 
 
 def hardly_told(covariances: Tensor, expected: Tensor) -> list[str]:
-    """A sentence for each direction that some views hardly tell, beside known matter.
+    """Describe each direction of pose space that some views hardly determine, given the matter.
 
     covariances: [V, K, K] of `NUMBERS`, prior included; expected: [K] prior standard deviations, 0 for what stays.
-    Numbers are taken in units of these, so that a direction of which frames say nothing has the variance 1.
+    Numbers are taken in units of these, so that an undetermined direction has the variance 1.
     """
     free = torch.nonzero(expected > 0)[:, 0]
     units = expected[free]

@@ -1,4 +1,4 @@
-"""How wrong a plan is, by what was found of its views and how well that is told; what is not told stays as planned."""
+"""Shrinkage of pose estimates towards the plan by their evidence; undetermined parts stay as planned."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ SWEEPS = 3
 
 @dataclass(frozen=True)
 class Weighed:
-    """What frames tell of K numbers of each of V views.
+    """Estimates of K parameters of each of V views.
 
-    numbers: [V, K] as far as frames tell them
+    numbers: [V, K] as far as the frames determine them
     covariance: [V · K, V · K] of what was found, with what is uncertain as the prior
     off: [V · K, V · K] mean squares and products of what `numbers` are off by: the covariance, and how far they are
-        from the likeliest with this prior, for what stays as planned may be as wrong as what was found says
+        from the likeliest with this prior, for what stays as planned may be as wrong as the estimates indicate
     scales: of each kind of numbers, the likeliest size of the plan's errors as a share of what is uncertain
     """
 
@@ -40,19 +40,19 @@ def weighed(
     kinds: list[list[int]],
     motions: np.ndarray,
 ) -> Weighed:
-    """The likeliest numbers of V views, where the plan's errors are as large as what was found of them says.
+    """The likeliest parameters of V views, with errors of the plan of the size of largest evidence.
 
     found: [V, K]; information: [V · K, V · K] of them, beside matter that is not known; expected: [K] their standard
     deviations; kinds: the places of those that are wrong by the same share of these; motions: [V · K, M] what common
-    motions do to all, which no frame tells and which are left out.
+    motions do to all, which no frame determines and which are left out.
 
     With found numbers normal about the true ones, and these about the plan, the evidence of a size of the plan's errors
     has a closed form (MacKay 1992). The largest is taken; for each kind with errors it must be larger by `STRONG`. Each
-    combination of numbers then goes back to the plan as far as frames do not tell it.
+    combination of parameters then shrinks to the plan as far as the frames do not determine it.
     """
     units = np.tile(expected, len(found))
     kept = beside(motions / units[:, None])
-    scaled = _without(units[:, None] * information * units, motions / units[:, None])
+    scaled = _project_out(units[:, None] * information * units, motions / units[:, None])
     told, values = kept.T @ scaled @ kept, kept.T @ (found.reshape(-1) / units)
     shares = np.zeros((len(kinds), found.size))
     for row, places in zip(shares.reshape(len(kinds), *found.shape), kinds):
@@ -78,12 +78,12 @@ def weighed(
 
 
 def _evidence(told: np.ndarray, values: np.ndarray, spread: np.ndarray) -> float:
-    """Log density, but for a constant, of `values`, whose errors have the information `told`, about 0 ± `spread`."""
+    """Log density, up to a constant, of `values`, whose errors have the information `told`, about 0 ± `spread`."""
     both = told @ spread + np.eye(len(told))
     return float(-0.5 * np.linalg.slogdet(both)[1] - 0.5 * values @ np.linalg.solve(both, told @ values))
 
 
-def _without(information: np.ndarray, motions: np.ndarray) -> np.ndarray:
+def _project_out(information: np.ndarray, motions: np.ndarray) -> np.ndarray:
     """Information of what is left when the best of all `motions` is taken out."""
     across = information @ motions
     return information - across @ np.linalg.pinv(motions.T @ across, rcond=1e-9, hermitian=True) @ across.T

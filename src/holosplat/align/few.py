@@ -1,4 +1,4 @@
-"""Poses of few views: what their frames tell of them beside matter that they do not know, and no more."""
+"""Poses of few views, estimated with the matter as a nuisance."""
 
 from __future__ import annotations
 
@@ -23,8 +23,7 @@ KINDS = {"shift": (0, 1), "angle": (2, 3), "roll": (4,), "distance": (DISTANCE,)
 SLOPES = {**{place: place for place in range(5)}, MAGNIFICATION: 5}
 """Places of these numbers among the derivatives of `projections`."""
 SIDE = 64
-"""Pixels along a frame's shorter side from which on larger ones say what is told: details of a pixel's size hardly
-change how well."""
+"""Pixels along a frame's shorter side from which on accuracy is computed on larger pixels, which hardly change it."""
 
 
 def beside_unknown(
@@ -109,7 +108,7 @@ def _information(
 
 
 def _motions(views: Views, places: list[int]) -> np.ndarray:
-    """[V · K, M] what is common to all views and no frame tells: motions of the object that only move the numbers
+    """[V · K, M] common motions, which no frame determines: those of the object that only move the parameters
     `places`, and its size."""
     free = np.tile(np.isin(np.arange(5), places), len(views))
     moved = motions(in_pixels(views))

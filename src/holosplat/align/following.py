@@ -1,4 +1,4 @@
-"""What frames tell of poses beside matter that is not known, but follows them as far as it can."""
+"""Information of frames on poses, given that unknown matter adapts to the poses."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What no frame can tell: a motion of the whole object, which all views could have made together."""
+"""The gauge freedom of poses: a common motion of the whole object, which no frame determines."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the frames of a run were found to be: beside the plan, in a form that files keep."""
+"""The estimated geometry of a run as changes of the plan, in a form for files."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TEXTS = ("refined", "words")
 
 @dataclass(frozen=True)
 class Geometry:
-    """Where V frames are: those for training by a volume of their own, those held out by the finished volume.
+    """Estimated poses of V frames: training frames by a volume of their own, held-out ones by the finished volume.
 
     rotations [V, 3, 3], shifts [V, 2] [m], distance [V] [m], pixel_sizes [V] [m]: as found
     changes, errors: [V, 7] of the plan, as in `AlignedViews`
@@ -121,7 +121,7 @@ class Geometry:
             raise InputError(f"the geometry of a run must be what reconstruct wrote, but {error} is amiss.") from None
 
     def lines(self) -> list[str]:
-        """What was found, in two sentences, and what stayed as planned."""
+        """The result in two sentences, and what stayed as planned."""
         said = f"geometry ({', '.join(self.refined)} refined), rms of the changes:"
         for name, at in (("training frames", ~self.held_out), ("held-out frames", self.held_out)):
             if at.any():

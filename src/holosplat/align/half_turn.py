@@ -1,4 +1,4 @@
-"""Where a half turn ends: the projection at 180° is the mirror image of the one at 0°."""
+"""Search for the end of a half turn: the projection at 180° is the mirror image of the one at 0°."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class HalfTurn:
     found: float
 
     def spread(self, angles: np.ndarray) -> np.ndarray:
-        """Angles [V] [rad] of some frames, the first of the scan before all, as the frames say."""
+        """Angles [V] [rad] of some frames, among them the first of the scan, estimated from the frames."""
         return angles[0] + (angles - angles[0]) * self.found / self.said
 
     def line(self) -> str:
-        """What was found, in words."""
+        """The result in words."""
         said, found = np.rad2deg([self.said, self.found])
         why = "it is the mirror image of the first" if found > said else "that would be the frame after it"
         return (

@@ -1,4 +1,4 @@
-"""Where held-out frames are, by the finished volume, which they took no part in."""
+"""Poses of held-out frames from the finished volume, which does not use them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def place_frames(
     on_progress: Progress = lambda stage, fraction: None,
     oversample: int = 0,
 ) -> AlignedViews:
-    """Where all frames of `scan` are beside the matter that was `found`, which stays as it is.
+    """Estimate the poses of all frames of `scan` with the fixed matter `found`.
 
     The matter counts as one material. Steps are those of `align_views`, from large pixels to small ones, with no
     common motion to be chosen: the matter has its place. Each frame is free by itself. The last steps are taken beside
@@ -107,7 +107,7 @@ def _expected(options: PoseOptions) -> Tensor:
 
 
 def fitted_frames(found: Stored, planned: Scan, fitted: Scan, options: PoseOptions, oversample: int) -> AlignedViews:
-    """What is to be said of the frames of `planned` that a fit has put where those of `fitted` are, in the same light.
+    """Describe the poses of `fitted` frames as changes of those `planned`, in the same light.
 
     Errors are those beside the matter that was `found`, as it is.
     """

@@ -87,12 +87,12 @@ def whens(time: np.ndarray) -> np.ndarray:
 
 
 def chosen_moments(scan: Scan, beams: Beams, most: int, fewest: int) -> list[Moment]:
-    """`most` times of a series, or all if there are no more, evenly spread; of each part the one that says most.
+    """`most` times of a series, or all if there are no more, evenly spread; of each part the most informative one.
 
-    The times are divided into as many parts as are to be chosen. Of each part that time is taken whose training frames
-    say most of shifts: the sum of the squares of their slopes, which is their information (Fisher 1922) in even noise.
-    Only times with the most beams for training are asked; frames held out of a beam that is for training elsewhere are
-    left out. Errors: `InputError` unless some time has `fewest` training frames.
+    The times are divided into as many parts as are to be chosen. Of each part that time is taken whose training
+    frames carry most information on shifts: the sum of the squares of their slopes (Fisher 1922), in even noise. Only
+    times with the most beams for training count; frames held out of a beam that is for training elsewhere do not.
+    Errors: `InputError` unless some time has `fewest` training frames.
     """
     is_test = scan.is_test
     time = scan.exposures.time if scan.is_series else np.zeros(len(scan))

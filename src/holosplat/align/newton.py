@@ -14,7 +14,7 @@ from .derivatives import Predicted
 
 @dataclass(frozen=True)
 class Normal:
-    """What frames say of K numbers of each of V views, near the present ones; sums of it are of many frames of a view.
+    """Information of frames on K parameters of each of V views, near the present ones; frames of a view add up.
 
     information: [V, K, K], the Hessian of half the squared residuals over their noise
     slope: [V, K], how fast these fall along each number

@@ -1,4 +1,4 @@
-"""Where each view really is, by its frames: a volume and the poses in turn, on ever smaller pixels."""
+"""Estimation of poses: a volume and the poses in alternation, on smaller and smaller pixels."""
 
 from __future__ import annotations
 
@@ -245,7 +245,7 @@ class PoseSearch:
         return self.options.edges > 0 and self.upper == 1.0
 
     def prepared(self, level: Level) -> Prepared:
-        """What the rounds of a level need."""
+        """Inputs of the rounds of a level."""
         scan = self.scan.binned(level.pixels)
         planned = scan.exposures
         retrieved = self.thickness(scan, planned) / scan.views.pitch
@@ -297,7 +297,7 @@ class PoseSearch:
         self.solve(self.normal(volume, grid, found, frames, oversample), found.views.shape)
 
     def normal(self, volume: Tensor, grid: Grid, found: Exposures, frames: Tensor, oversample: int) -> Normal:
-        """What frames [V, H, W] say of the numbers (shifts in detector pixels), beside `volume` on `grid`."""
+        """Information of frames [V, H, W] on the parameters (shifts in detector pixels), given `volume` on `grid`."""
         scales = torch.ones(len(NUMBERS), dtype=torch.float64)
         scales[SHIFT] = round(found.views.pitch / self.scan.views.pitch)
         magnified = self.options.uncertain.magnification > 0

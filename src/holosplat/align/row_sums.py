@@ -1,4 +1,4 @@
-"""What beams in one plane have in common, row by row: mass, and centre of mass. No volume is needed.
+"""Consistency of beams in one plane, row by row: mass, and centre of mass. No volume is needed.
 
 Beams normal to the object's y axis all look through the same slices. Of a slice with mass F and first moment G [2],
 each view's row has the mass F and the first moment `n · G`, with n the direction of its columns in the slice (Helgason
@@ -65,7 +65,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class RowPrior:
-    """What is expected of the numbers of V views.
+    """Prior of the parameters of V views.
 
     expected: [V, 5] standard deviations about zero of shifts [pixels] and turns [rad]; 0: as they begin
     drifts: [5] of half of what they change by from the first time to the last, likewise
@@ -93,7 +93,7 @@ class RowPrior:
 
 @dataclass(frozen=True)
 class RowEstimate:
-    """What rows of V views say.
+    """Estimates from the rows of V views.
 
     numbers, rates: [V, 6] of `COUNT`, at the middle of the times, and how much more at their end
     information, rate_information: [V · 6, V · 6] of either, without what is expected
@@ -194,12 +194,12 @@ def replaced(images: np.ndarray, shifts: np.ndarray, rolls: np.ndarray) -> np.nd
 
 
 def conditions(rows: Rows, angles: np.ndarray, weights: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    """What rows of beams at `angles` [V] [rad] about y have against being of one object: residuals [R], and how they
+    """Inconsistency of the rows of beams at `angles` [V] [rad] about y: residuals [R], and how they
     grow [R, V, 6] with the numbers of the views; R = 2 V H, those of masses, then those of first moments, so weighed.
 
     A turn about x moves mass at depth z along y, one about y along x; the mean depth of a row is that of its slice's
     first moment, the mixed moment of depth and x that of its second. Derivatives are those of the slices that fit all
-    views best: so no motion of the whole object seems to be told.
+    views best: so motions of the whole object stay undetermined.
     """
     count, height = rows.mass.shape
     across, along = _directions(angles)

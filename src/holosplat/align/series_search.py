@@ -90,7 +90,7 @@ class _Sums:
         self._slope = torch.zeros(beams, count, dtype=torch.float64)
 
     def add(self, normal: Normal, moment: Moment) -> None:
-        """What the frames of one time say."""
+        """Add the information of the frames of one time."""
         powers = torch.tensor([1.0, moment.when], dtype=torch.float64)
         beams = torch.from_numpy(moment.beams)
         information = torch.einsum("a,b,vij->vaibj", powers, powers, normal.information)

@@ -11,7 +11,7 @@ from ..scan import Scan
 DARKEST = 1e-3
 """Intensity [relative] below which a logarithm is that of noise; it is taken for this much."""
 EVEN_OR_NOT = LightOptions()
-"""Even, unless the air of frames says otherwise."""
+"""Even, unless the air of the frames shows otherwise."""
 TRIAL_DELTA = 1e-6
 """Any δ will do: shadows are counted in units of their own."""
 

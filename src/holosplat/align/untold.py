@@ -1,4 +1,4 @@
-"""What rows cannot tell of beams in one plane: combinations of their numbers, in words, and errors that know of it."""
+"""Null space of beams in one plane: undetermined combinations of their parameters, in words and in their errors."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .row_sums import COUNT, FACTOR, RETRIEVED
 
 NAMES = ("shift x", "shift y", "turn x", "turn y", "roll")
 NOTHING = 1.0
-"""Information, in units of the prior's, below which frames say less of a combination than was known before."""
+"""Information, in units of the prior's, below which frames add less about a combination than the prior."""
 ANGLES = 0.9
 """Share of turns about the axis that all beams are normal to, from which a combination is called an angle."""
 STRETCHED = (
@@ -25,7 +25,7 @@ PART = 0.35
 
 @dataclass(frozen=True)
 class Told:
-    """What rows tell of the 5 numbers of V views (`NAMES`), beside a motion of the whole object.
+    """Information of rows on the 5 parameters of V views (`NAMES`), up to a motion of the whole object.
 
     errors: [V, 5] standard errors, with what is expected
     ratios: [K] information of each independent combination, over that of what is expected, in growing order
@@ -56,8 +56,8 @@ class Told:
         return cls(errors.reshape(count, -1), ratios, combinations.reshape(-1, count, FACTOR))
 
     def words(self, held: float) -> list[str]:
-        """Combinations that are as planned, for frames say nothing of them; angles between beams also where frames say
-        less than `held` of them."""
+        """Combinations that stay as planned, for frames do not determine them; angles between beams also where their
+        information is less than `held`."""
         shares = (self.combinations[:, :, 3] ** 2).sum(1) / (self.combinations**2).sum((1, 2)).clip(1e-12)
         said = []
         if (self.ratios < held)[shares > ANGLES].any():

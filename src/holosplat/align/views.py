@@ -1,4 +1,4 @@
-"""`align_still`: a scan in, exposures as the frames say they are out, with errors and what the frames cannot tell."""
+"""`align_still`: exposures of a scan estimated from its frames, with errors and undetermined directions."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ MAY_BE_NOISE = "{kind} is as planned: what few frames say against it may be nois
 
 @dataclass(frozen=True)
 class AlignedViews:
-    """Where V views are.
+    """The estimated poses of V views.
 
     exposures: those of the scan, corrected
     changes: [V, 7] of the plan, all views moved together as near to it as can be: shifts x, y [pixels], turns about x,
@@ -75,7 +75,7 @@ class AlignedViews:
     words: tuple[str, ...]
 
     def lines(self) -> list[str]:
-        """What was found, in words, and a table of the views."""
+        """The result in words, and a table of the views."""
         larger = _rms(self.changes[:, 6])
         return [
             in_words(self.changes)
@@ -98,13 +98,13 @@ def align_still(
     light: LightOptions = EVEN_OR_NOT,
     on_progress: Progress = lambda stage, fraction: None,
 ) -> AlignedViews:
-    """Where the views of `scan`, frames of one time, really are.
+    """Estimate the poses of the views of `scan`, frames of one time.
 
-    The volume is that of the training frames; frames that are held out only tell where they are themselves. A motion of
-    the whole object, which no frame can tell, is chosen so that the mean turn and the mean shift are those planned.
+    The volume is that of the training frames; held-out frames determine their own poses alone. A motion of
+    the whole object, which no frame determines, is chosen so that the mean turn and the mean shift are those planned.
     What differs from the plan by less than the accuracy that was measured (`ACCURACY`) stays as planned.
 
-    prior: what is known of the matter; where its δ is not, the occupancy has no bound. Errors: `InputError` for fewer
+    prior: of the material; where its δ is unknown, the occupancy has no bound. Errors: `InputError` for fewer
     than two training frames.
     """
     count = int((~scan.is_test).sum())
@@ -134,7 +134,7 @@ def align_still(
     expected = options.uncertain.deviations()
     expected[DISTANCE] = options.uncertain.distance if sharp else 0.0
     words += hardly_told(search.covariances, expected)
-    words += _kept(search, scan.exposures, pixels, sharp, doubted)
+    words += _keep_planned(search, scan.exposures, pixels, sharp, doubted)
     found = search.exposures(scan.exposures)
     found = replace(found, views=moved_onto(found.views, scan.views))
     of = max(pixels, 2 if min(scan.views.shape) >= 2 * options.least_side else 1)
@@ -203,7 +203,7 @@ def by_edges(search: PoseSearch, pixels: int, on_progress: Progress) -> SurfaceM
     return found.surfaces
 
 
-def _kept(search: PoseSearch, planned: Exposures, pixels: int, sharp: bool, others: Sequence[str]) -> list[str]:
+def _keep_planned(search: PoseSearch, planned: Exposures, pixels: int, sharp: bool, others: Sequence[str]) -> list[str]:
     """Puts kinds of numbers, beside `others`, that differ from the plan by no more than they are known back to it; says
     which."""
     accuracy = SHARP_ACCURACY if sharp else ACCURACY
@@ -222,7 +222,7 @@ def _kept(search: PoseSearch, planned: Exposures, pixels: int, sharp: bool, othe
 
 @dataclass(frozen=True)
 class Judged:
-    """What a new volume in some exposures leaves unexplained.
+    """The residual of a new volume in some exposures.
 
     left: [V] rms, as a share of each frame's contrast
     mirrors: [V] which mirror image of a frame fits much better than itself, or ""

@@ -36,14 +36,29 @@ def retrieve(
     light: LightOptions = EVEN_OR_NOT,
     on_progress: Advance = lambda fraction: None,
 ) -> Retrieved:
-    """The projected thickness of one material in relative frames [V, H, W], each by itself, and the phase behind it.
+    """Retrieve the phase and the projected thickness of one material from single frames [V, H, W], each by itself.
 
-    material: δ and β at the reference energy; the phase depends on their ratio alone
+    frames: [V, H, W] relative to the flat field
+    material: δ and β at the reference energy, against the medium; the phase depends on their ratio alone
     method: one of `optics.retrieval.RETRIEVALS`
-    light: where it is uneven, each frame is divided by it. It is found in air; behind matter it goes on smoothly, for
-        one frame cannot tell the rest of it from matter, and what is not known of it counts as noise.
+    light: if the light is uneven, each frame is divided by it. The light is measured in air and continued smoothly
+        behind the object; its uncertainty counts as noise there.
 
-    Errors: those of `Light.of` and of `Retrieval`, and `InputError` for another method.
+    Thickness [m] and phase [rad] of the result are tensors [V, H, W]. Errors: `InputError` for another method, a δ that
+    is not above zero, and frames of another shape.
+
+    Examples:
+
+        >>> import holosplat as hs
+        >>> water = hs.materials.parse_material("water").delta_beta(20.0)
+        >>> views = hs.Views.evenly_spaced(8, shape=(16, 16), pixel_size=1e-6)
+        >>> cells = hs.specimens.random_cells(1, box=(16e-6, 16e-6, 16e-6), seed=1)
+        >>> scene = hs.MeshScene.of_one_material(cells, water)
+        >>> scan = hs.simulate(scene, hs.Exposures.of(views, energy_kev=20.0, distance=0.05))
+        >>> found = hs.retrieve(scan.frames, scan.exposures, water)
+        >>> _, D = scene.project(views)
+        >>> print(f"{1e6 * found.thickness.max():.1f} µm, true {1e6 * D.max() / water.delta:.1f} µm")
+        7.6 µm, true 7.5 µm
     """
     if method not in RETRIEVALS:
         raise InputError(f"method must be one of {', '.join(RETRIEVALS)}, but it is {method!r}.")

@@ -31,7 +31,7 @@ from ..units import in_percent
 
 FORMAT = "holosplat cells 1"
 TRAVEL = 1e-6
-"""How far the fastest fluid goes from snapshot to snapshot, unless an interval is given [m]."""
+"""Distance [m] that the fastest fluid moves between snapshots without a given interval."""
 MOST_VOLUME, MOST_AREA = 0.01, 0.05
 """Greatest change of a cell's volume and area, relative to rest."""
 FIRST_STEP = 0.01

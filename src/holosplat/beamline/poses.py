@@ -1,4 +1,4 @@
-"""Where views look from: evenly spaced, listed, tilted, as matrices, or as a known beamline has them."""
+"""Directions of views: evenly spaced, listed, tilted, as matrices, or of a known beamline."""
 
 from __future__ import annotations
 

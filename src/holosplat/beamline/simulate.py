@@ -122,11 +122,11 @@ class Simulation:
 
 
 def simulated_frames(obj: Object, exposures: Exposures, how: Simulation = Simulation()) -> Iterator[np.ndarray]:
-    """Frames [H, W] float32 of `obj`, one after another; only one is in memory.
+    """Simulate frames [H, W] float32 of `obj`, one by one, without keeping them.
 
     Plain torch (the `reference` of the optics, which fits use with that backend alone), on a GPU if the backend is
     `cuda`, on a fine raster in single precision, less than 1e-5 of the contrast from double precision. A frame is the
-    mean of the intensities at its pulses, with the light and the noise that are asked for.
+    average of the intensities at its pulses, with the light and the noise of `how`.
     """
     fine, detect, backend = how.samples(exposures), how.detector(exposures), resolve(how.backend)
     obj = obj.on(backend) if isinstance(obj, (MeshScene, MeshSeries)) else obj
@@ -153,11 +153,32 @@ def simulate(
     light: UnevenLight = EVEN_LIGHT,
     on_progress: Advance = lambda fraction: None,
 ) -> Scan:
-    """A scan of `obj`, held in memory (`simulated_frames` gives frame by frame): waves on a fine raster, integrated
-    over pixels, then photon noise if asked for.
+    """Simulate a scan of `obj`: wave propagation on a fine raster, pixel integration, photon noise.
 
-    is_test: [N] bool, default every fourth frame; oversample: samples per pixel, default from the fringe width;
-    shutter: motion blur; light: how it differs from the flat field; `on_progress(fraction)` is called after each frame.
+    obj: any `Object`, such as a `MeshScene` or a `MeshSeries` in motion
+    exposures: pose, energy, distance, blur and time of each of the N frames
+    photons_per_pixel: mean counts of the Poisson noise (default: no noise)
+    is_test: [N] bool, the frames to hold out (default: every fourth)
+    oversample: samples along a pixel (default: as many as the fringes need)
+    shutter: length of the exposures, for motion blur (default: none)
+    light: deviations of the light from the flat field (default: none)
+
+    The frames [N, H, W] are relative to the flat field, and all in memory (`beamline.simulated_frames` gives them one
+    by one). `on_progress(fraction)` is called after each frame. Errors: `InputError` for photons or seeds out of range,
+    and for fringes that no raster of reasonable size resolves.
+
+    Examples:
+
+        >>> import holosplat as hs
+        >>> water = hs.materials.parse_material("water").delta_beta(20.0)
+        >>> views = hs.Views.evenly_spaced(8, shape=(16, 16), pixel_size=1e-6)
+        >>> cells = hs.specimens.random_cells(1, box=(16e-6, 16e-6, 16e-6), seed=1)
+        >>> scene = hs.MeshScene.of_one_material(cells, water)
+        >>> scan = hs.simulate(scene, hs.Exposures.of(views, energy_kev=20.0, distance=0.05))
+        >>> scan
+        Scan(8 frames of 16 × 16 pixels, 2 of them held out)
+        >>> print(f"{scan.frames.min():.2f} to {scan.frames.max():.2f} of the flat field")
+        0.73 to 1.17 of the flat field
     """
     how = Simulation(photons_per_pixel, seed, oversample, shutter, light)
     frames = np.empty((len(exposures), *exposures.views.shape), dtype=np.float32)

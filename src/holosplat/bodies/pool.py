@@ -43,7 +43,7 @@ class Pool:
             self._own.append(self.every.strained([pose]) + float(self.every.hidden([pose])))
 
     def chosen(self, draws: np.random.Generator) -> list[Pose]:
-        """Those that explain most together."""
+        """The choice of bodies that explains most together."""
         if not self.poses:
             return []
         images = csr_array(vstack(self._rows))

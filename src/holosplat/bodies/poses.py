@@ -45,7 +45,7 @@ class Pose:
     turning: np.ndarray
 
     def nodes(self, rest: np.ndarray, time: float) -> np.ndarray:
-        """Where points `rest` [P, 3] about the centre are at a time, [P, 3]; turns are taken to be small."""
+        """Places [P, 3] at a time of the points `rest` [P, 3] about the centre, for small rotations."""
         away = rest @ self.matrix.T
         return away + time * np.cross(self.turning, away) + self.centre + time * self.velocity
 
@@ -55,7 +55,7 @@ class Pose:
 
 
 class Explained:
-    """What bodies of one rest shape leave of shadows, and what they cost.
+    """The residual shadows of bodies of one rest shape, and their cost.
 
     strain: cost of a squared strain of one; steps: of the calculation, one for each time that poses are `improved`.
     """
@@ -72,7 +72,7 @@ class Explained:
 
     @cached_property
     def shadow(self) -> float:
-        """What a whole shadow of the body at rest costs in a frame."""
+        """The cost of a whole shadow of the body at rest in a frame."""
         still = Pose(np.eye(3), *np.zeros((3, 3)))
         return float(self.cost(self.images([still]))) / len(self.seen)
 
@@ -101,7 +101,7 @@ class Explained:
             return self._project(_parts(poses)).numpy()
 
     def share(self, pose: Pose) -> float:
-        """What the pose explains of the shadows, over what it would of its own: 1 for a body that is there alone."""
+        """The explained part of the shadows over that of a body alone, which has 1."""
         images = self.images([pose])
         gain = self.cost(self.target) - self.cost(self.seen.thickness - images)
         return float(gain / self.cost(images).clamp_min(1.0))

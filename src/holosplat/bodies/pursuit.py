@@ -24,16 +24,16 @@ MOST_ROUNDS = 60
 
 def searched(every: Explained, search: Search, begun: list[Pose]) -> list[Pose]:
     """`begun` and what is found beside them, without those that explain nothing."""
-    found = _more(every, search, explaining(every, begun))
+    found = _add_bodies(every, search, explaining(every, begun))
     return explaining(every, exchanged(every, search, every.improved(found, LAST_STEPS)))
 
 
 def explaining(every: Explained, found: Sequence[Pose]) -> list[Pose]:
-    """Those that explain enough of what the others leave."""
+    """The bodies that explain enough of the residual of the others."""
     return [pose for pose, share in zip(found, every.shares(found)) if share >= LEAST]
 
 
-def _more(every: Explained, search: Search, found: list[Pose]) -> list[Pose]:
+def _add_bodies(every: Explained, search: Search, found: list[Pose]) -> list[Pose]:
     """`found`, and those that explain what these leave, one round after the other."""
     left = every.without(found)
     for _ in range(MOST_ROUNDS):
@@ -54,13 +54,13 @@ def candidates(
     left: Explained, search: Search, most: int, without: Sequence[np.ndarray] = ()
 ) -> list[tuple[float, Pose]]:
     """Bodies that explain enough of what is left, with their shares, the best first; none begins near `without`."""
-    hits = [_posed(hit) for hit in search.tops(left.seen, most, without)]
+    hits = [_pose_of(hit) for hit in search.tops(left.seen, most, without)]
     poses = [left.improved([pose], FIRST_STEPS)[0] for pose in hits]
     tried = [(left.share(pose), pose) for pose in poses]
     return sorted((one for one in tried if one[0] >= LEAST), key=lambda one: -one[0])
 
 
-def _posed(hit: Hit) -> Pose:
+def _pose_of(hit: Hit) -> Pose:
     return Pose(hit.matrix, hit.centre, hit.velocity, np.zeros(3))
 
 
@@ -98,8 +98,7 @@ def level_pairs(every: Explained, found: Sequence[Pose]) -> list[tuple[int, int]
 
 
 def swapped(every: Explained, search: Search, found: Sequence[Pose], i: int, j: int) -> list[Pose]:
-    """Two others in the place of bodies `i` and `j`: each where the one is in the first of two beams and the other in
-    the second."""
+    """Exchange the shadows of bodies `i` and `j` in the second of two beams."""
     first, second = (every.seen.rotations[n, :2].numpy() for n in _directions(every))
     left = every.without([pose for k, pose in enumerate(found) if k not in (i, j)])
     both, others = np.concatenate([first, second]), list[Pose]()
@@ -108,7 +107,7 @@ def swapped(every: Explained, search: Search, found: Sequence[Pose], i: int, j: 
             np.linalg.lstsq(both, np.concatenate([first @ a, second @ b]), rcond=1e-9)[0]
             for a, b in ((one.centre, other.centre), (one.velocity, other.velocity))
         ]
-        others.append(_posed(search.here(left.seen, moved[0], moved[1])))
+        others.append(_pose_of(search.here(left.seen, moved[0], moved[1])))
     return left.improved(others, 2 * FIRST_STEPS)
 
 

@@ -87,7 +87,7 @@ class Replaced:
 
         tried: other bodies that may be among the best.
 
-        What is little worse than the best is gone on from, too (record-to-record travel: Dueck 1993, J. Comput. Phys.
+        Slightly worse states are accepted, too (record-to-record travel: Dueck 1993, J. Comput. Phys.
         104, 86): of bodies that stand for each other's shadows all must change before anything is better. Each round
         ends with the best choice among all bodies that were tried so far.
         """
@@ -98,7 +98,7 @@ class Replaced:
             for number in range(tries):
                 part = number / tries
                 on_progress(max((turn + part) / MOST_ROUNDS, (idle + part) / PATIENCE))
-                other = self._combined() if number == tries - 1 else self._changed(now, number)
+                other = self._best_choice() if number == tries - 1 else self._perturb(now, number)
                 value = self.every.value(other)
                 now = other if other and value < (1 + WORSE) * least else now
                 if value < least:
@@ -108,24 +108,23 @@ class Replaced:
                 break
         return explaining(self.every, best)
 
-    def _changed(self, found: list[Pose], number: int) -> list[Pose]:
+    def _perturb(self, found: list[Pose], number: int) -> list[Pose]:
         """Another choice, made better."""
-        other = self._exchanged(found) if self._two and number % EXCHANGES == 0 else self._replaced(found)
+        other = self._exchange(found) if self._two and number % EXCHANGES == 0 else self._replace(found)
         other = self.every.improved(other, LAST_STEPS)
         self._pool.add(other)
         return other
 
-    def _combined(self) -> list[Pose]:
+    def _best_choice(self) -> list[Pose]:
         """The best choice among all bodies that were tried, made better."""
         other = explaining(self.every, self.every.improved(self._pool.chosen(self._draws), LAST_STEPS))
         other = self.every.improved(other, LAST_STEPS)
         self._pool.add(other)
         return other
 
-    def _replaced(self, found: list[Pose]) -> list[Pose]:
-        """Others in the place of a body, the rather the more is unexplained about it, and of some that share its
-        shadows."""
-        gone = self._gone(found)
+    def _replace(self, found: list[Pose]) -> list[Pose]:
+        """Replace a body, and some that share its shadows; more likely one with a larger residual about it."""
+        gone = self._draw_neighbours(found)
         kept, new = [pose for k, pose in enumerate(found) if k not in gone], list[Pose]()
         beside = left = self.every.without(kept)
         for turn in range(len(gone) + 1):
@@ -133,12 +132,12 @@ class Replaced:
             if not tried:
                 break
             self._pool.add([pose for _, pose in tried])
-            new.append(self._chosen(tried))
+            new.append(self._draw_candidate(tried))
             left = left.without(new[-1:])
         return [*kept, *beside.improved(new, LAST_STEPS)]
 
-    def _gone(self, found: list[Pose]) -> list[int]:
-        """Numbers of a body and of up to `MOST_OTHERS` others, the rather the more of a shadow they have in common."""
+    def _draw_neighbours(self, found: list[Pose]) -> list[int]:
+        """Draw a body and up to `MOST_OTHERS` others, more likely those with a larger common shadow; indices."""
         doubts = self.every.doubts(found) + LEAST_DOUBT
         first = int(self._draws.choice(len(found), p=doubts**2 / (doubts**2).sum()))
         each = self.every.each(found)
@@ -150,12 +149,12 @@ class Replaced:
         others = self._draws.choice(len(found), count, replace=False, p=common / common.sum())
         return [first, *map(int, others)]
 
-    def _chosen(self, tried: list[tuple[float, Pose]]) -> Pose:
-        """One of those that were tried, the rather the more it explains."""
+    def _draw_candidate(self, tried: list[tuple[float, Pose]]) -> Pose:
+        """Draw one of the bodies that were tried, more likely one that explains more."""
         likely = np.exp([(share - tried[0][0]) / CHOICE for share, _ in tried])
         return tried[int(self._draws.choice(len(tried), p=likely / likely.sum()))][1]
 
-    def _exchanged(self, found: list[Pose]) -> list[Pose]:
+    def _exchange(self, found: list[Pose]) -> list[Pose]:
         """The same bodies, two of one height, if there are such, as if each had the other's shadow in one beam."""
         pairs = level_pairs(self.every, found)
         if not pairs:

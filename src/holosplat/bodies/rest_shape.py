@@ -18,7 +18,7 @@ from .moments import centroid
 
 RED_CELL = "red-cell"
 LEAST_PX, MOST_PX = 3.0, 300.0
-"""Radius [pixels] of the ball of a body's volume: smaller ones have no orientation that frames tell."""
+"""Least radius [pixels] of the ball of a body's volume at which frames determine its orientation."""
 GUESSED = 0.15
 """By which part all red cells may be larger or smaller than a guess of them, whose volumes are hardly better."""
 COARSE, FEWEST, MOST = 180, 180, 3000
@@ -28,7 +28,7 @@ COARSE, FEWEST, MOST = 180, 180, 3000
 @dataclass(frozen=True)
 @ranged
 class KnownBody:
-    """What is known of the shape of all bodies."""
+    """The known shape that all bodies share."""
 
     shape: str = RED_CELL
     """red-cell, or a file of one closed mesh (.stl, .ply, .obj, .vtk, .vtp, .vtu); its pose there does not matter."""
@@ -37,7 +37,7 @@ class KnownBody:
     size: Metres = 0.0
     """Largest extent at rest [m] (0: a red cell's 7.82 µm, or the file's)."""
     uncertain: float = 0.1
-    """By which part all bodies may be larger or smaller than that, at most; frames tell (0: they are not)."""
+    """Largest relative change of the size of all bodies, which is fitted (0: fixed)."""
     stiffness: Weight = 100.0
     """Minus the logarithm of the probability of strains of about one: frames decide what they see, this the rest."""
     instants: int = 9

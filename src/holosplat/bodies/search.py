@@ -26,7 +26,7 @@ SIZES, SIZE_STEPS = 9, 8
 
 @dataclass(frozen=True)
 class BodySearch:
-    """What is searched. body: what is known of all bodies; seen: shadows in the frames, binned; bin: so many pixels of
+    """The problem of a search. body: known shape of all; seen: shadows in the frames, binned; bin: so many pixels of
     the frames are one of the search, in whose pixels `mesh` has the rest shape."""
 
     body: KnownBody

@@ -1,4 +1,4 @@
-"""What frames of several times show of matter, as thickness, and what affine bodies on straight paths leave of it."""
+"""Thickness in frames of several times, and its residual after affine bodies on straight paths."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Shadows:
 
     @classmethod
     def of(cls, scan: Scan, material: DeltaBeta, first: float, last: float) -> Shadows:
-        """What the frames of `scan`, of pixels of one size, show; first, last: times [s] of the whole scan."""
+        """The shadows in the frames of `scan`, of pixels of one size; first, last: times [s] of the whole scan."""
         exposures, views, pitch = scan.exposures, scan.views, scan.views.pixel_size
         frames = torch.from_numpy(scan.frames)
         how = Tikhonov(prior=FIXED)  # bodies are cut by the frames' edges
@@ -99,7 +99,7 @@ class Shadows:
         return replace(self, **parts, fringes=self.fringes[index], contrast=self.contrast[index])
 
     def information(self, n: int, size: tuple[int, int]) -> Tensor:
-        """What frame `n` knows of the thickness at each frequency of `rfft2` on a raster of `size`: |H|²/σ²."""
+        """Fisher information |H|²/σ² of frame `n` on thickness at each frequency of `rfft2` on a raster of `size`."""
         fy, fx = np.fft.fftfreq(size[0]), np.fft.rfftfreq(size[1])
         chi = np.pi * self.fringes[n] * (fy[:, None] ** 2 + fx**2)
         return torch.from_numpy((self.contrast[n] * np.sin(chi)) ** 2 + EVERYWHERE).float()

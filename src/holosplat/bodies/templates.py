@@ -1,6 +1,6 @@
-"""Shadows of a known body in many poses, and where in space and time they are seen.
+"""Template matching: shadows of a known body in many poses, in space and time.
 
-Frames know thickness at each frequency with the information W = |H|²/σ², H the contrast transfer and σ the noise. A
+Frames measure thickness at each frequency with the information W = |H|²/σ², H the contrast transfer and σ the noise. A
 body is where its shadows P gain most likelihood beside the thickness T, Σ over frames of 2⟨T, W P⟩ - ⟨P, W P⟩: all
 frames of several times together, each where a straight path leads. Edges count for more than matter does, so
 that bodies that lie behind each other do not pass for one.
@@ -84,7 +84,7 @@ def different(rows: Tensor) -> list[int]:
 
 @dataclass(frozen=True)
 class Hit:
-    """Where a template gains likelihood: its matrix [3, 3], and its centre [3] at time 0 and velocity [3] [pixels]."""
+    """A likely pose of a template: its matrix [3, 3], and its centre [3] at time 0 and velocity [3] [pixels]."""
 
     gain: float
     matrix: np.ndarray

@@ -1,9 +1,9 @@
-"""Twins: what two beams cannot tell of a body by its shadows' size and tilt.
+"""The two-view ambiguity: bodies whose shadows in two beams have the same size and tilt.
 
-Parallel beams along d₁ and d₂ tell the second moments Q of a body but for one number: with N = d₁ d₂ᵀ + d₂ d₁ᵀ, the
+Parallel beams along d₁ and d₂ determine the second moments Q of a body up to one number: with N = d₁ d₂ᵀ + d₂ d₁ᵀ, the
 shadows of Q + s N have the same moments for every s. Two of these have the same volume: s = 0, and
 s = 2 a₁₂/(a₁₁ a₂₂ - a₁₂²), a = dᵢᵀ Q⁻¹ dⱼ (det(1 + s Q⁻¹ N) = (1 + s a₁₂)² - s² a₁₁ a₂₂ is one there). A search that
-takes bodies for ellipsoids of a known volume finds the one or the other; finer details of the frames tell them apart.
+takes bodies for ellipsoids of a known volume finds the one or the other; finer details of the frames distinguish them.
 """
 
 from __future__ import annotations

@@ -34,11 +34,26 @@ LOADERS: tuple[Loader, ...] = (
 
 
 def read(path: str | Path, given: Mapping[str, Any] | None = None) -> Scan:
-    """The scan at `path`, a file or folder of any format in `LOADERS`.
+    """Read the scan at `path`, a file or folder of any format in `LOADERS`.
 
-    given: values that files lack, or that go before theirs, by name (`Loader.takes`): energy_kev [keV], distance [m],
-    pixel_size [m], angles_deg [N], and the others of `Loader.takes`. Errors: `InputError` for a path that does not
-    exist, holds no known scan or a damaged one, and for `given` values that do not belong to its format.
+    given: values that files lack, or that replace theirs, by name (`Loader.takes`): energy_kev [keV], distance [m],
+    pixel_size [m], angles_deg [N], and the others of `Loader.takes`.
+
+    The frames [N, H, W] are read when they are used. Errors: `InputError` for a path that does not exist, holds no
+    known scan or a damaged one, and for `given` values that do not belong to its format.
+
+    Examples:
+
+        >>> import holosplat as hs
+        >>> views = hs.Views.evenly_spaced(4, shape=(16, 16), pixel_size=1e-6)
+        >>> cells = hs.specimens.random_cells(1, box=(16e-6, 16e-6, 16e-6), seed=1)
+        >>> scene = hs.MeshScene.of_one_material(cells, hs.DeltaBeta(5.8e-7, 2.6e-10))
+        >>> exposures = hs.Exposures.of(views, energy_kev=20.0, distance=0.05)
+        >>> hs.write_scan("scan.nxs", hs.simulate(scene, exposures))
+        >>> hs.read("scan.nxs")
+        Scan(4 frames of 16 × 16 pixels, 1 of them held out)
+        >>> hs.read("scan.nxs", {"distance": 0.06}).exposures.distance
+        array([0.06, 0.06, 0.06, 0.06])
     """
     given = given or {}
     return _loader_for(path, given).read(Path(path), given)

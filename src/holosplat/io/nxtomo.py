@@ -50,7 +50,21 @@ def read_scan(path: str | Path, given: Mapping[str, Any] = NOTHING) -> Scan:
 
 
 def write_scan(path: str | Path, scan: Scan) -> None:
-    """Write `scan` as NXtomo (docs/scan_files.md), replacing `path` only once all is written."""
+    """Write a scan as NXtomo (docs/scan_files.md); `path` is replaced only once all is written.
+
+    Errors: `InputError` where `path` cannot be written.
+
+    Examples:
+
+        >>> import numpy as np
+        >>> import holosplat as hs
+        >>> views = hs.Views.evenly_spaced(4, shape=(16, 20), pixel_size=1e-6)
+        >>> exposures = hs.Exposures.of(views, energy_kev=20.0, distance=0.05)
+        >>> scan = hs.Scan(np.ones((4, 16, 20)), exposures, is_test=np.zeros(4))
+        >>> hs.write_scan("scan.nxs", scan)
+        >>> hs.read("scan.nxs")
+        Scan(4 frames of 16 × 20 pixels, 0 of them held out)
+    """
     with scan_writer(path, scan.exposures, scan.is_test, scan.provenance, light=scan.light) as add:
         for block in scan.blocks():
             for frame in block:

@@ -67,10 +67,22 @@ def require_refraction(path: str | Path, said: str) -> None:
 
 
 def read_volume(path: str | Path) -> Volume:
-    """The volume of a file with /delta and /beta [Z, Y, X], and `voxel_size` and `origin` [m] as attributes.
+    """Read a volume from an HDF5 file with /delta and /beta [Z, Y, X].
 
-    The attributes may stand on the datasets, on the file's root, or both (then they must agree); voxel_size
-    is one number or three, `(dx, dy, dz)`. `InputError` names the file and the field at fault.
+    The attributes `voxel_size` and `origin` [m] may be on the datasets, on the file's root, or both (then they must
+    agree); voxel_size is one number or three, `(dx, dy, dz)`. Errors: `InputError` naming the file and the field at
+    fault.
+
+    Examples:
+
+        >>> import numpy as np
+        >>> import holosplat as hs
+        >>> grid = hs.Grid.centred((4, 4, 4), voxel_size=1e-6)
+        >>> volume = hs.Volume(np.full(grid.shape, 5.8e-7), np.full(grid.shape, 2.6e-10), grid)
+        >>> hs.write_volume("volume.h5", volume)
+        >>> found = hs.read_volume("volume.h5")
+        >>> found.grid == grid, f"{found.delta.mean():.1e}"
+        (True, '5.8e-07')
     """
     with open_hdf5(path) as file:
         require_refraction(path, " ".join(file))
@@ -96,7 +108,20 @@ def grid_of(path: Path, shape: Sequence[int], size: Sequence[float], origin: Seq
 
 
 def write_volume(path: str | Path, volume: Volume) -> None:
-    """Write `volume` as /delta and /beta with their grid, replacing `path` only once all is written."""
+    """Write a volume to an HDF5 file as /delta and /beta with their grid; `path` is replaced only once all is written.
+
+    `export` writes other formats. Errors: `InputError` where `path` cannot be written.
+
+    Examples:
+
+        >>> import numpy as np
+        >>> import holosplat as hs
+        >>> grid = hs.Grid.centred((4, 4, 4), voxel_size=1e-6)
+        >>> volume = hs.Volume(np.full(grid.shape, 5.8e-7), np.full(grid.shape, 2.6e-10), grid)
+        >>> hs.write_volume("volume.h5", volume)
+        >>> print(hs.info("volume.h5").rows["shape"])
+        4 × 4 × 4 voxels (z, y, x)
+    """
     write_slabs(path, volume.grid, [(0, volume)])
 
 

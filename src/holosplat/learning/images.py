@@ -1,4 +1,4 @@
-"""What a network sees of a scan: the contrast of its frames, the thickness retrieved from each, and their noise."""
+"""Input images of a network: the contrast of frames, the thickness retrieved from each, and their noise."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where the voxels of a lattice lie on the images of parallel views: lifting of images, and its adjoint."""
+"""Lifting of images of parallel views to the voxels of a lattice, and its adjoint."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ class LearnedStart:
     """Steps of the fit of surfaces that follow, where matter has one known level."""
     cells: bool = True
     """Whether red cells, where the network knows these alone and beams are two, are also looked for by their shape at
-    rest: two views hardly say shapes. They are one more start to be compared."""
+    rest: two views hardly determine shapes. They are one more start to be compared."""
 
     @property
     def network(self) -> Trained:
@@ -59,7 +59,7 @@ class LearnedStart:
 
 @dataclass(frozen=True)
 class Guessed:
-    """What a network guesses.
+    """The guess of a network.
 
     values: [Z, Y, X] float32, occupancy from 0 to 1
     grid: its voxels, of a pixel of the (binned) frames
@@ -96,7 +96,7 @@ def guessed(scan: Scan, material: DeltaBeta, network: Guess, on_progress: Progre
 
 @dataclass(frozen=True)
 class GuessedMatter:
-    """What a network guessed, to be kept and shown.
+    """The guess of a network as matter, to be stored and shown.
 
     volume: δ and β; spread: [Z, Y, X] float32, standard deviation of occupancy in several guesses; of_copies: whether
     these are of copies of the scene, not without one of the views each
@@ -141,9 +141,9 @@ def unexplained(values: Tensor, seen: Tensor, taps: Taps, factor: int = 1) -> fl
 
 
 def spread(found: Guessed, network: Guess) -> Tensor:
-    """Standard deviation [Z, Y, X] of what `network` guesses without one of the views each: where it is large, few
-    frames say what is there. Of two views, one of which says too little, it is that of guesses of copies of the scene
-    (`COPIES`): where it is large, the network guesses what the frames do not say."""
+    """Standard deviation [Z, Y, X] of the guesses of `network` without one of the views each: where it is large, few
+    frames determine the matter. Of two views, it is that of guesses of copies of the scene (`COPIES`): where it is
+    large, the network guesses matter that the frames do not determine."""
     few = len(found.images) < FEWEST_VIEWS
     with torch.inference_mode():
         guesses = _of_copies(found, network) if few else _without_each(found, network)

@@ -27,7 +27,7 @@ VERSION = 1
 
 @dataclass(frozen=True)
 class Card:
-    """What weights are: a model card.
+    """The model card of trained weights.
 
     trained_on: the scenes' ranges and seed; training: options, steps and seed; made_by: version, commit and machine;
     scores: of scenes of another seed, by the number of views; typical_misfit: what guesses leave unexplained there of
@@ -52,7 +52,7 @@ class Card:
 
 
 def _nearest(said: Mapping[str, float], views: int, unsaid: float) -> float:
-    """What is said of `views`, or of the next smaller number that is there, or the smallest."""
+    """Look up `views`, or the next smaller number in the table, or the smallest."""
     known = sorted(int(count) for count in said)
     return said[str(max([count for count in known if count <= views] or known[:1]))] if known else unsaid
 
@@ -109,7 +109,7 @@ def size_of(kind: type[Kind], said: Mapping[str, str], tensors: Mapping[str, Ten
 
 
 def card_of(said: Mapping[str, str]) -> Card:
-    """The card in a file, which answers what is asked of it; raises what `as_written` takes for anything else."""
+    """The card in a file, whose entries can be looked up; raises what `as_written` takes for anything else."""
     card = from_table(Card, table_in(said["card"]))
     asked = (card.of_red_cells, card.dice(2))
     require(all(number >= 0 for number in asked), "a number of the card is below zero.")

@@ -42,7 +42,21 @@ from .surface_fit import SurfaceFit, SurfaceOptions, oversampling
 @dataclass(frozen=True)
 @ranged
 class Gaussians(GaussianOptions, Method):
-    """Gaussians where phase retrieval and tomography find matter, or at random, fitted to the frames."""
+    """The method that fits Gaussians to the frames; they start from phase retrieval and tomography, or at random.
+
+    Examples:
+
+        >>> import holosplat as hs
+        >>> water = hs.materials.parse_material("water").delta_beta(20.0)
+        >>> views = hs.Views.evenly_spaced(8, shape=(16, 16), pixel_size=1e-6)
+        >>> cells = hs.specimens.random_cells(1, box=(16e-6, 16e-6, 16e-6), seed=1)
+        >>> scene = hs.MeshScene.of_one_material(cells, water)
+        >>> scan = hs.simulate(scene, hs.Exposures.of(views, energy_kev=20.0, distance=0.05))
+        >>> quick = hs.Gaussians().with_effort(0.1)  # a tenth of the steps
+        >>> result = hs.reconstruct(scan, hs.MaterialPrior.known(water), quick)
+        >>> type(result.object).__name__
+        'GaussianCloud'
+    """
 
     kind: ClassVar[str] = "gaussians"
 

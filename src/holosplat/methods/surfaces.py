@@ -32,7 +32,21 @@ STAGE = "surfaces"
 
 @dataclass(frozen=True)
 class Surfaces(SurfaceOptions, Method):
-    """Closed surfaces cut out of Gaussians, and fitted to the frames."""
+    """The method that cuts closed surfaces out of Gaussians, and fits them to the frames.
+
+    Examples:
+
+        >>> import holosplat as hs
+        >>> water = hs.materials.parse_material("water").delta_beta(20.0)
+        >>> views = hs.Views.evenly_spaced(8, shape=(16, 16), pixel_size=1e-6)
+        >>> cells = hs.specimens.random_cells(1, box=(16e-6, 16e-6, 16e-6), seed=1)
+        >>> scene = hs.MeshScene.of_one_material(cells, water)
+        >>> scan = hs.simulate(scene, hs.Exposures.of(views, energy_kev=20.0, distance=0.05))
+        >>> quick = hs.Surfaces().with_effort(0.1)  # a tenth of the steps
+        >>> result = hs.reconstruct(scan, hs.MaterialPrior.known(water), quick)
+        >>> len(result.object.bodies())
+        1
+    """
 
     kind: ClassVar[str] = "surfaces"
 

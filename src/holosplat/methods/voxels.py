@@ -113,7 +113,20 @@ class VoxelFit:
 
 @dataclass(frozen=True)
 class Voxels(Method):
-    """Voxels from `HolographicTV`, fitted to the frames with total variation; δ and β apart where nothing is known."""
+    """The method that fits voxels to the frames with total variation; δ and β are free where the material is unknown.
+
+    Examples:
+
+        >>> import holosplat as hs
+        >>> water = hs.materials.parse_material("water").delta_beta(20.0)
+        >>> views = hs.Views.evenly_spaced(8, shape=(16, 16), pixel_size=1e-6)
+        >>> cells = hs.specimens.random_cells(1, box=(16e-6, 16e-6, 16e-6), seed=1)
+        >>> scene = hs.MeshScene.of_one_material(cells, water)
+        >>> scan = hs.simulate(scene, hs.Exposures.of(views, energy_kev=20.0, distance=0.05))
+        >>> result = hs.reconstruct(scan, hs.MaterialPrior.of_ratio(water.ratio), hs.Voxels())
+        >>> result.object.voxelise(hs.Grid.of_views(views)).delta.shape
+        (16, 16, 16)
+    """
 
     kind: ClassVar[str] = "voxels"
 

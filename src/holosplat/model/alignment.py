@@ -1,4 +1,4 @@
-"""Where beams really are: small corrections of planned exposures, as numbers that can be fitted."""
+"""Corrections of the planned exposures, as parameters that can be fitted."""
 
 from __future__ import annotations
 

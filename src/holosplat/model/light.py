@@ -1,4 +1,4 @@
-"""What the light adds to each frame: a smooth factor, as numbers that can be fitted."""
+"""The smooth light factor of each frame, as parameters that can be fitted."""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ class Model:
         return LineIntegrals.of_any(matter.project(self._views(index)))
 
     def pixels(self, index: Tensor | None = None) -> Poses:
-        """Where the beams of the exposures `index` are, on the detector's pixels."""
+        """Places of the beams of the exposures `index` on the detector's pixels."""
         return self._poses(self.instrument.detector, index)
 
     @property

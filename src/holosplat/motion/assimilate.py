@@ -53,7 +53,7 @@ class Assimilation:
     steps: int = 20
     """Of L-BFGS, at most."""
     curvature: bool = True
-    """Whether the curvature at the end says what the frames tell, where unknowns are few enough."""
+    """Whether to compute standard errors from the curvature at the end, where unknowns are few enough."""
 
     def __post_init__(self) -> None:
         at_least(self, 1, "steps", "oversample")
@@ -70,7 +70,7 @@ class Assimilation:
 
 @dataclass(frozen=True)
 class Assimilated:
-    """What frames say of a flow.
+    """A flow estimated from frames.
 
     unknowns: peak and modulus; told: standard errors after over those before, by name (1: nothing; absent: given, or
     not computed); meshes: the cells [m] at the first time; places: of each cell [T, Q, 3] [m] at the scan's times;
@@ -165,7 +165,7 @@ class _Fit:
         return found
 
     def misses(self, unknowns: Unknowns, nodes: Tensor) -> list[Tensor]:
-        """What is left of the frames of each time [V, H, W]."""
+        """Residuals of the frames of each time [V, H, W]."""
         found, unit = [], self.scan.views.finest
         for time, at, instrument in zip(self.scan.instants, self.ways(unknowns, nodes), self.instruments):
             vertices = torch.cat([self.model.frame.outside(one.places(x)) for one, x in zip(self.bound, at)])

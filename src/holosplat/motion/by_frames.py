@@ -43,11 +43,11 @@ def carry_by_frames(window: Window, train: Scan, oversample: int) -> tuple[Forec
     later = [own[1:] for own in later]
     pairs = zip(later, window.meshes(-1))
     left = np.array([normal_distance(TriangleMesh(own[0], seen.faces), seen) for own, seen in pairs])
-    return window.gone_on(later, left), _told(found, options, len(start))
+    return window.gone_on(later, left), _as_plain_numbers(found, options, len(start))
 
 
-def _told(found: Assimilated, options: Assimilation, cells: int) -> dict[str, float]:
-    """Plain numbers: peak and modulus, how well they are told, and how many unknowns there are where nobody asked."""
+def _as_plain_numbers(found: Assimilated, options: Assimilation, cells: int) -> dict[str, float]:
+    """Plain numbers: peak and modulus, their relative standard errors, and the number of chosen unknowns."""
     said = {"peak_m_s": float(found.unknowns.peak), "shear_n_m": float(found.unknowns.shear)}
     said |= {f"{name}_told": value for name, value in found.told.items()}
     said |= {"loss_before": found.losses[0], "loss_after": found.losses[1]}

@@ -1,7 +1,7 @@
-"""Matter that is no body, in motion: one volume for all times that a flow carries, begun around the middle time.
+"""Flow reconstruction: one volume for all times, carried by a flow, which starts around the middle time.
 
-Whether anything moves is asked first: where a flow beside the mean of all times explains frames, and hardly does so
-with the times in another order, it does. The flow begins steady, between the times next to the middle one, on voxels of
+First it tests for motion: there is motion if a flow explains frames better than the mean of all times does, and hardly
+with the times in another order. The flow begins steady, between the times next to the middle one, on voxels of
 two pixels. Then the window grows to all times, and the flow gets a higher degree in time and more cells, as long as
 frames that are held out for a moment are predicted better. At last the volume is fitted on voxels of a pixel, and
 Gaussians stand for it.
@@ -66,7 +66,7 @@ class CarriedOptions:
     cells: int = 4
     """Cells of the flow along the longest edge of the field, at first."""
     most_cells: int = 6
-    """At most, where held-out frames ask for more."""
+    """Upper limit, where held-out frames support more."""
     most_degree: int = 2
     """Highest degree of the flow in time."""
     steps: int = 6
@@ -102,7 +102,7 @@ class CarriedOptions:
 
 @dataclass(frozen=True)
 class Carried:
-    """What was found. object: the matter in motion; volume: of the reference time, on voxels; misfit: [T] χ² a pixel at
+    """The result. object: the matter in motion; volume: of the reference time, on voxels; misfit: [T] χ² a pixel at
     each time; history: what was tried, in words; timing: seconds by stage."""
 
     object: MovingGaussians
@@ -173,7 +173,7 @@ class Search:
         return gain > SURE**2 + AGAIN * chance
 
     def _still(self, u: Tensor) -> _State:
-        """Nothing moves, nothing fades."""
+        """The state without motion and fading."""
         flow = self.steady(self.options.cells)
         return _State(flow, u, Fading.none(flow.lattice) if self.options.fading > 0 else None)
 
@@ -215,12 +215,12 @@ class Search:
     def turns(self, problem: CarriedProblem, state: _State, rounds: int = 1) -> _State:
         """Flow, fading and volume in turns, each by `iterations`."""
         for _ in range(rounds):
-            state = self._moved(problem, state, self.options.iterations)
+            state = self._update_flow(problem, state, self.options.iterations)
             u, _ = descend(problem, state.u, self.options.iterations)
             state = replace(state, u=u)
         return state
 
-    def _moved(self, problem: CarriedProblem, state: _State, steps: int) -> _State:
+    def _update_flow(self, problem: CarriedProblem, state: _State, steps: int) -> _State:
         """`state` with a likelier flow, and then, where the problem is of all times, a likelier fading, which it takes,
         too: in a few times what moves may pass for what fades."""
         how, u, fading = self.options, state.u, state.fading
@@ -261,15 +261,15 @@ class Search:
 
     def run(self) -> Carried:
         """The whole way, from the middle time on."""
-        state = self._stepped("flow", self._begun)
+        state = self._run_stage("flow", self._initial_state)
         windows = self.windows()
         for n, window in enumerate(windows):
             self.task.on_progress("flow", n / (len(windows) + 3))
-            state = self._stepped("flow", lambda s=state, w=window: self.turns(self._whole(s, w), s))
+            state = self._run_stage("flow", lambda s=state, w=window: self.turns(self._whole(s, w), s))
         return self.finished(self.freer(state))
 
-    def _stepped(self, name: str, make: Callable[[], _State]) -> _State:
-        """What `make` finds, in the time of stage `name`; of steps that are done already, what the last one found."""
+    def _run_stage(self, name: str, make: Callable[[], _State]) -> _State:
+        """Run `make` and add its time to stage `name`; for finished steps, return the last result."""
         done, self._step = self._saved.get("steps", 0), self._step + 1
         if self._step <= done:
             return self._saved_state()
@@ -285,7 +285,7 @@ class Search:
             told = Fading(self._saved["fading"], lattice) if "fading" in self._saved else None
             return _State(Flow.from_state(self._saved["flow"]), self._saved["u"], told)
 
-    def _begun(self) -> _State:
+    def _initial_state(self) -> _State:
         return self._still(self.on(self.first(), self.factor))
 
     def _whole(self, state: _State, window: Sequence[int] | range) -> CarriedProblem:
@@ -301,17 +301,17 @@ class Search:
         return self.by_itself(merged(self.task.scan), "mean of all times")
 
     def freer(self, state: _State) -> _State:
-        """The state with the flow as free in time and space as held-out frames ask for."""
-        count, keep, how = len(self.times), self._kept(), self.options
+        """The state with as much freedom of the flow in time and space as held-out frames support."""
+        count, keep, how = len(self.times), self._training_mask(), self.options
         for change in freer_flows(self._extents, (how.cells, how.most_cells), min(how.most_degree, count - 2)):
-            state = self._stepped("flow", lambda s=state, c=change: self._changed(s, c, keep))
-        return self._stepped("flow", lambda: self.turns(self._whole(state, range(count)), state))
+            state = self._run_stage("flow", lambda s=state, c=change: self._try_freer_flow(s, c, keep))
+        return self._run_stage("flow", lambda: self.turns(self._whole(state, range(count)), state))
 
-    def _kept(self) -> np.ndarray:
+    def _training_mask(self) -> np.ndarray:
         """[T, V] bool: the frames that are not held out."""
         return kept_frames(len(self.times), len(self.frames.scans[0]), self.options.held_out, self.task.seed)
 
-    def _changed(self, state: _State, change: Change, keep: np.ndarray) -> _State:
+    def _try_freer_flow(self, state: _State, change: Change, keep: np.ndarray) -> _State:
         """The state with a freer flow, if that predicts the frames better that `keep` [T, V] leaves out."""
         wanted, count = change(state.flow), len(self.times)
         if wanted is None:
@@ -341,7 +341,7 @@ class Search:
 
     def finished(self, state: _State) -> Carried:
         """The state on voxels of a pixel, and the Gaussians that stand for it."""
-        state = self._stepped("volume", lambda: self._fine(state))
+        state = self._run_stage("volume", lambda: self._fit_fine_voxels(state))
         problem = self.problem(range(len(self.times)), 1, state)
         pixels = problem.count / len(self.times)
         misfit = [2 * one / pixels for one in problem.misfit(state.u)]
@@ -352,7 +352,7 @@ class Search:
     def _volume(self, u: Tensor, factor: int) -> VoxelGrid:
         return VoxelGrid(u[None], self._grid(factor), Matter.one(*self.frames.material))
 
-    def _fine(self, state: _State) -> _State:
+    def _fit_fine_voxels(self, state: _State) -> _State:
         """On voxels of a pixel: the volume, the flow by it, and once more the volume."""
         self.task.on_progress("volume", 0.0)
         wanted = self._long_enough(state)
@@ -361,7 +361,7 @@ class Search:
         for k, iterations in enumerate((wanted - wanted // 2, wanted // 2)):
             self.task.on_progress("volume", (k + 1) / 3)
             if k:
-                state = self._moved(problem, state, self.options.iterations // 2)
+                state = self._update_flow(problem, state, self.options.iterations // 2)
             state = replace(state, u=descend(problem, state.u, iterations)[0])
         return state
 
@@ -371,7 +371,7 @@ class Search:
     def _long_enough(self, state: _State) -> int:
         """Iterations of the volume on voxels of a pixel: as many as predict frames best that are held out, which the
         volume that they begin with is made to forget."""
-        keep, how = self._kept(), self.options
+        keep, how = self._training_mask(), self.options
         left = [int(k) for k in np.flatnonzero((~keep).any(1))]
         if not left or how.most_final <= how.final:
             return how.final

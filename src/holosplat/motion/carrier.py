@@ -1,8 +1,8 @@
-"""The velocity field of what carries bodies, which they share: what it costs to move otherwise, as the data decide.
+"""The prior of velocities: a field that bodies share, chosen by leave-one-out likelihood.
 
 The field is a `Flow`, `v = ∇ × A` of cubic B-splines, which has no divergence. It is one of a few families, of one
 cell: uniform, turning, a parabolic profile along the usual velocity, all that is linear and all that is quadratic in
-space; each steady, or changing evenly with time. Bodies move with it but for a scatter, which lasts (one is slower than
+space; each steady, or changing evenly with time. Bodies move with it up to a scatter, which lasts (one is slower than
 the fluid at its middle) or passes. Family and scatter are those under which velocities are likeliest as the
 other bodies predict them (leave one out), by a distribution with long tails (Student's). So bodies which follow no
 field leave the scatter large, one that goes its own way counts little, and the more freedom a family has the more it
@@ -82,7 +82,7 @@ FAMILIES = families()
 
 @dataclass(frozen=True)
 class Expected:
-    """What is expected of a field, and of bodies in it.
+    """The prior of a field, and of bodies in it.
 
     family: of the field; changes: whether with time; along, across, passing: standard deviations [pixels in the time of
     all frames] of a body's velocity about the field, of what lasts along the usual velocity and across it, and of
@@ -138,7 +138,7 @@ class Carrier:
         return places, length * np.einsum("nk,kbx->bnx", self.basis.weights(self.nodes, 1), centres)
 
     def fields(self, places: np.ndarray, expected: Expected) -> np.ndarray:
-        """Of the family at `places` [B, N, 3] of the nodes: [B, 3 N, F], or twice as many where it changes."""
+        """Basis fields of the family at the nodes `places` [B, N, 3]: [B, 3 N, F], twice as many where it changes."""
         powers = np.prod((places @ self.frame.T / (0.5 * self.lattice.cell / MARGIN))[..., None, :] ** POWERS, axis=-1)
         still = np.einsum("bnm,fcm,cx->bnxf", powers, FAMILIES[expected.family], self.frame)
         later = 2 * (self.nodes - self.basis.first) / (self.basis.last - self.basis.first) - 1
@@ -198,7 +198,7 @@ class Carrier:
         return likelihood(logs), meant(logs)
 
     def others(self, expected: Expected, fields: np.ndarray, speeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What each body's velocities [B, 3 N] are off by from what the others say, and the covariance of that
+        """Differences of each body's velocities [B, 3 N] from the others' prediction, and the covariance of that
         [B, 3 N, 3 N], its own scatter included (Rasmussen & Williams 2006, eq. 5.10 – 5.12, of blocks)."""
         count, each = len(speeds), speeds[0].size
         own, flat = expected.noise(self.frame[0], len(self.nodes)), fields.reshape(count * each, -1)
@@ -229,7 +229,7 @@ def _median(vectors: np.ndarray) -> np.ndarray:
 
 
 def _spread(speeds: np.ndarray) -> float:
-    """Of velocities [B, N, 3] about their mean, and something of their own, where all are alike."""
+    """Spread of velocities [B, N, 3] about their mean, with a least one where all are alike."""
     about, whole = (float(np.sqrt(np.square(one).mean())) for one in (speeds - speeds.mean((0, 1)), speeds))
     return max(about, 1e-3 * whole, 1e-9)
 
@@ -240,8 +240,7 @@ def _squares(away: np.ndarray, spreads: np.ndarray) -> np.ndarray:
 
 
 def _likelihoods(away: np.ndarray, spreads: np.ndarray) -> np.ndarray:
-    """[B], logarithms of Student's density of `away` [B, D] at the covariances `spreads` [B, D, D], but for a
-    constant."""
+    """Logarithms [B] of Student's density of `away` [B, D] at the covariances `spreads` [B, D, D], up to a constant."""
     size = away.shape[1]
     scale = gammaln(0.5 * (TAILS + size)) - gammaln(0.5 * TAILS) - 0.5 * np.linalg.slogdet(spreads)[1]
     return scale - 0.5 * (TAILS + size) * np.log1p(_squares(away, spreads) / TAILS)

@@ -95,7 +95,7 @@ class ChannelFrame:
 
 @dataclass(frozen=True)
 class Fitted:
-    """What a window says of the model.
+    """The model fitted to a window of times.
 
     unknowns: peak and modulus; told: standard errors of their logarithms over those before, by name (near 1: the window
     says nothing); wrong: velocity [C, 3] [m/s] and gradient [C, 3, 3] [1/s] of a flow beside; left: [C] m, along the
@@ -153,7 +153,7 @@ class CellModel:
         unknowns: Unknowns,
         wrong: tuple[Tensor, Tensor] | None = None,
     ) -> list[np.ndarray]:
-        """Of each of the surfaces `meshes` at `times[0]` the places [T, Q, 3] [m] at `times` [T] s.
+        """Run the model from the surfaces `meshes` at `times[0]`: places [T, Q, 3] [m] at `times` [T] s.
 
         wrong: velocity [C, 3] and gradient [C, 3, 3] of a flow beside, about each cell.
         """
@@ -179,11 +179,11 @@ class CellModel:
         with torch.no_grad():
             for wait in np.diff(times):
                 reach = LEAP * (float(unknowns.peak) * float(wait) + self.radius)
-                states.append(self._advanced(velocity, states[-1], float(wait), reach))
+                states.append(self._advance(velocity, states[-1], float(wait), reach))
         outward = self.frame.outward
         return [np.array([outward(one.places(at[cell]).numpy()) for at in states]) for cell, one in enumerate(bound)]
 
-    def _advanced(self, velocity: Velocity, nodes: Tensor, wait: float, reach: float) -> Tensor:
+    def _advance(self, velocity: Velocity, nodes: Tensor, wait: float, reach: float) -> Tensor:
         """Nodes later, in finer steps where the usual ones are too long: where a node moves beyond `reach` [m]."""
 
         def within(places: Tensor) -> Tensor:
@@ -238,7 +238,7 @@ class CellModel:
                 slopes.append([one.along(places) / np.log1p(change) for one, places in zip(compared, changed)])
                 widths[name] = 0.25 * float(np.log(high / low))
         speed = PRIOR * middle["peak"] if free else 0.0
-        values, errors, wrong, left = _solved(compared, slopes, list(widths.values()), (speed, self.radius))
+        values, errors, wrong, left = _solve(compared, slopes, list(widths.values()), (speed, self.radius))
         moved = {name: middle[name] * float(np.exp(value)) for name, value in zip(widths, values)}
         told = {name: error / width for (name, width), error in zip(widths.items(), errors)}
         return Fitted(Unknowns.of(**(middle | moved)), told, self._inward(wrong), left)
@@ -252,7 +252,7 @@ class CellModel:
 
 @dataclass(frozen=True)
 class _Compared:
-    """What a cell's surface says of the model: missed [T, Q] [m] along normals, root weights [Q], and what a velocity
+    """A cell's surface compared with the model: missed [T, Q] [m] along normals, root weights [Q], and what a velocity
     and a gradient beside would change [T, Q, 12] [m per m/s, per 1/s]."""
 
     said: np.ndarray
@@ -277,7 +277,7 @@ class _Compared:
         return ((places[1:] - self.said[1:]) * self.normals).sum(2)
 
 
-def _solved(
+def _solve(
     compared: Sequence[_Compared], slopes: list[list[np.ndarray]], widths: list[float], beside: tuple[float, float]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The likeliest values of the common unknowns and their standard errors, the flows beside [C, 12], and what is left

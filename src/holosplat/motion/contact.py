@@ -1,4 +1,4 @@
-"""That bodies do not lie in each other: what the overlap of their surfaces costs, on pairs that are close alone."""
+"""The penalty for overlap of bodies, on pairs whose surfaces are close."""
 
 from __future__ import annotations
 

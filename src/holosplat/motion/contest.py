@@ -1,4 +1,4 @@
-"""Whether what two beams show are red cells: bodies are followed as such, and as bodies of any shape.
+"""Model comparison for two beams: bodies tracked as red cells, and as bodies of any shape.
 
 Two beams leave shapes open, and bodies of unknown shape stay poor in them, while red cells are found by their shape at
 rest. Where a network that knows red cells alone guesses bodies that frames do not contradict, cells of that size are
@@ -38,7 +38,7 @@ class Parts:
         return Part(self, name)
 
     def load(self, name: str) -> Mapping[str, Any] | None:
-        """What was saved last of one of them."""
+        """Load the last saved state of one of them."""
         return self._states.get(name)
 
     def save(self, name: str, state: Mapping[str, Any]) -> None:
@@ -54,7 +54,7 @@ class Part:
         self._parts, self._name = parts, name
 
     def load(self) -> Mapping[str, Any] | None:
-        """What was saved last; None at the beginning."""
+        """Load the last saved state; None at the beginning."""
         return self._parts.load(self._name)
 
     def save(self, state: Mapping[str, Any]) -> None:
@@ -85,7 +85,7 @@ def cells_or_any(cells: Following, other: Following) -> Followed:
 
 
 def residual(of: Following) -> float:
-    """What its bodies leave of the frames, over their contrast, root mean squares."""
+    """Residual of the frames over their contrast, root mean squares."""
     assert of.bodies is not None
     frames = of.train.frames
     left = frames - predicted(of.train, of.bodies, of.oversample)

@@ -28,7 +28,7 @@ ALIKE = 0.3
 STRETCHED = 1.15
 """Area of a cell over that of a resting one of its volume, at most: membranes tear at less, and tracks are rough."""
 GOING_ON = PathForecast()
-"""How paths go on unless it is said."""
+"""The usual options of forecasts."""
 PEAK = 0.04
 """How far the peak may be from that which the bodies' velocities say, as a share."""
 
@@ -66,7 +66,7 @@ class DynamicsForecast:
 
 @dataclass(frozen=True)
 class Window:
-    """What mechanics begin with. bodies: fitted to the frames; past: last times [P] s; every: the last one and those
+    """State where mechanics begin. bodies: fitted to the frames; past: last times [P] s; every: the last one and those
     ahead [N + 1] s; seen: places of each body [P, Q, 3] [m]; spread: [P, B] m, of these; base: as paths go on; cells:
     numbers of the bodies that are whole cells in the channel; model: of these; peak: its range [m/s]."""
 
@@ -133,7 +133,7 @@ def window_of(
     paths: PathForecast = GOING_ON,
     halves: Halves | None = None,
 ) -> Window:
-    """What mechanics begin with, as of `carry`."""
+    """Initial state of the mechanics, as of `carry`."""
     known = paths.times(times)
     past = known[-1 - min(options.back, max(1, len(known) // 3)) :]
     seen, spread = smoothed(bodies, known, past, paths, halves)
@@ -171,7 +171,7 @@ def whole_cells(meshes: list[TriangleMesh], frame: ChannelFrame) -> list[int]:
 def _peak(
     model: CellModel, bodies: MovingSurfaces, cells: list[int], window: np.ndarray, options: DynamicsForecast
 ) -> Range:
-    """The range of the peak [m/s]: what is said, or about what the cells' velocities say."""
+    """The range of the peak [m/s]: as given, or about that of the cells' velocities."""
     if options.peak[1] > 0:
         return options.peak
     places, speeds = list[np.ndarray](), list[np.ndarray]()

@@ -1,4 +1,4 @@
-"""What it costs to deform bodies of known rest shape: the elastic energy of their membranes, in likelihoods.
+"""Elastic energy of bodies of known rest shape as a prior: that of their membranes, in likelihoods.
 
 Frames decide what they can see of a shape; what they cannot see, the rest shape decides. The membrane is that of
 `specimens.membrane`: Skalak's shear and dilation, bending of its edges, its whole area. Moduli go with the body's size,
@@ -51,7 +51,7 @@ class Elastic:
 
 @dataclass(frozen=True)
 class Rest:
-    """What is known of the shape of all bodies. elastic: their energy, lengths in the unit of their paths; stiffness:
+    """The known shape of all bodies at rest. elastic: their energy, lengths in the unit of their paths; stiffness:
     minus the logarithm of the probability of a unit of it."""
 
     elastic: Elastic
@@ -59,7 +59,7 @@ class Rest:
 
     @classmethod
     def of(cls, shape: TriangleMesh, stiffness: float, unit: float) -> Rest:
-        """Of bodies whose shape at rest is the mesh `shape` [m], on paths in `unit` [m]."""
+        """Prior of bodies whose shape at rest is the mesh `shape` [m], on paths in `unit` [m]."""
         return cls(Elastic(TriangleMesh(shape.vertices / unit, shape.faces, shape.name)), stiffness)
 
 

@@ -50,7 +50,7 @@ class MotionFit:
     pairs: int = 0
     """Pairs of steps that L-BFGS remembers, whose steps look at all frames (0: steps are Adam's)."""
     worth: Weight = 5.0
-    """Log-likelihood that a step of L-BFGS must gain for the fit to go on [nats], in the mean over ten."""
+    """Least log-likelihood gain of a step of L-BFGS [nats], averaged over ten, for the fit to continue."""
     stiffness: Weight = 10.0
     """How far a vertex draws its neighbours along, λ of Nicolet et al. (2021)."""
     acceleration: float = 1e-6
@@ -60,7 +60,7 @@ class MotionFit:
     area_kept: Weight = 0.03
     """The same of its area: red cells in flow change theirs by 1 to 5 % (0: areas are free)."""
     apart: Weight = 0.2
-    """How deep bodies may lie in each other, a standard deviation [pixels] (0: as they like)."""
+    """How deep bodies may lie in each other, a standard deviation [pixels] (0: unconstrained)."""
     carrier: Weight = 0.0
     """Weight of a velocity field that bodies share, whose scatter their velocities tell (1: as probabilities have it;
     0: none). Off, for frames that see bodies tell their velocities better than any field."""
@@ -86,9 +86,9 @@ def motion_fit(
     light: Light | None = None,
     rest: Rest | None = None,
 ) -> Fit:
-    """The fit of the paths of `start` to the training frames of `scan`, of any number of times, made ready.
+    """Prepare the fit of the paths of `start` to the training frames of `scan`, of any number of times.
 
-    rest: what is known of the bodies' shape at rest.
+    rest: the known shape of bodies at rest.
 
     Steps are Adam's, of one length for all vertices, or those of L-BFGS, in coordinates in which neighbours move
     together (Nicolet et al. 2021) and in which times count alike: the paths' Gram matrix over the times is one.
@@ -145,7 +145,7 @@ def _at_rest(base: Ground, start: MovingSurfaces, rest: Rest | None) -> list[Ter
 
 
 def _of_likelihood(base: Ground) -> float:
-    """What a unit of minus the logarithm of a probability is in units of the loss of frames.
+    """A unit of minus the logarithm of a probability, in units of the loss of frames.
 
     That is the mean over N pixels of √(r² + c²) - c, about r²/2c, while it should be the sum of r²/2σ²: σ²/(c N).
     """

@@ -45,10 +45,10 @@ AFTER_SOFT = {"soft": "twins", "soft again": "halves"}
 
 @dataclass(frozen=True)
 class Followed:
-    """What was found. bodies: on their paths; records: of the steps of all fits; oversample: wave samples a pixel
+    """The tracked bodies. bodies: on their paths; records: of the steps of all fits; oversample: wave samples a pixel
     in these; timing: seconds of each stage; found: how many bodies each time shows by itself; halves: the bodies by
     halves of the frames, two and two, empty without intervals; rest: their shape at rest [m], if that is known; begun:
-    what showed the bodies of single times, in words; body: what is known of their shape, told or found."""
+    the detection method at single times, in words; body: their known shape, given or found."""
 
     bodies: MovingSurfaces
     records: list[Record]
@@ -63,7 +63,7 @@ class Followed:
 
 @dataclass
 class Following:
-    """What has been done so far, and what is next: sightings, then stiff fits and looks beside their bodies in turn,
+    """Tracking stage by stage: sightings, then stiff fits and looks beside their bodies in turn,
     then paths, the soft fit, and fits to halves of the frames."""
 
     train: Scan
@@ -136,7 +136,7 @@ class Following:
             self.advance()
 
     def followed(self, said: str = "") -> Followed:
-        """What was found; said: of what the bodies are, beside what showed them."""
+        """The tracked bodies; said: a sentence on their kind."""
         assert self.bodies is not None
         told = self.records, self.oversample, self.timing, tuple(self.counts), tuple(self.halves)
         return Followed(self.bodies, *told, self.shape_at_rest(), self.guess + said, self.options.body)
@@ -198,7 +198,7 @@ class Following:
             self.stage = "done"
 
     @contextmanager
-    def _timed(self, name: str) -> Iterator[None]:
+    def _record_time(self, name: str) -> Iterator[None]:
         """Of what is done in steps; they are kept where Ctrl-C comes between."""
         began = time.perf_counter()
         try:
@@ -209,12 +209,12 @@ class Following:
         self.timing[name] = self.timing.get(name, 0.0) + time.perf_counter() - began
 
     def network(self) -> Guess | None:
-        """What guesses the volumes of single times: asked at the time in the middle."""
+        """The network that guesses the volumes of single times, tested at the middle time."""
         if self.options.learned is None:
             return None
         at = self.train.at_instant(len(self.train.instants) // 2)
         how = (self.options.sightings, self.options.learned)
-        with self._timed("sightings"):
+        with self._record_time("sightings"):
             found, decision = network_for(at, self.material, *how, lambda stage, part: None)
         self.guess = decision.line
         return found
@@ -226,7 +226,7 @@ class Following:
         """
         how = replace(self.options.sightings, level=level * self.options.sightings.level)
         times, found = frames.instants, list[list[Sighting]]()
-        with self._timed("sightings"):
+        with self._record_time("sightings"):
             for t in range(len(times)):
                 self.on_progress("bodies at each time", t / len(times), {})
                 found += to_sightings([self._steps.of(lambda t=t: self._look_at(frames.at_instant(t), how, network))])
@@ -243,27 +243,27 @@ class Following:
         if options.body is not None:
             begun = None
             with suppress(InputError):  # no track
-                begun = self._sighted(basis)
-            posed = self._posed(options.body, basis, begun=begun)
+                begun = self._detect(basis)
+            posed = self._search_poses(options.body, basis, begun=begun)
             if posed is None:
                 raise InputError(
                     f"no body of the shape {options.body.shape} was found in the frames; check its size, the material "
                     "and the pixel size, or leave --body."
                 )
             return posed
-        found = self._sighted(basis)
+        found = self._detect(basis)
         assert found is not None
         sure = sure_ones(found, self.train.views, times)
         return found if options.rounds == 0 or len(sure) == found.count else only(found, sure)
 
-    def _sighted(self, basis: TimeBasis) -> MovingSurfaces | None:
+    def _detect(self, basis: TimeBasis) -> MovingSurfaces | None:
         """The bodies of single times on first paths; None where none were looked for."""
         times, pixel = self.train.instants, self.train.views.finest
         return first_paths(self.seen, times, basis, pixel, self.material, self.options.links) if self.seen else None
 
     @property
     def rest(self) -> Rest | None:
-        """What is known of the bodies' shape."""
+        """The known shape of the bodies."""
         body = self.options.body
         return None if body is None else at_rest(body, self.train.views.finest, self.size)
 
@@ -274,7 +274,7 @@ class Following:
         mesh = rest.elastic.membrane.mesh
         return TriangleMesh(self.train.views.finest * mesh.vertices, mesh.faces, "rest")
 
-    def _posed(
+    def _search_poses(
         self,
         body: KnownBody,
         basis: TimeBasis,
@@ -282,7 +282,7 @@ class Following:
         begun: MovingSurfaces | None = None,
     ) -> MovingSurfaces | None:
         """Bodies of known shape beside `known` ones, on first paths; a search may begin with `begun` ones."""
-        with self._timed("poses"):
+        with self._record_time("poses"):
             self._search = self._search or KnownBodies(self.train, self.material, body, self.size)
             found = self._search.bodies(
                 basis, known, begun, self.seed, lambda share: self.on_progress("poses", share, {}), self._steps
@@ -298,7 +298,7 @@ class Following:
         """`bodies`, and those that frames show beside them; None where there are none."""
         times = self.train.instants
         if self.options.body is not None:
-            new = self._posed(self.options.body, bodies.basis, bodies)
+            new = self._search_poses(self.options.body, bodies.basis, bodies)
             own = [] if new is None else apart(new, bodies, times)
             return joined(bodies, only(new, own)) if new is not None and own else None
         found = self.look(beside(self.train, bodies, self.oversample), self.options.fainter)
@@ -320,14 +320,14 @@ class Following:
             return bodies
         how = (self.options.stiff, self.options.soft, self.oversample, self.seed, self.light, self._steps)
         trials = Trials(self.train, self.rest, *how)
-        with self._timed("twins"):
+        with self._record_time("twins"):
             return chosen_twins(bodies, trials, lambda share: self.on_progress("twins", share, {}))
 
     def on_chosen_paths(self, bodies: MovingSurfaces) -> MovingSurfaces:
-        """`bodies` on paths of as many pieces as frames ask for."""
+        """`bodies` on paths of as many pieces as the frames support."""
         how = (self.options.paths, self.options.stiff, self.seed, self.light, self.rest)
         self.on_progress("paths", 0.0, {})
-        with self._timed("paths"):
+        with self._record_time("paths"):
             return chosen_paths(self.train, bodies, *how, steps=self._steps)
 
     def fitted(

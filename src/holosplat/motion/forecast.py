@@ -1,4 +1,4 @@
-"""Bodies beyond the last frames: paths that go on, each part of the motion as far as the frames tell it."""
+"""Forecasts of bodies beyond the last frames: each part of the motion is extrapolated as far as it is determined."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class PathForecast:
 
 @dataclass(frozen=True)
 class Forecast:
-    """What is expected after the last frames.
+    """A forecast after the last frames.
 
     bodies: on paths from the last frames' time on; times: [N] s of the forecast; band: [N, B] m, standard error of each
     body's surface along its normals (rms over it), NaN where nothing tells it.
@@ -98,7 +98,7 @@ def on_paths(bodies: MovingSurfaces, times: np.ndarray, places: Places) -> Movin
 
 
 def places_of(bodies: MovingSurfaces, times: np.ndarray) -> Places:
-    """Where the vertices of each body are on their paths."""
+    """Places of the vertices of each body on their paths."""
     whole = np.array([along(bodies.basis, bodies.coefficients.detach(), float(time)).numpy() for time in times])
     return [bodies.unit_length * whole[:, bodies.body(k)[0].numpy()] for k in range(bodies.count)]
 
@@ -181,7 +181,7 @@ def _of_volume(vertices: np.ndarray, faces: np.ndarray, volume: float) -> np.nda
 def _backtest(
     bodies: MovingSurfaces, times: np.ndarray, options: PathForecast, halves: Halves | None
 ) -> tuple[np.ndarray, float]:
-    """What a forecast of the last time from the first two thirds misses of each body [B] m beyond its noise, together
+    """Error of a forecast of the last time from the first two thirds for each body [B] m beyond its noise, together
     with the median of all, and how far ahead it looked, in its own windows; NaN for fewer times than it needs."""
     early = times[: (2 * len(times) + 2) // 3]
     if len(early) <= options.degree or len(early) == len(times):

@@ -40,7 +40,7 @@ def of_degree(flow: Flow, degree: int) -> Flow:
 
 
 def on_lattice(flow: Flow, lattice: Lattice) -> Flow:
-    """About the same flow on another lattice: potentials agree in the mean square along each axis."""
+    """The least-squares approximation of the same flow on another lattice, along each axis."""
     matrices = []
     for axis in range(3):
         count, first, cell = lattice.counts[2 - axis], lattice.first[axis], lattice.cell

@@ -37,7 +37,7 @@ def network_for(
 
 
 def missed_by_bodies(values: Tensor, found: Guessed, level: float) -> Score:
-    """Of the thickness that the network saw and full bodies do not explain.
+    """Relative residual of the thickness that the network saw, with full bodies.
 
     values: [Z, Y, X] on the voxels of `found`, of which what is above `level` is full
     """

@@ -20,7 +20,7 @@ from .halves import astray, tell_shapes
 LEAST = 8
 """Times from which on halves of them still tell the paths of the whole."""
 USUAL = MotionFit()
-"""How halves are fitted unless it is said."""
+"""The usual options of fits to halves."""
 
 
 def half_sets(
@@ -35,10 +35,10 @@ def half_sets(
 ) -> Halves:
     """`bodies`, fitted to the frames `train` of all times, fitted on to those of every other time, both halves of them.
 
-    A path is told by times before and after, so that each half tells it nearly as the whole does, with noise of its
-    own. Of fewer views than tell shapes the halves begin with shapes that are astray, as those of standard errors do
-    (`halves.astray`), but at the same middles. light: of the frames, which were divided by it; rest: what is known of
-    the bodies' shape at rest. Errors: `InputError` for fewer than 8 times.
+    Times before and after determine a path, so that each half gives nearly the path of the whole, with independent
+    noise. If views are too few for shapes, the halves begin with perturbed shapes, as those of standard errors do
+    (`halves.astray`), but at the same middles. light: of the frames, which were divided by it; rest: the known shape of
+    the bodies. Errors: `InputError` for fewer than 8 times.
     """
     times = train.instants
     require(

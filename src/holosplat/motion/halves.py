@@ -67,7 +67,7 @@ def astray(bodies: MovingSurfaces, seed: int, side: int) -> MovingSurfaces:
 
 
 def standard_errors(bodies: MovingSurfaces, halves: Sequence[MovingSurfaces], scan: Scan) -> Mapping[str, np.ndarray]:
-    """By the name of a column, [T, B] standard errors of `bodies` at the times of `scan`; empty without `halves`.
+    """Standard errors [T, B] of `bodies` at the times of `scan`, by column; empty without `halves`.
 
     halves: bodies by the one and the other half of a split, split after split. The square of an error is the mean over
     splits of a quarter of the squared difference, in equal parts of the body at that time, and of all bodies at all

@@ -40,7 +40,7 @@ class Seen:
 @dataclass(frozen=True)
 @ranged
 class LinkOptions:
-    """What two sightings of one body have in common."""
+    """Options for linking detections into tracks."""
 
     gate: float = 0.8
     """A body is looked for within so many radii of where its velocity leads."""
@@ -62,9 +62,9 @@ Track = tuple[int, ...]
 
 def identified(seen: Sequence[Seen], times: np.ndarray, options: LinkOptions = LinkOptions()) -> list[Track]:
     """The tracks of all bodies among the sightings `seen` at `times` [T] s, the longest first."""
-    tracks = _stitched(_chains(seen, times, options), seen, times, options)
+    tracks = _join_gaps(_chains(seen, times, options), seen, times, options)
     tracks = sorted(tracks, key=lambda track: (-len(track), track))
-    return [track for track in _alone(tracks, seen, times) if _believed(track, seen, options)]
+    return [track for track in _drop_duplicates(tracks, seen, times) if _is_accepted(track, seen, options)]
 
 
 def velocity(track: Track, seen: Sequence[Seen], times: np.ndarray, flow: np.ndarray, late: bool) -> np.ndarray:
@@ -103,7 +103,7 @@ def _chains(seen: Sequence[Seen], times: np.ndarray, options: LinkOptions) -> li
         open_ones: list[Track] = []
         for t in range(len(times)):
             new = [k for k, one in enumerate(seen) if one.time == t]
-            pairs = _matched(open_ones, new, seen, times, flow, options)
+            pairs = _match(open_ones, new, seen, times, flow, options)
             linked = {new[j]: open_ones[i] for i, j in pairs}
             found += [track for i, track in enumerate(open_ones) if i not in {i for i, _ in pairs}]
             open_ones = [(*linked.get(k, ()), k) for k in new]
@@ -112,7 +112,7 @@ def _chains(seen: Sequence[Seen], times: np.ndarray, options: LinkOptions) -> li
     return found
 
 
-def _matched(
+def _match(
     tracks: Sequence[Track],
     new: Sequence[int],
     seen: Sequence[Seen],
@@ -130,15 +130,15 @@ def _matched(
             away = np.linalg.norm(last.centre + speed * (times[one.time] - times[last.time]) - one.centre)
             if away <= options.gate * max(last.reach, one.reach) and _alike(last, one, options):
                 cost[i, j] = away
-    return _assigned(cost)
+    return _assign(cost)
 
 
-def _assigned(cost: np.ndarray) -> list[tuple[int, int]]:
+def _assign(cost: np.ndarray) -> list[tuple[int, int]]:
     rows, columns = linear_sum_assignment(cost)
     return [(int(i), int(j)) for i, j in zip(rows, columns) if cost[i, j] < FAR]
 
 
-def _stitched(tracks: list[Track], seen: Sequence[Seen], times: np.ndarray, options: LinkOptions) -> list[Track]:
+def _join_gaps(tracks: list[Track], seen: Sequence[Seen], times: np.ndarray, options: LinkOptions) -> list[Track]:
     """Tracks joined over gaps of at most `gap` times, where the one's velocity leads to the other and back."""
     flow = drift(tracks, seen, times)
     while True:
@@ -146,7 +146,7 @@ def _stitched(tracks: list[Track], seen: Sequence[Seen], times: np.ndarray, opti
         for i, before in enumerate(tracks):
             for j, after in enumerate(tracks):
                 cost[i, j] = _gap_cost(before, after, seen, times, flow, options)
-        pairs = _assigned(cost)
+        pairs = _assign(cost)
         if not pairs:
             return tracks
         i, j = min(pairs, key=lambda pair: cost[pair])
@@ -168,7 +168,7 @@ def _gap_cost(
     return away if away <= options.gate * max(last.reach, first.reach) else FAR
 
 
-def _alone(tracks: Sequence[Track], seen: Sequence[Seen], times: np.ndarray) -> list[Track]:
+def _drop_duplicates(tracks: Sequence[Track], seen: Sequence[Seen], times: np.ndarray) -> list[Track]:
     """Tracks without those that are where longer ones already are: mergers and fragments of these."""
     kept, flow = list[Track](), drift(tracks, seen, times)
     for track in tracks:
@@ -188,7 +188,7 @@ def _holds(track: Track, number: int, seen: Sequence[Seen], times: np.ndarray, f
 
 
 def place_at(track: Track, time: int, seen: Sequence[Seen], times: np.ndarray, flow: np.ndarray) -> np.ndarray:
-    """Where a track is [3] [m] at a time: between its sightings on straight lines, beyond by its last velocity."""
+    """Place [3] [m] of a track at a time: between its detections on straight lines, beyond by its last velocity."""
     own = [seen[k] for k in track]
     if time > own[-1].time:
         return own[-1].centre + velocity(track, seen, times, flow, True) * (times[time] - times[own[-1].time])
@@ -198,5 +198,5 @@ def place_at(track: Track, time: int, seen: Sequence[Seen], times: np.ndarray, f
     return np.array([np.interp(times[time], when, [one.centre[axis] for one in own]) for axis in range(3)])
 
 
-def _believed(track: Track, seen: Sequence[Seen], options: LinkOptions) -> bool:
+def _is_accepted(track: Track, seen: Sequence[Seen], options: LinkOptions) -> bool:
     return len(track) >= options.least or any(seen[k].cut for k in track)

@@ -1,4 +1,4 @@
-"""Where a run of `follow` is kept while it goes on, so that it can be taken up again."""
+"""Storage of a run of `follow` in progress, so that it can be resumed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class Journal(Protocol):
     """Keeps the last state of a run: tensors, and plain values."""
 
     def load(self) -> Mapping[str, Any] | None:
-        """What was saved last; None at the beginning."""
+        """Load the last saved state; None at the beginning."""
         ...
 
     def save(self, state: Mapping[str, Any]) -> None:
@@ -27,7 +27,7 @@ class Nowhere:
     """Keeps nothing."""
 
     def load(self) -> None:
-        """Nothing."""
+        """Load nothing."""
 
     def save(self, state: Mapping[str, Any]) -> None:
         """Forget it."""
@@ -50,7 +50,7 @@ def from_sightings(found: Sequence[Sequence[Sighting]]) -> list[list[dict[str, A
 
 
 def to_sightings(saved: Sequence[Sequence[Mapping[str, Any]]]) -> list[list[Sighting]]:
-    """What `from_sightings` was given."""
+    """The inverse of `from_sightings`."""
     return [
         [
             Sighting(TriangleMesh(one["vertices"].numpy(), one["faces"].numpy(), one["name"]), bool(one["cut"]))

@@ -31,7 +31,7 @@ class KnownBodies:
     """The search for bodies of `body`'s rest shape in the training frames of a scan, of views of one pixel size."""
 
     def __init__(self, train: Scan, material: DeltaBeta, body: KnownBody, size: float = 1.0) -> None:
-        """size: of all bodies, beside what is said of it."""
+        """size: of all bodies, relative to the given one."""
         times, self.pixel = train.instants, train.views.pixel_size
         self.material, self.body, self.size = material, body, size
         self.first, self.last = float(times[0]), float(times[-1])
@@ -97,7 +97,7 @@ def poses_like(bodies: MovingSurfaces, rest: TriangleMesh, ends: tuple[float, fl
 
 
 def at_rest(body: KnownBody, pixel: float, size: float) -> Rest:
-    """What is known of the shape of all bodies that are `size` times as large as `body`, on paths in `pixel` [m]."""
+    """The known shape of bodies that are `size` times as large as `body`, on paths in `pixel` [m]."""
     return Rest(Elastic(sized(body.mesh(pixel), size)), body.stiffness)
 
 
@@ -122,14 +122,14 @@ def drift(seen: Shadows) -> np.ndarray:
         pause = float(np.median(np.diff(seen.times[own])))
         pairs = [(i, j) for i, j in pairwise(own) if abs(seen.times[j] - seen.times[i] - pause) < 0.2 * pause]
         rows.append(seen.rotations[own[0], :2].numpy())
-        moves.append(_moved(seen, pairs) / pause)
+        moves.append(_displacements(seen, pairs) / pause)
     if not rows:
         return np.zeros(3)
     return np.linalg.lstsq(np.concatenate(rows), np.concatenate(moves), rcond=1e-6)[0]
 
 
-def _moved(seen: Shadows, pairs: Sequence[tuple[int, int]]) -> np.ndarray:
-    """By how many pixels (x, y) what is seen moves from the first to the second frame of each pair."""
+def _displacements(seen: Shadows, pairs: Sequence[tuple[int, int]]) -> np.ndarray:
+    """Displacement (x, y) [pixels] from the first to the second frame of each pair."""
     size = tuple(2 * n for n in seen.shape)
     total = np.zeros(size)
     for i, j in pairs:

@@ -20,8 +20,8 @@ class Measures:
 
     Centre and velocity are the volume's; half axes a ≥ b ≥ c those of the ellipsoid with the same second moments, n the
     direction of the shortest (of either sign); elongation (a - b)/(a + b), deformation (a - c)/(a + c) (Taylor 1934);
-    spin the angular velocity of the rigid motion nearest to that of the vertices, which frames tell as far as a turn
-    changes what is seen; in_field the part of the vertices that some frame of that time sees.
+    spin the angular velocity of the rigid motion nearest to that of the vertices, which is determined as far as a
+    rotation changes frames; in_field the part of the vertices that some frame of that time sees.
     """
 
     time_s: float
@@ -54,7 +54,7 @@ def columns() -> list[str]:
 
 
 def measured(bodies: MovingSurfaces, exposures: Exposures) -> Iterator[Measures]:
-    """Of every body at each time of the `exposures`: one time after the other, and then by body."""
+    """Measure every body at each time of the `exposures`, ordered by time, then by body."""
     for time in np.unique(exposures.time):
         speeds, views = bodies.velocities(float(time)), exposures.views[exposures.time == time]
         for number, (mesh, speed) in enumerate(zip(bodies.bodies(float(time)), speeds)):
@@ -62,7 +62,7 @@ def measured(bodies: MovingSurfaces, exposures: Exposures) -> Iterator[Measures]
 
 
 def measure(mesh: TriangleMesh, speed: np.ndarray, time: float, number: int, views: Views) -> Measures:
-    """Of one body whose vertices have the velocities `speed` [P, 3] [m/s]; views: those of its time."""
+    """Measure one body whose vertices have the velocities `speed` [P, 3] [m/s]; views: those of its time."""
     volume, centre, second = moments(mesh)
     values, axes = np.linalg.eigh(second / volume)
     c, b, a = np.sqrt(5 * np.maximum(values, 0))
@@ -79,7 +79,7 @@ def row(of: Measures) -> list[str]:
 
 
 def area(mesh: TriangleMesh) -> float:
-    """Of the surface [m²]."""
+    """Area of the surface [m²]."""
     return float(np.linalg.norm(_normals(mesh), axis=1).sum())
 
 
@@ -94,7 +94,7 @@ def volume_velocity(mesh: TriangleMesh, speed: np.ndarray) -> np.ndarray:
 
 
 def angular_velocity(mesh: TriangleMesh, speed: np.ndarray) -> np.ndarray:
-    """ω [3] [rad/s] of the rigid motion nearest to the velocities `speed` [P, 3], in the mean square of the surface."""
+    """Angular velocity [3] [rad/s] of the rigid motion nearest to the velocities `speed` [P, 3] on the surface."""
     weights = np.bincount(mesh.faces.ravel(), np.repeat(np.linalg.norm(_normals(mesh), axis=1) / 3, 3))
     weights = weights / weights.sum()
     arms, speeds = (values - weights @ values for values in (mesh.vertices, speed))

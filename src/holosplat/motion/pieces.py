@@ -29,7 +29,7 @@ class PathOptions:
     degree: int = 2
     """Of the polynomials of time: 2 leaves 0.002 µm of the paths of flowing cells over 16 times."""
     pieces: int = 0
-    """Pieces of their splines (0: as many as the frames ask for)."""
+    """Pieces of their splines (0: chosen from the data)."""
     most_pieces: int = 8
     """At most, where frames are asked."""
     held_out: int = 5
@@ -104,7 +104,7 @@ def refined(start: MovingSurfaces, pieces: int) -> MovingSurfaces:
 
 
 def _errors(held_out: Scan, found: MovingSurfaces, oversample: int) -> torch.Tensor:
-    """Mean square [V] of what is left of each held-out frame."""
+    """Mean square residual [V] of each held-out frame."""
     said, measured = Prediction(found, held_out.exposures, oversample), torch.from_numpy(held_out.frames)
     with torch.no_grad():
         left = [float((said.view(v).frames()[0] - one).square().mean()) for v, one in enumerate(measured)]

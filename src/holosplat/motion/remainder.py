@@ -1,4 +1,4 @@
-"""What frames show beside bodies that are known, and bodies that are found there."""
+"""Detection of further bodies in the residual of the known ones."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def only(bodies: MovingSurfaces, numbers: Sequence[int]) -> MovingSurfaces:
 def apart(new: MovingSurfaces, known: MovingSurfaces, times: np.ndarray) -> list[int]:
     """Numbers of `new` bodies that are bodies of their own beside `known` ones.
 
-    Their centres lie `CENTRES` of the larger radius away from all of these, in the mean over times; and they are either
+    Their centres lie `CENTRES` of the larger radius away from all of these, averaged over times; and they are either
     `PART` of the median volume of these, at least, or touch none: small pieces at the surface of a body correct its
     shape, which the next fit does better.
     """

@@ -30,7 +30,7 @@ class Sighting:
 
     @property
     def volume(self) -> float:
-        """What is seen of it [m³]."""
+        """The visible volume [m³]."""
         return self.mesh.volume
 
     @property

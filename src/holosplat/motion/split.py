@@ -1,9 +1,9 @@
-"""The motion of a body in parts that frames tell well or poorly: its place, its turn, its stretch, and the rest.
+"""The motion of a body in parts of different accuracy: translation, rotation, strain, and the rest.
 
 The places of a body's vertices are x(t) = c(t) + R(t) (1 + A(t)) X + R(t) d(t): X are those of a reference time about
 their middle, R is the turn that fits best (Kabsch 1976, Acta Cryst. A 32, 922), A the linear map that fits best of
-what is left, d the rest. Each part is a polynomial of time, in Legendre's polynomials on the window: what they say
-apart from each other is right in the mean square, so that each can be believed to its own degree.
+what is left, d the rest. Each part is a polynomial of time, in Legendre's polynomials on the window: its
+coefficients are independent least-squares estimates, so that each has an accuracy of its own.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Window:
         return 2 * (np.asarray(times, dtype=np.float64) - self.first) / (self.last - self.first) - 1
 
     def coefficients(self, times: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """[D + 1, …] of the polynomials nearest to `values` [T, …] at `times` [T], in the mean square."""
+        """Least-squares coefficients [D + 1, …] of polynomials through `values` [T, …] at `times` [T]."""
         flat = np.reshape(values, (len(times), -1))
         found = legendre.legfit(self.scaled(times), flat, min(self.degree, len(times) - 1))
         full = np.zeros((self.degree + 1, flat.shape[1]))

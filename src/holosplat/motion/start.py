@@ -13,7 +13,7 @@ from .identities import LinkOptions, Seen, Track, drift, identified
 from .sightings import Sighting
 
 USUAL = LinkOptions()
-"""How sightings are linked unless it is said."""
+"""The usual options of linking detections."""
 SURE = 3
 """Whole sightings from which a track's own velocity is believed; with fewer it is that of the flow."""
 BENT = 6
@@ -53,7 +53,7 @@ def first_paths(
 
 
 def best_sighting(track: Track, seen: Sequence[Seen]) -> int:
-    """Of a track: whole if any is, and then that of the middle volume; else the largest."""
+    """The best detection of a track: of the whole ones that of median volume; else the largest."""
     whole = [k for k in track if not seen[k].cut]
     if not whole:
         return max(track, key=lambda k: seen[k].volume)

@@ -1,4 +1,4 @@
-"""What surfaces in motion cost beside what frames say: bending of surfaces and of paths, and changes of size."""
+"""Regularisation of surfaces in motion: bending of surfaces and of paths, and changes of size."""
 
 from __future__ import annotations
 
@@ -84,12 +84,12 @@ class SizeKept:
 
 
 def volume_kept(weight: float, start: MovingSurfaces, times: np.ndarray) -> SizeKept:
-    """That each body keeps its volume."""
+    """The penalty on changes of the volume of each body."""
     return SizeKept("volume_kept", _tetrahedra, weight, start, times)
 
 
 def area_kept(weight: float, start: MovingSurfaces, times: np.ndarray) -> SizeKept:
-    """That each body keeps its area."""
+    """The penalty on changes of the area of each body."""
     return SizeKept("area_kept", _triangles, weight, start, times)
 
 

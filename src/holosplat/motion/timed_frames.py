@@ -29,7 +29,7 @@ class Frames:
 
     @classmethod
     def of(cls, task: Task, material: DeltaBeta) -> Frames:
-        """Those of a task of several times, whose light has been evened."""
+        """The frames of a task of several times, corrected for uneven light."""
         times = task.scan.instants
         scans = [task.scan.at_instant(k) for k in range(len(times))]
         parts = [Task(scan, task.prior, light=task.light) for scan in scans]

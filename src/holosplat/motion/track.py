@@ -21,7 +21,7 @@ NOWHERE = Nowhere()
 """No journal."""
 
 USUAL = TrackOptions()
-"""What `follow` does unless it is told."""
+"""The usual options of `follow`."""
 
 
 def follow(

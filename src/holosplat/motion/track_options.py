@@ -31,7 +31,7 @@ class TrackOptions:
     kind: ClassVar[str] = "track"
 
     body: KnownBody | None = None
-    """What is known of the bodies' shape at rest, which makes two beams enough; None: nothing."""
+    """The known shape of bodies at rest, with which two beams are enough; None: unknown."""
     sightings: SightingOptions = field(default_factory=SightingOptions)
     """How bodies are found at single times."""
     learned: LearnedStart | None = field(default_factory=LearnedStart)
@@ -54,7 +54,7 @@ class TrackOptions:
     """The second one, in which they deform."""
 
     twins: bool = True
-    """Whether bodies of known shape are told from others whose shadows two beams do not tell from theirs."""
+    """Whether to compare bodies of known shape with others that have the same shadows in two beams."""
     intervals: bool = True
     """Whether halves of the frames are fitted, too, for standard errors: up to four short fits."""
     half: MotionFit = field(default_factory=_half)

@@ -22,7 +22,7 @@ from .fit import MotionFit, motion_fit
 from .remainder import beside, only
 
 APART = 0.05
-"""Distance of a body and its twin, over its extent, from which on they are told apart."""
+"""Least distance of a body and its twin, over its extent, at which they can be distinguished."""
 STRAINED = 10.0
 """Elastic energy by which a twin may exceed its body, in units of its area times the shear modulus: in trials cells in
 flow had up to four, their twins in beams across each other half a unit more, in beams at 24° 28 and more."""
@@ -32,7 +32,7 @@ STIFF_STEPS, SOFT_STEPS, TRIAL_VIEWS = 40, 40, 4
 """Steps of the two fits of a trial, and frames of a step of Adam's: with a third of these steps a body is not yet at
 home where its twin is."""
 CLOSE = 5e-4
-"""Part of the loss by which a body and its twin must differ to be told after these steps: so much they gain later."""
+"""Least relative difference of the losses of a body and its twin after these steps; later steps gain as much."""
 FIRST_LOOK = 0.7
 """About the share of the work before the closer ones are looked at again."""
 TRIAL_WORTH = 1.0
@@ -52,7 +52,7 @@ def trial_of(how: MotionFit, steps: int) -> MotionFit:
 
 @dataclass(frozen=True)
 class Trials:
-    """What fits need that decide. oversample: wave samples a pixel where others are divided out; steps: of the
+    """Settings of the fits that decide. oversample: wave samples a pixel where others are divided out; steps: of the
     calculation, one for each fit."""
 
     train: Scan
@@ -88,7 +88,7 @@ class Trials:
 
 
 class Tried(NamedTuple):
-    """What a fit leaves of frames, and its bodies."""
+    """The loss of a fit, and its bodies."""
 
     loss: float
     bodies: MovingSurfaces

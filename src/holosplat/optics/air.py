@@ -1,4 +1,4 @@
-"""Where frames show nothing but light: no matter, and no fringes of it."""
+"""Detection of air: pixels without matter and without its fringes."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ Box = tuple[int, int, int, int]
 
 
 def find_air(frames: Tensor) -> Tensor:
-    """Where frames [V, H, W] show air, [V, H, W] bool; nowhere in a frame that is too crowded to tell.
+    """Find the air in frames [V, H, W]: [V, H, W] bool, all False in a frame that is too crowded.
 
     Air is quiet: the power between two scales of blur is that of the frame's quietest parts. It reaches the left or
     the right border, where the inside of a smooth body does not, and it is about as bright as the frame is anywhere.

@@ -35,7 +35,7 @@ fitted to that as if it were known they run away where there is no air (measured
 OUTER = 0.1
 """Part of the columns at either side in which light must be uneven, too."""
 DARKEST = 0.05
-"""Relative intensity below which frames say nothing of the light."""
+"""Relative intensity below which a frame does not constrain the light."""
 FLUX = "unequal flux"
 """What light is called that differs between frames by a factor alone."""
 
@@ -48,7 +48,7 @@ Noise = Literal["auto", "white", "correlated"]
 @dataclass(frozen=True)
 @ranged
 class LightOptions:
-    """What is assumed of the light beside the flat fields."""
+    """Assumptions about the light beyond the flat fields."""
 
     kind: Kind = "auto"
     """auto: smooth where evidence is for it, else even; even: none; smooth: in any case."""
@@ -77,7 +77,7 @@ class LightOptions:
 
 @dataclass(frozen=True)
 class Light:
-    """What is known of the light of some frames: air [V, H, W] bool; noise; background, None where light is even;
+    """The estimated light of frames: air [V, H, W] bool; noise; background, None where light is even;
     still [H, W], the factor that all frames have beside that, None where there is none."""
 
     air: Tensor
@@ -107,7 +107,7 @@ class Light:
 
     @property
     def in_words(self) -> str:
-        """What the frames say of the light, with root mean square deviations from one."""
+        """The estimated light in words, with root mean square deviations from one."""
         said = []
         if self.background is not None and self.background.is_handed:
             said.append(f"divided out before, {self.background.size_of_doubt:.2%} of it in doubt")

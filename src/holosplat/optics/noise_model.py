@@ -162,7 +162,7 @@ class NoiseModel:
 
 
 def _without_light(frames: Tensor, air: Tensor) -> Tensor:
-    """What is left of frames [V, H, W] in their air without their slow light, relative to it; zero elsewhere."""
+    """Residuals of frames [V, H, W] in air, relative to their slow light; zero elsewhere."""
     modes = smooth_modes((frames.shape[1], frames.shape[2]), DETREND).double().flatten(1)
     seen = air.double().flatten(1)
     normal = torch.einsum("vp,kp,lp->vkl", seen, modes, modes) / seen.shape[1]

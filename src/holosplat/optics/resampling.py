@@ -26,7 +26,7 @@ class Resampling:
 
     Pixels average the intensity over their squares, which in Fourier space is a factor sinc(p f); a frame on coarser
     pixels is that on finer ones times sinc(p' f)/sinc(p f), which also keeps fine fringes from aliasing more than such
-    pixels would let them. On finer pixels the coarse ones' blur stays, and is told by `extra_blur`. Beyond its border
+    pixels would let them. On finer pixels the coarse ones' blur stays, which `extra_blur` is. Beyond its border
     a frame is mirrored (cosine series), and between samples it is band-limited.
     """
 

@@ -15,7 +15,7 @@ def fixed_pattern(frames: Tensor, predicted: Tensor) -> Tensor:
     """The pattern [H, W], float64, by frames [V, H, W] over those `predicted`; one where frames have nothing in common.
 
     The logarithms of frames over predictions are the pattern's and what each frame has alone. Products of different
-    frames tell the power of the former, and a Wiener filter of single pixels takes their mean for it as far as chance
+    frames give the power of the former, and a Wiener filter of single pixels takes their mean for it as far as chance
     allows: `p = mean · c / (c + o / V)`, c the common power and o that of a frame alone.
     """
     left, count = _logarithms(frames) - _logarithms(predicted), len(frames)

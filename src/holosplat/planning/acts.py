@@ -1,7 +1,7 @@
-"""What other commands than `reconstruct` and `simulate` of one time take, told before they start.
+"""Resource estimates of commands other than `reconstruct` and `simulate` of one time.
 
 `benchmarks/needs_acts.py` measures the memory that the constants below stand for, and writes docs/data/needs_acts.csv.
-Seconds and bytes on the disk are rough: they were looked at once or twice, on a machine that others used.
+Seconds and bytes on the disk are rough: they were measured once or twice, on a shared machine.
 """
 
 from __future__ import annotations
@@ -202,7 +202,7 @@ def of_dataset(simulated: Needs, shape: tuple[int, int], views: int, scenes: int
 
 
 def of_training(shape: tuple[int, int], views: int, network: str, size: Size, steps: int) -> Needs:
-    """What `train` takes for scenes of so many pixels, of which so many views are shown.
+    """Estimate resources of `train` for scenes of so many pixels, of which so many views are shown.
 
     size: of the network of `--start learned`; those of the others are of one size.
     """

@@ -1,4 +1,4 @@
-"""What a few frames of a scan show: the level of the air, noise, contrast and fringes, before any reconstruction."""
+"""A look at a few frames of a scan: level of the air, noise, contrast and fringes."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Spectrum:
 
 @dataclass(frozen=True)
 class Look:
-    """What K frames show. frames: [K, H, W] as they were read; air: mean of what passes for air, None where there is
+    """Properties of K frames. frames: [K, H, W] as read; air: mean of what passes for air, None where there is
     none, and `air_share` of the frames; level: what counts as one; noise, contrast: standard deviation and root mean
     square of relative intensity less one; least, most: of all but a thousandth of the pixels."""
 
@@ -77,7 +77,7 @@ class Look:
         return {"air level": air, "noise": seen if share > NOISELESS else "none is seen", "contrast": span}
 
     def fringes(self, widths: np.ndarray) -> str:
-        """What is said of first fringes of such `widths` √(λz) [pixels], and of the finest detail above the noise."""
+        """Describe first fringes of such `widths` √(λz) [pixels], and of the finest detail above the noise."""
         low, high = (f"{two_digits(float(each))}" for each in (widths.min(), widths.max()))
         finest = self.spectrum.finest
         said = (
@@ -90,7 +90,7 @@ class Look:
 
 
 def looked(frames: np.ndarray) -> Look:
-    """What `frames` [K, H, W] show, relative to their air, or else to their median."""
+    """Measure `frames` [K, H, W], relative to their air, or else to their median."""
     factor = max(1, math.ceil(max(frames.shape[1:]) / AIR_PIXELS))
     factor = min(factor, *frames.shape[1:])
     small = torch.from_numpy(binned(frames, factor))

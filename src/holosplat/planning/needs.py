@@ -1,4 +1,4 @@
-"""What a job takes, by the sizes of its arrays: memory, room on the disk and time, told before it starts.
+"""Resource estimates of a job from the sizes of its arrays: memory, disk and time.
 
 `benchmarks/needs.py` measures what the constants below stand for, and writes docs/data/needs.csv.
 """
@@ -147,7 +147,7 @@ def on_larger_pixels(exposures: Exposures, binning: int) -> Exposures:
 
 @dataclass(frozen=True)
 class Needs:
-    """What a job takes at its peak: memory and disk [bytes], processor time of all cores together [s];
+    """Peak resources of a job: memory and disk [bytes], processor time of all cores together [s];
     most_seconds: the same where what is found in the frames may make it longer (0: it cannot)."""
 
     memory: float
@@ -161,7 +161,7 @@ class Needs:
         return f"takes about {_size(self.memory)} of memory, {_size(self.disk)} on the disk{time}"
 
     def times(self, count: int) -> Needs:
-        """What so many of the same take, one after the other."""
+        """Resources of so many of the same, one after the other."""
         return Needs(self.memory, count * self.disk, count * self.seconds, count * self.most_seconds)
 
     def fit(self, path: Path) -> bool:
@@ -171,7 +171,7 @@ class Needs:
 
 @dataclass(frozen=True)
 class Seen:
-    """What frames say of it (`planning.seen`). windows: sizes of those that a run works on, None for whole frames;
+    """The properties of frames that change it (`planning.seen`). windows: sizes of windows, None for whole frames;
     noisy: whether surfaces begin with Gaussians, and may take turns with a volume."""
 
     windows: Sizes | None = None
@@ -184,7 +184,7 @@ UNSEEN = Seen()
 def of_reconstruction(
     sizes: Sizes, method: Method, matter: MatterKind | None = None, seen: Seen = UNSEEN
 ) -> Needs | None:
-    """What `reconstruct` takes for training frames of such sizes; None for a method of which nothing is known.
+    """Estimate resources of `reconstruct` for training frames of such sizes; None for a method without an estimate.
 
     matter: its kind, where that is settled; else the frames decide, and it takes what either kind takes.
     """

@@ -159,7 +159,27 @@ class Plan:
 
 
 def plan(subject: Subject, setup: Setup, recording: Recording) -> Plan:
-    """The plan of an experiment that images `subject` with `setup` and stores the frames of `recording`."""
+    """Compute the contrast, resolution, motion and data rate of an experiment on one object.
+
+    subject: the object, its material and its medium
+    setup: photon energy, distance, pixel and blur
+    recording: photons, views, detector, frame rate and velocity
+
+    Errors: `InputError` if object and medium are of the same material, and for a raster too fine to compute.
+
+    Examples:
+
+        >>> import holosplat as hs
+        >>> cell = hs.specimens.evans_fung_cell()
+        >>> subject = hs.planning.Subject(cell, hs.materials.RED_CELL, hs.materials.PLASMA)
+        >>> setup = hs.planning.Setup(energy_kev=20.0, distance=0.1, pixel_size=0.5e-6)
+        >>> recording = hs.planning.Recording(photons_per_pixel=1000, views=4, detector=(128, 128), frame_rate=1e6)
+        >>> found = hs.plan(subject, setup, recording)
+        >>> print(f"SNR {found.detection.snr:.1f}, phase {found.waves.phase:.3f} rad")
+        SNR 1.9, phase 0.007 rad
+        >>> print(f"{found.storage.data_rate / 1e9:.0f} GB/s")
+        131 GB/s
+    """
     seen = visibility(subject, setup)
     return Plan(
         _waves(subject, setup, seen),

@@ -1,4 +1,4 @@
-"""What `holosplat info` says of a scan: how it was taken, what its frames show, and what its reconstruction takes.
+"""The facts of a scan for `holosplat info`: conditions, properties of its frames, and resources of its reconstruction.
 
 A few frames, flats and darks are read, and no more, so that a scan of a terabyte is described as soon as a small one.
 """
@@ -51,7 +51,7 @@ Unsaid = Mapping[str, str]
 
 @dataclass(frozen=True)
 class ScanFacts:
-    """What is said of a scan. scan: read with stand-ins for what is `unsaid`; look: at its frames `numbers`."""
+    """The facts of a scan. scan: read with stand-ins for what is `unsaid`; look: at its frames `numbers`."""
 
     facts: Facts
     scan: Scan
@@ -61,7 +61,7 @@ class ScanFacts:
 
 
 def facts_of_scan(path: Path, reading: Reading) -> ScanFacts:
-    """What is said of the scan at `path`. Errors: `InputError` for what stops its reading, and no option can say."""
+    """Describe the scan at `path`. Errors: `InputError` for faults that stop its reading and that no option mends."""
     loader, stand_ins, unsaid = loader_of(path), dict[str, Any](), dict[str, str]()
     reading.told.vouch(path)
     while True:
@@ -192,7 +192,7 @@ def _angles(scan: Scan, file: ScanFile | None, unsaid: Unsaid) -> dict[str, str]
 
 
 def _needs(scan: Scan, numbers: np.ndarray) -> dict[str, str]:
-    """What `reconstruct` takes for closed bodies and for continuous matter, by the frames `numbers`."""
+    """Estimate resources of `reconstruct` for closed bodies and for continuous matter, from the frames `numbers`."""
     train = scan.train()
     if scan.is_series:
         needs = of_each_time(train.exposures, Auto(), None)

@@ -1,4 +1,4 @@
-"""What frames say of what their reconstruction takes: how much of them shows matter, and how noisy they are."""
+"""Properties of frames that change the resources of their reconstruction: foreground and noise."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def can_be_seen(scan: Scan) -> bool:
 
 
 def seen_of(scan: Scan, method: Method, whole: bool = False) -> Seen:
-    """What the training frames of `scan` say; nothing where all frames are too many, or of several times.
+    """Measure the training frames of `scan`; nothing where all frames are too many, or of several times.
 
     whole: whether a run works on whole frames whatever they show, as with free poses. Noise counts as white here, and
     light as even: in other light windows hold whole frames.

@@ -16,7 +16,7 @@ def relative_intensity(raw: np.ndarray, dark: np.ndarray | float, light: np.ndar
 
 
 def unlit(light: np.ndarray) -> np.ndarray:
-    """Where a flat field less its dark field is not positive, so that nothing can be divided by it."""
+    """Find pixels whose flat field less its dark field is not positive."""
     return ~(light > 0)
 
 

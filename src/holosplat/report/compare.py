@@ -17,11 +17,14 @@ from ..geometry import Grid
 from ..io.atomic import atomic_path
 from ..methods import METHODS
 from ..metrics import VolumeScores, volume_scores
+from ..scan import Scan
 from ..tables import to_table
 from ..units import in_percent, wavenumber
 from ..volume import Volume
 from ..workflows.binding import CONFIG_SUM, RUN
-from ..workflows.evaluate import Evaluation, of_absorption
+from ..workflows.evaluate import Evaluation, evaluate, of_absorption
+from ..workflows.moments import instants_of, moment
+from ..workflows.reconstruct import load_reconstruction
 from ..workflows.reconstruction import Reconstruction
 from ..workflows.run_folder import RunFolder
 from .block import Block, drawn_block
@@ -50,7 +53,7 @@ class Side:
     evaluation: Evaluation | None
 
     def score(self, part: str, name: str) -> str:
-        """A score of its `part`, "test" or "train", in the mean over frames."""
+        """A score of its `part`, "test" or "train", averaged over frames."""
         found = getattr(self.evaluation, part, None)
         return "–" if found is None else scientific(found.mean[name], 4)
 
@@ -111,7 +114,7 @@ class Comparison:
         return volume_scores(second, first) if np.any(first.delta) and np.any(second.delta) else None
 
     def found(self) -> list[Table]:
-        """What both runs found, and how their volumes differ."""
+        """Tables of the results of both runs, and of the differences of their volumes."""
         return [table for table in (self._found(), self._apart()) if table.rows]
 
     def asked(self) -> list[Table]:
@@ -175,14 +178,52 @@ class Comparison:
         return Table("Decisions that differ", differing(*made), HEAD)
 
     def _settings(self) -> Table:
-        """What was asked; of a setting that the other method does not have, only what is not the usual."""
-        (first, usual), (second, other) = (_asked(side) for side in self.sides)
+        """Settings that differ; of those of one method alone, only values other than the defaults."""
+        (first, usual), (second, other) = (_request(side) for side in self.sides)
         known = {name: value for name, value in (usual | other).items() if (name in first) != (name in second)}
         rows = [row for row in differing(first, second) if known.get(row[0]) not in row[1:]]
         return Table("Settings and input that differ", rows, HEAD)
 
 
-def _asked(side: Side) -> tuple[dict[str, str], dict[str, str]]:
+def compare(first: RunFolder, second: RunFolder, scan: Scan | None = None) -> Comparison:
+    """Compare two runs: what was asked, decided and found, and where their volumes differ.
+
+    scan: the frames on which both are scored (default: no scores of frames)
+
+    `found()` and `asked()` of the result are tables, `volumes` holds δ of both [Z, Y, X] on one grid, `scores` the
+    differences of the second from the first, and `verdict()` is the comparison in words; `write_comparison` makes a
+    page of it. Of runs of matter in motion the first times are compared. Errors: `InputError` for folders without a
+    finished run, and for a scan of another photon energy.
+
+    Examples:
+
+        >>> import holosplat as hs
+        >>> water = hs.materials.parse_material("water").delta_beta(20.0)
+        >>> views = hs.Views.evenly_spaced(8, shape=(16, 16), pixel_size=1e-6)
+        >>> cells = hs.specimens.random_cells(1, box=(16e-6, 16e-6, 16e-6), seed=1)
+        >>> scene = hs.MeshScene.of_one_material(cells, water)
+        >>> scan = hs.simulate(scene, hs.Exposures.of(views, energy_kev=20.0, distance=0.05))
+        >>> runs = [hs.RunFolder("voxels"), hs.RunFolder("gaussians")]
+        >>> for run, method in zip(runs, (hs.Voxels(), hs.preset("fast"))):
+        ...     result = hs.reconstruct(scan, hs.MaterialPrior.known(water), method, folder=run)
+        >>> comparison = hs.compare(*runs, scan)
+        >>> comparison.scores.dice > 0.8
+        True
+    """
+    return Comparison(*(_side_of(folder, scan) for folder in (first, second)))
+
+
+def _side_of(folder: RunFolder, scan: Scan | None) -> Side:
+    """A run, at its first time, with its scores on `scan`."""
+    folder.require_run()
+    result, times = load_reconstruction(folder), instants_of(folder)
+    if times:
+        result = moment(result, times, 0)
+        scan = scan.at_instant(0) if scan is not None and scan.is_series else scan
+    return Side(folder, result, None if scan is None else evaluate(result, scan, None))
+
+
+def _request(side: Side) -> tuple[dict[str, str], dict[str, str]]:
     """What a run was asked, by dotted names, and the usual settings of its method."""
     told = side.folder.read_config()
     kind = told.get("method", {}).get("kind")

@@ -103,27 +103,27 @@ class ProjectedMaps:
 
 @dataclass(frozen=True)
 class ReportContent:
-    """Everything the page shows; whatever is left out is said to be absent, in words.
+    """The content of the page; absent parts are named on it.
 
     - title: what was reconstructed; summary: a sentence or two on the experiment, plain text
     - reconstruction, truth: volumes on one grid
-    - energy_kev: at which δ and β are said [keV]; pixel_size: of the frames [m],
+    - energy_kev: at which δ and β hold [keV]; pixel_size: of the frames [m],
       the smallest where they differ
     - held_out: test views; projections: line integrals of a few views; volume_scores: against the truth
     - material_delta: the material's δ, for surfaces and masks; None: the robust maximum of the truth, or else
       of the reconstruction
     - lit: training frames in uneven light; None: the light is even
     - explained: the verdict on the training frames; None: not judged; scan: their name, as a command takes it
-    - delta_told: whether the frames say what δ is; else they show absorption alone, and β stands for δ in all volumes
-    - total: the total δ by these frames; None: not told
+    - delta_told: whether δ is known from frames or prior; else β stands for δ in all volumes
+    - total: the total δ by these frames; None: unknown
     - moving: bodies in motion, whose volumes are those of one time; None: matter stands still
-    - view: what can be turned; None: nothing
-    - guess: what a network guessed before the fit; None: none was asked
+    - view: the interactive 3D view; None: there is none
+    - guess: that of a network before the fit; None: there was none
     - forecast: of a forecast, its errors and scores; None: it is none
     - geometry: where the frames were found to be; None: as the scan says
     - history: columns of metrics.csv, each [S]: step, seconds, loss, the loss' terms, count, val_ssim …
     - seconds: time of the reconstruction [s]
-    - settings: the resolved configuration, nested or flat; usual: those of the method when nothing is told
+    - settings: the resolved configuration, nested or flat; usual: the defaults of the method
     - decisions: between hypotheses, with the evidence
     - versions, machine, timing: tables of names and values; input_hash: of the scan; run: its name
     """

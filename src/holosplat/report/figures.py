@@ -231,7 +231,7 @@ def slices_figure(
     quantity: Quantity = DELTA,
     names: tuple[str, str] = ("Truth", "Reconstruction"),
 ) -> Figure:
-    """δ, or what the frames tell of it, in three orthogonal planes at voxel `positions` (z, y, x): truth,
+    """δ, or µ, in three orthogonal planes at voxel `positions` (z, y, x): truth,
     reconstruction and difference; names: of these two."""
     volumes = [(name, v.delta) for name, v in zip(names, (truth, reconstruction)) if v is not None]
     scale, power = decimal_scale(quantity.factor * max(float(np.abs(v).max()) for _, v in volumes))

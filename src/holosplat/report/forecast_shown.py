@@ -1,4 +1,4 @@
-"""What the page shows of a forecast: how uncertain it is, and how it fared where frames were held out."""
+"""The part of a report on a forecast: its uncertainty, and its scores on held-out frames."""
 
 from __future__ import annotations
 

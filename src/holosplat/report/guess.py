@@ -1,4 +1,4 @@
-"""What a network guessed of the matter before the fit, where its guesses differ, and what became of them."""
+"""The guess of a network before the fit, its spread, and its difference from the result."""
 
 from __future__ import annotations
 

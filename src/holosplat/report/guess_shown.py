@@ -1,4 +1,4 @@
-"""What a report shows of a network's guess, as data."""
+"""The part of a report on the guess of a network, as data."""
 
 from __future__ import annotations
 

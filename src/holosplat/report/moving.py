@@ -1,4 +1,4 @@
-"""What the page shows of bodies in motion, as data."""
+"""The part of a report on bodies in motion, as data."""
 
 from __future__ import annotations
 

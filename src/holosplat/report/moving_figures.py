@@ -98,7 +98,7 @@ def shapes_figure(moving: Moving) -> Figure:
 
 
 def _limits(values: np.ndarray, whole: np.ndarray) -> Limits:
-    """Of an axis that holds what is known of whole bodies, or all where none is."""
+    """Limits of an axis for the values of whole bodies, or for all where there are none."""
     known = values[whole] if whole.any() else values.ravel()
     low, high = float(known.min()), float(known.max())
     margin = 0.12 * (high - low) or 0.05 * abs(high) or 1.0
@@ -155,5 +155,5 @@ def grey_of(moving: Moving) -> Limits:
 
 
 def residual_of(moving: Moving) -> float:
-    """Where colours of differences end: the 99.8 percentile of their magnitude."""
+    """Limit of the colours of differences: the 99.8 percentile of their magnitude."""
     return float(np.percentile(np.abs(moving.predicted - moving.measured), 99.8)) or 1.0

@@ -128,7 +128,7 @@ def score_tables(content: ReportContent) -> list[Table]:
 
 
 def record_tables(content: ReportContent) -> list[Table]:
-    """What makes the run repeatable: input, settings, versions, machine and timing."""
+    """Records that make the run repeatable: input, settings, versions, machine and timing."""
     shape, edges = content.reconstruction.grid.shape[::-1], content.reconstruction.grid.voxel_size
     data = [
         ("photon energy", f"{content.energy_kev:g} keV"),
@@ -154,7 +154,7 @@ def record_tables(content: ReportContent) -> list[Table]:
 
 
 def _bodies_table(content: ReportContent) -> Table | None:
-    """Each body in the mean over the times at which it is whole in the field, with standard errors where known."""
+    """Each body, averaged over the times at which it is whole in the field, with standard errors where known."""
     moving = content.moving
     if moving is None:
         return None
@@ -246,7 +246,7 @@ def _decisions_table(content: ReportContent) -> Table | None:
 
 
 def _geometry_table(content: ReportContent) -> Table | None:
-    """What was found of each frame beside the plan, and what is unexplained of it before and after."""
+    """Changes of the pose of each frame from the plan, and its residuals before and after."""
     found = content.geometry
     if found is None:
         return None

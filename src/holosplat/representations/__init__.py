@@ -31,7 +31,7 @@ from .voxels import VoxelGrid
 
 @runtime_checkable
 class Stored(TrainableObject, Protocol):
-    """What a reconstruction can be: an Object that can be fitted, and that files hold."""
+    """An Object that can be fitted and stored: the result of a reconstruction."""
 
     kind: ClassVar[str]
     """Its name in files."""

@@ -30,7 +30,7 @@ SLOPE = 0.1
 CHUNK = 1 << 12
 """Points that are evaluated at once: what is made of them stays in the cache."""
 FIRST_LOGIT = -2.0
-"""What a network without training says everywhere, before it is bounded: little, so that frames ask for more."""
+"""Output of an untrained network everywhere, before its bound; low, so that a fit raises it."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ class InParts(torch.autograd.Function):
 
 
 def called(net: PixelAligned, name: str, weights: Mapping[str, Tensor], *arguments: Tensor) -> Tensor:
-    """What the method `name` of `net` returns with other weights, by their names."""
+    """Call the method `name` of `net` with other weights, by their names."""
     return functional_call(_Calling(net, name), {f"net.{key}": weight for key, weight in weights.items()}, arguments)
 
 

@@ -1,4 +1,4 @@
-"""What a neural field knows of a position: features on grids of several resolutions, or random Fourier waves."""
+"""Position encodings of neural fields: features on grids of several resolutions, or random Fourier waves."""
 
 from __future__ import annotations
 

@@ -31,7 +31,7 @@ class Fading:
 
     @classmethod
     def none(cls, lattice: Lattice) -> Fading:
-        """Nothing changes, float32."""
+        """Coefficients without any change, float32."""
         return cls(torch.zeros(2, *lattice.counts), lattice)
 
     def with_coefficients(self, coefficients: Tensor) -> Fading:

@@ -24,7 +24,7 @@ LEVI_CIVITA = ((0, 2, 1, 1.0), (0, 1, 2, -1.0), (1, 0, 2, 1.0), (1, 2, 0, -1.0),
 
 @dataclass(frozen=True)
 class Lattice:
-    """Where the coefficients of a flow lie.
+    """The lattice of the coefficients of a flow.
 
     counts: nodes along z, y and x; cell: their distance; first: `(x, y, z)` of the first node; both in the flow's unit
     of length. Two cells beyond the outermost nodes, the flow stands still.
@@ -121,7 +121,7 @@ class Flow:
         return found
 
     def carried(self, points: Tensor, start: float, end: float) -> Tensor:
-        """Where `points` [P, 3] of the time `start` [s] are at the time `end`, before or after."""
+        """Carry `points` [P, 3] from the time `start` [s] to the time `end`, before or after."""
         return self._integrated(points, start, end, False)[0]
 
     def carried_with_jacobian(self, points: Tensor, start: float, end: float) -> tuple[Tensor, Tensor]:

@@ -76,7 +76,7 @@ class GaussianCloud:
 
     @property
     def strength(self) -> Tensor:
-        """What says whether a Gaussian is faint, [N]: its largest peak value."""
+        """The peak value of each Gaussian [N], by which faint ones are found."""
         return self.amplitudes.amax(dim=1)
 
     def values_times(self, factor: float, index: Tensor) -> dict[str, Tensor]:

@@ -1,4 +1,4 @@
-"""Where Gaussians start: on a volume that a classical reconstruction gave, or at random."""
+"""Initialisation of Gaussians: from the volume of a classical reconstruction, or at random."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def cloud_from_two(
 ) -> GaussianCloud:
     """A cloud of two materials that approximates `occupancies` [2, Z, Y, X] on `grid`; each Gaussian is of one.
 
-    The Gaussians of each are those of `cloud_from_volume`, with next to nothing of the other material. materials:
+    The Gaussians of each are those of `cloud_from_volume`, with almost nothing of the other material. materials:
     (δ, β) of each; the rest as there. Errors: `InputError` if there is nothing of one of them.
     """
     parts = []

@@ -195,7 +195,7 @@ class NeuralField:
         return self.upper * torch.sigmoid(raw) if self.matter.single and self.upper > 0 else softplus(raw)
 
     def raw(self, positions: Tensor) -> Tensor:
-        """What the network says [N, C + `beside`] at the same positions."""
+        """Output of the network [N, C + `beside`] at the same positions."""
         return functional_call(self._net, {**self._weights, **self._constants}, (positions,))
 
     def at(self, time: float) -> NeuralField:

@@ -71,7 +71,7 @@ class TimeBasis:
         return np.concatenate([ends[0], np.arange(self.pieces + 1.0), ends[1]])
 
     def fitted(self, times: np.ndarray, places: np.ndarray) -> np.ndarray:
-        """Coefficients [K, …] whose paths come nearest to `places` [T, …] at `times` [T], in the mean square.
+        """Least-squares coefficients [K, …] of paths through `places` [T, …] at `times` [T].
 
         Where the times leave coefficients open, these are the smallest that go with them.
         """

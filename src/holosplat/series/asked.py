@@ -1,4 +1,4 @@
-"""What is asked of a series and of Slurm: options, light enough for the command line to load for its help."""
+"""Options of a series and of Slurm, quick to import for the help of the command line."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Cut:
 @dataclass(frozen=True)
 @ranged
 class Slurm:
-    """What an array script asks Slurm for; what is empty is left to the cluster."""
+    """Resources of an array script of Slurm; empty ones are left to the cluster."""
 
     partition: str = ""
     """Partition (default: the cluster's)."""

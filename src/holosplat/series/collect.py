@@ -1,4 +1,4 @@
-"""All tasks of a series in one table, one list of bodies, and one page; what is missing is said."""
+"""All tasks of a series in one table, one list of bodies, and one page, with the missing ones named."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ BODY_COLUMNS = ("number", "time_s", "body", "x_m", "y_m", "z_m", "volume_m3")
 
 @dataclass(frozen=True)
 class Collected:
-    """A series with what is known of it. rows: of each time, None where it is missing; task: that it is of; runs: its
+    """A series and its results so far. rows: of each time, None where it is missing; task: that it is of; runs: its
     run folder; agreement: mean distance [m] of bodies at times that two tasks have done, by the later task."""
 
     plan: SeriesPlan
@@ -68,7 +68,7 @@ def collected(folder: SeriesFolder) -> Collected:
                 found[moment.number] = rows[moment.number]
     moments = tuple(plan.moments())
     rows = tuple(found.get(m.number) for m in moments)
-    names, agreement = _named(moments, found, early, task_of)
+    names, agreement = _identities(moments, found, early, task_of)
     return Collected(
         plan,
         tuple(folder.state(window) for window in windows),
@@ -81,7 +81,7 @@ def collected(folder: SeriesFolder) -> Collected:
     )
 
 
-def _named(
+def _identities(
     moments: Sequence[Moment], rows: dict[int, Row], early: dict[int, dict[int, Row]], task_of: dict[int, int]
 ) -> tuple[dict[int, tuple[int, ...]], dict[int, float]]:
     """Identities of the bodies at each time, and how well tasks agree.
@@ -99,7 +99,9 @@ def _named(
         last = before.get(moment.number - 1)
         if last is not None and moment.number - 1 in names and task_of[moment.number - 1] != task:
             mine, count = same_bodies(rows[moment.number - 1].bodies, names[moment.number - 1], last.bodies, count)
-            agreement[task] = _apart(rows[moment.number - 1].bodies, names[moment.number - 1], last.bodies, mine)
+            agreement[task] = _mean_distance(
+                rows[moment.number - 1].bodies, names[moment.number - 1], last.bodies, mine
+            )
             known = last.bodies, mine
         names[moment.number], count = same_bodies(*known, row.bodies, count)
         known = row.bodies, names[moment.number]
@@ -125,7 +127,9 @@ def same_bodies(
     return tuple(given), count
 
 
-def _apart(first: Sequence[Body], names: tuple[int, ...], second: Sequence[Body], others: tuple[int, ...]) -> float:
+def _mean_distance(
+    first: Sequence[Body], names: tuple[int, ...], second: Sequence[Body], others: tuple[int, ...]
+) -> float:
     """Mean distance [m] between bodies of one name; NaN where there is none."""
     places = dict(zip(others, (np.array(body[:3]) for body in second)))
     found = [float(np.linalg.norm(np.array(b[:3]) - places[n])) for b, n in zip(first, names) if n in places]
@@ -177,7 +181,7 @@ def _number(value: object) -> str:
 
 
 def page_of(folder: SeriesFolder, found: Collected) -> SeriesPage:
-    """What series.html shows."""
+    """The content of series.html."""
     from .pages.page import Frame, SeriesPage, headline
 
     frames = []

@@ -138,7 +138,7 @@ def plan_series(
     reading: Reading,
     cut: Cut,
 ) -> SeriesPlan:
-    """The plan for the `scans`, each of one time or many; frames are not read, but for the first time of each.
+    """The plan for the `scans`, each of one time or many; of each, only the first time is read.
 
     prior: of the matter, at a photon energy [keV]. Errors: `InputError` for scans that cannot be read, without times,
     and for too many tasks.

@@ -1,4 +1,4 @@
-"""What came of one time of a series, as a small JSON file beside its result."""
+"""The result of one time of a series as a small JSON file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Running what is left of a series: in this process, or in several, which share the tasks by their locks."""
+"""Running the remaining tasks of a series in one process, or in several, which share the tasks by locks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is done with every time of a series, as a table that its folder keeps."""
+"""Settings for every time of a series, as a table in its folder."""
 
 from __future__ import annotations
 

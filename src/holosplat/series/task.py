@@ -30,11 +30,11 @@ def nothing(row: Row) -> None:
 
 
 def run_task(folder: SeriesFolder, number: int, on_row: Told = nothing) -> TaskState:
-    """Do what is left of a task; how far it is then.
+    """Do the rest of a task, and return its progress.
 
     Every time has its run folder and its row, written whole: after a kill, the task goes on in the middle of the time
     that was lost, with the same result bit for bit. What fails is said in `failed.json`, and done again by the next
-    call. Ctrl-C is passed on. Errors: `InputError` for a task that there is not, and `TakenError` where another process
+    call. Ctrl-C is passed on. Errors: `InputError` for an unknown task, and `TakenError` where another process
     does it.
     """
     plan = folder.plan()

@@ -67,7 +67,7 @@ class WatchFolder:
         return self.scan(scan) / f"t{frame:04d}.{ROW}"
 
     def add(self, seen: Seen) -> None:
-        """Note a scan that is begun."""
+        """Note a scan whose work has started."""
         self.scan(seen.number).mkdir(exist_ok=True)
         name, size, changed = seen.key
         values = {"name": name, "bytes": size, "changed_ns": changed, "first": seen.first, "times": seen.times}

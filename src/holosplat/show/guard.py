@@ -1,4 +1,4 @@
-"""Who may see a live view: who has its token, on this machine's own address, and no page of another server.
+"""Access control of a live view: a token, this machine's own address, and no page of another server.
 
 The address that is printed has the token in it. The first answer turns it into a cookie that scripts cannot read and
 leads to the address without it; every later request, and the WebSocket, must bring the cookie.

@@ -47,7 +47,7 @@ Shown = Splats | TriangleMesh
 
 @dataclass(frozen=True)
 class Frame:
-    """Where the scene lies. middle: (x, y, z) [m]; scale: units a metre."""
+    """The frame of the scene. middle: (x, y, z) [m]; scale: units a metre."""
 
     middle: np.ndarray
     scale: float
@@ -95,7 +95,7 @@ def at_times(obj: Stored, times: Sequence[float]) -> dict[str, Stored]:
 
 
 def legend(part: Shown) -> tuple[str, str]:
-    """What the colours of a part mean, and these as CSS has them, from the near end to the far one."""
+    """The legend of the colours of a part, and these as CSS has them, from the near end to the far one."""
     places = part.centres if isinstance(part, Splats) else part.vertices[part.faces]
     low, high = (format_length(float(end)) for end in (places[..., 2].min(), places[..., 2].max()))
     if isinstance(part, TriangleMesh):
@@ -105,7 +105,7 @@ def legend(part: Shown) -> tuple[str, str]:
 
 
 def cut(part: Shown, axis: int, share: float) -> Shown:
-    """What is left where the nearest `share` (0 to 1) of the matter's extent along `axis` is taken away."""
+    """Cut away the nearest `share` (0 to 1) of the matter's extent along `axis`."""
     if share <= 0:
         return part
     if isinstance(part, Splats):

@@ -16,7 +16,7 @@ BOX = 1000
 
 
 class Scene:
-    """What a page shows: one of several objects, which a slider leads through, cut by another one.
+    """The scene of a page: one of several objects, chosen by a slider and cut by another one.
 
     The objects may be replaced while it is shown; sliders stay where they are.
     """

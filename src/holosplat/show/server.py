@@ -35,7 +35,7 @@ LEGEND = (
 
 
 class LiveView:
-    """A page in the browser that shows an object, what is said of it, and sliders.
+    """A page in the browser that shows an object, a description, and sliders.
 
     port: the first that is tried; the next free one is taken. Errors: `InputError` without the package viser, or for a
     version of it that starts its server in another way, which could not be guarded.

@@ -17,7 +17,7 @@ SHARE = 0.01
 
 
 class Watch:
-    """What a fit tells a view: `on_progress` and `on_state` of `reconstruct`.
+    """Callbacks from a fit to a view: `on_progress` and `on_state` of `reconstruct`.
 
     The object is taken at the end of a step, of the first one of a stage always, and drawn by another thread. The next
     update waits until the last one's cost is `SHARE` of the time. While no browser is there, only words are kept, and
@@ -63,7 +63,7 @@ class Watch:
 
 
 def words(stage: str, fraction: float, record: dict[str, float]) -> list[str]:
-    """What is said of a step."""
+    """The description of a step."""
     numbers = {name: record[name] for name in ("loss", "count") if name in record}
     said = [f"{stage}: {fraction:.0%}", f"step {record.get('step', 0):.0f}"]
     said += [f"loss {numbers['loss']:.4g}"] if "loss" in numbers else []

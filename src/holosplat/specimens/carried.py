@@ -30,11 +30,11 @@ class Motion(Protocol):
     """A map of space that grows with time from the identity at time 0."""
 
     def back(self, points: np.ndarray, time: float) -> np.ndarray:
-        """Where matter that is at `points` [3, P] [m] at `time` [s] was at time 0."""
+        """Trace `points` [3, P] [m] from `time` [s] back to time 0."""
         ...
 
     def forth(self, points: np.ndarray, time: float) -> np.ndarray:
-        """Where matter that was at `points` [3, P] [m] at time 0 is at `time` [s]."""
+        """Trace `points` [3, P] [m] from time 0 to `time` [s]."""
         ...
 
 
@@ -182,8 +182,8 @@ class CarriedScene:
     """A continuous scene that a motion carries along; as it stands, that of time 0.
 
     scene: at time 0; motion: how it goes on; reach: radius [m] of the ball about the origin that matter never leaves;
-    step: from point to point along a ray [m], a sixth of the narrowest edge; moment: [s] the time that is looked at;
-    fades: what is left of all matter with time.
+    step: from point to point along a ray [m], a sixth of the narrowest edge; moment: [s] the time of this object;
+    fades: the remaining share of all matter with time.
     Errors: `InputError` for lengths out of range.
     """
 

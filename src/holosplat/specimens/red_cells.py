@@ -73,7 +73,7 @@ class RedCell:
         return 0.5 * self.diameter * bent @ self.rotation.T + self.centre
 
     def level(self, points: np.ndarray) -> np.ndarray:
-        """Where `points` [..., 3] (metres) lie, [...]: below 1 inside, 1 on the surface, above 1 outside."""
+        """Level [...] of `points` [..., 3] (metres): below 1 inside, 1 on the surface, above 1 outside."""
         local = (points - self.centre) @ self.rotation / (0.5 * self.diameter)
         x, y, z = np.moveaxis(local, -1, 0)
         z = z - _bending(x, y, self.bend)

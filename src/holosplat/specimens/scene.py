@@ -17,7 +17,26 @@ from ..volume import LineIntegrals, Volume
 
 @dataclass(frozen=True)
 class MeshScene:
-    """Closed, outward-oriented meshes (see `specimens.repair.closed`) and the δ, β inside each of them."""
+    """A scene of closed meshes, each filled with one material.
+
+    meshes: with outward normals (see `specimens.repair.closed`); coordinates `(x, y, z)` [m].
+    materials: δ and β of each mesh, dimensionless.
+    backend: that projects them, resolved (see `backends`).
+
+    Errors: `InputError` without a mesh, and unless there is one material for each.
+
+    Examples:
+
+        >>> import holosplat as hs
+        >>> cells = hs.specimens.random_cells(2, box=(24e-6, 24e-6, 24e-6), seed=1)
+        >>> scene = hs.MeshScene.of_one_material(cells, hs.DeltaBeta(5.8e-7, 2.6e-10))
+        >>> volume = scene.voxelise(hs.Grid.centred((24, 24, 24), voxel_size=1e-6))
+        >>> f"{volume.delta.max():.1e}"
+        '5.8e-07'
+        >>> B, D = scene.project(hs.Views.evenly_spaced(3, shape=(24, 24), pixel_size=1e-6))
+        >>> tuple(D.shape)  # line integrals of δ [m]
+        (3, 24, 24)
+    """
 
     meshes: tuple[TriangleMesh, ...]
     materials: tuple[DeltaBeta, ...]

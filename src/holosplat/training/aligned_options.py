@@ -10,7 +10,7 @@ from ..ranges import Natural, Share, Weight, ranged
 @dataclass(frozen=True)
 @ranged
 class FrameGoal:
-    """What is minimised where networks learn from frames alone: no volume is looked at."""
+    """The training loss of networks that learn from frames alone, without volumes."""
 
     targets: Natural = 2
     """Frames that each step predicts; half of them, rounded up, are none of those that the network sees."""

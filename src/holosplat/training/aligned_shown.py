@@ -1,4 +1,4 @@
-"""What a pixel-aligned network sees of a scene in one step, and the frames that it should predict. No volumes."""
+"""Input and target frames of a pixel-aligned network in one step, without volumes."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class AlignedLesson:
         return max(float(np.sqrt(np.mean(shown**2))), float(np.finfo(np.float16).tiny))
 
     def field(self, weights: Mapping[str, Tensor], size: AlignedNetwork) -> PixelAlignedField:
-        """What the network says of the scene; where the views agree on nothing, it is asked everywhere."""
+        """Output of the network on the scene; where the views agree on nothing, it is evaluated everywhere."""
         scan, material = self.scene.scan[self.seen], self.scene.material
         thickness = torch.from_numpy(self.scene.thickness[self.seen]) / scan.views.finest
         shown = images(torch.from_numpy(scan.frames) - 1, thickness, torch.from_numpy(self.noise[self.seen]))

@@ -87,7 +87,7 @@ def _against(medium: DeltaBeta, contrast: DeltaBeta, share: float) -> Substance:
 
 @dataclass(frozen=True)
 class Room:
-    """Where bodies may be: extents `(x, y, z)` [m] about the origin, a box or a cylinder about y."""
+    """The room for bodies: extents `(x, y, z)` [m] about the origin, a box or a cylinder about y."""
 
     box: tuple[float, float, float]
     shape: Literal["box", "cylinder"]
@@ -119,22 +119,22 @@ def _room(rng: np.random.Generator, ranges: Ranges, pixel: float, tilted: bool) 
 
 
 def _directions(rng: np.random.Generator, ranges: Ranges, tilted: bool) -> tuple[tuple[float, float], ...]:
-    """Angles and tilts [degrees]. The angles of half of the scenes are even over half a turn, the others' are free but
-    for a least distance; there, the first two views are nearly at right angles, so that there are such pairs."""
+    """Angles and tilts [degrees]. The angles of half of the scenes are even over half a turn, the others' random with a
+    least distance; there, the first two views are nearly at right angles, so that there are such pairs."""
     count = ranges.views + ranges.held_out
     first = rng.uniform(0, 180)
     if tilted or rng.random() < 0.5:
         angles = first + np.arange(count) * (180 / count)
         rng.shuffle(angles)
     else:
-        angles = _apart(rng, first, count)
+        angles = _draw_separated_angles(rng, first, count)
         angles[1] = first + rng.uniform(80, 100)
     tilts = rng.uniform(-ranges.tilt, ranges.tilt, count) if tilted else np.zeros(count)
     return tuple((float(angle % 180), float(tilt)) for angle, tilt in zip(angles, tilts))
 
 
-def _apart(rng: np.random.Generator, first: float, count: int) -> np.ndarray:
-    """Angles [count] [degrees] about an axis, free but for a least distance."""
+def _draw_separated_angles(rng: np.random.Generator, first: float, count: int) -> np.ndarray:
+    """Draw angles [count] [degrees] about an axis, with a least distance."""
     least = 180 / count * LEAST_GAP
     gaps = least + (180 - count * least) * rng.dirichlet(np.ones(count))
     angles = first + np.concatenate([[0.0], np.cumsum(gaps)[:-1]])

@@ -82,7 +82,7 @@ def _onix(dataset: Dataset, target: Path, on_progress: Advance) -> Exported:
     found = []
     for number in range(dataset.count):
         scene = as_scan(dataset.sample(number))
-        found.append((_channels(scene), _poses(scene), scene.truth.delta / scene.material.delta, _told(scene)))
+        found.append((_channels(scene), _poses(scene), scene.truth.delta / scene.material.delta, _description(scene)))
         on_progress((number + 1) / dataset.count)
     projections, poses, volumes, told = zip(*found)
     training = int((~dataset.sample(0).is_test).sum())
@@ -125,7 +125,7 @@ def _order(scene: SampleScan) -> np.ndarray:
     return np.argsort(scene.scan.is_test, kind="stable")
 
 
-def _told(scene: SampleScan) -> dict[str, float]:
+def _description(scene: SampleScan) -> dict[str, float]:
     exposures, pixel = scene.scan.exposures, scene.scan.views.pixel_size
     return {
         "pixel_size_m": pixel,

@@ -66,7 +66,7 @@ class Dataset:
         return [range(first, min(first + SHARD, self.count)) for first in range(0, self.count, SHARD)]
 
     def file(self, shard: range) -> Path:
-        """Where the scenes of `shard` are."""
+        """Path of the scenes of `shard`."""
         return self.folder / f"scenes-{shard.start:06d}.h5"
 
     def missing(self) -> list[range]:

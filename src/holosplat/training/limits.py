@@ -1,4 +1,4 @@
-"""Where trained networks fail, in words: what they never saw, and where they scored least."""
+"""Limits of trained networks in words: untrained conditions, and lowest scores."""
 
 from __future__ import annotations
 

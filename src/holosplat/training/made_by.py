@@ -1,4 +1,4 @@
-"""Who made weights: versions, machine, and the commit of the program."""
+"""Provenance of weights: versions, machine, and the commit of the program."""
 
 from __future__ import annotations
 

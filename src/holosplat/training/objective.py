@@ -1,4 +1,4 @@
-"""What is minimised while a network learns, and how good its guesses are."""
+"""The training loss of networks, and the scores of their guesses."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .shown import Lesson
 
 
 def loss(network: Guess, lesson: Lesson, goal: Goal) -> tuple[Tensor, Tensor]:
-    """What is minimised, and the soft Dice coefficient [2] of the guess and of the corrected one."""
+    """The training loss, and the soft Dice coefficient [2] of the guess and of the corrected one."""
     parts, scores = [], []
     for logits in network(lesson.images, lesson.taps):
         dice = soft_dice(torch.sigmoid(logits.float()), lesson.occupancy)

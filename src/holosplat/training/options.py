@@ -48,7 +48,7 @@ class TrainOptions:
     rate: Rate = 1.5e-3
     """Largest rate of AdamW; it falls to `least_rate` of it along half a cosine."""
     least_rate: Share = 0.03
-    """What is left of the rate at the end."""
+    """Learning rate at the end, relative to the start."""
     warm_up: Natural = 100
     """Steps in which the rate rises."""
     decay: Weight = 1e-4
@@ -70,12 +70,12 @@ class TrainOptions:
     shown: Shown = field(default_factory=Shown)
     """How scenes are shown."""
     goal: Goal = field(default_factory=Goal)
-    """What is minimised."""
+    """The training loss."""
     network: Literal["start", "onix", "pixelnerf"] = "start"
     """What is trained: the network of `--start learned`, or those of the methods `onix` and `pixelnerf`, which learn
     from frames alone; these are of one size."""
     frames: FrameGoal = field(default_factory=FrameGoal)
-    """What is minimised where frames are all that is learnt from."""
+    """The training loss of networks that learn from frames alone."""
 
     def __post_init__(self) -> None:
         at_least(self, 1, "steps")

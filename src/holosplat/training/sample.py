@@ -19,7 +19,7 @@ from .draw import PURPOSE, drawn
 from .ranges import Ranges
 
 FEWER = 0.8
-"""What is left of the bodies asked for where they found no place."""
+"""Remaining share of the bodies where not all found a place."""
 
 
 @dataclass(frozen=True)

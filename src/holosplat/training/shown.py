@@ -1,4 +1,4 @@
-"""What a network sees of a sample in one step: some of its views, mirrored and turned, and what they should give."""
+"""Input and target of a network in one step: some views of a sample, mirrored and rotated."""
 
 from __future__ import annotations
 

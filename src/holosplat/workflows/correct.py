@@ -169,11 +169,33 @@ def correct(
     on_progress: Advance = lambda fraction: None,
     reading: Reading = Reading(),
 ) -> Corrected:
-    """Correct the raw file `source` (NXtomo with flats and darks) into the scan file `out`, one frame at a time.
+    """Correct the raw counts in the file `source` by its flats and darks, and write the scan file `out`.
 
-    Defective pixels, marked in the file or found in its darks and flats, are filled from their neighbours; frames are
-    turned upright, corrected as a whole, and then cut to the part that `reading` takes. `InputError` when the file has
-    no flats, or too many defective pixels.
+    options: flat-field method, normalisation, and ring removal
+    reading: values that the file lacks, and the part of it to take
+
+    One frame is in memory at a time. Defective pixels, marked in the file or found in its darks and flats, are filled
+    from their neighbours; frames are turned upright, corrected as a whole, and then cut. The result counts frames,
+    defective pixels and components. Errors: `InputError` for a file without flats, for too many defective pixels, and
+    where `out` cannot be written.
+
+    Examples:
+
+        >>> import holosplat as hs
+        >>> water = hs.materials.parse_material("water").delta_beta(20.0)
+        >>> views = hs.Views.evenly_spaced(8, shape=(16, 16), pixel_size=1e-6)
+        >>> cells = hs.specimens.random_cells(1, box=(16e-6, 16e-6, 16e-6), seed=1)
+        >>> scene = hs.MeshScene.of_one_material(cells, water)
+        >>> scan = hs.simulate(scene, hs.Exposures.of(views, energy_kev=20.0, distance=0.05))
+        >>> from holosplat.beamline.record import record
+        >>> hs.write_scan("scan.nxs", scan)
+        >>> options = hs.beamline.RecordingOptions(flats=10, darks=4)
+        >>> raw = record("scan.nxs", "raw.nxs", options, hs.optics.Camera(), hs.optics.Illumination())
+        >>> done = hs.correct("raw.nxs", "corrected.nxs")
+        >>> done.frames, done.flats, done.method
+        (8, 10, 'dynamic')
+        >>> hs.read("corrected.nxs")
+        Scan(8 frames of 16 × 16 pixels, 2 of them held out)
     """
     require_writable(out)
     require_apart(out, source)

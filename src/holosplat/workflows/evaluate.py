@@ -148,11 +148,28 @@ def render_object(obj: Object, exposures: Exposures, oversample: int, backend: s
 
 
 def evaluate(reconstruction: Reconstruction, scan: Scan | None, truth: Volume | None) -> Evaluation:
-    """Scores of `reconstruction`: on the frames of `scan`, and against `truth` on the truth's own grid.
+    """Score a reconstruction on the frames of `scan`, and against the true volume on the truth's own grid.
 
-    The data range is that of the scan's training frames. Where the light of the training frames is uneven, predictions
-    are compared in the light that each frame shows in its own air (`light_of`), held-out frames too, and in that which
-    the training frames were found to have in common.
+    scan: the frames that it was made of, training and held-out ones (None: no scores of frames)
+    truth: of a simulation (None: no scores of the volume)
+
+    The data range is that of the training frames. If the light of the training frames is uneven, predictions are
+    compared in the light that each frame shows in its own air (`light_of`), and in the light that the training frames
+    have in common. `lines()` of the result gives the scores as text. Errors: `InputError` for a scan of another photon
+    energy.
+
+    Examples:
+
+        >>> import holosplat as hs
+        >>> water = hs.materials.parse_material("water").delta_beta(20.0)
+        >>> views = hs.Views.evenly_spaced(8, shape=(16, 16), pixel_size=1e-6)
+        >>> cells = hs.specimens.random_cells(1, box=(16e-6, 16e-6, 16e-6), seed=1)
+        >>> scene = hs.MeshScene.of_one_material(cells, water)
+        >>> scan = hs.simulate(scene, hs.Exposures.of(views, energy_kev=20.0, distance=0.05))
+        >>> result = hs.reconstruct(scan, hs.MaterialPrior.known(water), hs.Voxels())
+        >>> scores = hs.evaluate(result, scan, truth=scene.voxelise(hs.Grid.of_views(views)))
+        >>> scores.volume.dice > 0.85, scores.test.mean["ssim"] > 0.85
+        (True, True)
     """
     found = _where_it_is_judged(reconstruction)
     lit = None

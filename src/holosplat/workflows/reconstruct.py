@@ -72,19 +72,33 @@ def reconstruct(
     on_progress: FitProgress = lambda stage, fraction, record: None,
     on_state: FitState = lambda stage, fraction, record, state: None,
 ) -> Reconstruction:
-    """The Object that `method` makes of the training frames of `scan`: the best of its states by these frames.
+    """Reconstruct the object in the training frames of `scan`: the best state of `method` by these frames.
 
-    matter: whether it has levels or is continuous; None: decided by the frames.
-    light: what is assumed of the light (default: what the frames show; see `illumination.prepared`).
-    uncertain: distance, energy or δ/β that are known to a range (default: nothing); `constants` of the result then has
-    their estimates, and `Reconstruction.placed` gives the scan that the result belongs to.
-    refine: fit the poses of frames, too, of held-out ones beside the finished matter (default: those of the scan);
-    `geometry` of the result, and again `placed`.
-    With a `folder`, everything is written there, and a later call with `resume=True` goes on from the last
-    checkpoint, with the same result as if nothing had happened. Ctrl-C (KeyboardInterrupt) ends a fit with what it has
-    reached (`finished` is False); during a start there is nothing yet, and it is passed on. Errors: `InputError` for
-    scans without training frames or matter, or of several times (`Scan.is_series`) where `method` takes one, for
-    folders that do not fit, and for what the method cannot do.
+    light: assumptions about the light (default: as the frames show; see `illumination.prepared`)
+    matter: "levels", with sharp edges, or "continuous" (default: chosen from the data)
+    uncertain: ranges of distance, energy or δ/β (default: exact), which the result estimates as `constants`
+    refine: how to estimate poses, too (default: as in the scan); the result has them as `geometry`
+    folder: for all files; with `resume=True` a later call continues from the last checkpoint, to the same result
+
+    Ctrl-C (KeyboardInterrupt) ends a fit with the state that it has reached (`finished` is False). Errors: `InputError`
+    for scans without training frames or matter, or of several times where `method` takes one, for other folders,
+    and for tasks that the method cannot do.
+
+    Examples:
+
+        >>> import holosplat as hs
+        >>> water = hs.materials.parse_material("water").delta_beta(20.0)
+        >>> views = hs.Views.evenly_spaced(8, shape=(16, 16), pixel_size=1e-6)
+        >>> cells = hs.specimens.random_cells(1, box=(16e-6, 16e-6, 16e-6), seed=1)
+        >>> scene = hs.MeshScene.of_one_material(cells, water)
+        >>> scan = hs.simulate(scene, hs.Exposures.of(views, energy_kev=20.0, distance=0.05))
+        >>> result = hs.reconstruct(scan, hs.MaterialPrior.known(water))
+        >>> volume = result.object.voxelise(hs.Grid.of_views(views))
+        >>> volume.delta.shape
+        (16, 16, 16)
+        >>> error = volume.delta.sum() / scene.voxelise(volume.grid).delta.sum() - 1
+        >>> bool(abs(error) < 0.05)
+        True
     """
     if not method.of_series:
         require_one_time(scan)
@@ -124,7 +138,22 @@ def reconstruct(
 
 
 def load_reconstruction(folder: RunFolder) -> Reconstruction:
-    """What a run folder holds; `InputError` if it holds no reconstruction."""
+    """Load the reconstruction in a run folder. Errors: `InputError` if it holds none.
+
+    Examples:
+
+        >>> import holosplat as hs
+        >>> water = hs.materials.parse_material("water").delta_beta(20.0)
+        >>> views = hs.Views.evenly_spaced(8, shape=(16, 16), pixel_size=1e-6)
+        >>> cells = hs.specimens.random_cells(1, box=(16e-6, 16e-6, 16e-6), seed=1)
+        >>> scene = hs.MeshScene.of_one_material(cells, water)
+        >>> scan = hs.simulate(scene, hs.Exposures.of(views, energy_kev=20.0, distance=0.05))
+        >>> run = hs.RunFolder("run")
+        >>> _ = hs.reconstruct(scan, hs.MaterialPrior.known(water), hs.preset("fast"), folder=run)
+        >>> result = hs.load_reconstruction(hs.RunFolder("run"))
+        >>> result.method, result.energy_kev, result.finished
+        ('gaussians', 20.0, True)
+    """
     folder.require_run()
     summary, config = folder.read_summary(), folder.read_config()
     found = folder.read_result()

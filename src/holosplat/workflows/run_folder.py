@@ -35,7 +35,25 @@ OBJECT_SUM = "object_sha256"
 
 
 class RunFolder:
-    """The files of one reconstruction. Every file is replaced as a whole; metrics.csv only grows."""
+    """The folder of a reconstruction: its settings, result, records and checkpoints.
+
+    path: of the folder, which `reconstruct` makes. Every file is replaced as a whole; metrics.csv only grows.
+
+    Examples:
+
+        >>> import holosplat as hs
+        >>> water = hs.materials.parse_material("water").delta_beta(20.0)
+        >>> views = hs.Views.evenly_spaced(8, shape=(16, 16), pixel_size=1e-6)
+        >>> cells = hs.specimens.random_cells(1, box=(16e-6, 16e-6, 16e-6), seed=1)
+        >>> scene = hs.MeshScene.of_one_material(cells, water)
+        >>> scan = hs.simulate(scene, hs.Exposures.of(views, energy_kev=20.0, distance=0.05))
+        >>> run = hs.RunFolder("run")
+        >>> _ = hs.reconstruct(scan, hs.MaterialPrior.known(water), hs.preset("fast"), folder=run)
+        >>> run.object.is_file(), run.config.is_file()
+        (True, True)
+        >>> run.read_summary()["method"]
+        'gaussians'
+    """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)

@@ -63,15 +63,38 @@ def track(
     resume: bool = False,
     on_progress: FitProgress = lambda stage, fraction, record: None,
 ) -> Reconstruction:
-    """Closed bodies of one material that move through the training frames of `scan`, of several times.
+    """Reconstruct closed bodies of one material that move through the training frames of `scan`, of several times.
 
-    `object` of the result is a `MovingSurfaces`: `object.at(t)` is right at any time [s], between frames too. light:
-    what is assumed of it (default: even, unless air says otherwise). A material that is not known is estimated from the
-    first time. With a `folder`, everything is written there: what `reconstruct` writes, `bodies.pvd` with one VTK file
-    (.vtp, µm) a body and time, and `tracks.csv`; and a later call with `resume=True` goes on from the last checkpoint,
-    with the same result as if nothing had happened. Ctrl-C (KeyboardInterrupt) is passed on. Errors: `InputError` for a
-    scan of one time, frames that are not relative to the flat field, two materials, no body that is seen, and folders
-    that do not fit.
+    light: assumptions about the light (default: even, unless air shows otherwise)
+    folder: where to write what `reconstruct` writes, and `bodies.pvd` with one VTK file (.vtp, µm) a body and time, and
+        `tracks.csv`; a later call with `resume=True` continues from the last checkpoint, with the same result
+
+    `object` of the result is a `MovingSurfaces`: `object.at(t)` holds at any time [s], between frames too. A material
+    that is not known is estimated from the first time. Ctrl-C (KeyboardInterrupt) is passed on. Errors: `InputError`
+    for a scan of one time, frames that are not relative to the flat field, two materials, no body that is seen, and
+    folders that do not fit.
+
+    Examples:
+
+        >>> from dataclasses import replace
+        >>> import numpy as np
+        >>> import holosplat as hs
+        >>> from holosplat.motion.track import TrackOptions
+        >>> water = hs.materials.parse_material("water").delta_beta(20.0)
+        >>> (cell,) = hs.specimens.random_cells(1, box=(16e-6, 16e-6, 16e-6), seed=1)
+        >>> times, speed = np.array([0.0, 1e-5, 2e-5]), 0.05  # s, m/s along y
+        >>> ways = [cell.transformed(np.eye(3), [0.0, speed * time, 0.0]) for time in times]
+        >>> series = hs.specimens.MeshSeries([hs.MeshScene.of_one_material([each], water) for each in ways], times)
+        >>> views = hs.Views.evenly_spaced(4, shape=(24, 24), pixel_size=1e-6)
+        >>> exposures = hs.Exposures.of(views, energy_kev=20.0, distance=0.05).repeated(times)
+        >>> scan = hs.simulate(series, exposures, is_test=np.zeros(len(exposures)))
+        >>> quick = replace(TrackOptions(), intervals=False).with_effort(0.1)
+        >>> found = hs.track(scan, hs.MaterialPrior.known(water), quick).object
+        >>> found.count
+        1
+        >>> first, last = (found.bodies(time)[0].vertices.mean(0) for time in times[[0, -1]])
+        >>> print(f"{(last - first)[1] / times[-1]:.2f} m/s")
+        0.05 m/s
     """
     require(not isinstance(prior, KnownTwo), "bodies are of one material, but two are known; leave --second-material.")
     require_times(scan.train())

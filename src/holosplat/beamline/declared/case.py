@@ -1,4 +1,4 @@
-"""A simulated experiment as a case: a true scene, how it is measured, and what methods are told."""
+"""A simulated experiment as a case: a true scene, how it is measured, and the information for methods."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from .declaration import Declaration
 @dataclass(frozen=True)
 class Case:
     """name: of the case; seed: of its scene and its noise; scene: the truth; exposures: N frames; is_test: [N] bool,
-    those held out; prior: what every method is told of the matter; photons: a pixel, None without noise; summary: one
+    those held out; prior: of the matter, for every method; photons: a pixel, None without noise; summary: one
     line about the case; specimen: what the scene is, in words; balls: those of a resolution phantom, mesh by mesh;
     light: how it differs from the flat field on the frames for training; misalignment: errors of the exposures, drawn
-    with `seed` added to their own. Methods are told the planned `exposures`; frames are taken in the true ones."""
+    with `seed` added to their own. Methods get the planned `exposures`; frames are taken in the true ones."""
 
     name: str
     seed: int

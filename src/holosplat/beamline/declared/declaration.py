@@ -1,4 +1,4 @@
-"""A case as its TOML file declares it: what is measured, of what, how, and what the methods are told.
+"""A case as its TOML file declares it: what is measured, of what, how, and the information for methods.
 
 A file is one case, or, with tables `[variants.NAME]`, as many cases that say what differs. `[with_snapshots]` says what
 differs where a folder of simulated cells is given. Lengths are in metres, angles in degrees, densities in g/cm³.
@@ -161,8 +161,8 @@ class Listed:
 @ranged
 class Declaration:
     """A case without its seed. summary: one line about it; photons: mean counts a pixel of a frame for training, or
-    none for frames without noise; prior: what methods are told of `matter.material` against the medium; light: how it
-    differs from the flat field on frames for training; misalignment: how far beams are from where methods are told."""
+    none for frames without noise; prior: for methods, of `matter.material` against the medium; light: how it
+    differs from the flat field on frames for training; misalignment: errors of the geometry for methods."""
 
     summary: str
     specimen: Specimen
@@ -198,7 +198,7 @@ class Declaration:
         return Exposures.of(views, self.beam.energy_kev, self.beam.distance, self.detector.psf_sigma_px), is_test
 
     def material_prior(self) -> MaterialPrior:
-        """What methods are told."""
+        """The information that methods get."""
         contrast = self._delta_beta(self.matter.material).against(self._delta_beta(self.matter.medium))
         if self.prior == "known":
             return MaterialPrior.known(contrast)

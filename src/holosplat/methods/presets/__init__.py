@@ -36,7 +36,17 @@ def preset_names() -> tuple[str, ...]:
 
 @lru_cache
 def preset(name: str) -> Gaussians:
-    """The options of Gaussians called `name`; `InputError` listing the names otherwise."""
+    """Look up the options of Gaussians called `name`; `InputError` lists the names otherwise.
+
+    Examples:
+
+        >>> import holosplat as hs
+        >>> hs.methods.presets.preset_names()
+        ('default', 'fast', 'random', 'thesis')
+        >>> fast = hs.preset("fast")
+        >>> fast.fit.schedule.steps < hs.Gaussians().fit.schedule.steps
+        True
+    """
     if name not in preset_names():
         raise InputError(f"preset must be one of {', '.join(preset_names())}, but it is {name!r}.")
     found = method_of(read_table(FOLDER / f"{name}.toml"), f"preset {name}")

@@ -1,7 +1,7 @@
 """Halos of matter that a frame's edge cuts, taken out of retrieved thickness.
 
-Fringes tell the curvature of the thickness, `∇²T` (the transport of intensity, Teague 1983), so that it is open up to a
-function without curvature, and such a function is told by its values at the border alone. Where matter goes on beyond
+Fringes determine the curvature of the thickness, `∇²T` (the transport of intensity, Teague 1983). The thickness is
+therefore free by a function without curvature, which its values at the border determine. Where matter extends beyond
 the frame these are wrong, and a smooth halo reaches from there far into the frame. It is found again where there is
 air, whose thickness is zero.
 """

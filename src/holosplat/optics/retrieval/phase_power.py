@@ -54,7 +54,7 @@ def expected_shapes(frames: Tensor, response2: Tensor, cycles: Tensor, noise: Te
 
 
 def _mean_shape(seen: np.ndarray, shape: np.ndarray, rest: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
-    """Corner and decay by a ring spectrum `seen` [R]; shape: what each pair of them predicts [C, D, R] but for a scale,
+    """Corner and decay by a ring spectrum `seen` [R]; shape: what each pair of them predicts [C, D, R] up to a scale,
     beside the power of everything else, `rest` [R]; weight: samples of each ring [R]."""
     tiny = np.finfo(float).tiny
     scale = np.maximum((seen - rest).clip(0).sum() / np.maximum(shape.sum(axis=-1), tiny), tiny)[..., None]

@@ -1,4 +1,4 @@
-"""Where a block of consecutive voxels lies: shared by kernels that give every voxel a lane."""
+"""Places of a block of consecutive voxels, for kernels that give every voxel a lane."""
 
 # pyright: reportGeneralTypeIssues=false, reportOperatorIssue=false, reportAttributeAccessIssue=false
 # pyright: reportCallIssue=false, reportIndexIssue=false, reportArgumentType=false, reportOptionalMemberAccess=false

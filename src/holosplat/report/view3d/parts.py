@@ -37,7 +37,7 @@ until it does."""
 
 @dataclass(frozen=True)
 class Part:
-    """What stands for one object.
+    """The representation of one object in the view.
 
     kind: `gaussians`, `surfaces`, `paths` or `volume`; arrays: by name; facts: what brings them back, as JSON holds it;
     channels: (δ, β) of a value of one.

@@ -1,4 +1,4 @@
-"""What the view in three dimensions shows, and the text of it that goes into the page."""
+"""The content of the view in three dimensions, and its text in the page."""
 
 from __future__ import annotations
 

@@ -47,7 +47,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class SeriesPage:
-    """What a page shows. failed: reasons by what failed; refresh: seconds after which a browser reads it again; 0:
+    """Content of a page. failed: reasons by what failed; refresh: seconds after which a browser reads it again; 0:
     never."""
 
     title: str
@@ -206,7 +206,7 @@ def _evenly(count: int) -> list[int]:
 
 
 def _maps(frames: Sequence[Frame]) -> tuple[list[tuple[Frame, np.ndarray]], list[str]]:
-    """The phase maps that are there, each with its time, and what is said of those that cannot be read."""
+    """The phase maps that exist, each with its time, and messages about those that cannot be read."""
     kept, unread = list[tuple[Frame, np.ndarray]](), list[str]()
     for frame in frames:
         if not frame.phase.exists():

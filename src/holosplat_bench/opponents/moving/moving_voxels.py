@@ -21,7 +21,7 @@ from holosplat.volume import LineIntegrals, Volume
 
 
 class OnVoxels:
-    """What Objects have in common whose matter at any time is occupancies of one material on the voxels of one grid.
+    """Base of moving objects whose matter is an occupancy of one material on one grid at any time.
 
     A kind of it says `values(time)`, `parameters()`, how tensors take the place of these (`_put`), and `state()`.
 
@@ -190,7 +190,7 @@ class LowRankVoxels(OnVoxels):
 
     @classmethod
     def nearest(cls, series: VoxelSeries, rank: int) -> LowRankVoxels:
-        """That of `rank` (or of as many as there are times) that is nearest to `series` in the mean square.
+        """The least-squares approximation of `series` of `rank` (at most the number of times).
 
         By the eigenvectors of the products of times, so that no matrix of voxels is decomposed (Eckart & Young 1936).
         Courses have a mean square of one.
