@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from fault_shop import Shop, Writer, is_whole, reads, snapshots
+from fault_shop import Shop, Writer, hidden_in, is_whole, reads, snapshots
 from forked import Ended, run
 
 BLOCK = 4096
@@ -38,14 +38,9 @@ def killed(shop: Shop, writer: Writer, seconds: float, rng: random.Random, folde
     second = run([*command, *writer.again] if writer.again and begun else command, limit=limit)
     if second.verdict:
         return second.verdict
-    if second.code != 0 or _left(folder):
+    if second.code != 0 or hidden_in(folder):
         return "lost"
     return "" if is_whole(out) else "lost"
-
-
-def _left(folder: Path) -> list[Path]:
-    """Hidden files that the next command should have cleared, or a lock."""
-    return [path for path in folder.rglob(".*") if path.is_file()]
 
 
 def full(shop: Shop, writer: Writer, largest: int, rng: random.Random, folder: Path) -> str:

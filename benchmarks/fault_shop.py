@@ -62,6 +62,11 @@ class Shop:
         return self.path / "run"
 
     @property
+    def track(self) -> Path:
+        """A run of `track` on that."""
+        return self.path / "track"
+
+    @property
     def quick(self) -> Path:
         """Options of that."""
         return self.path / "quick.json"
@@ -86,6 +91,7 @@ class Shop:
             shop.record(shop.raw),
             shop.reconstruct(shop.run),
             shop.in_motion(cells),
+            ["track", shop.moving, "--out", shop.track, *TRACK],
         ):
             ended = run(command, limit=600)
             if ended.code != 0:
@@ -127,6 +133,22 @@ class Writer:
     again: tuple[object, ...] = ()
     begun: tuple[str, ...] = ("config.json", "grow.json")
     goes_on: bool = False
+
+
+def pipeline(shop: Shop, out: Path) -> str:
+    """A pipeline file: raw counts are corrected, reconstructed and exported, into files whose names begin with `out`."""
+    stages = {
+        "correct": {"raw": shop.raw, "out": f"{out}.nxs"},
+        "reconstruct": {"out": f"{out}_run", "material": "haemoglobin", "matter": "levels", "config": shop.quick},
+        "export": {"volume": f"{out}.vti"},
+    }
+    tables = ([f"[{name}]", *(f'{key} = "{value}"' for key, value in keys.items())] for name, keys in stages.items())
+    return "\n".join(line for table in tables for line in table) + "\n"
+
+
+def hidden_in(folder: Path) -> list[Path]:
+    """Hidden files in a folder: what a command had not finished, or a lock."""
+    return [path for path in folder.rglob(".*") if path.is_file()]
 
 
 def copied_run(shop: Shop, folder: Path) -> Path:
