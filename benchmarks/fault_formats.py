@@ -179,7 +179,7 @@ def records(shop: Shop, rng: random.Random, folder: Path) -> str:
 
 def _judged(command: Sequence[object], folder: Path) -> str:
     left = set(hidden_in(folder))
-    verdict = sentence(run(list(command)))
+    verdict = sentence(run(list(command), first=lambda: os.chdir(folder)))
     if verdict:
         print(" ".join(map(str, command)), flush=True)
     return verdict or ("torn" if set(hidden_in(folder)) - left else "")

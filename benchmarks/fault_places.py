@@ -77,7 +77,7 @@ def outputs(shop: Shop, rng: random.Random, folder: Path) -> str:
     forced = rng.random() < 0.6 and "--log" not in options
     said += ["--force"] * forced
     before = _sums(folder)
-    ended = run(said, first=lambda: _into(folder), limit=120)
+    ended = run(said, first=lambda: os.chdir(folder), limit=120)
     after = _sums(folder)
     changed = [name for name, value in before.items() if after.get(name) != value]
     reads = {str(word) for word in command} | {name for name in names if name.startswith("run/")}
@@ -98,10 +98,6 @@ def _of(target: str, folder: Path) -> set[str]:
     real = str(place.relative_to(folder.resolve())) if folder.resolve() in place.parents else target
     pair = f"{real.removesuffix('.mrc')}.beta.mrc"
     return {target, real, pair, *(f"{name}.provenance.json" for name in (real, pair) if name == "volume.mrc")}
-
-
-def _into(folder: Path) -> None:
-    os.chdir(folder)
 
 
 def _sums(folder: Path) -> dict[str, str]:
@@ -142,7 +138,7 @@ def foreign(shop: Shop, rng: random.Random, folder: Path) -> str:
         _say_so(copied / "provenance.json", lambda said: {"records": [said["records"][0] | {"command": command}]})
     if kind == "scan":
         commands["scan"][2] += ["--out", out, *MATERIAL]
-    ended = run(rng.choice(commands[kind]), first=lambda: _into(folder))
+    ended = run(rng.choice(commands[kind]), first=lambda: os.chdir(folder))
     return sentence(ended) or ("let in" if ended.code == 0 else "")
 
 

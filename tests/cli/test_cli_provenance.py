@@ -195,6 +195,22 @@ def test_what_force_would_replace_comes_back_where_a_command_fails(place):
     refused(holosplat("convert", "scan.nxs", "frames", "--to", "tiff", "--force"), "frames.replaced", "rename it back")
 
 
+@pytest.mark.parametrize("link", [False, True])
+def test_pipes_and_devices_are_not_replaced(shop, place, link):
+    """With --force neither, nor by a link to one."""
+    for name in ("a.nxs", "a.png", "a.vti", "a.h5"):
+        pipe = place / (f"pipe_{name}" if link else name)
+        os.mkfifo(pipe)
+        if link:
+            Path(name).symlink_to(pipe.name)
+        words = {".nxs": ("align", "scan.nxs", "--axis-only", "--out"), ".png": ("info", "scan.nxs", "--picture")}
+        refused(
+            holosplat(*words.get(Path(name).suffix, ("export", shop.run, "--volume")), name, "--force"),
+            f"{name} must be a file to write, but it is a pipe or a device",
+        )
+        assert pipe.is_fifo()
+
+
 def test_a_link_to_a_folder_is_replaced_with_force(place):
     worked(holosplat("convert", "scan.nxs", "frames", "--to", "tiff"))
     Path("link").symlink_to("frames")
