@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from fault_shop import Shop, Writer, is_whole, reads, snapshots
+from fault_shop import Shop, Writer, hidden_in, is_whole, reads, snapshots
 from forked import Ended, run
 
 BLOCK = 4096
@@ -28,24 +28,20 @@ def killed(shop: Shop, writer: Writer, seconds: float, rng: random.Random, folde
     out = folder / writer.out
     if out.is_file() and not is_whole(out):
         return "lost"
-    begun = any((out / name).is_file() for name in writer.begun)
+    begun = any((out / name).is_file() for name in writer.begun) or not writer.begun
     done = writer.again and (first.code == 0 or ((out / "grow.json").is_file() and snapshots(out) == 4))
     if done:
         return ""
     at_once = writer.out != "run" and not writer.again and not writer.goes_on
     if at_once and out.exists():  # what is there is whole
         return "" if first.code == 0 or out.is_file() or reads(out) else "lost"
-    second = run([*command, *writer.again] if writer.again and begun else command, limit=limit)
+    again = writer.alone(out) if writer.alone else [*command, *writer.again]
+    second = run(again if writer.again and begun else command, limit=limit)
     if second.verdict:
         return second.verdict
-    if second.code != 0 or _left(folder):
+    if second.code != 0 or hidden_in(folder):
         return "lost"
     return "" if is_whole(out) else "lost"
-
-
-def _left(folder: Path) -> list[Path]:
-    """Hidden files that the next command should have cleared, or a lock."""
-    return [path for path in folder.rglob(".*") if path.is_file()]
 
 
 def full(shop: Shop, writer: Writer, largest: int, rng: random.Random, folder: Path) -> str:

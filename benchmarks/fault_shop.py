@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,6 +15,8 @@ from own_case import two_cells
 
 from holosplat.checks import InputError
 from holosplat.io.formats import read
+from holosplat.io.pvd import read_pvd
+from holosplat.io.volume_formats import read_volume_file
 from holosplat.io.vtk import read_meshes, write_mesh
 from holosplat.mesh import TriangleMesh
 from holosplat.specimens.red_cells import random_cells
@@ -30,6 +33,8 @@ QUICK = {
     "fit": {"objective": {"tv_volume": 0.05}, "schedule": {"steps": 12}},
 }
 METHODS = ("paganin-sirt", "paganin-tv")
+XDMF = re.compile(r">([^<>]*):/")
+"""Files that an XDMF file names."""
 TIMES, STEP = 3, 1e-4
 """Moments of the scan in which the cells move, and seconds between two."""
 
@@ -62,6 +67,11 @@ class Shop:
         return self.path / "run"
 
     @property
+    def track(self) -> Path:
+        """A run of `track` on that."""
+        return self.path / "track"
+
+    @property
     def quick(self) -> Path:
         """Options of that."""
         return self.path / "quick.json"
@@ -86,6 +96,7 @@ class Shop:
             shop.record(shop.raw),
             shop.reconstruct(shop.run),
             shop.in_motion(cells),
+            ["track", shop.moving, "--out", shop.track, *TRACK],
         ):
             ended = run(command, limit=600)
             if ended.code != 0:
@@ -119,7 +130,8 @@ class Shop:
 @dataclass(frozen=True)
 class Writer:
     """A command that writes `out` in a folder. again: what the command needs where `out` is begun, that is, has one of
-    the files `begun`; goes_on: whether the command goes on with what is there as it is."""
+    the files `begun`, or in any case where there are none; goes_on: whether the command goes on with what is there as
+    it is; alone: the command that goes on with `out`, where it is another one."""
 
     name: str
     command: Callable[[Shop, Path], list[object]]
@@ -127,6 +139,29 @@ class Writer:
     again: tuple[object, ...] = ()
     begun: tuple[str, ...] = ("config.json", "grow.json")
     goes_on: bool = False
+    alone: Callable[[Path], list[object]] | None = None
+
+
+def pipeline(shop: Shop, out: Path) -> str:
+    """A pipeline file: counts are corrected, a scan is reconstructed and exported, to paths that begin with `out`."""
+    stages = {
+        "correct": {"raw": shop.raw, "out": f"{out}.nxs"},
+        "reconstruct": {
+            "scan": shop.scan,
+            "out": f"{out}_run",
+            "material": "haemoglobin",
+            "matter": "levels",
+            "config": shop.quick,
+        },
+        "export": {"volume": f"{out}.vti"},
+    }
+    tables = ([f"[{name}]", *(f'{key} = "{value}"' for key, value in keys.items())] for name, keys in stages.items())
+    return "\n".join(line for table in tables for line in table) + "\n"
+
+
+def hidden_in(folder: Path) -> list[Path]:
+    """Hidden files in a folder: what a command had not finished, or a lock."""
+    return [path for path in folder.rglob(".*") if path.is_file()]
 
 
 def copied_run(shop: Shop, folder: Path) -> Path:
@@ -140,6 +175,24 @@ GROWTH = ["--cells", 1, "--box", "30e-6", "20e-6", "20e-6", "--snapshots", 4, "-
 TRACK = [*MATERIAL, "--effort", 0.05, "--pieces", 1, "--rounds", 0, "--no-intervals"]
 SURFACE = ["--steps", 8]
 
+
+def _piped(shop: Shop, folder: Path) -> list[object]:
+    (folder / "pipeline.toml").write_text(pipeline(shop, folder / "out"))
+    return ["run", folder / "pipeline.toml"]
+
+
+def _exported(name: str, *options: object, moving: bool = False) -> Writer:
+    """Files of several times, or two files, are begun anew by --force."""
+    suffix = {".pvd": ".vtu", ".xdmf": ".h5"}.get(Path(name).suffix, Path(name).suffix)
+
+    def command(shop: Shop, folder: Path) -> list[object]:
+        file = (folder / name).with_suffix(suffix)
+        return ["export", shop.track if moving else shop.run, *options[:1], file, *options[1:]]
+
+    return Writer(f"export {Path(name).suffix}", command, name, ("--force",), ())
+
+
+EVERY = ("--time-frame", "all")
 WRITERS = (
     Writer("simulate", lambda shop, folder: shop.simulate(folder / "out.nxs"), "out.nxs"),
     Writer("record", lambda shop, folder: shop.record(folder / "out.nxs"), "out.nxs"),
@@ -150,7 +203,27 @@ WRITERS = (
         "render", lambda shop, folder: ["render", shop.run, "--scan", shop.scan, "--out", folder / "out.nxs"], "out.nxs"
     ),
     Writer("export", lambda shop, folder: ["export", shop.run, "--volume", folder / "out.h5"], "out.h5"),
-    Writer("reconstruct", lambda shop, folder: shop.reconstruct(folder / "out"), "out", ("--resume",)),
+    *(_exported(f"out{suffix}", "--volume") for suffix in (".vti", ".nrrd", ".mrc", ".tif")),
+    _exported("out.vtu", "--bodies", moving=True),
+    _exported("out.pvd", "--bodies", *EVERY, moving=True),
+    _exported("out.xdmf", "--volume", *EVERY, moving=True),
+    Writer("compare", lambda shop, folder: ["compare", shop.run, shop.run, "--out", folder / "out.html"], "out.html"),
+    Writer("info", lambda shop, folder: ["info", shop.scan, "--picture", folder / "out.png"], "out.png"),
+    Writer("run", _piped, "out_run", goes_on=True),
+    Writer(
+        "reconstruct",
+        lambda shop, folder: [*shop.reconstruct(folder / "out"), "--log", folder / "log.txt"],
+        "out",
+        ("--resume",),
+    ),
+    Writer(
+        "resume RUN",
+        lambda shop, folder: shop.reconstruct(folder / "out"),
+        "out",
+        ("--resume",),
+        ("provenance.json",),
+        alone=lambda out: ["reconstruct", "--resume", out],
+    ),
     Writer("evaluate", lambda shop, folder: ["evaluate", copied_run(shop, folder)], "run"),
     Writer("grow", lambda shop, folder: ["grow", "--out", folder / "out", *GROWTH], "out", ("--resume",)),
     Writer("track", lambda shop, folder: ["track", shop.moving, "--out", folder / "out", *TRACK], "out", ("--resume",)),
@@ -175,9 +248,25 @@ def is_whole(out: Path) -> bool:
     if out.is_dir() and not (out / "config.json").is_file():
         return reads(out)
     try:
-        return not check(out)[1]
+        return _is_sound(out) if out.suffix in SOUND else not check(out)[1]
     except InputError:
         return False
+
+
+SOUND = (".vti", ".nrrd", ".mrc", ".tif", ".vtu", ".pvd", ".xdmf", ".html", ".png")
+"""Suffixes of files of other programs, which `check` does not know."""
+
+
+def _is_sound(out: Path) -> bool:
+    """Whether a file of another program is complete, and so are those that it names."""
+    if out.suffix in (".html", ".png"):
+        return out.suffix == ".png" or out.read_bytes().rstrip().endswith(b"</html>")  # pictures stay blank
+    if out.suffix == ".xdmf":
+        return all(not check(out.parent / name)[1] for name in XDMF.findall(out.read_text(encoding="utf-8")))
+    if out.suffix in (".vtu", ".pvd"):
+        files = [file for step in read_pvd(out) for file in step.files] if out.suffix == ".pvd" else [out]
+        return len(read_meshes(files, "um")) > 0
+    return read_volume_file(out).delta.size > 0
 
 
 def reads(out: Path) -> bool:

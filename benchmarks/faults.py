@@ -3,9 +3,10 @@
 python benchmarks/faults.py --trials 200 --csv docs/data/faults.csv
 
 Each trial is one command (or two: the next one), counted as a traceback, a hang (more than 60 s and, where it is
-killed, ten times what it takes undisturbed), a crash (a signal that nobody sent), a wrong result taken silently, or
-something lost: a file that was whole before and is no more, or a folder that no next command takes. Trials are drawn
-from the seed, and repeat with it but for moments of a kill.
+killed, ten times what it takes undisturbed), a crash (a signal that nobody sent), a wrong result taken silently, a file
+torn (half of it is left), something lost (a file that was whole before and is no more, or a folder that no next command
+takes), or values of another file let in without leave. Trials are drawn from the seed, and repeat with it but for
+moments of a kill.
 """
 
 from __future__ import annotations
@@ -24,13 +25,15 @@ from pathlib import Path
 
 import machine
 from fault_files import flipped, hostile, odd, tampered, two
+from fault_formats import formats, records
 from fault_kills import full, killed
 from fault_limits import denied, extreme, starved
+from fault_places import foreign, outputs
 from fault_shop import WRITERS, Shop, Writer
 from forked import loaded, run, size_of
 from rows import read, write
 
-OUTCOMES = ("traceback", "hang", "crash", "silent", "lost")
+OUTCOMES = ("traceback", "hang", "crash", "silent", "torn", "lost", "let in")
 DISTURBED = ("kill -9", "full disk")
 SINGLE: dict[str, Callable[[Shop, random.Random, Path], str]] = {
     "bit flips": flipped,
@@ -39,6 +42,10 @@ SINGLE: dict[str, Callable[[Shop, random.Random, Path], str]] = {
     "odd values": odd,
     "two writers": two,
     "extreme kernels": extreme,
+    "files of all formats": formats,
+    "files of a run": records,
+    "outputs over inputs": outputs,
+    "values of other files": foreign,
 }
 LIMITED: dict[str, Callable[[Shop, Writer, random.Random, Path], str]] = {
     "no permission": denied,
@@ -50,6 +57,8 @@ def timed(shop: Shop, writer: Writer) -> tuple[float, int]:
     """Seconds that a command takes, and bytes of the largest file that it writes."""
     with tempfile.TemporaryDirectory() as name:
         ended = run(writer.command(shop, Path(name)), limit=600)
+        if ended.code != 0:
+            raise SystemExit(f"{writer.name} must work before it is disturbed, but: {ended.said}")
         return ended.seconds, size_of(Path(name) / writer.out)
 
 

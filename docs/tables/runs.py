@@ -340,7 +340,7 @@ def families_scenes() -> str:
 
 def faults() -> str:
     """What commands did when they were disturbed, kind by kind."""
-    head = ("kind", "trials", "traceback", "hang", "crash", "silent", "lost")
+    head = ("kind", "trials", "traceback", "hang", "crash", "silent", "torn", "lost", "let in")
     return markdown(head, [[row[name] for name in head] for row in read("faults.csv")])
 
 

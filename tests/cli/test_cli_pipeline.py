@@ -128,3 +128,23 @@ def test_keys_are_the_options_of_the_command(name):
     assert keys == [key for key in wanted if f"--{key}" not in OF_ONE_CALL]
     assert len(short) < len(whole)
     assert list(tomllib.loads(short)) == list(tomllib.loads(whole)) == list(STAGES)
+
+
+EATERS = {
+    "what it reads": '[correct]\nraw = "raw.nxs"\nout = "a.nxs"\n[align]\nout = "raw.nxs"\n',
+    "a table over it": '[correct]\nraw = "raw.nxs"\nout = "a.nxs"\n[align]\nout = "b.nxs"\ntable = "raw.nxs"\n',
+    "itself": '[correct]\nraw = "raw.nxs"\nout = "run.toml"\n',
+    "a stage's file": '[correct]\nraw = "raw.nxs"\nout = "a.nxs"\n[reconstruct]\nscan = "raw.nxs"\nout = "a.nxs"\n',
+}
+
+
+@pytest.mark.parametrize("kind", EATERS)
+def test_no_stage_writes_over_what_the_pipeline_needs(place, kind):
+    """With --redo neither."""
+    shutil.copy("scan.nxs", "raw.nxs")
+    before = Path("raw.nxs").read_bytes()
+    for redo in ((), ("--redo",)):
+        refused(piped(EATERS[kind], *redo), "run.toml: --", "name another")
+        assert Path("raw.nxs").read_bytes() == before
+        assert Path("run.toml").read_text() == EATERS[kind]
+    assert {path.name for path in place.iterdir()} == {"scan.nxs", "raw.nxs", "quick.json", "run.toml"}

@@ -80,6 +80,11 @@ WAYS: dict[str, tuple[list[str], str]] = {
     "series: in a run": (["series", "plan", "a", "--out", "run/series"], INSIDE),
     "bench: a case": (["bench", "run", "--cases", "case.toml", "--out", "case.toml"], READS),
     "bench: in a run": (["bench", "run", "--out", "run/bench"], INSIDE),
+    "compare: the scan of a run": (["compare", "run", "run", "--out", "a", "--force"], READS),
+    "simulate: β": (["simulate", "v.mrc", *BEAM, "--out", "c", "--truth", "v.beta.mrc", "--force"], READS),
+    "simulate: β twice": (["simulate", "a", *BEAM, "--out", "n.beta.mrc", "--truth", "n.mrc"], TWICE),
+    "info: whence a file comes": (["info", "a.png.provenance.json", "--picture", "a.png"], READS),
+    "a log in a run": (["info", "a", "--log", "run/new.log"], INSIDE),
     "thesis: snapshots": (["bench", "thesis", "--snapshots", "folder", "--out", "folder"], READS),
 }
 
@@ -88,10 +93,12 @@ WAYS: dict[str, tuple[list[str], str]] = {
 def place(tmp_path, monkeypatch) -> Path:
     """Two files, a link, a folder with a file, and a run."""
     monkeypatch.chdir(tmp_path)
-    for name in ("a", "b", "a.h5", "case.toml", "folder/frames.tif", "run/config.json", "run/object.h5"):
+    more = ("v.mrc", "v.beta.mrc", "a.png.provenance.json", "folder/frames.tif", "run/config.json", "run/object.h5")
+    for name in ("a", "b", "a.h5", "case.toml", *more):
         path = tmp_path / name
         path.parent.mkdir(exist_ok=True)
         path.write_text(json.dumps({}))
+    (tmp_path / "run/source.json").write_text(json.dumps({"scan": "a"}))
     (tmp_path / "link").symlink_to("a")
     return tmp_path
 

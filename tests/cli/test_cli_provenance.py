@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import inspect
 import json
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,8 @@ import pytest
 
 from helpers.cli import Workshop, holosplat, known, refused, worked
 from holosplat.cli import entry
-from holosplat.io import provenance
+from holosplat.cli.resume import is_made_by
+from holosplat.io import hdf5_guard, provenance
 from holosplat.io.provenance import from_home, home_safe, records
 
 TAKEN = "must be new or empty, but it holds something already"
@@ -191,6 +193,91 @@ def test_what_force_would_replace_comes_back_where_a_command_fails(place):
     assert not Path("frames.replaced").exists()
     Path("frames.replaced").mkdir()
     refused(holosplat("convert", "scan.nxs", "frames", "--to", "tiff", "--force"), "frames.replaced", "rename it back")
+
+
+@pytest.mark.parametrize("link", [False, True])
+def test_pipes_and_devices_are_not_replaced(shop, place, link):
+    """With --force neither, nor by a link to one."""
+    for name in ("a.nxs", "a.png", "a.vti", "a.h5"):
+        pipe = place / (f"pipe_{name}" if link else name)
+        os.mkfifo(pipe)
+        if link:
+            Path(name).symlink_to(pipe.name)
+        words = {".nxs": ("align", "scan.nxs", "--axis-only", "--out"), ".png": ("info", "scan.nxs", "--picture")}
+        refused(
+            holosplat(*words.get(Path(name).suffix, ("export", shop.run, "--volume")), name, "--force"),
+            f"{name} must be a file to write, but it is a pipe or a device",
+        )
+        assert pipe.is_fifo()
+
+
+def test_a_link_to_a_folder_is_replaced_with_force(place):
+    worked(holosplat("convert", "scan.nxs", "frames", "--to", "tiff"))
+    Path("link").symlink_to("frames")
+    before = sorted(Path("frames").iterdir())
+    worked(holosplat("convert", "scan.nxs", "link", "--to", "tiff", "--force"))
+    assert not Path("link").is_symlink()
+    assert sorted(Path("frames").iterdir()) == before
+    assert {path.name for path in place.iterdir()} == {"scan.nxs", "truth.h5", "frames", "link"}
+
+
+@pytest.mark.parametrize("force", [(), ("--force",)])
+def test_what_others_keep_beside_a_file_is_not_replaced(shop, place, force):
+    Path("v.vti.provenance.json").write_text("theirs")
+    refused(holosplat("export", shop.run, "--volume", "v.vti", *force), "v.vti.provenance.json must be new")
+    assert Path("v.vti.provenance.json").read_text() == "theirs"
+    assert not Path("v.vti").exists()
+
+
+GARBLED = {
+    "nested": "[" * 100_000,
+    "a number of many digits": '{"records": [{"command": ' + "9" * 5000 + "}]}",
+    "other kinds": '{"records": [{"command": 5, "folder": [], "inputs": {}}]}',
+    "no list": '{"records": 5}',
+    "no text": b"\xff\xfe",
+}
+
+
+@pytest.mark.parametrize("kind", [*GARBLED, "a pipe"])
+def test_records_that_are_garbled_are_none(tmp_path, kind):
+    """And no pipe is waited for."""
+    for place in (tmp_path / "provenance.json", tmp_path / "file.provenance.json"):
+        if kind == "a pipe":
+            os.mkfifo(place)
+        else:
+            text = GARBLED[kind]
+            place.write_bytes(text if isinstance(text, bytes) else text.encode())
+    (tmp_path / "file").write_text("")
+    for path in (tmp_path, tmp_path / "file"):
+        assert not is_made_by(path, ["reconstruct"])
+    with h5py.File(tmp_path / "file.h5", "w") as file:
+        file.attrs["provenance"] = "[" * 10_000
+    assert not is_made_by(tmp_path / "file.h5", ["reconstruct"])
+
+
+def test_a_run_does_not_allow_itself_values_of_other_files(shop, place):
+    """Whoever reads it does, whatever its files say."""
+    shutil.copytree(shop.run, "run")
+    with h5py.File("scan.nxs", "r+") as file, h5py.File("other.h5", "w") as other:
+        name = "entry/instrument/detector/data"
+        other["frames"] = file[name][()]
+        del file[name]
+        file[name] = h5py.ExternalLink("other.h5", "/frames")
+    said = json.loads(Path("run/source.json").read_text())
+    said |= {"scan": str(place / "scan.nxs"), "reading": said["reading"] | {"allow_external": True}}
+    Path("run/source.json").write_text(json.dumps(said))
+    for words in (
+        ("evaluate", "run"),
+        ("convert", "run", "out", "--to", "tiff"),
+        ("compare", "run", "run", "--out", "page.html"),
+    ):
+        refused(holosplat(*words), "must hold its own values", "add --allow-external")
+        worked(holosplat(*words, "--allow-external"))
+        hdf5_guard._vouched.clear()
+    record = records(Path("run"))[0] if records(Path("run")) else {}
+    record |= {"command": "holosplat reconstruct scan.nxs --allow-external --out run", "inputs": [], "folder": "."}
+    Path("run/provenance.json").write_text(json.dumps({"records": [record]}))
+    refused(holosplat("reconstruct", "--resume", "run"), "must hold its own values", "add --allow-external")
 
 
 def test_force_and_resume_exclude_each_other(place):

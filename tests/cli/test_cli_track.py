@@ -144,6 +144,7 @@ def test_all_times_open_in_paraview(folder):
         for mesh, own in zip(read_meshes(step.files, "um"), found.bodies(time), strict=True):
             assert mesh.name == own.name
             assert mesh.vertices == pytest.approx(own.vertices, abs=1e-3 * PIXEL)
+    refused(holosplat(*command, "--volume", out / "w.vti", "--bodies", out / "w.vtu"), "would share", "w.pvd")
     (out / "v_t0001.vti").unlink()
     before = sorted(out.iterdir())
     refused(holosplat(*command, "--volume", out / "v.vti"), "v_t0000.vti must be new or empty")

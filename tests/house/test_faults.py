@@ -58,6 +58,10 @@ KINDS = [
     "odd values",
     "two writers",
     "extreme kernels",
+    "files of all formats",
+    "files of a run",
+    "outputs over inputs",
+    "values of other files",
 ]
 
 

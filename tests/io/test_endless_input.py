@@ -13,10 +13,13 @@ import tifffile
 import torch
 from safetensors.torch import save
 
+from helpers.cli import holosplat, worked
 from holosplat.checks import InputError, positive
+from holosplat.geometry import Grid
 from holosplat.io.beams import MOST_VIEWS, read_beams
 from holosplat.io.leftovers import LOCK
 from holosplat.io.lock import sole_writer, writer_of
+from holosplat.io.ome_tiff import read_ome_tiff, write_ome_tiff
 from holosplat.io.pvd import read_pvd
 from holosplat.io.reading import Reading, ends_of, marked, read_angles
 from holosplat.io.snapshots import find_snapshots
@@ -24,6 +27,8 @@ from holosplat.io.stacks import stack_of
 from holosplat.io.table import Table
 from holosplat.io.tiff_guard import all_images
 from holosplat.io.tube import Tube
+from holosplat.io.volume_formats import read_volume_file
+from holosplat.io.vtk import read_meshes
 from holosplat.learning.aligned_weights import read_aligned
 from holosplat.learning.weights import read_weights
 from holosplat.matter import MaterialPrior
@@ -34,6 +39,7 @@ from holosplat.series.folder import PLAN, SeriesFolder
 from holosplat.series.plan import MOST_TASKS, SeriesPlan, Source
 from holosplat.series.settings import Settings
 from holosplat.tables import overridden, read_table
+from holosplat.volume import Volume
 from holosplat.workflows.run_folder import RunFolder
 from holosplat.workflows.track import TRACKS, read_errors
 
@@ -175,3 +181,36 @@ def test_options_of_hundreds_of_digits_are_refused():
 
 def _seeded(seed: int) -> None:
     raise AssertionError(seed)
+
+
+SUFFIXES = (".nxs", ".tif", ".vtk", ".vti", ".vtu", ".pvd", ".nrrd", ".mrc", ".h5", ".npz", ".png", ".stl", ".zip", "")
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_pipes_in_the_place_of_a_file_of_any_format_are_not_waited_for(tmp_path, suffix):
+    path = tmp_path / f"a{suffix}"
+    os.mkfifo(path)
+    assert holosplat("info", path).code in (0, 2)
+    for read in (read_meshes, read_volume_file, read_pvd):
+        with pytest.raises(InputError):
+            read(*([path, "um"] if read is read_meshes else [path]))
+
+
+@pytest.mark.parametrize(
+    "content", [b"PK\x05\x06" + b"\xff" * 18, b"PK\x05\x06" + bytes(18), b"PK\x05\x06" + b"\1" * 18]
+)
+def test_archives_that_are_damaged_are_told_of(tmp_path, content):
+    path = tmp_path / "a.zip"
+    path.write_bytes(content)
+    assert "nothing that can be read" in worked(holosplat("info", path)).out
+
+
+def test_an_ome_tiff_of_hundreds_of_digits_is_none(tmp_path):
+    grid = Grid.centred((2, 3, 4), 1e-6)
+    values = np.zeros(grid.shape, np.float32)
+    write_ome_tiff(tmp_path / "a.tif", Volume(values, values, grid))
+    with tifffile.TiffFile(tmp_path / "a.tif") as file:
+        said = str(file.ome_metadata).replace('SizeZ="2"', f'SizeZ="{DIGITS}"')
+    tifffile.imwrite(tmp_path / "b.tif", np.zeros((4, 3, 4), np.float32), description=said.encode(), metadata=None)
+    with pytest.raises(InputError, match="another TIFF"):
+        read_ome_tiff(tmp_path / "b.tif")

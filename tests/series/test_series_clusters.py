@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import stat
@@ -85,6 +86,19 @@ def test_a_job_does_a_block_of_tasks(files, tmp_path):
     assert text.splitlines()[-1].endswith('"$SLURM_ARRAY_TASK_ID" --block 4')
     assert script_of(series, [1], Slurm(block=4), retry=True).splitlines()[-1].endswith("--block 4 --retry")
     subprocess.run(["bash", "-n"], input=text, text=True, check=True)
+
+
+def test_a_plan_does_not_allow_its_scans_values_of_other_files(fresh, monkeypatch):
+    """Whoever runs it does, and then its processes and its script, too."""
+    plan = json.loads(fresh.file.read_text())
+    write_json(fresh.file, plan | {"reading": plan["reading"] | {"allow_external": True}})
+    refused(holosplat("series", "run", fresh.path, "--jobs", 1), "values of other files", "add --allow-external")
+    monkeypatch.setattr(
+        running, "PROGRAM", ("-c", "import pathlib, sys; pathlib.Path(sys.argv[3], sys.argv[4]).touch()")
+    )
+    assert holosplat("series", "run", fresh.path, "--jobs", 1, "--allow-external").code == 4
+    assert (fresh.path / "--allow-external").exists()
+    assert script_of(fresh, [1], Slurm()).splitlines()[-1].endswith('"$SLURM_ARRAY_TASK_ID" --allow-external')
 
 
 def test_a_block_is_what_is_left_from_a_task_on(fresh, done):

@@ -111,7 +111,7 @@ def test_the_work_of_another_process_is_left_to_it(done, files, tmp_path):
 
 
 def test_what_fails_is_said_and_tried_again(files, tmp_path, monkeypatch):
-    """One time fails: the others are done, begun by themselves where need be; the next call does what is missing."""
+    """One time fails: the others are done, begun by themselves where need be; what follows is as if it never had."""
     folder = planned(tmp_path / "series", files.scan, window=3)
     real = series_time.reconstruct
 
@@ -126,7 +126,13 @@ def test_what_fails_is_said_and_tried_again(files, tmp_path, monkeypatch):
     assert state.reason == "1 of 3 times: ZeroDivisionError: matter here"
     assert run_left(folder).failed == 1  # which leaves it alone
     monkeypatch.setattr(series_time, "reconstruct", real)
+    (window,) = folder.plan().windows()[:1]
+    assert [row.begun for row in folder.rows(window) if row.done] == ["cold", "warm"]
     assert run_left(folder, retry=True).done == 2
+    whole = planned(tmp_path / "whole", files.scan, window=3)
+    assert run_left(whole).done == 2
+    for row, wanted in zip(folder.rows(window), whole.rows(window), strict=True):
+        assert replace(row, seconds=0.0) == replace(wanted, seconds=0.0)
 
 
 def test_a_warm_start_that_is_not_enough_begins_anew(done, files, tmp_path, monkeypatch):

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import asdict
+from pathlib import Path
 
 import pytest
 import torch
@@ -15,7 +17,10 @@ from holosplat.projectors.surface import surface_thickness
 from holosplat.series.rows import Row, read_row, write_row
 from holosplat.specimens.red_cells import icosphere
 from holosplat.workflows.resume import require_alike
+from holosplat.workflows.run_facts import facts_of_run
+from holosplat.workflows.run_folder import RunFolder
 
+OLD_RUN = Path(__file__).resolve().parents[1] / "data/run_0_1_0"
 ROW = Row(3, "scan", 0, 0.5, "done", test={"ssim": 0.9, "psnr": "inf"}, bodies=((1e-6, 2e-6, 3e-6, 4e-18),))
 OWN = {
     "step": 3,
@@ -97,3 +102,23 @@ def test_surfaces_are_seen_from_poses_that_are_some(rotations, shifts, pixels):
 def test_a_path_with_a_zero_byte_is_none():
     with pytest.raises(InputError, match="angles must be a path"):
         Reading.from_table({"angles": "a\0"})
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("config.json", {"versions": -1}),
+        ("summary.json", {"decided": -1}),
+        ("summary.json", {"decisions": [{"compared": [True]}]}),
+        ("summary.json", {"timing_s": {"fit": "\0"}}),
+        ("summary.json", {"unexplained": {"start": []}}),
+        ("summary.json", {"detector": {"rows": 3}}),
+        ("summary.json", {"verdict": []}),
+    ],
+)
+def test_a_run_with_a_garbled_entry_is_told_of(tmp_path, name, change):
+    run = Path(shutil.copytree(OLD_RUN, tmp_path / "run"))
+    table = json.loads((run / name).read_text())
+    (run / name).write_text(json.dumps(table | change))
+    with pytest.raises(InputError, match="must be .*as it was written"):
+        facts_of_run(RunFolder(run))

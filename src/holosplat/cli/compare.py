@@ -7,13 +7,16 @@ from typing import TYPE_CHECKING
 
 from tyro.conf import Positional
 
+from ..io.reading import Told
 from .places import Output
 
 if TYPE_CHECKING:
     from ..report.compare import Side
 
 
-def compare(a: Positional[Path], b: Positional[Path], out: Output = Path("compare.html")) -> None:
+def compare(
+    a: Positional[Path], b: Positional[Path], out: Output = Path("compare.html"), allow_external: bool = False
+) -> None:
     """Compare two runs side by side: what was asked, decided and found, and where their volumes differ.
 
     Of runs of matter in motion, the first times are compared.
@@ -22,9 +25,12 @@ def compare(a: Positional[Path], b: Positional[Path], out: Output = Path("compar
         a: Run folder.
         b: Another one.
         out: Page to write (HTML), with slices of both volumes and their difference.
+        allow_external: Follow links of the runs' scans to other files; only of files you trust.
     """
     from ..report.compare import Comparison, in_columns, write_comparison
 
+    for path in (a, b):
+        Told(allow_external=allow_external).vouch(path)
     comparison = Comparison(_side(a), _side(b))
     for table in (*comparison.found(), *comparison.asked()):
         print("\n".join(in_columns(table)))

@@ -138,8 +138,10 @@ def _require_free(timed: Sequence[Path], every: Sequence[int]) -> None:
             form = FORMATS.get(path.suffix.lower())
             for file in form.files(out) if form else ():
                 require_free(file)
-        if every and (series := SERIES.get(path.suffix.lower())):
-            require_free(path.with_suffix(series))
+    series = [path.with_suffix(SERIES[path.suffix.lower()]) for path in timed if path.suffix.lower() in SERIES]
+    for number, path in enumerate(series if every else ()):
+        require(path not in series[:number], f"--volume and --bodies would share {path}; give them different names.")
+        require_free(path)
 
 
 def _export_series(path: Path, steps: Sequence[tuple[float, Path]], grid: Grid | None, of: Contents) -> None:

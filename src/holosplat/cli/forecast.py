@@ -12,7 +12,7 @@ from tyro.conf import Positional
 
 from ..checks import positive, require
 from ..io.formats import read_frames
-from ..io.reading import Reading, ends_of
+from ..io.reading import Reading, Told, ends_of
 from ..io.run_scan import run_reading, run_source
 from ..motion.cell_model import ChannelFrame
 from ..motion.dynamics import DynamicsForecast
@@ -106,7 +106,13 @@ def _number_or_range(name: str, text: str) -> tuple[float, float]:
     return value, value
 
 
-def forecast(run: Positional[Path], out: Output, how: ForecastFlags = ForecastFlags(), seed: Seed = 0) -> None:
+def forecast(
+    run: Positional[Path],
+    out: Output,
+    how: ForecastFlags = ForecastFlags(),
+    seed: Seed = 0,
+    allow_external: bool = False,
+) -> None:
     """Carry a run of track on: its bodies and their frames at later times, with a standard error.
 
     Frames of the scan after the run's last time (track --time-frames) judge the forecast, and are used for nothing
@@ -117,7 +123,9 @@ def forecast(run: Positional[Path], out: Output, how: ForecastFlags = ForecastFl
         out: Run folder to make: what track writes, at the times ahead; forecast.nxs, the predicted frames;
             forecast.csv, the standard error of each body's surface; forecast.json.
         seed: Seed of the fits to half-sets.
+        allow_external: Follow links of the run's scan to other files; only of files you trust.
     """
+    Told(allow_external=allow_external).vouch(run)
     options, folder, new = how.options(), RunFolder(run), RunFolder(out)
     tracked = load_reconstruction(folder)
     tracked_bodies(tracked)

@@ -15,6 +15,7 @@ from typing import Any, TextIO
 from ..checks import InputError, require
 from ..io.folder import require_parent
 from ..version import __version__
+from .places import Place, require_apart
 
 OWN = re.compile(r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d ")
 """What each line of a log begins with."""
@@ -104,6 +105,7 @@ def _named(arguments: Sequence[str]) -> Path | None:
 def _require_log(path: Path) -> None:
     """`InputError` unless `path` is a log, empty, or new in an existing folder."""
     require_parent(path)
+    require_apart([Place("--log", path, written=True, kept=True)])
     require(not path.is_dir(), f"--log must be a file, but {path} is a folder; add a file name.")
     if not path.exists():
         return

@@ -21,7 +21,7 @@ from ..ranges import checked_later, with_checked_numbers
 from ..tables import read_table, shown
 from .entry import command
 from .help import CONFIG, Option, is_essential, options_of, parser_of, wrap
-from .places import Place, is_run, of_times, places_of
+from .places import Place, is_run, of_times, places_of, require_apart
 from .resume import OF_ONE_CALL, is_made_by
 
 STAGES = ("correct", "align", "reconstruct", "export")
@@ -49,9 +49,13 @@ class Stage:
     words: tuple[str, ...]
     given: inspect.BoundArguments
 
+    def places(self) -> list[Place]:
+        """What it reads and writes."""
+        return places_of(self.function, self.given.arguments)
+
     def outputs(self) -> list[Place]:
         """Where it writes."""
-        return [place for place in places_of(self.function, self.given.arguments) if place.written]
+        return [place for place in self.places() if place.written]
 
     def state(self) -> str:
         """new: no output is there; done: all are, whole, and made by this command from the same input; begun: some are,
@@ -154,7 +158,22 @@ def _stages(path: Path) -> list[Stage]:
         words = _words(name, table, path, before)
         found.append(_parsed(name, words, path))
         before = table.get("out", before)
+    _require_apart(found, path)
     return found
+
+
+def _require_apart(stages: Sequence[Stage], path: Path) -> None:
+    """`InputError` for a stage that would write over the pipeline file, or over what a stage reads and none makes, or
+    another one makes."""
+    read, made = [Place("PIPELINE", path, written=False)], list[Place]()
+    for stage in stages:
+        places = stage.places()
+        read += [one for one in places if not (one.written or any(map(one.is_same, made)))]
+        made += [one for one in places if one.written]
+        try:
+            require_apart([*read, *made])
+        except InputError as error:
+            raise InputError(f"[{stage.name}] of {path}: {error}") from None
 
 
 def _require_known(table: Mapping[str, Any], known: Sequence[str], where: str, are: str) -> None:

@@ -13,17 +13,18 @@ import shutil
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, is_dataclass, replace
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any, ParamSpec, TypeVar, get_args, get_origin
 
 from tyro.conf import Positional, arg
 
-from ..checks import require
+from ..checks import InputError, require
 from ..io.folder import is_taken, require_new, require_parent
+from ..io.json import read_json
 from ..io.leftovers import LOCK
-from ..io.provenance import NAME, Command, carried_out, records
+from ..io.provenance import NAME, Command, beside, carried_out, records
 from ..ranges import flag, hints_of, with_checked_numbers
 from ..workflows.manifest import MANIFEST
 
@@ -38,6 +39,10 @@ POSITIONAL = get_args(Positional[Path])[1]
 CONFIG = "config.json"
 OF_A_RUN = (MANIFEST, LOCK, "object.h5", "gaussians.h5", "checkpoint.pt", "metrics.csv")
 """Beside config.json: what tells the folder of a run from others."""
+SOURCE = "source.json"
+"""Where a run says which scan it is of."""
+PAIRED = (".nrrd", ".mrc")
+"""Suffixes of files of δ, beside which β has one of its own (`io.plain_values.both`)."""
 TIME = re.compile(r"_t\d{4,}(?=\.|$)")
 """What the names of files of single times have before their suffixes."""
 REPLACED = ".replaced"
@@ -62,6 +67,19 @@ class Place:
         with suppress(OSError, ValueError):
             return self.path.exists()
         return False
+
+    def companions(self) -> Iterator[Place]:
+        """What is read or written with it: β where a file holds δ alone, where a file that is written comes from, and
+        the scan of a run that is read."""
+        if self.path.suffix.lower() in PAIRED:
+            from ..io.plain_values import both  # needs more than options do
+
+            yield replace(self, path=both(self.path)[1])
+        if self.written:
+            yield replace(self, path=beside(self.path))
+        else:
+            with suppress(InputError, OSError):
+                yield replace(self, path=Path(str(read_json(self.path / SOURCE).get("scan"))))
 
     def is_same(self, other: Place) -> bool:
         """Whether both lead to one file or folder, by a link, too."""
@@ -110,9 +128,11 @@ def places_of(function: Callable[..., Any], values: Mapping[str, Any]) -> list[P
 
 
 def require_apart(places: Sequence[Place]) -> None:
-    """`InputError` that names the first output which is an input, another output, or within a run or an input."""
-    read = [one for one in places if not one.written and one.is_there()]
-    outputs = [one for one in places if one.written]
+    """`InputError` that names the first output which is an input, another output, or within a run or an input; with
+    each path goes what belongs to it (`Place.companions`)."""
+    every = [one for place in places for one in (place, *place.companions())]
+    read = [one for one in every if not one.written and one.is_there()]
+    outputs = [one for one in every if one.written]
     for number, out in enumerate(outputs):
         for other in outputs[:number]:
             require(
@@ -175,10 +195,17 @@ def _set_aside(paths: Sequence[Path]) -> Iterator[None]:
     finally:
         for folder in folders:
             if is_taken(folder):
-                shutil.rmtree(_aside(folder), ignore_errors=True)
+                _discard(_aside(folder))
             elif _aside(folder).is_dir():
                 shutil.rmtree(folder, ignore_errors=True)
                 os.rename(_aside(folder), folder)
+
+
+def _discard(folder: Path) -> None:
+    """Remove a folder, or a link to one."""
+    if folder.is_symlink():
+        folder.unlink()
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def of_times(path: Path) -> list[Path]:

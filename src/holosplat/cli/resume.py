@@ -15,6 +15,8 @@ from ..io.provenance import NAME, fingerprint, from_home, origin, records
 AGAIN = "give the scan, the options and --out again, with --resume"
 OF_ONE_CALL = ("--log", "--force", "--resume")
 """Options of the command that began a run which are not those of one that goes on."""
+PERMISSION = "--allow-external"
+"""What whoever goes on must say again: a run that came from elsewhere permits itself nothing."""
 
 
 def resumed(arguments: Sequence[str]) -> list[str]:
@@ -38,7 +40,7 @@ def is_made_by(path: Path, words: Sequence[str]) -> bool:
     """Whether the file or folder `path` says that the command with these `words` made it, from inputs which are what
     they were; of arguments that are too many files to be named one by one, this is not known, and taken to be so."""
     record = origin(path)
-    with suppress(InputError, KeyError, TypeError, ValueError):
+    with suppress(InputError), as_written(path):
         said, folder = shlex.split(record["command"])[1:], Path(from_home(record["folder"]))
         for one in record["inputs"]:
             if "files" not in one:
@@ -55,7 +57,7 @@ def _again(name: str, run: Path) -> list[str]:
         bool(begun), f"--resume alone needs the command in {run / NAME}, but there is none, or it is damaged; {AGAIN}."
     )
     with as_written(run / NAME):
-        _, command, *words = shlex.split(begun[0]["command"])
+        _, command, *words = (word for word in shlex.split(begun[0]["command"]) if word != PERMISSION)
         folder = Path(from_home(begun[0]["folder"]))
         inputs = [(Path(one["path"]), dict(one)) for one in begun[0]["inputs"]]
     require(command == name, f"{run} was begun by holosplat {command}; go on with holosplat {command} --resume {run}.")

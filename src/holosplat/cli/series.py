@@ -143,6 +143,7 @@ def run(
     retry: bool = False,
     dask: str | None = None,
     cluster: SlurmFlags = NO_SLURM,
+    allow_external: bool = False,
 ) -> None:
     """Do one task of a series, or all that are left; what is done already is not done again.
 
@@ -155,6 +156,7 @@ def run(
         jobs: Or: all that are left, by so many processes of this machine, with cores / jobs threads each.
         retry: Do failed tasks again.
         dask: Or: all that are left, on the Dask cluster whose scheduler has this address, such as tcp://host:8786.
+        allow_external: The plan says --allow-external, and you trust the folder and its scans.
     """
     from ..series.folder import SeriesFolder
     from ..series.run import counted, run_left, run_processes
@@ -165,6 +167,10 @@ def run(
     alone = cluster.block == 1 or task is not None or cluster.slurm or cluster.submit
     require(alone, "--block goes with a task's number or --slurm; give one of these, or leave it.")
     series = SeriesFolder(folder)
+    require(
+        allow_external or not series.plan().reading.told.allow_external,
+        f"{folder} lets its scans bring values of other files; if you trust all of them, add --allow-external.",
+    )
     if cluster.slurm or cluster.submit:
         cluster.carry_out(series, retry)
         return

@@ -15,8 +15,13 @@ from .provenance import leave_record, require_free
 
 
 def require_writable(path: str | Path) -> None:
-    """`InputError` unless `path` is a place for a file: in an existing folder, and no folder itself."""
-    require(not Path(path).is_dir(), f"{path} must be a file to write, but it is a folder; add a file name.")
+    """`InputError` unless `path` is a place for a file: in an existing folder, and no folder, pipe or device itself."""
+    place = Path(path)
+    require(not place.is_dir(), f"{path} must be a file to write, but it is a folder; add a file name.")
+    require(
+        place.is_file() or not place.exists(),
+        f"{path} must be a file to write, but it is a pipe or a device, which would be gone; name a file.",
+    )
     require_parent(path)
 
 

@@ -7,6 +7,7 @@ import re
 import zipfile
 from collections import Counter
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -80,10 +81,11 @@ def keys_of(path: Path) -> dict[str, str]:
         kinds = Counter(Path(name).suffix.lower() or name for name in files)
         listed = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common(MOST_KEYS))
         return {"files": f"{len(files)}: {listed}" if files else "none"}
+    if not path.is_file():  # a pipe, say, which may never end
+        return {}
     rows = {"size": f"{path.stat().st_size / 1e6:.4g} MB"}
-    if zipfile.is_zipfile(path):
-        with zipfile.ZipFile(path) as archive:
-            return rows | {"in the archive": ", ".join(archive.namelist()[:MOST_KEYS])}
+    with suppress(zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
+        return rows | {"in the archive": ", ".join(archive.namelist()[:MOST_KEYS])}
     if not h5py.is_hdf5(path):
         return rows
     found: list[str] = []

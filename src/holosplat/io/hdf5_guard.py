@@ -58,7 +58,7 @@ def require_own(file: h5py.File, path: Path) -> None:
     stamp = (state.st_dev, state.st_ino, state.st_size, state.st_mtime_ns, state.st_ctime_ns)
     if stamp in _known:
         return
-    allowed, now = _is_vouched(path), time.time_ns()
+    allowed, now = is_vouched(path), time.time_ns()
     seen, later = {path.resolve()}, _others(file, path, allowed)
     if not allowed and now - max(state.st_mtime_ns, state.st_ctime_ns) > AGED:
         if len(_known) >= MOST_KNOWN:
@@ -115,7 +115,8 @@ def _dataset_files(dataset: h5d.DatasetID, path: Path, name: bytes, allowed: boo
     return []
 
 
-def _is_vouched(path: Path) -> bool:
+def is_vouched(path: Path) -> bool:
+    """Whether `path` may bring values of other files (`allow_external`)."""
     whole = path.resolve()
     return any(whole == known or known in whole.parents for known in _vouched)
 

@@ -59,7 +59,7 @@ def _grid_of_ome(text: str) -> Grid | None:
         edges = [unit * float(pixels[f"PhysicalSize{axis}"]) for unit, axis in zip(units, "XYZ")]
         grid = Grid.centred((z, y, x), edges[0])
         place = [1e-6 * float(planes[0][f"Position{axis}"]) for axis in "XYZ"] if planes else grid.origin
-    except (KeyError, ValueError, ElementTree.ParseError):
+    except (KeyError, ValueError, OverflowError, ElementTree.ParseError):
         return None
     if named not in (list(REFRACTION.units), list(ABSORPTION.units)):
         return None

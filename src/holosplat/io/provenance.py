@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from ..checks import require
+from ..tables import read_table, table_in
 from ..version import __version__, source_commit
 from .durable import flushed
 from .leftovers import LOCK, files_in, is_left, temporary_name
@@ -29,6 +30,8 @@ ATTRIBUTE = "provenance"
 RECORDS = "records"
 HDF5 = b"\x89HDF\r\n\x1a\n"
 """What HDF5 files begin with."""
+GARBLED = (OSError, ValueError, LookupError, TypeError, RuntimeError)
+"""What reading a record ends in that is damaged, or none."""
 MOST_BYTES = 1 << 32
 """What is read of one input for its hash, at most: some seconds."""
 MOST_NAMED = 8
@@ -107,15 +110,25 @@ def attribute(path: Path) -> str:
     return json.dumps(record)
 
 
+def beside(path: Path) -> Path:
+    """The file that says where `path` comes from, of a format that cannot say so itself."""
+    return path.with_name(f"{path.name}.{NAME}")
+
+
 def require_free(path: Path) -> None:
     """`InputError` where a command would replace the file `path`, which stands by itself and is not its own, without
-    --force."""
+    --force, or another program's file `beside` it."""
     command = command_now()
-    if command is None or command.force or path in command.done or not path.exists():
+    if command is None or path in command.done or _folder_of(path, command) is not None:
         return
     require(
-        _folder_of(path, command) is not None,
+        command.force or not path.exists(),
         f"{path} must be new, but it is there already; choose another name, or add --force to replace it.",
+    )
+    require(
+        not os.path.lexists(beside(path)) or "program" in origin(path),
+        f"{beside(path)} must be new, or say where {path.name} comes from, but it is another file; choose another name "
+        f"than {path.name}.",
     )
 
 
@@ -128,7 +141,7 @@ def leave_record(path: Path) -> None:
     command.done.add(path)
     folder = _folder_of(path, command) or (path if path.is_dir() else None)
     if folder is None and not is_hdf5(path):
-        _write(path.with_name(f"{path.name}.{NAME}"), command.record(path.parent))
+        _write(beside(path), command.record(path.parent))
     elif folder is not None and folder / NAME not in command.done:
         command.done.add(folder / NAME)
         _write(folder / NAME, {RECORDS: [*records(folder), command.record(folder)]})
@@ -137,9 +150,8 @@ def leave_record(path: Path) -> None:
 def records(folder: Path) -> list[dict[str, Any]]:
     """What provenance.json of a folder says of each command that wrote there, the first one first; nothing where there
     is none, or another program's."""
-    with suppress(OSError, ValueError, KeyError, TypeError):
-        found = json.loads((folder / NAME).read_text(encoding="utf-8"))[RECORDS]
-        return [dict(each) for each in found]
+    with suppress(*GARBLED):
+        return [dict(each) for each in read_table(folder / NAME)[RECORDS]]
     return []
 
 
@@ -147,13 +159,13 @@ def origin(path: Path) -> dict[str, Any]:
     """The record of the command that made a file or folder, or began it; empty where none says so."""
     if path.is_dir():
         return next(iter(records(path)), {})
-    with suppress(OSError, ValueError, KeyError, TypeError):
+    with suppress(*GARBLED):
         if not is_hdf5(path):
-            return dict(json.loads(path.with_name(f"{path.name}.{NAME}").read_text(encoding="utf-8")))
-        import h5py
+            return read_table(beside(path))
+        from .hdf5_guard import opened_for_reading
 
-        with h5py.File(path) as file:
-            return dict(json.loads(str(file.attrs[ATTRIBUTE])))
+        with opened_for_reading(path) as file:
+            return table_in(str(file.attrs[ATTRIBUTE]))
     return {}
 
 

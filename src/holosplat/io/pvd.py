@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
-from ..checks import InputError, require
+from ..checks import InputError, require, require_regular
 from ..tables import number_in
 from .atomic import atomic_path
 
@@ -54,6 +54,7 @@ def read_pvd(path: str | Path) -> list[TimeStep]:
     `InputError` where the file is missing, is no collection, names no files or files that do not exist, or has no time
     for one.
     """
+    require_regular(path, "a ParaView collection (.pvd)")
     try:
         root = ElementTree.fromstring(Path(path).read_bytes())
     except (OSError, ElementTree.ParseError) as error:

@@ -19,13 +19,20 @@ ReadAs = Callable[[Path, Reading], Scan]
 
 
 def run_reading(path: str | Path) -> Reading:
-    """How the run folder `path` read its scan; `InputError` for a source.json that is damaged."""
+    """How the run folder `path` read its scan; `InputError` for a source.json that is damaged.
+
+    Whether the scan may bring values of other files, the folder does not decide: it is as whoever reads it allows
+    (`Told.vouch`).
+    """
     table = Table.read(Path(path) / SOURCE)
     time_frame = table.values.get("time_frame")
     known = time_frame is None or time_frame in ("all", "still") or isinstance(time_frame, int)
     require(known, f"{table.label('time_frame')} must be a number, 'all' or null, but it is {time_frame!r}.")
     said = Reading.from_table(table.values.get("reading", {}), f"{table.label('reading')}")
-    return replace(said, part=replace(said.part, time_frame=time_frame))
+    from .hdf5_guard import is_vouched  # needs h5py, which reading an option does not
+
+    told = replace(said.told, allow_external=is_vouched(Path(path)))
+    return Reading(told, replace(said.part, time_frame=time_frame))
 
 
 def run_source(scan: Path, reading: Reading) -> dict[str, object]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..checks import InputError, MissingError, note, require
+from ..checks import InputError, MissingError, note, require, require_regular
 from .guard import RATIO, SMALL, require_declared, require_inflated, require_memory
 
 DEFLATE = (8, 32946)
@@ -24,6 +24,7 @@ def open_tiff(file: Path) -> Iterator[Any]:
     """`file` opened by tifffile. Errors: `InputError` for one that is damaged or none."""
     import tifffile
 
+    require_regular(file, "a TIFF file")
     try:
         with tifffile.TiffFile(file) as opened:
             yield opened

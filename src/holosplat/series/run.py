@@ -88,13 +88,13 @@ def run_processes(
     processes, which save, and then passed on.
     """
     require(jobs >= 1, f"--jobs must be at least 1, but it is {jobs}.")
-    folder.plan()
+    allowed = folder.plan().reading.told.allow_external
     if retry:
         for state in states(folder):
             (folder.task(state.number) / FAILED).unlink(missing_ok=True)
     threads = str(max(1, cores() // jobs))
     environment = os.environ | dict.fromkeys(THREADS, threads)
-    command = [sys.executable, *PROGRAM, "series", "run", str(folder.path)]
+    command = [sys.executable, *PROGRAM, "series", "run", str(folder.path), *["--allow-external"] * allowed]
     workers = [
         subprocess.Popen(command, env=environment, stdin=subprocess.DEVNULL, start_new_session=True)
         for _ in range(jobs)

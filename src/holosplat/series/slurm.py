@@ -52,6 +52,7 @@ def script_of(folder: SeriesFolder, numbers: Sequence[int], options: Slurm, retr
     }
     lines = [f"#SBATCH --{name}={value}" for name, value in asked.items() if value]
     command = shlex.join([sys.executable, *PROGRAM, "series", "run", path])
+    allowed = " --allow-external" * folder.plan().reading.told.allow_external
     block = (f" --block {options.block}" + " --retry" * retry) if options.block > 1 else ""
     return "\n".join(
         [
@@ -59,7 +60,7 @@ def script_of(folder: SeriesFolder, numbers: Sequence[int], options: Slurm, retr
             *lines,
             "set -euo pipefail",
             'export OMP_NUM_THREADS="${SLURM_CPUS_PER_TASK:-1}"',
-            f'exec {command} "$SLURM_ARRAY_TASK_ID"{block}',
+            f'exec {command} "$SLURM_ARRAY_TASK_ID"{block}{allowed}',
             "",
         ]
     )

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -68,11 +69,15 @@ def _work(folder: SeriesFolder, plan: SeriesPlan, window: Window, on_row: Told) 
             on_row(row)
         return ""
     failed, before = list[Row](), None
-    for moment in window.moments:
+    for number, moment in enumerate(window.moments):
         path, run = folder.row(window.number, moment.number), RunFolder(folder.run(window.number, moment.number))
-        row = read_row(path) if path.is_file() else None
+        old = row = read_row(path) if path.is_file() else None
         if row is None or not row.done:
+            if old is not None:  # it failed, and began as what is before it was then
+                shutil.rmtree(run.path, ignore_errors=True)
             row = _row(plan, moment, scans, run, before)
+            if old is not None and row.done and plan.settings.warm.on:
+                _remove(folder, window.number, window.moments[number + 1 :])
             write_row(path, row)
             on_row(row)
         if row.done:
@@ -82,6 +87,13 @@ def _work(folder: SeriesFolder, plan: SeriesPlan, window: Window, on_row: Told) 
     if not failed:
         return ""
     return f"{len(failed)} of {len(window.moments)} times: {failed[0].reason}"
+
+
+def _remove(folder: SeriesFolder, task: int, moments: Sequence[Moment]) -> None:
+    """Remove times that were done without the one before them, which failed then: they are as if it never had."""
+    for moment in moments:
+        folder.row(task, moment.number).unlink(missing_ok=True)
+        shutil.rmtree(folder.run(task, moment.number), ignore_errors=True)
 
 
 def _row(plan: SeriesPlan, moment: Moment, scans: Scans, run: RunFolder, before: Before | None) -> Row:

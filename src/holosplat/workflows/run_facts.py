@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from ..checks import as_written
 from ..io.facts import Facts
 from ..io.json import read_json
 from ..units import in_percent
@@ -11,6 +12,11 @@ from .run_folder import RunFolder
 
 def facts_of_run(folder: RunFolder) -> Facts:
     """The facts of a run, begun or finished. Errors: `InputError` for files that are damaged, or of another run."""
+    with as_written(folder.path, "a run as it was written"):
+        return _facts(folder)
+
+
+def _facts(folder: RunFolder) -> Facts:
     config, summary = folder.read_config(), folder.read_summary() if folder.summary.is_file() else {}
     source = str(read_json(folder.source).get("scan", "")) if folder.source.is_file() else ""
     versions = config.get("versions", {})
