@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import TypeVar
 
 import numpy as np
@@ -27,6 +28,7 @@ ANGLE_UNITS = {
     **dict.fromkeys(("deg", "degree", "°"), math.pi / 180),
     **dict.fromkeys(("rad", "radian"), 1.0),
     **dict.fromkeys(("mrad", "milliradian"), 1e-3),
+    **dict.fromkeys(("mdeg", "millidegree"), math.pi / 180e3),
 }
 TIME_UNITS = {
     **{"s": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6, "ns": 1e-9, "sec": 1.0},
@@ -38,9 +40,9 @@ WORDS = 3
 
 def unit_factor(field: str, unit: str, table: dict[str, float]) -> float:
     """The factor that brings `unit` to the table's base unit; `InputError` naming `field` if it is unknown."""
-    said = unit.strip().strip("[]().")
+    said = re.sub(r"\s*/\s*(px|pixels?)$", "", unit.strip().strip("[]()."))
     words = {name.lower(): factor for name, factor in table.items() if len(name) >= WORDS and name != "MeV"}
-    word = said.lower()
+    word = re.sub(r"[\s_-]", "", said.lower())
     factor = table.get(said, words.get(word, words.get(word.removesuffix("s"))))
     if factor is None:
         raise InputError(f"{field} has the unknown unit {unit!r}; use one of {', '.join(table)}.")

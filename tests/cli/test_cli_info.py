@@ -9,13 +9,20 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+import tifffile
+import torch
 from PIL import Image
 
 from helpers.cli import copied, drop, holosplat, refused, truncated, worked
 from helpers.two_balls import scan as two_balls
+from holosplat.geometry import Grid
 from holosplat.io.nxtomo import write_scan
 from holosplat.io.raw_file import ScanFile
 from holosplat.io.tiff import write_tiff
+from holosplat.io.volume_formats import FORMATS, write_volume_file
+from holosplat.io.volumes import Contents
+from holosplat.matter import DeltaBeta, Matter
+from holosplat.representations import VoxelGrid
 
 DETECTOR = "entry/instrument/detector"
 
@@ -127,6 +134,38 @@ def test_the_air_is_found(tmp_path):
     np.savez(tmp_path / "air.npz", counts=1.25 * wide, **beam)
     level = float(rows(tmp_path / "air.npz")["air level"][0].split()[0])
     assert level == pytest.approx(1.25, abs=0.02)
+
+
+def test_the_next_command_repeats_what_was_said(shop, tmp_path):
+    path = copied(shop.scan, tmp_path, drop("entry/instrument/detector/distance"))
+    command = rows(path, "--distance", 0.2, "--views", "0:8:2")["next"]
+    assert command == [f"holosplat reconstruct {path} --distance 0.2 --views 0:8:2 --out run"]
+
+
+@pytest.mark.parametrize("level", [0.0, -1.0])
+def test_slices_of_a_volume_are_no_frames(tmp_path, level):
+    """Most of a volume is empty: its values have no level to be measured by."""
+    values = np.full((4, 32, 32), level, np.float32)
+    values[:, 8:14, 8:14] = 4e-8
+    tifffile.imwrite(tmp_path / "slices.tif", values, photometric="minisblack")
+    found = rows(tmp_path / "slices.tif")
+    assert found["values"] == [f"{level:g} to 4e-08, which are no intensities"]
+    assert found.keys().isdisjoint({"noise", "contrast", "fringes", "next"})
+    assert any("must hold intensities" in each and "--voxel-size" in each for each in found["missing"])
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_volumes_of_mu_say_so(tmp_path, suffix):
+    grid = Grid.centred((5, 6, 7), 2e-6)
+    obj = VoxelGrid(torch.ones(1, *grid.shape), grid, Matter((DeltaBeta(4e-7, 2e-10),)))
+    of = Contents.of(False, 20.0)
+    write_volume_file(tmp_path / f"v{suffix}", obj, grid, of=of)
+    found = rows(tmp_path / f"v{suffix}")
+    assert found["what"][0].startswith("a volume of µ and β")
+    assert "5 × 6 × 7" in found["shape"][0]
+    mu = float(obj.matter.beta * of.mu_per_beta)
+    if suffix in (".vti", ".nrrd", ".mrc", ".h5", ".hdf5"):
+        assert found["µ"][0].startswith(f"{mu:.3g} to {mu:.3g} m⁻¹")
 
 
 def test_the_picture_shows_frames_and_spectrum(shop, tmp_path):

@@ -155,6 +155,22 @@ def test_all_times_open_in_paraview(folder):
     worked_by("simulate", out / "b.pvd", *simulated, "--out", out / "s.nxs")
 
 
+def test_folders_of_all_times_are_replaced_by_force_alone(folder):
+    out = folder / "again"
+    out.mkdir()
+    command = ["export", folder / "run", "--time-frame", "all", "--bodies", out / "b"]
+    worked_by(*command)
+    before = {path.name: sorted(one.name for one in path.iterdir()) for path in out.iterdir() if path.is_dir()}
+    (out / "b_t0000" / "mine.txt").write_text("of another time")
+    refused(holosplat(*command), "b_t0000 must be new or empty", "--force")
+    worked_by(*command, "--force")
+    after = {path.name: sorted(one.name for one in path.iterdir()) for path in out.iterdir() if path.is_dir()}
+    assert after == before
+    assert len(after) == TIMES
+    (out / "b_t0000" / "provenance.json").unlink()
+    refused(holosplat(*command, "--force"), "--force replaces folders that holosplat made", "b_t0000")
+
+
 def test_bodies_move_in_one_file_for_viewers(folder):
     """A .glb of all times is a film, of one time a body as it is, and .stl a file a time."""
     worked_by("export", folder / "run", "--bodies", folder / "all.glb", "--time-frame", "all")

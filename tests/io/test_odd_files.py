@@ -38,6 +38,10 @@ from holosplat.io.stacks import stack_of
         ["v1.2.tif", "v1.9.tif", "v1.10.tif"],
         ["r1_c2.tif", "r1_c10.tif", "r2_c1.tif", "r2_c2.tif"],
         ["x_1_20240101T100000.tif", "x_2_20240101T100009.tif"],
+        ["p_m10.tif", "p_m5.tif", "p_p0.tif", "p_p5.tif"],
+        ["p_\u221210.tif", "p_\u22125.tif", "p_0.tif", "p_5.tif"],
+        ["a_1e-3.tif", "a_2e-3.tif", "a_1e-2.tif"],
+        [f"p_{10**17 + n}.tif" for n in range(3)],
     ],
 )
 def test_frames_follow_the_running_number(names):
@@ -48,6 +52,11 @@ def test_frames_follow_the_running_number(names):
 def test_two_numbers_that_count_differently_are_refused():
     with pytest.raises(InputError, match=r"several numbers in s_0_0\.tif and the others run differently"):
         in_order([Path("folder") / name for name in ("s_0_0.tif", "s_2_1.tif", "s_1_2.tif")])
+
+
+def test_two_files_of_one_number_are_refused():
+    with pytest.raises(InputError, match=r"p_01\.tif and p_1\.tif have the same number"):
+        in_order([Path("folder") / name for name in ("p_01.tif", "p_1.tif", "p_2.tif")])
 
 
 def test_a_golden_scan_gets_each_frame_its_own_angle(tmp_path, caplog):
@@ -62,7 +71,14 @@ def test_a_golden_scan_gets_each_frame_its_own_angle(tmp_path, caplog):
 
 
 @pytest.mark.parametrize(
-    "names", [("projections", "flats", "darks"), ("Proj", "FLAT_before", "Dark"), ("Tomo", "White", "DARKS")]
+    "names",
+    [
+        ("projections", "flats", "darks"),
+        ("Proj", "FLAT_before", "Dark"),
+        ("Tomo", "White", "DARKS"),
+        ("radios", "refs", "dc"),
+        ("raw", "OB", "df"),
+    ],
 )
 def test_a_tree_of_folders_with_angles_is_a_scan(tmp_path, names):
     projections, flats, darks = (tmp_path / "scan" / name for name in names)
@@ -73,6 +89,25 @@ def test_a_tree_of_folders_with_angles_is_a_scan(tmp_path, names):
     scan = read_as(tmp_path / "scan", said())
     np.testing.assert_allclose(scan.frames, (FRAMES - 10.0) / 5000, rtol=1e-6)
     np.testing.assert_allclose(scan.views.rotations, rotation_y(ANGLES), atol=1e-12)
+
+
+def test_arrays_in_the_folder_of_a_scan_are_its_flats_and_darks(tmp_path, caplog):
+    caplog.set_level("INFO")
+    images(tmp_path / "scan" / "projections", numbered(N), FRAMES)
+    images(tmp_path / "scan" / "slices", numbered(1), FRAMES)
+    np.save(tmp_path / "scan" / "flats.npy", np.full((2, *SHAPE), 5010, np.uint16))
+    np.savez(tmp_path / "scan" / "darks.npz", darks=np.full((2, *SHAPE), 10, np.uint16))
+    (tmp_path / "scan" / "theta.txt").write_text("\n".join(map(str, ANGLES)))
+    np.testing.assert_allclose(read_as(tmp_path / "scan", said()).frames, (FRAMES - 10.0) / 5000, rtol=1e-6)
+    assert "the images in slices are not read" in caplog.text
+    assert "2 flats, 2 darks" in caplog.text
+
+
+def test_an_array_of_frames_is_a_scan(tmp_path):
+    np.save(tmp_path / "frames.npy", FRAMES)
+    (tmp_path / "angles.txt").write_text("\n".join(map(str, ANGLES)))
+    scan = read_as(tmp_path / "frames.npy", said(angles=tmp_path / "angles.txt"))
+    np.testing.assert_array_equal(scan.frames, FRAMES)
 
 
 def test_two_folders_of_projections_are_refused(tmp_path):
@@ -96,6 +131,7 @@ READ = {
     "a log": LOG,
     "a list": "[" + ", ".join(PLAIN) + "]",
     "semicolons": ";\n".join(PLAIN),
+    "millidegrees in a column": "n,angle (mdeg)\n" + "\n".join(f"{n},{1000 * a}" for n, a in enumerate(ANGLES)),
     "radians that say so": "# rad\n" + "\n".join(f"{angle:.8f}" for angle in np.deg2rad(ANGLES)),
 }
 
@@ -145,19 +181,56 @@ def test_views_that_can_hardly_be_meant_are_warned_of(tmp_path, caplog, angles, 
 # --- TIFF ---------------------------------------------------------------------------------------------------------
 
 
-def test_all_planes_behind_one_page_are_read(tmp_path):
-    tifffile.imwrite(tmp_path / "all.tif", FRAMES, imagej=True)
-    content = (tmp_path / "all.tif").read_bytes()
-    with tifffile.TiffFile(tmp_path / "all.tif") as opened:
+def one_page(path: Path) -> bytes:
+    """A stack as ImageJ writes large ones: one page, and the planes behind it."""
+    tifffile.imwrite(path, FRAMES, imagej=True)
+    content = path.read_bytes()
+    with tifffile.TiffFile(path) as opened:
         assert opened.is_imagej
         first, count = opened.pages[0], len(opened.pages)
         place = first.offset + 2 + 12 * len(first.tags)
-    if count > 1:  # large stacks of ImageJ have one page: cut the chain there
+    if count > 1:
         content = content[:place] + b"\0\0\0\0" + content[place + 4 :]
-        (tmp_path / "all.tif").write_bytes(content)
+    path.write_bytes(content)
+    return content
+
+
+def test_all_planes_behind_one_page_are_read(tmp_path):
+    content = one_page(tmp_path / "all.tif")
     stack = stack_of(tmp_path / "all.tif")
     assert stack.shape == (N, *SHAPE)
     np.testing.assert_array_equal([stack[n, slice(0, SHAPE[0])] for n in range(N)], FRAMES)
+    (tmp_path / "all.tif").write_bytes(content[: len(content) // 2])
+    with pytest.raises(InputError, match=f"hold {N} images behind its one page, but it is cut short"):
+        stack_of(tmp_path / "all.tif")
+
+
+@pytest.mark.parametrize("imagej", [True, False])
+def test_pages_that_are_cut_short_are_refused(tmp_path, imagej):
+    with tifffile.TiffWriter(tmp_path / "all.tif", imagej=imagej) as file:
+        for frame in FRAMES:
+            file.write(frame, contiguous=imagej)
+    content = (tmp_path / "all.tif").read_bytes()
+    (tmp_path / "all.tif").write_bytes(content[: len(content) // 2])
+    with pytest.raises(InputError, match="must hold its pages whole, but the one after"):
+        stack_of(tmp_path / "all.tif")
+
+
+@pytest.mark.parametrize("kind", ["imagej", "ome"])
+def test_several_channels_are_no_frames(tmp_path, kind):
+    tifffile.imwrite(tmp_path / "a.tif", FRAMES.reshape(4, 2, *SHAPE), metadata={"axes": "TCYX"}, **{kind: True})
+    with pytest.raises(InputError, match="frames of one channel, but it has 2"):
+        stack_of(tmp_path / "a.tif")
+
+
+def test_planes_that_were_taken_for_colours_and_small_copies_are_told_from_frames(tmp_path):
+    colours = {"photometric": "rgb", "planarconfig": "separate", "extrasamples": ["unassalpha"]}
+    tifffile.imwrite(tmp_path / "a.tif", FRAMES[:4], **colours)
+    stack = stack_of(tmp_path / "a.tif")
+    np.testing.assert_array_equal([stack[n, slice(0, SHAPE[0])] for n in range(4)], FRAMES[:4])
+    tifffile.imwrite(tmp_path / "b.tif", FRAMES[0])
+    tifffile.imwrite(tmp_path / "b.tif", FRAMES[0][::4, ::4], append=True, subfiletype=1)
+    assert stack_of(tmp_path / "b.tif").shape == (1, *SHAPE)
 
 
 TURNED = {
@@ -228,6 +301,15 @@ def test_virtual_frames_without_data_are_refused(tmp_path, held, mapped, empty):
     if empty < N:
         left = read_as(path, Reading(Told(allow_external=True, leave_out="5:8")))
         np.testing.assert_array_equal(left.frames, a_scan().frames[:5])
+
+
+def test_virtual_frames_of_the_file_itself_are_its_own(tmp_path):
+    layout = h5py.VirtualLayout((N, *SHAPE), np.float32)
+    layout[:] = h5py.VirtualSource(".", "raw", (N, *SHAPE))
+    path = virtual(tmp_path / "scan.nxs", layout)
+    with h5py.File(path, "a") as file:
+        file["raw"] = a_scan().frames
+    np.testing.assert_array_equal(read_as(path, Reading()).frames, a_scan().frames)
 
 
 def test_filters_that_are_plugins_are_named(tmp_path, monkeypatch):

@@ -104,10 +104,10 @@ def of_library(path: Path, also: dict[str, tuple[object, str]]) -> Path:
     """A file as the nxtomo library writes it, with more entries."""
     entries: dict[str, tuple[object, str]] = {
         "instrument/detector/data": (FRAMES / 5000, ""),
-        "instrument/detector/x_pixel_size": (3.2, "Micrometers"),
+        "instrument/detector/x_pixel_size": (3.2, "micron/pixel"),
         "instrument/detector/y_pixel_size": (3.2, "um"),
         "instrument/detector/distance": (0.1, "meters"),
-        "instrument/beam/incident_energy": (20.0, "KeV"),
+        "instrument/beam/incident_energy": (20.0, "Kilo electron-volts"),
         "sample/rotation_angle": (ANGLES, "Degrees"),
     }
     with h5py.File(path, "w") as file:
@@ -170,6 +170,14 @@ def test_half_turns_of_the_detector_turn_frames_upright(tmp_path, vector, coordi
         file["entry/instrument/detector/transformations/r"][()] = 90.0
     with pytest.raises(InputError, match="turns the detector by 90 degrees"):
         read_scan(path)
+
+
+def test_a_sample_that_moves_is_warned_of(tmp_path, caplog):
+    still = {"sample/x_translation": (np.full(N, 3.0), "mm")}
+    read_scan(of_library(tmp_path / "a.nxs", still))
+    assert not caplog.records
+    read_scan(of_library(tmp_path / "b.nxs", {"sample/z_translation": (PIXEL * np.arange(N), "m")}))
+    assert "z_translation moves the sample by 22.4\N{NO-BREAK SPACE}µm between the projections" in caplog.text
 
 
 # --- pixels -------------------------------------------------------------------------------------------------------

@@ -286,7 +286,7 @@ def test_both_files_are_needed_and_belong_together(suffix, tmp_path):
     with pytest.raises(InputError, match="must be of the same voxels"):
         read_volume_file(tmp_path / f"v{suffix}")
     (tmp_path / f"v.beta{suffix}").unlink()
-    with pytest.raises(InputError, match=r"holds δ alone; its β must lie beside it as v\.beta"):
+    with pytest.raises(InputError, match=r"holds one array; its β must lie beside it as v\.beta"):
         read_volume_file(tmp_path / f"v{suffix}")
 
 

@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 LIGHT = LightFlags()
 """Even, unless the air of frames says otherwise."""
 
+TOML = ".toml"
+
 
 @dataclass(frozen=True)
 @ranged
@@ -125,6 +127,10 @@ def align(
 
     for path in (out, *([table] if table else []), *([geometry_out] if geometry_out else [])):
         require_writable(path)
+    require(
+        out.suffix.lower() != TOML,
+        f"--out must be the scan to write, NAME.nxs, but it is {out}; the geometry alone is --geometry-out.",
+    )
     require(table is None or not axis_only, "--table is of single views; leave it, or --axis-only.")
     require(geometry_out is None or reading.part.views is None, "--geometry-out is of all frames; leave --views.")
     measured, how = read_frames(scan, reading), unknown.options()

@@ -160,20 +160,29 @@ def _require_free(out: Place, places: Sequence[Place], force: bool, resume: bool
             require_new(path, way_out if resume is None else f"{way_out}, or --resume to go on with it")
         return
     require_parent(out.path)
-    if not (is_taken(out.path) and out.path.is_dir()):
-        return
+    for folder in _folders((out.path,)):
+        _require_replaceable(folder, out.flag, places)
+
+
+def _folders(paths: Sequence[Path]) -> list[Path]:
+    """The folders that hold something among `paths`, and among what is there of single times of these."""
+    return [one for path in paths for one in (path, *of_times(path)) if one.is_dir() and is_taken(one)]
+
+
+def _require_replaceable(folder: Path, option: str, places: Sequence[Place]) -> None:
+    """`InputError` for a folder that --force must not replace."""
     require(
-        is_run(out.path) or bool(records(out.path)),
-        f"--force replaces folders that holosplat made, but {out.path} has no {NAME} of it; remove it yourself, or "
-        f"choose another {out.flag}.",
+        is_run(folder) or bool(records(folder)),
+        f"--force replaces folders that holosplat made, but {folder} has no {NAME} of it; remove it yourself, or "
+        f"choose another {option}.",
     )
     for source in places:
         require(
-            source.written or not source.is_there() or not _is_in(source.path, out.path),
-            f"--force must not remove what the command reads, but {source.path} is in {out.path}; choose another "
-            f"{out.flag}.",
+            source.written or not source.is_there() or not _is_in(source.path, folder),
+            f"--force must not remove what the command reads, but {source.path} is in {folder}; choose another "
+            f"{option}.",
         )
-    aside = _aside(out.path)
+    aside = _aside(folder)
     require(
         not os.path.lexists(aside), f"{aside} is what an earlier --force was to replace; rename it back, or remove it."
     )
@@ -187,7 +196,7 @@ def _aside(folder: Path) -> Path:
 def _set_aside(paths: Sequence[Path]) -> Iterator[None]:
     """In the block, folders among `paths` have another name; they go when something has taken their place, and come
     back otherwise."""
-    folders = [path.absolute() for path in paths if path.is_dir() and is_taken(path)]
+    folders = [path.absolute() for path in _folders(paths)]
     try:
         for folder in folders:
             os.rename(folder, _aside(folder))

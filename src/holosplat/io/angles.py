@@ -12,13 +12,13 @@ import numpy as np
 
 from ..checks import InputError, finite, note, require, require_regular, warn
 from ..tables import number_in, shown
+from ..units import ANGLE_UNITS, unit_factor
 
 if TYPE_CHECKING:
     from ..geometry import Views
     from ..scan import Scan
 
-RADIANS = re.compile(r"\b(rad|radians?)\b", re.IGNORECASE)
-DEGREES = re.compile(r"\b(deg|degrees?)\b|°", re.IGNORECASE)
+UNIT = re.compile(rf"(?<![a-z])({'|'.join(sorted(ANGLE_UNITS, key=len, reverse=True))})s?(?![a-z])", re.IGNORECASE)
 NAME = re.compile(r"angle|theta|rotation|^rot\b|^deg", re.IGNORECASE)
 """Names of the column of angles, and of their part of a line of a log."""
 FIELD = re.compile(r"\b(flat|dark)", re.IGNORECASE)
@@ -39,8 +39,8 @@ def read_angles(path: Path) -> np.ndarray:
     """The angles [N] in degrees of a text file.
 
     It holds one a line, or all in one line, or a table with a header that names one column of angles, or lines of a log
-    with `angle: NUMBER` in each; # begins a comment. A header or comment may say that they are radians. Errors:
-    `InputError` for anything else, and for what looks like radians without saying so.
+    with `angle: NUMBER` in each; # begins a comment. A header or comment may say their unit. Errors: `InputError` for
+    anything else, and for what looks like radians without saying so.
     """
     require_regular(path, "a text file of angles (--angles)")
     lines = [line.partition("#") for line in _text(path).splitlines()]
@@ -49,9 +49,9 @@ def read_angles(path: Path) -> np.ndarray:
     words, header = _angle_words(path, rows)
     require(len(words) > 0, f"{path} must hold the frames' angles in degrees, but it holds none.")
     values = finite(f"{path}: angles", np.array([_number(path, word) for word in words]))
-    if RADIANS.search(said := f"{said} {header}".replace("_", " ")):
-        return np.rad2deg(values)
-    if not DEGREES.search(said) and len(values) >= FEW // 2:
+    if unit := UNIT.search(f"{header} {said}".replace("_", " ")):
+        return values * (unit_factor(f"{path}: angles", unit[1], ANGLE_UNITS) / ANGLE_UNITS["deg"])
+    if len(values) >= FEW // 2:
         reach = np.ptp(values) * np.array([[1.0], [len(values) / (len(values) - 1)]])
         require(
             not (np.abs(reach / WHOLE_TURNS - 1) < CLOSE).any(),

@@ -20,7 +20,7 @@ from .hdf5 import Fields, attribute_numbers, attribute_text, open_hdf5
 from .json import read_json
 from .ome_tiff import TIFF_SUFFIXES, ome_grid
 from .ome_zarr import ZARR_SUFFIX
-from .volume_formats import FORMATS, HDF5_SUFFIXES, read_volume_file
+from .volume_formats import FORMATS, HDF5_SUFFIXES, volume_format
 from .volumes import ABSORPTION, MU, REFRACTION, Contents
 from .vtk import SUFFIXES as MESHES
 from .vtk import mesh_files, read_meshes
@@ -151,35 +151,41 @@ def _of_mesh(path: Path) -> Facts:
 
 
 def _of_ome(path: Path) -> Facts | None:
-    grid = ome_grid(path)
-    return None if grid is None else Facts(_of_grid("OME-TIFF", grid))
+    found = ome_grid(path)
+    return None if found is None else Facts(_of_grid("OME-TIFF", *found))
 
 
-def _of_grid(form: str, grid: Grid) -> dict[str, str]:
+def _of_grid(form: str, grid: Grid, of: Contents) -> dict[str, str]:
     size = " × ".join(f"{1e6 * edge:.4g}" for edge in grid.voxel_size)
     shape = " × ".join(map(str, grid.shape))
-    return {"what": f"a volume of δ and β ({form})", "shape": f"{shape} voxels (z, y, x)", "voxels": f"{size} µm"}
+    what = f"a volume of {' and '.join(SYMBOLS[name] for name in of.units)} ({form})"
+    return {"what": what, "shape": f"{shape} voxels (z, y, x)", "voxels": f"{size} µm"}
 
 
 def _of_read(path: Path) -> Facts:
     """A volume whose format is known by its suffix, read as a whole."""
-    volume = read_volume_file(path)
-    rows = _of_grid(path.suffix[1:].upper(), volume.grid)
-    for values, symbol in ((volume.delta, "δ"), (volume.beta, "β")):
-        rows[symbol] = f"{values.min():.3g} to {values.max():.3g}"
+    stored = volume_format(path).read(path)
+    rows = _of_grid(path.suffix[1:].upper(), stored.grid, stored.of)
+    for values, (name, unit) in zip(stored.arrays, stored.of.units.items()):
+        rows[SYMBOLS[name]] = f"{values.min():.3g} to {values.max():.3g}{' m⁻¹' * (unit != '1')}"
     return Facts(rows)
 
 
 def _of_zarr(path: Path) -> Facts | None:
     places = [path / ".zattrs", path / "zarr.json"]
     said = next((read_json(place) for place in places if place.is_file()), {})
-    images = said.get("multiscales") or said.get("attributes", {}).get("multiscales")
+    said = said if "multiscales" in said else said.get("attributes", {})
+    images = said.get("multiscales")
     if not images:
         return None
+    labels = [SYMBOLS.get(str(one.get("label"))) for one in said.get("omero", {}).get("channels", [])]
+    of = f" of {' and '.join(map(str, labels))}" if labels and all(labels) else ""
     levels = [str(one.get("path")) for one in images[0].get("datasets", [])]
     first = path / (levels[0] if levels else "0") / ".zarray"
     shape = " × ".join(map(str, read_json(first).get("shape", []))) if first.is_file() else "unknown"
-    return Facts({"what": "a volume (OME-Zarr)", "shape": f"{shape} (channel, z, y, x)", "levels": str(len(levels))})
+    return Facts(
+        {"what": f"a volume{of} (OME-Zarr)", "shape": f"{shape} (channel, z, y, x)", "levels": str(len(levels))}
+    )
 
 
 def no_kind(path: Path, error: InputError) -> Facts:

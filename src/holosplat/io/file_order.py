@@ -4,35 +4,43 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from decimal import Decimal
+from itertools import pairwise
 from pathlib import Path
-
-import numpy as np
 
 from ..checks import InputError
 
 NUMBER = re.compile(r"\d+(?:\.\d+)*")
+SIGNS = str.maketrans({"\N{MINUS SIGN}": "-", "m": "-", "p": "+"})
 Words = tuple[str, ...]
-Numbers = tuple[float, ...]
+Numbers = tuple[Decimal, ...]
 
 
 def in_order(files: Sequence[Path]) -> list[Path]:
-    """The files in the order of the running number in their names, which may have a sign or decimals.
+    """The files in the order of the running number in their names, which may have a sign, decimals or an exponent.
 
     Of several numbers that run differently, the running one counts the files in steps of one, or is the only whole
     number that no two files share. Names without such a number are sorted by their words and numbers from left to
-    right. Errors: `InputError` where two numbers could be the running one.
+    right. Errors: `InputError` where two numbers could be the running one, and for two files with equal numbers.
     """
     files = sorted(files)
     split = _split([file.stem.lower() for file in files])
-    if len({words for words, _ in split}) > 1 or len(files) < 2:
-        return [files[i] for i in sorted(range(len(files)), key=lambda i: _by_words(*split[i]))]
-    columns = np.array([numbers for _, numbers in split]).reshape(len(files), -1)
-    columns = columns[:, (columns != columns[0]).any(axis=0)]
-    counting = [column for column in columns.T if len(np.unique(column)) == len(column)]
-    orders = {tuple(np.argsort(column)): column for column in counting}
+    order = sorted(range(len(files)), key=lambda i: _by_words(*split[i]))
+    for one, other in pairwise(order):
+        if split[one] == split[other]:
+            raise InputError(
+                f"{files[0].parent} must say by its files' names in which order the frames were taken, but "
+                f"{files[one].name} and {files[other].name} have the same number; take one of them out, or choose the "
+                "frames' names by --files."
+            )
+    if len({words for words, _ in split}) > 1:
+        return [files[i] for i in order]
+    columns = [column for column in zip(*(numbers for _, numbers in split)) if len(set(column)) > 1]
+    counting = [column for column in columns if len(set(column)) == len(column)]
+    orders = {tuple(sorted(range(len(files)), key=column.__getitem__)): column for column in counting}
     if len(orders) > 1:
-        whole = {order: column for order, column in orders.items() if (column == np.rint(column)).all()}
-        running = {order: column for order, column in whole.items() if np.ptp(column) == len(files) - 1}
+        whole = {order: column for order, column in orders.items() if all(n == int(n) for n in column)}
+        running = {order: column for order, column in whole.items() if max(column) - min(column) == len(files) - 1}
         orders = running or whole
     if len(orders) == 1:
         return [files[i] for i in next(iter(orders))]
@@ -41,19 +49,20 @@ def in_order(files: Sequence[Path]) -> list[Path]:
             f"{files[0].parent} must say by its files' names in which order the frames were taken, but several numbers "
             f"in {files[0].name} and the others run differently; leave one number in the names."
         )
-    return [files[i] for i in np.lexsort(columns.T[::-1])]
+    return [files[i] for i in order]
 
 
-def _by_words(words: Words, numbers: Numbers) -> list[str | float]:
+def _by_words(words: Words, numbers: Numbers) -> list[str | Decimal]:
     """Words and numbers of a name in turn."""
-    return [part for pair in zip(words, (*numbers, 0.0)) for part in pair]
+    return [part for pair in zip(words, (*numbers, Decimal(0))) for part in pair]
 
 
 def _split(names: Sequence[str]) -> list[tuple[Words, Numbers]]:
     """The words of names between their numbers, and the numbers.
 
     `1.10` beside `1.9` is two numbers, as in versions; elsewhere a point within a number is that of decimals. A minus
-    or plus is a sign where it does not join a word with the number, or where some of the names lack it.
+    or plus is a sign where it does not join a word with the number, or where some of the names lack it; so are the
+    letters m and p (m10, p10) where that makes the words of all names the same.
     """
     found = [NUMBER.findall(name) for name in names]
     fractions = [text.partition(".")[2] for texts in found for text in texts if "." in text]
@@ -61,13 +70,12 @@ def _split(names: Sequence[str]) -> list[tuple[Words, Numbers]]:
         len({len(text) for text in fractions}) < 2
         or not any(len(text) > 1 and text.endswith("0") for text in fractions)
     )
-    number = r"\d+(?:\.\d+)?" if decimal else r"\d+"
-    plain = [_parted(name, rf"(?<![a-z0-9])[-+]{number}|{number}") for name in names]
-    signed = [_parted(name, rf"[-+]?{number}") for name in names]
-    if len({words for words, _ in plain}) > 1 and len({words for words, _ in signed}) == 1:
-        return signed
-    return plain
+    number = r"\d+(?:\.\d+)?(?:e[-+]\d+)?" if decimal else r"\d+"
+    minus = "-+\N{MINUS SIGN}"
+    ways = (rf"(?<![a-z0-9])[{minus}]{number}|{number}", rf"[{minus}]?{number}", rf"(?:(?<![a-z0-9])[mp])?{number}")
+    split = [[_parted(name, way) for name in names] for way in ways]
+    return next((way for way in split if len({words for words, _ in way}) == 1), split[0])
 
 
 def _parted(name: str, number: str) -> tuple[Words, Numbers]:
-    return tuple(re.split(number, name)), tuple(float(text) for text in re.findall(number, name))
+    return tuple(re.split(number, name)), tuple(Decimal(text.translate(SIGNS)) for text in re.findall(number, name))

@@ -95,8 +95,9 @@ class Fields:
         return np.asarray(found[()], dtype=np.float64)
 
     def unit(self, name: str, table: dict[str, float], default: str) -> float:
-        """The factor of the dataset's `@units` to the base unit of `table`; `default` when it has none."""
-        text = attribute_text(self.dataset(name).attrs.get("units"))
+        """The factor of the dataset's `@units` (or `@unit`) to the base unit of `table`; `default` when it has none."""
+        said = self.dataset(name).attrs
+        text = attribute_text(said.get("units", said.get("unit")))
         return unit_factor(self.label(name), default if text is None else text, table)
 
 

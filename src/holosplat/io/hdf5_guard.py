@@ -104,7 +104,8 @@ def _dataset_files(dataset: h5d.DatasetID, path: Path, name: bytes, allowed: boo
     for length in dataset.shape:
         declared *= length
     virtual, external = plan.get_layout() == h5d.VIRTUAL, plan.get_external_count() > 0
-    require(allowed or not (virtual or external), _refers(path, name, "has its values in another file"))
+    others = virtual and any(plan.get_virtual_filename(n) != "." for n in range(plan.get_virtual_count()))
+    require(allowed or not (others or external), _refers(path, name, "has its values in another file"))
     if virtual:
         return virtual_sources(path, label, plan, declared)
     if external:

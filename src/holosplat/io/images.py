@@ -1,7 +1,7 @@
-"""Frames as images of other programs, TIFF or PNG: one file, or a folder of them, with flats and darks beside it.
+"""Frames as images of other programs (TIFF, PNG) or an array (.npy): a file, or a folder of images, flats and darks.
 
 In a folder, files named flat… and dark… (or in folders of such names) correct the others, which may be in a folder of
-their own, such as projections. A text file named angles… beside them holds their angles. Capitals do not matter.
+their own, such as projections. A text file named …angles… beside them holds their angles. Capitals do not matter.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from ..scan import Exposures
 from .angles import angles_of, read_angles, tell_angles
 from .file_order import in_order
 from .leftovers import is_hidden
+from .light_frames import light_frames
 from .loader import Loader
 from .nerf_synthetic import LOADER as NERF
 from .r2_gaussian import LOADER as R2
@@ -27,8 +28,13 @@ from .stacks import IMAGES, ImageStack, images_in, stack_of
 from .stored_frames import reader
 from .tiff import LOADER as TIFF
 
-FIELDS = ((FLAT, "flat|white|open_?beam"), (DARK, "dark"))
+FIELDS = {FLAT: "flat|white|open_?beam|bright|refs?(?![a-z])", DARK: "dark"}
 """How the names of flats and of darks, and of their folders, begin, or a word in them."""
+FOLDERS = {FLAT: "references?|ff|ob|i0|empty|gain|background", DARK: "dc|df|offsets?|bias"}
+"""Names of folders of flats and of darks beside these."""
+KINDS = {FLAT: "flats", DARK: "darks"}
+ARRAYS = (".npy", ".npz", ".h5", ".hdf5", ".hdf", ".nxs", ".nx")
+"""Endings of files of flats and darks that are no images."""
 PROJECTIONS = re.compile("proj|tomo|sample|radio", re.IGNORECASE)
 """How the names of folders of projections begin."""
 ANGLES = (".txt", ".csv", ".dat", ".log")
@@ -76,20 +82,22 @@ def _greys(path: Path, parts: list[tuple[int, Any]], given: Mapping[str, Any]) -
 
 def _in_folder(folder: Path, pattern: str | None) -> list[tuple[int, Any]]:
     """The projections in a folder, or in a folder within it, and the flats and darks beside them."""
-    beside = {kind: _fields_of_light(folder, names) for kind, names in FIELDS}
-    taken = {file for files in beside.values() for file in files}
-    files = [file for place in _places(folder) for file in images_in(place, pattern) if file not in taken]
+    light = {kind: _fields_of_light(folder, kind) for kind in FIELDS}
+    places = _places(folder)
+    files = [file for place in places for file in images_in(place, pattern) if _kind(file) is None]
     named = f" named {pattern}" if pattern else ""
     require(len(files) > 0, f"{folder} must hold projections ({', '.join(IMAGES)}), but it holds none{named}.")
-    parts: list[tuple[int, Any]] = [(PROJECTION, ImageStack.of(in_order(files)))]
-    return parts + [(kind, ImageStack.of(found)) for kind, found in beside.items() if found]
+    unread = [path.name for path in _folders(folder) if _kind(path) is None and path not in places]
+    if unread:
+        note(f"{folder}: the images in {', '.join(unread)} are not read")
+    return [(PROJECTION, ImageStack.of(in_order(files)))] + [item for item in light.items() if item[1] is not None]
 
 
 def _places(folder: Path) -> list[Path]:
     """The folders of projections: those within `folder` that are named so, or itself, or the only one that is left."""
-    inner = [path for path in _folders(folder) if not any(_is_named(path.name, names) for _, names in FIELDS)]
+    inner = [path for path in _folders(folder) if _kind(path) is None]
     named = [path for path in inner if PROJECTIONS.match(path.name)]
-    own = [file for file in images_in(folder) if not any(_is_named(file.name, names) for _, names in FIELDS)]
+    own = [file for file in images_in(folder) if _kind(file) is None]
     places = named or ([folder] if own else inner)
     if len(places) > 1:
         raise InputError(
@@ -104,24 +112,38 @@ def _folders(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.is_dir() and not is_hidden(path) and images_in(path))
 
 
-def _fields_of_light(folder: Path, names: str) -> list[Path]:
-    """Images whose names say that they are such, or all in folders of such a name."""
-    inner = [file for path in _folders(folder) if _is_named(path.name, names) for file in images_in(path)]
-    return inner + [file for file in images_in(folder) if _is_named(file.name, names)]
+def _fields_of_light(folder: Path, kind: int) -> Any:
+    """Images whose names say that they are of `kind`, or all in folders of such a name, or frames of an array or HDF5
+    file of such a name; None where there are none."""
+    inner = [file for path in _folders(folder) if _kind(path) == kind for file in images_in(path)]
+    if images := inner + [file for file in images_in(folder) if _kind(file) == kind]:
+        return ImageStack.of(images)
+    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in ARRAYS and _kind(file) == kind)
+    require(
+        len(files) < 2,
+        f"{folder} has several files of {KINDS[kind]}, {', '.join(file.name for file in files)}; say one by "
+        f"--{KINDS[kind]}.",
+    )
+    return light_frames(files[0], FIELDS[kind], kind) if files else None
 
 
-def _is_named(name: str, names: str) -> bool:
-    """Whether a name begins with one of `names`, or has one of them as a word."""
-    return re.search(rf"^({names})|(?<![a-z])({names})(s|_?fields?)?(?![a-z])", name.lower()) is not None
+def _kind(path: Path) -> int | None:
+    """The kind of frames, flats or darks, that the name of a file or folder says."""
+    name, words = path.name.lower(), path.suffix == "" and path.is_dir()
+    for kind, names in FIELDS.items():
+        begins = rf"^({names})|(?<![a-z])({names})(s|_?fields?)?(?![a-z])"
+        if re.search(begins, name) or (words and re.fullmatch(FOLDERS[kind], name)):
+            return kind
+    return None
 
 
 def _angles(folder: Path) -> dict[str, Any]:
-    """The angles of the text file in a folder, or in that of its projections, whose name begins with `angle`."""
+    """The angles of the text file in a folder, or in that of its projections, whose name has `angle` or `theta`."""
     found = sorted(
         file
         for place in dict.fromkeys((folder, *_places(folder)))
         for file in place.iterdir()
-        if file.name.lower().startswith("angle") and file.suffix.lower() in ANGLES
+        if re.search("angle|theta", file.stem.lower()) and file.suffix.lower() in ANGLES
     )
     require(
         len(found) < 2,
@@ -135,29 +157,29 @@ def _angles(folder: Path) -> dict[str, Any]:
 
 
 def _tell_order(source: Path, stacks: tuple[Any, ...], kinds: np.ndarray, exposures: Exposures) -> None:
-    """Say which files are the first and the last projection, with their angles, and the numbers of flats and darks."""
+    """Say which files are the first and the last projection, with their angles, and count the flats and darks."""
     first, angles = stacks[0], angles_of(exposures.views)
     if not isinstance(first, ImageStack) or angles is None or len(angles) < 2:
         return
     ends = ", ".join(f"{which} {first.name(n)} at {angles[n]:.6g}°" for which, n in (("first", 0), ("last", -1)))
-    flats, darks = (int((kinds == kind).sum()) for kind in (FLAT, DARK))
-    note(f"{source}: {len(angles)} projections ({ends}), {flats} flats and {darks} darks")
+    counts = [f", {count} {name}" for kind, name in KINDS.items() if (count := int((kinds == kind).sum()))]
+    note(f"{source}: {len(angles)} projections ({ends}){''.join(counts)}")
 
 
 def _recognises(path: Path) -> bool:
     if any(loader.recognises(path) for loader in (TIFF, NERF, R2)):
         return False
     if path.is_file():
-        return path.suffix.lower() in IMAGES
-    return bool(images_in(path) or any(PROJECTIONS.match(inner.name) for inner in _folders(path)) or _has_fields(path))
-
-
-def _has_fields(folder: Path) -> bool:
-    """Whether a folder holds folders of flats or darks."""
-    return any(_is_named(inner.name, names) for inner in _folders(folder) for _, names in FIELDS)
+        return path.suffix.lower() in (*IMAGES, ".npy")
+    return bool(images_in(path)) or any(PROJECTIONS.match(one.name) or _kind(one) for one in _folders(path))
 
 
 LOADER = Loader(
-    *("images", f"images ({', '.join(IMAGES)}), one file or a folder of them", _recognises, reader(open_images)),
+    *(
+        "images",
+        f"images ({', '.join(IMAGES)}), one file or a folder of them, or an array (.npy)",
+        _recognises,
+        reader(open_images),
+    ),
     *((*RAW_TAKES, "files", "black", "white"), open_images),
 )

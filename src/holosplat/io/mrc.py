@@ -13,9 +13,9 @@ from ..checks import require
 from ..geometry import Grid
 from ..progress import Advance
 from ..version import __version__
-from ..volume import Object, Volume
+from ..volume import Object
 from .plain_values import read_both, values_at, write_both
-from .volumes import REFRACTION, Contents, grid_of, require_refraction
+from .volumes import REFRACTION, Contents, Stored, contents_of, grid_of
 
 ANGSTROM = 1e-10
 FLOATS, VOLUME, VERSION = 2, 1, 20140
@@ -68,7 +68,7 @@ def write_mrc(
     write_both(path, head, obj, grid, on_progress, of)
 
 
-def read_mrc(path: Path) -> Volume:
+def read_mrc(path: Path) -> Stored:
     """The volume of NAME.mrc and NAME.beta.mrc, single volumes of float32.
 
     `InputError` for other MRC files. Lengths come back to seven digits, which the header has of them.
@@ -76,7 +76,7 @@ def read_mrc(path: Path) -> Volume:
     return read_both(path, _read_one)
 
 
-def _read_one(path: Path) -> tuple[np.ndarray, Grid]:
+def _read_one(path: Path) -> tuple[np.ndarray, Grid, Contents]:
     with path.open("rb") as file:
         raw = file.read(HEADER.itemsize).ljust(HEADER.itemsize, b"\0")
     head = np.frombuffer(raw, HEADER)[0]
@@ -85,7 +85,7 @@ def _read_one(path: Path) -> tuple[np.ndarray, Grid]:
         bytes(head["map"]).rstrip() == b"MAP" and order is not None,
         f"{path} must be an MRC2014 file, but its header is not that of one.",
     )
-    require_refraction(path, bytes(head["labels"][0]).decode("latin-1"))
+    of = contents_of(bytes(head["labels"][0]).decode("latin-1"))
     head = np.frombuffer(raw, HEADER.newbyteorder("<" if order == "<" else ">"))[0]
     columns, rows, pages = (int(n) for n in head["n"])
     fits = int(head["mode"]) == FLOATS and head["axes"].tolist() == [1, 2, 3] and (head["n"] == head["m"]).all()
@@ -97,4 +97,4 @@ def _read_one(path: Path) -> tuple[np.ndarray, Grid]:
     shape = pages, rows, columns
     size = ANGSTROM * head["cell"].astype(float) / head["n"]
     grid = grid_of(path, shape, size.tolist(), (ANGSTROM * head["origin"].astype(float)).tolist())
-    return values_at(path, HEADER.itemsize + int(head["extended"]), shape, f"{order}f4"), grid
+    return values_at(path, HEADER.itemsize + int(head["extended"]), shape, f"{order}f4"), grid, of

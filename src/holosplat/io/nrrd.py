@@ -17,10 +17,10 @@ from ..geometry import Grid
 from ..progress import Advance
 from ..units import LENGTH_UNITS, unit_factor
 from ..version import __version__
-from ..volume import Object, Volume
+from ..volume import Object
 from .guard import require_declared, require_memory
 from .plain_values import LENGTH_UNIT, micrometres, read_both, values_at, write_both
-from .volumes import REFRACTION, Contents, grid_of, require_refraction
+from .volumes import REFRACTION, Contents, Stored, contents_of, grid_of
 
 TYPES = {"float": "f4", "double": "f8"}
 ORDERS = {"little": "<", "big": ">"}
@@ -59,7 +59,7 @@ def _vector(numbers: list[float]) -> str:
     return f"({','.join(map(repr, numbers))})"
 
 
-def read_nrrd(path: Path) -> Volume:
+def read_nrrd(path: Path) -> Stored:
     """The volume of NAME.nrrd and NAME.beta.nrrd, of numbers float or double, raw or gzip, axes that are not turned.
 
     `InputError` for other NRRD files, and for values in a further file.
@@ -67,7 +67,7 @@ def read_nrrd(path: Path) -> Volume:
     return read_both(path, _read_one)
 
 
-def _read_one(path: Path) -> tuple[np.ndarray, Grid]:
+def _read_one(path: Path) -> tuple[np.ndarray, Grid, Contents]:
     with path.open("rb") as file:
         head, found, _ = file.read(LONGEST).partition(b"\n\n")
     require(
@@ -75,7 +75,7 @@ def _read_one(path: Path) -> tuple[np.ndarray, Grid]:
     )
     lines = head.decode("latin-1").split("\n")
     fields = {match[1]: match[2] for line in lines if (match := FIELD.fullmatch(line))}
-    require_refraction(path, fields.get("content", ""))
+    of = contents_of(fields.get("content", ""))
     for name in ("data file", "datafile", "line skip", "byte skip"):
         require(name not in fields, f"{path} must hold its values itself, but its header has {name!r}; save it whole.")
     with as_written(path, "an NRRD file of three axes, with sizes, space directions, units and origin"):
@@ -94,11 +94,11 @@ def _read_one(path: Path) -> tuple[np.ndarray, Grid]:
         encoding = fields["encoding"]
     begin = len(head) + 2
     if encoding == "raw":
-        return values_at(path, begin, shape, order + kind), grid
+        return values_at(path, begin, shape, order + kind), grid, of
     require(
         encoding in ("gzip", "gz"), f"{path} must be encoded as raw or gzip, but it is as {encoding!r}; save it so."
     )
-    return _unpacked(path, begin, np.dtype(order + kind), shape), grid
+    return _unpacked(path, begin, np.dtype(order + kind), shape), grid, of
 
 
 def _numbers(text: str) -> list[float]:

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import h5py
 import numpy as np
 
-from ..checks import InputError, in_range, note, require
+from ..checks import InputError, in_range, note, require, warn
 from ..geometry import Views
-from ..units import ANGLE_UNITS, LENGTH_UNITS, unit_factor
+from ..units import ANGLE_UNITS, LENGTH_UNITS, format_length, unit_factor
 from .hdf5 import Fields, attribute_text
 
 FLIPS = ("instrument/detector/y_flipped", "instrument/detector/x_flipped")
@@ -17,6 +17,7 @@ SHIFT = "instrument/detector/shift"
 AXIS = ("instrument/detector/x_rotation_axis_pixel_position", "instrument/detector/estimated_cor_from_motor")
 """Columns from the middle of a frame, as it is stored, to the axis."""
 SOURCES = ("instrument/source/distance", "sample/source_distance", "source/distance")
+MOVES = tuple(f"sample/{axis}_translation" for axis in "xyz")
 TRANSFORMATIONS = "instrument/detector/transformations"
 COORDINATES = "NeXus_Coordinate_System"
 FARTHEST_M = 1e4
@@ -73,6 +74,20 @@ def about_axis(fields: Fields, views: Views) -> Views:
     )
     note(f"{fields.label(name)}: the axis is at column {column:g} of {width}; --axis-column says otherwise")
     return views.about_column(column)
+
+
+def tell_moves(fields: Fields, per_frame: Callable[[str], np.ndarray], pixel: float) -> None:
+    """Warn of a sample that the file moves between the projections by half a pixel [m] or more: frames are read as if
+    it stood still."""
+    for name in MOVES:
+        if not fields.find(name):
+            continue
+        moved = float(np.ptp(per_frame(name))) * fields.unit(name, LENGTH_UNITS, "m")
+        if moved >= 0.5 * pixel:
+            warn(
+                f"{fields.label(name)} moves the sample by {format_length(moved)} between the projections, which is "
+                "not read; shift the frames accordingly first"
+            )
 
 
 def magnification(fields: Fields, per_frame: Callable[[str], np.ndarray], detector: str) -> np.ndarray | float:

@@ -14,26 +14,27 @@ from ..volume import Volume
 from .atomic import atomic_path
 from .hdf5_writing import require_room
 from .tiff_guard import all_images, image_count, open_tiff
-from .volumes import ABSORPTION, REFRACTION, Contents, require_refraction
+from .volumes import ABSORPTION, REFRACTION, Contents, Stored, contents_of
 
 TIFF_SUFFIXES = (".tif", ".tiff")
 UNITS_M = {"µm": 1e-6, "nm": 1e-9, "mm": 1e-3, "m": 1.0}
 
 
-def ome_grid(path: Path) -> Grid | None:
-    """The grid of an OME-TIFF of δ (or µ) and β; None for another TIFF file."""
+def ome_grid(path: Path) -> tuple[Grid, Contents] | None:
+    """The grid of an OME-TIFF of δ (or µ) and β, and what it holds; None for another TIFF file."""
     with open_tiff(path) as opened:
-        return _grid_of_ome(opened.ome_metadata or "")
+        text = opened.ome_metadata or ""
+    grid = _grid_of_ome(text)
+    return None if grid is None else (grid, contents_of(text))
 
 
-def read_ome_tiff(path: Path) -> Volume:
-    """δ and β of an OME-TIFF as `write_ome_tiff` writes it, about the origin if it does not say where it lies.
+def read_ome_tiff(path: Path) -> Stored:
+    """δ (or µ) and β of an OME-TIFF as `write_ome_tiff` writes it, about the origin if it does not say where it lies.
 
     Errors: `InputError` for other TIFF files, which do not say what their numbers are.
     """
     with open_tiff(path) as opened:
         text, count = opened.ome_metadata, image_count(opened, path)
-    require_refraction(path, text or "")
     grid = _grid_of_ome(text or "")
     if grid is None or count != 2 * grid.shape[0]:
         raise InputError(
@@ -44,7 +45,7 @@ def read_ome_tiff(path: Path) -> Volume:
     sizes = {page.shape for page in pages}
     require(sizes == {grid.shape[1:]}, f"{path} must hold images of the size that it declares, but they are {sizes}.")
     values = finite(f"{path}", np.stack(pages).astype(np.float32)).reshape(2, *grid.shape)
-    return Volume(values[0], values[1], grid)
+    return Stored((values[0], values[1]), grid, contents_of(text or ""))
 
 
 def _grid_of_ome(text: str) -> Grid | None:

@@ -21,7 +21,7 @@ from ..volume import Object, Volume
 from .folder import atomic_folder, require_new
 from .guard import require_memory
 from .hdf5_writing import require_room
-from .volumes import NAMES, REFRACTION, SLAB_VOXELS, Contents, grid_of, require_refraction, slabs_of
+from .volumes import NAMES, REFRACTION, SLAB_VOXELS, Contents, Stored, contents_of, grid_of, slabs_of
 
 ZARR_SUFFIX = ".zarr"
 CHUNK = 64
@@ -67,7 +67,7 @@ def write_ome_zarr(
         group.attrs.update(metadata(grid, len(shapes), limits, of))
 
 
-def read_ome_zarr(path: Path) -> Volume:
+def read_ome_zarr(path: Path) -> Stored:
     """The volume of an OME-Zarr folder with the channels δ and β, as `write_ome_zarr` writes it, at its finest level.
 
     Errors: `InputError` without the package zarr, and for other folders.
@@ -82,12 +82,12 @@ def read_ome_zarr(path: Path) -> Volume:
         factors = [unit_factor(f"{path}: axes", axis["unit"], LENGTH_UNITS) for axis in image["axes"][1:]]
         finest, array = image["datasets"][0], group[image["datasets"][0]["path"]]
         scale, place = (np.array(step[step["type"]], dtype=float) for step in finest["coordinateTransformations"])
-        require_refraction(path, " ".join(channels))
-        if channels != NAMES or axes != ["c", *"zyx"] or array.ndim != 4 or array.shape[0] != len(NAMES):
+        of = contents_of(" ".join(channels))
+        if channels != tuple(of.units) or axes != ["c", *"zyx"] or array.ndim != 4 or array.shape[0] != len(NAMES):
             raise ValueError(f"it has the channels {channels} and the axes {axes}")
         require_memory(str(path), 4 * math.prod(array.shape))
         size, origin = ((values[1:] * factors)[::-1] for values in (scale, place))
-        delta, beta = np.asarray(array[:], dtype=np.float32)
+        first, beta = np.asarray(array[:], dtype=np.float32)
     except (InputError, MemoryError):
         raise
     except Exception as error:  # zarr and its codecs raise many kinds for damaged folders
@@ -96,8 +96,8 @@ def read_ome_zarr(path: Path) -> Volume:
             f"{path} must be an OME-Zarr of δ and β, as `holosplat export` writes it, but it is damaged or another "
             f"one: {said}."
         ) from None
-    grid = grid_of(path, delta.shape, size.tolist(), origin.tolist())
-    return Volume(finite(f"{path}", delta), finite(f"{path}", beta), grid)
+    grid = grid_of(path, first.shape, size.tolist(), origin.tolist())
+    return Stored((finite(f"{path}", first), finite(f"{path}", beta)), grid, of)
 
 
 def levels_of(shape: tuple[int, int, int]) -> list[tuple[int, int, int]]:

@@ -13,11 +13,11 @@ import numpy as np
 from ..checks import finite, require, require_regular
 from ..geometry import Grid
 from ..progress import Advance
-from ..volume import Object, Volume
+from ..volume import Object
 from .atomic import atomic_path
 from .guard import require_memory
 from .hdf5_writing import require_room
-from .volumes import NAMES, REFRACTION, Contents, slab_rows, slabs_of
+from .volumes import NAMES, REFRACTION, Contents, Stored, slab_rows, slabs_of
 
 MICROMETRES = 1e6
 LENGTH_UNIT = "um"
@@ -91,15 +91,15 @@ def write_both(
             file.write(head(name, row))
 
 
-def read_both(path: Path, read_one: Callable[[Path], tuple[np.ndarray, Grid]]) -> Volume:
+def read_both(path: Path, read_one: Callable[[Path], tuple[np.ndarray, Grid, Contents]]) -> Stored:
     """The volume of two files (`both`), each as `read_one` reads it. `InputError` where one is missing or differs."""
-    delta, beta = both(path)
+    first, beta = both(path)
     require(
-        beta.is_file() or not delta.is_file(),
-        f"{path} holds δ alone; its β must lie beside it as {beta.name}, but there is no such file.",
+        beta.is_file() or not first.is_file(),
+        f"{path} holds one array; its β must lie beside it as {beta.name}, but there is no such file.",
     )
-    for one in (delta, beta):
+    for one in (first, beta):
         require_regular(one, f"a {path.suffix} file")
-    (values, grid), (others, other) = (read_one(one) for one in (delta, beta))
-    require(grid == other, f"{delta} and {beta.name} must be of the same voxels, but they differ; write both anew.")
-    return Volume(finite(f"{delta}", values), finite(f"{beta}", others), grid)
+    (values, grid, of), (others, other, _) = (read_one(one) for one in (first, beta))
+    require(grid == other, f"{first} and {beta.name} must be of the same voxels, but they differ; write both anew.")
+    return Stored((finite(f"{first}", values), finite(f"{beta}", others)), grid, of)

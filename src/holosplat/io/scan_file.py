@@ -21,7 +21,7 @@ from ..units import ANGLE_UNITS, ENERGY_UNITS, LENGTH_UNITS, TIME_UNITS
 from .divided_light import read_divided_light
 from .hdf5 import Fields, attribute_text, open_hdf5
 from .nxtomo_geometry import FLIPS as FLIPS
-from .nxtomo_geometry import SHIFT, about_axis, flips_of, magnification
+from .nxtomo_geometry import SHIFT, about_axis, flips_of, magnification, tell_moves
 from .raw_file import (
     DARK,
     FLAT,
@@ -200,6 +200,7 @@ def _views(fields: Fields, kinds: np.ndarray, given: Mapping[str, Any]) -> Views
     pixel_size = said(given, "pixel_size") or _pixel_sizes(fields, kinds) / _magnification(
         fields, kinds, PIXEL_SIZES[:2]
     )
+    tell_moves(fields, lambda name: _per_frame(fields, kinds, name), float(np.min(pixel_size)))
     if given.get("angles_deg") is not None or not fields.find(ROTATION):
         views = Views.of_pixels(_rotations_of_angles(fields, kinds, given), shifts, shape, pixel_size)
         return views if fields.find(SHIFT) else about_axis(fields, views)
@@ -216,7 +217,7 @@ def _rotations_of_angles(fields: Fields, kinds: np.ndarray, given: Mapping[str, 
     unsaid = {"angles_deg": np.zeros(int((kinds == PROJECTION).sum()))}
     name = fields.need(*ANGLES, way_out="say it by --angles FILE, or add it", stand_in=unsaid)
     angles = _per_frame(fields, kinds, name)
-    if "units" not in fields.dataset(name).attrs and np.abs(angles).max() > MOST_RADIANS:
+    if {"units", "unit"}.isdisjoint(fields.dataset(name).attrs) and np.abs(angles).max() > MOST_RADIANS:
         raise InputError(
             f"{fields.label(name)} must carry @units, without which it is in radians, but it reaches "
             f"{np.abs(angles).max():g}; set @units to 'deg' if these are degrees."

@@ -11,7 +11,7 @@ import numpy as np
 from ..checks import InputError, require
 from .guard import mapped_array
 from .leftovers import is_hidden
-from .tiff_guard import image_count, image_values, open_tiff
+from .tiff_guard import image_count, image_values, open_tiff, require_one_channel
 
 IMAGES = (".tif", ".tiff", ".png")
 
@@ -35,8 +35,10 @@ class ImageStack:
         return cls(pages, (len(pages), *first.shape))
 
     def name(self, number: int) -> str:
-        """The name of the file with image `number`."""
-        return self.pages[number][0].name
+        """The name of the file with image `number`, and which of its images that is, if there are more."""
+        file, page = self.pages[number]
+        alone = page == 0 and self.pages[number + 1 : number + 2] != ((file, 1),)
+        return file.name if alone else f"{file.name}, image {page}"
 
     def __getitem__(self, index: tuple[int, slice]) -> np.ndarray:
         number, rows = index
@@ -59,6 +61,10 @@ def stack_of(path: Path, pattern: str | None = None) -> ImageStack | np.ndarray:
     files = images_in(path, pattern) if path.is_dir() else [path]
     require(len(files) > 0, f"{path} must hold images ({', '.join(IMAGES)}), but it holds none{_like(pattern)}.")
     require(files[0].is_file(), f"{path} must be images or a folder of them, but there is nothing; check the path.")
+    require(
+        _is_image(files[0]),
+        f"{path} must be images ({', '.join(IMAGES)}), a folder of them, .npy or HDF5, but it is none; convert it.",
+    )
     return ImageStack.of(files)
 
 
@@ -85,6 +91,7 @@ def _page_count(file: Path) -> int:
     if file.suffix.lower() == ".png":
         return 1
     with open_tiff(file) as opened:
+        require_one_channel(opened, file)
         return image_count(opened, file)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,8 @@ DEFLATE = (8, 32946)
 WHITE_IS_ZERO, BLACK_IS_ZERO, COLOURS, PALETTE = range(4)
 """TIFF's photometric interpretations that are read."""
 UPRIGHT = 1
+APART = 2
+"""TIFF's planar configuration of colours that are stored one after another."""
 
 
 @contextmanager
@@ -40,28 +43,60 @@ def open_tiff(file: Path) -> Iterator[Any]:
 
 
 def image_count(opened: Any, file: Path) -> int:
-    """The images of an open TIFF file: its pages or, where there is one page, the planes behind it (ImageJ writes
-    large stacks so). Errors: `InputError` for pages that run in a circle."""
-    places = set[int]()
+    """The images of an open TIFF file: its pages, without smaller copies at their end, or, where there is one page, the
+    planes behind it (ImageJ writes large stacks so). Errors: `InputError` for pages that run in a circle or beyond its
+    end, and for fewer planes than ImageJ declares."""
+    places, count, following = set[int](), 0, 0
     while True:
         try:
-            place = opened.pages[len(places)].offset
+            page = opened.pages[len(places)]
         except IndexError:
             break
-        require(place not in places, f"{file} must hold its pages one after another, but they run in a circle.")
-        places.add(place)
-    return len(places) if len(places) != 1 else _planes(opened, file)
+        require(page.offset not in places, f"{file} must hold its pages one after another, but they run in a circle.")
+        places.add(page.offset)
+        count = count if page.is_reduced and count else len(places)
+        following = _next_page(opened, page)
+    require(following == 0, f"{file} must hold its pages whole, but the one after {len(places)} is not; save it anew.")
+    return count * _samples(opened.pages[0]) if count != 1 else _planes(opened, file)
+
+
+def require_one_channel(opened: Any, file: Path) -> None:
+    """`InputError` for a hyperstack of ImageJ or OME whose images are those of several channels."""
+    if opened.is_imagej or opened.is_ome:
+        axes = dict(zip(opened.series[0].axes, opened.series[0].shape))
+        several = axes.get("C", 1) > 1 and max(axes.get("T", 1), axes.get("Z", 1)) > 1
+        require(not several, f"{file} must hold frames of one channel, but it has {axes.get('C')}; save one of them.")
+
+
+def _next_page(opened: Any, page: Any) -> int:
+    """Where the page after `page` begins [bytes]; 0 for none. tifffile leaves pages beyond the end of a file."""
+    tiff, handle = opened.tiff, opened.filehandle
+    handle.seek(page.offset)
+    (tags,) = struct.unpack(tiff.tagnoformat, handle.read(tiff.tagnosize))
+    handle.seek(page.offset + tiff.tagnosize + tags * tiff.tagsize)
+    (found,) = struct.unpack(tiff.offsetformat, handle.read(tiff.offsetsize))
+    return int(found)
+
+
+def _samples(page: Any) -> int:
+    """The images in a page: 3 or 4 where tifffile was given so many and took them for colours, one after another."""
+    apart = page.is_shaped and int(page.planarconfig) == APART
+    return int(page.samplesperpixel) if apart else 1
 
 
 def _planes(opened: Any, file: Path) -> int:
     """The planes of the one page of an open TIFF file."""
     page, series = opened.pages[0], opened.series[0]
+    if (samples := _samples(page)) > 1:
+        return samples
     planes = int(np.prod(series.shape, dtype=object)) // max(1, int(np.prod(page.shape, dtype=object)))
+    if opened.is_imagej:
+        planes = max(planes, int(opened.imagej_metadata.get("images", 1)))
     if planes <= 1:
         return 1
     whole = series.dataoffset is not None and int(page.compression) == 1
     size = file.stat().st_size - (series.dataoffset or 0)
-    declared = int(np.prod(series.shape, dtype=object)) * np.dtype(series.dtype).itemsize
+    declared = planes * int(np.prod(page.shape, dtype=object)) * np.dtype(series.dtype).itemsize
     require(
         whole and declared <= size,
         f"{file} must hold {planes} images behind its one page, but it is cut short or compressed; save it anew.",
@@ -74,8 +109,9 @@ def image_values(opened: Any, file: Path, number: int) -> np.ndarray:
 
     It is turned upright as its orientation says, and white that is stored as 0 becomes the greatest number.
     """
+    samples = _samples(opened.pages[0])
     try:
-        page, plane = opened.pages[number], None
+        page, plane = opened.pages[number // samples], None
     except IndexError:
         page, plane = opened.pages[0], number
     label = f"{file}: an image of {'x'.join(map(str, page.shape))}"
@@ -85,7 +121,7 @@ def image_values(opened: Any, file: Path, number: int) -> np.ndarray:
     if int(page.compression) in DEFLATE:
         _require_segments(page, label, declared)
     values = page.asarray() if plane is None else _plane(opened, plane, file)
-    return _upright(page, _grey(page, values, file), file)
+    return _upright(page, _grey(page, values[number % samples] if samples > 1 else values, file), file)
 
 
 def _plane(opened: Any, number: int, file: Path) -> np.ndarray:

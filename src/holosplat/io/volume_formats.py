@@ -16,7 +16,7 @@ from .nrrd import read_nrrd, write_nrrd
 from .ome_tiff import TIFF_SUFFIXES, read_ome_tiff, write_ome_tiff
 from .ome_zarr import ZARR_SUFFIX, read_ome_zarr, require_zarr, write_ome_zarr
 from .plain_values import both
-from .volumes import REFRACTION, Contents, read_volume, write_voxels
+from .volumes import REFRACTION, Contents, Stored, read_stored, write_voxels
 from .vti import read_vti, write_vti
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
@@ -32,7 +32,7 @@ class VolumeFormat:
     asks for."""
 
     write: Callable[[Path, Object, Grid, Advance, Contents], None]
-    read: Callable[[Path], Volume]
+    read: Callable[[Path], Stored]
     files: Callable[[Path], tuple[Path, ...]] = _alone
     needs: Callable[[], Any] = lambda: None
 
@@ -43,7 +43,7 @@ def _write_tiff(path: Path, obj: Object, grid: Grid, on_progress: Advance, of: C
 
 
 FORMATS = {
-    **dict.fromkeys(HDF5_SUFFIXES, VolumeFormat(write_voxels, read_volume)),
+    **dict.fromkeys(HDF5_SUFFIXES, VolumeFormat(write_voxels, read_stored)),
     **dict.fromkeys(TIFF_SUFFIXES, VolumeFormat(_write_tiff, read_ome_tiff)),
     ZARR_SUFFIX: VolumeFormat(write_ome_zarr, read_ome_zarr, needs=require_zarr),
     ".vti": VolumeFormat(write_vti, read_vti),
@@ -83,4 +83,4 @@ def of_time(path: Path, frame: int) -> Path:
 
 def read_volume_file(path: Path) -> Volume:
     """δ and β of a volume file of any format, by its suffix."""
-    return volume_format(path).read(path)
+    return volume_format(path).read(path).volume(path)

@@ -59,11 +59,26 @@ REFRACTION, ABSORPTION = Contents(None), Contents.of(False, 1.0)
 """The latter at any energy, for its names and units."""
 
 
-def require_refraction(path: str | Path, said: str) -> None:
-    """`InputError` for a file that says that its numbers are µ."""
-    require(
-        MU not in said, f"{path} must hold δ, but it holds the attenuation coefficient µ; take a volume of δ and β."
-    )
+def contents_of(said: str) -> Contents:
+    """What the arrays of a file are that says so of them, in names or a description."""
+    return ABSORPTION if MU in said else REFRACTION
+
+
+@dataclass(frozen=True)
+class Stored:
+    """A volume as a file holds it: two arrays [Z, Y, X] float32 on a grid, and what they are."""
+
+    arrays: tuple[np.ndarray, np.ndarray]
+    grid: Grid
+    of: Contents = REFRACTION
+
+    def volume(self, path: str | Path) -> Volume:
+        """The same as δ and β. `InputError` that names the file where its numbers are µ."""
+        require(
+            self.of is not ABSORPTION,
+            f"{path} must hold δ, but it holds the attenuation coefficient µ; take a volume of δ and β.",
+        )
+        return Volume(*self.arrays, self.grid)
 
 
 def read_volume(path: str | Path) -> Volume:
@@ -84,18 +99,22 @@ def read_volume(path: str | Path) -> Volume:
         >>> found.grid == grid, f"{found.delta.mean():.1e}"
         (True, '5.8e-07')
     """
+    return read_stored(path).volume(path)
+
+
+def read_stored(path: str | Path) -> Stored:
+    """The same of a file that may hold /mu_per_m in place of /delta."""
     with open_hdf5(path) as file:
-        require_refraction(path, " ".join(file))
-        fields = Fields(Path(path), file)
-        arrays = [_array(fields, name) for name in NAMES]
-        if arrays[0].shape != arrays[1].shape:
+        of = contents_of(" ".join(file))
+        fields, names = Fields(Path(path), file), tuple(of.units)
+        first, beta = (_array(fields, name) for name in names)
+        if first.shape != beta.shape:
             raise InputError(
-                f"{path}: /delta and /beta must have the same shape, but they have {arrays[0].shape} and "
-                f"{arrays[1].shape}."
+                f"{path}: /{names[0]} and /beta must have the same shape, but they have {first.shape} and {beta.shape}."
             )
-        size = np.broadcast_to(_attribute(fields, "voxel_size", (1, 3)), (3,))
-        origin = _attribute(fields, "origin", (3,))
-    return Volume(arrays[0], arrays[1], grid_of(Path(path), arrays[0].shape, size.tolist(), origin.tolist()))
+        size = np.broadcast_to(_attribute(fields, names, "voxel_size", (1, 3)), (3,))
+        origin = _attribute(fields, names, "origin", (3,))
+    return Stored((first, beta), grid_of(Path(path), first.shape, size.tolist(), origin.tolist()), of)
 
 
 def grid_of(path: Path, shape: Sequence[int], size: Sequence[float], origin: Sequence[float]) -> Grid:
@@ -182,13 +201,13 @@ def _array(fields: Fields, name: str) -> np.ndarray:
     return finite(fields.label(name), data[()].astype(np.float32))
 
 
-def _attribute(fields: Fields, name: str, counts: tuple[int, ...]) -> np.ndarray:
+def _attribute(fields: Fields, datasets: Sequence[str], name: str, counts: tuple[int, ...]) -> np.ndarray:
     """The attribute `name` of the datasets and the root, wherever it stands."""
-    places = [fields.group, *(fields.group[dataset] for dataset in NAMES)]
+    places = [fields.group, *(fields.group[dataset] for dataset in datasets)]
     label = f"{fields.path}: @{name}"
     found = [attribute_numbers(label, place.attrs[name], counts) for place in places if name in place.attrs]
     if not found:
-        raise InputError(f"{label} (in metres, on /delta or the file's root) must be there, but it is missing.")
+        raise InputError(f"{label} (in metres, on /{datasets[0]} or the file's root) must be there, but it is missing.")
     if not all(np.allclose(value, found[0], rtol=1e-6, atol=1e-15, equal_nan=True) for value in found):
         values = ", ".join(str(value.tolist()) for value in found)
         raise InputError(f"{label} must be the same on the datasets and the root, but it is {values}.")

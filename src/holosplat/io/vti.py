@@ -18,12 +18,12 @@ from ..checks import InputError, require, require_regular
 from ..geometry import Grid
 from ..progress import Advance
 from ..units import LENGTH_UNITS, unit_factor
-from ..volume import Object, Volume
+from ..volume import Object
 from .atomic import atomic_path
 from .guard import require_declared, require_memory, xml_fault
 from .hdf5_writing import require_room
 from .plain_values import LENGTH_UNIT, fill, micrometres
-from .volumes import NAMES, REFRACTION, Contents, grid_of, require_refraction
+from .volumes import NAMES, REFRACTION, Contents, Stored, contents_of, grid_of
 from .vtk import quiet
 from .vtk_guard import blocks_fault
 
@@ -71,7 +71,7 @@ def _head(grid: Grid, of: Contents) -> bytes:
     ).encode()
 
 
-def read_vti(path: Path) -> Volume:
+def read_vti(path: Path) -> Stored:
     """The volume of a .vti file with the point data delta and beta, and the field data length_unit, by VTK's reader.
 
     `InputError` for damaged files, and for other image data.
@@ -86,8 +86,8 @@ def read_vti(path: Path) -> Volume:
         image = reader.GetOutput()
         require(not complaints(), f"{path} must be a complete .vti file, but it is damaged: {complaints()}.")
     data, unit = image.GetPointData(), image.GetFieldData().GetAbstractArray(UNIT)
-    arrays = [data.GetArray(name) for name in NAMES]
-    require_refraction(path, _names(data))
+    of = contents_of(_names(data))
+    arrays = [data.GetArray(name) for name in of.units]
     if unit is None or unit.GetNumberOfValues() != 1 or any(_is_none(one, image) for one in arrays):
         raise InputError(
             f"{path} must have the point data delta and beta, a number a point, and the field data {UNIT}, as "
@@ -102,8 +102,8 @@ def read_vti(path: Path) -> Volume:
     shape = image.GetDimensions()[::-1]
     low = np.array(image.GetOrigin()) + np.array(image.GetSpacing()) * np.array(image.GetExtent()[::2])
     grid = grid_of(path, shape, [factor * v for v in image.GetSpacing()], [factor * v for v in low])
-    delta, beta = (_values(array).reshape(shape) for array in arrays)
-    return Volume(delta, beta, grid)
+    first, beta = (_values(array).reshape(shape) for array in arrays)
+    return Stored((first, beta), grid, of)
 
 
 def _require_honest(path: Path) -> None:

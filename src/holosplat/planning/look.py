@@ -60,12 +60,19 @@ class Look:
     spectrum: Spectrum
 
     @property
+    def is_light(self) -> bool:
+        """Whether the values can be intensities, which are above 0 but for noise."""
+        return self.level > 0 and self.least > -self.level
+
+    @property
     def is_relative(self) -> bool:
         """Whether frames seem to have been divided by a flat field, by their level."""
         return RELATIVE[0] < self.level < RELATIVE[1]
 
     def rows(self) -> dict[str, str]:
         """The same in words, by name."""
+        if not self.is_light:
+            return {"values": f"{_number(self.least)} to {_number(self.most)}, which are no intensities"}
         air = (
             f"{_number(self.air)} in {in_percent(self.air_share)} of the frames"
             if self.air is not None
@@ -96,8 +103,7 @@ def looked(frames: np.ndarray) -> Look:
     small = torch.from_numpy(binned(frames, factor))
     air = find_air(small)
     level = float(small[air].mean()) if bool(air.any()) else float(small.median())
-    level = level if level > 0 else 1.0
-    part = torch.from_numpy(_middle(frames) / np.float32(level))
+    part = torch.from_numpy(_middle(frames) / np.float32(level if level > 0 else 1.0))
     noise = float(noise_levels(part).mean())
     contrast = float((part.double() - 1).square().mean().sqrt())
     least, most = np.quantile(small.numpy(), (0.001, 0.999))

@@ -81,6 +81,8 @@ class Costs:
     """A wave sample of whole frames, by which surfaces that were fitted in windows are judged."""
     judging: float = 1.6e-6
     """Seconds that it takes."""
+    run: float = 15.0
+    """Seconds of a run whose fit takes none: the program, decisions about light and noise, judging and the report."""
     turns: float = 2.5
     """Times what a fit of Gaussians takes: that, and the turns of surfaces and volume that may follow in noise."""
 
@@ -251,7 +253,7 @@ def _parts(sizes: Sizes, method: Method) -> tuple[float, float, float] | None:
     """Bytes beside the program, seconds, and numbers of the object."""
     if isinstance(method, PerView):
         memory = Costs.plain * sizes.voxels + Costs.rays * sizes.views * sizes.columns**2
-        return memory, 1 + 0.35e-6 * sizes.views * sizes.voxels, sizes.voxels
+        return memory, Costs.run + 0.35e-6 * sizes.views * sizes.voxels, sizes.voxels
     if isinstance(method, SmoothVolume):
         small = sizes.joined(method.max_voxels)
         memory = max(Costs.smooth * small.voxels, of_start(small, method.volume))
@@ -259,7 +261,7 @@ def _parts(sizes: Sizes, method: Method) -> tuple[float, float, float] | None:
     if isinstance(method, HolographicVoxels | Voxels | NeuralFields):
         begun, fine = of_start(sizes, method.volume), _fine(sizes, method.volume)[0]
         if isinstance(method, HolographicVoxels):
-            return begun, 3 + 1.5e-6 * fine, fine
+            return begun, Costs.run + 1.5e-6 * fine, fine
         fitted = Costs.waves * sizes.waves() + Costs.plain * sizes.voxels
         return max(begun, fitted), 20 + 3e-6 * fine, sizes.voxels
     if isinstance(method, Onix | PixelNerf):

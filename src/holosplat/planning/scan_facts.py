@@ -6,6 +6,7 @@ A few frames, flats and darks are read, and no more, so that a scan of a terabyt
 from __future__ import annotations
 
 import logging
+import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -120,19 +121,32 @@ def _facts(path: Path, reading: Reading, loader: Loader, opened: Opened, unsaid:
     look = looked(np.asarray(scan.source[numbers]))
     rows = {"what": f"a scan: {loader.mark} ({loader.name})"} | keys_of(path) | _frames(scan, file)
     rows |= _beam(scan.exposures, unsaid) | _angles(scan, file, unsaid) | look.rows()
-    if unsaid.keys().isdisjoint(OPTICS):
+    if look.is_light and unsaid.keys().isdisjoint(OPTICS):
         rows["fringes"] = look.fringes(fringes(scan.exposures) / scan.views.pixel_sizes)
-    if not unsaid:
+    if look.is_light and not unsaid:
         rows |= _needs(scan, numbers)
     missing = list(dict.fromkeys(unsaid.values()))
-    if not look.is_relative:
+    if not look.is_light:
+        missing.append(
+            f"{path} must hold intensities, which are above 0, but its level is {look.level:.4g}; of the slices of a "
+            "volume, `holosplat simulate` makes frames (--voxel-size)."
+        )
+    elif not look.is_relative:
         missing.append(
             f"{path} holds counts (level {look.level:.4g}) that nothing divides; divide them by --flats and --darks."
         )
-    words = ["holosplat reconstruct", str(path), *(f"--{OPTIONS.get(name, name)} …" for name in unsaid)]
+    words = ["holosplat reconstruct", shlex.quote(str(path)), *_options(reading)]
+    words += [f"--{OPTIONS.get(name, name)} …" for name in unsaid]
     more = " ".join([*words, *(["--motion each"] if scan.is_series else []), "--out run"])
     matter = "not in the file; --material NAME or --delta-beta RATIO says it, else δ/β is estimated"
-    return ScanFacts(Facts(rows | {"material": matter}, tuple(missing), (more,)), scan, look, numbers, tuple(unsaid))
+    facts = Facts(rows | {"material": matter}, tuple(missing), (more,) if look.is_light else ())
+    return ScanFacts(facts, scan, look, numbers, tuple(unsaid))
+
+
+def _options(reading: Reading) -> list[str]:
+    """What is said of a scan, and which part is taken, as options of a command."""
+    options = {f"--{name.replace('_', '-')}": value for name, value in reading.as_table().items()}
+    return [name if value is True else f"{name} {shlex.quote(str(value))}" for name, value in options.items()]
 
 
 def _frames(scan: Scan, file: ScanFile | None) -> dict[str, str]:

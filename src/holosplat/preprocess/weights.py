@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import minimize
 
 from ..checks import require
 from .eigen_flats import EigenFlats
@@ -48,6 +47,8 @@ class TotalVariationWeights:
         frame = np.maximum(frame, FAINTEST * frame.mean())
         if len(self.components) == 0:
             return np.zeros(0)
+        from scipy.optimize import minimize  # which takes long to load
+
         start = np.clip(self._projected(frame), -REACH, REACH)
         edge = float(np.median(_slopes(self._logarithm(frame, start)[0])[2])) + 1e-12
         bounds = [(-REACH, REACH)] * len(start)

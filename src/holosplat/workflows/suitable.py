@@ -37,7 +37,7 @@ def check_frames(train: Scan) -> None:
     require(
         FLAT_LEVELS[0] < level < FLAT_LEVELS[1],
         f"frames must be relative to the flat field (about 1 beside the sample), but their median is {level:.4g}; "
-        "add flats (image_key 1) to the scan, or divide by them.",
+        "divide counts by their flats, with --flats and --darks or image_key 1 and 2 in the file.",
     )
     negative = float((train.frames < 0).mean())
     require(
