@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
@@ -13,6 +13,8 @@ from .geometry import Grid
 from .ranges import Signed, ranged
 from .volume import Volume
 
+Sign = Literal[-1, 0, 1]
+"""1 for δ above the medium's, -1 below, 0 where that is not known."""
 MatterKind = Literal["levels", "continuous"]
 """What matter is like: of one level of δ, or several, with sharp edges, or varying smoothly."""
 LEAST_CONTRAST = 1.6
@@ -32,6 +34,11 @@ class DeltaBeta(NamedTuple):
     def against(self, medium: DeltaBeta) -> DeltaBeta:
         """What an object in `medium` adds to it: `(δ - δ_medium, β - β_medium)`."""
         return DeltaBeta(self.delta - medium.delta, self.beta - medium.beta)
+
+    @property
+    def sign(self) -> float:
+        """1 for δ above the medium's, -1 below: the sign of what an occupancy, which is never negative, adds."""
+        return math.copysign(1.0, self.delta)
 
     @property
     def ratio(self) -> float:
@@ -139,7 +146,9 @@ class MaterialPrior:
     kind = ""
     """The name of this knowledge in files and tables."""
     materials: tuple[DeltaBeta, ...] = ()
-    """The known materials, the denser first."""
+    """The known materials, that of the stronger contrast (the larger |δ|) first."""
+    sign: Sign = 0
+    """1 where δ of the matter lies above its medium's, -1 where it lies below, 0 where that is not known."""
 
     def __new__(cls, *args: object, **named: object) -> Self:
         """One of the four; of the base class alone nobody could say what is known."""
@@ -152,21 +161,31 @@ class MaterialPrior:
 
     @staticmethod
     def known(material: DeltaBeta, second: DeltaBeta | None = None) -> MaterialPrior:
-        """δ (above zero) and β of one material, or of two whose δ differ, are known."""
+        """δ (not zero) and β of one material, or of two whose δ differ, are known; below zero for holes in a medium."""
         if second is None:
             return Known(DeltaBeta(*material))
-        denser, lighter = sorted((material, second), reverse=True)
+        denser, lighter = sorted((material, second), key=lambda one: (abs(one[0]), one), reverse=True)
         return KnownTwo(DeltaBeta(*denser), DeltaBeta(*lighter))
 
     @staticmethod
-    def of_ratio(ratio: float) -> MaterialPrior:
-        """One material of unknown density, with δ/β known (negative where β lies below the medium's)."""
-        return KnownRatio(float(ratio))
+    def of_ratio(ratio: float, sign: Sign = 0) -> MaterialPrior:
+        """One material of unknown density, with δ/β known (negative where δ and β differ from the medium's otherwise);
+        sign: as for `unknown`."""
+        return KnownRatio(float(ratio), sign)
 
     @staticmethod
-    def unknown() -> MaterialPrior:
-        """Nothing is known: the frames decide."""
-        return Unknown()
+    def unknown(sign: Sign = 0) -> MaterialPrior:
+        """Nothing is known: the frames decide. sign: 1 where δ lies above the medium's, -1 below; 0: not known."""
+        return Unknown(sign)
+
+    def signed(self, sign: Sign) -> MaterialPrior:
+        """The same knowledge with a sign of δ, where that was not known."""
+        return self
+
+    @property
+    def delta_sign(self) -> float:
+        """The sign of δ that is taken, 1.0 or -1.0: 1.0 where it is not known."""
+        return -1.0 if self.sign < 0 else 1.0
 
     @property
     def fixes_level(self) -> bool:
@@ -196,12 +215,17 @@ class Known(MaterialPrior):
     kind = "known"
 
     def __post_init__(self) -> None:
-        _require_delta(self.material)
+        _require_contrast(self.material)
 
     @property
     def materials(self) -> tuple[DeltaBeta, ...]:  # type: ignore[override]
         """The material."""
         return (self.material,)
+
+    @property
+    def sign(self) -> Sign:  # type: ignore[override]
+        """That of the material's δ."""
+        return -1 if self.material.delta < 0 else 1
 
 
 @dataclass(frozen=True)
@@ -214,17 +238,28 @@ class KnownTwo(MaterialPrior):
 
     def __post_init__(self) -> None:
         for material in (self.denser, self.lighter):
-            _require_delta(material)
+            _require_contrast(material)
         require(
-            self.denser.delta >= LEAST_CONTRAST * self.lighter.delta,
+            self.denser.sign == self.lighter.sign,
+            "two materials must both have δ above their medium's, or both below, but the differences are "
+            f"{self.denser.delta:.3g} and {self.lighter.delta:.3g}; give the medium that lies on one side of both, or "
+            "one material.",
+        )
+        require(
+            abs(self.denser.delta) >= LEAST_CONTRAST * abs(self.lighter.delta),
             f"two materials are told apart by δ, of which one must have at least {LEAST_CONTRAST:g} times the other's, "
             f"but they have {self.denser.delta:.3g} and {self.lighter.delta:.3g}; take them for one.",
         )
 
     @property
     def materials(self) -> tuple[DeltaBeta, ...]:  # type: ignore[override]
-        """The two materials, the denser first."""
+        """The two materials, that of the larger |δ| first."""
         return (self.denser, self.lighter)
+
+    @property
+    def sign(self) -> Sign:  # type: ignore[override]
+        """That of δ of both."""
+        return -1 if self.denser.delta < 0 else 1
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON."""
@@ -235,9 +270,10 @@ class KnownTwo(MaterialPrior):
 @dataclass(frozen=True)
 @ranged
 class KnownRatio(MaterialPrior):
-    """One material of which only δ/β is known."""
+    """One material of which only δ/β is known, and perhaps the sign of δ."""
 
     ratio: Signed
+    sign: Sign = 0
     kind = "ratio"
 
     def __post_init__(self) -> None:
@@ -249,13 +285,18 @@ class KnownRatio(MaterialPrior):
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON."""
-        return super().as_dict() | {"ratio": self.ratio}
+        return super().as_dict() | {"ratio": self.ratio} | _told(self.sign)
+
+    def signed(self, sign: Sign) -> MaterialPrior:
+        """The same with that sign."""
+        return replace(self, sign=sign)
 
 
 @dataclass(frozen=True)
 class Unknown(MaterialPrior):
-    """Nothing is known of the matter."""
+    """Nothing is known of the matter, but perhaps the sign of δ."""
 
+    sign: Sign = 0
     kind = "free"
 
     @property
@@ -263,9 +304,21 @@ class Unknown(MaterialPrior):
         """Whether the ratio δ/β is known: it is not."""
         return False
 
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values, ready for JSON."""
+        return super().as_dict() | _told(self.sign)
 
-def _require_delta(material: DeltaBeta) -> None:
+    def signed(self, sign: Sign) -> MaterialPrior:
+        """The same with that sign."""
+        return replace(self, sign=sign)
+
+
+def _told(sign: Sign) -> dict[str, Any]:
+    return {"sign": sign} if sign else {}
+
+
+def _require_contrast(material: DeltaBeta) -> None:
     require(
-        material.delta > 0,
-        f"the material must have δ above its medium's, but the difference is {material.delta:.3g}; exchange the two.",
+        material.delta != 0,
+        "the material must differ from its medium in δ, but the difference is 0; give another material or medium.",
     )

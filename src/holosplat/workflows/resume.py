@@ -13,6 +13,7 @@ from ..checks import as_written, require
 from ..inference import Decision
 from ..io.provenance import sha256
 from ..methods import Task
+from ..methods.contrast import STAGE as SIGN
 from ..methods.illumination import STAGE, Prepared
 from ..methods.presets import SCHEMA
 from ..methods.uncertain import Uncertain
@@ -89,13 +90,15 @@ def _without_backends(table: Any) -> None:
 
 
 def decisions_of(task: Task) -> dict[str, Any]:
-    """Entries of config.json that `decided_before` reads: what was decided of light and noise, before the matter."""
+    """Entries of config.json that `decided_before` reads: what was decided of sign, light and noise, before the
+    matter."""
     taken = () if task.first is None else task.first.taken
-    return {"light": list(taken), "decisions": [each.as_dict() for each in task.decisions if each.name == STAGE]}
+    made = [each.as_dict() for each in task.decisions if each.name in (SIGN, STAGE)]
+    return {"light": list(taken), "decisions": made}
 
 
 def decided_before(folder: RunFolder) -> Prepared:
-    """What a run that goes on has decided of light and noise; `InputError` for a folder that does not say it."""
+    """What a run that goes on has decided of sign, light and noise; `InputError` for a folder that does not say it."""
     with as_written(folder.config, "of a run that has begun"):
         table = folder.read_config()["decided"]
         made = tuple(Decision.from_dict(each) for each in table["decisions"])

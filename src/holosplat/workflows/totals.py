@@ -80,7 +80,8 @@ def total_of_run(said: Prediction, frames: Scan, task: Task, constants: tuple[De
     found = cast(Stored, said.object)
     quantity: Literal["δ", "β"] = "δ" if task.delta_told else "β"
     held = _held(found, frames)
-    if held <= 0:
+    sign = found.matter.channels[0].sign
+    if sign * held <= 0:
         return TotalMatter(quantity, None, None, held, f"total {quantity}: none, for the volume is empty")
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), MOST_VIEWS)).round().astype(int))
     factor = binning(frames, MOST_VOXELS)
@@ -110,7 +111,9 @@ def in_words(total: Total, quantity: str, delta: float | None = None, ratio_know
     if total.share <= TOLD:
         volume = "" if delta is None else f" ({total.value / delta:.3g} m³ of the material)"
         return f"total {quantity} {total.value:.3g} m³ ± {in_percent(total.share)}{volume}{held}"
-    low, high = max(0.0, total.value - WIDE * total.error), max(0.0, total.value) + WIDE * total.error
+    sign = math.copysign(1.0, total.held)
+    size, reach = sign * total.value, WIDE * total.error
+    low, high = sorted((sign * max(0.0, size - reach), sign * (max(0.0, size) + reach)), key=abs)
     volume = "" if delta is None else f" ({low / delta:.2g} to {high / delta:.2g} m³ of the material)"
     cannot = "the frames cannot tell it" if ratio_known else "the frames cannot tell it without the ratio δ/β"
     return f"total {quantity}: {cannot}; between {low:.2g} and {high:.2g} m³{volume}{held}"
