@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
@@ -149,6 +149,8 @@ class MaterialPrior:
     """The known materials, that of the stronger contrast (the larger |δ|) first."""
     sign: Sign = 0
     """1 where δ of the matter lies above its medium's, -1 where it lies below, 0 where that is not known."""
+    medium: str = ""
+    """Name of the medium, as it was given."""
 
     def __new__(cls, *args: object, **named: object) -> Self:
         """One of the four; of the base class alone nobody could say what is known."""
@@ -160,12 +162,15 @@ class MaterialPrior:
         return super().__new__(cls)
 
     @staticmethod
-    def known(material: DeltaBeta, second: DeltaBeta | None = None) -> MaterialPrior:
-        """δ (not zero) and β of one material, or of two whose δ differ, are known; below zero for holes in a medium."""
+    def known(material: DeltaBeta, second: DeltaBeta | None = None, medium: str = "") -> MaterialPrior:
+        """δ (not zero) and β of one material, or of two whose δ differ, are known; below zero for holes in a medium.
+
+        medium: its name, for what is said; empty: vacuum, or not said.
+        """
         if second is None:
-            return Known(DeltaBeta(*material))
+            return Known(DeltaBeta(*material), medium)
         denser, lighter = sorted((material, second), key=lambda one: (abs(one[0]), one), reverse=True)
-        return KnownTwo(DeltaBeta(*denser), DeltaBeta(*lighter))
+        return KnownTwo(DeltaBeta(*denser), DeltaBeta(*lighter), medium)
 
     @staticmethod
     def of_ratio(ratio: float, sign: Sign = 0) -> MaterialPrior:
@@ -181,6 +186,11 @@ class MaterialPrior:
     def signed(self, sign: Sign) -> MaterialPrior:
         """The same knowledge with a sign of δ, where that was not known."""
         return self
+
+    @property
+    def against(self) -> str:
+        """What δ and β are differences to, in words; empty for vacuum, and where nothing is said."""
+        return self.medium or ("the medium" if self.sign < 0 else "")
 
     @property
     def delta_sign(self) -> float:
@@ -204,7 +214,9 @@ class MaterialPrior:
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON, as config.json holds them."""
         first = self.materials[0] if self.materials else DeltaBeta(0.0, 0.0)
-        return {"kind": self.kind, "delta": first.delta, "beta": first.beta, "ratio": 0.0}
+        told = {"sign": 0 if self.materials else self.sign, "medium": self.medium}
+        plain = {"kind": self.kind, "delta": first.delta, "beta": first.beta, "ratio": 0.0}
+        return plain | {name: value for name, value in told.items() if value}
 
 
 @dataclass(frozen=True)
@@ -212,6 +224,7 @@ class Known(MaterialPrior):
     """One material of known δ and β, both against its medium."""
 
     material: DeltaBeta
+    medium: str = field(default="", compare=False)
     kind = "known"
 
     def __post_init__(self) -> None:
@@ -234,6 +247,7 @@ class KnownTwo(MaterialPrior):
 
     denser: DeltaBeta
     lighter: DeltaBeta
+    medium: str = field(default="", compare=False)
     kind = "known"
 
     def __post_init__(self) -> None:
@@ -285,7 +299,7 @@ class KnownRatio(MaterialPrior):
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON."""
-        return super().as_dict() | {"ratio": self.ratio} | _told(self.sign)
+        return super().as_dict() | {"ratio": self.ratio}
 
     def signed(self, sign: Sign) -> MaterialPrior:
         """The same with that sign."""
@@ -304,17 +318,9 @@ class Unknown(MaterialPrior):
         """Whether the ratio δ/β is known: it is not."""
         return False
 
-    def as_dict(self) -> dict[str, Any]:
-        """Plain values, ready for JSON."""
-        return super().as_dict() | _told(self.sign)
-
     def signed(self, sign: Sign) -> MaterialPrior:
         """The same with that sign."""
         return replace(self, sign=sign)
-
-
-def _told(sign: Sign) -> dict[str, Any]:
-    return {"sign": sign} if sign else {}
 
 
 def _require_contrast(material: DeltaBeta) -> None:

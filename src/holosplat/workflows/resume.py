@@ -62,6 +62,7 @@ def _require_same(folder: RunFolder, old: dict[str, Any], same: dict[str, Any]) 
     )
     for table in (old, same):
         _without_backends(table.get("method", {}))
+        table.get("prior", {}).pop("medium", None)  # a name, which older versions did not keep
     for key, name in RESUMED_WITH.items():
         require(
             old.get(key) == same[key],
