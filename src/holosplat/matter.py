@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 
 from .checks import InputError, require
 from .geometry import Grid
-from .ranges import Signed, ranged
+from .ranges import Signed, Within, ranged
 from .volume import Volume
 
 Sign = Literal[-1, 0, 1]
@@ -287,7 +287,7 @@ class KnownRatio(MaterialPrior):
     """One material of which only δ/β is known, and perhaps the sign of δ."""
 
     ratio: Signed
-    sign: Sign = 0
+    sign: Annotated[Sign, Within(-1, 1)] = 0
     kind = "ratio"
 
     def __post_init__(self) -> None:
