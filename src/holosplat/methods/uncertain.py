@@ -166,7 +166,8 @@ def at_energy(prior: MaterialPrior, factor: float) -> MaterialPrior:
     if factor == 1:
         return prior
     if isinstance(prior, Known | KnownTwo):
-        return MaterialPrior.known(*(DeltaBeta(m.delta * factor**-2, m.beta * factor**-4) for m in prior.materials))
+        first, *rest = (DeltaBeta(m.delta * factor**-2, m.beta * factor**-4) for m in prior.materials)
+        return MaterialPrior.known(first, rest[0] if rest else None, prior.medium)
     return replace(prior, ratio=prior.ratio * factor**2) if isinstance(prior, KnownRatio) else prior
 
 
