@@ -86,6 +86,7 @@ class WaveModel:
         backend: str = "cpu",
         leaves: bool = False,
         prior: Prior | None = None,
+        *,
         sign: float = 1.0,
     ) -> None:
         estimate = bounded_estimate(frames, exposures, ratio, noise, leaves, prior, sign)

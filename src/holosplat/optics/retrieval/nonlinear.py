@@ -54,8 +54,8 @@ def tikhonov(
     """
 
     def solve(frames: Tensor, exposures: Exposures, noise: Noise, on_progress: Advance) -> Tensor:
-        how = (options.backend, options.leaves, options.prior, math.copysign(1.0, delta))
-        model = WaveModel(frames, exposures, beta / delta, noise, *how)
+        how = (options.backend, options.leaves, options.prior)
+        model = WaveModel(frames, exposures, beta / delta, noise, *how, sign=math.copysign(1.0, delta))
         return model.thickness(descend(model, options, on_progress)[0], delta)
 
     return view_by_view(frames, exposures, delta, options.noise, solve, on_progress)
