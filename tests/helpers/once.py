@@ -19,10 +19,10 @@ from torch import Tensor
 from holosplat.baselines import HolographicTV, holographic_tv
 from holosplat.baselines.material import estimate_delta, estimate_ratio
 from holosplat.geometry import Grid
-from holosplat.inference import Decision, Score
+from holosplat.inference import Decision
 from holosplat.matter import DeltaBeta
 from holosplat.methods import Task
-from holosplat.methods.contrast import BELOW, decide_sign, with_sign
+from holosplat.methods.contrast import BELOW, Scoring, decide_sign, with_sign
 from holosplat.methods.first_volumes import FirstVolumes
 from holosplat.methods.illumination import decided
 from holosplat.methods.levels import decide_matter
@@ -81,9 +81,9 @@ def once(memory: Once) -> Iterator[None]:
         key = ("light", *of(first.folds.scan), first.prior, *how)
         return memory.answer(key, lambda told: decided(replace(first, on_progress=told), *how), first.on_progress)
 
-    def sign(first: FirstVolumes, score: Callable[[FirstVolumes, int], Score]) -> Any:
+    def sign(first: FirstVolumes, *scores: Scoring) -> Any:
         def compute(told: Progress) -> tuple[Decision, ...]:
-            return decide_sign(replace(first, on_progress=told), score)[1]
+            return decide_sign(replace(first, on_progress=told), *scores)[1]
 
         made = memory.answer(("sign", *of(first.folds.scan), first.prior), compute, first.on_progress)
         above = not any(each.choice == BELOW for each in made)

@@ -18,12 +18,15 @@ STAGE = "sign of the contrast"
 ABOVE, BELOW = "δ above the medium's", "δ below the medium's"
 
 
-def decide_sign(
-    first: FirstVolumes, score: Callable[[FirstVolumes, int], Score]
-) -> tuple[FirstVolumes, tuple[Decision, ...]]:
+Scoring = Callable[[FirstVolumes, int], Score]
+"""Of first volumes, on the unseen frames of a fold."""
+
+
+def decide_sign(first: FirstVolumes, *scores: Scoring) -> tuple[FirstVolumes, tuple[Decision, ...]]:
     """The first volumes of the sign that unseen frames speak for, and the decision; none where the sign is known.
 
-    score: of first volumes on the unseen frames of a fold. A sign under which no matter is found predicts even light.
+    scores: in even light, and then in such light as may have hidden the sign: each is asked where those before it have
+    left the sign open. A sign under which no matter is found predicts even light.
     """
     if first.prior.sign:
         return first, ()
@@ -31,14 +34,21 @@ def decide_sign(
     holes = FirstVolumes(first.folds, first.prior.signed(-1), first.on_progress, first.options)
     volumes = {ABOVE: first, BELOW: holes}
 
-    def scored(name: str, fold: int) -> Score:
-        try:
-            return score(volumes[name], fold)
-        except InputError:  # there is no such matter
-            unseen = torch.from_numpy(first.folds.split(fold)[1].frames)
-            return score_of(unseen, torch.ones_like(unseen))
+    def asked(score: Scoring) -> Decision:
+        def scored(name: str, fold: int) -> Score:
+            try:
+                return score(volumes[name], fold)
+            except InputError:  # there is no such matter, or no such light
+                unseen = torch.from_numpy(first.folds.split(fold)[1].frames)
+                return score_of(unseen, torch.ones_like(unseen))
 
-    decision = select(STAGE, (ABOVE, BELOW), scored, first.folds.count, by=first.folds.by)
+        return select(STAGE, (ABOVE, BELOW), scored, first.folds.count, by=first.folds.by)
+
+    decision = asked(scores[0])
+    for score in scores[1:]:
+        if decision.choice == BELOW or decision.compared[0].loses:
+            break
+        decision = asked(score)
     return volumes[decision.choice], (decision,)
 
 

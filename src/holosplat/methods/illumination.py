@@ -6,7 +6,7 @@ Each is carried as far as a volume, and taken only where this predicts unseen me
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..backends import Backend, resolve
 from ..baselines import HolographicTV, holographic_tv
-from ..checks import InputError
+from ..checks import InputError, require
 from ..inference import MARGIN, Decision, Score, select
 from ..matter import MaterialPrior, Matter
 from ..optics.background import FLUX, Background, Light, LightOptions
@@ -25,7 +25,7 @@ from ..representations import VoxelGrid
 from ..scan import Scan
 from .assumed import assumed_material
 from .contrast import STAGE as SIGN
-from .contrast import decide_sign, with_sign
+from .contrast import Scoring, decide_sign, with_sign
 from .cross_validation import predicted_frames
 from .first_volumes import BY_FISSION, FirstVolumes, Folds, lit_by_halves, predictions, score_of
 from .method import Method, Task
@@ -202,7 +202,7 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
         return task
     first = first_of_task(task, _volume_of(method).backend)
     if before is None:
-        first, signs = decide_sign(first, lambda volumes, fold: _even(volumes, task.light, fold))
+        first, signs = decide_sign(first, *_scores(task.light))
     else:
         signs = tuple(each for each in before[1] if each.name == SIGN)
     task = replace(task, prior=with_sign(task.prior, signs), decisions=(*task.decisions, *signs))
@@ -233,10 +233,16 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
     return replace(task, scan=scan, lit=light, decisions=(*task.decisions, *made), first=first)
 
 
-def _even(volumes: FirstVolumes, options: LightOptions, fold: int) -> Score:
-    """The score of a volume of frames as they were measured."""
-    tried = Trials(volumes, options).tried((), fold)
-    return tried.score(tried.light)
+def _scores(options: LightOptions) -> list[Scoring]:
+    """The scores of volumes of frames as they were measured, and in smooth light where that may be."""
+
+    def under(hypothesis: Hypothesis, volumes: FirstVolumes, fold: int) -> Score:
+        trials = Trials(volumes, options)
+        require(not hypothesis or trials.proposed(hypothesis, fold), "the light of the frames is even.")
+        tried = trials.tried(hypothesis, fold)
+        return tried.score(tried.light)
+
+    return [partial(under, one) for one in ((), (UNEVEN,)) if not one or options.kind != "even"]
 
 
 def _applied(task: Task, light: Light, taken: Hypothesis) -> tuple[Scan, Light]:
