@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import holosplat as hs
-from holosplat.beamline.light import UnevenLight
 from holosplat.beamline.simulate import simulate
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior
@@ -24,11 +23,10 @@ AIR_IN_WATER = DeltaBeta(-5.75e-7, -2.56e-10)
 PIXEL, SHAPE, VIEWS = 1e-6, (35, 42), 8
 
 
-def of(scene, photons: float | None = None, light: UnevenLight | None = None) -> Scan:
+def of(scene, photons: float | None = None) -> Scan:
     views = Views.evenly_spaced(VIEWS, SHAPE, PIXEL)
-    lit = {} if light is None else {"light": light}
     is_test = np.arange(VIEWS) == 3
-    return simulate(scene, Exposures.of(views, 20.0, 0.1), photons_per_pixel=photons, seed=3, is_test=is_test, **lit)
+    return simulate(scene, Exposures.of(views, 20.0, 0.1), photons_per_pixel=photons, seed=3, is_test=is_test)
 
 
 @pytest.fixture(scope="module")
@@ -109,3 +107,14 @@ def test_light_that_a_medium_dims_is_no_matter(bubbles):
     for one in (scan, dimmed):
         done = hs.reconstruct(one, MaterialPrior.known(AIR_IN_WATER, medium="water"), PerView())
         assert volume_scores(done.object.voxelise(truth.grid), truth).dice > 0.9
+
+
+def test_uneven_light_does_not_hide_the_sign(bubbles):
+    """A slope of a tenth across frames leaves more of them than matter does, until both sides may have it."""
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]] / np.array(SHAPE)[:, None, None] - 0.5
+    draws = np.random.default_rng(2).normal(size=(VIEWS, 2))
+    slopes = np.stack([1 + 0.1 * (a * x + b * y) for a, b in draws])
+    scan = of(bubbles, 1e5)
+    task = prepared(Task(hs.Scan(scan.frames * slopes, scan.exposures, scan.is_test).train(), MaterialPrior.unknown()))
+    assert task.prior.sign == -1
+    assert task.uneven is not None
