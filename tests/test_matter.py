@@ -10,6 +10,7 @@ import pytest
 from holosplat import MaterialPrior
 from holosplat.checks import InputError
 from holosplat.materials import DeltaBeta
+from holosplat.series.settings import prior_of
 
 SOFT, BONE = DeltaBeta(1e-7, 1e-10), DeltaBeta(5e-7, 5e-9)
 KINDS = {
@@ -28,6 +29,31 @@ def test_what_is_known_must_be_said():
 @pytest.mark.parametrize("prior", KINDS.values(), ids=KINDS)
 def test_what_is_known_survives_copies_and_pickles(prior):
     assert copy.deepcopy(prior) == prior == pickle.loads(pickle.dumps(prior))
+
+
+def test_what_is_told_of_the_sign_is_known():
+    assert [prior.sign for prior in KINDS.values()] == [1, 1, 0, 0]
+    holes = MaterialPrior.known(DeltaBeta(-1e-7, 2e-10), DeltaBeta(-5e-7, -5e-9))
+    assert holes.materials == ((-5e-7, -5e-9), (-1e-7, 2e-10))  # the stronger contrast first
+    assert (holes.sign, holes.against) == (-1, "the medium")
+    assert MaterialPrior.known(SOFT, medium="water").against == "water"
+    assert MaterialPrior.known(SOFT).against == ""
+    below = MaterialPrior.of_ratio(1000).signed(-1)
+    assert (below.sign, below.delta_sign, below.as_dict()["sign"]) == (-1, -1.0, -1)
+    assert "sign" not in MaterialPrior.of_ratio(1000).as_dict()
+    assert prior_of(below.as_dict()) == below
+    assert prior_of(MaterialPrior.known(DeltaBeta(-1e-7, 0.0), medium="oil").as_dict()).medium == "oil"
+
+
+def test_what_cannot_be_seen_or_told_apart_is_refused():
+    with pytest.raises(InputError, match="must differ from its medium in δ, but the difference is 0"):
+        MaterialPrior.known(DeltaBeta(0.0, 1e-9))
+    with pytest.raises(InputError, match="both have δ above their medium's, or both below"):
+        MaterialPrior.known(SOFT, DeltaBeta(-5e-7, -5e-9))
+    with pytest.raises(InputError, match=r"at least 1\.6 times the other's"):
+        MaterialPrior.known(DeltaBeta(-1e-7, 0.0), DeltaBeta(-1.1e-7, 0.0))
+    with pytest.raises(InputError, match="sign must be -1, 0 or 1"):
+        prior_of(MaterialPrior.unknown().as_dict() | {"sign": 2})
 
 
 def test_only_where_nothing_is_known_is_the_ratio_open():

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, Self
+from dataclasses import dataclass, field, replace
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
 
 from .checks import InputError, require
 from .geometry import Grid
-from .ranges import Signed, ranged
+from .ranges import Signed, Within, ranged
 from .volume import Volume
 
+Sign = Literal[-1, 0, 1]
+"""1 for δ above the medium's, -1 below, 0 where that is not known."""
 MatterKind = Literal["levels", "continuous"]
 """What matter is like: of one level of δ, or several, with sharp edges, or varying smoothly."""
 LEAST_CONTRAST = 1.6
@@ -41,6 +43,11 @@ class DeltaBeta(NamedTuple):
     def against(self, medium: DeltaBeta) -> DeltaBeta:
         """What an object in `medium` adds to it: `(δ - δ_medium, β - β_medium)`."""
         return DeltaBeta(self.delta - medium.delta, self.beta - medium.beta)
+
+    @property
+    def sign(self) -> float:
+        """1 for δ above the medium's, -1 below: the sign of what an occupancy, which is never negative, adds."""
+        return math.copysign(1.0, self.delta)
 
     @property
     def ratio(self) -> float:
@@ -160,7 +167,11 @@ class MaterialPrior:
     kind = ""
     """The name of this knowledge in files and tables."""
     materials: tuple[DeltaBeta, ...] = ()
-    """The known materials, the denser first."""
+    """The known materials, that of the stronger contrast (the larger |δ|) first."""
+    sign: Sign = 0
+    """1 where δ of the matter lies above its medium's, -1 where it lies below, 0 where that is not known."""
+    medium: str = ""
+    """Name of the medium, as it was given."""
 
     def __new__(cls, *args: object, **named: object) -> Self:
         """One of the four; of the base class alone nobody could say what is known."""
@@ -172,22 +183,40 @@ class MaterialPrior:
         return super().__new__(cls)
 
     @staticmethod
-    def known(material: DeltaBeta, second: DeltaBeta | None = None) -> MaterialPrior:
-        """δ (above zero) and β of one material, or of two whose δ differ, are known."""
+    def known(material: DeltaBeta, second: DeltaBeta | None = None, medium: str = "") -> MaterialPrior:
+        """δ (not zero) and β of one material, or of two whose δ differ, are known; below zero for holes in a medium.
+
+        medium: its name, for what is said; empty: vacuum, or not said.
+        """
         if second is None:
-            return Known(DeltaBeta(*material))
-        denser, lighter = sorted((material, second), reverse=True)
-        return KnownTwo(DeltaBeta(*denser), DeltaBeta(*lighter))
+            return Known(DeltaBeta(*material), medium)
+        denser, lighter = sorted((material, second), key=lambda one: (abs(one[0]), one), reverse=True)
+        return KnownTwo(DeltaBeta(*denser), DeltaBeta(*lighter), medium)
 
     @staticmethod
-    def of_ratio(ratio: float) -> MaterialPrior:
-        """One material of unknown density, with δ/β known (negative where β lies below the medium's)."""
-        return KnownRatio(float(ratio))
+    def of_ratio(ratio: float, sign: Sign = 0) -> MaterialPrior:
+        """One material of unknown density, with δ/β known (negative where δ and β differ from the medium's otherwise);
+        sign: as for `unknown`."""
+        return KnownRatio(float(ratio), sign)
 
     @staticmethod
-    def unknown() -> MaterialPrior:
-        """Nothing is known: the frames decide."""
-        return Unknown()
+    def unknown(sign: Sign = 0) -> MaterialPrior:
+        """Nothing is known: the frames decide. sign: 1 where δ lies above the medium's, -1 below; 0: not known."""
+        return Unknown(sign)
+
+    def signed(self, sign: Sign) -> MaterialPrior:
+        """The same knowledge with a sign of δ, where that was not known."""
+        return self
+
+    @property
+    def against(self) -> str:
+        """What δ and β are differences to, in words; empty for vacuum, and where nothing is said."""
+        return self.medium or ("the medium" if self.sign < 0 else "")
+
+    @property
+    def delta_sign(self) -> float:
+        """The sign of δ that is taken, 1.0 or -1.0: 1.0 where it is not known."""
+        return -1.0 if self.sign < 0 else 1.0
 
     @property
     def fixes_level(self) -> bool:
@@ -206,7 +235,9 @@ class MaterialPrior:
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON, as config.json holds them."""
         first = self.materials[0] if self.materials else DeltaBeta(0.0, 0.0)
-        return {"kind": self.kind, "delta": first.delta, "beta": first.beta, "ratio": 0.0}
+        told = {"sign": 0 if self.materials else self.sign, "medium": self.medium}
+        plain = {"kind": self.kind, "delta": first.delta, "beta": first.beta, "ratio": 0.0}
+        return plain | {name: value for name, value in told.items() if value}
 
 
 @dataclass(frozen=True)
@@ -214,15 +245,21 @@ class Known(MaterialPrior):
     """One material of known δ and β, both against its medium."""
 
     material: DeltaBeta
+    medium: str = field(default="", compare=False)
     kind = "known"
 
     def __post_init__(self) -> None:
-        _require_delta(self.material)
+        _require_contrast(self.material)
 
     @property
     def materials(self) -> tuple[DeltaBeta, ...]:  # type: ignore[override]
         """The material."""
         return (self.material,)
+
+    @property
+    def sign(self) -> Sign:  # type: ignore[override]
+        """That of the material's δ."""
+        return -1 if self.material.delta < 0 else 1
 
 
 @dataclass(frozen=True)
@@ -231,21 +268,33 @@ class KnownTwo(MaterialPrior):
 
     denser: DeltaBeta
     lighter: DeltaBeta
+    medium: str = field(default="", compare=False)
     kind = "known"
 
     def __post_init__(self) -> None:
         for material in (self.denser, self.lighter):
-            _require_delta(material)
+            _require_contrast(material)
         require(
-            self.denser.delta >= LEAST_CONTRAST * self.lighter.delta,
+            self.denser.sign == self.lighter.sign,
+            "two materials must both have δ above their medium's, or both below, but the differences are "
+            f"{self.denser.delta:.3g} and {self.lighter.delta:.3g}; give the medium that lies on one side of both, or "
+            "one material.",
+        )
+        require(
+            abs(self.denser.delta) >= LEAST_CONTRAST * abs(self.lighter.delta),
             f"two materials are told apart by δ, of which one must have at least {LEAST_CONTRAST:g} times the other's, "
             f"but they have {self.denser.delta:.3g} and {self.lighter.delta:.3g}; take them for one.",
         )
 
     @property
     def materials(self) -> tuple[DeltaBeta, ...]:  # type: ignore[override]
-        """The two materials, the denser first."""
+        """The two materials, that of the larger |δ| first."""
         return (self.denser, self.lighter)
+
+    @property
+    def sign(self) -> Sign:  # type: ignore[override]
+        """That of δ of both."""
+        return -1 if self.denser.delta < 0 else 1
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values, ready for JSON."""
@@ -256,9 +305,10 @@ class KnownTwo(MaterialPrior):
 @dataclass(frozen=True)
 @ranged
 class KnownRatio(MaterialPrior):
-    """One material of which only δ/β is known."""
+    """One material of which only δ/β is known, and perhaps the sign of δ."""
 
     ratio: Signed
+    sign: Annotated[Sign, Within(-1, 1)] = 0
     kind = "ratio"
 
     def __post_init__(self) -> None:
@@ -272,11 +322,16 @@ class KnownRatio(MaterialPrior):
         """Plain values, ready for JSON."""
         return super().as_dict() | {"ratio": self.ratio}
 
+    def signed(self, sign: Sign) -> MaterialPrior:
+        """The same with that sign."""
+        return replace(self, sign=sign)
+
 
 @dataclass(frozen=True)
 class Unknown(MaterialPrior):
-    """Nothing is known of the matter."""
+    """Nothing is known of the matter, but perhaps the sign of δ."""
 
+    sign: Sign = 0
     kind = "free"
 
     @property
@@ -284,9 +339,13 @@ class Unknown(MaterialPrior):
         """Whether the ratio δ/β is known: it is not."""
         return False
 
+    def signed(self, sign: Sign) -> MaterialPrior:
+        """The same with that sign."""
+        return replace(self, sign=sign)
 
-def _require_delta(material: DeltaBeta) -> None:
+
+def _require_contrast(material: DeltaBeta) -> None:
     require(
-        material.delta > 0,
-        f"the material must have δ above its medium's, but the difference is {material.delta:.3g}; exchange the two.",
+        material.delta != 0,
+        "the material must differ from its medium in δ, but the difference is 0; give another material or medium.",
     )

@@ -247,7 +247,7 @@ def test_the_denser_of_two_known_materials_comes_first():
 def test_materials_that_delta_does_not_tell_apart_are_refused():
     with pytest.raises(InputError, match="told apart"):
         MaterialPrior.known(SILICA, DeltaBeta(0.8 * SILICA.delta, 0.0))
-    with pytest.raises(InputError, match="above its medium"):
+    with pytest.raises(InputError, match="both have δ above"):
         MaterialPrior.known(SILICA, DeltaBeta(-1e-7, 0.0))
 
 

@@ -155,3 +155,28 @@ def test_materials_are_listed():
     refused = holosplat("materials", "kryptonite")
     assert refused.code == 2
     assert "kryptonite is in none" in refused.err
+
+
+def test_bubbles_are_generated_against_their_medium(tmp_path):
+    """Air in water: δ and β of the truth are below zero, and frames are those of holes."""
+    scan, truth = tmp_path / "s.nxs", tmp_path / "t.h5"
+    drawn = ["--specimen-count", 5, "--specimen-radii", "3e-6", "8e-6", "--specimen-overlap"]
+    ran("simulate", "--specimen", "bubbles", "--medium", "water", *drawn, *FIELD, "--out", scan, "--truth", truth)
+    found, volume = read_scan(scan), read_volume(truth)
+    assert found.provenance["specimen"] == "bubbles"
+    assert found.provenance["specimen_radii"] == "3e-06 8e-06"
+    assert found.provenance["medium"] != "vacuum"
+    assert volume.delta.min() == pytest.approx(-5.75e-7, rel=0.01)
+    assert volume.delta.max() == 0
+    assert volume.beta.min() < 0
+    refused = holosplat("simulate", "--specimen", "bubbles", *FIELD, "--out", tmp_path / "x.nxs")
+    assert "--specimen bubbles needs --medium" in refused.err
+    stray = ["--specimen-overlap", *FIELD, "--out", tmp_path / "x.nxs"]
+    refused = holosplat("simulate", "--specimen", "tissue", *stray)
+    assert "--specimen-radii and --specimen-overlap are of bubbles, not of tissue" in refused.err
+    assert not (tmp_path / "x.nxs").exists()
+    equal = ["--material", "water", "--medium", "water", "--out", tmp_path / "run"]
+    refused = holosplat("reconstruct", scan, *equal)
+    assert refused.code != 0
+    assert "the material must differ from its medium in δ, but the difference is 0" in refused.err
+    assert not (tmp_path / "run").exists()

@@ -108,7 +108,7 @@ def test_one_parameter_at_a_time_is_minimised():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: _misfit_of(Matter.one(-1e-6, 0.0)), "δ > 0"),
+        (lambda: _misfit_of(Matter.one(0.0, 1e-9)), "needs a material with a δ, but it is 0"),
         (lambda: Objective(spectral=1.0, floor=0.0), "floor must be positive"),
     ],
 )

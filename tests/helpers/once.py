@@ -22,6 +22,7 @@ from holosplat.geometry import Grid
 from holosplat.inference import Decision
 from holosplat.matter import DeltaBeta
 from holosplat.methods import Task
+from holosplat.methods.contrast import BELOW, Scoring, decide_sign, with_sign
 from holosplat.methods.first_volumes import FirstVolumes
 from holosplat.methods.illumination import decided
 from holosplat.methods.levels import decide_matter
@@ -80,6 +81,15 @@ def once(memory: Once) -> Iterator[None]:
         key = ("light", *of(first.folds.scan), first.prior, *how)
         return memory.answer(key, lambda told: decided(replace(first, on_progress=told), *how), first.on_progress)
 
+    def sign(first: FirstVolumes, *scores: Scoring) -> Any:
+        def compute(told: Progress) -> tuple[Decision, ...]:
+            return decide_sign(replace(first, on_progress=told), *scores)[1]
+
+        made = memory.answer(("sign", *of(first.folds.scan), first.prior), compute, first.on_progress)
+        above = not any(each.choice == BELOW for each in made)
+        prior = with_sign(first.prior, made)
+        return (first if above else FirstVolumes(first.folds, prior, first.on_progress, first.options)), made
+
     def ratio(scan: Scan, on_progress: Progress, *how: Any) -> float:
         return memory.answer(("ratio", *of(scan), *how), lambda told: estimate_ratio(scan, told, *how), on_progress)
 
@@ -107,6 +117,7 @@ def once(memory: Once) -> Iterator[None]:
     shared = {
         "solve.decide_matter": decide,
         "illumination.decided": light,
+        "illumination.decide_sign": sign,
         "assumed.estimate_ratio": ratio,
         "assumed.estimate_delta": delta,
         "start.material_of_levels": level,

@@ -14,7 +14,7 @@ from holosplat.geometry import Views
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import Task
 from holosplat.methods.first_volumes import BY_FISSION, Folds
-from holosplat.methods.illumination import prepared
+from holosplat.methods.illumination import STAGE, prepared
 from holosplat.optics.background import Background, LightOptions
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import random_cells
@@ -54,7 +54,7 @@ def uneven() -> np.ndarray:
 
 def choices(scan: Scan, light: LightOptions | None = None) -> list[str]:
     light = light or LightOptions()
-    return [each.choice for each in prepared(Task(scan, PRIOR, light=light)).decisions]
+    return [each.choice for each in prepared(Task(scan, PRIOR, light=light)).decisions if each.name == STAGE]
 
 
 @pytest.mark.parametrize("family", ["soft", "sharp"])

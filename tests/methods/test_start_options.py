@@ -63,7 +63,7 @@ class Frames:
 
 
 def test_a_ratio_that_leaves_no_matter_is_none_that_is_found(monkeypatch):
-    def volume(scan, ratio, backend, options):
+    def volume(scan, ratio, backend, options, sign):
         return torch.full((2, 2, 2), {10: 1.0, 100: 2.0}.get(round(ratio), 0.0))
 
     monkeypatch.setattr("holosplat.baselines.material._trial_volume", volume)
@@ -77,7 +77,7 @@ def test_a_ratio_that_leaves_no_matter_is_none_that_is_found(monkeypatch):
 def test_as_many_ratios_are_tried_as_are_asked_for(monkeypatch):
     tried = []
 
-    def volume(scan, ratio, backend, options):
+    def volume(scan, ratio, backend, options, sign):
         tried.append(ratio)
         return torch.ones(2, 2, 2)
 

@@ -306,7 +306,7 @@ CUBE = Grid.centred((3, 3, 3), 1.0)
         (lambda: Encoding(bandwidth=0.0), "bandwidth must be positive"),
         (lambda: Network(hidden=0), "hidden must be at least 1"),
         (lambda: Matter(((1.0, 0.0),) * 3), "matter must have one or two channels, but it has 3"),  # type: ignore[arg-type]
-        (lambda: NeuralField(CUBE, Matter.one(0.0, 0.0), SMALL, torch.ones(3, 3, 3)), "matter of positive δ"),
+        (lambda: NeuralField(CUBE, Matter.one(0.0, 0.0), SMALL, torch.ones(3, 3, 3)), "matter with a δ"),
         (lambda: NeuralField(CUBE, ONE, SMALL, torch.ones(3, 3, 3), upper=-1.0), "upper must not be negative"),
         (lambda: NeuralField(CUBE, ONE, SMALL, torch.ones(2, 3, 3)), "mask"),
     ],

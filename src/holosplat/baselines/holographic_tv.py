@@ -111,7 +111,7 @@ def holographic_tv(
     light: Light | None = None,
     wanted: Wanted = _always,
 ) -> tuple[Tensor, Grid]:
-    """Occupancy [Z, Y, X] of `material` (δ > 0, β of any sign) from the frames of `scan`, and its grid.
+    """Occupancy [Z, Y, X] of `material` (δ and β of any sign) from the frames of `scan`, and its grid.
 
     `on_progress(stage, fraction)` is called between pieces of work. light: uneven light that the frames were divided
     by; what is left of it is found anew in each round of agreement, beside what the volume predicts. wanted: asked

@@ -20,7 +20,7 @@ from .rays import rays_of
 from .tomography import TotalVariation, tv_solver
 
 TRIAL_DELTA = 1e-6
-"""Any value will do: the retrieved D = δT does not depend on it."""
+"""Any size will do: the retrieved D = δT does not depend on it."""
 NO_MATTER = "the start found no matter in the holograms; check material, energy and distance."
 
 
@@ -54,9 +54,13 @@ DEFAULT = MaterialEstimate()
 
 
 def estimate_ratio(
-    scan: Scan, on_progress: Progress, backend: Backend = "auto", options: MaterialEstimate = DEFAULT
+    scan: Scan,
+    on_progress: Progress,
+    backend: Backend = "auto",
+    options: MaterialEstimate = DEFAULT,
+    sign: float = 1.0,
 ) -> float:
-    """A coarse δ/β of the matter in `scan`: the one that gives the most compact volume.
+    """A coarse δ/β of the matter in `scan`, whose δ has that `sign`: the one that gives the most compact volume.
 
     A wrong ratio leaves halos of positive or negative matter around everything, in every view alike, which
     lower the level of the matter itself. So of several ratios, the one whose non-negative tomography has the highest
@@ -68,7 +72,7 @@ def estimate_ratio(
     levels = np.empty(len(ratios))
     for i, ratio in enumerate(ratios):
         on_progress("estimate of delta/beta", i / len(ratios))
-        trial = _trial_volume(coarse, ratio, backend, options)
+        trial = _trial_volume(coarse, ratio, backend, options, sign)
         levels[i] = plateau(trial) if bool((trial > 0).any()) else 0.0  # a wrong ratio may leave nothing
     require(bool(levels.any()), NO_MATTER)
     best = _first_peak(levels)
@@ -88,12 +92,17 @@ def _first_peak(levels: np.ndarray) -> int:
 
 
 def estimate_delta(
-    scan: Scan, ratio: float, on_progress: Progress, backend: Backend = "auto", options: MaterialEstimate = DEFAULT
+    scan: Scan,
+    ratio: float,
+    on_progress: Progress,
+    backend: Backend = "auto",
+    options: MaterialEstimate = DEFAULT,
+    sign: float = 1.0,
 ) -> float:
-    """δ of the one material in `scan` whose δ/β is `ratio`: the plateau of a non-negative tomography."""
+    """δ, of that `sign`, of the one material in `scan` with δ/β = `ratio`: the plateau of a non-negative tomography."""
     on_progress("estimate of delta", 0.0)
     coarse = scan.coarsened(max(1, round(scan.views.shape[1] / (2 * options.width))))
-    return plateau(_trial_volume(coarse, ratio, backend, options)) * TRIAL_DELTA
+    return plateau(_trial_volume(coarse, ratio, backend, options, sign)) * sign * TRIAL_DELTA
 
 
 def plateau(occupancy: Tensor) -> float:
@@ -118,9 +127,9 @@ def level_of(occupancy: Tensor) -> float:
     return plateau(occupancy * (occupancy >= values[int(between.argmax())]))
 
 
-def _trial_volume(scan: Scan, ratio: float, backend: Backend, options: MaterialEstimate) -> Tensor:
+def _trial_volume(scan: Scan, ratio: float, backend: Backend, options: MaterialEstimate, sign: float) -> Tensor:
     """Occupancy by Paganin's retrieval and a little total variation, not negative and without an upper bound."""
-    lines = paganin(torch.from_numpy(scan.frames), scan.exposures, TRIAL_DELTA, TRIAL_DELTA / ratio)
+    lines = paganin(torch.from_numpy(scan.frames), scan.exposures, sign * TRIAL_DELTA, sign * TRIAL_DELTA / ratio)
     used = resolve(backend)
     rays = rays_of(lines, scan.views, Grid.of_views(scan.views), used)
     how = TotalVariation(weight=options.weight, first=options.iterations, iterations=0)

@@ -9,6 +9,7 @@ error.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -156,7 +157,7 @@ def absorption(
     backend: Backend = "auto",
     options: TwoMaterials = DEFAULT,
 ) -> list[float]:
-    """β, none below zero, of the materials of δ `deltas` with the occupancies `values` [C, Z, Y, X] on `grid`.
+    """β, none of another sign than δ, of the materials of δ `deltas` with occupancies `values` [C, Z, Y, X] on `grid`.
 
     Those whose frames, blurred until no fringe is left, come nearest to the blurred frames of `scan` (least squares,
     linearised a few times): refraction moves light about, only absorption takes it away.
@@ -170,12 +171,12 @@ def absorption(
         return gaussian_filter(frames.cpu().numpy().astype(np.float64), (0, sigma, sigma)).ravel()
 
     measured = blurred(torch.from_numpy(scan.frames))
-    betas = np.zeros(len(deltas))
+    betas, step = np.zeros(len(deltas)), math.copysign(STEP, deltas[0])
     for _ in range(ITERATIONS):
         now = blurred(_frames(instrument, lines, zip(deltas, betas)))
-        varied = (betas + STEP * unit for unit in np.eye(len(betas)))
+        varied = (betas + step * unit for unit in np.eye(len(betas)))
         slopes = np.stack([blurred(_frames(instrument, lines, zip(deltas, b))) - now for b in varied], axis=1)
-        betas = STEP * nnls(slopes, measured - now + slopes @ (betas / STEP))[0]
+        betas = step * nnls(slopes, measured - now + slopes @ (betas / step))[0]
     return [float(beta) for beta in betas]
 
 

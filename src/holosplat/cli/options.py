@@ -389,10 +389,11 @@ class PriorOptions:
                 raise InputError(f"--delta-beta must be one number here, but {said}")
             return MaterialPrior.unknown() if self.delta_beta is None else MaterialPrior.of_ratio(self.delta_beta)
         first = self._known(self.material, self.density, energy_kev)
+        medium = self.medium or ""
         if self.second_material is None:
             require(self.second_density is None, "--second-density needs --second-material.")
-            return MaterialPrior.known(first)
-        return MaterialPrior.known(first, self._known(self.second_material, self.second_density, energy_kev))
+            return MaterialPrior.known(first, medium=medium)
+        return MaterialPrior.known(first, self._known(self.second_material, self.second_density, energy_kev), medium)
 
     def _known(self, name: str, density: float | None, energy_kev: float) -> DeltaBeta:
         return MaterialOptions(name, density, self.medium, self.medium_density).filling().of("", energy_kev)

@@ -36,13 +36,14 @@ if TYPE_CHECKING:
     from ..beamline.series import Timing
     from ..geometry import Views
     from ..scan import Exposures
+    from ..specimens.bubbles import Bubbles
     from ..specimens.carried import CarriedScene
     from ..specimens.continuous import ContinuousScene
     from ..specimens.mesh_series import MeshSeries
     from ..specimens.scene import MeshScene
     from ..specimens.voxel_scene import VoxelScene
 
-    Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene
+    Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene | Bubbles
 
 
 MOST_FRAMES = 10**6
@@ -101,7 +102,7 @@ def simulate(
     motion, source, beamline = experiment.motion, experiment.source, beamline.told()
     require(beamline.exposures is None or not source.cone, "--cone goes with --distance; leave it, or --exposures.")
     of_source, beamline = source.facts(beamline), source.applied(beamline)
-    views, filled = beamline.planned(), filling.filling()
+    views, filled = beamline.planned(), imaged.generated.in_medium(filling).filling()
     true_views = experiment.misalignment.errors().true_exposures(views)
     with ProgressBar() as bar:
         times = imaged.generated.timing(motion) if imaged.generated.specimen else np.zeros(1)
@@ -179,7 +180,10 @@ def _facts_of_still(imaged: SpecimenOptions, files: tuple[Path, ...]) -> dict[st
     generated = imaged.generated
     if generated.specimen is None:
         return {"volume": ", ".join(path.name for path in files[:3]) + (" …" if len(files) > 3 else "")}
-    return {"specimen": generated.specimen, "specimen_seed": str(generated.specimen_seed)}
+    radii, overlap = generated.specimen_radii, generated.specimen_overlap
+    drawn = {"specimen_radii": "{:g} {:g}".format(*radii)} if radii else {}
+    drawn |= {"specimen_overlap": "yes"} if overlap else {}
+    return {"specimen": generated.specimen, "specimen_seed": str(generated.specimen_seed), **drawn}
 
 
 def _require_few(frames: int) -> None:

@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from ..checks import InputError, require
 from ..ranges import Grams, Many, Seed, Signed, Small, ranged
-from .options import BeamlineOptions, MeshOptions, MotionOptions
+from .options import BeamlineOptions, MaterialOptions, MeshOptions, MotionOptions
 
 if TYPE_CHECKING:
     import numpy as np
 
     from ..beamline.scenes import Filling
+    from ..specimens.bubbles import Bubbles
     from ..specimens.carried import CarriedScene
     from ..specimens.continuous import ContinuousScene
     from ..specimens.voxel_scene import VoxelScene
 
 Moving = Literal["stirred-blob", "collapsing-foam"]
-Kind = Literal["soft-cells", "round-cell", "tissue", "head-phantom", "coated-droplets", "body-with-absorber"] | Moving
+Kind = (
+    Literal["soft-cells", "round-cell", "tissue", "head-phantom", "coated-droplets", "body-with-absorber", "bubbles"]
+    | Moving
+)
 MOVING: tuple[Moving, ...] = ("stirred-blob", "collapsing-foam")
 CORED = ("coated-droplets", "body-with-absorber")
 
@@ -62,7 +66,7 @@ class VolumeOptions:
 @dataclass(frozen=True)
 @ranged
 class GeneratedOptions:
-    """Continuous matter that is generated, in place of files."""
+    """Matter that is generated, in place of files."""
 
     specimen: Kind | None = None
     """Kind of specimen."""
@@ -73,6 +77,11 @@ class GeneratedOptions:
     specimen_edge: Small | None = None
     """Width of the edges of soft cells, of the head phantom and of a foam [m] (default: 3 pixels, or 4 % of the
     extent where that is less)."""
+    specimen_radii: tuple[Small, Small] | None = None
+    """Radii of the smallest and of the largest bubble [m] (default: 5 and 14 % of the extent); the others lie evenly
+    between them."""
+    specimen_overlap: bool = False
+    """Whether bubbles may overlap, as those that merge."""
     specimen_seed: Seed = 0
     """Seed of the specimen."""
     specimen_motion: float | None = None
@@ -97,11 +106,21 @@ class GeneratedOptions:
         require(start is None, f"--specimen {self.specimen} begins to move at the first frame; leave --start.")
         return np.arange(timing.frames) / timing.frame_rate
 
+    def in_medium(self, filling: MaterialOptions) -> MaterialOptions:
+        """The materials: bubbles hold air unless said otherwise, and are in a medium; `InputError` without one."""
+        if self.specimen != "bubbles":
+            return filling
+        require(
+            filling.medium is not None, "--specimen bubbles needs --medium, what the bubbles are in, such as water."
+        )
+        return replace(filling, material=filling.material or "air")
+
     def scene(
         self, beamline: BeamlineOptions, filling: Filling, duration: float = 0.0
-    ) -> ContinuousScene | CarriedScene:
+    ) -> ContinuousScene | CarriedScene | Bubbles:
         """The specimen in the beamline's field of view; duration: from the first frame to the last [s]."""
         from ..specimens import soft_matter, soft_motion
+        from ..specimens.bubbles import random_bubbles
 
         assert self.specimen is not None
         pixel = beamline.pixel_size
@@ -114,6 +133,14 @@ class GeneratedOptions:
             goes is None or self.specimen in MOVING,
             f"--specimen-motion is of {' and '.join(MOVING)}, not of {self.specimen}; leave it.",
         )
+        of_bubbles = self.specimen_radii is not None or self.specimen_overlap
+        require(
+            self.specimen == "bubbles" or not of_bubbles,
+            f"--specimen-radii and --specimen-overlap are of bubbles, not of {self.specimen}; leave them.",
+        )
+        if self.specimen == "bubbles":
+            radii = self.specimen_radii or (0.05 * size, 0.14 * size)
+            return random_bubbles(self.specimen_count, radii, box, matter, seed, overlapping=self.specimen_overlap)
         if self.specimen == "stirred-blob":
             turn = math.radians(60.0 if goes is None else goes)
             return soft_motion.stirred_blob(size, matter, seed, turn, duration)
@@ -160,7 +187,7 @@ class SpecimenOptions:
 
     def continuous(
         self, paths: tuple[Path, ...], beamline: BeamlineOptions, filling: Filling, duration: float = 0.0
-    ) -> ContinuousScene | CarriedScene | VoxelScene | None:
+    ) -> ContinuousScene | CarriedScene | VoxelScene | Bubbles | None:
         """The specimen, unless `paths` are meshes; `InputError` for a mixture. duration: of its motion [s]."""
         from ..io.volume_formats import FORMATS
 

@@ -47,7 +47,7 @@ class WhitenedFrames:
     The unknowns are line integrals [V, H, W] of one material's occupancy, in (the smallest) pixels of path length; with
     matter `beyond` the frames, H is that of `field`.
 
-    train: the frames; material: δ > 0 and β of an occupancy of one; noise: their noise; light: a factor of each frame,
+    train: the frames; material: δ and β of an occupancy of one; noise: their noise; light: a factor of each frame,
     None for even light; oversample: wave samples a pixel (0: as the first fringe needs); beyond: rows above and
     below the frames in which there may be matter; doubt: uneven light that the frames were divided by, of which what is
     not known is then an unknown of each frame (`LightApart`): P with it in the `noise` is only its mean.

@@ -164,12 +164,13 @@ def _of_copies(found: Guessed, network: Guess) -> list[Tensor]:
 def _shown(scan: Scan, material: DeltaBeta) -> tuple[Tensor, Views, Grid]:
     """The network's images [V, 3, 2H, 2W], the views of H × W pixels twice as large, and the lattice in them.
 
-    Odd frames get a row or a column of air more.
+    Odd frames get a row or a column of air more. Of holes in a medium, contrast is shown with the opposite sign: that
+    of bodies of the same shape, to first order, of which networks learn.
     """
     frames, views = torch.from_numpy(scan.frames), scan.views
     thickness = retrieved_thickness(frames, scan.exposures, material) / views.finest
     (h, w), more = views.shape, [n % FINE for n in views.shape]
-    seen = images(frames - 1, thickness, noise_levels(frames))
+    seen = images(material.sign * (frames - 1), thickness, noise_levels(frames))
     seen = pad(seen, (0, more[1], 0, more[0]))
     whole = views.cropped(slice(0, h + more[0]), slice(0, w + more[1]))
     large = replace(whole, shape=(seen.shape[2] // FINE, seen.shape[3] // FINE), pitch=FINE * views.pitch)

@@ -6,7 +6,7 @@ Each is carried as far as a volume, and taken only where this predicts unseen me
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import torch
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..backends import Backend, resolve
 from ..baselines import HolographicTV, holographic_tv
-from ..checks import InputError
+from ..checks import InputError, require
 from ..inference import MARGIN, Decision, Score, select
 from ..matter import MaterialPrior, Matter
 from ..optics.background import FLUX, Background, Light, LightOptions
@@ -24,6 +24,8 @@ from ..progress import Progress
 from ..representations import VoxelGrid
 from ..scan import Scan
 from .assumed import assumed_material
+from .contrast import STAGE as SIGN
+from .contrast import Scoring, decide_sign, with_sign
 from .cross_validation import predicted_frames
 from .first_volumes import BY_FISSION, FirstVolumes, Folds, lit_by_halves, predictions, score_of
 from .method import Method, Task
@@ -189,7 +191,8 @@ def decided(
 
 
 def prepared(task: Task, method: Method | None = None, before: Prepared | None = None) -> Task:
-    """The task with frames in even light, where evidence or `task.light` says that their light was not even.
+    """The task with frames in even light, where evidence or `task.light` says that their light was not even; and, where
+    nothing tells it, with the sign of the contrast (`contrast`), which is decided first.
 
     Frames that were divided by light before stay as they are: what that left open (`Scan.light`) is then what is not
     known of it. A pattern that is an unknown of the `method` itself is not looked for. Of several times the middle one
@@ -197,6 +200,12 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
     """
     if task.lit is not None:
         return task
+    first = first_of_task(task, _volume_of(method).backend)
+    if before is None:
+        first, signs = decide_sign(first, *_scores(task.light))
+    else:
+        signs = tuple(each for each in before[1] if each.name == SIGN)
+    task = replace(task, prior=with_sign(task.prior, signs), decisions=(*task.decisions, *signs))
     frames, options, handed = torch.from_numpy(task.scan.frames), task.light, task.scan.light
     if handed is not None and options.kind != "even":
         return replace(task, lit=Light.handed(frames, options, handed))
@@ -212,16 +221,28 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
         if free
     ]
     told = tuple([UNEVEN] * (options.kind == "smooth"))
-    first = first_of_task(task, _volume_of(method).backend)
     if before is None:
         task.on_progress(STAGE, 0.0)
         first.taken, made = decided(first, options, told, tuple(open_to))
         if options.noise == "correlated":
             first.taken = (*first.taken, "correlated noise")
     else:
-        first.taken, made = before
+        first = replace(first, prior=task.prior)
+        first.taken, made = before[0], tuple(each for each in before[1] if each.name != SIGN)
     scan, light = _applied(task, light, first.taken)
     return replace(task, scan=scan, lit=light, decisions=(*task.decisions, *made), first=first)
+
+
+def _scores(options: LightOptions) -> list[Scoring]:
+    """The scores of volumes of frames as they were measured, and in smooth light where that may be."""
+
+    def under(hypothesis: Hypothesis, volumes: FirstVolumes, fold: int) -> Score:
+        trials = Trials(volumes, options)
+        require(not hypothesis or trials.proposed(hypothesis, fold), "the light of the frames is even.")
+        tried = trials.tried(hypothesis, fold)
+        return tried.score(tried.light)
+
+    return [partial(under, one) for one in ((), (UNEVEN,)) if not one or options.kind != "even"]
 
 
 def _applied(task: Task, light: Light, taken: Hypothesis) -> tuple[Scan, Light]:

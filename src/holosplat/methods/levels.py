@@ -100,7 +100,8 @@ class _Fits:
 
     def __init__(self, task: Task, first: FirstVolumes, methods: Mapping[MatterKind, Method]) -> None:
         self._task, self._methods = task, methods
-        self._trial, self._ratio = accepted(task, first, 0), MaterialPrior.of_ratio(first.material.ratio)
+        self._trial = accepted(task, first, 0)
+        self._ratio = MaterialPrior.of_ratio(first.material.ratio, task.prior.sign)
 
     def score(self, name: str, fold: int) -> Score:
         """Of the fit for one kind of matter."""

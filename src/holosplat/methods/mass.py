@@ -36,8 +36,8 @@ DOUBTFUL = 0.1
 
 @dataclass(frozen=True)
 class Total:
-    """`∫ δ dV` of the matter that frames show. value, error: it and its standard error [m³]; held: what the volume of
-    the reconstruction has of it [m³]."""
+    """`∫ δ dV` of the matter that frames show against its medium, below zero for holes in it. value, error: it and its
+    standard error [m³]; held: what the volume of the reconstruction has of it [m³]."""
 
     value: float
     error: float
@@ -45,8 +45,8 @@ class Total:
 
     @property
     def share(self) -> float:
-        """The standard error as a share of the value; infinite where the value is not above zero."""
-        return self.error / self.value if self.value > 0 else math.inf
+        """The standard error as a share of the value's size; infinite where it has not the sign of the volume."""
+        return self.error / abs(self.value) if self.value * self.held > 0 else math.inf
 
 
 def total_delta(
@@ -60,7 +60,8 @@ def total_delta(
     root of χ² over the number of coefficients (Birge 1932). This is done in ranges of frequencies, and the total is
     that of the best one (`methods.modulation`).
 
-    The total is that of the field of view; matter that goes on above and below it is seen, and not counted.
+    The total is that of the field of view; matter that goes on above and below it is seen, and not counted. Of holes in
+    a medium it is below zero: what the medium lacks.
 
     predicted: frames [V, H, W] of `found` by its own model; None where voxels of a pixel say the same. ratio_doubt:
     standard error of δ/β as a share, which joins that of the total; from `DOUBTFUL` on, low frequencies, which see the
@@ -69,15 +70,16 @@ def total_delta(
     (`MODEL_SHARE`); it does not know of a wrong distance or energy. Errors: `InputError` for a volume without matter.
     """
     there, grid = found.at(float(train.exposures.time[0])), Grid.of_views(train.views)
-    delta, beta = _indices(there, grid)
+    sign = found.matter.channels[0].sign
+    delta, beta = _indices(there, grid, sign)
     whole = float(delta.double().clamp_min(0).sum())
     require(whole > 0, "the total δ of a volume without matter has no standard error; look at its frames first.")
     level = plateau(delta.clamp_min(0))
     unit = level * math.prod(grid.voxel_size)
-    material = DeltaBeta(level, level * float(beta.double().sum()) / whole)
+    material = DeltaBeta(sign * level, sign * level * float(beta.double().sum()) / whole)
     backend = found.backend
     beyond = rows_beyond(delta.clamp_min(0), train, material.beta / material.delta)
-    taller = _indices(there, Grid.of_views(train.views.taller(beyond)))[0] if beyond else delta
+    taller = _indices(there, Grid.of_views(train.views.taller(beyond)), sign)[0] if beyond else delta
     frames = WhitenedFrames(train, material, noise, backend=backend, beyond=beyond)
     problem = VolumeProblem(frames, ContinuousPrior(), 1.0, backend)
     ranges = Ranges(problem, predicted)
@@ -85,10 +87,11 @@ def total_delta(
     told = best(ranges.by_range((taller.clamp_min(0) / level).to(problem.device), limits))
     doubts = MODEL_SHARE**2 + ratio_doubt**2
     error = math.sqrt(SHAPES**2 * told.variance + doubts * told.value**2)
-    return Total(told.value * unit, error * unit, float(delta.double().sum()) * math.prod(grid.voxel_size))
+    held = float(delta.double().sum()) * math.prod(grid.voxel_size)
+    return Total(sign * told.value * unit, error * unit, sign * held)
 
 
-def _indices(found: Object, grid: Grid) -> tuple[Tensor, Tensor]:
-    """δ and β [Z, Y, X] on `grid`."""
+def _indices(found: Object, grid: Grid, sign: float) -> tuple[Tensor, Tensor]:
+    """δ and β [Z, Y, X] on `grid`, times the `sign` of the matter's δ."""
     volume = found.voxelise(grid)
-    return torch.as_tensor(volume.delta).float(), torch.as_tensor(volume.beta).float()
+    return sign * torch.as_tensor(volume.delta).float(), sign * torch.as_tensor(volume.beta).float()

@@ -80,7 +80,7 @@ class Task:
     def __post_init__(self) -> None:
         if not self.prior.fixes_ratio and shows_no_refraction(self.scan):
             object.__setattr__(self, "delta_told", False)
-            object.__setattr__(self, "prior", MaterialPrior.of_ratio(STAND_IN_RATIO))
+            object.__setattr__(self, "prior", MaterialPrior.of_ratio(STAND_IN_RATIO, self.prior.sign))
 
     def in_windows(self) -> Task:
         """The same task on windows about its matter where these save much (`windows_of`), or the task itself.

@@ -33,7 +33,7 @@ from ..scan import Scan
 from .method import Task, quiet
 
 UNIT_DELTA = 1e-6
-"""δ of an occupancy of one; any value does, for occupancies have no bound."""
+"""Size of the δ of an occupancy of one; any value does, for occupancies have no bound."""
 
 SPECK = 27
 """Voxels of which a connected piece of matter has at least, or it may be noise: a cube of three."""
@@ -101,7 +101,7 @@ class Profile:
         corners: Sequence[Constants],
         options: ProfileOptions = ProfileOptions(),
     ) -> None:
-        self.options, self._ratio = options, ratio
+        self.options, self._ratio, self._sign = options, ratio, task.prior.delta_sign
         factor = task.scan.largest_binning(math.ceil(max(task.scan.views.shape) / options.width))
         self._scan = task.scan.binned(factor)
         contrast = torch.from_numpy(self._scan.frames - 1).double().square().mean(dim=(1, 2))
@@ -136,7 +136,7 @@ class Profile:
         """The misfit of the coarse frames under `constants`."""
         scan = self._exposed(constants)
         ratio = constants.get("delta_beta", self._ratio * ratio_factor(scan, self._energy))
-        material = DeltaBeta(UNIT_DELTA, UNIT_DELTA / ratio)
+        material = DeltaBeta(self._sign * UNIT_DELTA, self._sign * UNIT_DELTA / ratio)
         backend, samples = self.options.start.backend, self._samples
         return WhitenedFrames(scan, material, self._noise, backend=backend, oversample=samples, beyond=self._beyond)
 

@@ -36,5 +36,5 @@ def material_of_levels(task: Task, backend: Backend = "auto", options: MaterialE
     values = found.values[0]
     if not bool((values > 0).any()):
         return material
-    delta = max(material.delta, level_of(values) * found.matter.channels[0].delta)
+    delta = max(material.delta, level_of(values) * found.matter.channels[0].delta, key=abs)
     return DeltaBeta(delta, delta / task.prior.ratio)

@@ -88,20 +88,21 @@ def _shares(
     (volume, grid), scan, prior, backend = found, task.scan, task.prior, options.volume.backend
     pixel, how = round(scan.views.finest / grid.voxel_size[0]) or 1, options.two_materials
     known = prior.materials if len(prior.materials) == 2 else ()
-    levels = (known[0].delta, known[1].delta) if known else None
+    levels = (abs(known[0].delta), abs(known[1].delta)) if known else None
     if task.matter == "levels" and not prior.fixes_ratio and options.most_materials == 2 and not options.separate:
-        levels = two_levels(volume * material.delta, pixel, how)
+        levels = two_levels(volume * abs(material.delta), pixel, how)
     if levels is None:
         return None
     for _ in range(how.rounds):
-        delta = volume * material.delta
-        levels = levels if known else two_levels(delta, pixel, how) or levels
-        values = told_apart(delta, levels, pixel, how)
-        betas = [m.beta for m in known] or absorption(scan, values, grid, levels, backend, how)
-        first, second = (DeltaBeta(*pair) for pair in zip(levels, betas))
+        size = volume * abs(material.delta)
+        levels = levels if known else two_levels(size, pixel, how) or levels
+        values = told_apart(size, levels, pixel, how)
+        deltas = [material.sign * level for level in levels]
+        betas = [m.beta for m in known] or absorption(scan, values, grid, deltas, backend, how)
+        first, second = (DeltaBeta(*pair) for pair in zip(deltas, betas))
         shares = Shares(values, grid, (first, second))
         volume, grid = retrieve(at_one_ratio(scan, shares, material.ratio, backend))
-    return replace(shares, values=told_apart(volume * material.delta, levels, pixel, how), grid=grid)
+    return replace(shares, values=told_apart(volume * abs(material.delta), levels, pixel, how), grid=grid)
 
 
 def _spacing_px(scan: Scan, options: GaussianOptions) -> float:
@@ -118,8 +119,10 @@ def _random(task: Task, options: GaussianOptions) -> GaussianCloud:
     material = WATER.delta_beta(scan.exposures.reference_energy)
     if prior.materials:
         material = prior.materials[0]
+    elif prior.sign < 0 and not prior.fixes_ratio:
+        material = DeltaBeta(-material.delta, -material.beta)
     elif isinstance(prior, KnownRatio):
-        material = DeltaBeta(material.delta, material.delta / prior.ratio)
+        material = DeltaBeta(prior.delta_sign * material.delta, prior.delta_sign * material.delta / prior.ratio)
     frames, pitch, optics = torch.from_numpy(scan.frames), scan.views.finest, scan.exposures.optical
     refraction = optics.refraction(*material)
     retrieved = retrieve_thickness(frames, optics.views.pixel_size, optics.distance, optics.energy_kev, *refraction)

@@ -132,7 +132,7 @@ def likeliest_ratio(task: Task, options: ProfileOptions | None = None) -> Determ
     found = determine(task, Uncertain(delta_beta=LIKELY_RATIOS), options)[0]
     if found.told:
         return found
-    return replace(found, value=min(max(estimate_ratio(task.scan, task.on_progress), found.low), found.high))
+    return replace(found, value=min(max(_estimated_ratio(task, task.scan), found.low), found.high))
 
 
 def _untold(ranges: Mapping[str, Range], middle: Mapping[str, float], why: str) -> tuple[Determined, ...]:
@@ -146,7 +146,9 @@ def told(task: Task, found: tuple[Determined, ...]) -> Task:
         return task
     scan, values = placed(task.scan, found), {each.name: each.value for each in found}
     if "delta_beta" in values:
-        return replace(task, scan=scan, prior=MaterialPrior.of_ratio(values["delta_beta"]), delta_told=True)
+        return replace(
+            task, scan=scan, prior=MaterialPrior.of_ratio(values["delta_beta"], task.prior.sign), delta_told=True
+        )
     return replace(
         task,
         scan=scan,
@@ -164,8 +166,9 @@ def at_energy(prior: MaterialPrior, factor: float) -> MaterialPrior:
     if factor == 1:
         return prior
     if isinstance(prior, Known | KnownTwo):
-        return MaterialPrior.known(*(DeltaBeta(m.delta * factor**-2, m.beta * factor**-4) for m in prior.materials))
-    return MaterialPrior.of_ratio(prior.ratio * factor**2) if isinstance(prior, KnownRatio) else prior
+        first, *rest = (DeltaBeta(m.delta * factor**-2, m.beta * factor**-4) for m in prior.materials)
+        return MaterialPrior.known(first, rest[0] if rest else None, prior.medium)
+    return replace(prior, ratio=prior.ratio * factor**2) if isinstance(prior, KnownRatio) else prior
 
 
 def _require_one(task: Task, uncertain: Uncertain) -> None:
@@ -191,7 +194,11 @@ def _assumed_ratio(task: Task, middle: Mapping[str, float]) -> float:
         return known.ratio if math.isfinite(known.ratio) else 10 ** MaterialEstimate().highest * 10
     if isinstance(task.prior, KnownRatio):
         return task.prior.ratio
-    return estimate_ratio(exposed(task.scan, middle), task.on_progress)
+    return _estimated_ratio(task, exposed(task.scan, middle))
+
+
+def _estimated_ratio(task: Task, scan: Scan) -> float:
+    return estimate_ratio(scan, task.on_progress, sign=task.prior.delta_sign)
 
 
 def _sorted(ends: Range) -> Range:

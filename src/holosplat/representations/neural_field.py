@@ -108,7 +108,7 @@ class NeuralField:
         require(np.allclose(grid.voxel_size, grid.voxel_size[0]), "a neural field needs a grid of cubic voxels.")
         shape = tuple(mask.shape)
         require(shape == grid.shape, f"the mask must have the grid's shape {grid.shape}, but it has {shape}.")
-        require(matter.delta > 0, f"a neural field needs matter of positive δ, but it is {matter.delta:g}.")
+        require(matter.delta != 0, "a neural field needs matter with a δ, but it is 0.")
         require(upper >= 0, f"upper must not be negative, but it is {upper:g}.")
         self.grid, self.matter, self.network, self.upper = grid, matter, network, float(upper)
         self.pitch, self.backend = grid.voxel_size[0], "cpu"

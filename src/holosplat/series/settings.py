@@ -91,11 +91,14 @@ def prior_of(table: Mapping[str, Any]) -> MaterialPrior:
     """The prior that `MaterialPrior.as_dict` described; `InputError` for anything else."""
     with as_written("", "a prior"):
         kind, first = table["kind"], DeltaBeta(float(table["delta"]), float(table["beta"]))
+        sign, medium = table.get("sign", 0), str(table.get("medium", ""))
+        require(sign in (-1, 0, 1), f"sign must be -1, 0 or 1, but it is {sign!r}.")
         if kind == "free":
-            return MaterialPrior.unknown()
+            return MaterialPrior.unknown(sign)
         if kind == "ratio":
-            return MaterialPrior.of_ratio(float(table["ratio"]))
+            return MaterialPrior.of_ratio(float(table["ratio"]), sign)
         require(kind == "known", f"kind must be known, ratio or free, but it is {kind!r}.")
         if "second_delta" not in table:
-            return MaterialPrior.known(first)
-        return MaterialPrior.known(first, DeltaBeta(float(table["second_delta"]), float(table.get("second_beta", 0.0))))
+            return MaterialPrior.known(first, medium=medium)
+        second = DeltaBeta(float(table["second_delta"]), float(table.get("second_beta", 0.0)))
+        return MaterialPrior.known(first, second, medium)

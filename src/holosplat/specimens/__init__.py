@@ -1,5 +1,5 @@
-"""Truth objects: meshes made closed, red blood cells by their published shape, capsules, foam, balls in series, and
-continuous matter."""
+"""Truth objects: meshes made closed, red blood cells by their published shape, capsules, foam, bubbles, balls in
+series, and continuous matter."""
 
 from __future__ import annotations
 

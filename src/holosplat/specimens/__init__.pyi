@@ -1,3 +1,5 @@
+from .bubbles import Bubbles as Bubbles
+from .bubbles import random_bubbles as random_bubbles
 from .capsules import Capsule as Capsule
 from .capsules import place_capsules as place_capsules
 from .carried import CarriedScene as CarriedScene

@@ -36,7 +36,8 @@ class MaterialFound:
     """What a reconstruction says about the matter: mass-weighted medians of δ over its volume, and of δ/β in the
     matter; or those of the one material, or the two (`second`: the lighter one's), that it is made of.
 
-    delta_told: whether prior or frames said what δ is; else `delta` stands for β.
+    delta_told: whether prior or frames said what δ is; else `delta` stands for β; against: the medium that both are
+    differences to, empty for vacuum.
     """
 
     delta: float
@@ -44,6 +45,7 @@ class MaterialFound:
     single_material: bool
     second: DeltaBeta | None = None
     delta_told: bool = True
+    against: str = ""
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,7 @@ class Evaluation(Scores):
         material: dict[str, Any] = _as_dict(found.delta, found.ratio) | {
             "single_material": found.single_material,
             "delta_told": found.delta_told,
+            **({"against": found.against} if found.against else {}),
         }
         if found.second is not None:
             material["second"] = _as_dict(found.second.delta, found.second.ratio)
@@ -124,6 +127,7 @@ class Evaluation(Scores):
         kind = "one for all" if found.single_material else "found apart"
         if found.second is not None:
             kind = f"of two; the other: {_as_text(*found.second)}"
+        kind += f", against {found.against}" if found.against else ""
         return [*super().lines(), *said, f"material: {_as_text(found.delta, found.delta / found.ratio)} ({kind})"]
 
 
@@ -178,7 +182,8 @@ def evaluate(reconstruction: Reconstruction, scan: Scan | None, truth: Volume | 
         lit = light_of(scan, reconstruction.light, reconstruction.still)
     truth = of_absorption(truth) if truth is not None and not reconstruction.delta_told else truth
     scores = score_object(found, scan, truth, reconstruction.oversample, found.backend, _factor(lit))
-    material = replace(material_found(found), delta_told=reconstruction.delta_told)
+    told = {"delta_told": reconstruction.delta_told, "against": reconstruction.choice.against}
+    material = replace(material_found(found), **told)
     said = held_out_verdict(reconstruction, scan, lit) if scan is not None else None
     return Evaluation(scores.test, scores.train, scores.volume, scores.predicted, material, said, lit)
 
@@ -265,11 +270,12 @@ def material_found(found: Stored) -> MaterialFound:
     if matter.occupancies:
         return MaterialFound(matter.delta, matter.channels[0].ratio, matter.single, matter.second)
     volume = found.voxelise(found.enclosing_grid(MOST_VOXELS))
-    delta, beta = volume.delta.ravel().astype(np.float64), volume.beta.ravel().astype(np.float64)
+    sign = matter.channels[0].sign
+    delta, beta = (sign * values.ravel().astype(np.float64) for values in (volume.delta, volume.beta))
     level = _weighted_median(delta, delta)
     matter = delta > 0.5 * level
     ratio = _weighted_median(delta[matter] / np.maximum(beta[matter], 1e-30), delta[matter])
-    return MaterialFound(level, ratio, False)
+    return MaterialFound(sign * level, ratio, False)
 
 
 def _as_text(delta: float, beta: float) -> str:

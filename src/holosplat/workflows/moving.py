@@ -101,7 +101,7 @@ def reconstruct_moving(
         oversample,
         found.timing,
         True,
-        Choice("continuous", {}, "Gaussians", decisions=task.decisions),
+        Choice("continuous", {}, "Gaussians", decisions=task.decisions, against=task.prior.against),
         task.delta_told,
         judge(said, task.scan, task.noise if task.uneven else None),
         light=found_in(task),

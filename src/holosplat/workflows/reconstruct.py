@@ -338,7 +338,7 @@ class _Run:
             oversample,
             dict(self.timing),
             complete,
-            Choice(self.task.matter, dict(self._keeper.judged), kept, decisions=decisions),
+            Choice.of(self.task, dict(self._keeper.judged), kept, decisions),
             self.task.delta_told,
             judge_run(found, fit, self.task, oversample),
             self._total(found, fit, oversample),

@@ -13,6 +13,7 @@ from ..checks import as_written, require
 from ..inference import Decision
 from ..io.provenance import sha256
 from ..methods import Task
+from ..methods.contrast import STAGE as SIGN
 from ..methods.illumination import STAGE, Prepared
 from ..methods.presets import SCHEMA
 from ..methods.uncertain import Uncertain
@@ -61,6 +62,7 @@ def _require_same(folder: RunFolder, old: dict[str, Any], same: dict[str, Any]) 
     )
     for table in (old, same):
         _without_backends(table.get("method", {}))
+        table.get("prior", {}).pop("medium", None)  # a name, which older versions did not keep
     for key, name in RESUMED_WITH.items():
         require(
             old.get(key) == same[key],
@@ -89,13 +91,15 @@ def _without_backends(table: Any) -> None:
 
 
 def decisions_of(task: Task) -> dict[str, Any]:
-    """Entries of config.json that `decided_before` reads: what was decided of light and noise, before the matter."""
+    """Entries of config.json that `decided_before` reads: what was decided of sign, light and noise, before the
+    matter."""
     taken = () if task.first is None else task.first.taken
-    return {"light": list(taken), "decisions": [each.as_dict() for each in task.decisions if each.name == STAGE]}
+    made = [each.as_dict() for each in task.decisions if each.name in (SIGN, STAGE)]
+    return {"light": list(taken), "decisions": made}
 
 
 def decided_before(folder: RunFolder) -> Prepared:
-    """What a run that goes on has decided of light and noise; `InputError` for a folder that does not say it."""
+    """What a run that goes on has decided of sign, light and noise; `InputError` for a folder that does not say it."""
     with as_written(folder.config, "of a run that has begun"):
         table = folder.read_config()["decided"]
         made = tuple(Decision.from_dict(each) for each in table["decisions"])

@@ -80,7 +80,8 @@ def total_of_run(said: Prediction, frames: Scan, task: Task, constants: tuple[De
     found = cast(Stored, said.object)
     quantity: Literal["δ", "β"] = "δ" if task.delta_told else "β"
     held = _held(found, frames)
-    if held <= 0:
+    sign = found.matter.channels[0].sign
+    if sign * held <= 0:
         return TotalMatter(quantity, None, None, held, f"total {quantity}: none, for the volume is empty")
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), MOST_VIEWS)).round().astype(int))
     factor = binning(frames, MOST_VOXELS)
@@ -92,7 +93,11 @@ def total_of_run(said: Prediction, frames: Scan, task: Task, constants: tuple[De
     total = total_delta(found, few.binned(factor), noise, shown, doubt)
     material = task.prior.materials[0].delta if len(task.prior.materials) == 1 else None
     return TotalMatter(
-        quantity, total.value, total.error, total.held, in_words(total, quantity, material, doubt < DOUBTFUL)
+        quantity,
+        total.value,
+        total.error,
+        total.held,
+        in_words(total, quantity, material, doubt < DOUBTFUL, task.prior.against),
     )
 
 
@@ -104,16 +109,21 @@ def _ratio_doubt(task: Task, constants: tuple[Determined, ...]) -> float:
     return 0.0 if task.prior.fixes_ratio else RATIO_SHARE
 
 
-def in_words(total: Total, quantity: str, delta: float | None = None, ratio_known: bool = True) -> str:
-    """A total in a line; delta: of the one known material, whose volume is then said too."""
+def in_words(
+    total: Total, quantity: str, delta: float | None = None, ratio_known: bool = True, against: str = ""
+) -> str:
+    """A total in a line; delta: of the one known material, whose volume is then said too; against: the medium."""
+    named = f"total {quantity}" + (f" against {against}" if against else "")
     held = f"; the volume itself holds {total.held:.3g}" if abs(total.held - total.value) > WIDE * total.error else ""
     if total.share <= TOLD:
         volume = "" if delta is None else f" ({total.value / delta:.3g} m³ of the material)"
-        return f"total {quantity} {total.value:.3g} m³ ± {in_percent(total.share)}{volume}{held}"
-    low, high = max(0.0, total.value - WIDE * total.error), max(0.0, total.value) + WIDE * total.error
+        return f"{named} {total.value:.3g} m³ ± {in_percent(total.share)}{volume}{held}"
+    sign = math.copysign(1.0, total.held)
+    size, reach = sign * total.value, WIDE * total.error
+    low, high = sorted((sign * max(0.0, size - reach), sign * (max(0.0, size) + reach)), key=abs)
     volume = "" if delta is None else f" ({low / delta:.2g} to {high / delta:.2g} m³ of the material)"
     cannot = "the frames cannot tell it" if ratio_known else "the frames cannot tell it without the ratio δ/β"
-    return f"total {quantity}: {cannot}; between {low:.2g} and {high:.2g} m³{volume}{held}"
+    return f"{named}: {cannot}; between {low:.2g} and {high:.2g} m³{volume}{held}"
 
 
 def _held(found: Stored, frames: Scan) -> float:

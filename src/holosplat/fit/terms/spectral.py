@@ -21,23 +21,24 @@ NOISE_FLOOR = 5.0
 
 
 class SpectralMisfit:
-    """½ Σ (r, W r) over the pixels of each view, with `r = (√I - √I₀) / (k p δ s)` and I from the full wave model.
+    """½ Σ (r, W r) over the pixels of each view, with `r = (√I - √I₀) / (k p |δ| s)` and I from the full wave model.
 
     Amplitudes √I have the same noise everywhere (Godard et al. 2012, eq. 9). A pixel of thickness p of the material
-    changes them by up to k p δ s, so r is a thickness in pixels; δ, β: of the first material of `matter`; s: 1 where
+    changes them by up to k p |δ| s, so r is a thickness in pixels; δ, β: of the first material of `matter`; s: 1 where
     fringes are seen, else less (`optics.retrieval.spectra.sensitivity`). W divides the spectrum by `H² + f²`: H s =
     sin χ + (β/δ) cos χ is the linear response of single views (Cloetens et al. 1999, eq. 3; χ = πλz f²) up to its first
     maximum, and H = 1/s beyond. Without W, shapes larger than some fringes hardly count. The smaller f, the larger the
     shapes that are fitted, and the more of the noise: f is `floor` and more where frames are noisy. Errors:
-    `InputError` for matter whose δ is not positive.
+    `InputError` for matter whose δ is zero.
     """
 
     def __init__(self, train: Scan, instrument: Instrument, matter: Matter, floor: float) -> None:
-        require(matter.delta > 0, f"a spectral misfit needs a material with δ > 0, but δ is {matter.delta:g}.")
+        require(matter.delta != 0, "a spectral misfit needs a material with a δ, but it is 0.")
         on, exposures = instrument.device, train.exposures
         ratio = matter.beta / matter.delta
         strongest = sensitivity(exposures, ratio)
-        phase = wavenumber(exposures.energy_kev) * exposures.refraction(matter.delta, 0.0)[0] * train.views.finest
+        delta = exposures.refraction(abs(matter.delta), 0.0)[0]
+        phase = wavenumber(exposures.energy_kev) * delta * train.views.finest
         unit = phase * strongest
         self._unit = torch.from_numpy(unit).float()[:, None, None].to(on)
         self._amplitudes = torch.from_numpy(train.frames).clamp_min(0).sqrt().to(on)

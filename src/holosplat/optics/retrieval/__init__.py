@@ -35,10 +35,10 @@ class Retrieval(Protocol):
         *,
         on_progress: Advance = lambda fraction: None,
     ) -> Tensor:
-        """Thickness [V, H, W] in metres of one material (δ > 0, β of any sign) from relative intensities [V, H, W].
+        """Thickness [V, H, W] in metres of one material (δ and β of any sign) from relative intensities [V, H, W].
 
-        The result has the frames' type, float32 or float64. `InputError` for frames that do not match `exposures` or
-        are not finite, or δ ≤ 0.
+        Of holes in a medium, whose δ against it is negative, it is theirs. The result has the frames' type, float32 or
+        float64. `InputError` for frames that do not match `exposures` or are not finite, or δ = 0.
         """
         ...
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,7 +42,7 @@ def admm(
 ) -> Tensor:
     """Thickness [V, H, W] in metres of one material, β of any sign, with edges: frames [V, H, W] through full waves.
 
-    `½ Σ (√I(φ) - √I)² + w TV(φ)` over phases φ = kδT that are not negative and lie within a support, split as by
+    `½ Σ (√I(φ) - √I)² + w TV(φ)` over phases φ = k|δ|T that are not negative and lie within a support, split as by
     Goldstein & Osher (2009): slopes d = ∇φ are shrunk, a copy z = φ is bounded, and φ takes one damped Newton step,
     which is diagonal in Fourier space. Wen et al. (2012) split at the detector instead, where the amplitude has an
     exact proximal map; but point-spread function and pixel stand between wave and amplitude there, and the phase of
@@ -50,7 +51,8 @@ def admm(
     """
 
     def solve(frames: Tensor, exposures: Exposures, noise: Noise, on_progress: Advance) -> Tensor:
-        model = WaveModel(frames, exposures, beta / delta, noise, options.backend, options.leaves, options.prior)
+        how = (options.backend, options.leaves, options.prior)
+        model = WaveModel(frames, exposures, beta / delta, noise, *how, sign=math.copysign(1.0, delta))
         return model.thickness(_alternate(model, options, on_progress), delta)
 
     return view_by_view(frames, exposures, delta, options.noise, solve, on_progress)

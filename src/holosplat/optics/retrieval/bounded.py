@@ -1,7 +1,8 @@
 """A first estimate for everything iterative: the linear inverse, bounded from below by zero, and where matter is.
 
 One frame hardly constrains the lowest frequencies, and the frequencies where the response is zero. Two conditions fill
-them in: matter is nowhere negative, and there is none outside its bodies.
+them in: matter is nowhere negative, and there is none outside its bodies. Of holes in a medium that is said of the
+thickness of the holes.
 """
 
 from __future__ import annotations
@@ -31,16 +32,23 @@ lowest frequencies; or it is what a volume lacks, which is flatter than matter. 
 
 @dataclass(frozen=True)
 class Estimate:
-    """phase: delay [V, H, W] in radians, not negative, float64; support: [V, H, W] bool, where there may be matter."""
+    """phase: delay (of holes: advance) [V, H, W] in radians, not negative, float64; support: [V, H, W] bool, where
+    there may be matter."""
 
     phase: Tensor
     support: Tensor
 
 
 def bounded_estimate(
-    frames: Tensor, exposures: Exposures, ratio: float, noise: Noise, leaves: bool = False, prior: Prior | None = None
+    frames: Tensor,
+    exposures: Exposures,
+    ratio: float,
+    noise: Noise,
+    leaves: bool = False,
+    prior: Prior | None = None,
+    sign: float = 1.0,
 ) -> Estimate:
-    """From frames [V, H, W] of a material with β/δ = `ratio`; noise: theirs, None to estimate it.
+    """From frames [V, H, W] of a material with β/δ = `ratio` and that `sign` of δ; noise: theirs, None to estimate it.
 
     Wiener's inverse `W` of the contrast transfer function, in alternation with the bound (Papoulis 1975 and
     Gerchberg 1974, who extend spectra so): `φ ← φ₀ + (1 - W H) [φ]`, where `[φ]` is φ where it exceeds
@@ -61,7 +69,7 @@ def bounded_estimate(
     else:
         doubtful = known.noise_of(known.inverse)
     least = (SIGNIFICANT * doubtful)[:, None, None]
-    linear = -filtered(contrast, known.inverse)
+    linear = -sign * filtered(contrast, known.inverse)
     inside = torch.zeros_like(linear[:1])
     inside[:, slice(None) if leaves else crop[1], crop[2]] = 1
     phase = linear

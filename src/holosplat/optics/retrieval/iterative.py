@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -95,7 +96,7 @@ def _alternate(
     delta, beta = material
 
     def solve(frames: Tensor, exposures: Exposures, noise: Noise, on_progress: Advance) -> Tensor:
-        model = WaveModel(frames, exposures, beta / delta, noise, options.backend)
+        model = WaveModel(frames, exposures, beta / delta, noise, options.backend, sign=math.copysign(1.0, delta))
         phase = model.phase
         for done in range(options.iterations):
             on_progress(done / options.iterations)
@@ -113,15 +114,15 @@ def through_detector(model: WaveModel, phase: Tensor) -> Tensor:
     than π: a phase of many radians never wraps. The phase of one material nearest to it, in the logarithm, is
     `φ + (dφ + r dℓ) / (1 + r²)`, `r = β/δ`.
     """
-    path, r = model.path, model.ratio
+    path, r, sign = model.path, model.ratio, model.sign
     transfer = path.rows[:, :, None] * path.columns[:, None]
-    before = exit_wave_of(r * phase, phase)
+    before = exit_wave_of(sign * r * phase, sign * phase)
     detector = 1 + torch.fft.ifft2(torch.fft.fft2(before) * transfer)
     gain = _gain(model, phase)
     after = before + torch.fft.ifft2(torch.fft.fft2((gain - 1) * detector) * transfer.conj())
     change = (1 + after) / (1 + before)
     loss, delay = -torch.log(change.abs().clamp_min(DARKEST)), -torch.angle(change)
-    return phase + (delay + r * loss) / (1 + r**2)
+    return phase + sign * (delay + r * loss) / (1 + r**2)
 
 
 def _gain(model: WaveModel, phase: Tensor) -> Tensor:

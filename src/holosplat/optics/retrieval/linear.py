@@ -73,10 +73,10 @@ def paganin(
 
     The plain filter (`retrieve_thickness`) divides noise by 2β/δ at low frequencies: 2000 photons a pixel leave
     nothing of a cell. Here it is Wiener's inverse of the same transport of intensity, `2 (β/δ + χ)`, for the noise
-    that the frames have; with `noise=0` it is the plain one. A contrast with β ≤ 0 has no such filter and is
+    that the frames have; with `noise=0` it is the plain one. A contrast with β/δ ≤ 0 has no such filter and is
     solved by `contrast_transfer`.
     """
-    if beta < WEAKEST_ABSORPTION * delta and options.noise != 0:
+    if beta / delta < WEAKEST_ABSORPTION and options.noise != 0:
         return contrast_transfer(frames, exposures, delta, beta, options=options, on_progress=on_progress)
     frames = checked(frames, exposures, delta)
     on_progress(0.0)
@@ -129,14 +129,14 @@ def retrieve_thickness(
 
     energy_kev, delta, beta: of all views, or of each [V].
 
-    Paganin et al. (2002), eq. 12: `T = -ln(F⁻¹[F[I] / (1 + πλz (δ/β) f²)]) / 2kβ`. A contrast with β ≤ 0 (cells
+    Paganin et al. (2002), eq. 12: `T = -ln(F⁻¹[F[I] / (1 + πλz (δ/β) f²)]) / 2kβ`. A contrast with β/δ ≤ 0 (cells
     in plasma) has no such filter and is solved in the linear limit (`invert_contrast`), but for frames in contact
-    (all distances 0), which need none. Frames are continued by their edge values; pitch: pixel size [m]; δ must be
-    positive.
+    (all distances 0), which need none. Frames are continued by their edge values; pitch: pixel size [m]; δ must not be
+    zero.
     """
     z, energy, d, b = _per_view(distance, energy_kev, delta, beta)
-    require(bool((d > 0).all()), f"phase retrieval needs a material with δ > 0, but δ is {d.min():g}.")
-    if (b < WEAKEST_ABSORPTION * d).any() and z.any():
+    require(bool(d.all()), "phase retrieval needs a material that differs from its medium in δ, but δ is 0.")
+    if (b / d < WEAKEST_ABSORPTION).any() and z.any():
         return invert_contrast(frames - 1, pitch, distance, energy_kev, delta, beta)
     lam_z = wavelength(energy) * z
     padded, crop = _continued(frames, pitch, lam_z, d, b, "replicate")
@@ -164,10 +164,10 @@ def invert_contrast(
     chi = np.pi * lam_z * _squared_frequency(padded.shape, pitch)
     k2 = 2 * wavenumber(energy)
     response = k2 * (b * np.cos(chi) + d * np.sin(chi))
-    floor = k2 * np.where(chi < 0.5 * np.pi, WEAKEST_ABSORPTION * d, 0.3 * d)
+    floor = k2 * np.where(chi < 0.5 * np.pi, WEAKEST_ABSORPTION * abs(d), 0.3 * abs(d))
     # Where absorption is feeble, the lowest frequencies say next to nothing, or change their sign.
-    feeble = np.maximum(floor, k2 * np.maximum(abs(b), FEEBLE_FLOOR * d))
-    floor = np.where(b < WEAKEST_ABSORPTION * d, feeble, floor)
+    feeble = np.maximum(floor, k2 * np.maximum(abs(b), FEEBLE_FLOOR * abs(d)))
+    floor = np.where(b / d < WEAKEST_ABSORPTION, feeble, floor)
     inverse = torch.from_numpy(-response / (response**2 + floor**2))
     solved = torch.fft.irfft2(torch.fft.rfft2(padded) * inverse, s=padded.shape[-2:])
     return solved[crop].to(contrast.dtype)
@@ -187,8 +187,8 @@ def _continued(
 
     lam_z [m²], delta, beta: [V, 1, 1].
     """
-    weakest = np.maximum(abs(beta), WEAKEST_ABSORPTION * delta)
-    reach = math.sqrt((lam_z * delta / weakest).max() / math.pi)
+    weakest = np.maximum(abs(beta), WEAKEST_ABSORPTION * abs(delta))
+    reach = math.sqrt((lam_z * abs(delta) / weakest).max() / math.pi)
     h, w = frames.shape[-2:]
     my, mx = (min(n - 1, math.ceil(2 * reach / pitch)) for n in (h, w))
     padded = pad(frames[None].double(), (mx, mx, my, my), mode=mode)[0]

@@ -67,13 +67,14 @@ class Regularised:
 
 
 class WaveModel:
-    """Frames [V, h, w] as a function of the phase delay [V, H, W] in radians, `phase = kδT`, on the waves' raster.
+    """Frames [V, h, w] as a function of the phase delay [V, H, W] in radians, `phase = k|δ|T`, on the waves' raster.
 
     The raster is the frame padded by the fringes' reach, `oversample` times finer; `support` [V, H, W] marks the
     samples where matter may be: where the estimate has matter, and beyond the frame's border where the estimate touches
     it. float32 frames are computed by `backend`, float64 ones by `reference`. `phase` is the estimate to start from,
-    `ratio` the matter's β/δ at the frames' energy, which is one, and `strongest` [V, 1, 1] about the curvature of the
-    strongest frequency: 1 where fringes are seen, and far less where hardly any are.
+    `ratio` the matter's β/δ at the frames' energy, which is one, `sign` that of its δ (-1: holes, which advance waves),
+    and `strongest` [V, 1, 1] about the curvature of the strongest frequency: 1 where fringes are seen, and far less
+    where hardly any are.
     """
 
     def __init__(
@@ -85,8 +86,11 @@ class WaveModel:
         backend: str = "cpu",
         leaves: bool = False,
         prior: Prior | None = None,
+        *,
+        sign: float = 1.0,
     ) -> None:
-        estimate = bounded_estimate(frames, exposures, ratio, noise, leaves, prior)
+        estimate = bounded_estimate(frames, exposures, ratio, noise, leaves, prior, sign)
+        self.sign = sign
         energy = exposures.one_energy("the wave model of a phase retrieval")
         self.exposures, self.ratio = exposures, float(absorption(exposures, ratio)[0])
         self.backend = resolve("reference" if frames.dtype == torch.float64 else backend)
@@ -137,12 +141,12 @@ class WaveModel:
         """Means over the frame's pixels [V, h, w], in metres."""
         (my, mx), s, (h, w) = self.margin, self.oversample, self.exposures.views.shape
         inside = phase[:, my * s : (my + h) * s, mx * s : (mx + w) * s]
-        radians = radian(self.exposures, delta).to(inside.device, inside.dtype)
+        radians = radian(self.exposures, abs(delta)).to(inside.device, inside.dtype)
         return (avg_pool2d(inside[None], s)[0] if s > 1 else inside) * radians
 
     def image(self, phase: Tensor) -> Tensor:
         """Frames [V, h, w]; differentiable once."""
-        return hologram(phase[:, None], [(1.0, self.ratio)], self.path, self.backend)
+        return hologram(phase[:, None], [(self.sign, self.sign * self.ratio)], self.path, self.backend)
 
     def misfit(self, phase: Tensor) -> tuple[Tensor, Tensor]:
         """`½ Σ (√I(φ) - √I)²` [V], float64, and its gradient [V, H, W].

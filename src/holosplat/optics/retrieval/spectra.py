@@ -51,7 +51,7 @@ class Prior:
 
 
 def checked(frames: Tensor | np.ndarray, exposures: Exposures, delta: float) -> Tensor:
-    """The frames [V, H, W] as a tensor, if they are finite, floating, and match `exposures`; and δ, if it is positive.
+    """The frames [V, H, W] as a tensor, if they are finite, floating, and match `exposures`; and δ is not zero.
 
     A NumPy array of the host's byte order is taken as it is.
     """
@@ -61,7 +61,7 @@ def checked(frames: Tensor | np.ndarray, exposures: Exposures, delta: float) -> 
         frames = torch.from_numpy(np.ascontiguousarray(frames, dtype=frames.dtype.newbyteorder("=")))
     shaped("frames", frames.detach().cpu().numpy(), (len(exposures), *exposures.views.shape))
     finite("frames", frames.detach().cpu().numpy())
-    require(delta > 0, f"phase retrieval needs a material with δ > 0, but δ is {delta:g}.")
+    require(delta != 0, "phase retrieval needs a material that differs from its medium in δ, but δ is 0.")
     return frames
 
 
@@ -71,7 +71,8 @@ def column(values: np.ndarray) -> Tensor:
 
 
 def radian(exposures: Exposures, delta: float) -> Tensor:
-    """The thickness [V, 1, 1] in metres of matter that delays each view's wave by one radian, 1/kδ, float64."""
+    """The thickness [V, 1, 1] in metres of matter that delays each view's wave by one radian, 1/kδ, float64; below zero
+    for holes in a medium, which advance it."""
     return column(1 / (wavenumber(exposures.energy_kev) * exposures.refraction(delta, 0.0)[0]))
 
 

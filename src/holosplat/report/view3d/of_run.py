@@ -27,6 +27,7 @@ def view_of(obj: Stored, volume: Volume, truth: Volume | None, scan: Scan, delta
     _, _, pixel = raster_of(*exposures.views.shape, exposures.views.pitch)
     times = np.unique(scan.exposures.time) if isinstance(obj, MovingSurfaces) else None
     shift = first_phase(obj, scan) * (1.0 if delta_told else 2.0)  # without δ, which is β then: the absorption 2k∫β
+    sign = obj.matter.channels[0].sign
     shown = {"reconstruction": volume} | ({} if truth is None else {"truth": truth})
     parts = {"reconstruction": part_of(obj, volume, pixel, times)}
     if truth is not None and times is None:
@@ -39,8 +40,8 @@ def view_of(obj: Stored, volume: Volume, truth: Volume | None, scan: Scan, delta
         views=scan.views,
         labels=view_labels(scan.views),
         grey=(float(low), float(max(high, low + 1e-6))),
-        top=float(np.percentile(shift, ENDS[1])) or 1.0,
-        picture=still(shift),
+        top=sign * (float(np.percentile(sign * shift, ENDS[1])) or 1.0),
+        picture=still(shift, sign),
         delta_told=delta_told,
     )
 
@@ -54,11 +55,11 @@ def first_phase(obj: Stored, scan: Scan) -> np.ndarray:
 
 
 @styled
-def still(phase: np.ndarray) -> str:
-    """The picture that stands where the view cannot be turned, as a `data:` URI."""
+def still(phase: np.ndarray, sign: float = 1.0) -> str:
+    """The picture that stands where the view cannot be turned, as a `data:` URI; sign: that of the matter's δ."""
     rows, columns = phase.shape
     figure = new_figure(2.4, 2.4 * rows / columns, layout="none")
     axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    axes.imshow(phase, cmap="magma", vmin=0.0)
+    axes.imshow(sign * phase, cmap="magma", vmin=0.0)
     axes.axis("off")
     return data_uri(figure, "png")

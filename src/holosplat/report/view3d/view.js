@@ -398,9 +398,10 @@ function start(buffer) {
     state.depth = Math.min(state.depth, count - 1);
     const { w, h, values } = sliceOf(part, arrays, state.plane, state.depth);
     const low = part.low[0] < -1.5 * part.step[0] ? part.low[0] : 0, top = part.low[0] + 255 * part.step[0] || 1;
-    const colour = shade(low, top, facts.colours);
+    const ends = -low > top ? [top, low] : [low, top];  // what fills the field is dark
+    const colour = shade(...ends, facts.colours);
     paint(pick("slice"), w, h, values, colour);
-    bar("slice", low, top, colour, cutUnit, cutFactor);
+    bar("slice", ...ends, colour, cutUnit, cutFactor);
     ruler("slice", w * facts.pixel * part.voxel[[2, 0, 0][state.plane]]);
     const axis = "xyz"[state.plane];
     const place = (state.depth + 0.5 - count / 2) * part.voxel[state.plane] + part.middle[state.plane];

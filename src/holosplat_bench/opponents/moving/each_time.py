@@ -65,7 +65,7 @@ def each_time(
     chosen = settled(method, first, matter)
     for k in range(len(times)):
         on_progress(EACH, k / len(times))
-        task = chosen.task(prepared(Task(train.at_instant(k), prior, seed), chosen.method))
+        task = chosen.task(prepared(Task(train.at_instant(k), first.prior, seed), chosen.method))
         found.append(_gone_on(chosen.method, task, found[-1]) if warm and found else solve_stages(chosen.method, task))
     return Snapshots(times, tuple(found))
 

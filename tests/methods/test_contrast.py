@@ -1,0 +1,120 @@
+"""Holes in a medium: taken where they predict unseen frames better than bodies, and found by methods as bodies are."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import holosplat as hs
+from holosplat.beamline.simulate import simulate
+from holosplat.geometry import Grid, Views
+from holosplat.matter import DeltaBeta, MaterialPrior
+from holosplat.methods import METHODS, PerView, Task
+from holosplat.methods.contrast import ABOVE, BELOW, STAGE, decide_sign
+from holosplat.methods.illumination import first_of_task, prepared
+from holosplat.metrics import volume_scores
+from holosplat.scan import Exposures, Scan
+from holosplat.specimens import Bubbles, MeshScene, random_bubbles
+from holosplat.specimens.red_cells import random_cells
+from holosplat.workflows.resume import decisions_of
+from holosplat.workflows.totals import TotalMatter
+
+AIR_IN_WATER = DeltaBeta(-5.75e-7, -2.56e-10)
+PIXEL, SHAPE, VIEWS = 1e-6, (35, 42), 8
+
+
+def of(scene, photons: float | None = None) -> Scan:
+    views = Views.evenly_spaced(VIEWS, SHAPE, PIXEL)
+    is_test = np.arange(VIEWS) == 3
+    return simulate(scene, Exposures.of(views, 20.0, 0.1), photons_per_pixel=photons, seed=3, is_test=is_test)
+
+
+@pytest.fixture(scope="module")
+def bubbles() -> Bubbles:
+    return random_bubbles(4, (3e-6, 6e-6), (34e-6, 30e-6, 34e-6), AIR_IN_WATER, 5)
+
+
+@pytest.fixture(scope="module")
+def holes(bubbles) -> Scan:
+    return of(bubbles, 5000)
+
+
+@pytest.fixture(scope="module")
+def cells() -> Scan:
+    matter = DeltaBeta(4e-7, 4e-7 / 1500)
+    return of(MeshScene.of_one_material(random_cells(3, (34e-6, 30e-6, 34e-6), 5, 12e-6), matter), 5000)
+
+
+@pytest.mark.parametrize("prior", [MaterialPrior.unknown(), MaterialPrior.of_ratio(AIR_IN_WATER.ratio)])
+def test_holes_are_taken_where_they_predict_unseen_frames(prior, holes):
+    """And what is decided later is decided of holes; the run's folder keeps it."""
+    task = prepared(Task(holes.train(), prior))
+    (sign,) = (each for each in task.decisions if each.name == STAGE)
+    assert sign.choice == BELOW
+    assert sign.compared[0].gain > 0.2
+    assert task.prior == prior.signed(-1)
+    assert task.first is not None
+    assert task.first.material.delta < 0
+    assert decisions_of(task)["decisions"][0]["choice"] == BELOW
+    again = prepared(Task(holes.train(), prior), before=(tuple(task.first.taken), task.decisions))
+    assert again.prior == task.prior
+    assert again.decisions == task.decisions
+
+
+def test_bodies_stay_bodies(cells):
+    task = prepared(Task(cells.train(), MaterialPrior.of_ratio(1500)))
+    (sign,) = (each for each in task.decisions if each.name == STAGE)
+    assert sign.choice == ABOVE
+    assert sign.compared[0].loses
+    assert task.prior.delta_sign == 1.0
+
+
+def test_what_is_told_is_not_asked(holes):
+    told = Task(holes.train(), MaterialPrior.known(AIR_IN_WATER))
+    first = first_of_task(told)
+    assert decide_sign(first, lambda volumes, fold: pytest.fail("a score was asked for")) == (first, ())
+
+
+@pytest.mark.parametrize("name", ["tikhonov-tv", "ctf-tv", "holographic-tv"])
+def test_methods_find_bubbles_in_water_that_fills_the_field(name, bubbles, holes):
+    prior = MaterialPrior.known(AIR_IN_WATER, medium="water")
+    truth = bubbles.voxelise(Grid.of_views(holes.views))
+    done = hs.reconstruct(holes, prior, METHODS[name])
+    found = done.object.voxelise(truth.grid)
+    scores = volume_scores(found, truth)
+    assert scores.dice > 0.85
+    assert scores.relative_error_delta < 0.35
+    assert found.delta.max() <= 0
+    said = hs.evaluate(done, holes, truth)
+    assert said.material.delta == pytest.approx(AIR_IN_WATER.delta)
+    assert any("against water" in line and "-5.75" in line for line in said.lines())
+    assert any(line.startswith("against water: δ and β are differences") for line in done.choice.lines())
+    assert done.total is not None
+    assert total_of(done.total) / float(truth.delta.sum() * PIXEL**3) == pytest.approx(1.0, abs=0.2)
+    assert "total δ against water -" in done.total.words
+
+
+def total_of(total: TotalMatter) -> float:
+    assert total.value is not None
+    return total.value
+
+
+def test_light_that_a_medium_dims_is_no_matter(bubbles):
+    """Frames over flat fields without the water: its even absorption is in no difference, and counts as light."""
+    scan = of(bubbles)
+    truth = bubbles.voxelise(Grid.of_views(scan.views))
+    dimmed = hs.Scan(0.9 * scan.frames, scan.exposures, scan.is_test)
+    for one in (scan, dimmed):
+        done = hs.reconstruct(one, MaterialPrior.known(AIR_IN_WATER, medium="water"), PerView())
+        assert volume_scores(done.object.voxelise(truth.grid), truth).dice > 0.9
+
+
+def test_uneven_light_does_not_hide_the_sign(bubbles):
+    """A slope of a tenth across frames leaves more of them than matter does, until both sides may have it."""
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]] / np.array(SHAPE)[:, None, None] - 0.5
+    draws = np.random.default_rng(2).normal(size=(VIEWS, 2))
+    slopes = np.stack([1 + 0.1 * (a * x + b * y) for a, b in draws])
+    scan = of(bubbles, 1e5)
+    task = prepared(Task(hs.Scan(scan.frames * slopes, scan.exposures, scan.is_test).train(), MaterialPrior.unknown()))
+    assert task.prior.sign == -1
+    assert task.uneven is not None
