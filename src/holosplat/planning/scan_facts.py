@@ -144,7 +144,7 @@ def _facts(path: Path, reading: Reading, loader: Loader, opened: Opened, unsaid:
 
 
 def _options(reading: Reading) -> list[str]:
-    """What is said of a scan, and which part is taken, as options of a command."""
+    """Metadata overrides and the selected part of a scan, as options of a command."""
     options = {f"--{name.replace('_', '-')}": value for name, value in reading.as_table().items()}
     return [name if value is True else f"{name} {shlex.quote(str(value))}" for name, value in options.items()]
 
