@@ -120,5 +120,5 @@ def test_a_run_with_a_garbled_entry_is_told_of(tmp_path, name, change):
     run = Path(shutil.copytree(OLD_RUN, tmp_path / "run"))
     table = json.loads((run / name).read_text())
     (run / name).write_text(json.dumps(table | change))
-    with pytest.raises(InputError, match="must be .*as it was written"):
+    with pytest.raises(InputError, match=r"must be .*as it was written"):
         facts_of_run(RunFolder(run))
