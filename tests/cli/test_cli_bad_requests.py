@@ -131,7 +131,7 @@ BAD_REQUESTS: dict[str, tuple[list[str], list[str]]] = {
     "ratio and density": (["--delta-beta", "2800", "--density", "1"], ["--density", "--delta-beta"]),
     "ratio and medium": (["--delta-beta", "2800", "--medium", "water"], ["--medium", "--delta-beta"]),
     "ratio of zero": (["--delta-beta", "0"], ["delta", "beta", "0"]),
-    "lighter than its medium": (["--material", "water", "--medium", "haemoglobin"], ["δ", "medium"]),
+    "same as its medium": (["--material", "water", "--medium", "water"], ["differ from its medium in δ"]),
     "missing config": (["--config", "none.json"], ["none.json"]),
     "config and preset": (["--config", "quick.json", "--preset", "fast"], ["--config", "--preset"]),
 }

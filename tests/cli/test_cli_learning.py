@@ -45,9 +45,9 @@ def test_a_dataset_of_other_ranges_is_refused_and_a_part_of_it_is_no_dataset(sce
     refused(holosplat("train", tmp_path, "--out", tmp_path / "out"), "holosplat dataset made")
 
 
-def test_a_guess_that_the_frames_contradict_is_not_begun_with_and_the_run_says_so(shop, tmp_path):
+def test_a_guess_that_predicts_less_is_not_begun_with_and_the_run_says_so(shop, tmp_path):
     weights = tmp_path / "weights.safetensors"
-    write_weights(weights, Guess(Size((4, 4, 4, 4), 3, (4, 4, 4))), Card(typical_misfit={"2": 0.01}))
+    write_weights(weights, Guess(Size((4, 4, 4, 4), 3, (4, 4, 4))), Card())
 
     done = worked(
         holosplat(
@@ -56,8 +56,9 @@ def test_a_guess_that_the_frames_contradict_is_not_begun_with_and_the_run_says_s
         )
     )
 
-    assert "start: The frames contradict the network's guess" in done.out
-    assert RunFolder(tmp_path / "run").read_summary()["decided"]["begun"].endswith("began with phase retrieval.")
+    assert "start: phase retrieval (data fission: network's guess -" in done.out
+    (decision,) = (d for d in RunFolder(tmp_path / "run").read_summary()["decisions"] if d["name"] == "start")
+    assert decision["choice"] == "phase retrieval"
     guess, spread, of_copies = read_guess(tmp_path / "run" / "guess.h5")
     assert spread is not None
     assert not of_copies

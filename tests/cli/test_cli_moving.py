@@ -103,7 +103,7 @@ def test_matter_may_fade(quick):
     asked = ["reconstruct", quick / "s.nxs", "--material", "PMMA", "--fading", 0.3, "--out", quick / "run"]
     refused = holosplat(*asked, "--time-frame", 1)
     assert refused.code == 2
-    assert "--fading is of matter in motion" in refused.err
+    assert "--fading is of matter that a flow carries" in refused.err
     worked(holosplat(*asked, "--time-frame", "all"))
     found = load_reconstruction(RunFolder(quick / "run")).object
     assert isinstance(found, MovingGaussians)

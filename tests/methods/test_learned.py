@@ -33,7 +33,7 @@ OPTIONS = Gaussians(
     start="learned",
     approximate_steps=10,
     volume=HolographicTV(retrieval=10, iterations=20, corrections=1, inner=5),
-    learned=LearnedStart(steps=6, surface_steps=4),
+    learned=LearnedStart(trial_steps=6, trial_surfaces=4),
 )
 
 

@@ -43,9 +43,9 @@ class LearnedStart:
 
     weights: str = ""
     """File of the network's weights (default: those of the package, if it has any)."""
-    steps: Natural = 300
+    trial_steps: Natural = 300
     """Steps of the fit of Gaussians from every start, before they are compared: those of a whole fit."""
-    surface_steps: Natural = 100
+    trial_surfaces: Natural = 100
     """Steps of the fit of surfaces that follow, where matter has one known level."""
     cells: bool = True
     """Whether red cells, where the network knows these alone and beams are two, are also looked for by their shape at

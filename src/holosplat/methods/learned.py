@@ -132,10 +132,10 @@ class _Fits:
         )
         start, how, found = self.starts[name], self.options.learned, None
         if isinstance(start, SurfaceMesh):
-            found = _settled(task, start, how.surface_steps)
+            found = _settled(task, start, how.trial_surfaces)
         else:
-            start = self.fitted(task, start, how.steps)
-            found = _surfaces(task, start, how.surface_steps) if task.bounded else None
+            start = self.fitted(task, start, how.trial_steps)
+            found = _surfaces(task, start, how.trial_surfaces) if task.bounded else None
         samples = 0 if found is None else oversampling(seen)
         return score_of(from_numpy(unseen.frames), predicted_frames(unseen.exposures, found or start, samples))
 
