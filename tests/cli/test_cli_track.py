@@ -38,7 +38,7 @@ def folder(tmp_path_factory) -> Path:
     how = (*KNOWN, "--effort", "0.2", "--pieces", "1", "--rounds", "0")
     with undrawn():
         said = worked_by("track", folder / "scan.nxs", *how, "--out", folder / "run")
-    assert "start: bodies that tomography shows at single times" in said.out
+    assert "start: bodies at single times: tomography (frames of one time: network's guess -" in said.out
     return folder
 
 
@@ -59,7 +59,7 @@ def test_a_run_has_its_bodies_and_tracks(folder):
     summary = json.loads((run / "summary.json").read_text())
     assert summary["times_s"] == pytest.approx(STEP * np.arange(TIMES))
     assert summary["kind"] == "moving-surfaces"
-    assert summary["decided"]["begun"].startswith("bodies that tomography shows")
+    assert summary["decided"]["begun"].startswith("bodies at single times: tomography (")
     assert (run / "report.html").is_file()
 
 
@@ -156,7 +156,7 @@ def test_all_times_open_in_paraview(folder):
 
 
 def test_folders_of_all_times_are_replaced_by_force_alone(folder):
-    out = folder / "again"
+    out = folder / "times"
     out.mkdir()
     command = ["export", folder / "run", "--time-frame", "all", "--bodies", out / "b"]
     worked_by(*command)
