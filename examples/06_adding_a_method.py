@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import holosplat as hs
-from holosplat.methods import Stage, Task
+from holosplat.methods import Method, Stage, Task
 from holosplat.representations import Stored, VoxelGrid
 
 
@@ -31,7 +31,7 @@ class Threshold:
 
 
 @dataclass(frozen=True)
-class Thresholded:
+class Thresholded(Method):
     """Phase retrieval and tomography, then a threshold of the occupancy at `level`."""
 
     kind: ClassVar[str] = "thresholded"

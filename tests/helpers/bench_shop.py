@@ -43,13 +43,16 @@ def voxels(scan: hs.Scan, value: float = 1.0) -> VoxelGrid:
 
 
 @dataclass(frozen=True)
-class Fake:
+class Fake(hs.methods.Method):
     """Options of a method with one stage, without a fit."""
 
     act: Callable[[Task], hs.volume.Object]
     kind: ClassVar[str] = "fake"
     name: ClassVar[str] = "fake"
-    wants_levels: ClassVar[bool] = False
+
+    @property
+    def wants_levels(self) -> bool:
+        return False
 
     def stages(self) -> tuple[Fake]:
         return (self,)

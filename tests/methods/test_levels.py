@@ -15,7 +15,7 @@ from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
-from holosplat.methods import Auto, Gaussians, Task, settled
+from holosplat.methods import Auto, Gaussians, Method, Task, settled
 from holosplat.methods.cross_validation import MissingMatter
 from holosplat.methods.levels import CONTINUOUS, LEVELS, decide_matter, flattened
 from holosplat.representations import Stored, VoxelGrid
@@ -79,7 +79,7 @@ def test_noise_that_hides_the_matter_leaves_the_null(soft, sharp):
 
 
 @dataclass(frozen=True)
-class Answer:
+class Answer(Method):
     """A method that finds a given object, on whatever frames."""
 
     kind: ClassVar[str] = "answer"

@@ -81,13 +81,13 @@ class Keeper:
         best = self.best
         if best is None:
             return True
-        same = best.object.kind == latest.object.kind
-        if not (fitted and (self.mixed or same)):
-            return not (same and _lost(latest.predicted, best.predicted))
-        measured = torch.from_numpy(self.train.frames)
+        same, measured = best.object.kind == latest.object.kind, torch.from_numpy(self.train.frames)
         earlier, later = (Score.of(measured - each.predicted) for each in (best, latest))
-        self.compared.append(Compared(best.name, *earlier.gain_over(later)))
-        return not self.compared[-1].wins
+        compared = Compared(best.name, *earlier.gain_over(later))
+        if not (fitted and (self.mixed or same)):
+            return not (same and compared.wins and _lost(latest.predicted, best.predicted))
+        self.compared.append(compared)
+        return not compared.wins
 
     def state_dict(self) -> dict[str, Any] | None:
         """What `load` needs; None before the first state."""
