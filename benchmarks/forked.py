@@ -123,11 +123,11 @@ def _code(act: Callable[[], None]) -> int:
 
 
 NEEDED = (
-    "bench.specimens beamline.grow beamline.record beamline.simulate io.formats io.objects io.volumes io.nxtomo "
-    "methods.presets report.run specimens.red_cells workflows.correct workflows.evaluate workflows.join "
-    "workflows.reconstruct workflows.track report.moving report.motion_blocks bench.run bench.methods bench.pages "
-    "align.views"
+    "beamline.declared.specimens beamline.grow beamline.record beamline.simulate io.formats io.objects io.volumes "
+    "io.nxtomo methods.presets report.run specimens.red_cells workflows.correct workflows.evaluate workflows.join "
+    "workflows.reconstruct workflows.track report.moving report.motion_blocks align.views"
 )
+OF_BENCHMARK = ("run", "methods", "pages")
 
 
 def loaded() -> None:
@@ -136,6 +136,8 @@ def loaded() -> None:
         command(name)
     for name in NEEDED.split():
         import_module(f"holosplat.{name}")
+    for name in OF_BENCHMARK:
+        import_module(f"holosplat_bench.suite.{name}")
     import_module("torch._dynamo")
     import_module("matplotlib.figure").Figure.savefig = _blank
 

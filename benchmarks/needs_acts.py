@@ -43,6 +43,7 @@ from holosplat.specimens.red_cells import random_cells
 from holosplat.training.ranges import Ranges
 from holosplat_bench.suite.case import planned_frames
 from holosplat_bench.suite.methods import METHODS as BENCH_METHODS
+from holosplat_bench.suite.needs import of_methods
 
 PIXEL, STEP = 3.2e-6, 1e-4
 """Of frames [m], and between two times [s]."""
@@ -214,7 +215,7 @@ def said_of_bench(sizes: Sizes) -> Needs:
     with tempfile.TemporaryDirectory() as name:
         planned = planned_frames(case(Path(name), sizes))
     samples = Simulation().samples(planned[0])
-    return acts.of_methods(*planned, samples, [BENCH_METHODS[method].options for method in COMPARED])
+    return of_methods(*planned, samples, [BENCH_METHODS[method].options for method in COMPARED])
 
 
 def said_of_dataset(sizes: Sizes) -> Needs:

@@ -23,6 +23,7 @@ from holosplat.motion.track_options import TrackOptions
 from holosplat.planning import acts
 from holosplat.planning.needs import Needs, Sizes, coarser, of_fit, of_reconstruction
 from holosplat.scan import Exposures
+from holosplat_bench.suite.needs import of_benchmark, of_methods
 
 ROOT = Path(__file__).resolve().parents[2]
 TABLE = ROOT / "docs/data/needs_acts.csv"
@@ -131,9 +132,9 @@ def test_a_wider_network_and_more_views_take_more():
 def test_a_benchmark_takes_the_memory_of_its_largest_case_and_the_time_of_all():
     planned, is_test = series((64, 71), 8, 1), np.arange(8) % 4 == 3
     methods = [METHODS["tikhonov-tv"], METHODS["gaussians"]]
-    small, both = (acts.of_methods(planned, is_test, 4, methods[:k]) for k in (1, 2))
+    small, both = (of_methods(planned, is_test, 4, methods[:k]) for k in (1, 2))
     assert both.seconds > small.seconds
-    total = acts.of_benchmark([small, both, replace(small, memory=3e9)])
+    total = of_benchmark([small, both, replace(small, memory=3e9)])
     assert total.memory == 3e9
     assert total.disk == pytest.approx(2 * small.disk + both.disk)
     assert total.seconds == pytest.approx(2 * small.seconds + both.seconds)

@@ -178,7 +178,7 @@ def test_snapshots_that_cannot_be_are_refused(tmp_path):
         ([pvd, files[0]], {}, "must be given alone"),
         ([pvd], {}, "a_001.vtk and .*a_000.vtk are the same body"),
         (files, {"time_unit": "s"}, "goes with a collection"),
-        ([folder / "none.pvd"], {}, "No such file"),
+        ([folder / "none.pvd"], {}, "there is no such file"),
         ([collection(folder / "e.pvd", [])], {}, "must name at least one file"),
         ([collection(folder / "f.pvd", [("soon", "a_000.vtk")])], {}, "timestep of 'a_000.vtk' must be a number"),
         ([collection(folder / "g.pvd", [(0, "gone.vtk")])], {}, "names 'gone.vtk'"),
