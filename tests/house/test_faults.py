@@ -35,6 +35,7 @@ def shop(faults, tmp_path_factory):
     write_mesh(path / "cell.vtk", cell, "um")
     made = faults.Shop(path, (path / "cell.vtk",))
     made.quick.write_text(json.dumps(shop.QUICK))
+    made.case.write_text(shop.two_cells(shop.ROWS, shop.COLUMNS, shop.PIXEL, 24e-6, 5))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Figure, "savefig", Figure.savefig)  # which is put back in the end
         faults.loaded()
