@@ -44,7 +44,7 @@ def test_bodies_are_tracked(monkeypatch):
     [
         ({"how": MethodOptions(method="voxels")}, LiveFlags(), "--method"),
         ({"how": MethodOptions(matter="levels")}, LiveFlags(), "--matter"),
-        ({}, LiveFlags(view=True), "--view"),
+        ({}, LiveFlags(view=True), "them, or choose a time"),
     ],
 )
 def test_bodies_refuse_what_they_cannot_do(change, live, name):

@@ -157,7 +157,8 @@ def test_cells_are_begun_with_where_they_do_better(monkeypatch, better, of):
     made = SurfaceMesh(vertices, torch.from_numpy(faces), PIXEL, Matter.one(*MATERIAL))
     asked = []
     monkeypatch.setattr(methods_learned, "red_cells", lambda *given: asked.append(given) or made)
-    powers = {methods_learned.CELLS: 0.5 if better else 2.0}
+    taken = better and of == ["red-cells"]
+    powers = {methods_learned.CELLS: 0.5 if better else 2.0, methods_learned.GUESS: 0.5 if taken else 1.0}
 
     def left(self, name: str) -> Score:
         return Score(powers.get(name, 1.0) * np.ones((8, 3)), 2)
@@ -166,7 +167,6 @@ def test_cells_are_begun_with_where_they_do_better(monkeypatch, better, of):
     told = list[Decision]()
     task = Task(scan, PRIOR, on_start=lambda decision, guess: told.append(decision))
     begun = BodiesStage(Gaussians(start="learned").with_effort(0.05)).start(task, None)
-    taken = better and of == ["red-cells"]
     assert len(asked) == (of == ["red-cells"])
     assert told[0].choice == (methods_learned.CELLS if taken else methods_learned.PLAIN)
     assert (isinstance(begun, Near) and begun.object is made) == taken

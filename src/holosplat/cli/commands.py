@@ -57,11 +57,11 @@ class Asked:
         shared = {"light": self.illumination.options(), "seed": seed}
         return Settings("reconstruct", method, self.how.kind_of_matter(), **shared)
 
-    def require_bodies(self, method: Method, watched: bool) -> None:
+    def require_bodies(self, method: Method) -> None:
         """`InputError` for what --motion bodies cannot be asked."""
         from ..methods import Auto
 
-        stray = {"--view and --strict": watched, "--refine": self.geometry.options() is not None}
+        stray = {"--refine": self.geometry.options() is not None}
         stray |= {"--method": not isinstance(method, Auto), "--matter": self.how.kind_of_matter() is not None}
         for name, given in stray.items():
             require(not given, f"--motion bodies follows closed bodies through all times; leave {name}.")
@@ -116,18 +116,9 @@ def reconstruct(
 
     method, reading = asked.how.chosen(), asked.motion.applied(reading)
     asked.motion.require_all(reading)
-    if asked.motion.motion == "bodies":
-        from .track import track
-
-        asked.require_bodies(method, live.view or strict)
-        track(scan, out, asked.matter, seed=seed, resume=resume, reading=reading, illumination=asked.illumination)
-        return
-    if reading.part.time_frame == "each":
-        from .each_time import reconstruct_each
-
+    if asked.motion.motion == "bodies" or reading.part.time_frame == "each":
         require(not (live.view or strict), "--view and --strict are of one time; leave them, or choose a time.")
-        settings = asked.each_time(method, reading, seed)
-        reconstruct_each(scan, out, settings, asked.matter.prior, reading, resume)
+        _time_by_time(scan, out, asked, reading, seed, resume)
         return
     if method.of_series and reading.part.time_frame == "all":
         reading = replace(reading, part=replace(reading.part, time_frame=None))
@@ -156,6 +147,20 @@ def reconstruct(
     _print_scores(evaluation)
     _print_result(folder, result, report)
     _end(result, out, strict)
+
+
+def _time_by_time(scan: Path, out: Path, asked: Asked, reading: Reading, seed: int, resume: bool) -> None:
+    """Bodies followed through all times, or a run for each time."""
+    from .each_time import reconstruct_each
+    from .track import track
+
+    method = asked.how.chosen()
+    if asked.motion.motion == "bodies":
+        asked.require_bodies(method)
+        track(scan, out, asked.matter, seed=seed, resume=resume, reading=reading, illumination=asked.illumination)
+    else:
+        settings = asked.each_time(method, reading, seed)
+        reconstruct_each(scan, out, settings, asked.matter.prior, reading, resume)
 
 
 def _scored(
