@@ -40,7 +40,8 @@ from rows import machine, read, replaced, shown
 import holosplat as hs
 from holosplat.matter import MatterKind
 from holosplat.methods import Auto
-from holosplat.methods.illumination import NULL, STAGE, prepared
+from holosplat.methods.illumination import STAGE, prepared
+from holosplat.methods.trials import NULL
 from holosplat.methods.levels import CONTINUOUS, NAME
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "decision_families.csv"

@@ -11,7 +11,8 @@ from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import METHODS, PerView, Task
 from holosplat.methods.contrast import ABOVE, BELOW, STAGE, decide_sign
-from holosplat.methods.illumination import first_of_task, prepared
+from holosplat.methods.illumination import prepared
+from holosplat.methods.trials import first_of_task
 from holosplat.metrics import volume_scores
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens import Bubbles, MeshScene, random_bubbles

@@ -5,21 +5,19 @@ Each is carried as far as a volume, and taken only where this predicts unseen me
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ..backends import Backend, resolve
+from ..backends import resolve
 from ..baselines import HolographicTV, holographic_tv
 from ..checks import InputError, require
-from ..inference import MARGIN, Decision, Score, select
+from ..inference import Decision, Score, select
 from ..matter import MaterialPrior, Matter
-from ..optics.background import FLUX, Background, Light, LightOptions
-from ..optics.noise_model import NoiseModel
-from ..optics.still_light import fixed_pattern
+from ..optics.background import FLUX, Light, LightOptions
 from ..progress import Progress
 from ..representations import VoxelGrid
 from ..scan import Scan
@@ -27,148 +25,21 @@ from .assumed import assumed_material
 from .contrast import STAGE as SIGN
 from .contrast import Scoring, decide_sign, with_sign
 from .cross_validation import predicted_frames
-from .first_volumes import BY_FISSION, FirstVolumes, Folds, lit_by_halves, predictions, score_of
+from .first_volumes import BY_FISSION, FirstVolumes
+from .levels import TrialFits
 from .method import Method, Task
+from .trials import UNEVEN, Hypothesis, Trials, first_of_task, name_of, named, plain_light, rivals, with_more
+from .volume import SmoothVolume
 
 STAGE = "light and noise"
-NULL = "as measured"
-UNEVEN = "uneven light"
 HYPOTHESES = ("fixed pattern", FLUX, UNEVEN, "correlated noise")
 """What may be added to the null, in this order where several predict alike."""
-FREE = "; of unseen frames free: "
-"""Beside light of each frame's own: the volume before it, whose prediction is allowed the same light."""
 
-Hypothesis = tuple[str, ...]
-"""What is added to the null, in the order in which it was taken."""
-
+EFFORT = 0.2
+"""Part of the usual steps of a fit that confirms a hypothesis: what it is compared with has as many."""
 
 Prepared = tuple[Hypothesis, tuple[Decision, ...]]
 """What was taken, and the decisions that led to it."""
-
-
-@dataclass(frozen=True)
-class Trial:
-    """A hypothesis in a fold. volume: by the fitted frames `seen`; light: what the hypothesis says of these; unseen,
-    expected: the frames that are not fitted, and what the volume predicts for them in even light"""
-
-    volume: VoxelGrid
-    light: Light
-    seen: Scan
-    unseen: Scan
-    expected: Tensor
-
-    @property
-    def measured(self) -> Tensor:
-        """The unseen frames [V, H, W]."""
-        return torch.from_numpy(self.unseen.frames)
-
-    @cached_property
-    def predicted(self) -> Tensor:
-        """The fitted frames [V, H, W] as the volume has them in even light."""
-        return predictions(self.volume, self.seen)
-
-    def of(self, expected: Tensor) -> Trial:
-        """The same with another prediction of the unseen frames."""
-        return replace(self, expected=expected)
-
-    def score(self, light: Light) -> Score:
-        """Of the unseen frames in such light as `light` is."""
-        measured = self.measured if light.still is None else (self.measured / light.still).to(self.measured.dtype)
-        known = light.background
-        lit = self.expected.double() if known is None else lit_by_halves(measured, self.expected, known)
-        return score_of(self.measured, lit if light.still is None else lit * light.still)
-
-
-class Trials:
-    """The hypotheses about some frames, each carried to a volume in every fold that is asked for."""
-
-    def __init__(self, first: FirstVolumes, options: LightOptions) -> None:
-        self._first, self._options = first, options
-
-    def tried(self, hypothesis: Hypothesis, fold: int) -> Trial:
-        """The volume and the score of a hypothesis."""
-        return self._first.once(("light", hypothesis), fold, lambda: self._made(hypothesis, fold))
-
-    def proposed(self, hypothesis: Hypothesis, fold: int = 0) -> bool:
-        """Whether the last part of a hypothesis changes frames by more than the margin of what is left without it: a
-        smaller correction could not take that away, and needs no volume."""
-        before = self.tried(hypothesis[:-1], fold)
-        light = self._light(hypothesis, fold)
-        if light is None:
-            return False
-        change = (light.factor() / before.light.factor() - 1).square().mean()
-        left = before.light.evened(torch.from_numpy(before.seen.frames)) - before.predicted
-        power = float(change) + max(light.noise.grain_level**2 - before.light.noise.grain_level**2, 0.0)
-        return power > MARGIN**2 * float(left.double().square().mean())
-
-    def score(self, name: str, fold: int) -> Score:
-        """That of a hypothesis by its name."""
-        plain, _, free = name.partition(FREE)
-        parts = () if plain == NULL else tuple(plain.split(" and "))
-        tried = self.tried(parts, fold)
-        if not free:
-            return tried.score(tried.light)
-        known = self._light((*parts, free), fold)
-        assert known is not None  # it was proposed
-        return tried.score(known)
-
-    def _light(self, hypothesis: Hypothesis, fold: int) -> Light | None:
-        """What a hypothesis says of the fitted frames, by the volume without its last part; None where it cannot be."""
-        return self._first.once(("light of", hypothesis), fold, lambda: self._found(hypothesis, fold))
-
-    def _found(self, hypothesis: Hypothesis, fold: int) -> Light | None:
-        if not hypothesis:
-            frames = torch.from_numpy(self._first.folds.split(fold)[0].frames)
-            return plain_light(frames, self._options)
-        before = self.tried(hypothesis[:-1], fold)
-        return with_more(before.light, hypothesis[-1], before.seen, before.predicted, self._options)
-
-    def _made(self, hypothesis: Hypothesis, fold: int) -> Trial:
-        seen, unseen = self._first.folds.split(fold)
-        light = self._light(hypothesis, fold)
-        assert light is not None
-        volume = self._first.volume(seen, light)
-        return Trial(volume, light, seen, unseen, predictions(volume, unseen))
-
-
-def first_of_task(task: Task, backend: Backend = "auto") -> FirstVolumes:
-    """The first volumes that the decisions of a task share, computed by `backend` where they are new."""
-    if task.first is not None:
-        return task.first
-    one_time = task.scan.at_instant(len(task.scan.instants) // 2) if task.scan.is_series else task.scan
-    found = FirstVolumes(Folds.of(one_time), task.prior, task.on_progress)
-    return replace(found, options=replace(found.options, backend=backend))
-
-
-def accepted(task: Task, first: FirstVolumes, fold: int) -> Trial:
-    """The trial of what was decided of light and noise, in a fold."""
-    return Trials(first, task.light).tried(first.taken, fold)
-
-
-def plain_light(frames: Tensor, options: LightOptions) -> Light:
-    """Even light and white noise."""
-    air = options.air_of(frames)
-    return Light(air, NoiseModel.of_frames(frames, air), None)
-
-
-def with_more(light: Light, hypothesis: str, seen: Scan, predicted: Tensor, options: LightOptions) -> Light | None:
-    """`light` and what a hypothesis adds to it, by frames and their prediction [V, H, W] in even light; None where it
-    cannot be: a pattern of one frame, or light where none shows air."""
-    frames = torch.from_numpy(seen.frames)
-    if hypothesis == "fixed pattern":
-        return replace(light, still=fixed_pattern(light.evened(frames), predicted)) if len(seen) > 1 else None
-    if hypothesis == "correlated noise":
-        return replace(light, noise=NoiseModel.of_residuals(light.evened(frames), predicted))
-    if hypothesis == FLUX:
-        known = light.background is not None  # then it holds the flux
-        return None if known else replace(light, background=Background.of_flux(light.evened(frames), predicted))
-    try:
-        found = Light.of(
-            frames if light.still is None else (frames / light.still).float(), replace(options, kind="smooth")
-        )
-    except InputError:  # no frame shows air
-        return None
-    return replace(found, still=light.still)
 
 
 def decided(
@@ -179,15 +50,28 @@ def decided(
     if first.folds.by == BY_FISSION:  # of two views, a pattern is what volumes leave in both
         hypotheses = tuple(one for one in hypotheses if one != "fixed pattern")
     while left := [one for one in hypotheses if one not in taken and trials.proposed((*taken, one))]:
-        null = " and ".join(taken) or NULL
-        names = [" and ".join((*taken, one)) for one in left]
-        beside = {name: (null + FREE + one,) for name, one in zip(names, left) if one in (FLUX, UNEVEN)}
+        null, names = name_of(taken), [name_of((*taken, one)) for one in left]
+        beside = {name: rivals(taken, one) for name, one in zip(names, left)}
         decision = select(STAGE, (null, *names), trials.score, first.folds.count, by=first.folds.by, beside=beside)
         made.append(decision)
         if decision.choice == null:
             break
-        taken = tuple(decision.choice.split(" and "))
+        taken = named(decision.choice)
     return taken, tuple(made)
+
+
+def confirmed(task: Task, first: FirstVolumes, told: Hypothesis) -> Decision:
+    """What first volumes have taken of light and noise beside what is told, against fits of smooth volumes.
+
+    A first volume gains by a hypothesis that only steadies it: what it leaves of matter passes for correlated noise, or
+    for light. A fit through the waves, in units of the noise, leaves less.
+    """
+    fits = TrialFits(task, first, {"continuous": SmoothVolume().with_effort(EFFORT)})
+    counts = range(len(told), len(first.taken))
+    candidates = [name_of(first.taken[:count]) for count in (*counts, len(first.taken))]
+    beside = {name_of(first.taken[: n + 1]): rivals(first.taken[:n], first.taken[n]) for n in counts}
+    by = f"{first.folds.by}, by fits"
+    return select(STAGE, candidates, lambda name, fold: fits.score(name, "continuous", fold), by=by, beside=beside)
 
 
 def prepared(task: Task, method: Method | None = None, before: Prepared | None = None) -> Task:
@@ -224,6 +108,9 @@ def prepared(task: Task, method: Method | None = None, before: Prepared | None =
     if before is None:
         task.on_progress(STAGE, 0.0)
         first.taken, made = decided(first, options, told, tuple(open_to))
+        if method is not None and first.taken != told and not method.of_series:
+            decision = confirmed(task, first, told)
+            first.taken, made = named(decision.choice), (*made, decision)
         if options.noise == "correlated":
             first.taken = (*first.taken, "correlated noise")
     else:

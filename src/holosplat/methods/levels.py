@@ -22,8 +22,8 @@ from ..inference import Decision, Score, select
 from ..matter import KnownTwo, MaterialPrior, MatterKind
 from ..representations import VoxelGrid
 from .first_volumes import BY_FISSION, FirstVolumes, predictions
-from .illumination import Trial, accepted, first_of_task
 from .method import Method, Task, solve_stages
+from .trials import EMPTY, FREE, Trial, Trials, accepted, first_of_task, name_of, named
 
 STAGE = "levels or continuous matter"
 NAME = "matter"
@@ -55,8 +55,12 @@ def decide_matter(task: Task, methods: Mapping[MatterKind, Method] | None = None
     sure = found.choice != CONTINUOUS or (not known and all(each.loses for each in found.compared))
     if methods is None or sure:
         return found
-    fits = _Fits(task, first, methods)
-    return select(NAME, candidates, fits.score, by=f"{first.folds.by}, by fits")
+    fits = TrialFits(task, first, methods)
+
+    def scored(name: str, fold: int) -> Score:
+        return fits.score(name_of(first.taken), kind_of(name), fold, two=name == LEVELS[1])
+
+    return select(NAME, candidates, scored, by=f"{first.folds.by}, by fits")
 
 
 class _FlatVolumes:
@@ -92,26 +96,36 @@ class _FlatVolumes:
         return trial, [one.on(trial.volume.backend) for one in flat]
 
 
-class _Fits:
-    """Fits of the methods for either kind of matter to the frames of the first fold.
+class TrialFits:
+    """Fits of the methods for either kind of matter to coarse frames, under hypotheses about light and noise.
 
     Two levels alone need no ratio δ/β; else it is, where nothing is known, that of the first volume.
     """
 
     def __init__(self, task: Task, first: FirstVolumes, methods: Mapping[MatterKind, Method]) -> None:
-        self._task, self._methods = task, methods
-        self._trial = accepted(task, first, 0)
-        self._ratio = MaterialPrior.of_ratio(first.material.ratio, task.prior.sign)
+        self._task, self._first, self._methods = task, first, methods
+        self._trials = Trials(first, task.light)
 
-    def score(self, name: str, fold: int) -> Score:
-        """Of the fit for one kind of matter."""
-        assert fold == 0
-        trial, kind = self._trial, kind_of(name)
-        self._task.on_progress(f"{STAGE}: {self._methods[kind].kind}", 0.0)
+    def score(self, name: str, kind: MatterKind, fold: int, two: bool = False) -> Score:
+        """Of the fit for a `kind` of matter (two: of two levels) to the fitted frames of a fold, under the hypothesis
+        that has this `name`, or as a rival of one (`trials.rivals`)."""
+        hypothesis = named(name.partition(FREE)[0])
+        if name.endswith(EMPTY):
+            return self._trials.score(name, fold)
+        trial = self._trials.tried(hypothesis, fold)
+        expected = self._first.once(("fit", hypothesis, kind, two), fold, lambda: self._fitted(trial, kind, two))
+        return trial.of(expected).score(self._trials.light_allowed(name, fold))
+
+    def _fitted(self, trial: Trial, kind: MatterKind, two: bool) -> Tensor:
+        """What a fit predicts for the unseen frames."""
+        task, method = self._task, self._methods[kind]
+        task.on_progress(f"fit of coarse frames: {method.kind}", 0.0)
         seen = replace(trial.seen, frames=trial.light.evened(torch.from_numpy(trial.seen.frames)).numpy())
-        prior = self._task.prior if self._task.prior.fixes_ratio or name == LEVELS[1] else self._ratio
-        task = replace(self._task, scan=seen, prior=prior, lit=trial.light, matter=kind, first=None)
-        return trial.of(predictions(solve_stages(self._methods[kind], task), trial.unseen)).score(trial.light)
+        prior = task.prior
+        if not (prior.fixes_ratio or two):
+            prior = MaterialPrior.of_ratio(self._first.material.ratio, prior.sign)
+        fitted = replace(task, scan=seen, prior=prior, lit=trial.light, matter=kind, first=None)
+        return predictions(solve_stages(method, fitted), trial.unseen)
 
 
 def kind_of(choice: str) -> MatterKind:

@@ -1,0 +1,177 @@
+"""Hypotheses about light and noise, each carried as far as a volume in every fold of the coarse frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from ..backends import Backend
+from ..checks import InputError
+from ..inference import MARGIN, Score
+from ..optics.background import FLUX, Background, Light, LightOptions
+from ..optics.noise_model import NoiseModel
+from ..optics.still_light import fixed_pattern
+from ..representations import VoxelGrid
+from ..scan import Scan
+from .first_volumes import FirstVolumes, Folds, lit_by_halves, predictions, score_of
+from .method import Task
+
+NULL = "as measured"
+UNEVEN = "uneven light"
+FREE = "; of unseen frames free: "
+"""A rival of light of each frame's own: the volume before it, whose prediction is allowed the same light."""
+EMPTY = ", without matter"
+"""A rival of every hypothesis: its light and noise alone. What predicts no better has silenced the matter."""
+
+Hypothesis = tuple[str, ...]
+"""What is added to the null, in the order in which it was taken."""
+
+
+def name_of(hypothesis: Hypothesis) -> str:
+    """What a decision calls it."""
+    return " and ".join(hypothesis) or NULL
+
+
+def named(name: str) -> Hypothesis:
+    """The hypothesis of a name that `name_of` gave."""
+    return () if name == NULL else tuple(name.split(" and "))
+
+
+def rivals(before: Hypothesis, one: str) -> tuple[str, ...]:
+    """What `one` must win against beside the hypothesis `before` it: light and noise alone; and, where it is light of
+    each frame's own, the volume before it in such light."""
+    free = (name_of(before) + FREE + one,) if one in (FLUX, UNEVEN) else ()
+    return (name_of((*before, one)) + EMPTY, *free)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A hypothesis in a fold. volume: by the fitted frames `seen`; light: what the hypothesis says of these; unseen,
+    expected: the frames that are not fitted, and what the volume predicts for them in even light"""
+
+    volume: VoxelGrid
+    light: Light
+    seen: Scan
+    unseen: Scan
+    expected: Tensor
+
+    @property
+    def measured(self) -> Tensor:
+        """The unseen frames [V, H, W]."""
+        return torch.from_numpy(self.unseen.frames)
+
+    @cached_property
+    def predicted(self) -> Tensor:
+        """The fitted frames [V, H, W] as the volume has them in even light."""
+        return predictions(self.volume, self.seen)
+
+    def of(self, expected: Tensor) -> Trial:
+        """The same with another prediction of the unseen frames."""
+        return replace(self, expected=expected)
+
+    def score(self, light: Light) -> Score:
+        """Of the unseen frames in such light as `light` is."""
+        measured = self.measured if light.still is None else (self.measured / light.still).to(self.measured.dtype)
+        known = light.background
+        lit = self.expected.double() if known is None else lit_by_halves(measured, self.expected, known)
+        return score_of(self.measured, lit if light.still is None else lit * light.still)
+
+
+class Trials:
+    """The hypotheses about some frames, each carried to a volume in every fold that is asked for."""
+
+    def __init__(self, first: FirstVolumes, options: LightOptions) -> None:
+        self._first, self._options = first, options
+
+    def tried(self, hypothesis: Hypothesis, fold: int) -> Trial:
+        """The volume and the score of a hypothesis."""
+        return self._first.once(("light", hypothesis), fold, lambda: self._made(hypothesis, fold))
+
+    def proposed(self, hypothesis: Hypothesis, fold: int = 0) -> bool:
+        """Whether the last part of a hypothesis changes frames by more than the margin of what is left without it: a
+        smaller correction could not take that away, and needs no volume."""
+        before = self.tried(hypothesis[:-1], fold)
+        light = self._light(hypothesis, fold)
+        if light is None:
+            return False
+        change = (light.factor() / before.light.factor() - 1).square().mean()
+        left = before.light.evened(torch.from_numpy(before.seen.frames)) - before.predicted
+        power = float(change) + max(light.noise.grain_level**2 - before.light.noise.grain_level**2, 0.0)
+        return power > MARGIN**2 * float(left.double().square().mean())
+
+    def score(self, name: str, fold: int) -> Score:
+        """That of a hypothesis by its name, or of one of its `rivals`."""
+        plain = name.removesuffix(EMPTY).partition(FREE)[0]
+        trial = self.tried(named(plain), fold)
+        if name.endswith(EMPTY):
+            trial = trial.of(torch.ones_like(trial.expected))
+        return trial.score(self.light_allowed(name, fold))
+
+    def light_allowed(self, name: str, fold: int) -> Light:
+        """The light in which a hypothesis, or a rival of it, predicts unseen frames."""
+        plain, _, free = name.removesuffix(EMPTY).partition(FREE)
+        parts = named(plain)
+        light = self._light((*parts, free) if free else parts, fold)
+        assert light is not None  # it was proposed
+        return light
+
+    def _light(self, hypothesis: Hypothesis, fold: int) -> Light | None:
+        """What a hypothesis says of the fitted frames, by the volume without its last part; None where it cannot be."""
+        return self._first.once(("light of", hypothesis), fold, lambda: self._found(hypothesis, fold))
+
+    def _found(self, hypothesis: Hypothesis, fold: int) -> Light | None:
+        if not hypothesis:
+            frames = torch.from_numpy(self._first.folds.split(fold)[0].frames)
+            return plain_light(frames, self._options)
+        before = self.tried(hypothesis[:-1], fold)
+        return with_more(before.light, hypothesis[-1], before.seen, before.predicted, self._options)
+
+    def _made(self, hypothesis: Hypothesis, fold: int) -> Trial:
+        seen, unseen = self._first.folds.split(fold)
+        light = self._light(hypothesis, fold)
+        assert light is not None
+        volume = self._first.volume(seen, light)
+        return Trial(volume, light, seen, unseen, predictions(volume, unseen))
+
+
+def first_of_task(task: Task, backend: Backend = "auto") -> FirstVolumes:
+    """The first volumes that the decisions of a task share, computed by `backend` where they are new."""
+    if task.first is not None:
+        return task.first
+    one_time = task.scan.at_instant(len(task.scan.instants) // 2) if task.scan.is_series else task.scan
+    found = FirstVolumes(Folds.of(one_time), task.prior, task.on_progress)
+    return replace(found, options=replace(found.options, backend=backend))
+
+
+def accepted(task: Task, first: FirstVolumes, fold: int) -> Trial:
+    """The trial of what was decided of light and noise, in a fold."""
+    return Trials(first, task.light).tried(first.taken, fold)
+
+
+def plain_light(frames: Tensor, options: LightOptions) -> Light:
+    """Even light and white noise."""
+    air = options.air_of(frames)
+    return Light(air, NoiseModel.of_frames(frames, air), None)
+
+
+def with_more(light: Light, hypothesis: str, seen: Scan, predicted: Tensor, options: LightOptions) -> Light | None:
+    """`light` and what a hypothesis adds to it, by frames and their prediction [V, H, W] in even light; None where it
+    cannot be: a pattern of one frame, or light where none shows air."""
+    frames = torch.from_numpy(seen.frames)
+    if hypothesis == "fixed pattern":
+        return replace(light, still=fixed_pattern(light.evened(frames), predicted)) if len(seen) > 1 else None
+    if hypothesis == "correlated noise":
+        return replace(light, noise=NoiseModel.of_residuals(light.evened(frames), predicted))
+    if hypothesis == FLUX:
+        known = light.background is not None  # then it holds the flux
+        return None if known else replace(light, background=Background.of_flux(light.evened(frames), predicted))
+    try:
+        found = Light.of(
+            frames if light.still is None else (frames / light.still).float(), replace(options, kind="smooth")
+        )
+    except InputError:  # no frame shows air
+        return None
+    return replace(found, still=light.still)
