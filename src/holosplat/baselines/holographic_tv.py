@@ -230,12 +230,8 @@ def _settled(
         misfit = replace(after, noise=first).misfit(measured, predicted)
         if best is not None and misfit >= least:
             break
-        best, least = (scan, light, solver), misfit
-        if (
-            after.background is not None and not after.background.is_flux
-        ):  # smooth modes are not all of uneven light: the rest of it is correlated noise
-            after = replace(after, noise=NoiseModel.of_residuals(after.evened(measured), predicted))
-        light = after
+        noise = NoiseModel.of_residuals(after.evened(measured), predicted)
+        best, least, light = (scan, light, solver), misfit, replace(after, noise=noise)
     assert best is not None
     return best
 

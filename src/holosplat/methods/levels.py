@@ -23,7 +23,7 @@ from ..matter import KnownTwo, MaterialPrior, MatterKind
 from ..representations import VoxelGrid
 from .first_volumes import BY_FISSION, FirstVolumes, predictions
 from .method import Method, Task, solve_stages
-from .trials import EMPTY, FREE, Trial, Trials, accepted, first_of_task, name_of, named
+from .trials import FREE, Trial, Trials, accepted, first_of_task, name_of, named
 
 STAGE = "levels or continuous matter"
 NAME = "matter"
@@ -110,8 +110,6 @@ class TrialFits:
         """Of the fit for a `kind` of matter (two: of two levels) to the fitted frames of a fold, under the hypothesis
         that has this `name`, or as a rival of one (`trials.rivals`)."""
         hypothesis = named(name.partition(FREE)[0])
-        if name.endswith(EMPTY):
-            return self._trials.score(name, fold)
         trial = self._trials.tried(hypothesis, fold)
         expected = self._first.once(("fit", hypothesis, kind, two), fold, lambda: self._fitted(trial, kind, two))
         return trial.of(expected).score(self._trials.light_allowed(name, fold))

@@ -23,8 +23,6 @@ NULL = "as measured"
 UNEVEN = "uneven light"
 FREE = "; of unseen frames free: "
 """A rival of light of each frame's own: the volume before it, whose prediction is allowed the same light."""
-EMPTY = ", without matter"
-"""A rival of every hypothesis: its light and noise alone. What predicts no better has silenced the matter."""
 
 Hypothesis = tuple[str, ...]
 """What is added to the null, in the order in which it was taken."""
@@ -41,10 +39,9 @@ def named(name: str) -> Hypothesis:
 
 
 def rivals(before: Hypothesis, one: str) -> tuple[str, ...]:
-    """What `one` must win against beside the hypothesis `before` it: light and noise alone; and, where it is light of
-    each frame's own, the volume before it in such light."""
-    free = (name_of(before) + FREE + one,) if one in (FLUX, UNEVEN) else ()
-    return (name_of((*before, one)) + EMPTY, *free)
+    """What `one` must win against beside the hypothesis `before` it: where it is light of each frame's own, the volume
+    before it in such light."""
+    return (name_of(before) + FREE + one,) if one in (FLUX, UNEVEN) else ()
 
 
 @dataclass(frozen=True)
@@ -104,17 +101,12 @@ class Trials:
 
     def score(self, name: str, fold: int) -> Score:
         """That of a hypothesis by its name, or of one of its `rivals`."""
-        plain = name.removesuffix(EMPTY).partition(FREE)[0]
-        trial = self.tried(named(plain), fold)
-        if name.endswith(EMPTY):
-            trial = trial.of(torch.ones_like(trial.expected))
-        return trial.score(self.light_allowed(name, fold))
+        return self.tried(named(name.partition(FREE)[0]), fold).score(self.light_allowed(name, fold))
 
     def light_allowed(self, name: str, fold: int) -> Light:
         """The light in which a hypothesis, or a rival of it, predicts unseen frames."""
-        plain, _, free = name.removesuffix(EMPTY).partition(FREE)
-        parts = named(plain)
-        light = self._light((*parts, free) if free else parts, fold)
+        plain, _, free = name.partition(FREE)
+        light = self._light((*named(plain), free) if free else named(plain), fold)
         assert light is not None  # it was proposed
         return light
 

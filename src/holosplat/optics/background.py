@@ -213,18 +213,14 @@ class Background:
         """Light that differs between frames [V, H, W] by a factor alone, by their means beside those `predicted` by a
         volume, which have one flux; even where these differ no more than by noise.
 
-        The noise of a mean is what the residual holds at the lowest frequencies beside it (`LOWEST`): noise and errors
-        of the volume are in all of them, a flux is in the mean alone. What the fluxes have in common, a volume takes
-        for absorption: the mean flux is as unsure as V draws leave it.
+        What they have in common, a volume takes for absorption: the mean flux is as unsure as V draws leave it.
         """
         shape, count = (frames.shape[-2], frames.shape[-1]), len(frames)
         ratio = frames.double().mean(dim=(1, 2)) / predicted.double().mean(dim=(1, 2))
         rest = frames.double() / ratio[:, None, None] - predicted.double()
-        lowest = smooth_modes(shape, LOWEST).double().flatten(1)[1:]
-        noise = (rest.flatten(1) @ lowest.T / math.prod(shape)).square().mean()
         powers = rest.square().mean(dim=(1, 2)).clamp_min(FAINTEST**2)
         flux = ratio.log() - ratio.log().mean()
-        variance = max(0.0, float(flux.square().sum() / max(count - 1, 1) - noise))
+        variance = max(0.0, float(flux.square().sum() / max(count - 1, 1) - powers.mean() / math.prod(shape)))
         level = torch.zeros((ORDER + 1) ** 2, dtype=torch.float64)
         level[0] = 1.0
         doubt = torch.diag(level * variance / count).expand(count, -1, -1)
