@@ -111,7 +111,8 @@ class TrialFits:
         that has this `name`, or as a rival of one (`trials.rivals`)."""
         hypothesis = named(name.partition(FREE)[0])
         trial = self._trials.tried(hypothesis, fold)
-        expected = self._first.once(("fit", hypothesis, kind, two), fold, lambda: self._fitted(trial, kind, two))
+        key = ("fit", hypothesis, self._methods[kind], two)
+        expected = self._first.once(key, fold, lambda: self._fitted(trial, kind, two))
         return trial.of(expected).score(self._trials.light_allowed(name, fold))
 
     def _fitted(self, trial: Trial, kind: MatterKind, two: bool) -> Tensor:
