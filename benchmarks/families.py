@@ -41,8 +41,8 @@ import holosplat as hs
 from holosplat.matter import MatterKind
 from holosplat.methods import Auto
 from holosplat.methods.illumination import STAGE, prepared
-from holosplat.methods.trials import NULL
 from holosplat.methods.levels import CONTINUOUS, NAME
+from holosplat.methods.trials import NULL
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "decision_families.csv"
 FIRST_OF_REPORTS = 101
