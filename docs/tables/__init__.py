@@ -237,6 +237,9 @@ TABLES |= {
     f"families-{name}": Table(make, ("decision_families.csv",), DECIDED, "an hour")
     for name, make in (("rules", runs.families_rules), ("scenes", runs.families_scenes))
 }
+TABLES["cell"] = Table(
+    measured.cell, ("measured_cell.csv",), "python benchmarks/measured_cell.py --data FOLDER", "a quarter of an hour"
+)
 TABLES["bed"] = Table(
     measured.bed, ("real_data.csv",), "python benchmarks/packed_bed.py --data FOLDER --work FOLDER", "an hour"
 )

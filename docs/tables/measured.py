@@ -107,3 +107,14 @@ def triangles() -> str:
         lines.append([*of, f"{float(row['seconds']):.0f}", *scores, row["stages"]])
     head = ("pixels", "photons", "seed", "triangles that are", "in all", "processor time / s", "SSIM", "FRCM", "Dice")
     return markdown((*head, "error of δ", "on the way"), lines)
+
+
+def cell() -> str:
+    """The living cell by default."""
+    lines = []
+    for row in read("measured_cell.csv"):
+        views, distance, photons, *unknown = row["case"].split("-")
+        errors = (row[name] for name in ("phase", "mass", "hologram", "seconds"))
+        lines.append([views, distance, photons if photons != "0" else "–", "nothing" if unknown else "δ/β", *errors])
+    head = ("views", "λz / pixel²", "photons", "told", "held-out phase", "total phase", "held-out hologram")
+    return markdown((*head, "processor / s"), lines)

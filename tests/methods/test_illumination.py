@@ -12,7 +12,7 @@ from holosplat.beamline.light import UnevenLight, correlated_field
 from holosplat.beamline.simulate import simulate
 from holosplat.geometry import Views
 from holosplat.matter import DeltaBeta, MaterialPrior
-from holosplat.methods import Task
+from holosplat.methods import SmoothVolume, Task
 from holosplat.methods.first_volumes import BY_FISSION, Folds
 from holosplat.methods.illumination import STAGE, prepared
 from holosplat.optics.background import Background, LightOptions
@@ -74,6 +74,25 @@ def test_uneven_light_is_found(family, request):
     if family == "sharp":  # soft matter leaves next to no air, so that the light is known badly, and still is better
         off = task.lit.factor().numpy() / uneven()  # type: ignore[union-attr]
         assert float(off.std()) < 0.2 * float(uneven().std())
+
+
+@pytest.mark.parametrize("family", ["soft", "sharp"])
+def test_fits_confirm_uneven_light(family, request):
+    task = prepared(Task(lit(request.getfixturevalue(family), uneven()), PRIOR), SmoothVolume())
+    last = [each for each in task.decisions if each.name == STAGE][-1]
+    assert last.by == "views set aside, by fits"
+    assert "uneven light" in last.choice
+    assert task.uneven is not None
+
+
+def test_fits_refuse_what_steadies_first_volumes(soft, monkeypatch):
+    """Grain that a first volume finds in even light and white noise is what it leaves of the matter."""
+    monkeypatch.setattr("holosplat.methods.illumination.decided", lambda *how: (("correlated noise",), ()))
+    task = prepared(Task(soft, PRIOR), SmoothVolume())
+    last = [each for each in task.decisions if each.name == STAGE][-1]
+    assert last.choice == "as measured"
+    assert len(last.compared) == 1
+    assert not task.noise.has_grain
 
 
 @pytest.mark.parametrize("family", ["soft", "sharp"])
