@@ -30,14 +30,11 @@ from holosplat.beamline.declared.case import Case
 from holosplat.geometry import Grid
 from holosplat.methods import Onix
 from holosplat.training.aligned import AlignedTraining, AlignedValidation
-from holosplat.training.aligned_options import FrameGoal
-from holosplat.training.folder import Dataset
-from holosplat.training.made_by import made_by
-from holosplat.training.make import make
-from holosplat.training.options import Shown, TrainOptions
+from holosplat.training.folder import Dataset, make
+from holosplat.training.options import FrameGoal, Shown, TrainOptions
 from holosplat.training.ranges import Ranges
 from holosplat.training.sample import drawn_case
-from holosplat.training.train import WEIGHTS
+from holosplat.training.train import WEIGHTS, made_by
 from holosplat.training.validate import Validation
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "onix_scenes.csv"

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from holosplat.learning.copies import COPIES
+from holosplat.learning.lattice import COPIES
 from holosplat.training.sample import Sample
 from holosplat.training.shown import as_shown, whole
 

@@ -10,11 +10,10 @@ import pytest
 import torch
 
 from holosplat.learning.weights import SHIPPED, read_weights
-from holosplat.training.objective import dice
 from holosplat.training.options import TrainOptions
 from holosplat.training.ranges import Ranges
 from holosplat.training.sample import sample_of
-from holosplat.training.shown import whole
+from holosplat.training.shown import dice, whole
 
 CELLS = Ranges(
     rows=48, columns=48, views=4, held_out=1, tilted=0.0, noiseless=1.0, across=(12.0, 14.0), fresnel=(0.02, 0.1)

@@ -13,17 +13,13 @@ from helpers.ball_sample import ball_sample
 from helpers.two_balls import ONE, scan, truth
 from holosplat.checks import InputError
 from holosplat.fit.schedule import Schedule
-from holosplat.learning.aligned_weights import read_aligned, write_aligned
-from holosplat.learning.weights import Card, write_weights
+from holosplat.learning.weights import Card, read_aligned, write_aligned, write_weights
 from holosplat.matter import MaterialPrior
 from holosplat.methods import AlignedFit, Onix, PixelNerf, Task, solve
 from holosplat.representations import AlignedNetwork, PixelAligned, PixelAlignedField
-from holosplat.training.aligned import AlignedTraining, AlignedValidation
-from holosplat.training.aligned_options import FrameGoal
-from holosplat.training.aligned_shown import aligned_lesson, first_views
-from holosplat.training.critic import Critic
+from holosplat.training.aligned import AlignedTraining, AlignedValidation, Critic, aligned_lesson, first_views
 from holosplat.training.folder import Dataset
-from holosplat.training.options import Shown, TrainOptions
+from holosplat.training.options import FrameGoal, Shown, TrainOptions
 from holosplat.training.ranges import Ranges
 from holosplat.training.sample import Sample
 
@@ -149,8 +145,7 @@ def test_a_discriminator_learns_to_tell_and_says_how_to_mislead_it():
 
 
 def test_other_files_are_no_weights(tmp_path):
-    from holosplat.learning.network import Guess
-    from holosplat.learning.size import Size
+    from holosplat.learning.network import Guess, Size
 
     path = tmp_path / "weights.safetensors"
     write_weights(path, Guess(Size((4, 4, 4, 4), 3, (4, 4, 4))), Card())

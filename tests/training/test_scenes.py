@@ -10,11 +10,9 @@ from torch.nn.functional import avg_pool2d
 
 from holosplat.checks import InputError
 from holosplat.learning.network import FINE, coarse, thickness_of
-from holosplat.training.datasheet import write_datasheet
-from holosplat.training.draw import drawn
-from holosplat.training.folder import Dataset
+from holosplat.training.folder import Dataset, write_datasheet
 from holosplat.training.ranges import Ranges
-from holosplat.training.sample import Sample, sample_of
+from holosplat.training.sample import Sample, drawn, sample_of
 from holosplat.training.shown import as_shown
 
 TINY = Ranges(rows=34, columns=30, views=3, held_out=1, across=(9.0, 11.0), fresnel=(0.02, 0.1), noiseless=1.0)

@@ -12,14 +12,13 @@ import torch
 
 from holosplat.checks import InputError
 from holosplat.geometry import rotation_y
-from holosplat.learning.size import Size
+from holosplat.learning.network import Size
 from holosplat.learning.weights import read_weights
 from holosplat.training.folder import Dataset
-from holosplat.training.objective import dice, loss, soft_dice
 from holosplat.training.options import Goal, Shown, TrainOptions
 from holosplat.training.ranges import Ranges
 from holosplat.training.sample import Sample
-from holosplat.training.shown import whole
+from holosplat.training.shown import dice, loss, soft_dice, whole
 from holosplat.training.train import Training
 from holosplat.training.validate import Validation
 

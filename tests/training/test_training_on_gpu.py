@@ -15,14 +15,12 @@ import pytest
 from helpers.ball_sample import ball_sample
 from helpers.pretended_gpu import OnGpu, pretended_gpu
 from holosplat.checks import InputError
-from holosplat.learning.aligned_weights import read_aligned
-from holosplat.learning.size import Size
-from holosplat.learning.weights import read_weights
+from holosplat.learning.network import Size
+from holosplat.learning.weights import read_aligned, read_weights
 from holosplat.representations import AlignedNetwork
 from holosplat.training.aligned import AlignedTraining, AlignedValidation
-from holosplat.training.aligned_options import FrameGoal
 from holosplat.training.folder import Dataset
-from holosplat.training.options import Shown, TrainOptions
+from holosplat.training.options import FrameGoal, Shown, TrainOptions
 from holosplat.training.ranges import Ranges
 from holosplat.training.sample import Sample
 from holosplat.training.train import Training

@@ -42,8 +42,7 @@ def dataset(
         layouts: Layouts of other programs into which the scenes are written too, each into a folder of its name in out.
     """
     from ..training.export import export
-    from ..training.folder import Dataset
-    from ..training.make import make
+    from ..training.folder import Dataset, make
 
     wanted = Dataset(out, drawn, seed, count)
     left = sum(map(len, wanted.missing()))

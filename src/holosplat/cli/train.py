@@ -33,8 +33,7 @@ def train(
     from ..report.learning import training_curves
     from ..training.aligned import AlignedTraining, AlignedValidation
     from ..training.folder import Dataset
-    from ..training.made_by import made_by
-    from ..training.train import Training
+    from ..training.train import Training, made_by
     from ..training.validate import Validation
 
     scenes = Dataset.read(data)

@@ -19,9 +19,8 @@ from ..progress import Progress
 from ..ranges import Natural, ranged
 from ..scan import Scan
 from ..volume import Volume
-from .copies import COPIES
 from .images import images, retrieved_thickness
-from .lattice import Taps
+from .lattice import COPIES, Taps
 from .network import FINE, Guess, coarse, thickness_of
 from .weights import Trained, read_weights
 

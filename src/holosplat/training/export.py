@@ -16,8 +16,8 @@ from ..io.nerf_synthetic import camera_poses, write_nerf_synthetic
 from ..io.r2_gaussian import R2Options, write_r2_gaussian
 from ..progress import Advance
 from ..units import wavenumber
-from .as_scan import SampleScan, as_scan
 from .folder import Dataset
+from .sample import SampleScan, as_scan
 
 Format = Literal["nerf-synthetic", "r2-gaussian", "onix"]
 """Layouts of others."""

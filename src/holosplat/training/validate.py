@@ -16,10 +16,9 @@ from ..io.atomic import atomic_path
 from ..learning.network import Guess
 from ..learning.start import unexplained
 from ..learning.weights import Card
-from .objective import dice
 from .ranges import Ranges
 from .sample import Sample, sample_of
-from .shown import whole
+from .shown import dice, whole
 
 COUNTS = (2, 3, 4, 6)
 """Numbers of views."""
