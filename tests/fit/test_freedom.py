@@ -13,8 +13,8 @@ from helpers.bumpy import bumpy, surfaces
 from holosplat.align.gauge import moved_onto
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.checks import InputError
-from holosplat.fit.batch import Batch
 from holosplat.fit.freedom import Expected, Freedom, mean_distance_error, moved, projection
+from holosplat.fit.problem import Batch
 from holosplat.fit.schedule import Schedule
 from holosplat.geometry import Views, rotation_y
 from holosplat.methods.surface_fit import SurfaceFit, surface_fit

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from helpers.blobs import MATERIAL, SHAPE, blob_scan
-from holosplat.fit.light_apart import LightApart
-from holosplat.fit.whitened import WhitenedFrames
+from holosplat.fit.whitened import LightApart, WhitenedFrames
 from holosplat.optics.background import Background, Light
 from holosplat.optics.modes import smooth_modes
 from holosplat.optics.noise_model import NoiseModel

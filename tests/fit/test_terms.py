@@ -9,10 +9,9 @@ import torch
 
 from helpers.fit_balls import a_cloud, cloud_of, fit_of, run
 from holosplat.checks import InputError
-from holosplat.fit.batch import Batch
-from holosplat.fit.problem import Part
+from holosplat.fit.problem import Batch, Part
 from holosplat.fit.terms import TERMS
-from holosplat.fit.terms.geometry import EXPECTED
+from holosplat.fit.terms.frames import EXPECTED
 from holosplat.geometry import Views
 from holosplat.methods import ExtraTerm
 from holosplat.model import Alignment, Instrument, LightField, Model, smooth_modes

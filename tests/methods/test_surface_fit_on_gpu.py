@@ -18,9 +18,8 @@ from helpers.poses import relative
 from holosplat.beamline.simulate import simulate
 from holosplat.fit.freedom import Freedom
 from holosplat.fit.loop import Fit
-from holosplat.fit.neighbours import Neighbours, membrane_inverse
 from holosplat.fit.schedule import Schedule
-from holosplat.fit.terms.object import squared_product
+from holosplat.fit.terms.object import Neighbours, membrane_inverse, squared_product
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.methods import Auto, SurfaceFit, Surfaces, finished
 from holosplat.methods.surface_fit import surface_fit

@@ -18,14 +18,11 @@ from holosplat.bodies.moments import centroid
 from holosplat.geometry import Grid, Views
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
-from holosplat.report.animation import encoded
-from holosplat.report.body_picture import body_colours, paint_bodies
-from holosplat.report.content import ReportContent
-from holosplat.report.motion_blocks import motion_blocks
-from holosplat.report.moving import Moving
-from holosplat.report.moving_figures import film_figure, shapes_figure, trajectories_figure
+from holosplat.report.content import Moving, ReportContent
+from holosplat.report.moving_figures import encoded, film_figure, motion_blocks, shapes_figure, trajectories_figure
 from holosplat.report.run import moving_of
 from holosplat.report.style import new_figure
+from holosplat.report.surface import body_colours, paint_bodies
 from holosplat.report.tables import score_tables, verdict
 from holosplat.representations import SurfaceMesh
 from holosplat.specimens.red_cells import icosphere

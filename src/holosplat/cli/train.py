@@ -30,7 +30,7 @@ def train(
         resume: Go on with an interrupted training; --resume FOLDER alone, with its scenes and options.
     """
     from ..planning.acts import of_training
-    from ..report.learning import training_curves
+    from ..report.curves import training_curves
     from ..training.aligned import AlignedTraining, AlignedValidation
     from ..training.folder import Dataset
     from ..training.train import Training, made_by

@@ -15,12 +15,10 @@ from ..model import Alignment, Model
 from ..optics.noise import noise_levels
 from ..optics.sampling import fringes
 from ..scan import Exposures, Scan
-from .batch import Batch
 from .loop import Plan, Stateless
-from .optimiser import Adam, Apart, Leaves, Optimiser
-from .problem import Part
-from .trainable import Trainable
-from .validation import set_aside
+from .optimiser import Adam, Apart, Leaves, Optimiser, Trainable
+from .problem import Batch, Part
+from .residuals import set_aside
 
 RATE_PX = 0.05
 """First steps of shifts, and of turns at the edge of the field [pixels]: what voxels leave is found in some twenty."""

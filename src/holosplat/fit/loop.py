@@ -19,16 +19,11 @@ from ..checks import InputError
 from ..geometry import Grid
 from ..memory import memory_kept
 from ..model import Model
-from .batch import Batch
-from .batches import Batches
-from .capture import CapturedStep
-from .interrupt import interrupts_held
-from .optimiser import Leaves, Optimiser
-from .problem import Problem
-from .running import Record
+from .optimiser import Leaves, Optimiser, Trainable
+from .problem import Batch, Batches, CapturedStep, Problem
+from .residuals import Judge
+from .running import Record, interrupts_held
 from .schedule import Schedule
-from .trainable import Trainable
-from .validation import Judge
 
 UNREAD_STEPS = 20
 """Steps on a GPU between looks at their values, each of which waits for it."""

@@ -11,14 +11,13 @@ import torch
 
 from ..backends import Backend, resolve
 from ..baselines.beyond import rows_of
-from ..fit.batches import block_shape
 from ..fit.density import DensityEvent
 from ..fit.freedom import Freedom, freed
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Adam
-from ..fit.problem import Problem, Term
+from ..fit.problem import Problem, Term, block_shape
+from ..fit.residuals import set_aside, split_validation
 from ..fit.terms import Anisotropy, VolumeTerm
-from ..fit.validation import set_aside, split_validation
 from ..geometry import Grid
 from ..matter import Matter
 from ..optics.background import Light

@@ -21,7 +21,7 @@ from ..fit.optimiser import Adam
 from ..fit.problem import Problem, Term
 from ..fit.schedule import Schedule
 from ..fit.terms import Objective
-from ..fit.terms.aligned import AlignedFrames, AlignedLines
+from ..fit.terms.field import AlignedFrames, AlignedLines
 from ..geometry import Grid
 from ..learning.images import images, retrieved_thickness
 from ..learning.weights import ONIX, PIXELNERF, read_aligned

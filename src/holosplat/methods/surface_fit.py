@@ -14,12 +14,11 @@ from ..backends import Backend, device, resolve
 from ..checks import in_range, positive, require
 from ..fit.freedom import Freedom, freed
 from ..fit.loop import Fit, Plan
-from ..fit.neighbours import membrane_inverse
 from ..fit.optimiser import Adam, Group
 from ..fit.problem import Problem, Term
 from ..fit.schedule import Schedule
 from ..fit.terms import Objective
-from ..fit.terms.object import Bending
+from ..fit.terms.object import Bending, membrane_inverse
 from ..geometry import Grid
 from ..matter import Matter
 from ..optics.background import Light

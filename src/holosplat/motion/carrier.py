@@ -23,8 +23,7 @@ from scipy.optimize import minimize
 from scipy.special import gammaln
 from torch import Tensor
 
-from ..fit.batch import Batch
-from ..fit.problem import Part
+from ..fit.problem import Batch, Part
 from ..model import Model
 from ..representations import Flow, Lattice, MovingSurfaces, TimeBasis
 from .terms import COEFFICIENTS

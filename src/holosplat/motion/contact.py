@@ -9,8 +9,7 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from ..fit.batch import Batch
-from ..fit.problem import Part
+from ..fit.problem import Batch, Part
 from ..model import Model
 from ..representations import MovingSurfaces
 from .terms import COEFFICIENTS

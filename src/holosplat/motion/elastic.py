@@ -17,8 +17,7 @@ from torch.autograd.function import once_differentiable
 
 from ..bodies.rest_shape import surface
 from ..checks import require
-from ..fit.batch import Batch
-from ..fit.problem import Part
+from ..fit.problem import Batch, Part
 from ..mesh import TriangleMesh
 from ..model import Model
 from ..representations import MovingSurfaces

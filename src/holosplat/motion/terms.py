@@ -9,8 +9,7 @@ import torch
 from scipy.sparse import csr_array, eye_array
 from torch import Tensor
 
-from ..fit.batch import Batch
-from ..fit.problem import Part
+from ..fit.problem import Batch, Part
 from ..fit.terms.object import squared_product
 from ..model import Model
 from ..representations import MovingSurfaces

@@ -27,14 +27,12 @@ from ..workflows.moments import instants_of, moment
 from ..workflows.reconstruct import load_reconstruction
 from ..workflows.reconstruction import Reconstruction
 from ..workflows.run_folder import RunFolder
-from .block import Block, drawn_block
-from .content import flatten
+from .content import DELTA, Quantity, flatten
 from .curves import correlation_figure
 from .figures import richest_planes, slices_figure
 from .page import template
-from .quantity import DELTA, Quantity
 from .run import LARGEST_VOLUME
-from .style import format_length, in_print, scientific
+from .style import Block, drawn_block, format_length, in_print, scientific
 from .tables import Table, duration, resolved
 
 HEAD = ("", "A", "B")

@@ -12,9 +12,8 @@ import torch
 
 from ..checks import InputError
 from ..fit.causes import Cause, causes, scores
-from ..fit.residuals import Prediction, Residuals, residuals
+from ..fit.residuals import Prediction, Residuals, residuals, split_validation
 from ..fit.running import Running
-from ..fit.validation import split_validation
 from ..methods import Task
 from ..model import LightField, Model, SolvedLight
 from ..optics.noise import noise_levels

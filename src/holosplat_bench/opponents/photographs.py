@@ -18,11 +18,10 @@ import torch
 from holosplat.checks import at_least, require
 from holosplat.fit.density import DensityControl, DensityEvent
 from holosplat.fit.loop import Fit, Plan, Stateless
-from holosplat.fit.optimiser import Adam
+from holosplat.fit.optimiser import Adam, Trainable
 from holosplat.fit.problem import Problem
 from holosplat.fit.schedule import Schedule
 from holosplat.fit.terms import Objective
-from holosplat.fit.trainable import Trainable
 from holosplat.geometry import Grid
 from holosplat.matter import Matter
 from holosplat.methods.assumed import assumed_material

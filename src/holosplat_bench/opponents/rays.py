@@ -7,8 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from holosplat.fit.batch import Batch
-from holosplat.fit.problem import Part
+from holosplat.fit.problem import Batch, Part
 from holosplat.model import Model
 from holosplat.representations.neural_field import uniform
 from holosplat.scan import Scan

@@ -24,8 +24,7 @@ from ...representations import SpaceTimeField
 from ...representations.neural_field import uniform
 from ...representations.perceptron import Jet
 from ...representations.space_time import Frame
-from ..batch import Batch
-from ..problem import Part
+from ..problem import Batch, Part
 from ..total_variation import total_variation
 
 

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from holosplat.checks import at_least, require
-from holosplat.fit.batch import Batch
-from holosplat.fit.problem import Part
+from holosplat.fit.problem import Batch, Part
 from holosplat.fit.terms.frames import FrameTerm
 from holosplat.fit.total_variation import total_variation
 from holosplat.model import Model
