@@ -17,7 +17,7 @@ from holosplat.matter import MaterialPrior
 from holosplat.methods import Task
 from holosplat.methods.illumination import prepared
 from holosplat.optics.background import Background, LightOptions
-from holosplat.optics.modes import smooth_modes
+from holosplat.optics.patterns import smooth_modes
 from holosplat.scan import Exposures, Scan
 from holosplat.workflows.join import join
 from holosplat.workflows.run_light import light_of

@@ -19,7 +19,7 @@ from holosplat.matter import MaterialPrior
 from holosplat.methods import SmoothVolume, Task
 from holosplat.motion.carried import CarriedOptions, Search, merged
 from holosplat.representations import Fading, Flow, Lattice, TimeBasis
-from holosplat.representations.fading import faded
+from holosplat.representations.flow import faded
 
 QUICK = SmoothVolume(coarser=(), rounds=1, iterations=8)
 LATTICE = Lattice.around((SHAPE[1], SHAPE[0], SHAPE[1]), 2)

@@ -9,7 +9,7 @@ import torch
 
 from helpers.bumpy import area, bumpy
 from holosplat.mesh import TriangleMesh
-from holosplat.representations.subdivision import edge_lengths, subdivided
+from holosplat.representations.isosurface import edge_lengths, subdivided
 
 TETRAHEDRON = (
     torch.tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=torch.float64),

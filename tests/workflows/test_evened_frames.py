@@ -13,7 +13,7 @@ import holosplat as hs
 from helpers.cli import holosplat, refused, worked
 from holosplat.checks import InputError
 from holosplat.io.nxtomo import read_scan, write_scan
-from holosplat.optics.modes import smooth_modes
+from holosplat.optics.patterns import smooth_modes
 from holosplat.projectors.voxels import SliceProjector
 from holosplat.units import wavenumber
 from holosplat.workflows.still_light import StillLight, evened

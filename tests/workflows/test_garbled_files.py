@@ -16,8 +16,8 @@ from holosplat.io.table import Table
 from holosplat.projectors.surface import surface_thickness
 from holosplat.series.rows import Row, read_row, write_row
 from holosplat.specimens.red_cells import icosphere
-from holosplat.workflows.resume import require_alike
-from holosplat.workflows.run_facts import facts_of_run
+from holosplat.workflows.latest import facts_of_run
+from holosplat.workflows.preconditions import require_alike
 from holosplat.workflows.run_folder import RunFolder
 
 OLD_RUN = Path(__file__).resolve().parents[1] / "data/run_0_1_0"

@@ -19,9 +19,8 @@ from ..planning.acts import of_motion
 from ..report.run import report_run
 from ..scan import Scan
 from ..workflows.evaluate import evaluate as score
-from ..workflows.moments import moment
 from ..workflows.moving import begun_in_motion, reconstruct_moving
-from ..workflows.reconstruction import Reconstruction
+from ..workflows.reconstruction import Reconstruction, moment
 from ..workflows.run_folder import RunFolder
 from .progress import INTERRUPTED, ProgressBar
 from .room import tell_frames

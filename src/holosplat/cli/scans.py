@@ -14,12 +14,11 @@ from ..io.run_scan import run_reading
 from ..mesh import TriangleMesh
 from ..representations import InMotion, MovingSurfaces, SurfaceMesh
 from ..scan import Scan
-from ..workflows.moments import chosen_frames, instants_of, moment
+from ..workflows.preconditions import require_one_time
 from ..workflows.reconstruct import load_reconstruction
-from ..workflows.reconstruction import Reconstruction
+from ..workflows.reconstruction import Reconstruction, chosen_frames, instants_of, moment
 from ..workflows.refine import where_found
 from ..workflows.run_folder import RunFolder
-from ..workflows.suitable import require_one_time
 
 
 def scan_for(folder: RunFolder, scan: Path | None, reading: Reading) -> Scan:

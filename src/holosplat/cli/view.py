@@ -84,7 +84,7 @@ def _objects(what: Path) -> tuple[dict[str, Stored], list[str]]:
     from ..io.series import read_series
     from ..show.parts import at_times
     from ..show.scene import steps_of
-    from ..workflows.moments import instants_of
+    from ..workflows.reconstruction import instants_of
     from ..workflows.run_folder import RunFolder
 
     require(what.exists(), f"{what} must be a run folder or an object file, but there is none; check the path.")

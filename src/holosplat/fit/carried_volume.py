@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
-from ..representations.fading import Fading, faded
-from ..representations.flow import Flow
+from ..representations.flow import Fading, Flow, faded
 from .smooth_volume import ContinuousPrior, VolumeProblem
 from .whitened import WhitenedFrames
 

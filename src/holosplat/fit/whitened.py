@@ -13,8 +13,8 @@ from torch.nn.functional import pad
 from ..matter import DeltaBeta
 from ..model import Instrument, LightField
 from ..optics.background import Light
-from ..optics.modes import cosines
 from ..optics.noise_model import NoiseModel
+from ..optics.patterns import cosines
 from ..optics.retrieval.spectra import Raster, response, squared_frequency
 from ..optics.sampling import fringe_sampling
 from ..scan import Scan

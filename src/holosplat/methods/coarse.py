@@ -21,7 +21,7 @@ from ..matter import DeltaBeta
 from ..optics.noise import noise_levels
 from ..ranges import Pixels, Positive, Share, Weight, ranged
 from ..representations import GaussianCloud, SurfaceMesh
-from ..representations.subdivision import edge_lengths, subdivided
+from ..representations.isosurface import edge_lengths, subdivided
 from ..scan import Scan
 from .cross_validation import MissingMatter, predicted_frames
 from .method import Task, run_quietly

@@ -19,7 +19,7 @@ from ..inference import MARGIN, Decision, Score, select
 from ..matter import MaterialPrior, Matter
 from ..optics.background import FLUX, Background, Light, LightOptions
 from ..optics.noise_model import NoiseModel
-from ..optics.still_light import fixed_pattern
+from ..optics.patterns import fixed_pattern
 from ..progress import Progress
 from ..representations import VoxelGrid
 from ..scan import Scan

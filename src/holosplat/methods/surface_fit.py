@@ -26,8 +26,7 @@ from ..optics.noise import noise_share
 from ..optics.sampling import fringe_sampling
 from ..ranges import Rate, Weight, ranged
 from ..representations import GaussianCloud, SurfaceMesh, isosurface
-from ..representations.isosurface import adjacency, neighbour_mean
-from ..representations.subdivision import edge_lengths
+from ..representations.isosurface import adjacency, edge_lengths, neighbour_mean
 from ..scan import Scan
 from .field import field_of
 from .ground import ExtraTerm, ground

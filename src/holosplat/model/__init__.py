@@ -1,6 +1,6 @@
 """From matter to frames: the only way that leads there."""
 
-from ..optics.modes import smooth_modes
+from ..optics.patterns import smooth_modes
 from .alignment import Alignment
 from .instrument import Instrument
 from .scene import LightField, Model, SolvedLight, measure

@@ -23,9 +23,8 @@ from ..units import in_percent, wavenumber
 from ..volume import Volume
 from ..workflows.binding import CONFIG_SUM, RUN
 from ..workflows.evaluate import Evaluation, evaluate, of_absorption
-from ..workflows.moments import instants_of, moment
 from ..workflows.reconstruct import load_reconstruction
-from ..workflows.reconstruction import Reconstruction
+from ..workflows.reconstruction import Reconstruction, instants_of, moment
 from ..workflows.run_folder import RunFolder
 from .content import DELTA, Quantity, flatten
 from .curves import correlation_figure

@@ -29,10 +29,9 @@ from ..scan import Scan
 from ..tables import read_rows, to_table
 from .evaluate import render_object
 from .provenance import environment, scan_hash
-from .reconstruction import Reconstruction
+from .reconstruction import Reconstruction, summary_of
 from .run_folder import RunFolder
 from .run_light import light_of
-from .run_record import summary_of
 from .track import write_tracks
 
 FRAMES, TABLE, NUMBERS = "forecast.nxs", "forecast.csv", "forecast.json"

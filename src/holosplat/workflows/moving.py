@@ -22,14 +22,11 @@ from ..progress import FitProgress
 from ..representations import VoxelGrid
 from ..scan import Scan
 from ..tables import to_table
-from .choice import Choice
+from .preconditions import check_frames, goes_on
 from .provenance import environment, scan_hash
-from .reconstruction import Reconstruction
-from .resume import goes_on
+from .reconstruction import Choice, Reconstruction, summary_of
 from .run_folder import Checkpoint, RunFolder
 from .run_light import found_in
-from .run_record import summary_of
-from .suitable import check_frames
 from .verdict import judge
 
 KIND = "carried"

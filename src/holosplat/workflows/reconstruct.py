@@ -32,9 +32,17 @@ from ..ranges import require_plausible
 from ..representations import KINDS, Stored
 from ..scan import Scan
 from ..tables import to_table
-from .choice import Choice
+from .preconditions import (
+    check_frames,
+    decided_before,
+    decisions_of,
+    goes_on,
+    is_complete,
+    require_alike,
+    require_one_time,
+)
 from .provenance import environment, scan_hash
-from .reconstruction import Reconstruction
+from .reconstruction import Choice, Reconstruction, config_of, read_rest, summary_of
 from .refine import (
     freedom_of,
     keep_geometry,
@@ -45,12 +53,8 @@ from .refine import (
     with_fitted,
     with_held_out,
 )
-from .rest_file import read_rest
-from .resume import decided_before, decisions_of, goes_on, is_complete, require_alike
 from .run_folder import RunFolder, claimed
 from .run_light import found_in, read_light_options, still_in
-from .run_record import config_of, summary_of
-from .suitable import check_frames, require_one_time
 from .totals import TotalMatter, total_of_run
 from .verdict import Verdict, judge_run, said_of_run
 

@@ -13,7 +13,7 @@ from ..methods import Method, Task
 from ..methods.cross_validation import predicted_frames
 from ..methods.illumination import still_order
 from ..optics.background import FLUX, Light, LightOptions
-from ..optics.still_light import mean_light
+from ..optics.patterns import mean_light
 from ..representations import Stored
 from ..scan import Scan
 from ..tables import from_table

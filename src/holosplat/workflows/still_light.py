@@ -12,7 +12,7 @@ from ..checks import require
 from ..frames import divided
 from ..matter import MaterialPrior
 from ..methods.illumination import predicted_first
-from ..optics.still_light import mean_light
+from ..optics.patterns import mean_light
 from ..progress import Progress
 from ..scan import Scan
 

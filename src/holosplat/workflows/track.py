@@ -33,15 +33,11 @@ from ..progress import FitProgress
 from ..representations import MovingSurfaces
 from ..scan import Scan
 from ..tables import read_rows, to_table
-from .choice import Choice
+from .preconditions import check_frames, goes_on
 from .provenance import environment, scan_hash
-from .reconstruction import Reconstruction
-from .rest_file import write_rest
-from .resume import goes_on
+from .reconstruction import Choice, Reconstruction, summary_of, write_rest
 from .run_folder import Checkpoint, RunFolder, claimed
 from .run_light import found_in
-from .run_record import summary_of
-from .suitable import check_frames
 from .verdict import judge
 
 LENGTH_UNIT = "um"
