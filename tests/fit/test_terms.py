@@ -9,7 +9,7 @@ import torch
 
 from helpers.fit_balls import a_cloud, cloud_of, fit_of, run
 from holosplat.checks import InputError
-from holosplat.fit.problem import Batch, Part
+from holosplat.fit.problem import FIXED, Batch, Part
 from holosplat.fit.terms import TERMS
 from holosplat.fit.terms.frames import EXPECTED
 from holosplat.geometry import Views
@@ -27,6 +27,7 @@ class Mass:
 
     weight: float
     names = ("mass",)
+    resolved = FIXED
 
     def __call__(self, model: Model, batch: Batch) -> list[Part]:
         assert isinstance(model.object, GaussianCloud)

@@ -17,7 +17,7 @@ from ..optics.sampling import fringes
 from ..scan import Exposures, Scan
 from .loop import Plan, Stateless
 from .optimiser import Adam, Apart, Leaves, Optimiser, Trainable
-from .problem import Batch, Part
+from .problem import FIXED, Batch, Part
 from .residuals import set_aside
 
 RATE_PX = 0.05
@@ -161,6 +161,7 @@ class Expected:
     """The term of what is expected of the geometry: half the sum of squares of its numbers in their deviations."""
 
     names = ("geometry",)
+    resolved = FIXED
 
     def __init__(self, freedom: Freedom, weight: float, device: torch.device) -> None:
         """weight: of one number; that of a fit whose data term is a mean over pixels."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -44,15 +45,21 @@ class Part(NamedTuple):
     value: Tensor
 
 
-class Term(Protocol):
-    """What a model costs in one batch. A term reads the model's frames, its object, its alignment or its light.
+FIXED: Mapping[str, float] = MappingProxyType({})
+"""`Term.resolved` of a term whose weights and widths do not depend on the frames."""
 
-    A term whose weights or widths follow from the frames says them in `resolved`, name → number, for config.json.
-    """
+
+class Term(Protocol):
+    """What a model costs in one batch. A term reads the model's frames, its object, its alignment or its light."""
 
     @property
     def names(self) -> Sequence[str]:
         """The names of all parts that it can have, as columns of metrics.csv."""
+        ...
+
+    @property
+    def resolved(self) -> Mapping[str, float]:
+        """Weights and widths that follow from the frames, by name, for config.json; `FIXED` where there are none."""
         ...
 
     def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
@@ -80,7 +87,7 @@ class Problem:
         """The weights and widths that options have become by noise, prior and number of views."""
         found: dict[str, float] = {}
         for term in self.terms:
-            found |= getattr(term, "resolved", {})
+            found |= term.resolved
         return found
 
     def loss(self, model: Model, batch: Batch) -> tuple[Tensor, Tensor, list[str]]:

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 from ..checks import require
 from ..fit.residuals import Prediction
-from ..io.light import write_light
-from ..io.objects import write_object
 from ..matter import KnownTwo, MaterialPrior
 from ..methods import Task
 from ..methods.assumed import assumed_material
 from ..methods.illumination import prepared
-from ..methods.presets import SCHEMA
-from ..methods.uncertain import Uncertain
 from ..motion.carried import NOWHERE, CarriedOptions, Search, merged
 from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling
@@ -23,8 +18,8 @@ from ..representations import VoxelGrid
 from ..scan import Scan
 from ..tables import to_table
 from .preconditions import check_frames, goes_on
-from .provenance import environment, scan_hash
-from .reconstruction import Choice, Reconstruction, summary_of
+from .provenance import environment
+from .reconstruction import Asked, Choice, Reconstruction, config_of, write_run
 from .run_folder import Checkpoint, RunFolder
 from .run_light import found_in
 from .verdict import judge
@@ -75,7 +70,8 @@ def reconstruct_moving(
     )
     check_frames(train)
     assumed = light or LightOptions()
-    config = _config(scan, prior, options, seed, assumed)
+    method = {"kind": KIND, **to_table(options)}
+    config = config_of(scan, prior, method, seed, "continuous", Asked(assumed))
     going = goes_on(folder, config, resume)
     task = prepared(Task(train, prior, seed, lambda stage, part: on_progress(stage, part, {}), assumed))
     mean = merged(task.scan)
@@ -105,31 +101,11 @@ def reconstruct_moving(
     )
     if folder is not None:
         folder.start_metrics([])
-        write_object(folder.object, found.object, folder.marks())
-        if task.uneven is not None and task.uneven.background is not None:
-            write_light(folder.light, task.uneven.background, marks=folder.marks())
         seen = {"times_s": task.scan.instants.tolist(), "misfit": found.misfit, "asked": list(found.history)}
-        folder.write_summary(summary_of(done, None, task.scan) | seen | {"light": task.light_in_words})
+        write_run(folder, done, task, None, seen)
     return Motion(done, found.volume, found.history)
 
 
 def begun_in_motion(folder: RunFolder) -> bool:
     """Whether a folder holds a run of matter in motion, finished or not."""
     return folder.config.is_file() and folder.read_config().get("method", {}).get("kind") == KIND
-
-
-def _config(
-    scan: Scan, prior: MaterialPrior, options: CarriedOptions, seed: int, light: LightOptions
-) -> dict[str, Any]:
-    """What config.json says the run is of."""
-    return {
-        "schema_version": SCHEMA,
-        "method": {"kind": KIND, **to_table(options)},
-        "matter": "continuous",
-        "seed": seed,
-        "prior": prior.as_dict(),
-        "scan_hash": scan_hash(scan),
-        "light": to_table(light),
-        "uncertain": to_table(Uncertain()),
-        "refine": None,
-    }

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..align.geometry import Geometry
+from ..align.poses import PoseOptions
 from ..backends import device_name
 from ..bodies.rest_shape import KnownBody
 from ..checks import as_written, require
@@ -17,13 +18,15 @@ from ..fit.running import Running
 from ..geometry import Grid
 from ..inference import Decision
 from ..io.json import read_json
+from ..io.light import write_light
+from ..io.objects import write_object
 from ..io.volumes import Contents
 from ..io.vtk import read_meshes, write_mesh
 from ..matter import MaterialPrior, MatterKind
 from ..mesh import TriangleMesh
-from ..methods import Method, Task
+from ..methods import Task
 from ..methods.presets import SCHEMA
-from ..methods.uncertain import Determined, placed
+from ..methods.uncertain import Determined, Uncertain, placed
 from ..motion.elastic import Rest
 from ..optics.background import LightOptions
 from ..representations import InMotion, MovingSurfaces, Stored
@@ -127,16 +130,47 @@ def summary_of(done: Reconstruction, fit: Running | None, train: Scan) -> dict[s
     }
 
 
-def config_of(scan: Scan, prior: MaterialPrior, method: Method, seed: int, matter: MatterKind | None) -> dict[str, Any]:
-    """Entries of config.json that say what a run is of."""
+@dataclass(frozen=True)
+class Asked:
+    """Assumptions of a run beside its method: light, ranges of the scan's constants, and which poses are refined."""
+
+    light: LightOptions
+    uncertain: Uncertain = field(default_factory=Uncertain)
+    refine: PoseOptions | None = None
+
+
+def config_of(
+    scan: Scan,
+    prior: MaterialPrior,
+    method: dict[str, Any],
+    seed: int,
+    matter: MatterKind | Literal["auto"],
+    asked: Asked,
+) -> dict[str, Any]:
+    """Entries of config.json that determine a run; method: its table of options, with its `kind`."""
     return {
         "schema_version": SCHEMA,
-        "method": to_table(method),
+        "method": method,
         "prior": prior.as_dict(),
-        "matter": matter or "auto",
+        "matter": matter,
         "seed": seed,
         "scan_hash": scan_hash(scan),
+        **to_table(asked),
     }
+
+
+def write_run(
+    folder: RunFolder, done: Reconstruction, task: Task, fit: Running | None, entries: Mapping[str, Any]
+) -> None:
+    """Write object.h5, light.h5 where light is uneven, and summary.json with further `entries`.
+
+    fit: the last one, if there was any.
+    """
+    write_object(folder.object, done.object, folder.marks())
+    background = task.uneven and task.uneven.background
+    if background is not None or done.still is not None:
+        write_light(folder.light, background, done.still, folder.marks())
+    folder.write_summary(summary_of(done, fit, task.scan) | dict(entries) | {"light": task.light_in_words})
 
 
 @dataclass(frozen=True)

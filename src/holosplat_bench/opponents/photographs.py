@@ -20,7 +20,7 @@ from holosplat.checks import at_least, require
 from holosplat.fit.density import DensityControl, DensityEvent
 from holosplat.fit.loop import Fit, Plan, Stateless
 from holosplat.fit.optimiser import Adam, Trainable
-from holosplat.fit.problem import Batch, Part, Problem
+from holosplat.fit.problem import FIXED, Batch, Part, Problem
 from holosplat.fit.schedule import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.geometry import Grid
@@ -256,6 +256,7 @@ class RandomRays:
     """
 
     names = ("rays",)
+    resolved = FIXED
 
     def __init__(self, train: Scan, count: int, generator: torch.Generator) -> None:
         self._views, self._generator = train.views, generator

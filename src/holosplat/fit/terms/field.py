@@ -13,7 +13,7 @@ from ...geometry import Views
 from ...model import Model
 from ...representations import NeuralField, PixelAlignedField, VoxelGrid
 from ...representations.neural_field import Samples, uniform
-from ..problem import Batch, Part
+from ..problem import FIXED, Batch, Part
 from ..total_variation import total_variation
 from .frames import FrameTerm
 
@@ -51,6 +51,7 @@ class RetrievedThickness:
     """
 
     names = ("thickness",)
+    resolved = FIXED
 
     def __init__(self, target: Tensor, views: Views, share: float, generator: torch.Generator) -> None:
         self._target, self._views, self._share, self._generator = target, views, share, generator

@@ -18,7 +18,7 @@ from ...optics.retrieval.spectra import sensitivity
 from ...scan import Exposures, Scan
 from ...units import wavelength, wavenumber
 from ..fidelity import Target, l1_and_ssim
-from ..problem import Batch, Part, Term
+from ..problem import FIXED, Batch, Part, Term
 from . import comparisons
 from .objective import IMAGE_TERMS, Objective
 
@@ -210,7 +210,7 @@ class Quadratic:
 
     def __init__(self, name: str, weight: float, expected: dict[str, float]) -> None:
         """expected: standard deviation of each parameter by the name `part.parameter`."""
-        self.names = (name,)
+        self.names, self.resolved = (name,), FIXED
         self._weight, self._expected = weight, expected
 
     def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:

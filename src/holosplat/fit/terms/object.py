@@ -15,7 +15,7 @@ from ...backends import device
 from ...geometry import Grid
 from ...model import Model
 from ...representations import GaussianCloud
-from ..problem import Batch, Part
+from ..problem import FIXED, Batch, Part
 from ..total_variation import total_variation
 from . import comparisons
 from .objective import Objective
@@ -68,6 +68,7 @@ class Anisotropy:
     """Gaussians longer than `limit` times their shortest axis."""
 
     names = ("anisotropy",)
+    resolved = FIXED
 
     def __init__(self, weight: float, limit: float) -> None:
         self._weight, self._limit = weight, limit
