@@ -9,7 +9,7 @@ import torch
 
 from helpers.fit_balls import a_cloud, cloud_of, fit_of, run
 from holosplat.checks import InputError
-from holosplat.fit.problem import FIXED, Batch, Part
+from holosplat.fit.problem import FIXED, Batch, LossPart
 from holosplat.fit.terms import TERMS
 from holosplat.fit.terms.frames import EXPECTED
 from holosplat.geometry import Views
@@ -29,9 +29,9 @@ class Mass:
     names = ("mass",)
     resolved = FIXED
 
-    def __call__(self, model: Model, batch: Batch) -> list[Part]:
+    def __call__(self, model: Model, batch: Batch) -> list[LossPart]:
         assert isinstance(model.object, GaussianCloud)
-        return [Part("mass", self.weight, model.object.amplitudes.mean())]
+        return [LossPart("mass", self.weight, model.object.amplitudes.mean())]
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import torch
 import holosplat as hs
 from helpers.fading_lumps import MATTER, SHAPE, TIMES, Fades, drifting, series
 from holosplat.checks import InputError
-from holosplat.fit.carried_volume import CarriedProblem, likelier_fading
+from holosplat.fit.flow_volume import FlowProblem, likelier_fading
 from holosplat.fit.smooth_volume import ContinuousPrior
 from holosplat.geometry import Grid
 from holosplat.io.objects import read_object, write_object
@@ -78,7 +78,7 @@ def test_the_gradient_is_that_of_finite_differences():
     flow = Flow.still(LATTICE, TimeBasis(0, 1, 0), float(TIMES[2]), 3)
     flow = flow.with_parameters({"potential": 3 * torch.randn(1, 3, *LATTICE.counts)})
     frames = [made.frames.whitened(k, 1) for k in range(len(TIMES))]
-    problem = CarriedProblem(frames, TIMES.tolist(), ContinuousPrior(), 0.5, flow, 1)
+    problem = FlowProblem(frames, TIMES.tolist(), ContinuousPrior(), 0.5, flow, 1)
     u = torch.from_numpy(scene.at(TIMES[2]).voxelise(Grid.of_views(scan.views)).delta / MATTER.delta).float()
     fading = some(0.3).with_coefficients(some(0.3).coefficients.float())
     leaf, way = fading.coefficients.clone().requires_grad_(), torch.randn_like(fading.coefficients)

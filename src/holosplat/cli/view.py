@@ -34,8 +34,8 @@ def view(what: Positional[Path], port: Port = 8080) -> None:
         port: Port; the next free one is taken.
     """
     from ..show.server import LiveView
-    from ..workflows.latest import fitted_by
     from ..workflows.run_folder import RunFolder
+    from ..workflows.run_status import fitted_by
 
     folder = RunFolder(what)
     followed = what.is_dir() and fitted_by(folder) is not None

@@ -34,7 +34,7 @@ class Batch:
     volume: int
 
 
-class Part(NamedTuple):
+class LossPart(NamedTuple):
     """One summand of the loss: `weight · value`, value a tensor []; its name is a column of metrics.csv.
 
     A weight of None shows a value that is part of another summand already.
@@ -62,7 +62,7 @@ class Term(Protocol):
         """Weights and widths that follow from the frames, by name, for config.json; `FIXED` where there are none."""
         ...
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The parts of the loss, which are added up; none where the term does not look at this batch.
 
         Nothing in a call waits for the device or depends on values that are not tensors there, but `batch.volume`.

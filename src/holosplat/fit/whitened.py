@@ -22,7 +22,7 @@ from ..units import wavelength, wavenumber
 from ..volume import LineIntegrals
 
 
-class LightApart:
+class LightProjection:
     """The part of images over their noise that light in doubt does not explain, exact for small changes of it.
 
     Light `1 + M c`, c ~ N(0, C), changes amplitudes by `B c = ½ √I₀ M c`, so that their errors have the covariance
@@ -86,7 +86,7 @@ class WhitenedFrames:
     train: the frames; material: δ and β of an occupancy of one; noise: their noise; light: a factor of each frame,
     None for even light; oversample: wave samples a pixel (0: as the first fringe needs); beyond: rows above and
     below the frames in which there may be matter; doubt: uneven light that the frames were divided by, of which what is
-    not known is then an unknown of each frame (`LightApart`): P with it in the `noise` is only its mean.
+    not known is then an unknown of each frame (`LightProjection`): P with it in the `noise` is only its mean.
     """
 
     def __init__(
@@ -117,7 +117,7 @@ class WhitenedFrames:
         self._own, self._apart = self.power, None
         if doubt is not None and doubt.background is not None:
             self._own = (0.25 * (doubt.noise.power() + error + FAINTEST)).float().to(on)
-            self._apart = LightApart(self._amplitudes, doubt.background.covariances, self._over_noise)
+            self._apart = LightProjection(self._amplitudes, doubt.background.covariances, self._over_noise)
         self._sharp = self._sharpening().to(on)
 
     @property

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from ..backends import Backend, device, resolve
 from ..checks import in_range, positive, require
-from ..fit.freedom import Freedom, freed
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Adam, Group
+from ..fit.pose_refinement import PoseRefinement, with_pose_refinement
 from ..fit.problem import Problem, Term
 from ..fit.schedule import Schedule
 from ..fit.terms import Objective
@@ -129,7 +129,7 @@ def surface_fit(
     options: SurfaceFit = SurfaceFit(),
     seed: int = 0,
     light: Light | None = None,
-    freedom: Freedom | None = None,
+    freedom: PoseRefinement | None = None,
 ) -> Fit:
     """The fit of the surfaces `start` to the training frames of `scan`, of the same triangles, made ready.
 
@@ -150,7 +150,7 @@ def surface_fit(
         judge=base.judge,
         capture=False,  # not yet tried as a CUDA graph
     )
-    return Fit(freed(plan, freedom, base.train), seed)
+    return Fit(with_pose_refinement(plan, freedom, base.train), seed)
 
 
 def softened(options: SurfaceFit, start: SurfaceMesh, edge: float) -> SurfaceFit:

@@ -24,7 +24,7 @@ from ..volume import Volume
 from ..workflows.binding import CONFIG_SUM, RUN
 from ..workflows.evaluate import Evaluation, evaluate, of_absorption
 from ..workflows.reconstruct import load_reconstruction
-from ..workflows.reconstruction import Reconstruction, instants_of, moment
+from ..workflows.reconstruction import Reconstruction, instants_of, reconstruction_at
 from ..workflows.run_folder import RunFolder
 from .content import DELTA, Quantity, flatten
 from .curves import correlation_figure
@@ -215,7 +215,7 @@ def _side_of(folder: RunFolder, scan: Scan | None) -> Side:
     folder.require_run()
     result, times = load_reconstruction(folder), instants_of(folder)
     if times:
-        result = moment(result, times, 0)
+        result = reconstruction_at(result, times, 0)
         scan = scan.at_instant(0) if scan is not None and scan.is_series else scan
     return Side(folder, result, None if scan is None else evaluate(result, scan, None))
 

@@ -9,8 +9,8 @@ from collections.abc import Mapping, Sequence
 from ..checks import InputError
 from ..io.objects import read_object
 from ..representations import Stored
-from ..workflows.latest import fitted_by, latest
 from ..workflows.run_folder import RunFolder
+from ..workflows.run_status import fitted_by, read_status
 from .parts import Frame, Shown, at_times, cut, shown
 from .server import LiveView
 
@@ -102,7 +102,7 @@ class Follow:
         draws = kept != self._drawn and self._page.watched
         if kept is None or not (draws or kept != self._said):
             return
-        found = latest(self._folder)
+        found = read_status(self._folder)
         words = [*found.lines(), f"kept at {time.strftime('%H:%M:%S', time.localtime(kept[0] / 1e9))}", by]
         if draws and found.object is not None:
             self._scene.put(at_times(found.object, ()), [found.object.described, *words])

@@ -31,7 +31,7 @@ from .evaluate import render_object
 from .provenance import environment, scan_hash
 from .reconstruction import Reconstruction, summary_of
 from .run_folder import RunFolder
-from .run_light import light_of
+from .run_illumination import light_of
 from .track import write_tracks
 
 FRAMES, TABLE, NUMBERS = "forecast.nxs", "forecast.csv", "forecast.json"

@@ -19,9 +19,9 @@ from ..scan import Scan
 from ..tables import to_table
 from .preconditions import check_frames, goes_on
 from .provenance import environment
-from .reconstruction import Asked, Choice, Reconstruction, config_of, write_run
+from .reconstruction import Assumptions, Choice, Reconstruction, config_of, write_run
 from .run_folder import Checkpoint, RunFolder
-from .run_light import found_in
+from .run_illumination import light_options_of
 from .verdict import judge
 
 KIND = "carried"
@@ -31,7 +31,7 @@ USUAL = CarriedOptions()
 
 
 @dataclass(frozen=True)
-class Motion:
+class FlowReconstruction:
     """What was found of matter in motion. reconstruction: `object.at(t)` is the matter at any time [s]; volume: of the
     flow's reference time, on voxels; history: what was asked of the frames on the way, in words."""
 
@@ -51,7 +51,7 @@ def reconstruct_moving(
     folder: RunFolder | None = None,
     resume: bool = False,
     on_progress: FitProgress = lambda stage, fraction, record: None,
-) -> Motion | None:
+) -> FlowReconstruction | None:
     """Continuous matter that moves through the training frames of `scan`, of several times; None where nothing moves.
 
     `reconstruction.object` of the result is a `MovingGaussians`. ask: whether the frames are asked first if anything
@@ -71,7 +71,7 @@ def reconstruct_moving(
     check_frames(train)
     assumed = light or LightOptions()
     method = {"kind": KIND, **to_table(options)}
-    config = config_of(scan, prior, method, seed, "continuous", Asked(assumed))
+    config = config_of(scan, prior, method, seed, "continuous", Assumptions(assumed))
     going = goes_on(folder, config, resume)
     task = prepared(Task(train, prior, seed, lambda stage, part: on_progress(stage, part, {}), assumed))
     mean = merged(task.scan)
@@ -97,13 +97,13 @@ def reconstruct_moving(
         Choice("continuous", {}, "Gaussians", decisions=task.decisions, against=task.prior.against),
         task.delta_told,
         judge(said, task.scan, task.noise if task.uneven else None),
-        light=found_in(task),
+        light=light_options_of(task),
     )
     if folder is not None:
         folder.start_metrics([])
         seen = {"times_s": task.scan.instants.tolist(), "misfit": found.misfit, "asked": list(found.history)}
         write_run(folder, done, task, None, seen)
-    return Motion(done, found.volume, found.history)
+    return FlowReconstruction(done, found.volume, found.history)
 
 
 def begun_in_motion(folder: RunFolder) -> bool:

@@ -41,7 +41,7 @@ from .preconditions import (
     require_one_time,
 )
 from .provenance import environment, scan_hash
-from .reconstruction import Asked, Choice, Reconstruction, config_of, read_rest, write_run
+from .reconstruction import Assumptions, Choice, Reconstruction, config_of, read_rest, write_run
 from .refine import (
     freedom_of,
     keep_geometry,
@@ -53,7 +53,7 @@ from .refine import (
     with_held_out,
 )
 from .run_folder import RunFolder, claimed
-from .run_light import found_in, read_light_options, still_in
+from .run_illumination import fixed_pattern_of, light_options_of, read_light_options
 from .totals import TotalMatter, total_of_run
 from .verdict import Verdict, judge_run, said_of_run
 
@@ -109,7 +109,7 @@ def reconstruct(
     if not resume:  # a run that goes on may be past them
         method.require_files()
     assumed, ranges, planned = light or LightOptions(), uncertain or Uncertain(), scan
-    asked = Asked(assumed, ranges, refine)
+    asked = Assumptions(assumed, ranges, refine)
     config = config_of(scan, prior, to_table(method), seed, matter or "auto", asked)
 
     def tell(stage: str, part: float) -> None:
@@ -394,8 +394,8 @@ class _Run:
             judge_run(found, fit, self.task, oversample),
             self._total(found, fit, oversample),
             self.constants,
-            found_in(self.task),
-            still=still_in(self.task, self.method, found, oversample),
+            light_options_of(self.task),
+            still=fixed_pattern_of(self.task, self.method, found, oversample),
         )
         if self.folder is not None:
             self._make_folder(found.backend)

@@ -34,7 +34,7 @@ from ..scan import Scan
 from ..tables import to_table
 from .provenance import scan_hash
 from .run_folder import RunFolder
-from .run_light import EVEN
+from .run_illumination import EVEN
 from .totals import TotalMatter
 from .verdict import Verdict
 
@@ -131,7 +131,7 @@ def summary_of(done: Reconstruction, fit: Running | None, train: Scan) -> dict[s
 
 
 @dataclass(frozen=True)
-class Asked:
+class Assumptions:
     """Assumptions of a run beside its method: light, ranges of the scan's constants, and which poses are refined."""
 
     light: LightOptions
@@ -145,7 +145,7 @@ def config_of(
     method: dict[str, Any],
     seed: int,
     matter: MatterKind | Literal["auto"],
-    asked: Asked,
+    asked: Assumptions,
 ) -> dict[str, Any]:
     """Entries of config.json that determine a run; method: its table of options, with its `kind`."""
     return {
@@ -270,7 +270,7 @@ def chosen_frames(time_frame: int | Literal["all"] | None, times: list[float]) -
     return [frame]
 
 
-def moment(done: Reconstruction, times: list[float], frame: int) -> Reconstruction:
+def reconstruction_at(done: Reconstruction, times: list[float], frame: int) -> Reconstruction:
     """`done` as it is at the instant `frame` (0 is the first) of `times` [s]: matter that stands still.
 
     Errors: `InputError` for an instant that there is not.
@@ -280,7 +280,7 @@ def moment(done: Reconstruction, times: list[float], frame: int) -> Reconstructi
     return replace(done, object=done.object.at(times[frame]))
 
 
-def timed(scan: Scan, times: list[float], frame: int) -> Scan:
+def with_time(scan: Scan, times: list[float], frame: int) -> Scan:
     """A scan of one time, which says 0 of it, as of the instant `frame` of `times` [s]."""
     exposures = replace(scan.exposures, time=[times[frame]] * len(scan))
     return Scan.of(scan.source, exposures, scan.is_test, scan.provenance)

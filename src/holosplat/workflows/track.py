@@ -30,9 +30,9 @@ from ..scan import Scan
 from ..tables import read_rows, to_table
 from .preconditions import check_frames, goes_on
 from .provenance import environment
-from .reconstruction import Asked, Choice, Reconstruction, config_of, write_rest, write_run
+from .reconstruction import Assumptions, Choice, Reconstruction, config_of, write_rest, write_run
 from .run_folder import Checkpoint, RunFolder, claimed
-from .run_light import found_in
+from .run_illumination import light_options_of
 from .verdict import judge
 
 LENGTH_UNIT = "um"
@@ -92,7 +92,7 @@ def track(
     check_frames(scan.train())
     assumed = light or LightOptions()
     method = {"kind": options.kind, **to_table(options)}
-    config = config_of(scan, prior, method, seed, "levels", Asked(assumed))
+    config = config_of(scan, prior, method, seed, "levels", Assumptions(assumed))
     with claimed(folder):
         if folder is not None and not goes_on(folder, config, resume):
             folder.begin(config | environment("cpu"))
@@ -112,7 +112,7 @@ def track(
             Choice("levels", {}, "soft fit", found.begun, task.decisions),
             task.delta_told,
             judge(said, train, task.noise if task.uneven else None),
-            light=found_in(task),
+            light=light_options_of(task),
             rest=_rest(found),
         )
         if folder is not None:

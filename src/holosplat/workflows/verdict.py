@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from ..checks import InputError
-from ..fit.causes import Cause, causes, scores
+from ..fit.misfit_diagnosis import Cause, cause_scores, likely_causes
 from ..fit.residuals import Prediction, Residuals, residuals, split_validation
 from ..fit.running import Running
 from ..methods import Task
@@ -200,11 +200,11 @@ def verdict(found: Residuals) -> Verdict:
     counts, views = found.rings.counts, len(found.residual)
     over = found.residual.mean(axis=0) / found.allowed.mean(axis=0)
     limit = TOO_MUCH**2 * (1 + SCATTER * np.sqrt(2 / (counts * views)))
-    bad, single = np.flatnonzero(over > limit), scores(found)
+    bad, single = np.flatnonzero(over > limit), cause_scores(found)
     faults = [name for name, size in LARGE.items() if _is_fault(single[name], size)]
     good, cause = not len(bad) and not faults, next(iter(faults), "")
     if len(bad):
-        named = causes(found)
+        named = likely_causes(found)
         cause = named[0].name if named else STIFF
         reasons = _reasons(found, named, single)
         words = _unexplained(found, bad, over)

@@ -20,7 +20,7 @@ from holosplat.checks import at_least, require
 from holosplat.fit.density import DensityControl, DensityEvent
 from holosplat.fit.loop import Fit, Plan, Stateless
 from holosplat.fit.optimiser import Adam, Trainable
-from holosplat.fit.problem import FIXED, Batch, Part, Problem
+from holosplat.fit.problem import FIXED, Batch, LossPart, Problem
 from holosplat.fit.schedule import Schedule
 from holosplat.fit.terms import Objective
 from holosplat.geometry import Grid
@@ -263,7 +263,7 @@ class RandomRays:
         self._frames = torch.from_numpy(train.frames).flatten(1)
         self._of_each = max(1, round(count / len(train)))
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The one part."""
         field, generator = model.object, self._generator
         assert isinstance(field, RadianceField)
@@ -275,4 +275,4 @@ class RandomRays:
             rays.append(ray + len(measured))
             measured = torch.cat((measured, frame[chosen]))
         found = field.intensities(torch.cat(positions), torch.cat(rays), len(measured))
-        return [Part("rays", 1.0, (found - measured).square().mean())]
+        return [LossPart("rays", 1.0, (found - measured).square().mean())]

@@ -13,7 +13,7 @@ from ...geometry import Views
 from ...model import Model
 from ...representations import NeuralField, PixelAlignedField, VoxelGrid
 from ...representations.neural_field import Samples, uniform
-from ..problem import FIXED, Batch, Part
+from ..problem import FIXED, Batch, LossPart
 from ..total_variation import total_variation
 from .frames import FrameTerm
 
@@ -31,7 +31,7 @@ class FieldVariation:
         self._weight, self._probes, self._generator = weight, probes, generator
         self.resolved = {"variation": weight}
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The one part."""
         field, generator = model.object, self._generator
         assert isinstance(field, NeuralField)
@@ -41,7 +41,7 @@ class FieldVariation:
         along = torch.randn(self._probes, 3, generator=generator, device=at.device)
         first, second = field(torch.cat((at, at + APART * normalize(along, dim=1)))).split(self._probes)
         total = (second - first).abs().mean(dim=0).sum() * (2 * len(cells) / APART)
-        return [Part("variation", self._weight, total)]
+        return [LossPart("variation", self._weight, total)]
 
 
 class RetrievedThickness:
@@ -56,12 +56,12 @@ class RetrievedThickness:
     def __init__(self, target: Tensor, views: Views, share: float, generator: torch.Generator) -> None:
         self._target, self._views, self._share, self._generator = target, views, share, generator
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The one part."""
         field = model.object
         assert isinstance(field, NeuralField)
         total = sum((self._view(field, v) for v in range(len(self._views))), start=self._target.new_zeros(()))
-        return [Part("thickness", 1.0, total / (self._share * len(self._views)))]
+        return [LossPart("thickness", 1.0, total / (self._share * len(self._views)))]
 
     def _view(self, field: NeuralField, v: int) -> Tensor:
         chosen = uniform(self._generator, self._target[v].numel()) < self._share
@@ -80,11 +80,11 @@ class AlignedFrames:
         self.names = (*frames.names, "variation")
         self.resolved = {**frames.resolved, "variation": weight}
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The parts of the data term, and the variation."""
         voxels = _voxels(model)
         seen = self._frames(replace(model, object=voxels), batch)
-        return [*seen, Part("variation", self._weight, _variation(voxels.values, self._smoothing))]
+        return [*seen, LossPart("variation", self._weight, _variation(voxels.values, self._smoothing))]
 
 
 class AlignedLines:
@@ -99,15 +99,15 @@ class AlignedLines:
         self._target, self._views, self._weight, self._smoothing = target, views, weight, smoothing
         self.resolved = {"variation": weight}
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """Both parts."""
         voxels, target = _voxels(model), self._target
         views = self._views if batch.index is None else self._views[batch.index.numpy()]
         lines = voxels.project(views).channels[:, 0] / self._views.finest
         missing = lines - (target if batch.index is None else target[batch.index])
         return [
-            Part("thickness", 1.0, 0.5 * missing.square().sum((1, 2)).mean()),
-            Part("variation", self._weight, _variation(voxels.values, self._smoothing)),
+            LossPart("thickness", 1.0, 0.5 * missing.square().sum((1, 2)).mean()),
+            LossPart("variation", self._weight, _variation(voxels.values, self._smoothing)),
         ]
 
 

@@ -18,7 +18,7 @@ from ...optics.retrieval.spectra import sensitivity
 from ...scan import Exposures, Scan
 from ...units import wavelength, wavenumber
 from ..fidelity import Target, l1_and_ssim
-from ..problem import FIXED, Batch, Part, Term
+from ..problem import FIXED, Batch, LossPart, Term
 from . import comparisons
 from .objective import IMAGE_TERMS, Objective
 
@@ -136,15 +136,15 @@ class FrameTerm:
             found["rounding"] = self._rounding
         return found if self.spectral is None else found | {"floor": self.spectral.floor}
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The loss of the frames, and the comparisons that it is made of."""
         parts = self.compared(model.frames(batch.index), batch)
         per_view = sum(weight * value for weight, value in parts.values())
         assert isinstance(per_view, Tensor)
         if self._detach_worst and len(per_view) > 1:
             per_view = torch.where(per_view > per_view.detach().median(), per_view.detach(), per_view)
-        shown = [Part(name, None, value.detach().mean()) for name, (_, value) in parts.items()]
-        return [Part("frames", 1.0, per_view.mean()), *shown]
+        shown = [LossPart(name, None, value.detach().mean()) for name, (_, value) in parts.items()]
+        return [LossPart("frames", 1.0, per_view.mean()), *shown]
 
     def compared(self, predicted: Tensor, batch: Batch) -> dict[str, Weighted]:
         """Weight and value [V] of every comparison in use."""
@@ -213,11 +213,11 @@ class Quadratic:
         self.names, self.resolved = (name,), FIXED
         self._weight, self._expected = weight, expected
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The one part."""
         parameters = model.parameters()
         squares = [(parameters[name] / deviation).square().sum() for name, deviation in self._expected.items()]
-        return [Part(self.names[0], self._weight, 0.5 * torch.stack([s.to(torch.float32) for s in squares]).sum())]
+        return [LossPart(self.names[0], self._weight, 0.5 * torch.stack([s.to(torch.float32) for s in squares]).sum())]
 
 
 EXPECTED = {

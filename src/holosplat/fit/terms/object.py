@@ -15,7 +15,7 @@ from ...backends import device
 from ...geometry import Grid
 from ...model import Model
 from ...representations import GaussianCloud
-from ..problem import FIXED, Batch, Part
+from ..problem import FIXED, Batch, LossPart
 from ..total_variation import total_variation
 from . import comparisons
 from .objective import Objective
@@ -45,7 +45,7 @@ class VolumeTerm:
         self.resolved = {name: self._scale * weight for name, weight in self._weights.items()}
         """The weights, after noise and the number of views, of sums along the beam in voxels."""
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The parts in use, where the batch looks at the volume."""
         if not (batch.volume and self._weights):
             return []
@@ -59,7 +59,7 @@ class VolumeTerm:
         }
         ramps = {"two_levels": batch.progress}
         return [
-            Part(name, batch.volume * weight * ramps.get(name, 1.0), self._scale * values[name]())
+            LossPart(name, batch.volume * weight * ramps.get(name, 1.0), self._scale * values[name]())
             for name, weight in self._weights.items()
         ]
 
@@ -73,11 +73,11 @@ class Anisotropy:
     def __init__(self, weight: float, limit: float) -> None:
         self._weight, self._limit = weight, limit
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The one part."""
         cloud = model.object
         assert isinstance(cloud, GaussianCloud)
-        return [Part("anisotropy", self._weight, comparisons.anisotropy(cloud.log_scales, self._limit))]
+        return [LossPart("anisotropy", self._weight, comparisons.anisotropy(cloud.log_scales, self._limit))]
 
 
 class Bending:
@@ -92,10 +92,10 @@ class Bending:
         self._weight = weight
         self.resolved = {"bending": weight}
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The one part."""
         vertices = model.parameters()["object.vertices"]
-        return [Part("bending", self._weight, squared_product(vertices, *self._operators))]
+        return [LossPart("bending", self._weight, squared_product(vertices, *self._operators))]
 
 
 def squared_product(x: Tensor, matrix: csr_array | Neighbours, transposed: csr_array | Neighbours) -> Tensor:
@@ -134,10 +134,10 @@ class VoxelVariation:
         self._weight, self._smoothing = weight, smoothing
         self.resolved = {"variation": weight}
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The one part."""
         values = model.parameters()["object.values"]
-        return [Part("variation", self._weight, total_variation(values, self._smoothing, "cpu") * values.numel())]
+        return [LossPart("variation", self._weight, total_variation(values, self._smoothing, "cpu") * values.numel())]
 
 
 class Neighbours:

@@ -23,7 +23,7 @@ SPARSE = 6.0
 """Distance [pixels] at most of the points that a flow carries back exactly; what lies between is linear."""
 
 
-class CarriedProblem:
+class FlowProblem:
     """½ χ² of the frames of several times and the prior of the volume u [Z, Y, X] ≥ 0 of the reference time.
 
     frames: of each time, of the same field; times: [s]; flow: what carries the volume, in `unit` pixels of the frames
@@ -172,7 +172,7 @@ def _minimised(tensors: list[Tensor], iterations: int) -> torch.optim.LBFGS:
 
 
 def likelier_fading(
-    problem: CarriedProblem, u: Tensor, fading: Fading, flow: Flow, iterations: int, spread: float
+    problem: FlowProblem, u: Tensor, fading: Fading, flow: Flow, iterations: int, spread: float
 ) -> tuple[Fading, list[float]]:
     """`fading` after some iterations of L-BFGS towards the likeliest one of `u`, which the problem's flow carries; and
     the objective's values.
@@ -195,7 +195,7 @@ def likelier_fading(
 
 
 def likelier_flow(
-    problem: CarriedProblem,
+    problem: FlowProblem,
     u: Tensor,
     flow: Flow,
     iterations: int,

@@ -53,7 +53,7 @@ def excess(found: Residuals) -> float:
     return float(np.maximum((ratio - 1).sum(axis=0) * found.rings.counts, 0.0).sum())
 
 
-def scores(found: Residuals) -> dict[str, Cause]:
+def cause_scores(found: Residuals) -> dict[str, Cause]:
     """Each change tested by itself: the step to the minimum of χ², whose derivatives the probes hold.
 
     This is Rao's score test (Rao 1948), with the derivatives by finite differences. The object has already taken up
@@ -63,7 +63,7 @@ def scores(found: Residuals) -> dict[str, Cause]:
     return {cause.name: cause for cause in _tested(found, left)}
 
 
-def causes(found: Residuals, least: float = 0.1, most: int = 3) -> list[Cause]:
+def likely_causes(found: Residuals, least: float = 0.1, most: int = 3) -> list[Cause]:
     """At most `most` causes, one after another: that which takes away most of what those before it left.
 
     Those that take away less than the share `least` of the excess are left out.

@@ -22,7 +22,7 @@ EVEN = LightOptions("even")
 """Frames are compared as they are."""
 
 
-def found_in(task: Task) -> LightOptions:
+def light_options_of(task: Task) -> LightOptions:
     """What a run assumes of other frames of its scan: smooth light if that of the training frames is uneven; other
     frames are taken to have the mean flux."""
     known = task.uneven and task.uneven.background
@@ -37,7 +37,7 @@ def read_light_options(config: Mapping[str, Any], summary: Mapping[str, Any]) ->
     return replace(from_table(LightOptions, config.get("light", {}), "light"), kind="smooth")
 
 
-def still_in(task: Task, method: Method, found: Stored, oversample: int) -> np.ndarray | None:
+def fixed_pattern_of(task: Task, method: Method, found: Stored, oversample: int) -> np.ndarray | None:
     """The light [H, W] that the frames of a run have in common, float32; None where they have none.
 
     It was divided out before (`prepared`), or is an unknown of `method`: then it is what is left beside what was found.

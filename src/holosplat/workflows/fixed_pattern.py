@@ -21,7 +21,7 @@ FEWEST = 2
 
 
 @dataclass(frozen=True)
-class StillLight:
+class FixedPatternOptions:
     """How still light is found."""
 
     order: int
@@ -39,7 +39,9 @@ class StillLight:
         require(self.inside >= 0, f"matter must lie within 0 m or more, but it is {self.inside:g} m.")
 
 
-def still_light(scan: Scan, prior: MaterialPrior, options: StillLight, on_progress: Progress) -> np.ndarray:
+def estimate_fixed_pattern(
+    scan: Scan, prior: MaterialPrior, options: FixedPatternOptions, on_progress: Progress
+) -> np.ndarray:
     """The light [H, W], relative to the flat field, that the training frames of `scan` have in common.
 
     Their matter is made by phase retrieval and total variation, with an occupancy of at most one where `prior` knows
@@ -62,14 +64,14 @@ def still_light(scan: Scan, prior: MaterialPrior, options: StillLight, on_progre
     return mean_light(torch.from_numpy(train.frames), predicted, options.order).float().numpy()
 
 
-def evened(
+def flatfield_corrected(
     scan: Scan,
     prior: MaterialPrior,
-    options: StillLight,
+    options: FixedPatternOptions,
     on_progress: Progress = lambda stage, fraction: None,
 ) -> Scan:
-    """The scan with all its frames, held-out ones too, divided by the `still_light` of those for training."""
-    light = still_light(scan, prior, options, on_progress)
+    """The scan with all frames, held-out ones too, divided by the fixed pattern of the training frames."""
+    light = estimate_fixed_pattern(scan, prior, options, on_progress)
     said = {"still_light": f"{np.log(light).std():.2%} (rms), order {options.order}, divided out"}
     frames, provenance = divided(scan.source, light[None]), scan.provenance | said
     return Scan.of(frames, scan.exposures, scan.is_test, provenance, scan.light)

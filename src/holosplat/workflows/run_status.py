@@ -20,7 +20,7 @@ OBJECT = "object."
 
 
 @dataclass(frozen=True)
-class Latest:
+class RunStatus:
     """stage: its name, empty before the first; step, loss: the last that are kept; object: None until there is one."""
 
     stage: str
@@ -46,11 +46,11 @@ def fitted_by(folder: RunFolder) -> Writer | None:
     return None if ended else writer
 
 
-def latest(folder: RunFolder) -> Latest:
+def read_status(folder: RunFolder) -> RunStatus:
     """What the run has come to; `InputError` for files that are damaged, or of another run."""
     state = folder.load_checkpoint()
     if state is None:
-        return Latest("")
+        return RunStatus("")
     with as_written(folder.checkpoint, "a checkpoint of this run"):
         if "start" in state:  # of `reconstruct`, whose records are in metrics.csv
             stages, history = list(folder.read_config().get("resolved", {})), folder.history()
@@ -60,7 +60,7 @@ def latest(folder: RunFolder) -> Latest:
             records = state.get("records") or [{}]
             record, stage = records[-1], str(state.get("next") or f"{state.get('steps')} steps are done")
         step, loss = record.get("step"), record.get("loss")
-        return Latest(stage, None if step is None else int(step), loss, _object_of(state))
+        return RunStatus(stage, None if step is None else int(step), loss, _object_of(state))
 
 
 def _object_of(state: Mapping[str, Any]) -> Stored | None:
