@@ -19,7 +19,7 @@ from holosplat.matter import MaterialPrior
 from holosplat.methods import SmoothVolume, Task
 from holosplat.motion.carried import CarriedOptions, Search, merged
 from holosplat.representations import Fading, Flow, Lattice, TimeBasis
-from holosplat.representations.flow import faded
+from holosplat.representations.flow import fading_factor
 
 QUICK = SmoothVolume(coarser=(), rounds=1, iterations=8)
 LATTICE = Lattice.around((SHAPE[1], SHAPE[0], SHAPE[1]), 2)
@@ -41,7 +41,7 @@ def test_a_field_on_voxels_is_that_at_points():
     assert fading.on(axes).numpy() == pytest.approx(there.numpy())
     even = fading.with_coefficients(torch.ones_like(fading.coefficients))
     assert even.on(axes).numpy() == pytest.approx(1.0)
-    assert float(faded(torch.tensor([0.3, -0.4]), 0.5)) == pytest.approx(np.exp(0.15 - 0.1))
+    assert float(fading_factor(torch.tensor([0.3, -0.4]), 0.5)) == pytest.approx(np.exp(0.15 - 0.1))
 
 
 def test_gaussians_fade_as_the_field_says():
@@ -52,7 +52,7 @@ def test_gaussians_fade_as_the_field_says():
     before = torch.nn.functional.softplus(raw)
     for later, bound in (*((s, 1e-9) for s in ENDS), (0.2, 0.02), (-0.3, 0.02)):
         found = torch.nn.functional.softplus(raw + later * linear + later**2 * square) / before
-        assert found.numpy() == pytest.approx(faded(fading.at(centres), later).numpy(), rel=bound)
+        assert found.numpy() == pytest.approx(fading_factor(fading.at(centres), later).numpy(), rel=bound)
 
 
 def search(scan, spread: float) -> Search:

@@ -20,7 +20,7 @@ from holosplat.learning.weights import read_aligned, read_weights
 from holosplat.representations import AlignedNetwork
 from holosplat.training.aligned import AlignedTraining, AlignedValidation
 from holosplat.training.folder import Dataset
-from holosplat.training.options import FrameGoal, Shown, TrainOptions
+from holosplat.training.options import FrameLossWeights, TrainOptions, ViewSampling
 from holosplat.training.ranges import Ranges
 from holosplat.training.sample import Sample
 from holosplat.training.train import Training
@@ -35,9 +35,9 @@ OPTIONS = TrainOptions(
     warm_up=2,
     rate=0.02,
     precision="float32",
-    shown=Shown(views=(2, 3), rows=(16,)),
+    shown=ViewSampling(views=(2, 3), rows=(16,)),
     size=Size((4, 4, 6, 6), 3, (4, 6, 8)),
-    frames=FrameGoal(adversary=0.1, pretrain=0.3),
+    frames=FrameLossWeights(adversary=0.1, pretrain=0.3),
 )
 
 

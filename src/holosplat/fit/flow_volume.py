@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
-from ..representations.flow import Fading, Flow, faded
+from ..representations.flow import Fading, Flow, fading_factor
 from .smooth_volume import ContinuousPrior, VolumeProblem
 from .whitened import WhitenedFrames
 
@@ -64,7 +64,7 @@ class FlowProblem:
     def _factor(self, fading: Fading, flow: Flow, time: float) -> Tensor:
         """What matter has become at `time` [Z, Y, X], as a share of what it was at the reference of `flow`."""
         values = fading.on([self._unit * torch.from_numpy(places) for places in self.grid.axes()])
-        return faded(values, (time - flow.reference) / (flow.basis.last - flow.basis.first))
+        return fading_factor(values, (time - flow.reference) / (flow.basis.last - flow.basis.first))
 
     def at(self, u: Tensor, k: int) -> Tensor:
         """The volume [Z, Y, X] of the time numbered k."""

@@ -1,4 +1,4 @@
-"""What would explain a residual: score tests of the changes that `residuals` probed."""
+"""Diagnosis of a misfit: score tests of the changes that `residuals` probed."""
 
 from __future__ import annotations
 

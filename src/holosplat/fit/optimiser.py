@@ -1,4 +1,4 @@
-"""Optimisers over named parameters: Adam, with what a method may ask of single groups."""
+"""Adam over named parameters with options of single groups, and a model whose free parameters it moves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where beams are, as numbers of a fit beside its object: which are free, what is expected of them, and the gauge."""
+"""Poses as parameters of a fit: which are free, their prior, and the gauge that the object shares with them."""
 
 from __future__ import annotations
 

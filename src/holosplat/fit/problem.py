@@ -1,4 +1,4 @@
-"""`Problem`: a model, and the terms whose sum its parameters are to make small."""
+"""The problem of a fit: a model and the terms of its loss, the batches of its steps, and steps as CUDA graphs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a model leaves of measured frames, by spatial frequency and view, and what would explain it."""
+"""Residuals of measured frames by spatial frequency and view, what would explain them, and validation frames."""
 
 from __future__ import annotations
 

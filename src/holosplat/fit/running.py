@@ -1,4 +1,4 @@
-"""What a run asks of a fit, whatever drives it: steps that can be stopped, saved and gone on with."""
+"""The interface of a resumable fit: steps that stop, save and continue; Ctrl-C between them; memoised steps."""
 
 from __future__ import annotations
 

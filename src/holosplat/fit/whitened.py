@@ -1,4 +1,4 @@
-"""How far predicted frames are from measured ones in units of their noise, as a function of line integrals."""
+"""Misfit of frames in units of their noise, as a function of line integrals; smooth light is projected out."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Lifting of images of parallel views to the voxels of a lattice, and its adjoint."""
+"""Lifting of images of parallel views to the voxels of a lattice, its adjoint, and symmetric copies of a scene."""
 
 from __future__ import annotations
 

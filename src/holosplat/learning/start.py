@@ -75,7 +75,7 @@ class Guessed:
         return unexplained(self.values, self.images, self.taps, factor)
 
 
-def guessed(scan: Scan, material: DeltaBeta, network: Guess, on_progress: Progress) -> Guessed:
+def guess_matter(scan: Scan, material: DeltaBeta, network: Guess, on_progress: Progress) -> Guessed:
     """The occupancy of `material` that `network` guesses from the frames of `scan`.
 
     The network knows bodies of some pixels across. So frames are shown on pixels of two sizes, and the larger ones are

@@ -1,4 +1,4 @@
-"""`Model`: matter, where the beams are, wave optics and light; the only way from these to frames."""
+"""`Model`: matter, poses, wave optics and light in, frames out."""
 
 from __future__ import annotations
 

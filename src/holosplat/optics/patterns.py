@@ -1,4 +1,4 @@
-"""Fixed pattern: the factor that all frames have in common in the same pixels, beside what matter predicts for them."""
+"""Patterns of light: smooth modes, and the fixed pattern that all frames have in common beside their matter."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The figures of the page with their captions; where data is absent, a sentence says so instead."""
+"""The figures of the page with their captions; a sentence replaces a figure without data."""
 
 from __future__ import annotations
 

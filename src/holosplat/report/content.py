@@ -1,4 +1,4 @@
-"""Everything a report shows, as data."""
+"""The content of a report as data: quantities, bodies in motion, guesses, scores."""
 
 from __future__ import annotations
 

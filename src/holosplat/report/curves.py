@@ -1,4 +1,4 @@
-"""The plots: correlation curves, the course of the fit, and histograms. Each function returns a figure."""
+"""The plots: correlation curves, the course of fits and trainings, histograms. Each function returns a figure."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Figures of bodies in motion: their ways, their shapes over time, and a film strip beside the frames."""
+"""Bodies in motion: trajectories, shapes over time, a film strip and an animation, with their captions."""
 
 from __future__ import annotations
 
@@ -183,10 +183,10 @@ def animation(moving: Moving, most_bytes: int = MOST_BYTES) -> bytes | None:
     if not features.check("webp"):
         return None
     seconds = min(LONGEST, SECONDS / len(moving.shown))
-    return encoded([_picture(moving, k) for k in range(len(moving.shown))], seconds, most_bytes)
+    return encode_animation([_picture(moving, k) for k in range(len(moving.shown))], seconds, most_bytes)
 
 
-def encoded(pictures: Sequence[np.ndarray], seconds: float, most_bytes: int) -> bytes:
+def encode_animation(pictures: Sequence[np.ndarray], seconds: float, most_bytes: int) -> bytes:
     """RGB pictures [H, W, 3] uint8 as one WebP that moves: each stays for `seconds`, over and over.
 
     Its quality, and then its size, are lowered until it has no more than `most_bytes`.

@@ -1,4 +1,4 @@
-"""The report of a run folder: collects what the page shows."""
+"""The report of a run folder: collects the content of the page, with the view in three dimensions."""
 
 from __future__ import annotations
 
@@ -211,8 +211,10 @@ def _lit(reconstruction: Reconstruction, scan: Scan, evaluation: Evaluation) -> 
     predicted = render(reconstruction, shown.exposures)
     measured, part = torch.from_numpy(shown.frames), light.part(torch.from_numpy(chosen))
     if part.background is not None:
-        still = 1.0 if part.still is None else part.still
-        part = replace(part, background=part.background.seen_beside(measured / still, torch.from_numpy(predicted)))
+        fixed = 1.0 if part.still is None else part.still
+        part = replace(
+            part, background=part.background.seen_beside(measured / fixed, torch.from_numpy(predicted))
+        )
     return LitViews(
         shown.frames,
         part.factor().numpy(),
@@ -290,7 +292,7 @@ def view_of(obj: Stored, volume: Volume, truth: Volume | None, scan: Scan, delta
         labels=view_labels(scan.views),
         grey=(float(low), float(max(high, low + 1e-6))),
         top=sign * (float(np.percentile(sign * shift, ENDS[1])) or 1.0),
-        picture=still(shift, sign),
+        picture=still_picture(shift, sign),
         delta_told=delta_told,
     )
 
@@ -304,7 +306,7 @@ def first_phase(obj: Stored, scan: Scan) -> np.ndarray:
 
 
 @styled
-def still(phase: np.ndarray, sign: float = 1.0) -> str:
+def still_picture(phase: np.ndarray, sign: float = 1.0) -> str:
     """The picture that stands where the view cannot be turned, as a `data:` URI; sign: that of the matter's δ."""
     rows, columns = phase.shape
     figure = new_figure(2.4, 2.4 * rows / columns, layout="none")

@@ -263,7 +263,7 @@ class Fading:
         amplitudes = softplus(raw)
         a, b = ends
         now, g = raw_of(amplitudes), self.at(centres).to(raw)
-        first, last = (raw_of(amplitudes * faded(g, s)) - now for s in ends)
+        first, last = (raw_of(amplitudes * fading_factor(g, s)) - now for s in ends)
         curved = (first / a - last / b) / (a - b)
         return torch.stack([first / a - a * curved, curved])
 
@@ -273,6 +273,6 @@ class Fading:
         return self.lattice.weights(points, axis, 0)[0]
 
 
-def faded(values: Tensor, later: float) -> Tensor:
+def fading_factor(values: Tensor, later: float) -> Tensor:
     """The factors exp(s g₁ + s² g₂) [...] of g₁ and g₂ `values` [2, ...] at s = `later`."""
     return (later * values[0] + later**2 * values[1]).exp()

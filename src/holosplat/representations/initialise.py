@@ -1,4 +1,4 @@
-"""Initialisation of Gaussians: from the volume of a classical reconstruction, or at random."""
+"""Initialisation of Gaussians: from the volume of a classical reconstruction, from moments, or at random."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Surfaces out of volumes: marching cubes, what is too small left out, the cubes' steps smoothed away."""
+"""Surfaces out of volumes: marching cubes, removal of small shells, smoothing; subdivision of triangles."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def edge_lengths(vertices: Tensor, faces: Tensor) -> Tensor:
     return (corners - corners.roll(1, dims=1)).norm(dim=2).flatten()
 
 
-def subdivided(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
+def loop_subdivision(vertices: Tensor, faces: Tensor) -> tuple[Tensor, Tensor]:
     """Vertices [P + E, 3] and faces [4 F, 3]: each triangle of closed surfaces is four (C. Loop 1987, "Smooth
     subdivision surfaces based on triangles", section 3), wound as before.
 

@@ -1,4 +1,4 @@
-"""Gaussians that a flow carries along, turning and stretching each, as an Object."""
+"""Gaussians that a flow carries, rotates and stretches, as an Object; their principal axes."""
 
 from __future__ import annotations
 

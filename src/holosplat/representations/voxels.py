@@ -1,4 +1,4 @@
-"""Matter on voxels, as an Object: what the classical methods give, and what can be fitted to frames."""
+"""Matter on voxels, as an Object, and its line integrals: results of classical methods, and parameters of fits."""
 
 from __future__ import annotations
 

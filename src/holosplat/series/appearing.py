@@ -1,4 +1,4 @@
-"""Files that appear in a folder: which are there, and which of them are complete."""
+"""Scan files in folders: lists of them, new ones, and whether they are complete."""
 
 from __future__ import annotations
 

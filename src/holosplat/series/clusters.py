@@ -1,4 +1,4 @@
-"""A Slurm array script for the tasks of a series that are left: written, and submitted only when asked for."""
+"""Clusters for the tasks of a series: a Slurm array script, and dask."""
 
 from __future__ import annotations
 

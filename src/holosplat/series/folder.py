@@ -1,4 +1,4 @@
-"""The folder of a series: its plan, and a folder for each task, which says how far that is."""
+"""The folder of a series: its plan, a folder for each task, and the state of each in words."""
 
 from __future__ import annotations
 

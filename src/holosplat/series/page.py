@@ -1,4 +1,4 @@
-"""The page of a series: what every time gave, with a phase map to page through; of `watch`, kept up to date."""
+"""The page of a series: results of every time, charts, and phase maps; `watch` updates it."""
 
 from __future__ import annotations
 

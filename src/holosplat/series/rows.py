@@ -1,4 +1,4 @@
-"""The result of one time of a series as a small JSON file."""
+"""The result of one time of a series as a small JSON file, and as a line of text."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings for every time of a series, as a table in its folder."""
+"""Settings for every time of a series, as a table in its folder, and its options on the command line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One task of a series: a window of times, done in order; what is done already is not done again."""
+"""One task of a series: a window of times in order, each reconstructed, or all tracked; finished times are skipped."""
 
 from __future__ import annotations
 

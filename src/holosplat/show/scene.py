@@ -1,4 +1,4 @@
-"""An object on a page, with sliders that cut matter away and lead through time."""
+"""An object on a page, with sliders for cuts and time; a run in progress is updated."""
 
 from __future__ import annotations
 

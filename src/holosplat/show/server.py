@@ -1,4 +1,4 @@
-"""The live view: viser's server, on the loopback address only and behind a token (`guard`)."""
+"""The live view: viser's server, on the loopback address only and behind a token."""
 
 from __future__ import annotations
 

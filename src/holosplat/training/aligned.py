@@ -1,4 +1,4 @@
-"""Training of pixel-aligned networks on frames alone, and how they do on scenes of another seed."""
+"""Training of pixel-aligned networks on frames alone: examples, discriminator, training and validation."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from ..representations import AlignedNetwork, PixelAligned, PixelAlignedField, V
 from ..representations.neural_field import grown
 from ..scan import Exposures
 from .folder import Dataset
-from .options import Shown, TrainOptions
+from .options import TrainOptions, ViewSampling
 from .sample import Sample, SampleScan, as_scan
 from .shown import share_of_overlap
 from .train import BETAS, PURPOSE, Training
@@ -38,7 +38,7 @@ FIT = AlignedFit()
 
 
 @dataclass(frozen=True)
-class AlignedLesson:
+class AlignedExample:
     """scene: all frames of a sample; noise: [N], of these; seen: those that the network is shown; targets: those that
     it should predict; network: `onix` or `pixelnerf`; device: where the network is, and all is compared."""
 
@@ -49,7 +49,7 @@ class AlignedLesson:
     network: str
     device: str = "cpu"
 
-    def on(self, device: str) -> AlignedLesson:
+    def on(self, device: str) -> AlignedExample:
         """The same on a device."""
         return replace(self, device=device)
 
@@ -104,7 +104,9 @@ class AlignedLesson:
         return Model(voxels, Instrument(exposures, fringe_sampling(exposures), backend=voxels.backend)).frames()
 
 
-def aligned_lesson(sample: Sample, how: Shown, targets: int, network: str, rng: np.random.Generator) -> AlignedLesson:
+def draw_aligned_example(
+    sample: Sample, how: ViewSampling, targets: int, network: str, rng: np.random.Generator
+) -> AlignedExample:
     """`sample` as it is shown once: some of its views, and others that are to be foretold."""
     training = np.flatnonzero(~sample.is_test)
     count = min(int(rng.choice(how.views)), len(training))
@@ -112,14 +114,14 @@ def aligned_lesson(sample: Sample, how: Shown, targets: int, network: str, rng: 
     seen, rest = order[:count], np.concatenate([order[count:], np.flatnonzero(sample.is_test)])
     new = rng.permutation(rest)[: (targets + 1) // 2]
     old = rng.permutation(seen)[: targets - len(new)]
-    return AlignedLesson(as_scan(sample), sample.noise, seen, np.concatenate([new, old]), network)
+    return AlignedExample(as_scan(sample), sample.noise, seen, np.concatenate([new, old]), network)
 
 
-def first_views(sample: Sample, count: int, network: str) -> AlignedLesson:
+def first_views(sample: Sample, count: int, network: str) -> AlignedExample:
     """The first `count` views for training, to foretell those that are held out."""
     training = np.flatnonzero(~sample.is_test)
     rest = np.concatenate([np.flatnonzero(sample.is_test), training[count:]])
-    return AlignedLesson(as_scan(sample), sample.noise, training[:count], rest, network)
+    return AlignedExample(as_scan(sample), sample.noise, training[:count], rest, network)
 
 
 WIDTHS = (1, 16, 32, 32)
@@ -187,7 +189,7 @@ class AlignedTraining(Training):
 
     def _value(self, sample: Sample, rng: np.random.Generator) -> tuple[Tensor, list[float]]:
         goal = self.options.frames
-        lesson = aligned_lesson(sample, self.options.shown, goal.targets, self.options.network, rng)
+        lesson = draw_aligned_example(sample, self.options.shown, goal.targets, self.options.network, rng)
         lesson = lesson.on(self.options.device)
         voxels = lesson.field(dict(self.network.named_parameters()), self.size).at(0.0)
         misfit, misled = lesson.misfit(voxels), torch.zeros(())

@@ -1,4 +1,4 @@
-"""A folder of scenes for learning: shards in HDF5, a datasheet, and what they were drawn from."""
+"""A dataset folder of scenes: shards in HDF5, made in one or several processes, and a datasheet."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ class Dataset:
             return Sample(**{name: np.asarray(fields.dataset(name)[index % SHARD]) for name in Sample.names()})
 
 
-def make(dataset: Dataset, jobs: int, on_progress: Advance) -> int:
+def make_dataset(dataset: Dataset, jobs: int, on_progress: Advance) -> int:
     """Simulate what `dataset` lacks and write its datasheet; the number of files that were made.
 
     What is interrupted keeps its whole files. Errors: those of `Dataset.begin`.

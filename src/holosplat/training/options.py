@@ -13,7 +13,7 @@ from ..ranges import Natural, Positive, Rate, Seed, Share, Weight, ranged
 
 @dataclass(frozen=True)
 @ranged
-class FrameGoal:
+class FrameLossWeights:
     """The training loss of networks that learn from frames alone, without volumes."""
 
     targets: Natural = 2
@@ -30,7 +30,7 @@ class FrameGoal:
 
 @dataclass(frozen=True)
 @ranged
-class Shown:
+class ViewSampling:
     """How samples are shown, so that few scenes stand for many."""
 
     views: tuple[Natural, ...] = (2, 2, 2, 2, 3, 3, 3, 4, 5, 6)
@@ -43,7 +43,7 @@ class Shown:
 
 @dataclass(frozen=True)
 @ranged
-class Goal:
+class LossWeights:
     """Weights of what is minimised."""
 
     entropy: Weight = 20.0
@@ -83,14 +83,14 @@ class TrainOptions:
     """Of the first weights, and of what is shown when."""
     size: Size = field(default_factory=Size)
     """Of the network."""
-    shown: Shown = field(default_factory=Shown)
+    shown: ViewSampling = field(default_factory=ViewSampling)
     """How scenes are shown."""
-    goal: Goal = field(default_factory=Goal)
+    goal: LossWeights = field(default_factory=LossWeights)
     """The training loss."""
     network: Literal["start", "onix", "pixelnerf"] = "start"
     """What is trained: the network of `--start learned`, or those of the methods `onix` and `pixelnerf`, which learn
     from frames alone; these are of one size."""
-    frames: FrameGoal = field(default_factory=FrameGoal)
+    frames: FrameLossWeights = field(default_factory=FrameLossWeights)
     """The training loss of networks that learn from frames alone."""
 
     def __post_init__(self) -> None:

@@ -1,4 +1,4 @@
-"""One scene for learning: drawn, imaged, and what phase retrieval makes of its frames."""
+"""One scene for learning: drawn from ranges, imaged, with retrieved thickness; also as a scan."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ THICKEST = 0.33
 """Thickness of a resting red cell at most, in diameters (Evans & Fung 1972)."""
 
 
-def drawn(ranges: Ranges, seed: int, index: int) -> Declaration:
+def draw_scene(ranges: Ranges, seed: int, index: int) -> Declaration:
     """The scene number `index` of `seed`; the same for ever, whatever else is drawn."""
     rng = np.random.default_rng([PURPOSE, seed, index])
     kind = ranges.kinds[index % len(ranges.kinds)]
@@ -245,7 +245,7 @@ class Sample:
 
 def drawn_case(ranges: Ranges, seed: int, index: int) -> Case:
     """The scene number `index` of `seed` as a case; where not all of its bodies find a place, with fewer of them."""
-    declared = drawn(ranges, seed, index)
+    declared = draw_scene(ranges, seed, index)
     own = int(np.random.default_rng([PURPOSE, seed, index, 1]).integers(2**31))
     while True:
         try:

@@ -1,4 +1,4 @@
-"""Training: from a dataset to weights, in a folder that can be taken up again."""
+"""Training: from a dataset to weights with a model card, in a folder that can be continued."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from .folder import Dataset
 from .options import TrainOptions
 from .ranges import Ranges
 from .sample import Sample
-from .shown import lesson, loss
+from .shown import draw_example, loss
 from .validate import Validation
 
 PURPOSE = 2102
@@ -148,7 +148,7 @@ class Training:
     def _value(self, sample: Sample, rng: np.random.Generator) -> tuple[Tensor, list[float]]:
         """What this step minimises, and the scores that the curves show beside it."""
         assert isinstance(self.network, Guess)
-        shown = lesson(sample, self.options.shown, rng)
+        shown = draw_example(sample, self.options.shown, rng)
         with self._precision():
             value, scores = loss(self.network, shown.on(self.options.device), self.options.goal)
         return value, scores.tolist()

@@ -1,4 +1,4 @@
-"""Still light: what all frames have in common beside the matter that they show, as where a flat field is missing."""
+"""Fixed pattern: the common factor of all frames beside their matter, where a flat field is missing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`reconstruct` of matter in motion: a scan of several times in, Gaussians that a flow carries and their folder out."""
+"""`reconstruct` of moving continuous matter: Gaussians that a flow carries, from a scan of several times."""
 
 from __future__ import annotations
 

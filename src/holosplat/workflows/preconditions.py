@@ -1,4 +1,4 @@
-"""Whether an interrupted run can go on: with what it was started with, and nothing else."""
+"""Preconditions of a run: scans that can be reconstructed, and folders that can be continued."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `reconstruct` gives back: the matter, and what was decided and found on the way."""
+"""The result of `reconstruct`: the object, decisions and estimates, and their entries in the files of a run."""
 
 from __future__ import annotations
 

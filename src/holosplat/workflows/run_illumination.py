@@ -1,4 +1,4 @@
-"""The light of frames that a reconstruction is compared with, each by its own air: no matter is predicted for it."""
+"""The illumination of frames that a reconstruction is compared with, estimated from the air of each frame."""
 
 from __future__ import annotations
 

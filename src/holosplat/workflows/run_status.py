@@ -1,4 +1,4 @@
-"""What a run that another process fits has come to, by its folder: the last checkpoint, and the last row of metrics."""
+"""The status of a run by its folder: its last checkpoint and metrics, and a summary for `holosplat info`."""
 
 from __future__ import annotations
 

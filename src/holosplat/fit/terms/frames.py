@@ -1,4 +1,4 @@
-"""The data term: how far predicted frames are from measured ones, by the weights of an `Objective`."""
+"""The data term: differences of predicted and measured frames, weighted by an `Objective`; priors of geometry and light."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A field of space and time by six planes of features and a small decoder."""
+"""Fields of space and time by six planes of features and a small decoder, and low-rank voxels; fits of both."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The thesis' study as a page: its Table 2, all its curves, and what of its findings reproduces."""
+"""The thesis' study as a page: its Table 2, all its curves as figures, and which findings reproduce."""
 
 from __future__ import annotations
 
