@@ -62,7 +62,7 @@ class FlowProblem:
             self._fading = [None if fading is None else self._factor(fading, flow, time) for time in self.times]
 
     def _factor(self, fading: Fading, flow: Flow, time: float) -> Tensor:
-        """What matter has become at `time` [Z, Y, X], as a share of what it was at the reference of `flow`."""
+        """The matter at `time` [Z, Y, X], as a share of what it was at the reference of `flow`."""
         values = fading.on([self._unit * torch.from_numpy(places) for places in self.grid.axes()])
         return fading_factor(values, (time - flow.reference) / (flow.basis.last - flow.basis.first))
 
@@ -107,7 +107,7 @@ class FlowProblem:
         return value
 
     def _came_from(self, flow: Flow, time: float) -> Tensor | None:
-        """Where each voxel's matter at `time` was at the reference, as `grid_sample` wants it; None: where it is."""
+        """Reference positions of each voxel's matter at `time`, as `grid_sample` takes them; None: unchanged."""
         if time == flow.reference:
             return None
         moved = flow.carried(self._points.to(flow.potential), time, flow.reference) / self._unit

@@ -68,18 +68,18 @@ class Stateless:
     the record, and has no state."""
 
     def on_gradients(self, leaves: Leaves) -> None:
-        """Nothing."""
+        """Leaves gradients as they are."""
 
     def columns(self, model: Model) -> Record:
-        """Nothing."""
+        """No columns."""
         return {}
 
     def state_dict(self) -> dict[str, Any]:
-        """Nothing."""
+        """An empty state."""
         return {}
 
     def load(self, state: dict[str, Any]) -> None:
-        """Nothing."""
+        """There is no state to load."""
 
 
 def _no_rates(factor: float, step: int) -> Mapping[str, float]:

@@ -56,7 +56,7 @@ def excess(found: Residuals) -> float:
 def cause_scores(found: Residuals) -> dict[str, Cause]:
     """Each change tested by itself: the step to the minimum of χ², whose derivatives the probes hold.
 
-    This is Rao's score test (Rao 1948), with the derivatives by finite differences. The object has already taken up
+    This is Rao's score test (Rao 1948), with the derivatives by finite differences. The object has already absorbed
     what it could, so that the change of a constant that it imitates is underestimated.
     """
     left = [probe.product for probe in found.probes]

@@ -91,7 +91,7 @@ class PoseRefinement:
         return replace(self, so_far=so_far)
 
     def tells_mean(self, exposures: Exposures) -> bool:
-        """Whether frames tell the mean distance better than the plan does (see `SAMPLED`)."""
+        """Whether the mean distance is known better from the frames than from the plan (see `SAMPLED`)."""
         return self.edges and mean_distance_error(exposures) < self.distance / np.sqrt(len(self))
 
 
@@ -186,8 +186,8 @@ class GeometryPrior:
 
 
 class Gauge(Stateless):
-    """What no frame tells stays: a motion and a turn of the whole object, its size (the mean magnification), and a mean
-    distance that sampling would move.
+    """Projects out what frames do not determine: a motion and a turn of the whole object, its size (the mean
+    magnification), and a mean distance that sampling would move.
 
     An event of a fit: gradients and numbers are projected onto what changes frames. What is not free has no gradient.
     """
@@ -211,7 +211,7 @@ class Gauge(Stateless):
                 values.copy_((kept.to(values) @ values.flatten()).reshape(values.shape))
 
     def on_gradients(self, leaves: Leaves) -> None:
-        """Gradients along what no frame tells are chance."""
+        """Project out gradients along directions that frames do not determine."""
         self._each(leaves, lambda leaf: leaf.grad)
 
     def after_step(self, trainable: Trainable, step: int, steps: int, generator: torch.Generator) -> bool:

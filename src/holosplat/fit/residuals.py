@@ -153,7 +153,7 @@ class Allowance:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What is said of V frames; each is computed when it is asked for, so that the waves of one are held at a time.
+    """The predictions of V frames; each is computed at its first use, so that the waves of one are held at a time.
 
     object: the matter
     exposures: the V planned exposures
@@ -179,7 +179,7 @@ class Prediction:
 
 
 def residuals(said: Prediction, measured: Tensor, noise: Tensor, allowance: Allowance = Allowance()) -> Residuals:
-    """What a prediction leaves of `measured` frames [V, h, w], whose noise has the power `noise` [V, h, w//2 + 1].
+    """The residuals of a prediction of `measured` frames [V, h, w], whose noise has the power `noise` [V, h, w//2 + 1].
 
     The power is that of `rfft2` with norm "ortho", in which white noise of variance s² has s². The sampling's error is
     the difference from waves sampled twice as finely, taken in the probed views; the others have their neighbour's.

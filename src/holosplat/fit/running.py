@@ -24,7 +24,7 @@ class Running(Protocol):
 
     @property
     def finished(self) -> bool:
-        """Whether it has come to its end."""
+        """Whether it has ended."""
         ...
 
     @property
@@ -107,7 +107,7 @@ def interrupts_held() -> Iterator[Callable[[], None]]:
 
 
 class Steps:
-    """What the steps of a calculation gave, in their order: those that an earlier run has done are not done again.
+    """The results of the steps of a calculation, in order; steps of an earlier run are not repeated.
 
     The calculation must take the same steps each time, as all that are seeded do; each gives tensors and plain values.
     done: what an earlier run's steps gave; on_step: called after each new one.
@@ -117,7 +117,7 @@ class Steps:
         self.done, self._taken, self._on_step = list(done), 0, on_step
 
     def of(self, make: Callable[[], Any]) -> Any:
-        """What the next step gives, by `make` if no run has done it."""
+        """The result of the next step, by `make` if no run has done it."""
         new = self._taken == len(self.done)
         if new:
             self.done.append(make())

@@ -23,7 +23,7 @@ from ..volume import LineIntegrals
 
 
 class LightProjection:
-    """The part of images over their noise that light in doubt does not explain, exact for small changes of it.
+    """The part of images over their noise that uncertain light does not explain, exact for small changes of it.
 
     Light `1 + M c`, c ~ N(0, C), changes amplitudes by `B c = ½ √I₀ M c`, so that their errors have the covariance
     `P + B C Bᵀ`, of which the inverse is `P⁻¹ - P⁻¹ B R (1 + Rᵀ Bᵀ P⁻¹ B R)⁻¹ Rᵀ Bᵀ P⁻¹`, R Rᵀ = C (Woodbury 1950).
@@ -224,7 +224,7 @@ def model_error(frames: Tensor, noise: Tensor) -> Tensor:
     """Power [H, W//2 + 1] of what no sampled matter explains of frames [V, H, W], float64.
 
     Of the contrast at a frequency f, by its mean over rings and views beyond the `noise` [V, H, W//2 + 1], it is the
-    part `1 - sinc f` that a box of one pixel takes away: so much voxels, strips and samples of waves leave in doubt.
+    part `1 - sinc f` that a box of one pixel takes away: the error of voxels, strips and samples of waves.
     Optics mixes frequencies, so that `LEAKED` of the whole contrast joins at all of them.
     """
     power = torch.fft.rfft2(frames.double() - 1, norm="ortho").abs().square()

@@ -28,7 +28,7 @@ STAGE = "learned start"
 MOST_COLUMNS = 128
 """Pixels across that the network sees, at most: larger frames are binned."""
 CLEARLY = 0.75
-"""What larger pixels may leave unexplained, over what smaller ones leave: these show shapes better."""
+"""Largest ratio of unexplained parts on larger and smaller pixels: these show shapes better."""
 FEWEST = 32
 """Rows and columns of binned frames, at least."""
 FEWEST_VIEWS = 3
@@ -71,7 +71,7 @@ class Guessed:
     taps: Taps
 
     def left(self, factor: int = 1) -> float:
-        """What the volume leaves `unexplained` on pixels `factor` times larger."""
+        """The `unexplained` part of the volume on pixels `factor` times larger."""
         return unexplained(self.values, self.images, self.taps, factor)
 
 

@@ -49,7 +49,7 @@ class Card:
         return set(self.trained_on.get("kinds", ())) in ({"red-cells"}, {"red-cells", "crowd"}, {"crowd"})
 
     def dice(self, views: int) -> float:
-        """Mean Dice coefficient of guesses from so many views and the truth, likewise; 0 where it is not said."""
+        """Mean Dice coefficient of guesses from so many views, by the same rule; 0 where it is not known."""
         return _nearest({count: said.get("dice", 0.0) for count, said in self.scores.items()}, views, 0.0)
 
 

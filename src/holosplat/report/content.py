@@ -58,7 +58,7 @@ class Moving:
     """Bodies in motion, their numbers, and one frame of each of a few times.
 
     - bodies: on their paths; times: [T] of the frames [s]
-    - tracks: numbers by the names of tracks.csv, [T, B] each; errors: standard errors of some of them, likewise
+    - tracks: numbers by the names of tracks.csv, [T, B] each; errors: standard errors of some of them, [T, B] each
     - low, high: corners `(x, y, z)` of the field of view [m]
     - shown: [K] indices of the times that are drawn; views: K, one of each; measured, predicted: their frames
       [K, H, W], relative intensity
@@ -85,7 +85,7 @@ class Moving:
         return self._over_time(name, np.mean)
 
     def spread(self, name: str) -> np.ndarray:
-        """[B] standard deviations of a column, likewise."""
+        """[B] standard deviations of a column, over the same times."""
         return self._over_time(name, np.std)
 
     def _over_time(self, name: str, what: object) -> np.ndarray:

@@ -212,9 +212,7 @@ def _lit(reconstruction: Reconstruction, scan: Scan, evaluation: Evaluation) -> 
     measured, part = torch.from_numpy(shown.frames), light.part(torch.from_numpy(chosen))
     if part.background is not None:
         fixed = 1.0 if part.still is None else part.still
-        part = replace(
-            part, background=part.background.seen_beside(measured / fixed, torch.from_numpy(predicted))
-        )
+        part = replace(part, background=part.background.seen_beside(measured / fixed, torch.from_numpy(predicted)))
     return LitViews(
         shown.frames,
         part.factor().numpy(),

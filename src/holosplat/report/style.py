@@ -35,7 +35,7 @@ DPI = 160
 INK, FAINT, GROUND = "#1b1f24", "#8b929b", "#fffffe"
 RECONSTRUCTION, TRUTH, TRUE_SURFACE = "#c2502f", "#5a626d", "#939ca8"
 CYCLE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5a626d")
-"""Okabe & Ito's palette: told apart also by readers who do not see red and green as most do."""
+"""Okabe & Ito's palette: distinct also for readers who do not see red and green as most do."""
 IN_THE_DARK = {GROUND: "#14171b", INK: "#e6e8eb", TRUTH: "#a0a8b2"}
 """What stands for the colours of paper and ink, and of the truth's curves, where a page is dark (see `themed`)."""
 DELTA_MAP, BETA_MAP, HOLOGRAM_MAP, SIGNED_MAP = "magma", "cividis", "gray", "RdBu_r"

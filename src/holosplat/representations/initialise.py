@@ -29,7 +29,7 @@ FILLED = 0.05
 CALM = 0.2
 """Change of a block's occupancy towards its neighbours, as a share of it, below which nothing changes there."""
 RATES = (0.02, 0.02, 0.02, 0.05)
-"""Adam's first rates of centres, log-scales, quaternions and amplitudes while a cloud learns a volume, likewise."""
+"""Adam's first rates of centres, log-scales, quaternions and amplitudes while a cloud learns a volume."""
 
 
 def cloud_from_volume(

@@ -102,7 +102,7 @@ def render_page(page: SeriesPage) -> str:
 
 
 def headline(state: str, frames: Sequence[Frame]) -> Headline:
-    """Whether the frames of all times are explained, and else why not and what to try next; `state`: what is done."""
+    """Whether the frames of all times are explained, or why not and what to try next; `state`: what is done."""
     bad = [frame for frame in frames if frame.row.good is False]
     if not bad:
         return Headline(state, True if any(frame.row.good for frame in frames) else None, ())

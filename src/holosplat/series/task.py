@@ -162,7 +162,7 @@ def opened(source: Source, reading: Reading) -> Scan:
 
 
 def track_window(scan: Scan, source: Source, plan: SeriesPlan, rows: Sequence[Row], folder: RunFolder) -> list[Row]:
-    """Follow the bodies through the times of `rows`, and fill these in; a run that is there is gone on with.
+    """Follow the bodies through the times of `rows`, and fill these in; an unfinished run is continued.
 
     Errors: `InputError` of `track`. Ctrl-C is passed on.
     """

@@ -107,7 +107,7 @@ class AlignedExample:
 def draw_aligned_example(
     sample: Sample, how: ViewSampling, targets: int, network: str, rng: np.random.Generator
 ) -> AlignedExample:
-    """`sample` as it is shown once: some of its views, and others that are to be foretold."""
+    """`sample` as it is shown once: some of its views, and others that are to be predicted."""
     training = np.flatnonzero(~sample.is_test)
     count = min(int(rng.choice(how.views)), len(training))
     order = rng.permutation(training)
@@ -221,7 +221,7 @@ class AlignedTraining(Training):
 
 @dataclass
 class AlignedValidation(Validation):
-    """How well frames that are held out are foretold, and (for us, the network never sees it) the Dice coefficient."""
+    """Errors of predicted held-out frames, and (for us, the network never sees it) the Dice coefficient."""
 
     columns: ClassVar[tuple[str, ...]] = ("step", "views", "misfit", "dice")
 

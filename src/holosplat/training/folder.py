@@ -54,7 +54,7 @@ class Dataset:
         return cls(folder, from_table(Ranges, said["ranges"]), int(said["seed"]), int(said["count"]))
 
     def begin(self) -> None:
-        """Make the folder, or take up the one that is there; `InputError` where that holds other scenes."""
+        """Make the folder, or continue an existing one; `InputError` where that holds other scenes."""
         path = self.folder / NAME
         if path.is_file():
             there = Dataset.read(self.folder)

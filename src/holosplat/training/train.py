@@ -175,7 +175,7 @@ class Training:
 
     @property
     def record(self) -> dict[str, float]:
-        """Of the last step, for progress: steps and seconds since the training began, or went on."""
+        """Of the last step, for progress: steps and seconds since the training began, or was continued."""
         return {"step": self.step - self._first, "loss": self.rows[-1][1], "seconds": time.monotonic() - self._began}
 
     def _precision(self) -> AbstractContextManager[Any]:

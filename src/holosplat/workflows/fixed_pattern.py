@@ -17,12 +17,12 @@ from ..progress import Progress
 from ..scan import Scan
 
 FEWEST = 2
-"""Frames for training that still light takes: one frame's light cannot be told from its matter."""
+"""Least number of training frames: in one frame, light and matter cannot be separated."""
 
 
 @dataclass(frozen=True)
 class FixedPatternOptions:
-    """How still light is found."""
+    """Options of the estimate of a fixed pattern."""
 
     order: int
     """Half waves across a frame up to which light changes, such as 4; its mean is taken to be right. 0: any pattern,

@@ -32,8 +32,8 @@ USUAL = CarriedOptions()
 
 @dataclass(frozen=True)
 class FlowReconstruction:
-    """What was found of matter in motion. reconstruction: `object.at(t)` is the matter at any time [s]; volume: of the
-    flow's reference time, on voxels; history: what was asked of the frames on the way, in words."""
+    """The result for moving matter. reconstruction: `object.at(t)` is the matter at any time [s]; volume: at the flow's
+    reference time, on voxels; history: the decisions on the way, in words."""
 
     reconstruction: Reconstruction
     volume: VoxelGrid
@@ -54,8 +54,8 @@ def reconstruct_moving(
 ) -> FlowReconstruction | None:
     """Continuous matter that moves through the training frames of `scan`, of several times; None where nothing moves.
 
-    `reconstruction.object` of the result is a `MovingGaussians`. ask: whether the frames are asked first if anything
-    moves; without, it does. light: what is assumed of it (default: even, unless air says otherwise). A material that is
+    `reconstruction.object` of the result is a `MovingGaussians`. ask: whether to test for motion first; without, matter
+    is taken to move. light: what is assumed of it (default: even, unless air says otherwise). A material that is
     not known is estimated from the mean of all times. With a `folder`, everything is written there, unless nothing
     moves, and every step is kept; a later call with `resume=True` goes on from the last one, with the same result, bit
     for bit, as if nothing had happened. Errors: `InputError` for a scan of one or two times, frames that are not

@@ -245,7 +245,7 @@ class _Run:
         )
 
     def complete(self) -> Reconstruction:
-        """Run what is left of the stages."""
+        """Run the remaining stages."""
         found: Stored | None = None
         with self.as_written():
             stages, first = self.method.stages(), int(self._saved["stage"]) if self._saved else 0

@@ -42,7 +42,7 @@ GAUGE = (
     "against {}: δ and β are differences, zero where it is alone; a constant phase is in no frame, and even absorption "
     "of what fills the field counts as light"
 )
-"""What is said of matter in a medium."""
+"""The note on matter in a medium."""
 
 
 @dataclass(frozen=True)
@@ -184,14 +184,14 @@ class Reconstruction:
     timing: seconds that each stage took
     finished: whether all stages came to their end
     choice: what was decided on the way, and which state `object` is
-    delta_told: whether prior or frames say what δ is; else β alone is known, and δ = β stands for it
+    delta_told: whether prior or frames determine δ; else β alone is known, and δ = β stands for it
     verdict: whether the training frames are explained; None for runs of versions that did not say
     total: the total δ by these frames, with its standard error; None likewise
     constants: what was known to a range only, or of continuous matter not at all, by the frames
     light: what is assumed of the light of other frames of the scan: smooth if that of the training frames is uneven
     geometry: where the frames were found to be; None: they are taken to be where the scan says
     still: [H, W] the light that all frames of the scan have in common, by those for training; None: there is none
-    rest: what is known of the shape of moving bodies at rest; None: nothing
+    rest: the shape of moving bodies at rest; None: unknown
     """
 
     object: Stored
@@ -212,7 +212,7 @@ class Reconstruction:
 
     @property
     def contents(self) -> Contents:
-        """What files of its volume hold: δ only where it is told."""
+        """The quantities in files of its volume: δ only where it is determined."""
         return Contents.of(self.delta_told, self.energy_kev)
 
     def _repr_html_(self) -> str:
@@ -273,7 +273,7 @@ def chosen_frames(time_frame: int | Literal["all"] | None, times: list[float]) -
 def reconstruction_at(done: Reconstruction, times: list[float], frame: int) -> Reconstruction:
     """`done` as it is at the instant `frame` (0 is the first) of `times` [s]: matter that stands still.
 
-    Errors: `InputError` for an instant that there is not.
+    Errors: `InputError` for an instant that the run does not have.
     """
     chosen_frames(frame, times)
     assert isinstance(done.object, InMotion)

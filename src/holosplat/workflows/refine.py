@@ -46,7 +46,7 @@ def require_compatible(ranges: Uncertain) -> None:
 def trained_geometry(
     scan: Scan, prior: MaterialPrior, options: PoseOptions, light: LightOptions, on_progress: Progress
 ) -> Geometry:
-    """Where the training frames of `scan` are, by themselves alone; held-out ones are as planned."""
+    """The poses of the training frames of `scan`, estimated from these alone; held-out ones are as planned."""
     found = align_views(scan.train(), prior, options, light=light, on_progress=on_progress)
     return Geometry.of_training(scan, found, options.uncertain)
 

@@ -40,7 +40,7 @@ def read_light_options(config: Mapping[str, Any], summary: Mapping[str, Any]) ->
 def fixed_pattern_of(task: Task, method: Method, found: Stored, oversample: int) -> np.ndarray | None:
     """The light [H, W] that the frames of a run have in common, float32; None where they have none.
 
-    It was divided out before (`prepared`), or is an unknown of `method`: then it is what is left beside what was found.
+    It was divided out before (`prepared`), or is an unknown of `method`: then it is the residual of the frames.
     """
     if task.lit is not None and task.lit.still is not None:
         return task.lit.still.numpy().astype(np.float32)
@@ -54,8 +54,8 @@ def fixed_pattern_of(task: Task, method: Method, found: Stored, oversample: int)
 def light_of(scan: Scan, assumed: LightOptions, still: np.ndarray | None = None) -> Light | None:
     """The light of all frames of `scan`, held-out ones too, by their air; None where it is even.
 
-    How strong light of each number of half waves is, all frames say together; the light itself is each frame's own. A
-    frame without air has the light that is expected before it is seen: even; so have all where no frame has air.
+    The power of light at each number of half waves is estimated from all frames together; the light itself is each
+    frame's own. A frame without air has its prior mean, even light; so have all frames where none has air.
     still: [H, W], beside that: what the training frames of the run have in common, and frames of this raster with them.
     """
     frames = torch.from_numpy(scan.frames)

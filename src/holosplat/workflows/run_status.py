@@ -38,7 +38,7 @@ class RunStatus:
 
 
 def fitted_by(folder: RunFolder) -> Writer | None:
-    """The process that fits the run in `folder`; None where nobody writes there, or the run has come to its end."""
+    """The process that fits the run in `folder`; None where nobody writes there, or the run has ended."""
     writer = writer_of(folder.path)
     if writer is None or writer.gone or not folder.config.is_file():
         return None
@@ -47,7 +47,7 @@ def fitted_by(folder: RunFolder) -> Writer | None:
 
 
 def read_status(folder: RunFolder) -> RunStatus:
-    """What the run has come to; `InputError` for files that are damaged, or of another run."""
+    """The status of the run; `InputError` for files that are damaged, or of another run."""
     state = folder.load_checkpoint()
     if state is None:
         return RunStatus("")

@@ -136,7 +136,7 @@ def _more(found: Followed, scan: Scan) -> dict[str, np.ndarray]:
 
 
 def _write(folder: RunFolder, done: Reconstruction, found: Followed, task: Task) -> None:
-    """The object, the light, and what is said of the fits."""
+    """Write the object, the light, and the records and summary of the fits."""
     folder.start_metrics(dict.fromkeys(name for record in found.records for name in record))
     folder.append_metrics(found.records)
     if found.rest is not None:

@@ -1,4 +1,4 @@
-"""Terms on neural fields and pixel-aligned networks: total variation, retrieved thickness, frames and line integrals."""
+"""Terms on neural fields and pixel-aligned networks: total variation, thickness, frames and line integrals."""
 
 from __future__ import annotations
 

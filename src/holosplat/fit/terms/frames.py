@@ -1,4 +1,4 @@
-"""The data term: differences of predicted and measured frames, weighted by an `Objective`; priors of geometry and light."""
+"""The data term: differences of predicted and measured frames, weighted by an `Objective`; priors of poses, light."""
 
 from __future__ import annotations
 
@@ -123,8 +123,8 @@ class FrameTerm:
         self._rounding = max(SMALLEST_ROUNDING, objective.rounding * noise)
         self.spectral = SpectralMisfit(train, instrument, matter, objective.floor) if objective.spectral > 0 else None
         self.resolved = self._resolved(coarse if self._blur else 0.0)
-        """What the frames make of the objective's options: `coarse` [pixels], `noise_width` (its mean over the pixels)
-        and `rounding` in units of the frames' range, `floor`."""
+        """The objective's options as the frames determine them: `coarse` [pixels], `noise_width` (its mean over the
+        pixels) and `rounding` in units of the frames' range, `floor`."""
 
     def _resolved(self, coarse: float) -> dict[str, float]:
         w, found = self.objective, dict[str, float]()

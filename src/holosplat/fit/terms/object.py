@@ -21,8 +21,8 @@ from . import comparisons
 from .objective import Objective
 
 DEPTH, VIEWS = 100.0, 8.0
-"""Voxels along the beam, and views, for which the weights of the terms on the volume are meant. Few views leave more
-to what is known of the volume; the weights go with one over the root of their number."""
+"""Voxels along the beam, and views, for which the weights of the terms on the volume are meant. Few views give
+the prior of the volume more weight; the weights go with one over the root of their number."""
 
 
 class VolumeTerm:
