@@ -113,8 +113,8 @@ def optical_path(
     """The path of V exposures: distance [V] in metres, psf_sigma [V] in samples of `pitch` [m], on `raster` [H, W].
 
     energy_kev: photon energy [keV], one or [V]; frame: (rows, columns) of the frame, its margin (y, x) in samples, and
-    the samples along a pixel's edge. Distances and widths that are tensors (float64, on the device of the path) pass gradients on, as `OpticalPath.corrected` says. Widths in an array that are all zero make a path
-    without blur.
+    the samples along a pixel's edge. Distances and widths that are tensors (float64, on the device of the path) pass
+    gradients on, as `OpticalPath.corrected` says. Widths in an array that are all zero make a path without blur.
     """
     tensors = [x for x in (distance, psf_sigma) if isinstance(x, Tensor)]
     on = tensors[0].device if tensors else torch.device("cpu")
