@@ -27,7 +27,7 @@ import holosplat as hs
 from holosplat.io.atomic import atomic_path
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
-from holosplat.metrics.distances import normal_distance
+from holosplat.metrics.volumes import normal_distance
 from holosplat.motion.assimilate import Assimilation, assimilate
 from holosplat.motion.cell_flow import Unknowns
 from holosplat.motion.cell_model import CellModel, ChannelFrame

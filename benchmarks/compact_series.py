@@ -24,7 +24,7 @@ from holosplat.io.compact import Steps
 from holosplat.io.objects import read_object, write_compact, write_object
 from holosplat.io.series import names_of, read_series, write_series
 from holosplat.representations import MovingGaussians, MovingSurfaces, Stored
-from holosplat.workflows.moments import instants_of
+from holosplat.workflows.reconstruction import instants_of
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "data" / "compact_series.csv"
 COLUMNS = ("name", "kind", "objects", "plain_bytes", "alone_bytes", "series_bytes", "largest_difference_px", "commit")

@@ -131,7 +131,7 @@ def run(name: str, seed: int, made: Scene, told: Choice | None) -> Row:
 
 
 def _told(made: Scene, light: str, matter: MatterKind) -> hs.workflows.Reconstruction:
-    """Told what was decided, as a run that goes on is (`workflows.resume.decided_before`): so a pattern can be, too.
+    """The reconstruction with the decisions of `workflows.preconditions.decided_before`: also of a fixed pattern.
 
     The command line cannot tell that there is one.
     """

@@ -28,7 +28,7 @@ from holosplat.beamline.light import UnevenLight
 from holosplat.geometry import Grid, Views
 from holosplat.metrics import volume_scores
 from holosplat.model import measure
-from holosplat.optics.modes import smooth_modes
+from holosplat.optics.patterns import smooth_modes
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.continuous import Bump, ContinuousScene, Element, Soft, ellipsoid
 from holosplat.specimens.phantoms import packed_balls

@@ -32,7 +32,7 @@ from holosplat.io.atomic import atomic_path
 from holosplat.io.objects import read_object, write_object
 from holosplat.matter import Matter
 from holosplat.metrics import image_scores, intensity_range, volume_scores
-from holosplat.metrics.distances import normal_distance
+from holosplat.metrics.volumes import normal_distance
 from holosplat.motion.cell_model import ChannelFrame
 from holosplat.motion.dynamics import DynamicsForecast, carry
 from holosplat.motion.elastic import Rest

@@ -125,7 +125,7 @@ def _code(act: Callable[[], None]) -> int:
 NEEDED = (
     "beamline.declared.specimens beamline.grow beamline.record beamline.simulate io.formats io.objects io.volumes "
     "io.nxtomo methods.presets report.run specimens.red_cells workflows.correct workflows.evaluate workflows.join "
-    "workflows.reconstruct workflows.track report.moving report.motion_blocks align.views"
+    "workflows.reconstruct workflows.track report.content report.moving_figures align.views"
 )
 OF_BENCHMARK = ("run", "methods", "pages")
 

@@ -29,7 +29,7 @@ from rows import read, write
 
 import holosplat as hs
 from holosplat.geometry import Grid
-from holosplat.learning.start import LearnedStart, guessed
+from holosplat.learning.start import LearnedStart, guess_matter
 from holosplat.methods import Auto, Task
 from holosplat.methods.learned import NAME
 from holosplat.methods.sharp_level import material_of_levels
@@ -133,7 +133,7 @@ def rows(given: Setting, weights: str, starts: Sequence[str]) -> list[tuple[str,
     how, prior, train = LearnedStart(weights=weights), given.prior, given.scan.train()
     began = time.perf_counter()
     material = material_of_levels(Task(train, prior))
-    guess = guessed(train, material, how.network.network, lambda stage, fraction: None)
+    guess = guess_matter(train, material, how.network.network, lambda stage, fraction: None)
     seconds = time.perf_counter() - began
     truth, found = given.scene.voxelise(guess.grid), guess.values.numpy() * material.delta
     scores = volume_scores(hs.Volume(found, found / material.ratio, guess.grid), truth)

@@ -28,8 +28,7 @@ import holosplat as hs
 from holosplat.io.atomic import atomic_path
 from holosplat.io.formats import read_as
 from holosplat.io.reading import Part, Reading
-from holosplat.show.guard import HOST
-from holosplat.show.server import LiveView
+from holosplat.show.server import HOST, LiveView
 from holosplat.show.watch import Watch
 
 OUT = Path(__file__).resolve().parents[1] / "docs" / "data" / "live_view.csv"

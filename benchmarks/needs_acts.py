@@ -28,7 +28,7 @@ from holosplat.beamline.simulate import Simulation
 from holosplat.cli.dataset import _needs
 from holosplat.geometry import Views
 from holosplat.io.vtk import write_mesh
-from holosplat.learning.size import Size
+from holosplat.learning.network import Size
 from holosplat.mesh import TriangleMesh
 from holosplat.methods import METHODS, Gaussians, Pinn, SurfaceOptions
 from holosplat.motion.carried import CarriedOptions

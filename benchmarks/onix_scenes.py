@@ -30,14 +30,11 @@ from holosplat.beamline.declared.case import Case
 from holosplat.geometry import Grid
 from holosplat.methods import Onix
 from holosplat.training.aligned import AlignedTraining, AlignedValidation
-from holosplat.training.aligned_options import FrameGoal
-from holosplat.training.folder import Dataset
-from holosplat.training.made_by import made_by
-from holosplat.training.make import make
-from holosplat.training.options import Shown, TrainOptions
+from holosplat.training.folder import Dataset, make_dataset
+from holosplat.training.options import FrameLossWeights, TrainOptions, ViewSampling
 from holosplat.training.ranges import Ranges
 from holosplat.training.sample import drawn_case
-from holosplat.training.train import WEIGHTS
+from holosplat.training.train import WEIGHTS, made_by
 from holosplat.training.validate import Validation
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "data" / "onix_scenes.csv"
@@ -93,8 +90,8 @@ def trained(folder: Path, scenes: Dataset, steps: int, seed: int, adversary: flo
         validation=4,
         seed=seed,
         network="onix",
-        shown=Shown(views=(2, 2, 3, 3, 4)),
-        frames=FrameGoal(adversary=adversary),
+        shown=ViewSampling(views=(2, 2, 3, 3, 4)),
+        frames=FrameLossWeights(adversary=adversary),
     )
     taken = out / "seconds.txt"
     if not taken.is_file():
@@ -154,7 +151,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     scenes = Dataset(options.folder / "scenes", LEARNT, LEARNT_SEED, options.count)
-    make(scenes, 1, lambda fraction: None)
+    make_dataset(scenes, 1, lambda fraction: None)
     every = [
         trained(options.folder, scenes, options.steps, seed, weight)
         for seed, weight in product(options.seeds, options.adversaries)

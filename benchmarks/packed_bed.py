@@ -27,7 +27,7 @@ import holosplat as hs
 from holosplat.io.objects import read_object
 from holosplat.io.samples import sample
 from holosplat.metrics import dice
-from holosplat.optics.modes import smooth_modes
+from holosplat.optics.patterns import smooth_modes
 from holosplat.projectors.voxels import projector_for
 
 PIXEL, MU = 26.33e-6, 246.06

@@ -25,7 +25,7 @@ from torch import Tensor
 import holosplat as hs
 from holosplat.bodies.touching import parted
 from holosplat.inference import Compared
-from holosplat.learning.start import Guessed, LearnedStart, guessed, unexplained
+from holosplat.learning.start import Guessed, LearnedStart, guess_matter, unexplained
 from holosplat.matter import Matter
 from holosplat.motion.guesses import NETWORK, missed_by_bodies
 from holosplat.motion.sightings import SightingOptions, occupancy
@@ -75,7 +75,7 @@ def rows(data: Path) -> Iterator[dict[str, str]]:
             scan = imaged(cells, angles, 1)
             for t in CHOSEN:
                 at = scan.at_instant(t)
-                guess = guessed(at, MATERIAL, network, lambda stage, part: None)
+                guess = guess_matter(at, MATERIAL, network, lambda stage, part: None)
                 values, grid = occupancy(at, MATERIAL, options, lambda stage, part: None, None)
                 seen = VoxelGrid(values[None], grid, Matter.one(*MATERIAL)).resampled(guess.grid).values[0]
                 where = (beams, str(first), str(t))

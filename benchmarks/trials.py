@@ -29,16 +29,13 @@ from torch import Tensor
 from torch.nn.functional import softplus
 
 import holosplat as hs
-from holosplat.fit.batch import Batch
 from holosplat.fit.density import _pair
 from holosplat.fit.fidelity import Target
 from holosplat.fit.loop import Fit, Plan, Record
-from holosplat.fit.optimiser import Leaves, Optimiser
-from holosplat.fit.problem import Problem
+from holosplat.fit.optimiser import Leaves, Optimiser, Trainable
+from holosplat.fit.problem import Batch, Problem
 from holosplat.fit.terms import FrameTerm, Objective
-from holosplat.fit.terms.frames import NarrowingBlur, Weighted
-from holosplat.fit.terms.spectral import linear_response
-from holosplat.fit.trainable import Trainable
+from holosplat.fit.terms.frames import NarrowingBlur, Weighted, linear_response
 from holosplat.methods import FitOptions, Task, finished, gaussian_fit
 from holosplat.methods.gaussians import GaussianStage, resolved
 from holosplat.model import Model

@@ -32,7 +32,7 @@ from holosplat.methods.illumination import prepared as lit
 from holosplat.methods.method import run_quietly
 from holosplat.methods.surface_fit import oversampling, surface_fit
 from holosplat.representations import GaussianCloud, SurfaceMesh
-from holosplat.representations.subdivision import edge_lengths
+from holosplat.representations.isosurface import edge_lengths
 from holosplat.workflows.evaluate import score_object
 
 

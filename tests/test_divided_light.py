@@ -17,10 +17,10 @@ from holosplat.matter import MaterialPrior
 from holosplat.methods import Task
 from holosplat.methods.illumination import prepared
 from holosplat.optics.background import Background, LightOptions
-from holosplat.optics.modes import smooth_modes
+from holosplat.optics.patterns import smooth_modes
 from holosplat.scan import Exposures, Scan
 from holosplat.workflows.join import join
-from holosplat.workflows.run_light import light_of
+from holosplat.workflows.run_illumination import light_of
 
 SHAPE, HALF_WAVES, COUNT = (31, 44), 3, 3
 MODES = (HALF_WAVES + 1) ** 2

@@ -8,8 +8,7 @@ from pathlib import Path
 import holosplat as hs
 from holosplat.io.formats import read_as
 from holosplat.io.run_scan import run_reading
-from holosplat.report.animation import animation
-from holosplat.report.moving_figures import shapes_figure
+from holosplat.report.moving_figures import animation, shapes_figure
 from holosplat.report.run import moving_of
 from holosplat.workflows.track import read_errors
 

@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from tables.thesis import DATA, SCHEDULES, read_rows, studies
 
 from holosplat.report.style import CYCLE, FAINT, WIDTH, letter, new_figure, styled
-from holosplat_bench.thesis.pages.figures import pictures, save
+from holosplat_bench.thesis.pages.page import pictures, save
 
 IMAGES = Path(__file__).resolve().parents[1] / "images"
 CELL_PX = 7.8

@@ -15,7 +15,7 @@ class DividedLight:
     """Frames were divided by smooth light; what is left of it is `exp(Σ c m)`, and this is how sure c = 0 is.
 
     The K = (k + 1)² modes m are products of cosines of 0 to k half waves along the rows and columns of whole frames, of
-    rms one (`optics.modes.smooth_modes`).
+    rms one (`optics.patterns.smooth_modes`).
 
     covariances: [N, K, K] of c: what the air of the frames leaves open
     variances: [N, K] expected squares of the coefficients of all light, before air is looked at

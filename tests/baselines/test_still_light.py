@@ -15,7 +15,7 @@ from holosplat.baselines.rays import rays_of
 from holosplat.baselines.tomography import TotalVariation, near_axis, tv_solver
 from holosplat.geometry import Grid, Views
 from holosplat.metrics import dice
-from holosplat.optics.modes import smooth_modes
+from holosplat.optics.patterns import smooth_modes
 from holosplat.projectors.voxels import SliceProjector
 from holosplat.units import wavenumber
 

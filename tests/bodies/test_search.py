@@ -14,7 +14,7 @@ from holosplat.bodies.pursuit import exchanged
 from holosplat.bodies.replaced import pursued
 from holosplat.bodies.search import best_size
 from holosplat.bodies.templates import Search, Templates
-from holosplat.fit.steps import Steps
+from holosplat.fit.running import Steps
 
 
 def axis_error(found: Pose, turn: np.ndarray) -> float:

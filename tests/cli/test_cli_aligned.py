@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from helpers.ball_sample import ball_sample
 from helpers.cli import holosplat, refused, worked
-from holosplat.learning.aligned_weights import read_aligned
+from holosplat.learning.weights import read_aligned
 from holosplat.representations import AlignedNetwork
 from holosplat.training.folder import Dataset
 from holosplat.training.ranges import Ranges

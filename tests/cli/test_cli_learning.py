@@ -9,8 +9,7 @@ import pytest
 from helpers.cli import MATTER, holosplat, known, refused, worked
 from holosplat.cli.options import MethodOptions
 from holosplat.io.guess import read_guess
-from holosplat.learning.network import Guess
-from holosplat.learning.size import Size
+from holosplat.learning.network import Guess, Size
 from holosplat.learning.weights import Card, read_weights, write_weights
 from holosplat.methods import Gaussians
 from holosplat.workflows.run_folder import RunFolder

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from helpers.jets import jet_of
-from holosplat.fit.batch import Batch
+from holosplat.fit.problem import Batch
 from holosplat.fit.terms.equations import Equations, EquationTerm, SpaceTimeVariation, continuity, divergence, momentum
 from holosplat.geometry import Grid, Views
 from holosplat.matter import Matter

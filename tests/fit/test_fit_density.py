@@ -12,8 +12,7 @@ from torch import Tensor
 from helpers.fit_balls import MATERIAL, PIXEL, SHAPE, a_cloud, a_scan, fit_of, run
 from holosplat.fit.density import CENTRES, DensityControl, DensityEvent, doomed, outside
 from holosplat.fit.loop import Fit
-from holosplat.fit.optimiser import Adam
-from holosplat.fit.trainable import Trainable
+from holosplat.fit.optimiser import Adam, Trainable
 from holosplat.geometry import Views, rotation_y
 from holosplat.matter import Matter
 from holosplat.representations import GaussianCloud

@@ -13,8 +13,8 @@ from helpers.bumpy import bumpy, surfaces
 from holosplat.align.gauge import moved_onto
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.checks import InputError
-from holosplat.fit.batch import Batch
-from holosplat.fit.freedom import Expected, Freedom, mean_distance_error, moved, projection
+from holosplat.fit.pose_refinement import GeometryPrior, PoseRefinement, mean_distance_error, projection, with_alignment
+from holosplat.fit.problem import Batch
 from holosplat.fit.schedule import Schedule
 from holosplat.geometry import Views, rotation_y
 from holosplat.methods.surface_fit import SurfaceFit, surface_fit
@@ -38,8 +38,8 @@ def misaligned(distance: float = 0.1) -> tuple[Scan, Exposures]:
     return Scan(measure(matter(), true, 3).detach().numpy(), planned, np.zeros(5, dtype=bool)), true
 
 
-def free(count: int = 5, **known: float) -> Freedom:
-    return replace(Freedom(1.0, 0.02, 0.02, 0.03, np.zeros((count, 7)), edges=True), **known)
+def free(count: int = 5, **known: float) -> PoseRefinement:
+    return replace(PoseRefinement(1.0, 0.02, 0.02, 0.03, np.zeros((count, 7)), edges=True), **known)
 
 
 OPTIONS = SurfaceFit(schedule=Schedule(steps=30, oversample=3, decay=0.2))
@@ -132,14 +132,14 @@ def test_projections_take_out_common_motions_alone():
 def test_what_is_expected_counts_from_the_plan():
     """Half the squares of all numbers in their deviations, those found before included; of fixed ones nothing."""
     so_far = np.array([[2.0, 0, 0, 0, 0.04, 0, 0], [0, 0, 0, 0, 0, 0.06, 0.05]])
-    known = Freedom(2.0, 0.0, 0.02, 0.03, so_far, 0.01)
+    known = PoseRefinement(2.0, 0.0, 0.02, 0.03, so_far, 0.01)
     exposures = Exposures.of(Views(ANY[:2], np.zeros((2, 2)), SHAPE, PIXEL), 20.0, 0.1)
     model = Model(matter(1), Instrument(exposures), Alignment.planned(2, "shifts", "turns", "stretches", "magnified"))
-    (part,) = Expected(known, 0.5, torch.device("cpu"))(model, Batch(None, torch.zeros(3), torch.zeros(()), 0))
+    (part,) = GeometryPrior(known, 0.5, torch.device("cpu"))(model, Batch(None, torch.zeros(3), torch.zeros(()), 0))
     assert float(part.value) == pytest.approx(0.5 * (1 + 4 + 4 + 25))
     assert part.weight == 0.5
     with pytest.raises(InputError, match="so_far"):
-        Freedom(1.0, 0.0, 0.0, 0.0, np.zeros((3, 5)))
+        PoseRefinement(1.0, 0.0, 0.0, 0.0, np.zeros((3, 5)))
 
 
 def test_what_a_fit_found_is_added_and_places_the_frames():
@@ -152,7 +152,7 @@ def test_what_a_fit_found_is_added_and_places_the_frames():
     start = replace(free(), so_far=np.full((5, 7), 0.5))
     after = start.after(found)
     numbers = torch.cat([some[1], some[0], some[2][:, None], some[3][:, None]], dim=1).numpy()
-    placed = moved(exposures, found)
+    placed = with_alignment(exposures, found)
     aside = np.flatnonzero((after.so_far == 0.5).all(axis=1))
     assert len(aside) == 1
     fitted = np.delete(np.arange(5), aside)

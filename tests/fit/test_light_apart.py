@@ -8,11 +8,10 @@ import torch
 from torch import Tensor
 
 from helpers.blobs import MATERIAL, SHAPE, blob_scan
-from holosplat.fit.light_apart import LightApart
-from holosplat.fit.whitened import WhitenedFrames
+from holosplat.fit.whitened import LightProjection, WhitenedFrames
 from holosplat.optics.background import Background, Light
-from holosplat.optics.modes import smooth_modes
 from holosplat.optics.noise_model import NoiseModel
+from holosplat.optics.patterns import smooth_modes
 
 ORDER, POWER, MODES = 2, 0.01, 9
 
@@ -30,7 +29,7 @@ def test_images_over_their_errors_are_those_of_the_inverse_covariance():
     amplitudes = 0.4 + 0.6 * torch.rand(2, *shape, generator=draw)
     image = torch.randn(2, *shape, generator=draw)
     known = covariances(2)
-    found = LightApart(amplitudes, known, lambda one: one / POWER)(image / POWER)
+    found = LightProjection(amplitudes, known, lambda one: one / POWER)(image / POWER)
     modes = smooth_modes(shape, ORDER).double().flatten(1)
     for v in range(2):
         changes = 0.5 * (amplitudes[v].double().flatten() * modes).T

@@ -11,10 +11,9 @@ import torch
 from torch import Tensor
 
 from holosplat.checks import InputError
-from holosplat.fit.optimiser import EPSILON, Adam, Group, Leaves
+from holosplat.fit.optimiser import EPSILON, Adam, Group, Leaves, Trainable
 from holosplat.fit.problem import Problem
 from holosplat.fit.projected_gradient import ProjectedGradient
-from holosplat.fit.trainable import Trainable
 from holosplat.geometry import Views
 from holosplat.matter import Matter
 from holosplat.model import Alignment, Instrument, Model

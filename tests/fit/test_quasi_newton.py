@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from holosplat.checks import InputError
-from holosplat.fit.batch import Batch
-from holosplat.fit.batches import Batches
+from holosplat.fit.problem import Batch, Batches
 from holosplat.fit.quasi_newton import LONGER, QuasiNewton, direction
 from holosplat.fit.schedule import Schedule
 

@@ -10,7 +10,7 @@ import torch
 
 from helpers.fit_balls import MATERIAL, PIXEL
 from holosplat.checks import InputError
-from holosplat.fit.causes import causes, excess, scores
+from holosplat.fit.misfit_diagnosis import cause_scores, excess, likely_causes
 from holosplat.fit.residuals import Prediction, Residuals, Rings, residuals
 from holosplat.geometry import Views
 from holosplat.matter import Matter
@@ -74,7 +74,7 @@ def test_the_true_object_leaves_the_noise_and_has_no_cause():
     found = left(frames_of(said()))
     ratio = (found.residual.mean(axis=0) * found.rings.counts).sum() / (SIGMA**2 * np.prod(SHAPE))
     assert ratio == pytest.approx(1.0, abs=0.08)
-    assert max(cause.significance for name, cause in scores(found).items() if name in ("mass", "distance")) < 4
+    assert max(cause.significance for name, cause in cause_scores(found).items() if name in ("mass", "distance")) < 4
     assert excess(found) < 0.02 * VIEWS * np.prod(SHAPE)
 
 
@@ -91,7 +91,7 @@ VALUES = {"mass": 0.08, "distance": 0.1, "blur": 0.8**2 - 0.6**2, "shift_x": 0.4
 @pytest.mark.parametrize("name", TRUE)
 def test_the_cause_is_named_with_its_size(name):
     """The frames are those of another experiment; the object is the right one, so that the score test is exact."""
-    named = causes(left(frames_of(TRUE[name])))
+    named = likely_causes(left(frames_of(TRUE[name])))
     assert named[0].name == name
     assert float(named[0].value[0]) == pytest.approx(VALUES[name], rel=0.2)
     assert named[0].significance > 8
@@ -101,7 +101,7 @@ def test_the_cause_is_named_with_its_size(name):
 def test_views_shifted_by_themselves_are_named_with_their_shifts():
     shifts = torch.zeros(VIEWS, 2, dtype=torch.float64)
     shifts[1], shifts[4] = torch.tensor([0.5, -0.3]), torch.tensor([-0.5, 0.3])
-    named = causes(left(frames_of(said(alignment=Alignment(shifts=shifts)))))
+    named = likely_causes(left(frames_of(said(alignment=Alignment(shifts=shifts)))))
     assert named[0].name == "shifts"
     np.testing.assert_allclose(named[0].value, shifts, atol=0.1)
 
@@ -109,7 +109,7 @@ def test_views_shifted_by_themselves_are_named_with_their_shifts():
 def test_uneven_light_is_named_with_its_size():
     modes = smooth_modes(SHAPE, 2)
     coefficients = 0.005 * torch.randn(VIEWS, len(modes), generator=torch.Generator().manual_seed(2))
-    named = causes(left(frames_of(said(light=LightField(coefficients, modes)))))
+    named = likely_causes(left(frames_of(said(light=LightField(coefficients, modes)))))
     assert named[0].name == "light"
     assert named[0].share > 0.8
     np.testing.assert_allclose(named[0].value, coefficients, atol=0.002)

@@ -14,7 +14,7 @@ from helpers.two_balls import BETA, DELTA, ONE, PIXEL, chords, scan
 from holosplat.checks import InputError
 from holosplat.fit.projected_gradient import ProjectedGradient
 from holosplat.fit.terms import Objective
-from holosplat.fit.terms.spectral import SpectralMisfit, linear_response
+from holosplat.fit.terms.frames import SpectralMisfit, linear_response
 from holosplat.matter import Matter
 from holosplat.model import Instrument
 from holosplat.optics.noise import noise_level

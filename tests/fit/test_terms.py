@@ -9,10 +9,9 @@ import torch
 
 from helpers.fit_balls import a_cloud, cloud_of, fit_of, run
 from holosplat.checks import InputError
-from holosplat.fit.batch import Batch
-from holosplat.fit.problem import Part
+from holosplat.fit.problem import FIXED, Batch, LossPart
 from holosplat.fit.terms import TERMS
-from holosplat.fit.terms.geometry import EXPECTED
+from holosplat.fit.terms.frames import EXPECTED
 from holosplat.geometry import Views
 from holosplat.methods import ExtraTerm
 from holosplat.model import Alignment, Instrument, LightField, Model, smooth_modes
@@ -28,10 +27,11 @@ class Mass:
 
     weight: float
     names = ("mass",)
+    resolved = FIXED
 
-    def __call__(self, model: Model, batch: Batch) -> list[Part]:
+    def __call__(self, model: Model, batch: Batch) -> list[LossPart]:
         assert isinstance(model.object, GaussianCloud)
-        return [Part("mass", self.weight, model.object.amplitudes.mean())]
+        return [LossPart("mass", self.weight, model.object.amplitudes.mean())]
 
 
 @pytest.fixture

@@ -61,7 +61,7 @@ def undrawn() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for name in (f"{figure}_figure" for figure in FIGURES):
             patch.setattr(blocks, name, _once(name, getattr(blocks, name)))
-        patch.setattr("holosplat.report.block.data_uri", _blank)
+        patch.setattr("holosplat.report.style.data_uri", _blank)
         patch.setattr("holosplat.report.figures.render_surface", _coarse)
-        patch.setattr("holosplat.report.motion_blocks.animation", lambda moving: b"still")
+        patch.setattr("holosplat.report.moving_figures.animation", lambda moving: b"still")
         yield

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from holosplat.fit.terms.spectral import SpectralMisfit
+from holosplat.fit.terms.frames import SpectralMisfit
 from holosplat.geometry import Grid, Views
 from holosplat.matter import Matter
 from holosplat.model import Instrument, Model

@@ -90,7 +90,7 @@ def operations(every_size: bool) -> list[Callable[[], None]]:
     from holosplat.projectors.splat import triton_boxes, triton_pixels
     from holosplat.projectors.surface import cuda as surfaces
     from holosplat.projectors.voxels.lattice_kernels import cuda as hats
-    from holosplat.projectors.voxels.lattice_kernels.frames import Lattice
+    from holosplat.projectors.voxels.lattice_kernels.reference import Lattice
     from holosplat.projectors.voxels.slice_products import cuda as slices
 
     def cloud(channels: int) -> list[Tensor]:

@@ -17,7 +17,7 @@ from holosplat.beamline.simulate import simulate
 from holosplat.checks import InputError
 from holosplat.cli import main
 from holosplat.fit import terms
-from holosplat.fit.batch import Batch
+from holosplat.fit.problem import Batch
 from holosplat.geometry import Grid, Views
 from holosplat.io.nxtomo import write_scan
 from holosplat.io.objects import read_object

@@ -14,7 +14,7 @@ from holosplat.checks import InputError, whole_seed
 from holosplat.cli.options import MaterialOptions
 from holosplat.geometry import Views
 from holosplat.scan import Exposures, Scan
-from holosplat.workflows.suitable import check_frames
+from holosplat.workflows.preconditions import check_frames
 
 VIEWS = Views.evenly_spaced(2, (5, 13), 1e-6)
 

@@ -29,15 +29,13 @@ from holosplat.io.tiff_guard import all_images
 from holosplat.io.tube import Tube
 from holosplat.io.volume_formats import read_volume_file
 from holosplat.io.vtk import read_meshes
-from holosplat.learning.aligned_weights import read_aligned
-from holosplat.learning.weights import read_weights
+from holosplat.learning.weights import read_aligned, read_weights
 from holosplat.matter import MaterialPrior
 from holosplat.methods import Gaussians
 from holosplat.ranges import COUNT, with_checked_numbers
-from holosplat.series.asked import Cut
 from holosplat.series.folder import PLAN, SeriesFolder
 from holosplat.series.plan import MOST_TASKS, SeriesPlan, Source
-from holosplat.series.settings import Settings
+from holosplat.series.settings import Cut, Settings
 from holosplat.tables import overridden, read_table
 from holosplat.volume import Volume
 from holosplat.workflows.run_folder import RunFolder

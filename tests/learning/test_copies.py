@@ -7,9 +7,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from holosplat.learning.copies import COPIES
+from holosplat.learning.lattice import COPIES
 from holosplat.training.sample import Sample
-from holosplat.training.shown import as_shown, whole
+from holosplat.training.shown import example_of_views, make_example
 
 VIEWS = np.arange(3)
 
@@ -33,8 +33,8 @@ def sample() -> Sample:
 
 @pytest.mark.parametrize("copy", COPIES, ids=str)
 def test_a_copy_is_what_the_geometry_makes_of_it(copy, sample):
-    scene = whole(sample, 3)
-    meant = as_shown(sample, VIEWS, slice(None), copy.upside_down, copy.turns)
+    scene = example_of_views(sample, 3)
+    meant = make_example(sample, VIEWS, slice(None), copy.upside_down, copy.turns)
 
     taps, seen = copy.taps(scene.taps), copy.images(scene.images)
 
@@ -47,7 +47,7 @@ def test_a_copy_is_what_the_geometry_makes_of_it(copy, sample):
 
 @pytest.mark.parametrize("copy", COPIES, ids=str)
 def test_what_is_lifted_comes_back_to_the_same_voxels_to_the_last_bit(copy, sample):
-    scene = whole(sample, 3)
+    scene = example_of_views(sample, 3)
     images = torch.arange(3.0 * 10 * 8).reshape(3, 1, *scene.taps.shape)
     shown = images.flip(2) if copy.upside_down else images
     taps = copy.taps(scene.taps)
@@ -59,7 +59,7 @@ def test_what_is_lifted_comes_back_to_the_same_voxels_to_the_last_bit(copy, samp
 
 
 def test_all_copies_differ(sample):
-    occupancy = whole(sample, 3).occupancy
+    occupancy = example_of_views(sample, 3).occupancy
 
     assert len({copy.volume(occupancy).numpy().tobytes() for copy in COPIES}) == 8
     assert torch.equal(COPIES[0].volume(occupancy), occupancy)

@@ -8,8 +8,7 @@ import torch
 
 from holosplat.geometry import Grid, Views
 from holosplat.learning.lattice import Taps
-from holosplat.learning.network import Guess, _fine, coarse, thickness_of
-from holosplat.learning.size import Size
+from holosplat.learning.network import Guess, Size, _fine, coarse, thickness_of
 
 SMALL = Size((4, 4, 6, 6), 3, (4, 6, 8))
 

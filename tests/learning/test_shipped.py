@@ -10,11 +10,10 @@ import pytest
 import torch
 
 from holosplat.learning.weights import SHIPPED, read_weights
-from holosplat.training.objective import dice
 from holosplat.training.options import TrainOptions
 from holosplat.training.ranges import Ranges
 from holosplat.training.sample import sample_of
-from holosplat.training.shown import whole
+from holosplat.training.shown import dice, example_of_views
 
 CELLS = Ranges(
     rows=48, columns=48, views=4, held_out=1, tilted=0.0, noiseless=1.0, across=(12.0, 14.0), fresnel=(0.02, 0.1)
@@ -43,7 +42,7 @@ def test_they_say_where_they_fail(monkeypatch):
 
 @pytest.mark.parametrize(("views", "least"), [(2, 0.5), (4, 0.7)])
 def test_they_know_red_cells(views, least):
-    lesson = whole(sample_of(CELLS, 77, 1), views)
+    lesson = example_of_views(sample_of(CELLS, 77, 1), views)
 
     with torch.inference_mode():
         found = read_weights().network(lesson.images, lesson.taps)[1]

@@ -11,7 +11,7 @@ import holosplat as hs
 from holosplat.geometry import Views
 from holosplat.learning.lattice import Taps
 from holosplat.learning.network import FINE, THICKNESS
-from holosplat.learning.start import GuessedMatter, guessed, spread
+from holosplat.learning.start import GuessedMatter, guess_matter, spread
 from holosplat.specimens import Ball
 
 MATERIAL = hs.DeltaBeta(2e-7, 2e-10)
@@ -40,7 +40,7 @@ def scan_of(shape: tuple[int, int], pixel: float = 0.4e-6, shift: float = 0.0) -
 def test_matter_is_guessed_where_it_is(shape, shift):
     scan = scan_of(shape, shift=shift)
 
-    found = guessed(scan, MATERIAL, Shadows(), lambda stage, fraction: None)  # type: ignore[arg-type]
+    found = guess_matter(scan, MATERIAL, Shadows(), lambda stage, fraction: None)  # type: ignore[arg-type]
 
     x, y, z = np.meshgrid(*found.grid.axes(), indexing="ij")
     share = found.values.numpy().transpose(2, 1, 0)
@@ -61,7 +61,7 @@ def test_large_pixels_are_taken_where_they_explain_the_frames_clearly_better():
             guess = super().forward(images, taps)
             return guess if images.shape[2] < 64 else (guess[0] - 100, guess[1] - 100)
 
-    found = guessed(scan, MATERIAL, Larger(), lambda stage, fraction: None)  # type: ignore[arg-type]
+    found = guess_matter(scan, MATERIAL, Larger(), lambda stage, fraction: None)  # type: ignore[arg-type]
 
     assert factors == [64, 32]
     assert found.values.shape[1] == 32
@@ -71,7 +71,7 @@ def test_large_pixels_are_taken_where_they_explain_the_frames_clearly_better():
 
 def test_what_the_views_agree_on_has_no_spread():
     scan, network = scan_of((40, 48)), Shadows()
-    found = guessed(scan, MATERIAL, network, lambda stage, fraction: None)  # type: ignore[arg-type]
+    found = guess_matter(scan, MATERIAL, network, lambda stage, fraction: None)  # type: ignore[arg-type]
 
     doubt = spread(found, network)  # type: ignore[arg-type]
 
@@ -85,7 +85,7 @@ def two_views() -> hs.Scan:
 
 def test_with_two_views_guesses_of_an_equivariant_network_have_no_spread():
     network = Shadows()
-    found = guessed(two_views(), MATERIAL, network, lambda stage, fraction: None)  # type: ignore[arg-type]
+    found = guess_matter(two_views(), MATERIAL, network, lambda stage, fraction: None)  # type: ignore[arg-type]
 
     kept = GuessedMatter.of(found, MATERIAL, network)  # type: ignore[arg-type]
 
@@ -105,7 +105,7 @@ def test_with_two_views_it_shows_where_a_network_guesses_by_directions_of_its_ow
             return guess + side, guess + side
 
     network = Sided()
-    found = guessed(two_views(), MATERIAL, network, lambda stage, fraction: None)  # type: ignore[arg-type]
+    found = guess_matter(two_views(), MATERIAL, network, lambda stage, fraction: None)  # type: ignore[arg-type]
 
     assert float(spread(found, network).max()) > 0.1  # type: ignore[arg-type]
 
@@ -118,6 +118,6 @@ def test_an_empty_guess_leaves_everything():
             empty = torch.full([2 * n for n in taps.grid], -50.0)
             return empty, empty
 
-    found = guessed(scan_of((40, 48)), MATERIAL, Nothing(), lambda stage, fraction: None)  # type: ignore[arg-type]
+    found = guess_matter(scan_of((40, 48)), MATERIAL, Nothing(), lambda stage, fraction: None)  # type: ignore[arg-type]
 
     assert found.left() == pytest.approx(1.0, abs=1e-6)

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from holosplat.checks import InputError
-from holosplat.learning.network import Guess
-from holosplat.learning.size import Size
+from holosplat.learning.network import Guess, Size
 from holosplat.learning.weights import Card, read_weights, write_weights
 
 SMALL = Size((4, 4, 6, 6), 3, (4, 6, 8))

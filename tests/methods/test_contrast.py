@@ -17,7 +17,7 @@ from holosplat.metrics import volume_scores
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens import Bubbles, MeshScene, random_bubbles
 from holosplat.specimens.red_cells import random_cells
-from holosplat.workflows.resume import decisions_of
+from holosplat.workflows.preconditions import decisions_of
 from holosplat.workflows.totals import TotalMatter
 
 AIR_IN_WATER = DeltaBeta(-5.75e-7, -2.56e-10)

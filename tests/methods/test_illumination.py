@@ -20,7 +20,7 @@ from holosplat.scan import Exposures, Scan
 from holosplat.specimens.red_cells import random_cells
 from holosplat.specimens.scene import MeshScene
 from holosplat.specimens.soft_matter import soft_cells
-from holosplat.workflows.run_light import EVEN, found_in
+from holosplat.workflows.run_illumination import EVEN, light_options_of
 
 MATTER = DeltaBeta(4e-7, 4e-7 / 1500)
 PIXEL, SHAPE, VIEWS = 1e-6, (45, 52), 8
@@ -105,7 +105,7 @@ def test_unequal_flux_is_found(family, request):
     off = (task.lit.factor().numpy() / flux).mean(axis=(1, 2))
     assert float(off.std()) < 0.3 * float(flux.std())
     if family == "sharp":  # in soft matter, light by air alone tells the flux better still
-        assert found_in(task) == EVEN
+        assert light_options_of(task) == EVEN
 
 
 def test_flux_is_told_from_noise_of_means():

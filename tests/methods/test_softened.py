@@ -18,7 +18,7 @@ from holosplat.methods import SurfaceFit
 from holosplat.methods.coarse import CoarseToFine
 from holosplat.methods.surface_fit import _membrane, softened, surface_fit
 from holosplat.representations import SurfaceMesh
-from holosplat.representations.subdivision import edge_lengths
+from holosplat.representations.isosurface import edge_lengths
 from holosplat.scan import Exposures, Scan
 from holosplat.specimens.scene import MeshScene
 

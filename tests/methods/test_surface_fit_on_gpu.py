@@ -16,11 +16,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from helpers.bumpy import bumpy, poses, surfaces
 from helpers.poses import relative
 from holosplat.beamline.simulate import simulate
-from holosplat.fit.freedom import Freedom
 from holosplat.fit.loop import Fit
-from holosplat.fit.neighbours import Neighbours, membrane_inverse
+from holosplat.fit.pose_refinement import PoseRefinement
 from holosplat.fit.schedule import Schedule
-from holosplat.fit.terms.object import squared_product
+from holosplat.fit.terms.object import Neighbours, membrane_inverse, squared_product
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.methods import Auto, SurfaceFit, Surfaces, finished
 from holosplat.methods.surface_fit import surface_fit
@@ -125,7 +124,7 @@ def run(fit: Fit) -> tuple[Tensor, list[float]]:
 @pytest.mark.usefixtures("quick_waves")
 def test_a_fit_is_that_on_the_cpu(tiny, freed):
     start = surfaces(bumpy(1, 3.4, depth=0.0), unit=PITCH)
-    freedom = Freedom(0.5, 0.01, 0.01, 0.02, np.zeros((3, 7)), edges=True) if freed else None
+    freedom = PoseRefinement(0.5, 0.01, 0.01, 0.02, np.zeros((3, 7)), edges=True) if freed else None
     ends, losses = zip(
         *(run(surface_fit(tiny, start, replace(STEPS, backend=of), freedom=freedom)) for of in ("cpu", "cuda"))
     )

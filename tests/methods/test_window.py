@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from holosplat.beamline.simulate import simulate
-from holosplat.fit.freedom import Freedom
+from holosplat.fit.pose_refinement import PoseRefinement
 from holosplat.geometry import Grid, Views, rotation_tilted
 from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import Auto, solve
@@ -120,7 +120,7 @@ def test_a_task_looks_at_windows_only_in_even_light_and_known_poses():
     assert part.lit is not None
     assert part.lit.air.shape == part.scan.frames.shape
     assert part.noise.shape == part.scan.views.shape
-    free = replace(task, freedom=Freedom(1.0, 0.0, 0.0, 0.0, np.zeros((3, 7))))
+    free = replace(task, freedom=PoseRefinement(1.0, 0.0, 0.0, 0.0, np.zeros((3, 7))))
     assert free.in_windows() is free
 
 

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from holosplat.mesh import TriangleMesh
-from holosplat.metrics.distances import distances, normal_distance
+from holosplat.metrics.volumes import distances, normal_distance
 from holosplat.specimens.red_cells import icosphere
 
 

@@ -11,7 +11,7 @@ import holosplat as hs
 from holosplat.checks import InputError
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
-from holosplat.metrics.distances import normal_distance
+from holosplat.metrics.volumes import normal_distance
 from holosplat.motion.assimilate import Assimilation, _Fit, assimilate
 from holosplat.motion.cell_flow import Unknowns
 from holosplat.motion.cell_model import CellModel, ChannelFrame

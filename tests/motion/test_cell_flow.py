@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from holosplat.bodies.moments import moments
 from holosplat.checks import InputError
 from holosplat.mesh import TriangleMesh
-from holosplat.metrics.distances import normal_distance
+from holosplat.metrics.volumes import normal_distance
 from holosplat.motion.cell_flow import CellFlow, Unknowns, advanced
 from holosplat.motion.cell_model import CellModel, ChannelFrame
 from holosplat.motion.dynamics import whole_cells

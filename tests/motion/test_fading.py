@@ -11,7 +11,7 @@ import torch
 import holosplat as hs
 from helpers.fading_lumps import MATTER, SHAPE, TIMES, Fades, drifting, series
 from holosplat.checks import InputError
-from holosplat.fit.carried_volume import CarriedProblem, likelier_fading
+from holosplat.fit.flow_volume import FlowProblem, likelier_fading
 from holosplat.fit.smooth_volume import ContinuousPrior
 from holosplat.geometry import Grid
 from holosplat.io.objects import read_object, write_object
@@ -19,7 +19,7 @@ from holosplat.matter import MaterialPrior
 from holosplat.methods import SmoothVolume, Task
 from holosplat.motion.carried import CarriedOptions, Search, merged
 from holosplat.representations import Fading, Flow, Lattice, TimeBasis
-from holosplat.representations.fading import faded
+from holosplat.representations.flow import fading_factor
 
 QUICK = SmoothVolume(coarser=(), rounds=1, iterations=8)
 LATTICE = Lattice.around((SHAPE[1], SHAPE[0], SHAPE[1]), 2)
@@ -41,7 +41,7 @@ def test_a_field_on_voxels_is_that_at_points():
     assert fading.on(axes).numpy() == pytest.approx(there.numpy())
     even = fading.with_coefficients(torch.ones_like(fading.coefficients))
     assert even.on(axes).numpy() == pytest.approx(1.0)
-    assert float(faded(torch.tensor([0.3, -0.4]), 0.5)) == pytest.approx(np.exp(0.15 - 0.1))
+    assert float(fading_factor(torch.tensor([0.3, -0.4]), 0.5)) == pytest.approx(np.exp(0.15 - 0.1))
 
 
 def test_gaussians_fade_as_the_field_says():
@@ -52,7 +52,7 @@ def test_gaussians_fade_as_the_field_says():
     before = torch.nn.functional.softplus(raw)
     for later, bound in (*((s, 1e-9) for s in ENDS), (0.2, 0.02), (-0.3, 0.02)):
         found = torch.nn.functional.softplus(raw + later * linear + later**2 * square) / before
-        assert found.numpy() == pytest.approx(faded(fading.at(centres), later).numpy(), rel=bound)
+        assert found.numpy() == pytest.approx(fading_factor(fading.at(centres), later).numpy(), rel=bound)
 
 
 def search(scan, spread: float) -> Search:
@@ -78,7 +78,7 @@ def test_the_gradient_is_that_of_finite_differences():
     flow = Flow.still(LATTICE, TimeBasis(0, 1, 0), float(TIMES[2]), 3)
     flow = flow.with_parameters({"potential": 3 * torch.randn(1, 3, *LATTICE.counts)})
     frames = [made.frames.whitened(k, 1) for k in range(len(TIMES))]
-    problem = CarriedProblem(frames, TIMES.tolist(), ContinuousPrior(), 0.5, flow, 1)
+    problem = FlowProblem(frames, TIMES.tolist(), ContinuousPrior(), 0.5, flow, 1)
     u = torch.from_numpy(scene.at(TIMES[2]).voxelise(Grid.of_views(scan.views)).delta / MATTER.delta).float()
     fading = some(0.3).with_coefficients(some(0.3).coefficients.float())
     leaf, way = fading.coefficients.clone().requires_grad_(), torch.randn_like(fading.coefficients)

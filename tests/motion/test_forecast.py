@@ -15,7 +15,7 @@ from holosplat.checks import InputError
 from holosplat.fit.schedule import Schedule
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
-from holosplat.metrics.distances import normal_distance
+from holosplat.metrics.volumes import normal_distance
 from holosplat.motion.fit import MotionFit
 from holosplat.motion.forecast import PathForecast, across, extrapolate, normals
 from holosplat.motion.half_sets import half_sets

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import holosplat as hs
-from holosplat.fit.carried_volume import CarriedProblem
+from holosplat.fit.flow_volume import FlowProblem
 from holosplat.fit.smooth_volume import ContinuousPrior, Descent
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior
@@ -33,7 +33,7 @@ def test_a_share_of_the_frames_is_held_out_and_one_a_time_is_kept():
     assert lonely.all()
 
 
-def problems(photons: float) -> tuple[CarriedProblem, CarriedProblem, torch.Tensor]:
+def problems(photons: float) -> tuple[FlowProblem, FlowProblem, torch.Tensor]:
     """Matter that stands still, on 19 × 23 pixels: of kept frames, and of those held out; and a faint start."""
     parts = tuple(
         ellipsoid(c, (3e-6, 2.4e-6, 2.7e-6), Bump(2), MATTER) for c in [(-3e-6, -1e-6, 1e-6), (2e-6, 2e-6, -2e-6)]
@@ -47,7 +47,7 @@ def problems(photons: float) -> tuple[CarriedProblem, CarriedProblem, torch.Tens
     flow = Flow.still(Lattice.around((23.0, 19.0, 23.0), 2), TimeBasis(0, 1, 0), 0.0, 2)
     weak = ContinuousPrior().weakened(1 / 16)
     made = [
-        CarriedProblem([frames.whitened(k, 1, which[k]) for k in range(2)], [0.0, 1.0], weak, 0.5, flow, 1)
+        FlowProblem([frames.whitened(k, 1, which[k]) for k in range(2)], [0.0, 1.0], weak, 0.5, flow, 1)
         for which in (~LEFT, LEFT)
     ]
     return made[0], made[1], torch.full(Grid.of_views(scan.views).shape, 0.02)

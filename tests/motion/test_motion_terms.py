@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from helpers.moving_ellipsoids import MATERIAL, PIXEL, true_paths, truth
-from holosplat.fit.batch import Batch
+from holosplat.fit.problem import Batch
 from holosplat.matter import Matter
 from holosplat.motion.contact import Apart
 from holosplat.motion.terms import Acceleration, MovingBending, area_kept, square_root, volume_kept

@@ -8,7 +8,7 @@ import torch
 
 import holosplat as hs
 from holosplat.checks import InputError
-from holosplat.fit.carried_volume import CarriedProblem, likelier_flow, strain
+from holosplat.fit.flow_volume import FlowProblem, likelier_flow, strain
 from holosplat.fit.smooth_volume import ContinuousPrior
 from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid, Views
@@ -70,9 +70,9 @@ def error(found: hs.volume.Volume, true: hs.volume.Volume) -> float:
     return float(np.linalg.norm(found.delta - true.delta) / np.linalg.norm(true.delta))
 
 
-def problem_of(scan: Scan, flow: Flow, noise) -> CarriedProblem:
+def problem_of(scan: Scan, flow: Flow, noise) -> FlowProblem:
     frames = [WhitenedFrames(scan.at_instant(k), MATTER, noise[k]) for k in range(len(TIMES))]
-    return CarriedProblem(frames, TIMES.tolist(), ContinuousPrior(), 0.5, flow, 1)
+    return FlowProblem(frames, TIMES.tolist(), ContinuousPrior(), 0.5, flow, 1)
 
 
 def test_gradients_of_volume_and_flow_are_those_of_finite_differences(drifting):

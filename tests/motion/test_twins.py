@@ -13,8 +13,8 @@ import holosplat as hs
 from helpers.motion_shadows import OTHER, TURN, cell
 from holosplat.bodies.moments import moments
 from holosplat.bodies.twin import map_near, twin_map, twin_of
+from holosplat.fit.running import Steps
 from holosplat.fit.schedule import Schedule
-from holosplat.fit.steps import Steps
 from holosplat.geometry import rotation_y
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import Matter

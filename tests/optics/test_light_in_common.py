@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from holosplat.beamline.light import correlated_field
-from holosplat.optics.still_light import fixed_pattern, mean_light
+from holosplat.optics.patterns import fixed_pattern, mean_light
 
 SHAPE, NOISE, PATTERN = (31, 48), 0.004, 0.003
 

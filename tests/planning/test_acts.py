@@ -15,8 +15,7 @@ import pytest
 
 from holosplat.align import PoseOptions
 from holosplat.geometry import Views
-from holosplat.learning.network import FINE
-from holosplat.learning.size import Size
+from holosplat.learning.network import FINE, Size
 from holosplat.methods import METHODS, Pinn, SurfaceOptions
 from holosplat.motion.carried import CarriedOptions
 from holosplat.motion.track_options import TrackOptions

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from holosplat.geometry import Grid
-from holosplat.report.guess import guess_block
-from holosplat.report.guess_shown import GuessShown
+from holosplat.report.blocks import guess_block
+from holosplat.report.content import GuessShown
 
 GRID = Grid.centred((6, 5, 6), 1e-6)
 

@@ -18,14 +18,17 @@ from holosplat.bodies.moments import centroid
 from holosplat.geometry import Grid, Views
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
-from holosplat.report.animation import encoded
-from holosplat.report.body_picture import body_colours, paint_bodies
-from holosplat.report.content import ReportContent
-from holosplat.report.motion_blocks import motion_blocks
-from holosplat.report.moving import Moving
-from holosplat.report.moving_figures import film_figure, shapes_figure, trajectories_figure
+from holosplat.report.content import Moving, ReportContent
+from holosplat.report.moving_figures import (
+    encode_animation,
+    film_figure,
+    motion_blocks,
+    shapes_figure,
+    trajectories_figure,
+)
 from holosplat.report.run import moving_of
 from holosplat.report.style import new_figure
+from holosplat.report.surface import body_colours, paint_bodies
 from holosplat.report.tables import score_tables, verdict
 from holosplat.representations import SurfaceMesh
 from holosplat.specimens.red_cells import icosphere
@@ -136,12 +139,12 @@ def test_a_film_strip_shows_frames_and_what_is_left():
 def test_moving_pictures_are_bounded_and_move():
     """Noise does not compress, so that quality and then size must fall; a dot that moves is where it should be."""
     noise = np.random.default_rng(0).integers(0, 255, (6, 120, 160, 3)).astype(np.uint8)
-    small, large = (encoded(list(noise), 0.1, most) for most in (20_000, 400_000))
+    small, large = (encode_animation(list(noise), 0.1, most) for most in (20_000, 400_000))
     assert len(small) <= 20_000 < len(large) <= 400_000
     dots = np.zeros((4, 48, 64, 3), dtype=np.uint8)
     for k in range(4):
         dots[k, 20:28, 10 + 12 * k : 18 + 12 * k] = 255
-    picture = Image.open(io.BytesIO(encoded(list(dots), 0.1, 400_000)))
+    picture = Image.open(io.BytesIO(encode_animation(list(dots), 0.1, 400_000)))
     assert (picture.size, picture.n_frames) == ((64, 48), 4)  # type: ignore[attr-defined]
     for k in range(4):
         picture.seek(k)

@@ -10,7 +10,7 @@ from holosplat.matter import Matter
 from holosplat.metrics import image_scores, intensity_range, volume_scores
 from holosplat.model import measure
 from holosplat.report import HeldOutViews, ProjectedMaps, ReportContent, view_labels, write_report
-from holosplat.report.view3d.of_run import view_of
+from holosplat.report.run import view_of
 from holosplat.representations import SurfaceMesh
 from holosplat.scan import Scan
 from holosplat.specimens.red_cells import place_cells

@@ -19,7 +19,7 @@ from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, Matter
 from holosplat.model import Instrument
 from holosplat.report.view3d import parts as packing
-from holosplat.report.view3d.parts import Part, binned, part_of, volume_part
+from holosplat.report.view3d.parts import ViewPart, binned, part_of, volume_part
 from holosplat.report.view3d.view import View3D, html, packed, raster_of
 from holosplat.representations import GaussianCloud, MovingSurfaces, SurfaceMesh
 from holosplat.representations.gaussians import raw_of
@@ -87,7 +87,7 @@ def view() -> View3D:
 # --- what is stored -----------------------------------------------------------------------------------------
 
 
-def restored(part: Part, name: str) -> np.ndarray:
+def restored(part: ViewPart, name: str) -> np.ndarray:
     """Places or values of a part, from its whole numbers."""
     low, step = (
         np.array(part.facts[key]).reshape(-1, 1, 1, 1) if part.kind == "volume" else part.facts[key]

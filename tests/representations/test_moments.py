@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from holosplat.matter import Matter
 from holosplat.representations import GaussianCloud
-from holosplat.representations.moments import SMOOTH, cloud_of_moments, moments
+from holosplat.representations.initialise import SMOOTH, cloud_of_moments, moments
 
 MATTER = Matter.one(1e-6, 1e-9)
 

@@ -16,7 +16,7 @@ from holosplat.io.objects import read_object, write_object
 from holosplat.matter import Matter
 from holosplat.projectors.splat.reference import rotation_matrices
 from holosplat.representations import Flow, GaussianCloud, Lattice, MovingGaussians, TimeBasis
-from holosplat.representations.principal import principal_axes, quaternions_of
+from holosplat.representations.moving_gaussians import principal_axes, quaternions_of
 
 LATTICE = Lattice.around((40.0, 26.0, 32.0), 4)
 BASIS = TimeBasis(1.0, 3.0, 2)

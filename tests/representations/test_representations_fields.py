@@ -15,7 +15,7 @@ from holosplat.geometry import Grid, Views
 from holosplat.matter import Matter
 from holosplat.representations import Encoding, Network, NeuralField, VoxelGrid, VoxelLines
 from holosplat.representations.neural_field import grown
-from holosplat.representations.voxel_lines import resampling
+from holosplat.representations.voxels import resampling
 from holosplat.volume import Object
 
 PIXEL = 2e-6

@@ -9,7 +9,7 @@ import torch
 
 from helpers.bumpy import area, bumpy
 from holosplat.mesh import TriangleMesh
-from holosplat.representations.subdivision import edge_lengths, subdivided
+from holosplat.representations.isosurface import edge_lengths, loop_subdivision
 
 TETRAHEDRON = (
     torch.tensor([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]], dtype=torch.float64),
@@ -23,7 +23,7 @@ def arrays(mesh: TriangleMesh) -> tuple[torch.Tensor, torch.Tensor]:
 
 def test_a_tetrahedron_by_hand():
     """n = 3 has β = 3/16: corners go to 7/16 of themselves and 3/16 of the others'; middles to 3/8, 3/8, 1/8, 1/8."""
-    vertices, faces = subdivided(*TETRAHEDRON)
+    vertices, faces = loop_subdivision(*TETRAHEDRON)
     corners = TETRAHEDRON[0]
     assert vertices.shape == (4 + 6, 3)
     assert faces.shape == (16, 3)
@@ -34,7 +34,7 @@ def test_a_tetrahedron_by_hand():
 
 def test_surfaces_stay_closed_and_wound_outwards():
     start = bumpy(2, 9.0, (0.6, -0.4, 0.3), depth=0.25)
-    vertices, faces = subdivided(*arrays(start))
+    vertices, faces = loop_subdivision(*arrays(start))
     finer = TriangleMesh(vertices.numpy(), faces.numpy(), "finer")
     assert len(faces) == 4 * len(start.faces)
     sides = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
@@ -52,7 +52,7 @@ def test_facets_become_round():
     start = bumpy(2, 9.0, depth=0.0)
     vertices, faces = arrays(start)
     for _ in range(2):
-        vertices, faces = subdivided(vertices, faces)
+        vertices, faces = loop_subdivision(vertices, faces)
     radii = vertices.norm(dim=1)
     finer = TriangleMesh(vertices.numpy(), faces.numpy(), "finer")
     assert float(radii.std() / radii.mean()) < 0.002  # facets of the start are up to 1.4 % nearer than its corners

@@ -21,12 +21,11 @@ from holosplat.io.nxtomo import write_scan
 from holosplat.report.tables import Headline
 from holosplat.representations import MovingSurfaces
 from holosplat.series.collect import collect, same_bodies
-from holosplat.series.folder import SeriesFolder
-from holosplat.series.pages.charts import Point, chart, labels
-from holosplat.series.pages.page import Frame, SeriesPage, headline, render_page
+from holosplat.series.folder import SeriesFolder, table_of, time_left
+from holosplat.series.page import Frame, Point, SeriesPage, chart, headline, labels, render_page
+from holosplat.series.rows import duration
 from holosplat.series.run import run_left, states
 from holosplat.series.time import PHASE
-from holosplat.series.words import duration, table_of, time_left
 from holosplat.workflows.reconstruction import Reconstruction
 
 
@@ -146,7 +145,7 @@ def test_bodies_are_followed_from_task_to_task(tmp_path, monkeypatch):
             bodies = MovingSurfaces(bodies.coefficients + 50e-9 / bodies.unit_length / 3**0.5, *parts)
         return Reconstruction(bodies, "track", 20.0, 1, {}, True)
 
-    monkeypatch.setattr("holosplat.series.tracked.track", found)
+    monkeypatch.setattr("holosplat.series.task.track", found)
     folder = SeriesFolder(tmp_path / "series")
     assert run_left(folder).done == 2
     assert asked == [[10 * k for k in range(TIMES - 1)], [10 * k for k in range(TIMES - 3, TIMES)]]

@@ -15,11 +15,10 @@ from holosplat.matter import DeltaBeta, MaterialPrior
 from holosplat.methods import Auto
 from holosplat.motion.track import TrackOptions
 from holosplat.optics.background import LightOptions
-from holosplat.series.asked import Cut
+from holosplat.series.appearing import listed
 from holosplat.series.folder import SeriesFolder
 from holosplat.series.plan import SeriesPlan, Source, plan_series
-from holosplat.series.settings import Settings, prior_of
-from holosplat.series.sources import listed
+from holosplat.series.settings import Cut, Settings, prior_of
 
 CELL = HAEMOGLOBIN.delta_beta(20.0)
 

@@ -22,9 +22,8 @@ from holosplat.report.style import format_length
 from holosplat.representations import GaussianCloud, MovingSurfaces, SurfaceMesh, TimeBasis
 from holosplat.representations.gaussians import raw_of
 from holosplat.show import server
-from holosplat.show.guard import Guard
 from holosplat.show.parts import Frame, Splats, at_times, cut, shown
-from holosplat.show.server import LiveView
+from holosplat.show.server import Guard, LiveView
 from holosplat.show.watch import Watch
 from holosplat.specimens.red_cells import icosphere
 

@@ -13,25 +13,27 @@ from helpers.ball_sample import ball_sample
 from helpers.two_balls import ONE, scan, truth
 from holosplat.checks import InputError
 from holosplat.fit.schedule import Schedule
-from holosplat.learning.aligned_weights import read_aligned, write_aligned
-from holosplat.learning.weights import Card, write_weights
+from holosplat.learning.weights import Card, read_aligned, write_aligned, write_weights
 from holosplat.matter import MaterialPrior
 from holosplat.methods import AlignedFit, Onix, PixelNerf, Task, solve
 from holosplat.representations import AlignedNetwork, PixelAligned, PixelAlignedField
-from holosplat.training.aligned import AlignedTraining, AlignedValidation
-from holosplat.training.aligned_options import FrameGoal
-from holosplat.training.aligned_shown import aligned_lesson, first_views
-from holosplat.training.critic import Critic
+from holosplat.training.aligned import AlignedTraining, AlignedValidation, Critic, draw_aligned_example, first_views
 from holosplat.training.folder import Dataset
-from holosplat.training.options import Shown, TrainOptions
+from holosplat.training.options import FrameLossWeights, TrainOptions, ViewSampling
 from holosplat.training.ranges import Ranges
 from holosplat.training.sample import Sample
 
 SMALL = AlignedNetwork((4, 6), 8, 2)
 OPTIONS = TrainOptions(
-    steps=4, warm_up=2, keep_every=2, rate=0.02, network="onix", shown=Shown(views=(2, 3)), frames=FrameGoal()
+    steps=4,
+    warm_up=2,
+    keep_every=2,
+    rate=0.02,
+    network="onix",
+    shown=ViewSampling(views=(2, 3)),
+    frames=FrameLossWeights(),
 )
-ADVERSE = replace(OPTIONS, frames=FrameGoal(adversary=0.1, pretrain=0.3))
+ADVERSE = replace(OPTIONS, frames=FrameLossWeights(adversary=0.1, pretrain=0.3))
 KNOWN = MaterialPrior.known(ONE.channels[0])
 
 
@@ -128,7 +130,7 @@ def test_a_misfit_is_nothing_where_the_prediction_is_right(sample, network):
 
 def test_half_of_what_is_foretold_is_not_shown(sample):
     for step in range(8):
-        lesson = aligned_lesson(sample, Shown(views=(2, 3)), 3, "onix", np.random.default_rng(step))
+        lesson = draw_aligned_example(sample, ViewSampling(views=(2, 3)), 3, "onix", np.random.default_rng(step))
         assert sum(target not in lesson.seen for target in lesson.targets) == 2
         assert len(set(lesson.targets)) == 3
         assert not sample.is_test[lesson.seen].any()
@@ -149,8 +151,7 @@ def test_a_discriminator_learns_to_tell_and_says_how_to_mislead_it():
 
 
 def test_other_files_are_no_weights(tmp_path):
-    from holosplat.learning.network import Guess
-    from holosplat.learning.size import Size
+    from holosplat.learning.network import Guess, Size
 
     path = tmp_path / "weights.safetensors"
     write_weights(path, Guess(Size((4, 4, 4, 4), 3, (4, 4, 4))), Card())

@@ -12,11 +12,10 @@ from PIL import Image
 
 from holosplat.checks import InputError
 from holosplat.geometry import rotation_tilted
-from holosplat.training.as_scan import as_scan
 from holosplat.training.export import export
 from holosplat.training.folder import Dataset
 from holosplat.training.ranges import Ranges
-from holosplat.training.sample import Sample
+from holosplat.training.sample import Sample, as_scan
 
 ANGLES = (0.0, 70.0, 110.0)
 PIXEL, ENERGY, DISTANCE, DELTA, BETA = 0.5e-6, 20.0, 0.05, 3e-7, 4e-10

@@ -10,12 +10,10 @@ from torch.nn.functional import avg_pool2d
 
 from holosplat.checks import InputError
 from holosplat.learning.network import FINE, coarse, thickness_of
-from holosplat.training.datasheet import write_datasheet
-from holosplat.training.draw import drawn
-from holosplat.training.folder import Dataset
+from holosplat.training.folder import Dataset, write_datasheet
 from holosplat.training.ranges import Ranges
-from holosplat.training.sample import Sample, sample_of
-from holosplat.training.shown import as_shown
+from holosplat.training.sample import Sample, draw_scene, sample_of
+from holosplat.training.shown import make_example
 
 TINY = Ranges(rows=34, columns=30, views=3, held_out=1, across=(9.0, 11.0), fresnel=(0.02, 0.1), noiseless=1.0)
 
@@ -29,12 +27,12 @@ def test_a_scene_is_the_same_for_ever_and_others_differ(sample):
     again = sample_of(TINY, 3, 0)
 
     assert all(np.array_equal(getattr(sample, name), getattr(again, name)) for name in Sample.names())
-    assert drawn(TINY, 3, 0) == drawn(TINY, 3, 0) != drawn(TINY, 3, 1) != drawn(TINY, 4, 0)
+    assert draw_scene(TINY, 3, 0) == draw_scene(TINY, 3, 0) != draw_scene(TINY, 3, 1) != draw_scene(TINY, 4, 0)
 
 
 def test_what_is_drawn_lies_in_its_ranges():
     for index in range(40):
-        scene = drawn(Ranges(), 1, index)
+        scene = draw_scene(Ranges(), 1, index)
         pixel, energy = scene.detector.pixel_size, scene.beam.energy_kev
         number = pixel**2 / (12.398e-10 / energy * scene.beam.distance)
         assert number * 1.001 >= 0.02
@@ -52,7 +50,7 @@ def test_every_kind_can_be_imaged(kind):
 
 
 def test_a_medium_turns_the_sign_of_the_absorption_and_changes_nothing_else_that_is_drawn():
-    dry, wet = (drawn(replace(TINY, medium=share), 0, 0) for share in (0.0, 1.0))
+    dry, wet = (draw_scene(replace(TINY, medium=share), 0, 0) for share in (0.0, 1.0))
     told = [scene.material_prior().materials[0] for scene in (dry, wet)]
 
     assert told[1].delta == pytest.approx(told[0].delta)
@@ -62,7 +60,7 @@ def test_a_medium_turns_the_sign_of_the_absorption_and_changes_nothing_else_that
 
 
 def test_filled_capsules_are_of_two_levels_of_one_ratio():
-    found = drawn(replace(TINY, kinds=("filled-capsules",), medium=1.0), 0, 0)
+    found = draw_scene(replace(TINY, kinds=("filled-capsules",), medium=1.0), 0, 0)
     assert found.matter.core is not None
     core, shell, medium = (
         part.delta_beta(20.0) for part in (found.matter.core, found.matter.material, found.matter.medium)
@@ -76,7 +74,7 @@ def test_filled_capsules_are_of_two_levels_of_one_ratio():
 def test_images_are_those_of_the_occupancy_that_is_shown(sample, flipped, turns):
     truth = replace(sample, thickness=_true_thickness(sample))
 
-    shown = as_shown(truth, [2, 0], slice(4, 30), flipped, turns)
+    shown = make_example(truth, [2, 0], slice(4, 30), flipped, turns)
 
     seen = avg_pool2d(shown.images[:, 1:2], FINE)[:, 0]
     meant = thickness_of(coarse(shown.occupancy).flatten(), shown.taps)
@@ -86,7 +84,7 @@ def test_images_are_those_of_the_occupancy_that_is_shown(sample, flipped, turns)
 
 def _true_thickness(sample: Sample) -> np.ndarray:
     """What the frames' retrieved thickness should be, by the lattice of whole frames."""
-    whole = as_shown(sample, list(range(4)), slice(None), False, 0)
+    whole = make_example(sample, list(range(4)), slice(None), False, 0)
     shadows = thickness_of(coarse(whole.occupancy).flatten(), whole.taps) * 4
     return shadows.repeat_interleave(2, 1).repeat_interleave(2, 2).numpy().astype(np.float16)
 

@@ -12,14 +12,13 @@ import torch
 
 from holosplat.checks import InputError
 from holosplat.geometry import rotation_y
-from holosplat.learning.size import Size
+from holosplat.learning.network import Size
 from holosplat.learning.weights import read_weights
 from holosplat.training.folder import Dataset
-from holosplat.training.objective import dice, loss, soft_dice
-from holosplat.training.options import Goal, Shown, TrainOptions
+from holosplat.training.options import LossWeights, TrainOptions, ViewSampling
 from holosplat.training.ranges import Ranges
 from holosplat.training.sample import Sample
-from holosplat.training.shown import whole
+from holosplat.training.shown import dice, example_of_views, loss, soft_dice
 from holosplat.training.train import Training
 from holosplat.training.validate import Validation
 
@@ -30,7 +29,7 @@ OPTIONS = TrainOptions(
     rate=5e-3,
     precision="float32",
     size=Size((4, 4, 6, 6), 3, (4, 6, 8)),
-    shown=Shown(rows=(16,)),
+    shown=ViewSampling(rows=(16,)),
 )
 
 
@@ -176,7 +175,7 @@ def test_rates_rise_fall_and_end():
 
 
 def test_scores_are_one_where_the_guess_is_right_and_the_loss_is_small():
-    truth = whole(a_sample(1), 2).occupancy
+    truth = example_of_views(a_sample(1), 2).occupancy
     right = 200 * (truth - 0.5)
 
     assert dice(right, truth) == 1
@@ -186,7 +185,7 @@ def test_scores_are_one_where_the_guess_is_right_and_the_loss_is_small():
 
 
 def test_the_loss_counts_both_guesses():
-    lesson = whole(a_sample(1), 2)
+    lesson = example_of_views(a_sample(1), 2)
 
     class Known(torch.nn.Module):
         """A wrong guess, and a right correction."""
@@ -194,7 +193,7 @@ def test_the_loss_counts_both_guesses():
         def forward(self, images, taps):
             return torch.full_like(lesson.occupancy, -100.0), 200 * (lesson.occupancy - 0.5)
 
-    value, scores = loss(Known(), lesson, Goal(entropy=0.0, dice=1.0, first=0.5))  # type: ignore[arg-type]
+    value, scores = loss(Known(), lesson, LossWeights(entropy=0.0, dice=1.0, first=0.5))  # type: ignore[arg-type]
 
     assert float(value) == pytest.approx(0.5, abs=5e-3)
     assert scores.tolist() == pytest.approx([0, 1], abs=5e-3)

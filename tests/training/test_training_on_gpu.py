@@ -15,14 +15,12 @@ import pytest
 from helpers.ball_sample import ball_sample
 from helpers.pretended_gpu import OnGpu, pretended_gpu
 from holosplat.checks import InputError
-from holosplat.learning.aligned_weights import read_aligned
-from holosplat.learning.size import Size
-from holosplat.learning.weights import read_weights
+from holosplat.learning.network import Size
+from holosplat.learning.weights import read_aligned, read_weights
 from holosplat.representations import AlignedNetwork
 from holosplat.training.aligned import AlignedTraining, AlignedValidation
-from holosplat.training.aligned_options import FrameGoal
 from holosplat.training.folder import Dataset
-from holosplat.training.options import Shown, TrainOptions
+from holosplat.training.options import FrameLossWeights, TrainOptions, ViewSampling
 from holosplat.training.ranges import Ranges
 from holosplat.training.sample import Sample
 from holosplat.training.train import Training
@@ -37,9 +35,9 @@ OPTIONS = TrainOptions(
     warm_up=2,
     rate=0.02,
     precision="float32",
-    shown=Shown(views=(2, 3), rows=(16,)),
+    shown=ViewSampling(views=(2, 3), rows=(16,)),
     size=Size((4, 4, 6, 6), 3, (4, 6, 8)),
-    frames=FrameGoal(adversary=0.1, pretrain=0.3),
+    frames=FrameLossWeights(adversary=0.1, pretrain=0.3),
 )
 
 

@@ -13,10 +13,10 @@ import holosplat as hs
 from helpers.cli import holosplat, refused, worked
 from holosplat.checks import InputError
 from holosplat.io.nxtomo import read_scan, write_scan
-from holosplat.optics.modes import smooth_modes
+from holosplat.optics.patterns import smooth_modes
 from holosplat.projectors.voxels import SliceProjector
 from holosplat.units import wavenumber
-from holosplat.workflows.still_light import StillLight, evened
+from holosplat.workflows.fixed_pattern import FixedPatternOptions, flatfield_corrected
 
 SHAPE, COUNT, PIXEL = (5, 31), 15, 2e-5
 MATERIAL = hs.DeltaBeta(1e-6, 1e-9)
@@ -51,7 +51,7 @@ def a_scan(factor: np.ndarray) -> hs.Scan:
 def test_held_out_frames_lose_the_light_of_those_for_training(order, left):
     """What is left of light, as a share of it; pixel by pixel, errors of the volume are in it, too."""
     clean, shone = a_scan(np.ones(SHAPE)), a_scan(light(order))
-    found = evened(shone, PRIOR, StillLight(order, inside=14 * PIXEL))
+    found = flatfield_corrected(shone, PRIOR, FixedPatternOptions(order, inside=14 * PIXEL))
 
     def unlike(scan: hs.Scan) -> float:
         return float(np.log(scan.test().frames / clean.test().frames).std())
@@ -66,15 +66,15 @@ def test_held_out_frames_say_nothing_of_the_light():
     frames = shone.frames.copy()
     frames[HELD_OUT] = 0.5
     other = replace(shone, frames=frames)
-    one, two = (evened(scan, PRIOR, StillLight(2)).train().frames for scan in (shone, other))
+    one, two = (flatfield_corrected(scan, PRIOR, FixedPatternOptions(2)).train().frames for scan in (shone, other))
     np.testing.assert_array_equal(one, two)
 
 
 def test_one_frame_has_no_still_light():
     with pytest.raises(InputError, match="at least 2 frames"):
-        evened(a_scan(light(2))[[0]], PRIOR, StillLight(2))
+        flatfield_corrected(a_scan(light(2))[[0]], PRIOR, FixedPatternOptions(2))
     with pytest.raises(InputError, match="half waves"):
-        StillLight(-1)
+        FixedPatternOptions(-1)
 
 
 def test_the_command_reads_frames_when_they_are_asked_for_and_says_what_it_found(tmp_path: Path):

@@ -12,8 +12,8 @@ from holosplat.matter import DeltaBeta, Matter
 from holosplat.representations import GaussianCloud, MovingSurfaces, TimeBasis, VoxelGrid
 from holosplat.representations.gaussians import raw_of
 from holosplat.specimens.red_cells import icosphere
-from holosplat.workflows.latest import Latest, latest
 from holosplat.workflows.run_folder import RunFolder
+from holosplat.workflows.run_status import RunStatus, read_status
 
 MATTER = Matter((DeltaBeta(4e-7, 2e-10),))
 
@@ -38,7 +38,7 @@ def test_gaussians_are_those_of_the_last_step(folder):
     folder.start_metrics(["step", "loss"])
     folder.append_metrics([{"step": 1, "loss": 0.5}, {"step": 2, "loss": 0.25}])
     folder.save_checkpoint({"stage": 1, "start": {"kind": begun.kind, "state": begun.state()}, "fit": fit})
-    found = latest(folder)
+    found = read_status(folder)
     assert (found.stage, found.step, found.loss) == ("fit", 2, 0.25)
     assert found.lines() == ["stage: fit", "step 2, loss 0.25"]
     assert torch.equal(found.object.centres, now.centres)
@@ -49,9 +49,9 @@ def test_other_fits_show_their_volume_or_what_they_begin_with(folder):
     start = {"kind": begun.kind, "state": begun.state()}
     volume = VoxelGrid(torch.rand(1, 3, 4, 5), Grid.centred((3, 4, 5), 1e-6), MATTER)
     folder.save_checkpoint({"stage": 0, "start": start, "fit": {"volume": volume.state()}})
-    assert torch.equal(latest(folder).object.values, volume.values)
+    assert torch.equal(read_status(folder).object.values, volume.values)
     folder.save_checkpoint({"stage": 0, "start": start, "fit": {"trainable": {"parameters": {"object.other": 1.0}}}})
-    assert len(latest(folder).object) == 20
+    assert len(read_status(folder).object) == 20
 
 
 def test_bodies_in_motion_are_those_of_their_fit(folder):
@@ -61,16 +61,16 @@ def test_bodies_in_motion_are_those_of_their_fit(folder):
     bodies = MovingSurfaces(paths, torch.from_numpy(faces.copy()), body, TimeBasis(0.0, 1e-5, 1), 2e-6, MATTER)
     state = {"next": "soft", "bodies": bodies.state(), "records": [{"step": 7, "loss": 0.5}], "fit": None}
     folder.save_checkpoint(state)
-    found = latest(folder)
+    found = read_status(folder)
     assert (found.stage, found.step, found.object.count) == ("soft", 7, 1)
     moved = {"trainable": {"parameters": {"object.coefficients": bodies.coefficients + 1}}}
     folder.save_checkpoint(state | {"fit": moved})
-    assert torch.equal(latest(folder).object.coefficients, bodies.coefficients + 1)
+    assert torch.equal(read_status(folder).object.coefficients, bodies.coefficients + 1)
     folder.save_checkpoint(state | {"bodies": None, "next": "first paths", "records": []})
-    assert latest(folder) == Latest("first paths")
+    assert read_status(folder) == RunStatus("first paths")
 
 
 def test_matter_in_motion_says_its_steps_and_a_run_without_a_state_nothing(folder):
-    assert latest(folder).lines() == ["nothing is kept yet"]
+    assert read_status(folder).lines() == ["nothing is kept yet"]
     folder.save_checkpoint({"steps": 3, "history": [], "timing": {}, "strength": 1.0})
-    assert latest(folder).lines() == ["stage: 3 steps are done"]
+    assert read_status(folder).lines() == ["stage: 3 steps are done"]

@@ -24,7 +24,7 @@ from holosplat.scan import Exposures, Scan
 from holosplat.workflows.evaluate import evaluate
 from holosplat.workflows.reconstruct import Reconstruction, load_reconstruction, reconstruct
 from holosplat.workflows.run_folder import RunFolder
-from holosplat.workflows.run_light import EVEN, light_of, read_light_options
+from holosplat.workflows.run_illumination import EVEN, light_of, read_light_options
 
 SHAPE = (45, 64)
 MATTER = DeltaBeta(*MATERIAL)

@@ -14,7 +14,7 @@ from holosplat.bodies.rest_shape import KnownBody, guessed_cells
 from holosplat.checks import InputError
 from holosplat.motion.known import at_rest
 from holosplat.representations import MovingSurfaces, TimeBasis
-from holosplat.workflows.rest_file import read_rest, write_rest
+from holosplat.workflows.reconstruction import read_rest, write_rest
 from holosplat.workflows.run_folder import RunFolder
 from holosplat.workflows.track import STRAIN, TRACKS, read_errors, write_tracks
 

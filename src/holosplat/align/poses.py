@@ -12,7 +12,7 @@ from torch.nn.functional import interpolate
 
 from ..baselines.primal_dual import PrimalDual
 from ..checks import at_least, in_range, require
-from ..fit.freedom import Freedom
+from ..fit.pose_refinement import PoseRefinement
 from ..geometry import Grid
 from ..matter import DeltaBeta
 from ..model import Alignment
@@ -68,10 +68,10 @@ class Uncertain:
         found = [self.shift, self.shift, turn, turn, roll, distance, self.magnification * turning, self.flux]
         return torch.tensor(found, dtype=torch.float64)
 
-    def freedom(self, so_far: np.ndarray) -> Freedom:
+    def freedom(self, so_far: np.ndarray) -> PoseRefinement:
         """The same for a fit of matter and geometry; so_far: [V, 7] changes of the plan [pixels, rad, shares]."""
         angle, roll = np.deg2rad([self.angle, self.roll])
-        return Freedom(self.shift, float(angle), float(roll), self.distance, so_far, self.magnification)
+        return PoseRefinement(self.shift, float(angle), float(roll), self.distance, so_far, self.magnification)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ..checks import InputError
-from ..fit.freedom import Freedom, mean_distance_error
+from ..fit.pose_refinement import PoseRefinement, mean_distance_error
 from ..fit.schedule import Schedule
 from ..geometry import Grid
 from ..matter import DeltaBeta, Matter
@@ -92,7 +92,7 @@ def sharpened(scan: Scan, numbers: Tensor, start: SurfaceMesh, search: PoseOptio
     return Sharpened(Step(after, covariances), unexplained(frames, beside.frames(after)), model.object)
 
 
-def mean_error(freedom: Freedom, exposures: Exposures) -> float:
+def mean_error(freedom: PoseRefinement, exposures: Exposures) -> float:
     """Standard error of the mean distance, as a share: what sampling does, or what the plan leaves open."""
     return min(mean_distance_error(exposures), freedom.distance / math.sqrt(len(freedom)))
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from ..geometry import Grid, Views
 from ..memory import memory_kept
 from ..metrics.correlation import shortest_side
-from ..optics.modes import smooth_modes
+from ..optics.patterns import smooth_modes
 from ..progress import Advance
 from ..ranges import Metres, Share, Weight, ranged
 from .algebraic import Algebraic, art, sirt

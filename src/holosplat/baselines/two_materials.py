@@ -28,7 +28,7 @@ from ..model import Instrument
 from ..optics.sampling import fringe_sampling
 from ..projectors.voxels import voxel_line_integrals
 from ..ranges import Pixels, Share, Weight, ranged
-from ..representations.voxel_lines import VoxelLines
+from ..representations.voxels import VoxelLines
 from ..scan import Scan
 from ..units import wavelength
 from ..volume import LineIntegrals

@@ -11,7 +11,7 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
-from ..fit.steps import Steps
+from ..fit.running import Steps
 from ..mesh import TriangleMesh
 from .shadows import Shadows
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ..fit.steps import Steps
+from ..fit.running import Steps
 from ..mesh import TriangleMesh
 from .pool import Pool
 from .poses import FREER, Explained, Pose

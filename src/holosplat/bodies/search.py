@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ..fit.steps import Steps
+from ..fit.running import Steps
 from ..matter import DeltaBeta
 from ..mesh import TriangleMesh
 from ..scan import Scan

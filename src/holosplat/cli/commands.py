@@ -170,7 +170,7 @@ def _scored(
     from ..io.run_scan import run_source
     from ..report.run import report_run
     from ..workflows.evaluate import evaluate as score
-    from ..workflows.moments import instants_of
+    from ..workflows.reconstruction import instants_of
     from .motion import report_of_middle
 
     found = {each.name: each.value for each in result.constants if each.name in reading.told.ranges()}
@@ -265,8 +265,8 @@ def evaluate(
     from ..report.run import report_run
     from ..workflows.evaluate import evaluate as score
     from ..workflows.evaluate import require_overlap, require_same_field
-    from ..workflows.moments import instants_of
     from ..workflows.provenance import scan_hash
+    from ..workflows.reconstruction import instants_of
     from ..workflows.run_folder import RunFolder, claimed
     from .scans import run_and_scan
 

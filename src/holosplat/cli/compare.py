@@ -45,7 +45,7 @@ def _side(path: Path) -> Side:
     from ..io.reading import Part, Reading
     from ..report.compare import Side
     from ..workflows.evaluate import evaluate
-    from ..workflows.moments import instants_of
+    from ..workflows.reconstruction import instants_of
     from ..workflows.run_folder import RunFolder
     from .scans import moments_of, run_and_scan
 

@@ -25,7 +25,7 @@ from ..methods.method import STAND_IN_RATIO, shows_no_refraction
 from ..optics import retrieve_thickness
 from ..ranges import Metres, Natural, Positive, ranged
 from ..scan import Scan
-from ..workflows.still_light import StillLight, evened
+from ..workflows.fixed_pattern import FixedPatternOptions, flatfield_corrected
 from .options import PriorOptions
 from .places import Output
 from .progress import ProgressBar
@@ -77,8 +77,8 @@ class EveningOptions:
         )
         prior = prior if prior.fixes_ratio else MaterialPrior.of_ratio(STAND_IN_RATIO)
         with ProgressBar() as bar:
-            options = StillLight(self.still_light, self.inside or 0.0)
-            found = evened(scan, prior, options, lambda stage, fraction: bar.show(stage, fraction, {}))
+            options = FixedPatternOptions(self.still_light, self.inside or 0.0)
+            found = flatfield_corrected(scan, prior, options, lambda stage, fraction: bar.show(stage, fraction, {}))
         _say(f"still light: {found.provenance['still_light']}")
         return found
 

@@ -42,8 +42,7 @@ def dataset(
         layouts: Layouts of other programs into which the scenes are written too, each into a folder of its name in out.
     """
     from ..training.export import export
-    from ..training.folder import Dataset
-    from ..training.make import make
+    from ..training.folder import Dataset, make_dataset
 
     wanted = Dataset(out, drawn, seed, count)
     left = sum(map(len, wanted.missing()))
@@ -51,7 +50,7 @@ def dataset(
     tell("the dataset", _needs(drawn, left, jobs), out, fewer)
     with ProgressBar() as bar:
         try:
-            made = make(wanted, jobs, lambda fraction: bar.show("scenes", fraction, {}))
+            made = make_dataset(wanted, jobs, lambda fraction: bar.show("scenes", fraction, {}))
         except KeyboardInterrupt:
             print(f"interrupted; {out} keeps its whole files, and the same command goes on", file=sys.stderr)
             raise SystemExit(INTERRUPTED) from None

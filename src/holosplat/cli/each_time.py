@@ -11,13 +11,12 @@ from ..checks import require
 from ..io.formats import read_frames
 from ..io.reading import Reading
 from ..matter import MaterialPrior
-from ..series.asked import Cut
 from ..series.collect import collect
 from ..series.folder import SeriesFolder
 from ..series.plan import plan_series
+from ..series.rows import line_of
 from ..series.run import run_left
-from ..series.settings import Settings
-from ..series.words import line_of
+from ..series.settings import Cut, Settings
 from .progress import INTERRUPTED
 from .room import tell_each_time
 from .series import UNFINISHED

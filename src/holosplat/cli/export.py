@@ -73,7 +73,7 @@ def export(
     """
     from ..io.volume_formats import of_time
     from ..io.volumes import REFRACTION
-    from ..workflows.moments import instants_of
+    from ..workflows.reconstruction import instants_of
     from ..workflows.run_folder import RunFolder
     from .scans import moments_of
 
@@ -195,8 +195,8 @@ def _moves(folder: RunFolder) -> bool:
 def _export_motion(folder: RunFolder, out: Path) -> None:
     from ..io.solids import write_moving_glb
     from ..representations import MovingSurfaces
-    from ..workflows.moments import instants_of
     from ..workflows.reconstruct import load_reconstruction
+    from ..workflows.reconstruction import instants_of
 
     result = load_reconstruction(folder)
     found = result.object

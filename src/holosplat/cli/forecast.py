@@ -26,8 +26,8 @@ from ..specimens.flow.suspension import PLASMA_VISCOSITY
 from ..workflows.evaluate import evaluate
 from ..workflows.forecast import FRAMES, TABLE, Forecasted, ForecastOptions, config_of, tracked_bodies, write_forecast
 from ..workflows.forecast import forecast as carry_on
-from ..workflows.moments import instants_of, moment
 from ..workflows.reconstruct import load_reconstruction
+from ..workflows.reconstruction import instants_of, reconstruction_at
 from ..workflows.refine import where_found
 from ..workflows.run_folder import RunFolder, claimed
 from ..workflows.track import COLLECTION, TRACKS
@@ -142,7 +142,7 @@ def forecast(
             print(line)
         last = len(found.forecast.times) - 1
         shown = _shown(scan, found)
-        final = moment(done, found.forecast.times.tolist(), last)
+        final = reconstruction_at(done, found.forecast.times.tolist(), last)
         print(f"report: {report_run(new, final, shown, evaluate(final, shown, None), None)}", file=sys.stderr)
     print(f"wrote {out / COLLECTION}, {out / TRACKS}, {out / FRAMES}, {out / TABLE}", file=sys.stderr)
 

@@ -19,9 +19,8 @@ from ..planning.acts import of_motion
 from ..report.run import report_run
 from ..scan import Scan
 from ..workflows.evaluate import evaluate as score
-from ..workflows.moments import moment
 from ..workflows.moving import begun_in_motion, reconstruct_moving
-from ..workflows.reconstruction import Reconstruction
+from ..workflows.reconstruction import Reconstruction, reconstruction_at
 from ..workflows.run_folder import RunFolder
 from .progress import INTERRUPTED, ProgressBar
 from .room import tell_frames
@@ -97,6 +96,6 @@ def report_of_middle(folder: RunFolder, result: Reconstruction, measured: Scan) 
     times = measured.train().instants.tolist()
     middle = len(times) // 2
     shown = measured[(measured.exposures.time == times[middle]).nonzero()[0]].as_static()
-    now = moment(result, times, middle)
+    now = reconstruction_at(result, times, middle)
     whole = f"This is the time {1e6 * times[middle]:.4g} µs, of {len(measured)} frames of {len(times)} times in all."
     return report_run(folder, now, shown, score(now, shown, None), None, whole)

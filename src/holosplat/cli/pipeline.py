@@ -70,7 +70,7 @@ class Stage:
     def _is_whole(self, out: Place) -> bool:
         """Whether all of an output is there and sound: itself, or a file for each time of the run that is exported."""
         from ..workflows.check import check
-        from ..workflows.moments import instants_of
+        from ..workflows.reconstruction import instants_of
         from ..workflows.run_folder import RunFolder
 
         if is_run(out.path):

@@ -14,12 +14,11 @@ from ..io.run_scan import run_reading
 from ..mesh import TriangleMesh
 from ..representations import InMotion, MovingSurfaces, SurfaceMesh
 from ..scan import Scan
-from ..workflows.moments import chosen_frames, instants_of, moment
+from ..workflows.preconditions import require_one_time
 from ..workflows.reconstruct import load_reconstruction
-from ..workflows.reconstruction import Reconstruction
+from ..workflows.reconstruction import Reconstruction, chosen_frames, instants_of, reconstruction_at
 from ..workflows.refine import where_found
 from ..workflows.run_folder import RunFolder
-from ..workflows.suitable import require_one_time
 
 
 def scan_for(folder: RunFolder, scan: Path | None, reading: Reading) -> Scan:
@@ -51,7 +50,7 @@ def run_and_scan(folder: RunFolder, scan: Path | None, reading: Reading) -> tupl
         return result, scan_for(folder, scan, reading)
     frame = reading.part.time_frame
     if isinstance(frame, int):
-        result = moment(result, times, frame)
+        result = reconstruction_at(result, times, frame)
     else:
         reading = replace(reading, part=replace(reading.part, time_frame=None))
     return result, scan_for(folder, scan, reading)
@@ -82,4 +81,4 @@ def moments_of(folder: RunFolder, time_frame: int | Literal["all"] | None) -> It
         return
     for k in chosen_frames(time_frame, times):
         bodies = found.bodies(times[k]) if isinstance(found, MovingSurfaces) else None
-        yield Moment(k if time_frame == "all" else None, times[k], moment(result, times, k), bodies)
+        yield Moment(k if time_frame == "all" else None, times[k], reconstruction_at(result, times, k), bodies)

@@ -12,7 +12,7 @@ from tyro.conf import Positional, arg, subcommand
 from ..checks import require
 from ..io.reading import Reading
 from ..ranges import Jobs, Positive, Seed, ranged
-from ..series.asked import Cut, Slurm
+from ..series.settings import Cut, Slurm
 from .bodies import BodyFlags, MotionFlags
 from .light import RunLightFlags
 from .options import MethodOptions, PriorOptions
@@ -89,7 +89,7 @@ class SlurmFlags(Slurm):
 
     def carry_out(self, folder: SeriesFolder, retry: bool) -> None:
         """Write the script, and submit it if that is asked for."""
-        from ..series.slurm import submit, write_script
+        from ..series.clusters import submit, write_script
 
         count, numbers = write_script(folder, self, retry)
         _say(f"wrote {folder.script} for {count} task(s): {numbers}")
@@ -123,9 +123,9 @@ def plan(
         seed: Seed of everything random.
         track: Follow closed bodies through all times of a task, as holosplat track does; else each is reconstructed.
     """
+    from ..series.appearing import listed
     from ..series.folder import SeriesFolder
     from ..series.plan import plan_series
-    from ..series.sources import listed
 
     require(not matter.ranges(), "a series needs one number for --delta-beta; find it by reconstruct of one time.")
     settings = act.settings(track, seed)
@@ -180,7 +180,7 @@ def run(
         elif task is not None:
             counts = counted([run_task(series, task, _tell_row)])
         elif dask is not None:
-            from ..series.dask_cluster import run_on_dask
+            from ..series.clusters import run_on_dask
 
             counts = run_on_dask(series, dask, retry, lambda state: _say(f"task {state.number}: {state.state}"))
         elif jobs:
@@ -194,7 +194,7 @@ def run(
 
 
 def _tell_row(row: Row) -> None:
-    from ..series.words import line_of
+    from ..series.rows import line_of
 
     _say(line_of(row))
 
@@ -213,9 +213,8 @@ def status(folder: Positional[Path]) -> None:
     Args:
         folder: Folder of the series.
     """
-    from ..series.folder import SeriesFolder
+    from ..series.folder import SeriesFolder, table_of, time_left
     from ..series.run import states
-    from ..series.words import table_of, time_left
 
     found = states(SeriesFolder(folder))
     for line in table_of(found):
@@ -233,7 +232,7 @@ def collect(folder: Positional[Path]) -> None:
     """
     from ..series.collect import collect as join
     from ..series.folder import SeriesFolder
-    from ..series.words import some
+    from ..series.rows import some
 
     found = join(series := SeriesFolder(folder))
     for path in (series.table, series.bodies, series.page):

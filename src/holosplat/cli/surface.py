@@ -24,9 +24,9 @@ from ..planning.acts import of_surfaces
 from ..representations import MovingSurfaces
 from ..workflows.evaluate import evaluate as score
 from ..workflows.evaluate import score_object
-from ..workflows.moments import instants_of
 from ..workflows.provenance import scan_hash
 from ..workflows.reconstruct import load_reconstruction
+from ..workflows.reconstruction import instants_of
 from ..workflows.run_folder import RunFolder
 from .places import Output
 from .progress import ProgressBar

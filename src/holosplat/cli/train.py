@@ -30,11 +30,10 @@ def train(
         resume: Go on with an interrupted training; --resume FOLDER alone, with its scenes and options.
     """
     from ..planning.acts import of_training
-    from ..report.learning import training_curves
+    from ..report.curves import training_curves
     from ..training.aligned import AlignedTraining, AlignedValidation
     from ..training.folder import Dataset
-    from ..training.made_by import made_by
-    from ..training.train import Training
+    from ..training.train import Training, made_by
     from ..training.validate import Validation
 
     scenes = Dataset.read(data)

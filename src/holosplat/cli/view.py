@@ -34,8 +34,8 @@ def view(what: Positional[Path], port: Port = 8080) -> None:
         port: Port; the next free one is taken.
     """
     from ..show.server import LiveView
-    from ..workflows.latest import fitted_by
     from ..workflows.run_folder import RunFolder
+    from ..workflows.run_status import fitted_by
 
     folder = RunFolder(what)
     followed = what.is_dir() and fitted_by(folder) is not None
@@ -58,7 +58,7 @@ def view(what: Positional[Path], port: Port = 8080) -> None:
 
 def _follow(page: LiveView, folder: RunFolder) -> None:
     """Show what another process fits, until that ends."""
-    from ..show.follow import Follow
+    from ..show.scene import Follow
 
     run = Follow(page, folder)
     say_where(page)
@@ -82,9 +82,9 @@ def _objects(what: Path) -> tuple[dict[str, Stored], list[str]]:
     from ..io.hdf5 import open_hdf5
     from ..io.objects import read_object
     from ..io.series import read_series
-    from ..show.follow import steps_of
     from ..show.parts import at_times
-    from ..workflows.moments import instants_of
+    from ..show.scene import steps_of
+    from ..workflows.reconstruction import instants_of
     from ..workflows.run_folder import RunFolder
 
     require(what.exists(), f"{what} must be a run folder or an object file, but there is none; check the path.")

@@ -13,8 +13,7 @@ from ..geometry import Views
 from ..model import Model
 from ..ranges import Natural, Share, ranged
 from ..representations.gaussians import GaussianCloud, unit_quaternions
-from .optimiser import Leaves
-from .trainable import Trainable
+from .optimiser import Leaves, Trainable
 
 CENTRES = "object.centres"
 

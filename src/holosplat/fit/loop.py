@@ -19,16 +19,11 @@ from ..checks import InputError
 from ..geometry import Grid
 from ..memory import memory_kept
 from ..model import Model
-from .batch import Batch
-from .batches import Batches
-from .capture import CapturedStep
-from .interrupt import interrupts_held
-from .optimiser import Leaves, Optimiser
-from .problem import Problem
-from .running import Record
+from .optimiser import Leaves, Optimiser, Trainable
+from .problem import Batch, Batches, CapturedStep, Problem
+from .residuals import Judge
+from .running import Record, interrupts_held
 from .schedule import Schedule
-from .trainable import Trainable
-from .validation import Judge
 
 UNREAD_STEPS = 20
 """Steps on a GPU between looks at their values, each of which waits for it."""
@@ -73,18 +68,18 @@ class Stateless:
     the record, and has no state."""
 
     def on_gradients(self, leaves: Leaves) -> None:
-        """Nothing."""
+        """Leaves gradients as they are."""
 
     def columns(self, model: Model) -> Record:
-        """Nothing."""
+        """No columns."""
         return {}
 
     def state_dict(self) -> dict[str, Any]:
-        """Nothing."""
+        """An empty state."""
         return {}
 
     def load(self, state: dict[str, Any]) -> None:
-        """Nothing."""
+        """There is no state to load."""
 
 
 def _no_rates(factor: float, step: int) -> Mapping[str, float]:

@@ -14,7 +14,7 @@ from .optimiser import Leaves
 MEMORY = 8
 """Values of which the largest may not be exceeded (Birgin et al. 2000 take 10)."""
 SHRINK = 0.25
-"""What is left of a step that was too long."""
+"""Factor that shortens a step that was too long."""
 FIRST_MOVE = 0.1
 """The first step moves no value by more than this."""
 
@@ -45,7 +45,7 @@ class ProjectedGradient:
         self._least, self._length, self._done = float("inf"), 0.0, 0
 
     def prepare(self, rates: Mapping[str, float]) -> None:
-        """Nothing: there are no rates."""
+        """No columns: there are no rates."""
 
     @torch.no_grad()
     def apply(self, loss: Tensor) -> None:

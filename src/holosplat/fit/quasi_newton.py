@@ -14,7 +14,7 @@ from .optimiser import Leaves
 SUFFICIENT = 1e-4
 """Share of the decrease that the slope promises which a step must bring."""
 LEAST_SHRINK, MOST_SHRINK = 0.1, 0.5
-"""What is left of a step that was too long, at least and at most."""
+"""Smallest and largest factor that shortens a step that was too long."""
 LONGER = 10.0
 """How much longer than the first step any other may be."""
 BENT = 1e-10
@@ -60,7 +60,7 @@ class QuasiNewton:
     minimum of a parabola. The rate bounds the first step, in the units of the parameter, and ten times it any other.
 
     inverse: about the inverse of the second derivative, up to a factor; memory: pairs that are remembered; worth: the
-    fit has settled when accepted steps gain less of the loss than this, in the mean over ten.
+    fit has settled when accepted steps gain less of the loss than this, averaged over ten.
     """
 
     def __init__(self, leaves: Leaves, inverse: Callable[[Tensor], Tensor], memory: int, worth: float) -> None:

@@ -1,4 +1,4 @@
-"""What a model leaves of measured frames, by spatial frequency and view, and what would explain it."""
+"""Residuals of measured frames by spatial frequency and view, what would explain them, and validation frames."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from ..checks import finite, require
 from ..memory import memory_kept
 from ..model import Alignment, Instrument, LightField, Model, smooth_modes
 from ..ranges import Weight, ranged
-from ..scan import Exposures
+from ..scan import Exposures, Scan
 from ..volume import LineIntegrals, Object
+from .terms import comparisons
 
 COMMON = ("mass", "absorption", "distance", "blur", "shift_x", "shift_y")
 """Changes that all views share, whose effect on frames is measured."""
@@ -152,7 +153,7 @@ class Allowance:
 
 @dataclass(frozen=True)
 class Prediction:
-    """What is said of V frames; each is computed when it is asked for, so that the waves of one are held at a time.
+    """The predictions of V frames; each is computed at its first use, so that the waves of one are held at a time.
 
     object: the matter
     exposures: the V planned exposures
@@ -178,7 +179,7 @@ class Prediction:
 
 
 def residuals(said: Prediction, measured: Tensor, noise: Tensor, allowance: Allowance = Allowance()) -> Residuals:
-    """What a prediction leaves of `measured` frames [V, h, w], whose noise has the power `noise` [V, h, w//2 + 1].
+    """The residuals of a prediction of `measured` frames [V, h, w], whose noise has the power `noise` [V, h, w//2 + 1].
 
     The power is that of `rfft2` with norm "ortho", in which white noise of variance s² has s². The sampling's error is
     the difference from waves sampled twice as finely, taken in the probed views; the others have their neighbour's.
@@ -273,3 +274,43 @@ def _squared(spectrum: Tensor) -> Tensor:
 
 def _power(frames: Tensor) -> Tensor:
     return _squared(_transform(frames))
+
+
+class Judge:
+    """Scores a model on frames that the fit does not see. low, span: the affine map that takes frames to [0, 1]."""
+
+    COLUMNS = ("val_l1", "val_ssim", "val_frcm")
+
+    def __init__(self, frames: Scan, instrument: Instrument, low: float, span: float) -> None:
+        """instrument: of the exposures of `frames`."""
+        self.scan, self._instrument, self._low, self._span = frames, instrument, low, span
+
+    def __call__(self, model: Model) -> tuple[float, dict[str, float]]:
+        """The score, smaller is better, and the columns of metrics.csv.
+
+        It is that of SSIM and FRCM, not of L1, which prefers a blurred object to one with its fringes misplaced.
+        """
+        with torch.no_grad():
+            predicted = replace(model, instrument=self._instrument, alignment=None, light=None).frames().cpu()
+        a, b = ((f - self._low) / self._span for f in (predicted, torch.from_numpy(self.scan.frames)))
+        ssim, frcm = (1 - float(term(a, b).mean()) for term in (comparisons.one_minus_ssim, comparisons.one_minus_frcm))
+        columns = {"val_l1": float(comparisons.l1(a, b).mean()), "val_ssim": ssim, "val_frcm": frcm}
+        return 1 - 0.5 * (ssim + frcm), columns
+
+
+def split_validation(train: Scan, count: int) -> tuple[Scan, Scan]:
+    """Training frames without, and only, `count` evenly spread validation frames; `InputError` if none is left."""
+    require(
+        count < len(train),
+        f"validation_views must leave a training frame: {count} of {len(train)} are asked for.",
+    )
+    chosen = set_aside(len(train), count)
+    return train[np.flatnonzero(~chosen)], train[np.flatnonzero(chosen)]
+
+
+def set_aside(frames: int, count: int) -> np.ndarray:
+    """Which of so many training frames `split_validation` sets aside, [V] bool."""
+    chosen = np.zeros(frames, dtype=bool)
+    if count > 0:
+        chosen[((np.arange(count) + 0.5) * frames / count).astype(int)] = True
+    return chosen

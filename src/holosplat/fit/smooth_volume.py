@@ -22,8 +22,8 @@ from .whitened import WhitenedFrames
 MEMORY = 6
 """Pairs of steps and changes of the gradient that L-BFGS remembers."""
 SUFFICIENT, SHRINK, TRIALS = 1e-4, 0.3, 12
-"""Armijo's condition: the share of the expected decrease that a step must give, what is left of one that does not, and
-after how many trials the iteration ends."""
+"""Armijo's condition: the share of the expected decrease that a step must give, the factor that shortens one that does
+not, and after how many trials the iteration ends."""
 REFRESH = 10
 """Iterations after which the preconditioner is made anew."""
 MATTER = 0.05
@@ -33,9 +33,9 @@ MATTER = 0.05
 @dataclass(frozen=True)
 @ranged
 class ContinuousPrior:
-    """What is expected of continuous matter: `a Σ log(1 + (√(|∇u|² + ε²) - ε) / b) + m Σ log(1 + u / v)`.
+    """The prior of continuous matter: `a Σ log(1 + (√(|∇u|² + ε²) - ε) / b) + m Σ log(1 + u / v)`.
 
-    Slopes of few voxels are large, those of most are next to nothing, and most of space is empty: logarithms, as of
+    Slopes of few voxels are large, those of most are almost zero, and most of space is empty: logarithms, as of
     power laws, hardly shrink what is large, where total variation takes from every edge in proportion to its height
     (Nikolova 2005). As the misfit is in units of the noise, a and m have no unit, and hold for every noise.
     """

@@ -1,8 +1,9 @@
-"""How far predicted frames are from measured ones in units of their noise, as a function of line integrals."""
+"""Misfit of frames in units of their noise, as a function of line integrals; smooth light is projected out."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -13,12 +14,47 @@ from ..matter import DeltaBeta
 from ..model import Instrument, LightField
 from ..optics.background import Light
 from ..optics.noise_model import NoiseModel
+from ..optics.patterns import cosines
 from ..optics.retrieval.spectra import Raster, response, squared_frequency
 from ..optics.sampling import fringe_sampling
 from ..scan import Scan
 from ..units import wavelength, wavenumber
 from ..volume import LineIntegrals
-from .light_apart import LightApart
+
+
+class LightProjection:
+    """The part of images over their noise that uncertain light does not explain, exact for small changes of it.
+
+    Light `1 + M c`, c ~ N(0, C), changes amplitudes by `B c = ½ √I₀ M c`, so that their errors have the covariance
+    `P + B C Bᵀ`, of which the inverse is `P⁻¹ - P⁻¹ B R (1 + Rᵀ Bᵀ P⁻¹ B R)⁻¹ Rᵀ Bᵀ P⁻¹`, R Rᵀ = C (Woodbury 1950).
+
+    amplitudes: √I₀ [V, H, W]; covariances: C [V, K, K] of the coefficients of `smooth_modes`; over_noise: P⁻¹ of images
+    [V, H, W].
+    """
+
+    def __init__(self, amplitudes: Tensor, covariances: Tensor, over_noise: Callable[[Tensor], Tensor]) -> None:
+        order = math.isqrt(covariances.shape[1]) - 1
+        self._half, self._over_noise = 0.5 * amplitudes, over_noise
+        on = amplitudes.device
+        self._rows, self._columns = (cosines(n, order, on).float() for n in amplitudes.shape[1:])
+        modes = (self._rows[:, None, :, None] * self._columns[None, :, None, :]).flatten(0, 1)
+        products = [self._modes_in(over_noise(self._half * mode)) for mode in modes]
+        normal = torch.stack(products, dim=2).double().cpu()  # a small system of each view
+        strength, vectors = torch.linalg.eigh(covariances)
+        roots = vectors * strength.clamp_min(0).sqrt()[:, None]
+        inner = roots.mT @ normal @ roots + torch.eye(len(modes), dtype=torch.float64)
+        self._gain = (roots @ torch.linalg.solve(0.5 * (inner + inner.mT), roots.mT)).float().to(on)
+
+    def __call__(self, weighted: Tensor) -> Tensor:
+        """Images [V, H, W] over their noise, without what light explains."""
+        said = torch.einsum("vkl,vl->vk", self._gain, self._modes_in(weighted))
+        light = said.unflatten(1, (len(self._rows), len(self._columns)))
+        return weighted - self._over_noise(self._half * (self._rows.T @ light @ self._columns))
+
+    def _modes_in(self, images: Tensor) -> Tensor:
+        """Bᵀ of images [V, H, W], [V, K]."""
+        return (self._rows @ (self._half * images) @ self._columns.T).flatten(1)
+
 
 DARKEST = 1e-3
 """Least intensity under a root, whose slope would have no bound."""
@@ -50,7 +86,7 @@ class WhitenedFrames:
     train: the frames; material: δ and β of an occupancy of one; noise: their noise; light: a factor of each frame,
     None for even light; oversample: wave samples a pixel (0: as the first fringe needs); beyond: rows above and
     below the frames in which there may be matter; doubt: uneven light that the frames were divided by, of which what is
-    not known is then an unknown of each frame (`LightApart`): P with it in the `noise` is only its mean.
+    not known is then an unknown of each frame (`LightProjection`): P with it in the `noise` is only its mean.
     """
 
     def __init__(
@@ -81,7 +117,7 @@ class WhitenedFrames:
         self._own, self._apart = self.power, None
         if doubt is not None and doubt.background is not None:
             self._own = (0.25 * (doubt.noise.power() + error + FAINTEST)).float().to(on)
-            self._apart = LightApart(self._amplitudes, doubt.background.covariances, self._over_noise)
+            self._apart = LightProjection(self._amplitudes, doubt.background.covariances, self._over_noise)
         self._sharp = self._sharpening().to(on)
 
     @property
@@ -188,7 +224,7 @@ def model_error(frames: Tensor, noise: Tensor) -> Tensor:
     """Power [H, W//2 + 1] of what no sampled matter explains of frames [V, H, W], float64.
 
     Of the contrast at a frequency f, by its mean over rings and views beyond the `noise` [V, H, W//2 + 1], it is the
-    part `1 - sinc f` that a box of one pixel takes away: so much voxels, strips and samples of waves leave in doubt.
+    part `1 - sinc f` that a box of one pixel takes away: the error of voxels, strips and samples of waves.
     Optics mixes frequencies, so that `LEAKED` of the whole contrast joins at all of them.
     """
     power = torch.fft.rfft2(frames.double() - 1, norm="ortho").abs().square()

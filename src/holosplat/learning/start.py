@@ -19,9 +19,8 @@ from ..progress import Progress
 from ..ranges import Natural, ranged
 from ..scan import Scan
 from ..volume import Volume
-from .copies import COPIES
 from .images import images, retrieved_thickness
-from .lattice import Taps
+from .lattice import COPIES, Taps
 from .network import FINE, Guess, coarse, thickness_of
 from .weights import Trained, read_weights
 
@@ -29,7 +28,7 @@ STAGE = "learned start"
 MOST_COLUMNS = 128
 """Pixels across that the network sees, at most: larger frames are binned."""
 CLEARLY = 0.75
-"""What larger pixels may leave unexplained, over what smaller ones leave: these show shapes better."""
+"""Largest ratio of unexplained parts on larger and smaller pixels: these show shapes better."""
 FEWEST = 32
 """Rows and columns of binned frames, at least."""
 FEWEST_VIEWS = 3
@@ -72,11 +71,11 @@ class Guessed:
     taps: Taps
 
     def left(self, factor: int = 1) -> float:
-        """What the volume leaves `unexplained` on pixels `factor` times larger."""
+        """The `unexplained` part of the volume on pixels `factor` times larger."""
         return unexplained(self.values, self.images, self.taps, factor)
 
 
-def guessed(scan: Scan, material: DeltaBeta, network: Guess, on_progress: Progress) -> Guessed:
+def guess_matter(scan: Scan, material: DeltaBeta, network: Guess, on_progress: Progress) -> Guessed:
     """The occupancy of `material` that `network` guesses from the frames of `scan`.
 
     The network knows bodies of some pixels across. So frames are shown on pixels of two sizes, and the larger ones are

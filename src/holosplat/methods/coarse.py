@@ -21,7 +21,7 @@ from ..matter import DeltaBeta
 from ..optics.noise import noise_levels
 from ..ranges import Pixels, Positive, Share, Weight, ranged
 from ..representations import GaussianCloud, SurfaceMesh
-from ..representations.subdivision import edge_lengths, subdivided
+from ..representations.isosurface import edge_lengths, loop_subdivision
 from ..scan import Scan
 from .cross_validation import MissingMatter, predicted_frames
 from .method import Task, run_quietly
@@ -214,7 +214,7 @@ def on_pixels(mesh: SurfaceMesh, pixel: float, edge: float) -> SurfaceMesh:
     in the mean."""
     vertices, faces = mesh.vertices.cpu() * (mesh.unit_length / pixel), mesh.faces.cpu()
     while float(edge_lengths(vertices, faces).mean()) > edge:
-        vertices, faces = subdivided(vertices, faces)
+        vertices, faces = loop_subdivision(vertices, faces)
     return SurfaceMesh(vertices, faces, pixel, mesh.matter, mesh.lines)
 
 

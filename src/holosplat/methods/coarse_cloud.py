@@ -14,7 +14,7 @@ from ..geometry import Grid
 from ..mesh import shell_labels
 from ..projectors.surface import surface_occupancy
 from ..representations import GaussianCloud, SurfaceMesh
-from ..representations.moments import cloud_of_moments, moments
+from ..representations.initialise import cloud_of_moments, moments
 from .method import Task
 
 MOST_VOXELS = 1 << 24

@@ -11,14 +11,13 @@ import torch
 
 from ..backends import Backend, resolve
 from ..baselines.beyond import rows_of
-from ..fit.batches import block_shape
 from ..fit.density import DensityEvent
-from ..fit.freedom import Freedom, freed
 from ..fit.loop import Fit, Plan
 from ..fit.optimiser import Adam
-from ..fit.problem import Problem, Term
+from ..fit.pose_refinement import PoseRefinement, with_pose_refinement
+from ..fit.problem import Problem, Term, block_shape
+from ..fit.residuals import set_aside, split_validation
 from ..fit.terms import Anisotropy, VolumeTerm
-from ..fit.validation import set_aside, split_validation
 from ..geometry import Grid
 from ..matter import Matter
 from ..optics.background import Light
@@ -213,14 +212,14 @@ def gaussian_fit(
     options: FitOptions,
     seed: int = 0,
     light: Light | None = None,
-    freedom: Freedom | None = None,
+    freedom: PoseRefinement | None = None,
 ) -> Fit:
     """The fit of `cloud` to the training frames of `scan` in uneven `light`, made ready; errors: those of `ground`.
 
     freedom: of where these frames are, which is then fitted, too.
     """
     plan, train = gaussian_plan(scan, cloud, options, light)
-    return Fit(freed(plan, freedom, train), seed)
+    return Fit(with_pose_refinement(plan, freedom, train), seed)
 
 
 def gaussian_plan(

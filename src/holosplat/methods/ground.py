@@ -9,9 +9,9 @@ import torch
 
 from ..checks import InputError, require
 from ..fit.problem import Term
+from ..fit.residuals import Judge, set_aside, split_validation
 from ..fit.schedule import Schedule
 from ..fit.terms import TERMS, FrameTerm, Objective
-from ..fit.validation import Judge, set_aside, split_validation
 from ..matter import Matter
 from ..model import Instrument, Model, SolvedLight
 from ..optics.background import Light

@@ -15,7 +15,7 @@ from torch import from_numpy
 
 from ..checks import InputError
 from ..inference import Decision, Score, select
-from ..learning.start import GuessedMatter, guessed
+from ..learning.start import GuessedMatter, guess_matter
 from ..representations import GaussianCloud, SurfaceMesh
 from .coarse import Way, first_of
 from .cross_validation import predicted_frames
@@ -85,7 +85,7 @@ def guessed_start(task: Task, options: GaussianOptions, fitted: Fitted, plain: P
     """The cloud of the network's guess, or red cells of its size by their shape at rest (`posed.red_cells`), or None
     where the run is the same as without it. `task.on_start` is told the decision, and the guess.
 
-    fitted: the fit of Gaussians; plain: the null, as surfaces where it is some. Errors: those of `guessed`, of the
+    fitted: the fit of Gaussians; plain: the null, as surfaces where it is some. Errors: those of `guess_matter`, of the
     weights' file and of all starts.
     """
     if len(task.prior.materials) == 2:
@@ -93,7 +93,7 @@ def guessed_start(task: Task, options: GaussianOptions, fitted: Fitted, plain: P
         return None
     material = material_of_levels(task, options.volume.backend, options.estimate)
     how, trained = options.learned, options.learned.network
-    found = guessed(task.scan, material, trained.network, task.on_progress)
+    found = guess_matter(task.scan, material, trained.network, task.on_progress)
     starts: dict[str, Start] = {PLAIN: plain()}
     if how.cells and task.bounded and trained.card.of_red_cells:
         cells = red_cells(task, found, material, trained.card.dice(len(task.scan)))

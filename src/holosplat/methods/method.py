@@ -9,7 +9,7 @@ from typing import ClassVar, Protocol, runtime_checkable
 import torch
 
 from ..baselines.material import MaterialEstimate
-from ..fit.freedom import Freedom, moved
+from ..fit.pose_refinement import PoseRefinement, with_alignment
 from ..fit.running import Running
 from ..inference import Decision
 from ..learning.start import GuessedMatter
@@ -71,7 +71,7 @@ class Task:
     lit: Light | None = None
     matter: MatterKind = "levels"
     delta_told: bool = True
-    freedom: Freedom | None = None
+    freedom: PoseRefinement | None = None
     near: bool = False
     on_start: Callable[[Decision, GuessedMatter | None], None] = unheard
     decisions: tuple[Decision, ...] = ()
@@ -101,7 +101,7 @@ class Task:
         """The same task with the frames where a fit has found them."""
         if fitted.alignment is None or self.freedom is None:
             return self
-        scan = replace(self.scan, exposures=moved(self.scan.exposures, fitted.alignment))
+        scan = replace(self.scan, exposures=with_alignment(self.scan.exposures, fitted.alignment))
         return replace(self, scan=scan, freedom=self.freedom.after(fitted.alignment))
 
     @property

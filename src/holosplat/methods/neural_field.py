@@ -15,14 +15,13 @@ from ..backends import Backend, device, resolve
 from ..baselines import HolographicTV
 from ..checks import at_least, require
 from ..fit.loop import Fit, Plan
-from ..fit.optimiser import Adam, Group, Leaves
+from ..fit.optimiser import Adam, Group, Leaves, Trainable
 from ..fit.problem import Problem
 from ..fit.running import Record
 from ..fit.schedule import Schedule
 from ..fit.terms import Objective
 from ..fit.terms.field import FieldVariation, RetrievedThickness
-from ..fit.terms.spectral import SpectralMisfit
-from ..fit.trainable import Trainable
+from ..fit.terms.frames import SpectralMisfit
 from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..model import Model

@@ -21,10 +21,10 @@ from ..fit.optimiser import Adam
 from ..fit.problem import Problem, Term
 from ..fit.schedule import Schedule
 from ..fit.terms import Objective
-from ..fit.terms.aligned import AlignedFrames, AlignedLines
+from ..fit.terms.field import AlignedFrames, AlignedLines
 from ..geometry import Grid
-from ..learning.aligned_weights import ONIX, PIXELNERF, read_aligned
 from ..learning.images import images, retrieved_thickness
+from ..learning.weights import ONIX, PIXELNERF, read_aligned
 from ..matter import DeltaBeta, Matter
 from ..optics.noise import noise_levels
 from ..ranges import Natural, Rate, Share, Weight, ranged

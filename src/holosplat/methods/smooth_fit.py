@@ -12,9 +12,8 @@ from torch import Tensor
 
 from ..backends import device, resolve
 from ..baselines.material import plateau
-from ..fit.interrupt import interrupts_held
 from ..fit.loop import DivergedError
-from ..fit.running import Record
+from ..fit.running import Record, interrupts_held
 from ..fit.smooth_volume import ContinuousPrior, Descent, VolumeProblem
 from ..fit.whitened import WhitenedFrames
 from ..geometry import Grid

@@ -12,14 +12,13 @@ from torch import Tensor
 
 from ..backends import Backend, device, resolve
 from ..checks import in_range, positive, require
-from ..fit.freedom import Freedom, freed
 from ..fit.loop import Fit, Plan
-from ..fit.neighbours import membrane_inverse
 from ..fit.optimiser import Adam, Group
+from ..fit.pose_refinement import PoseRefinement, with_pose_refinement
 from ..fit.problem import Problem, Term
 from ..fit.schedule import Schedule
 from ..fit.terms import Objective
-from ..fit.terms.object import Bending
+from ..fit.terms.object import Bending, membrane_inverse
 from ..geometry import Grid
 from ..matter import Matter
 from ..optics.background import Light
@@ -27,8 +26,7 @@ from ..optics.noise import noise_share
 from ..optics.sampling import fringe_sampling
 from ..ranges import Rate, Weight, ranged
 from ..representations import GaussianCloud, SurfaceMesh, isosurface
-from ..representations.isosurface import adjacency, neighbour_mean
-from ..representations.subdivision import edge_lengths
+from ..representations.isosurface import adjacency, edge_lengths, neighbour_mean
 from ..scan import Scan
 from .field import field_of
 from .ground import ExtraTerm, ground
@@ -131,7 +129,7 @@ def surface_fit(
     options: SurfaceFit = SurfaceFit(),
     seed: int = 0,
     light: Light | None = None,
-    freedom: Freedom | None = None,
+    freedom: PoseRefinement | None = None,
 ) -> Fit:
     """The fit of the surfaces `start` to the training frames of `scan`, of the same triangles, made ready.
 
@@ -152,7 +150,7 @@ def surface_fit(
         judge=base.judge,
         capture=False,  # not yet tried as a CUDA graph
     )
-    return Fit(freed(plan, freedom, base.train), seed)
+    return Fit(with_pose_refinement(plan, freedom, base.train), seed)
 
 
 def softened(options: SurfaceFit, start: SurfaceMesh, edge: float) -> SurfaceFit:

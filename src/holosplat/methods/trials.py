@@ -13,7 +13,7 @@ from ..checks import InputError
 from ..inference import MARGIN, Score
 from ..optics.background import FLUX, Background, Light, LightOptions
 from ..optics.noise_model import NoiseModel
-from ..optics.still_light import fixed_pattern
+from ..optics.patterns import fixed_pattern
 from ..representations import VoxelGrid
 from ..scan import Scan
 from .first_volumes import FirstVolumes, Folds, lit_by_halves, predictions, score_of

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..mesh import TriangleMesh
-from ..metrics.distances import normal_distance
+from ..metrics.volumes import normal_distance
 from ..scan import Scan
 from .assimilate import MOST_UNKNOWNS, Assimilated, Assimilation, assimilate
 from .dynamics import Window

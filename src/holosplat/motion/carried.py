@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ..baselines.material import plateau
 from ..checks import as_written, at_least, positive, require
-from ..fit.carried_volume import CarriedProblem, likelier_fading, likelier_flow
+from ..fit.flow_volume import FlowProblem, likelier_fading, likelier_flow
 from ..fit.smooth_volume import descend
 from ..geometry import Grid
 from ..matter import DeltaBeta, MaterialPrior, Matter
@@ -196,12 +196,12 @@ class Search:
         state: _State,
         keep: np.ndarray | None = None,
         times: np.ndarray | None = None,
-    ) -> CarriedProblem:
+    ) -> FlowProblem:
         """The frames of the times numbered `which`; keep: [T, V] bool, of these frames; times: other ones for them."""
         frames = [self.frames.whitened(k, factor, None if keep is None else keep[k]) for k in which]
         prior = self.prior if factor == 1 else self.prior.on_larger_voxels(factor)
         taken = self.times[list(which)] if times is None else times
-        problem = CarriedProblem(frames, taken.tolist(), prior, plateau(state.u), state.flow, factor)
+        problem = FlowProblem(frames, taken.tolist(), prior, plateau(state.u), state.flow, factor)
         problem.fade(state.fading, state.flow)
         return problem
 
@@ -212,7 +212,7 @@ class Search:
     def _grid(self, factor: int) -> Grid:
         return Grid.of_views(self.frames.scans[0].binned(factor).views)
 
-    def turns(self, problem: CarriedProblem, state: _State, rounds: int = 1) -> _State:
+    def turns(self, problem: FlowProblem, state: _State, rounds: int = 1) -> _State:
         """Flow, fading and volume in turns, each by `iterations`."""
         for _ in range(rounds):
             state = self._update_flow(problem, state, self.options.iterations)
@@ -220,7 +220,7 @@ class Search:
             state = replace(state, u=u)
         return state
 
-    def _update_flow(self, problem: CarriedProblem, state: _State, steps: int) -> _State:
+    def _update_flow(self, problem: FlowProblem, state: _State, steps: int) -> _State:
         """`state` with a likelier flow, and then, where the problem is of all times, a likelier fading, which it takes,
         too: in a few times what moves may pass for what fades."""
         how, u, fading = self.options, state.u, state.fading
@@ -288,7 +288,7 @@ class Search:
     def _initial_state(self) -> _State:
         return self._still(self.on(self.first(), self.factor))
 
-    def _whole(self, state: _State, window: Sequence[int] | range) -> CarriedProblem:
+    def _whole(self, state: _State, window: Sequence[int] | range) -> FlowProblem:
         """The frames of the times numbered `window`, with the matter of `state`."""
         return self.problem(window, self.factor, state)
 

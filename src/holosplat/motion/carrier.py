@@ -23,8 +23,7 @@ from scipy.optimize import minimize
 from scipy.special import gammaln
 from torch import Tensor
 
-from ..fit.batch import Batch
-from ..fit.problem import Part
+from ..fit.problem import Batch, LossPart
 from ..model import Model
 from ..representations import Flow, Lattice, MovingSurfaces, TimeBasis
 from .terms import COEFFICIENTS
@@ -270,9 +269,9 @@ class Carried:
     def _centres(self, paths: Tensor) -> Tensor:
         return torch.einsum("bp,kpx->kbx", self._middles, paths)
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The one part."""
-        return [Part("carrier", self._weight, self.cost(self._centres(model.parameters()[COEFFICIENTS])))]
+        return [LossPart("carrier", self._weight, self.cost(self._centres(model.parameters()[COEFFICIENTS])))]
 
     def cost(self, centres: Tensor) -> Tensor:
         """[] of bodies whose middles have the coefficients `centres` [K, B, 3]."""

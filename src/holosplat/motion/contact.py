@@ -9,8 +9,7 @@ import torch
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from ..fit.batch import Batch
-from ..fit.problem import Part
+from ..fit.problem import Batch, LossPart
 from ..model import Model
 from ..representations import MovingSurfaces
 from .terms import COEFFICIENTS
@@ -37,13 +36,13 @@ class Apart:
         self._areas.index_add_(0, start.faces.reshape(-1), areas.repeat_interleave(3))
         self.resolved = {"apart": weight}
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The one part."""
         paths = model.parameters()[COEFFICIENTS]
         shown = self._times if batch.index is None else self._times[batch.index.numpy()]
         times = np.unique(shown)
         places = (torch.einsum("k,kpx->px", torch.from_numpy(w), paths) for w in self._basis.weights(times))
-        return [Part("apart", self._weight, torch.stack([self.overlap(vertices) for vertices in places]).mean())]
+        return [LossPart("apart", self._weight, torch.stack([self.overlap(vertices) for vertices in places]).mean())]
 
     def overlap(self, vertices: Tensor) -> Tensor:
         """Σ ∫ d² dA [] of surfaces with `vertices` [P, 3] [pixels], over the parts that lie in other bodies."""

@@ -17,8 +17,7 @@ from torch.autograd.function import once_differentiable
 
 from ..bodies.rest_shape import surface
 from ..checks import require
-from ..fit.batch import Batch
-from ..fit.problem import Part
+from ..fit.problem import Batch, LossPart
 from ..mesh import TriangleMesh
 from ..model import Model
 from ..representations import MovingSurfaces
@@ -92,8 +91,8 @@ class RestShapeKept:
         self._weights = torch.from_numpy(start.basis.weights(instants.numpy()))
         self.resolved = {"rest_shape": weight}
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The one part."""
         paths = model.parameters()[COEFFICIENTS]
         nodes = torch.einsum("tk,kpx->tpx", self._weights, paths).unflatten(1, (self._count, -1))
-        return [Part("rest_shape", self._weight, self._elastic(nodes).mean(0).sum())]
+        return [LossPart("rest_shape", self._weight, self._elastic(nodes).mean(0).sum())]

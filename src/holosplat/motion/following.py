@@ -12,8 +12,7 @@ import torch
 
 from ..bodies.rest_shape import KnownBody, extent_like
 from ..checks import InputError, as_written, require
-from ..fit.running import Record
-from ..fit.steps import Steps
+from ..fit.running import Record, Steps
 from ..learning.network import Guess
 from ..matter import DeltaBeta
 from ..mesh import TriangleMesh

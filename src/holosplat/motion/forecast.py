@@ -12,7 +12,7 @@ from ..checks import in_range
 from ..mesh import TriangleMesh
 from ..ranges import ranged
 from ..representations import MovingSurfaces, TimeBasis
-from ..representations.paths import along
+from ..representations.paths import path_positions
 from .split import Split, Window, shrunk
 
 Places = list[np.ndarray]
@@ -99,7 +99,9 @@ def on_paths(bodies: MovingSurfaces, times: np.ndarray, places: Places) -> Movin
 
 def places_of(bodies: MovingSurfaces, times: np.ndarray) -> Places:
     """Places of the vertices of each body on their paths."""
-    whole = np.array([along(bodies.basis, bodies.coefficients.detach(), float(time)).numpy() for time in times])
+    whole = np.array(
+        [path_positions(bodies.basis, bodies.coefficients.detach(), float(time)).numpy() for time in times]
+    )
     return [bodies.unit_length * whole[:, bodies.body(k)[0].numpy()] for k in range(bodies.count)]
 
 

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ..inference import Decision, Score, select
 from ..learning.network import Guess
-from ..learning.start import Guessed, LearnedStart, guessed, missing_thickness
+from ..learning.start import Guessed, LearnedStart, guess_matter, missing_thickness
 from ..matter import DeltaBeta, Matter
 from ..progress import Progress
 from ..representations import VoxelGrid
@@ -27,7 +27,7 @@ def network_for(
     Tomography, the null, was fitted to these frames, and the guess was not.
     """
     trained = how.network
-    found = guessed(scan, material, trained.network, on_progress)
+    found = guess_matter(scan, material, trained.network, on_progress)
     values, grid = occupancy(scan, material, options, on_progress, None)
     seen = VoxelGrid(values[None], grid, Matter.one(*material)).resampled(found.grid).values[0]
     scores = {TOMOGRAPHY: missed_by_bodies(seen, found, options.level)}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from torch import Tensor
 
-from ..fit.carried_volume import CarriedProblem
+from ..fit.flow_volume import FlowProblem
 from ..fit.smooth_volume import Descent
 
 WINDOW, PATIENCE = 10, 3
@@ -21,7 +21,7 @@ def kept_frames(times: int, views: int, held_out: int, seed: int) -> np.ndarray:
     return keep
 
 
-def iterations_that_predict(kept: CarriedProblem, aside: CarriedProblem, u: Tensor, most: int) -> tuple[int, float]:
+def iterations_that_predict(kept: FlowProblem, aside: FlowProblem, u: Tensor, most: int) -> tuple[int, float]:
     """How many iterations from `u` [Z, Y, X] on, fitted to the frames `kept`, predict those `aside` best; and what that
     takes from ½ χ² of these, beside the first look.
 

@@ -15,7 +15,7 @@ from ..bodies.rest_shape import KnownBody
 from ..bodies.search import BodySearch, sized
 from ..bodies.shadows import Shadows
 from ..checks import require
-from ..fit.steps import Steps
+from ..fit.running import Steps
 from ..geometry import Views
 from ..matter import DeltaBeta, Matter
 from ..mesh import TriangleMesh

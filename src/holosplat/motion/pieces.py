@@ -9,7 +9,7 @@ import torch
 
 from ..checks import at_least, in_range
 from ..fit.residuals import Prediction
-from ..fit.steps import Steps
+from ..fit.running import Steps
 from ..optics.background import Light
 from ..ranges import ranged
 from ..representations import MovingSurfaces

@@ -13,7 +13,7 @@ from ..bodies.moments import centroid
 from ..checks import in_range
 from ..geometry import Grid
 from ..learning.network import Guess
-from ..learning.start import guessed
+from ..learning.start import guess_matter
 from ..matter import DeltaBeta
 from ..mesh import TriangleMesh
 from ..progress import Progress
@@ -87,5 +87,5 @@ def occupancy(
     """The volume [Z, Y, X] of one time, and its voxels; by `network`, if there is one."""
     if network is None:
         return holographic_tv(scan, material, options.volume, on_progress)
-    found = guessed(scan, material, network, on_progress)
+    found = guess_matter(scan, material, network, on_progress)
     return found.values, found.grid

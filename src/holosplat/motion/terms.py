@@ -9,8 +9,7 @@ import torch
 from scipy.sparse import csr_array, eye_array
 from torch import Tensor
 
-from ..fit.batch import Batch
-from ..fit.problem import Part
+from ..fit.problem import Batch, LossPart
 from ..fit.terms.object import squared_product
 from ..model import Model
 from ..representations import MovingSurfaces
@@ -36,10 +35,10 @@ class MovingBending:
         self._root = torch.from_numpy(square_root(start.basis.gram(times)))
         self.resolved = {"bending": weight}
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The one part."""
         paths = torch.einsum("kl,lpx->pkx", self._root, model.parameters()[COEFFICIENTS])
-        return [Part("bending", self._weight, squared_product(paths.flatten(1), *self._operators))]
+        return [LossPart("bending", self._weight, squared_product(paths.flatten(1), *self._operators))]
 
 
 class Acceleration:
@@ -52,11 +51,11 @@ class Acceleration:
         self._curvature = torch.from_numpy(start.basis.curvature())
         self.resolved = {"acceleration": weight}
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The one part."""
         paths = model.parameters()[COEFFICIENTS]
         bent: Tensor = torch.einsum("jk,kpx->jpx", self._curvature, paths)
-        return [Part("acceleration", self._weight, bent.square().sum() / paths.shape[1])]
+        return [LossPart("acceleration", self._weight, bent.square().sum() / paths.shape[1])]
 
 
 class SizeKept:
@@ -70,12 +69,12 @@ class SizeKept:
         self._weights = torch.from_numpy(start.basis.weights(times))
         self.resolved = {name: weight}
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The one part."""
         paths = model.parameters()[COEFFICIENTS]
         sizes = torch.stack([self._sizes(torch.einsum("k,kpx->px", w, paths)) for w in self._weights])
         change = sizes / sizes.mean(0) - 1
-        return [Part(self.names[0], self._weight, change.square().mean(0).sum())]
+        return [LossPart(self.names[0], self._weight, change.square().mean(0).sum())]
 
     def _sizes(self, vertices: Tensor) -> Tensor:
         """[B] of all bodies, about the middle of all vertices."""

@@ -12,7 +12,7 @@ import torch
 from ..bodies.moments import moments, second_moments
 from ..bodies.twin import distance, map_near, twin_map, two_beams
 from ..fit.loop import Fit
-from ..fit.steps import Steps
+from ..fit.running import Steps
 from ..mesh import TriangleMesh
 from ..optics.background import Light
 from ..representations import MovingSurfaces

@@ -13,8 +13,8 @@ from ..checks import InputError, require
 from ..divided_light import DividedLight
 from ..ranges import ranged
 from .air import Box, air_in_boxes, find_air, has_air
-from .modes import cosines, half_waves, smooth_modes
 from .noise_model import NoiseModel
+from .patterns import cosines, half_waves, smooth_modes
 
 ORDER = 8
 """Half waves across a frame up to which light changes."""

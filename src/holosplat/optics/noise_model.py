@@ -11,8 +11,8 @@ from torch import Tensor
 
 from ..checks import require
 from .air import find_air, has_air
-from .modes import smooth_modes
 from .noise import sure_noise
+from .patterns import smooth_modes
 
 DETREND = 3
 """Half waves across a frame up to which light, and not grain, changes."""

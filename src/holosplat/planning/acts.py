@@ -19,7 +19,7 @@ from .needs import KEPT, Costs, Needs, Sizes, of_fit, of_start, with_report
 
 if TYPE_CHECKING:
     from ..align import PoseOptions
-    from ..learning.size import Size
+    from ..learning.network import Size
     from ..matter import MatterKind
     from ..methods import Method, Pinn
     from ..methods.surface_fit import SurfaceOptions

@@ -1,32 +1,53 @@
-"""The figures of the page with their captions; where data is absent, a sentence says so instead."""
+"""The figures of the page with their captions; a sentence replaces a figure without data."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from ..metrics import VolumeScores
 from ..units import in_percent, plain, wavenumber
-from .block import Block, drawn_block
-from .content import ReportContent
+from ..volume import Volume
+from ..workflows.verdict import Verdict
+from .content import UNSURE, GuessShown, ReportContent
 from .curves import correlation_figure, histogram_figure, history_figure
-from .explained import explained_figure
 from .figures import (
     evenly_chosen,
     grey_limits,
     held_out_figure,
+    plane_sizes,
     projections_figure,
     residual_limit,
     richest_planes,
     scene_figure,
+    slice_row,
+    slice_titles,
     slices_figure,
 )
 from .forecast_shown import forecast_block
-from .guess import guess_block
 from .light import light_figure
-from .motion_blocks import motion_blocks
-from .style import format_length, in_print, scientific
+from .moving_figures import motion_blocks
+from .style import (
+    CYCLE,
+    DELTA_MAP,
+    FAINT,
+    INK,
+    RECONSTRUCTION,
+    WIDTH,
+    Block,
+    PanelGrid,
+    colour_bar,
+    drawn_block,
+    format_length,
+    in_print,
+    letter,
+    new_figure,
+    scientific,
+    styled,
+)
 from .view3d.view import html
 
 MOST_VIEWS = 4
@@ -249,3 +270,105 @@ def _histograms(content: ReportContent) -> Block:
             text += "The truth's δ\u2060/\u2060β is the ratio of its mean δ to its mean β. "
     title = "Distribution of δ\u2060/\u2060β and of δ." if content.delta_told else f"Distribution of {shown.symbol}."
     return drawn_block(heading, text, title, figure)
+
+
+LARGEST = 3.0
+"""Residual over what is allowed at which colours end."""
+
+
+@styled
+def explained_figure(found: Verdict) -> Figure:
+    """Residual, noise and contrast by band (left), and the residual over what is allowed by view and band (right)."""
+    figure = new_figure(WIDTH, 2.4)
+    left, right, bar = figure.subplots(1, 3, width_ratios=[1.1, 1.0, 0.045])
+    _curves(left, found)
+    letter(left, 0, "By period")
+    over = found.residual / np.maximum(found.allowed, 1e-30)
+    drawn = right.imshow(
+        over, cmap="magma", vmin=0, vmax=LARGEST, aspect="auto", interpolation="nearest", origin="lower"
+    )
+    right.set_xticks(range(over.shape[1]), _labels(found))
+    right.tick_params(axis="x", labelrotation=40)
+    right.set(xlabel="shortest period (µm)", ylabel="training view")
+    right.set_yticks(*_views(len(over)))
+    letter(right, 1, "By view")
+    colour_bar(figure, drawn, bar, "residual / allowed", "max")
+    return figure
+
+
+def _curves(axes: Axes, found: Verdict) -> None:
+    places = np.arange(found.residual.shape[1])
+    rms = {
+        name: np.sqrt(np.mean(np.square(getattr(found, name)), axis=0))
+        for name in ("contrast", "noise", "allowed", "residual")
+    }
+    how = {
+        "contrast": {"color": FAINT, "ls": (0, (1, 1.5))},
+        "noise": {"color": CYCLE[1]},
+        "allowed": {"color": INK, "ls": (0, (4, 2)), "lw": 0.8},
+        "residual": {"color": RECONSTRUCTION, "marker": "o", "ms": 3.0},
+    }
+    top = max(float(rms["contrast"].max()), float(rms["residual"].max()), 1e-12)
+    for name, values in rms.items():
+        axes.plot(places, np.where(values > 1e-5 * top, values, np.nan), label=name, **how[name])
+    axes.set_yscale("log")
+    axes.set_xticks(places, _labels(found))
+    axes.tick_params(axis="x", labelrotation=40)
+    axes.set(xlabel="shortest period (µm)", ylabel="rms of coefficients")
+    axes.legend(loc="best")
+
+
+def _labels(found: Verdict) -> list[str]:
+    return [plain(1e6 * shortest) for shortest in found.periods[:, 0]]
+
+
+def _views(count: int) -> tuple[list[int], list[str]]:
+    """Ticks of views, counted from 1."""
+    step = max(1, -(-count // 12))
+    places = list(range(0, count, step))
+    return places, [str(place + 1) for place in places]
+
+
+SPREAD_MAP = "magma"
+MOST_SPREAD = 0.5
+"""Largest standard deviation of values between 0 and 1."""
+
+
+WITHOUT_EACH = "without one of the views each: where it is large, few frames say what is there"
+OF_COPIES = (
+    "of the same scene mirrored and turned, for one of two views alone says too little: where it is large, the network "
+    "guesses what the frames do not say; where it is small, it may err in all of them alike"
+)
+"""What guesses the spread is of."""
+
+
+def guess_block(shown: GuessShown) -> Block:
+    """The figure with its caption."""
+    text = f"{shown.words} a to c, the occupancy that the network guessed; "
+    if shown.spread is None or shown.unsure is None:
+        text += "d to f, that of the reconstruction. Where it is guessed, this run did not keep."
+    else:
+        text += (
+            f"d to f, the standard deviation of guesses {OF_COPIES if shown.of_copies else WITHOUT_EACH}. g to i, the "
+            "occupancy of the reconstruction. "
+            f"{in_percent(shown.unsure)} of its matter lies where guesses differ by more than {UNSURE:g}. There it may "
+            "be a guess also after the fit, for other matter might explain the frames as well."
+        )
+    return drawn_block("What was guessed", text, "A network's guess, and its spread.", guess_figure(shown))
+
+
+@styled
+def guess_figure(shown: GuessShown) -> Figure:
+    """Guess, spread and reconstruction in the three planes with most of the guessed matter."""
+    planes = richest_planes(Volume(shown.occupancy, shown.occupancy, shown.grid))
+    rows = [("Guess", shown.occupancy, DELTA_MAP, 1.0)]
+    if shown.spread is not None:
+        rows.append(("Spread", shown.spread, SPREAD_MAP, MOST_SPREAD))
+    rows.append(("Reconstruction", shown.found, DELTA_MAP, 1.0))
+    panels = PanelGrid(len(rows), *plane_sizes(shown.grid), (2,))
+    for row, (name, values, colours, most) in enumerate(rows):
+        drawn = slice_row(panels.axes[row], values, shown.grid, planes, colours, (0.0, most))
+        slice_titles(panels.axes[row], 3 * row, name, shown.grid, planes)
+        label = "standard deviation" if name == "Spread" else "occupancy"
+        panels.bar(drawn, 2, (row, row), label, "max" if name == "Reconstruction" else "neither")
+    return panels.figure

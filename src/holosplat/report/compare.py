@@ -23,18 +23,15 @@ from ..units import in_percent, wavenumber
 from ..volume import Volume
 from ..workflows.binding import CONFIG_SUM, RUN
 from ..workflows.evaluate import Evaluation, evaluate, of_absorption
-from ..workflows.moments import instants_of, moment
 from ..workflows.reconstruct import load_reconstruction
-from ..workflows.reconstruction import Reconstruction
+from ..workflows.reconstruction import Reconstruction, instants_of, reconstruction_at
 from ..workflows.run_folder import RunFolder
-from .block import Block, drawn_block
-from .content import flatten
+from .content import DELTA, Quantity, flatten
 from .curves import correlation_figure
 from .figures import richest_planes, slices_figure
 from .page import template
-from .quantity import DELTA, Quantity
 from .run import LARGEST_VOLUME
-from .style import format_length, in_print, scientific
+from .style import Block, drawn_block, format_length, in_print, scientific
 from .tables import Table, duration, resolved
 
 HEAD = ("", "A", "B")
@@ -218,7 +215,7 @@ def _side_of(folder: RunFolder, scan: Scan | None) -> Side:
     folder.require_run()
     result, times = load_reconstruction(folder), instants_of(folder)
     if times:
-        result = moment(result, times, 0)
+        result = reconstruction_at(result, times, 0)
         scan = scan.at_instant(0) if scan is not None and scan.is_series else scan
     return Side(folder, result, None if scan is None else evaluate(result, scan, None))
 

@@ -1,4 +1,4 @@
-"""Everything a report shows, as data."""
+"""The content of a report as data: quantities, bodies in motion, guesses, scores."""
 
 from __future__ import annotations
 
@@ -10,17 +10,120 @@ import numpy as np
 
 from ..align.geometry import Geometry
 from ..checks import InputError, positive, require, shaped
-from ..geometry import Views
+from ..geometry import Grid, Views
 from ..inference import Decision
 from ..metrics import ImageScores, VolumeScores, require_same_grid, robust_material_delta
+from ..representations import MovingSurfaces
+from ..units import wavenumber
 from ..volume import Volume
 from ..workflows.totals import TotalMatter
 from ..workflows.verdict import Verdict
 from .forecast_shown import ForecastShown
-from .guess_shown import GuessShown
-from .moving import Moving
-from .quantity import DELTA, Quantity, attenuation
+from .style import scientific
 from .view3d.view import View3D
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """symbol: its letter; factor: by which δ (or β, which then stands for it) is multiplied; unit: empty for none."""
+
+    symbol: str
+    factor: float
+    unit: str
+
+    def text(self, value: float) -> str:
+        """A δ, or the β that stands for it, as this quantity with its unit."""
+        return f"{scientific(self.factor * value)}\u00a0{self.unit}".rstrip()
+
+    def label(self, power: str = "") -> str:
+        """The name of an axis in units of `power`, such as 10⁻⁷."""
+        unit = " ".join(filter(None, (power, self.unit)))
+        return f"{self.symbol} ({unit})" if unit else self.symbol
+
+
+DELTA = Quantity("δ", 1.0, "")
+
+
+def attenuation(energy_kev: float) -> Quantity:
+    """The attenuation coefficient µ = 4πβ/λ [m⁻¹] at `energy_kev` [keV]."""
+    return Quantity("µ", 2 * float(wavenumber(energy_kev)), "m⁻¹")
+
+
+WHOLE = 0.999
+"""Part of the vertices in the field from which on a body is whole there."""
+
+
+@dataclass(frozen=True)
+class Moving:
+    """Bodies in motion, their numbers, and one frame of each of a few times.
+
+    - bodies: on their paths; times: [T] of the frames [s]
+    - tracks: numbers by the names of tracks.csv, [T, B] each; errors: standard errors of some of them, [T, B] each
+    - low, high: corners `(x, y, z)` of the field of view [m]
+    - shown: [K] indices of the times that are drawn; views: K, one of each; measured, predicted: their frames
+      [K, H, W], relative intensity
+    """
+
+    bodies: MovingSurfaces
+    times: np.ndarray
+    tracks: Mapping[str, np.ndarray]
+    low: np.ndarray
+    high: np.ndarray
+    shown: np.ndarray
+    views: Views
+    measured: np.ndarray
+    predicted: np.ndarray
+    errors: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def whole(self) -> np.ndarray:
+        """[T, B] whether a body is whole in the field."""
+        return self.tracks["in_field"] >= WHOLE
+
+    def mean(self, name: str) -> np.ndarray:
+        """[B] of a column, over the times at which a body is whole in the field; NaN where it never is."""
+        return self._over_time(name, np.mean)
+
+    def spread(self, name: str) -> np.ndarray:
+        """[B] standard deviations of a column, over the same times."""
+        return self._over_time(name, np.std)
+
+    def _over_time(self, name: str, what: object) -> np.ndarray:
+        assert callable(what)
+        columns = zip(self.tracks[name].T, self.whole.T)
+        return np.array([what(values[whole]) if whole.any() else np.nan for values, whole in columns])
+
+
+UNSURE = 0.2
+"""Spread from which on matter counts as guessed."""
+
+
+@dataclass(frozen=True)
+class GuessShown:
+    """occupancy, found: [Z, Y, X] of the guess and of the reconstruction, both in units of the material's δ; spread:
+    [Z, Y, X] standard deviation of guesses, or None; words: what the run began with, and why; of_copies: whether these
+    guesses are of copies of the scene, mirrored and turned, and not without one of the views each."""
+
+    occupancy: np.ndarray
+    found: np.ndarray
+    spread: np.ndarray | None
+    grid: Grid
+    words: str
+    of_copies: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("occupancy", "found", "spread"):
+            if getattr(self, name) is not None:
+                shaped(name, np.asarray(getattr(self, name)), self.grid.shape)
+
+    @property
+    def unsure(self) -> float | None:
+        """Share of the reconstructed matter where guesses differ by more than `UNSURE`; None without a spread."""
+        if self.spread is None:
+            return None
+        matter = np.clip(self.found, 0, None, dtype=np.float64)
+        return float(matter[self.spread > UNSURE].sum() / max(float(matter.sum()), np.finfo(float).tiny))
+
 
 WIDER_GAP = 1.5
 """How many times wider than the gap across 0° another gap between angles must be for angles to be counted from it."""

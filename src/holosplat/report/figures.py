@@ -16,8 +16,7 @@ from ..geometry import Grid
 from ..metrics import robust_material_delta
 from ..units import length_unit, wavenumber
 from ..volume import Volume
-from .content import HeldOutViews, ProjectedMaps, pixel_of
-from .quantity import DELTA, Quantity
+from .content import DELTA, HeldOutViews, ProjectedMaps, Quantity, pixel_of
 from .style import (
     BETA_MAP,
     DELTA_MAP,

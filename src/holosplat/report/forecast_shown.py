@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.figure import Figure
 
-from .block import Block, drawn_block
-from .body_picture import body_colours
-from .style import INK, WIDTH, letter, new_figure, styled
+from .style import INK, WIDTH, Block, drawn_block, letter, new_figure, styled
+from .surface import body_colours
 
 BUSY = 16
 """Bodies beyond which the legend takes another column."""

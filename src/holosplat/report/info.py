@@ -9,8 +9,8 @@ from ..io.atomic import atomic_path, require_writable
 from ..io.facts import Facts, facts_of_matter, no_kind
 from ..io.reading import Reading
 from ..planning.scan_facts import facts_of_scan
-from ..workflows.run_facts import facts_of_run
 from ..workflows.run_folder import RunFolder
+from ..workflows.run_status import facts_of_run
 from .look import look_figure
 
 

@@ -1,30 +1,38 @@
-"""Figures of bodies in motion: their ways, their shapes over time, and a film strip beside the frames."""
+"""Bodies in motion: trajectories, shapes over time, a film strip and an animation, with their captions."""
 
 from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
+from PIL import Image, features
 from scipy.spatial import ConvexHull
 
-from .body_picture import UNIT, body_colours, paint_bodies
+from ..geometry import Grid
+from .content import Moving
 from .figures import evenly_chosen
-from .moving import Moving
 from .style import (
     FAINT,
     HOLOGRAM_MAP,
     INK,
     SIGNED_MAP,
     WIDTH,
+    Block,
     PanelGrid,
     decimal_scale,
+    drawn_block,
     image_panel,
     letter,
     new_figure,
     scale_bar,
     styled,
 )
+from .surface import UNIT, body_colours, box_edges, camera, paint_bodies
 
 STRIP = 6
 """Times of a film strip, at most."""
@@ -157,3 +165,142 @@ def grey_of(moving: Moving) -> Limits:
 def residual_of(moving: Moving) -> float:
     """Limit of the colours of differences: the 99.8 percentile of their magnitude."""
     return float(np.percentile(np.abs(moving.predicted - moving.measured), 99.8)) or 1.0
+
+
+MOST_BYTES = 400_000
+"""Size of a moving picture, at most: a page holds several figures of a tenth of that."""
+QUALITIES = (75, 55, 35, 20)
+SMALLER = 0.7
+"""What the edges of pictures are multiplied by where the lowest quality is still too large."""
+SECONDS = 4.0
+"""How long a round takes, and `LONGEST` how long a picture stays, at most [s]."""
+LONGEST = 0.5
+ANIMATION_DPI = 100
+
+
+def animation(moving: Moving, most_bytes: int = MOST_BYTES) -> bytes | None:
+    """A WebP picture that moves, of at most `most_bytes`; None where Pillow was built without WebP."""
+    if not features.check("webp"):
+        return None
+    seconds = min(LONGEST, SECONDS / len(moving.shown))
+    return encode_animation([_picture(moving, k) for k in range(len(moving.shown))], seconds, most_bytes)
+
+
+def encode_animation(pictures: Sequence[np.ndarray], seconds: float, most_bytes: int) -> bytes:
+    """RGB pictures [H, W, 3] uint8 as one WebP that moves: each stays for `seconds`, over and over.
+
+    Its quality, and then its size, are lowered until it has no more than `most_bytes`.
+    """
+    images = [Image.fromarray(picture) for picture in pictures]
+    while True:
+        for quality in QUALITIES:
+            buffer = io.BytesIO()
+            how = {"duration": round(1000 * seconds), "loop": 0, "quality": quality, "method": 4}
+            images[0].save(buffer, "WEBP", save_all=True, append_images=images[1:], **how)
+            if buffer.tell() <= most_bytes or min(images[0].size) < 16:
+                return buffer.getvalue()
+        size = tuple(max(1, round(SMALLER * edge)) for edge in images[0].size)
+        images = [image.resize((size[0], size[1]), Image.Resampling.LANCZOS) for image in images]
+
+
+@styled
+def _picture(moving: Moving, k: int) -> np.ndarray:
+    """One picture [H, W, 3] uint8: the bodies from the side above, and three small panels of frames."""
+    high, wide = moving.measured.shape[1:]
+    figure = new_figure(7.2, 3.6, "none")
+    figure.set_dpi(ANIMATION_DPI)
+    _turned(figure.add_axes((0.0, 0.0, 0.43, 0.93)), moving, k)
+    time = 1e6 * float(moving.times[moving.shown[k]])
+    figure.text(0.02, 0.93, f"{time:.1f} µs", fontsize=10, weight="bold")
+    limit, pixel = residual_of(moving), float(moving.views[[k]].pixel_sizes[0])
+    panels = (
+        ("measured", moving.measured[k], HOLOGRAM_MAP, grey_of(moving)),
+        ("predicted", moving.predicted[k], HOLOGRAM_MAP, grey_of(moving)),
+        ("difference", moving.predicted[k] - moving.measured[k], SIGNED_MAP, (-limit, limit)),
+    )
+    upright = high > wide  # panels side by side, or one over the other
+    for i, (name, image, colours, limits) in enumerate(panels):
+        place = (0.435 + 0.188 * i, 0.02, 0.183, 0.92) if upright else (0.44, 0.665 - 0.325 * i, 0.55, 0.265)
+        _frame(figure.add_axes(place), image, pixel, colours, limits, name)
+    return _pixels(figure)
+
+
+def _turned(axes: Axes, moving: Moving, k: int) -> None:
+    """The bodies in their field, whose box stays in place."""
+    views, time = moving.views, float(moving.times[moving.shown[k]])
+    grid, rotation = Grid.of_views(views), camera()
+    at = UNIT * (rotation @ grid.centre)[:2]
+    edges = [UNIT * points + at for points in box_edges(grid, rotation)]
+    for points in edges:
+        axes.plot(points[:, 0], points[:, 1], lw=0.5, color=INK, alpha=0.4, zorder=0)
+    paint_bodies(axes, moving.bodies.bodies(time), rotation, np.zeros(2), body_colours(moving.bodies.count))
+    every = np.concatenate(edges)
+    low, high = every.min(0), every.max(0)
+    half = 0.58 * (high - low)
+    axes.set(xlim=(at[0] - half[0], at[0] + half[0]), ylim=(at[1] + half[1], at[1] - half[1]), aspect="equal")
+    axes.set_axis_off()
+    left, right = axes.get_xlim()
+    scale_bar(axes, 1e-6 * (right - left), INK, 0.03)
+
+
+def _frame(axes: Axes, image: np.ndarray, pixel: float, colours: str, limits: tuple[float, float], title: str) -> None:
+    image_panel(axes, image, (pixel, pixel), colours, limits)
+    axes.set_title(title, fontsize=7.5, pad=3)
+
+
+def _pixels(figure: Figure) -> np.ndarray:
+    """What is drawn, [H, W, 3] uint8."""
+    canvas = figure.canvas
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[attr-defined]
+
+
+COLOURS = "A body has the same colour and number in all figures. "
+
+
+def motion_blocks(moving: Moving) -> list[Block]:
+    """Moving picture, film strip, ways, and shapes over time."""
+    return [_animation(moving), _film(moving), _trajectories(moving), _shapes(moving)]
+
+
+def _animation(moving: Moving) -> Block:
+    heading, picture = "Motion", animation(moving)
+    if picture is None:
+        return Block(heading, "Pillow was built without WebP here, so no moving picture was made.")
+    image = f"data:image/webp;base64,{base64.b64encode(picture).decode()}"
+    text = (
+        f"The bodies in the field of view from the side above, at {len(moving.shown)} of {len(moving.times)} times "
+        f"from {1e6 * moving.times[0]:.4g} to {1e6 * moving.times[-1]:.4g} µs, beside one frame of each of these, what "
+        f"the bodies predict of it, and the difference. {COLOURS}"
+    )
+    return Block(heading, text.strip(), "Bodies in motion.", image, 100)
+
+
+def _film(moving: Moving) -> Block:
+    figure, (low, high) = film_figure(moving), grey_of(moving)
+    rms = float(np.sqrt(np.mean(np.square(np.subtract(moving.predicted, moving.measured, dtype=np.float64)))))
+    text = (
+        "a, bodies as the beam of the frames below sees them, in the same place and to the same scale. b, measured "
+        f"frames; c, what the bodies predict of them; both on the grey scale {low:.3f} to {high:.3f}. d, their "
+        f"difference, whose colours end at ±{residual_of(moving):.2g} and whose root mean square is {rms:.2g}."
+    )
+    return drawn_block("Film strip", text, "Bodies and frames over time.", figure)
+
+
+def _trajectories(moving: Moving) -> Block:
+    text = (
+        "Ways of the bodies' centres, thick where the whole body is in the field of view (dashed), and outlines at the "
+        f"first (light) and the last time, where dots and numbers are. {COLOURS}"
+    )
+    return drawn_block("Ways", text, "Ways of the bodies.", trajectories_figure(moving))
+
+
+def _shapes(moving: Moving) -> Block:
+    known = [name for name in ("volume_m3", "area_m2", "deformation") if name in moving.errors]
+    text = (
+        "Volume, area and deformation (a − c)/(a + c) of each body over time; a and c are the longest and shortest "
+        "half axes of the ellipsoid of the same second moments. Thick: the whole body is in the field of view; scales "
+        "are made for these. "
+    )
+    text += "Bands are standard errors, from fits to halves of the frames." if known else "Errors were not estimated."
+    return drawn_block("Shapes", text, "Shapes over time.", shapes_figure(moving))

@@ -1,4 +1,4 @@
-"""The report of a run folder: collects what the page shows."""
+"""The report of a run folder: collects the content of the page, with the view in three dimensions."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ from ..projectors.voxels import voxel_line_integrals
 from ..representations import MovingSurfaces, Stored
 from ..scan import Scan
 from ..tables import to_table
-from ..units import span
+from ..units import span, wavenumber
 from ..volume import Volume
 from ..workflows.evaluate import Evaluation, of_absorption, render
 from ..workflows.forecast import NUMBERS, flow_in_words, read_band
 from ..workflows.reconstruct import Reconstruction
 from ..workflows.run_folder import RunFolder
 from ..workflows.track import read_errors
-from .content import HeldOutViews, LitViews, ProjectedMaps, ReportContent, view_labels
+from .content import GuessShown, HeldOutViews, LitViews, Moving, ProjectedMaps, ReportContent, view_labels
 from .figures import evenly_chosen
 from .forecast_shown import ForecastShown
-from .guess_shown import GuessShown
-from .moving import Moving
 from .page import write_report
-from .view3d.of_run import view_of
+from .style import data_uri, new_figure, styled
+from .view3d.parts import SLICE_BYTES, VOLUME_BYTES, part_of, volume_part
+from .view3d.view import View3D, raster_of
 
 MOST_FRAMES = 24
 """Times that the animation of a report shows, at most."""
@@ -211,8 +211,8 @@ def _lit(reconstruction: Reconstruction, scan: Scan, evaluation: Evaluation) -> 
     predicted = render(reconstruction, shown.exposures)
     measured, part = torch.from_numpy(shown.frames), light.part(torch.from_numpy(chosen))
     if part.background is not None:
-        still = 1.0 if part.still is None else part.still
-        part = replace(part, background=part.background.seen_beside(measured / still, torch.from_numpy(predicted)))
+        fixed = 1.0 if part.still is None else part.still
+        part = replace(part, background=part.background.seen_beside(measured / fixed, torch.from_numpy(predicted)))
     return LitViews(
         shown.frames,
         part.factor().numpy(),
@@ -261,3 +261,54 @@ def moving_of(
     box = (middle - half, middle + half)
     shots = (shown, scan.views[chosen], scan.frames[chosen], predicted)
     return Moving(done.object, times, tracks, *box, *shots, errors=errors or {})
+
+
+ENDS = (0.2, 99.8)
+"""Percentiles of the frames between which the grey scale lies."""
+
+
+def view_of(obj: Stored, volume: Volume, truth: Volume | None, scan: Scan, delta_told: bool = True) -> View3D:
+    """What can be turned of `obj`, whose `volume` (and `truth`, where known) also gives the slices.
+
+    volume, truth: of the middle time where something moves.
+    """
+    exposures = scan.exposures[np.array([0])]
+    _, _, pixel = raster_of(*exposures.views.shape, exposures.views.pitch)
+    times = np.unique(scan.exposures.time) if isinstance(obj, MovingSurfaces) else None
+    shift = first_phase(obj, scan) * (1.0 if delta_told else 2.0)  # without δ, which is β then: the absorption 2k∫β
+    sign = obj.matter.channels[0].sign
+    shown = {"reconstruction": volume} | ({} if truth is None else {"truth": truth})
+    parts = {"reconstruction": part_of(obj, volume, pixel, times)}
+    if truth is not None and times is None:
+        parts["truth"] = volume_part(truth, pixel, VOLUME_BYTES)
+    low, high = np.percentile(scan.train().frames if len(scan.train()) else scan.frames, ENDS)
+    return View3D(
+        parts=parts,
+        slices={name: volume_part(v, pixel, SLICE_BYTES) for name, v in shown.items()},
+        exposures=exposures,
+        views=scan.views,
+        labels=view_labels(scan.views),
+        grey=(float(low), float(max(high, low + 1e-6))),
+        top=sign * (float(np.percentile(sign * shift, ENDS[1])) or 1.0),
+        picture=still_picture(shift, sign),
+        delta_told=delta_told,
+    )
+
+
+def first_phase(obj: Stored, scan: Scan) -> np.ndarray:
+    """k∫δ [H, W] [rad] in the first view."""
+    exposures = scan.exposures[np.array([0])]
+    with torch.no_grad():
+        _, delta = obj.project(exposures.views)
+    return float(wavenumber(exposures.energy_kev)[0]) * delta[0].numpy()
+
+
+@styled
+def still_picture(phase: np.ndarray, sign: float = 1.0) -> str:
+    """The picture that stands where the view cannot be turned, as a `data:` URI; sign: that of the matter's δ."""
+    rows, columns = phase.shape
+    figure = new_figure(2.4, 2.4 * rows / columns, layout="none")
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    axes.imshow(sign * phase, cmap="magma", vmin=0.0)
+    axes.axis("off")
+    return data_uri(figure, "png")

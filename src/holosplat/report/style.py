@@ -12,12 +12,14 @@ import io
 import math
 import re
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import ParamSpec, TypeVar
 from urllib.parse import quote
 
 import matplotlib
 import numpy as np
 from cycler import cycler
+from markupsafe import Markup
 from matplotlib import font_manager, patheffects
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -33,7 +35,7 @@ DPI = 160
 INK, FAINT, GROUND = "#1b1f24", "#8b929b", "#fffffe"
 RECONSTRUCTION, TRUTH, TRUE_SURFACE = "#c2502f", "#5a626d", "#939ca8"
 CYCLE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#5a626d")
-"""Okabe & Ito's palette: told apart also by readers who do not see red and green as most do."""
+"""Okabe & Ito's palette: distinct also for readers who do not see red and green as most do."""
 IN_THE_DARK = {GROUND: "#14171b", INK: "#e6e8eb", TRUTH: "#a0a8b2"}
 """What stands for the colours of paper and ink, and of the truth's curves, where a page is dark (see `themed`)."""
 DELTA_MAP, BETA_MAP, HOLOGRAM_MAP, SIGNED_MAP = "magma", "cividis", "gray", "RdBu_r"
@@ -283,3 +285,41 @@ def scientific(value: float | None, digits: int = 3) -> str:
 def in_print(text: str) -> str:
     """`text` whose numbers have their powers of ten as print has them: "9.1e-19 m³" → "9.1 × 10⁻¹⁹ m³"."""
     return POWER.sub(lambda m: f"{m[1].replace('-', '−')}\u00a0×\u00a010{superscript(int(m[2]))}", text)
+
+
+@dataclass(frozen=True)
+class Block:
+    """One figure of the page: image is a `data:` URI, drawn `width` per cent of the page wide, or `live` is what stands
+    in its place, as HTML.
+
+    Without either, `caption` says why there is none.
+    """
+
+    heading: str
+    caption: str
+    title: str = ""
+    image: str | None = None
+    width: int = 100
+    number: int | None = None
+    live: Markup | None = None
+
+    @property
+    def anchor(self) -> str:
+        """The heading as the page links to it."""
+        return re.sub(r"\W+", "-", self.heading.lower()).strip("-")
+
+    @property
+    def paper(self) -> bool:
+        """Whether the image is on white paper, also where the page is dark."""
+        return self.image is not None and not self.image.startswith("data:image/svg")
+
+    @property
+    def drawn(self) -> bool:
+        """Whether there is a figure."""
+        return self.image is not None or self.live is not None
+
+
+def drawn_block(heading: str, caption: str, title: str, figure: Figure) -> Block:
+    """`figure` in its block."""
+    width = round(100 * float(figure.get_figwidth()) / WIDTH)
+    return Block(heading, caption.strip(), title, data_uri(figure), width)

@@ -9,8 +9,7 @@ import numpy as np
 
 from ..units import in_percent
 from ..workflows.next_step import Step, next_step
-from .content import ReportContent, flatten
-from .moving import Moving
+from .content import Moving, ReportContent, flatten
 from .style import format_length, in_print, scientific
 
 

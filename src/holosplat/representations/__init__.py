@@ -12,9 +12,7 @@ from ..matter import Matter
 from ..plugins import Extended
 from ..volume import LineIntegrals, TrainableObject
 from .aligned_network import AlignedNetwork, PixelAligned
-from .encodings import Encoding
-from .fading import Fading
-from .flow import Flow, Lattice
+from .flow import Fading, Flow, Lattice
 from .gaussians import GaussianCloud
 from .initialise import approximate, at_pitch, cloud_from_two, cloud_from_volume, freed, random_cloud
 from .isosurface import isosurface
@@ -22,11 +20,11 @@ from .moving_gaussians import MovingGaussians
 from .moving_surfaces import MovingSurfaces
 from .neural_field import Network, NeuralField
 from .paths import TimeBasis
+from .perceptron import Encoding
 from .pixel_aligned import PixelAlignedField
 from .space_time import SpaceTime, SpaceTimeField
 from .surfaces import SurfaceMesh
-from .voxel_lines import VoxelLines
-from .voxels import VoxelGrid
+from .voxels import VoxelGrid, VoxelLines
 
 
 @runtime_checkable

@@ -198,6 +198,6 @@ def _corners(places: Tensor, shape: tuple[int, int, int]) -> tuple[Tensor, Tenso
 
 
 def _inside(pixel: Tensor, share: Tensor, count: int) -> tuple[Tensor, Tensor]:
-    """Whole numbers of pixels from 0 to `count` - 1, and the shares of those that lie there."""
+    """Whole numbers of pixels from 0 to `count` - 1, and the shares of those within."""
     there = (pixel >= 0) & (pixel < count)
     return pixel.clamp(0, count - 1).long(), share * there

@@ -16,7 +16,7 @@ from ..geometry import Grid, Poses, Views
 from ..matter import Matter
 from ..mesh import TriangleMesh
 from ..volume import LineIntegrals, Volume
-from .paths import TimeBasis, along
+from .paths import TimeBasis, path_positions
 from .surfaces import SurfaceMesh
 
 
@@ -123,7 +123,7 @@ class MovingSurfaces:
 
     def at(self, time: float) -> SurfaceMesh:
         """The surfaces as they are at `time` [s], between frames too; beyond the frames paths go on."""
-        vertices = along(self.basis, self.coefficients, time)
+        vertices = path_positions(self.basis, self.coefficients, time)
         surfaces = SurfaceMesh(vertices, self.faces, self.unit_length, self.matter, self.lines)
         surfaces.backend = self.backend
         return surfaces
@@ -144,7 +144,7 @@ class MovingSurfaces:
 
     def bodies(self, time: float) -> list[TriangleMesh]:
         """One mesh [m] for each body at `time` [s], named body000, body001 …, the same body at every time."""
-        return self.parted(along(self.basis, self.coefficients.detach(), time))
+        return self.parted(path_positions(self.basis, self.coefficients.detach(), time))
 
     def parted(self, vertices: Tensor) -> list[TriangleMesh]:
         """One mesh [m] for each body, named as those of `bodies`, of all their vertices [P, 3] [units of length]."""
@@ -153,5 +153,5 @@ class MovingSurfaces:
 
     def velocities(self, time: float) -> list[np.ndarray]:
         """Velocities [P, 3] [m/s] of the vertices of each of `bodies` at `time` [s]."""
-        speeds = self.unit_length * along(self.basis, self.coefficients.detach(), time, 1)
+        speeds = self.unit_length * path_positions(self.basis, self.coefficients.detach(), time, 1)
         return [speeds[self.body(k)[0]].numpy() for k in range(self.count)]

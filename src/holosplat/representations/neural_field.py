@@ -23,8 +23,8 @@ from ..matter import Matter
 from ..ranges import ranged
 from ..tables import from_table, to_table
 from ..volume import LineIntegrals, Volume
-from .encodings import Encoding
-from .voxel_lines import resampling
+from .perceptron import Encoding
+from .voxels import resampling
 
 CHUNK = 1 << 18
 """Positions evaluated at once where no gradient is needed."""

@@ -110,7 +110,7 @@ class TimeBasis:
         return cls(*ends, int(values["degree"]), int(values["pieces"]))
 
 
-def along(basis: TimeBasis, coefficients: Tensor, time: float, derivative: int = 0) -> Tensor:
+def path_positions(basis: TimeBasis, coefficients: Tensor, time: float, derivative: int = 0) -> Tensor:
     """Places [P, 3] at `time` [s] of paths with `coefficients` [K, P, 3], or their derivative by the time."""
     weights = torch.from_numpy(basis.weights(time, derivative)[0]).to(coefficients)
     return torch.einsum("k,kpx->px", weights, coefficients)

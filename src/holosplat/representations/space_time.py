@@ -23,8 +23,7 @@ from ..volume import LineIntegrals, Volume
 from .flow import Lattice
 from .paths import TimeBasis
 from .perceptron import Jet, VelocityNetwork
-from .voxel_lines import along_axes
-from .voxels import VoxelGrid
+from .voxels import VoxelGrid, along_axes
 
 FLOW = "flow."
 """Before the names of the velocity's weights."""

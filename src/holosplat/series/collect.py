@@ -13,14 +13,13 @@ from scipy.optimize import linear_sum_assignment
 
 from ..io.atomic import atomic_path
 from ..tables import number_in
-from .folder import SeriesFolder, TaskState
+from .folder import SeriesFolder, TaskState, time_left
 from .plan import Moment, SeriesPlan
-from .rows import Body, Row
+from .rows import Body, Row, plain
 from .time import PHASE
-from .words import plain, time_left
 
 if TYPE_CHECKING:
-    from .pages.page import SeriesPage
+    from .page import SeriesPage
 
 COLUMNS = (
     *("number", "scan", "frame", "time_s", "task", "status", "begun", "kind", "explained", "unexplained"),
@@ -138,7 +137,7 @@ def _mean_distance(
 
 def collect(folder: SeriesFolder) -> Collected:
     """Write series.csv, bodies.csv and series.html of what is done so far."""
-    from .pages.page import write_page  # which needs matplotlib
+    from .page import write_page  # which needs matplotlib
 
     found = collected(folder)
     _write_csv(folder.table, COLUMNS, _lines(folder, found))
@@ -182,7 +181,7 @@ def _number(value: object) -> str:
 
 def page_of(folder: SeriesFolder, found: Collected) -> SeriesPage:
     """The content of series.html."""
-    from .pages.page import Frame, SeriesPage, headline
+    from .page import Frame, SeriesPage, headline
 
     frames = []
     for moment, row, run, names in zip(found.moments, found.rows, found.runs, found.bodies):

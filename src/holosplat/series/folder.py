@@ -1,8 +1,9 @@
-"""The folder of a series: its plan, and a folder for each task, which says how far that is."""
+"""The folder of a series: its plan, a folder for each task, and the state of each in words."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -12,7 +13,7 @@ from ..io.folder import atomic_folder, require_new
 from ..io.json import read_json, write_json
 from ..io.lock import Writer, writer_of
 from .plan import SeriesPlan, Window
-from .rows import ROW, Row, read_row
+from .rows import ROW, Row, duration, plain, read_row
 
 PLAN, TASKS, DONE, FAILED = "series.json", "tasks", "done.json", "failed.json"
 State = Literal["done", "running", "failed", "left"]
@@ -95,3 +96,33 @@ def cores() -> int:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on Linux
         return os.cpu_count() or 1
+
+
+def table_of(states: Sequence[TaskState]) -> list[str]:
+    """A line for each task."""
+    return [
+        f"{s.number:5d}  {s.state:8s} {s.times[0]:4d} of {s.times[1]:4d} times  {_detail(s)}".rstrip() for s in states
+    ]
+
+
+def _detail(state: TaskState) -> str:
+    if state.writer is not None:
+        writer = state.writer
+        return f"by process {writer.process} on {writer.host} since {writer.since}"
+    return plain(state.reason) or (f"{state.seconds:.1f} s" if state.state == "done" else "")
+
+
+def time_left(states: Sequence[TaskState]) -> str:
+    """How many tasks are in each state, and how long the rest takes at the pace so far."""
+    names = [state.state for state in states]
+    counts = ", ".join(f"{names.count(name)} {name}" for name in ("done", "running", "failed", "left"))
+    times, done = sum(s.times[1] for s in states), sum(s.times[0] for s in states)
+    seconds, open_ = sum(s.seconds for s in states), sum(s.times[1] - s.times[0] for s in states if s.state != "failed")
+    if not open_:
+        return f"{counts}; {done} of {times} times are done"
+    running = names.count("running")
+    if not done or not seconds:
+        return f"{counts}; {done} of {times} times are done, and none says yet how long the rest takes"
+    left = open_ * seconds / done / max(1, running)
+    by = f"by the {running} processes that run" if running > 1 else "by one process"
+    return f"{counts}; {done} of {times} times are done; the rest takes about {duration(left)} {by}"

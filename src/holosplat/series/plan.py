@@ -15,8 +15,7 @@ from ..io.formats import read_frames
 from ..io.reading import Reading
 from ..matter import MaterialPrior
 from ..scan import Scan
-from .asked import Cut
-from .settings import Settings, prior_of
+from .settings import Cut, Settings, prior_of
 
 FORMAT = "holosplat series 1"
 MOST_TASKS = 100_000

@@ -1,8 +1,8 @@
-"""The result of one time of a series as a small JSON file."""
+"""The result of one time of a series as a small JSON file, and as a line of text."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
@@ -69,3 +69,32 @@ def read_row(path: Path) -> Row:
         odd = sorted({f.name for f in fields(Row)} ^ set(values))
         require(not odd, f"it differs in {', '.join(odd)} from this version's.")
         return from_table(Row, values)
+
+
+LONGEST = 160
+"""Characters of a reason in a table."""
+
+
+def plain(text: str) -> str:
+    """`text` on one line without control characters, cut where it is long."""
+    line = "".join(c if c.isprintable() else " " for c in text)
+    return line if len(line) <= LONGEST else f"{line[: LONGEST - 1]}…"
+
+
+def duration(seconds: float) -> str:
+    """Seconds for people: 75 s, 12 min, 3.4 h."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+
+
+def line_of(row: Row) -> str:
+    """How a time went, in a line."""
+    said = f"{row.begun}, {row.size}, {row.seconds:.1f} s" if row.done else f"failed: {row.reason}"
+    return f"time {row.number}: {said}"
+
+
+def some(numbers: Sequence[int], most: int = 12) -> str:
+    """The first of some numbers."""
+    shown = ", ".join(str(number) for number in numbers[:most])
+    return shown if len(numbers) <= most else f"{shown} …"

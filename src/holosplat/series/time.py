@@ -59,7 +59,7 @@ def quiet(stage: str, fraction: float, record: dict[str, float]) -> None:
 def reconstruct_time(
     shot: Shot, settings: Settings, folder: RunFolder, before: Before | None = None, on_progress: FitProgress = quiet
 ) -> Row:
-    """Reconstruct one time into `folder`, and say what came of it; what is there already is gone on with.
+    """Reconstruct one time into `folder`, and say what came of it; an unfinished run is continued.
 
     A time that goes on from the one before begins anew, by itself, if its frames are not explained and leave clearly
     more matter unexplained than the last time that began by itself. Ctrl-C is passed on. Errors: `InputError` of
@@ -91,8 +91,8 @@ def _same_field(before: Before, scan: Scan) -> bool:
 
 
 def _begun_alone(folder: RunFolder, method: Continued) -> bool:
-    """Whether a run that is there began by itself. One that went on from another file, as before its folder was moved,
-    is removed: it is done again with the same numbers."""
+    """Whether a run that is there began by itself. One that was continued from another file, as before its folder was
+    moved, is removed: it is done again with the same numbers."""
     if not folder.config.is_file():
         return False
     was = folder.read_config().get("method", {})

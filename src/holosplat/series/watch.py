@@ -21,12 +21,11 @@ from ..ranges import Positive, Seconds, ranged
 from ..scan import Scan
 from .appearing import Folder, Found
 from .plan import at, times_of
-from .rows import Row, write_row
+from .rows import Row, plain, write_row
 from .settings import Settings
 from .task import attempted
 from .time import PHASE, Before, Shot, reconstruct_time
 from .watch_folder import Seen, WatchFolder
-from .words import plain
 
 COLUMNS = (
     *("number", "scan", "frame", "time_s", "status", "begun", "explained", "unexplained", "total_m3", "total_error_m3"),
@@ -203,7 +202,7 @@ class Watch:
 
     def _show(self, state: str, refresh: float) -> None:
         """Bring the page and the table up to date."""
-        from .pages.page import Frame, SeriesPage, headline, write_page  # which need matplotlib
+        from .page import Frame, SeriesPage, headline, write_page  # which need matplotlib
 
         self._said = self.clock()
         with atomic_path(self.folder.table) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:

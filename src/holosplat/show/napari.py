@@ -20,7 +20,7 @@ from ..io.objects import FORMAT, read_object
 from ..io.volumes import NAMES, read_volume
 from ..representations import InMotion, Stored, SurfaceMesh
 from ..volume import Volume
-from ..workflows.moments import instants_of
+from ..workflows.reconstruction import instants_of
 from ..workflows.run_folder import RunFolder
 from .parts import at_times
 

@@ -1,12 +1,17 @@
-"""An object on a page, with sliders that cut matter away and lead through time."""
+"""An object on a page, with sliders for cuts and time; a run in progress is updated."""
 
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Mapping, Sequence
 
+from ..checks import InputError
+from ..io.objects import read_object
 from ..representations import Stored
-from .parts import Frame, Shown, cut, shown
+from ..workflows.run_folder import RunFolder
+from ..workflows.run_status import fitted_by, read_status
+from .parts import Frame, Shown, at_times, cut, shown
 from .server import LiveView
 
 CUTS = 50
@@ -68,3 +73,64 @@ class Scene:
 
     def _tell(self) -> None:
         self._page.tell(*self._words, self._label()[1])
+
+
+class Follow:
+    """The folder is only read. It is looked at by `look`, and the object is drawn anew where its checkpoint is another
+    one and a browser is there. What cannot be read just now is read the next time."""
+
+    def __init__(self, page: LiveView, folder: RunFolder) -> None:
+        self._page, self._folder, self._scene = page, folder, Scene(page)
+        self._drawn: tuple[int, int] | None = None
+        self._said: tuple[int, int] | None = None
+        self._scene.say(["it has begun; nothing is kept yet"])
+
+    def look(self) -> bool:
+        """Show what there is; whether the run goes on."""
+        try:
+            writer = fitted_by(self._folder)
+            if writer is not None:
+                self._go_on(f"fitted by process {writer.process} on {writer.host}")
+        except (InputError, OSError):  # files of two moments: they are replaced one after the other
+            return True
+        if writer is None:
+            self._end()
+        return writer is not None
+
+    def _go_on(self, by: str) -> None:
+        kept = self._kept()
+        draws = kept != self._drawn and self._page.watched
+        if kept is None or not (draws or kept != self._said):
+            return
+        found = read_status(self._folder)
+        words = [*found.lines(), f"kept at {time.strftime('%H:%M:%S', time.localtime(kept[0] / 1e9))}", by]
+        if draws and found.object is not None:
+            self._scene.put(at_times(found.object, ()), [found.object.described, *words])
+        else:
+            self._scene.say(words)
+        self._drawn, self._said = kept if draws else self._drawn, kept
+
+    def _end(self) -> None:
+        """What the run has ended with."""
+        result = self._folder.result()
+        if not result.is_file():
+            self._scene.say(["the run was cut off; finish it with --resume"])
+            return
+        found = read_object(result)
+        complete = self._folder.summary.is_file() and bool(self._folder.read_summary().get("finished"))
+        how = "the run has ended" if complete else "the run was interrupted; it goes on with --resume"
+        self._scene.put(at_times(found, ()), [found.described, *steps_of(self._folder), how])
+
+    def _kept(self) -> tuple[int, int] | None:
+        """What tells one checkpoint from another; None before the first."""
+        try:
+            found = self._folder.checkpoint.stat()
+        except FileNotFoundError:
+            return None
+        return found.st_mtime_ns, found.st_size
+
+
+def steps_of(folder: RunFolder) -> list[str]:
+    """How far the last fit of a run has come, in words; nothing where metrics.csv does not say."""
+    losses = folder.history().get("loss")
+    return [] if losses is None or len(losses) == 0 else [f"step {len(losses)}, loss {losses[-1]:.4g}"]

@@ -1,26 +1,163 @@
-"""Training of pixel-aligned networks on frames alone, and how they do on scenes of another seed."""
+"""Training of pixel-aligned networks on frames alone: examples, discriminator, training and validation."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import leaky_relu, softplus
 
-from ..learning.aligned_weights import write_aligned
-from ..learning.weights import Card
-from ..representations import AlignedNetwork, PixelAligned, VoxelGrid
-from .aligned_shown import aligned_lesson, first_views
-from .critic import Critic
+from ..checks import InputError
+from ..geometry import Grid, Views, rotation_y
+from ..learning.images import images
+from ..learning.weights import ONIX, Card, write_aligned
+from ..matter import Matter
+from ..methods.neural_field import visual_hull
+from ..methods.onix import AlignedFit
+from ..model import Instrument, Model
+from ..optics.sampling import fringe_sampling
+from ..representations import AlignedNetwork, PixelAligned, PixelAlignedField, VoxelGrid
+from ..representations.neural_field import grown
+from ..scan import Exposures
 from .folder import Dataset
-from .objective import share_of_overlap
-from .options import TrainOptions
-from .sample import Sample
+from .options import TrainOptions, ViewSampling
+from .sample import Sample, SampleScan, as_scan
+from .shown import share_of_overlap
 from .train import BETAS, PURPOSE, Training
 from .validate import Validation
+
+FIT = AlignedFit()
+"""The field lives where that of a reconstruction does."""
+
+
+@dataclass(frozen=True)
+class AlignedExample:
+    """scene: all frames of a sample; noise: [N], of these; seen: those that the network is shown; targets: those that
+    it should predict; network: `onix` or `pixelnerf`; device: where the network is, and all is compared."""
+
+    scene: SampleScan
+    noise: np.ndarray
+    seen: np.ndarray
+    targets: np.ndarray
+    network: str
+    device: str = "cpu"
+
+    def on(self, device: str) -> AlignedExample:
+        """The same on a device."""
+        return replace(self, device=device)
+
+    @cached_property
+    def rms(self) -> float:
+        """Of the contrast of the frames that are shown."""
+        shown = self.scene.scan.frames[self.seen] - 1
+        return max(float(np.sqrt(np.mean(shown**2))), float(np.finfo(np.float16).tiny))
+
+    def field(self, weights: Mapping[str, Tensor], size: AlignedNetwork) -> PixelAlignedField:
+        """Output of the network on the scene; where the views agree on nothing, it is evaluated everywhere."""
+        scan, material = self.scene.scan[self.seen], self.scene.material
+        thickness = torch.from_numpy(self.scene.thickness[self.seen]) / scan.views.finest
+        shown = images(torch.from_numpy(scan.frames) - 1, thickness, torch.from_numpy(self.noise[self.seen]))
+        grid = Grid.of_views(scan.views)
+        try:
+            mask = grown(visual_hull(thickness, scan.views, grid, FIT.hull), FIT.margin)
+        except InputError:
+            mask = torch.ones(grid.shape, dtype=torch.bool)
+        field = PixelAlignedField(
+            weights, shown.to(self.device), scan.views, mask, grid, Matter.one(*material), network=size
+        )
+        return field.with_parameters(weights)
+
+    def misfit(self, voxels: VoxelGrid, which: np.ndarray | None = None) -> Tensor:
+        """Mean square difference [] of predicted frames (default: the targets), over that of their contrast; without
+        waves, of thickness over that of the retrieved one."""
+        chosen = self.targets if which is None else which
+        if self.network == ONIX:
+            measured = self._here(self.scene.scan.frames[chosen])
+            return (self._frames(voxels, self.scene.scan.exposures[chosen]) - measured).square().mean() / self.rms**2
+        wanted = self._here(self.scene.thickness[chosen])
+        lines = voxels.project(self.scene.scan.views[chosen]).channels[:, 0]
+        return (lines - wanted).square().mean() / wanted.square().mean().clamp_min(1e-30)
+
+    def unseen(self, voxels: VoxelGrid, angle: float) -> Tensor:
+        """A predicted image [1, 1, H, W] in a direction about y without a frame [radians], in units of contrast."""
+        exposures = self.scene.scan.exposures[self.seen[:1]]
+        views = exposures.views
+        turned = Views(rotation_y([float(np.degrees(angle))]), views.shifts, views.shape, views.pitch)
+        frame = self._frames(voxels, replace(exposures, views=turned))
+        return (frame - 1)[None] / self.rms
+
+    def real(self) -> Tensor:
+        """A measured one of those that are shown."""
+        return self._here(self.scene.scan.frames[self.seen[:1]] - 1)[None] / self.rms
+
+    def _here(self, images: np.ndarray) -> Tensor:
+        return torch.from_numpy(images).to(self.device)
+
+    def _frames(self, voxels: VoxelGrid, exposures: Exposures) -> Tensor:
+        return Model(voxels, Instrument(exposures, fringe_sampling(exposures), backend=voxels.backend)).frames()
+
+
+def draw_aligned_example(
+    sample: Sample, how: ViewSampling, targets: int, network: str, rng: np.random.Generator
+) -> AlignedExample:
+    """`sample` as it is shown once: some of its views, and others that are to be predicted."""
+    training = np.flatnonzero(~sample.is_test)
+    count = min(int(rng.choice(how.views)), len(training))
+    order = rng.permutation(training)
+    seen, rest = order[:count], np.concatenate([order[count:], np.flatnonzero(sample.is_test)])
+    new = rng.permutation(rest)[: (targets + 1) // 2]
+    old = rng.permutation(seen)[: targets - len(new)]
+    return AlignedExample(as_scan(sample), sample.noise, seen, np.concatenate([new, old]), network)
+
+
+def first_views(sample: Sample, count: int, network: str) -> AlignedExample:
+    """The first `count` views for training, to foretell those that are held out."""
+    training = np.flatnonzero(~sample.is_test)
+    rest = np.concatenate([np.flatnonzero(sample.is_test), training[count:]])
+    return AlignedExample(as_scan(sample), sample.noise, training[:count], rest, network)
+
+
+WIDTHS = (1, 16, 32, 32)
+"""Channels, each on pixels twice as large as the ones before: patches of 22 pixels are looked at."""
+SLOPE = 0.2
+"""Of the leaky rectifiers."""
+FLATTER = 10.0
+"""Weight of the squared slope at measured images (R₁ of Mescheder et al. 2018), which keeps it honest."""
+
+
+class Critic(nn.Module):
+    """Scores of the patches of an image: large where it looks measured."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layers = nn.ModuleList(nn.Conv2d(a, b, 4, stride=2, padding=1) for a, b in pairwise(WIDTHS))
+        self.last = nn.Conv2d(WIDTHS[-1], 1, 1)
+
+    def forward(self, images: Tensor) -> Tensor:
+        """[N, 1, h, w] of images [N, 1, H, W]."""
+        for layer in self.layers:
+            images = leaky_relu(layer(images), SLOPE)
+        return self.last(images)
+
+    def misled(self, made: Tensor) -> Tensor:
+        """What a predicted image costs that does not look measured []."""
+        return softplus(-self(made)).mean()
+
+    def loss(self, made: Tensor, measured: Tensor) -> Tensor:
+        """What the discriminator minimises []."""
+        measured = measured.detach().requires_grad_()
+        score = self(measured)
+        (slope,) = torch.autograd.grad(score.sum(), measured, create_graph=True)
+        honest = softplus(-score).mean() + softplus(self(made.detach())).mean()
+        return honest + 0.5 * FLATTER * slope.square().sum() / score.numel()
+
 
 DEFAULT = AlignedNetwork()
 COLUMNS = ("step", "loss", "misfit", "misled", "rate")
@@ -52,7 +189,7 @@ class AlignedTraining(Training):
 
     def _value(self, sample: Sample, rng: np.random.Generator) -> tuple[Tensor, list[float]]:
         goal = self.options.frames
-        lesson = aligned_lesson(sample, self.options.shown, goal.targets, self.options.network, rng)
+        lesson = draw_aligned_example(sample, self.options.shown, goal.targets, self.options.network, rng)
         lesson = lesson.on(self.options.device)
         voxels = lesson.field(dict(self.network.named_parameters()), self.size).at(0.0)
         misfit, misled = lesson.misfit(voxels), torch.zeros(())
@@ -84,7 +221,7 @@ class AlignedTraining(Training):
 
 @dataclass
 class AlignedValidation(Validation):
-    """How well frames that are held out are foretold, and (for us, the network never sees it) the Dice coefficient."""
+    """Errors of predicted held-out frames, and (for us, the network never sees it) the Dice coefficient."""
 
     columns: ClassVar[tuple[str, ...]] = ("step", "views", "misfit", "dice")
 

@@ -16,11 +16,11 @@ from ..io.nerf_synthetic import camera_poses, write_nerf_synthetic
 from ..io.r2_gaussian import R2Options, write_r2_gaussian
 from ..progress import Advance
 from ..units import wavenumber
-from .as_scan import SampleScan, as_scan
 from .folder import Dataset
+from .sample import SampleScan, as_scan
 
 Format = Literal["nerf-synthetic", "r2-gaussian", "onix"]
-"""Layouts of others."""
+"""Layouts of other programs."""
 ONIX_FORMAT = "holosplat ONIX 1"
 ONIX_WORLD = np.diag([1.0, -1.0, -1.0])
 """`x_world = ONIX_WORLD x_obj`: y goes up and z towards the first camera, as in its `get_world_mat(0, 0, 0)`."""
@@ -36,7 +36,7 @@ class Exported:
 
 
 def export(dataset: Dataset, layout: Format, on_progress: Advance = lambda fraction: None) -> Exported:
-    """Write the scenes of `dataset` in the layout of others, into a folder of its own beside them.
+    """Write the scenes of `dataset` in the layout of another program, into a folder of its own beside them.
 
     The folder appears when all of it is written. Errors: `InputError` where files are missing, where the folder is
     there already, and where no scene fits the layout.

@@ -1,17 +1,24 @@
-"""A folder of scenes for learning: shards in HDF5, a datasheet, and what they were drawn from."""
+"""A dataset folder of scenes: shards in HDF5, made in one or several processes, and a datasheet."""
 
 from __future__ import annotations
 
+import inspect
+import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, fields, replace
+from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from ..checks import InputError, require
+from ..io.atomic import atomic_path
 from ..io.hdf5 import Fields, open_hdf5
 from ..io.hdf5_writing import new_hdf5
 from ..io.json import read_json, write_json
+from ..io.provenance import command_now, take_up
 from ..progress import Advance
 from ..tables import from_table, to_table
 from ..version import __version__
@@ -47,7 +54,7 @@ class Dataset:
         return cls(folder, from_table(Ranges, said["ranges"]), int(said["seed"]), int(said["count"]))
 
     def begin(self) -> None:
-        """Make the folder, or take up the one that is there; `InputError` where that holds other scenes."""
+        """Make the folder, or continue an existing one; `InputError` where that holds other scenes."""
         path = self.folder / NAME
         if path.is_file():
             there = Dataset.read(self.folder)
@@ -110,3 +117,107 @@ class Dataset:
         with open_hdf5(path) as file:
             fields = Fields(path, file)
             return Sample(**{name: np.asarray(fields.dataset(name)[index % SHARD]) for name in Sample.names()})
+
+
+def make_dataset(dataset: Dataset, jobs: int, on_progress: Advance) -> int:
+    """Simulate what `dataset` lacks and write its datasheet; the number of files that were made.
+
+    What is interrupted keeps its whole files. Errors: those of `Dataset.begin`.
+    """
+    dataset.begin()
+    write_datasheet(dataset)
+    missing, whole = dataset.missing(), len(dataset.shards())
+    done = whole - len(missing)
+    if jobs == 1:
+        for shard in missing:
+            before = done
+            dataset.make(shard, lambda part, before=before: on_progress((before + part) / whole))
+            done += 1
+        return len(missing)
+    pool = ProcessPoolExecutor(jobs, get_context("spawn"), take_up, (command_now(),))
+    try:
+        for future in as_completed([pool.submit(_made, dataset, shard) for shard in missing]):
+            future.result()
+            done += 1
+            on_progress(done / whole)
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return len(missing)
+
+
+def _made(dataset: Dataset, shard: range) -> None:
+    """In a process of its own, which shares the machine."""
+    torch.set_num_threads(1)
+    dataset.make(shard)
+
+
+DATASHEET = "datasheet.md"
+TEXT = """# Simulated scenes for learning
+
+**What.** {count} scenes of {kinds}, each imaged in {views} noisy frames for training and {held_out} noise-free frames
+that are held out, of {rows} × {columns} pixels, in parallel beams. Made to train networks that guess matter from few
+X-ray phase-contrast views. No measured data, no persons, nothing confidential.
+
+**Made by** holosplat {version}: `holosplat dataset` with seed {seed}. The scene of a seed and a number is always the
+same, so that the files can be made again from `dataset.json`. Bodies are closed meshes or continuous matter; waves are
+propagated on a raster at least four times finer than the pixels and integrated over them; counts are Poisson.
+`thickness` is no measurement: it is what nonlinear phase retrieval of each frame by itself finds, the true δ/β given.
+
+**Not in it.** Absorption edges, materials of different δ/β in one scene, scatter, drifting light and defective pixels;
+a medium, uneven light and misaligned views only where the ranges below say so. Two materials are in filled capsules
+alone. Networks trained on it know the bodies that are in it.
+
+**Licence.** Made by you with BSD-3-Clause software, which claims nothing in its output.
+
+## Files
+
+`scenes-NNNNNN.h5` holds {shard} scenes from number NNNNNN on (HDF5, deflated, with checksums); the first axis of every
+array counts them. Coordinates, signs and pixel centres are those of holosplat's `docs/conventions.md`.
+
+{arrays}
+
+## Ranges
+
+| range | drawn from | meaning |
+| --- | --- | --- |
+{ranges}
+"""
+
+
+def write_datasheet(dataset: Dataset) -> None:
+    """Write the datasheet of `dataset` into its folder."""
+    ranges = dataset.ranges
+    text = TEXT.format(
+        count=dataset.count,
+        kinds=", ".join(ranges.kinds),
+        views=ranges.views,
+        held_out=ranges.held_out,
+        rows=ranges.rows,
+        columns=ranges.columns,
+        version=__version__,
+        seed=dataset.seed,
+        shard=SHARD,
+        arrays=_arrays(),
+        ranges="\n".join(_rows(ranges)),
+    )
+    with atomic_path(dataset.folder / DATASHEET) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def _arrays() -> str:
+    """The arrays of a sample, as its docstring has them, a bullet each."""
+    said = inspect.cleandoc(Sample.__doc__ or "").split("\n\n", 1)[1].replace("\n    ", " ")
+    return re.sub(r"^", "- ", said, flags=re.MULTILINE)
+
+
+def _rows(ranges: Ranges) -> list[str]:
+    """A row of the table for each field, with what stands below it in the source."""
+    meanings = re.findall(r'^    (\w+): .*\n    """((?:.|\n)*?)"""', inspect.getsource(Ranges), flags=re.MULTILINE)
+    said = {name: " ".join(text.split()) for name, text in meanings}
+    return [f"| {each.name} | {_shown(getattr(ranges, each.name))} | {said[each.name]} |" for each in fields(ranges)]
+
+
+def _shown(value: object) -> str:
+    if isinstance(value, tuple) and isinstance(value[0], float):
+        return f"{value[0]:g} to {value[1]:g}"
+    return ", ".join(value) if isinstance(value, tuple) else f"{value:g}" if isinstance(value, float) else str(value)

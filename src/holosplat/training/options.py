@@ -7,14 +7,30 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from ..checks import at_least
-from ..learning.size import Size
+from ..learning.network import Size
 from ..ranges import Natural, Positive, Rate, Seed, Share, Weight, ranged
-from .aligned_options import FrameGoal
 
 
 @dataclass(frozen=True)
 @ranged
-class Shown:
+class FrameLossWeights:
+    """The training loss of networks that learn from frames alone, without volumes."""
+
+    targets: Natural = 2
+    """Frames that each step predicts; half of them, rounded up, are none of those that the network sees."""
+    mse: Weight = 5.0
+    """Of the mean square difference of frames, in that of their contrast (4D-ONIX: 5)."""
+    adversary: Weight = 0.0
+    """Of a discriminator that looks at frames in directions without one (4D-ONIX: 0.1; default: none)."""
+    pretrain: Share = 0.5
+    """Share of the steps before the discriminator begins."""
+    adversary_rate: Weight = 1e-4
+    """AdamW's rate of the discriminator (4D-ONIX: 1e-4)."""
+
+
+@dataclass(frozen=True)
+@ranged
+class ViewSampling:
     """How samples are shown, so that few scenes stand for many."""
 
     views: tuple[Natural, ...] = (2, 2, 2, 2, 3, 3, 3, 4, 5, 6)
@@ -27,7 +43,7 @@ class Shown:
 
 @dataclass(frozen=True)
 @ranged
-class Goal:
+class LossWeights:
     """Weights of what is minimised."""
 
     entropy: Weight = 20.0
@@ -67,14 +83,14 @@ class TrainOptions:
     """Of the first weights, and of what is shown when."""
     size: Size = field(default_factory=Size)
     """Of the network."""
-    shown: Shown = field(default_factory=Shown)
+    shown: ViewSampling = field(default_factory=ViewSampling)
     """How scenes are shown."""
-    goal: Goal = field(default_factory=Goal)
+    goal: LossWeights = field(default_factory=LossWeights)
     """The training loss."""
     network: Literal["start", "onix", "pixelnerf"] = "start"
     """What is trained: the network of `--start learned`, or those of the methods `onix` and `pixelnerf`, which learn
     from frames alone; these are of one size."""
-    frames: FrameGoal = field(default_factory=FrameGoal)
+    frames: FrameLossWeights = field(default_factory=FrameLossWeights)
     """The training loss of networks that learn from frames alone."""
 
     def __post_init__(self) -> None:

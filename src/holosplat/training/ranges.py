@@ -31,7 +31,7 @@ class Ranges:
     views: Many = 6
     """Frames with noise, for training."""
     held_out: Many = 2
-    """Frames without noise, which show how well others are foretold."""
+    """Frames without noise, which show how well others are predicted."""
     tilted: Share = 0.2
     """Share of scenes whose views have no common axis."""
     tilt: Angle = 40.0

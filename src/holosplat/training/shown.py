@@ -1,4 +1,4 @@
-"""Input and target of a network in one step: some views of a sample, mirrored and rotated."""
+"""Training examples: some views of a sample, mirrored and rotated; the loss and the Dice coefficient."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import binary_cross_entropy_with_logits
 
 from ..geometry import Grid, Views
 from ..learning.images import images
 from ..learning.lattice import Taps
-from ..learning.network import FINE
-from .options import Shown
+from ..learning.network import FINE, Guess
+from .options import LossWeights, ViewSampling
 from .sample import Sample
 
 UPSIDE_DOWN = np.diag([1.0, -1.0, 1.0])
@@ -22,7 +23,7 @@ QUARTER = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
 
 
 @dataclass(frozen=True)
-class Lesson:
+class TrainingExample:
     """images: [V, 3, H, W]; taps: of the lattice [W/2, H/2, W/2] in images of half as many pixels; occupancy: [W, H, W]
     float32, what the network should say."""
 
@@ -30,12 +31,12 @@ class Lesson:
     taps: Taps
     occupancy: Tensor
 
-    def on(self, device: str) -> Lesson:
+    def on(self, device: str) -> TrainingExample:
         """The same on a device."""
-        return Lesson(self.images.to(device), self.taps.on(device), self.occupancy.to(device))
+        return TrainingExample(self.images.to(device), self.taps.on(device), self.occupancy.to(device))
 
 
-def lesson(sample: Sample, how: Shown, rng: np.random.Generator) -> Lesson:
+def draw_example(sample: Sample, how: ViewSampling, rng: np.random.Generator) -> TrainingExample:
     """`sample` as it is shown once: views are chosen, rows cut out, up and down exchanged, and the object is turned
     about its y axis by quarter turns, all at random."""
     training = np.flatnonzero(~sample.is_test)
@@ -43,15 +44,17 @@ def lesson(sample: Sample, how: Shown, rng: np.random.Generator) -> Lesson:
     pair = count == 2 and rng.random() < how.first_two
     chosen = training[:2] if pair else rng.permutation(training)[:count]
     rows = _rows(sample, how, rng)
-    return as_shown(sample, chosen, rows, bool(rng.random() < 0.5), int(rng.integers(4)))
+    return make_example(sample, chosen, rows, bool(rng.random() < 0.5), int(rng.integers(4)))
 
 
-def whole(sample: Sample, count: int) -> Lesson:
+def example_of_views(sample: Sample, count: int) -> TrainingExample:
     """The first `count` views for training as they are."""
-    return as_shown(sample, np.flatnonzero(~sample.is_test)[:count], slice(None), False, 0)
+    return make_example(sample, np.flatnonzero(~sample.is_test)[:count], slice(None), False, 0)
 
 
-def as_shown(sample: Sample, views: Sequence[int] | np.ndarray, rows: slice, flipped: bool, turns: int) -> Lesson:
+def make_example(
+    sample: Sample, views: Sequence[int] | np.ndarray, rows: slice, flipped: bool, turns: int
+) -> TrainingExample:
     """Some `views` and some `rows` of `sample`, upside down or not, after quarter turns about y."""
     contrast, thickness = (array[views][:, rows] for array in (sample.contrast, sample.thickness))
     rotations, shifts, occupancy = sample.rotations[views], sample.shifts[views], sample.occupancy[:, rows]
@@ -64,10 +67,10 @@ def as_shown(sample: Sample, views: Sequence[int] | np.ndarray, rows: slice, fli
     large = Views(rotations, shifts, (h // FINE, w // FINE), float(FINE))
     taps = Taps.of(Grid.centred((w // FINE, h // FINE, w // FINE), float(FINE)), large)
     seen = images(_tensor(contrast), _tensor(thickness), _tensor(sample.noise[views]))
-    return Lesson(seen, taps, _tensor(occupancy) / 255)
+    return TrainingExample(seen, taps, _tensor(occupancy) / 255)
 
 
-def _rows(sample: Sample, how: Shown, rng: np.random.Generator) -> slice:
+def _rows(sample: Sample, how: ViewSampling, rng: np.random.Generator) -> slice:
     """An even number of rows from an even one on; all of them where beams are tilted."""
     height = sample.contrast.shape[1]
     count = min(int(rng.choice(how.rows)), height) // FINE * FINE
@@ -79,3 +82,30 @@ def _rows(sample: Sample, how: Shown, rng: np.random.Generator) -> slice:
 
 def _tensor(array: np.ndarray) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(array, dtype=np.float32))
+
+
+def loss(network: Guess, example: TrainingExample, goal: LossWeights) -> tuple[Tensor, Tensor]:
+    """The training loss, and the soft Dice coefficient [2] of the guess and of the corrected one."""
+    parts, scores = [], []
+    for logits in network(example.images, example.taps):
+        dice = soft_dice(torch.sigmoid(logits.float()), example.occupancy)
+        entropy = binary_cross_entropy_with_logits(logits.float(), example.occupancy)
+        parts.append(goal.entropy * entropy + goal.dice * (1 - dice))
+        scores.append(dice.detach())
+    return goal.first * parts[0] + parts[1], torch.stack(scores)
+
+
+def soft_dice(guess: Tensor, truth: Tensor) -> Tensor:
+    """`(2 Σ ab + 1) / (Σ a² + Σ b² + 1)` of shares a and b; one where both are empty."""
+    return (2 * (guess * truth).sum() + 1) / (guess.square().sum() + truth.square().sum() + 1)
+
+
+def dice(logits: Tensor, truth: Tensor) -> float:
+    """The Dice coefficient of voxels of which more than half is matter; one where there are none in either."""
+    return share_of_overlap(logits > 0, truth > 0.5)
+
+
+def share_of_overlap(found: Tensor, there: Tensor) -> float:
+    """The Dice coefficient of two masks; one where both are empty."""
+    total = int(found.sum() + there.sum())
+    return 1.0 if total == 0 else 2 * int((found & there).sum()) / total

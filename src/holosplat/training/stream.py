@@ -51,7 +51,7 @@ class Scenes(TorchDataset[Any]):
         if not 0 <= number < self.count:
             raise IndexError(f"scenes are numbered from 0 to {self.count - 1}, but {index} is asked for")
         sample = self._sample(number)
-        return tensors(sample) if self.shown is None else self.shown(sample)
+        return tensors_of(sample) if self.shown is None else self.shown(sample)
 
     def _sample(self, number: int) -> Sample:
         return sample_of(self.ranges, self.seed, number)
@@ -68,6 +68,6 @@ class _Kept(Scenes):
         return self._dataset.sample(number)
 
 
-def tensors(sample: Sample) -> Tensors:
+def tensors_of(sample: Sample) -> Tensors:
     """The arrays of `sample` as tensors of their own."""
     return {name: torch.from_numpy(np.array(getattr(sample, name))) for name in Sample.names()}

@@ -1,11 +1,11 @@
-"""Training: from a dataset to weights, in a folder that can be taken up again."""
+"""Training: from a dataset to weights with a model card, in a folder that can be continued."""
 
 from __future__ import annotations
 
 import csv
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
@@ -23,13 +23,14 @@ from ..io.json import read_json, write_json
 from ..learning.network import Guess
 from ..learning.weights import Card, write_weights
 from ..tables import to_table
+from ..version import source_commit
+from ..workflows.provenance import environment
 from ..workflows.run_folder import checkpoint_state
 from .folder import Dataset
-from .limits import limits
-from .objective import loss
 from .options import TrainOptions
+from .ranges import Ranges
 from .sample import Sample
-from .shown import lesson
+from .shown import draw_example, loss
 from .validate import Validation
 
 PURPOSE = 2102
@@ -147,7 +148,7 @@ class Training:
     def _value(self, sample: Sample, rng: np.random.Generator) -> tuple[Tensor, list[float]]:
         """What this step minimises, and the scores that the curves show beside it."""
         assert isinstance(self.network, Guess)
-        shown = lesson(sample, self.options.shown, rng)
+        shown = draw_example(sample, self.options.shown, rng)
         with self._precision():
             value, scores = loss(self.network, shown.on(self.options.device), self.options.goal)
         return value, scores.tolist()
@@ -174,7 +175,7 @@ class Training:
 
     @property
     def record(self) -> dict[str, float]:
-        """Of the last step, for progress: steps and seconds since the training began, or went on."""
+        """Of the last step, for progress: steps and seconds since the training began, or was continued."""
         return {"step": self.step - self._first, "loss": self.rows[-1][1], "seconds": time.monotonic() - self._began}
 
     def _precision(self) -> AbstractContextManager[Any]:
@@ -201,3 +202,69 @@ def _write_rows(path: Path, columns: Sequence[str], rows: Sequence[tuple[float, 
         writer = csv.writer(file)
         writer.writerow(columns)
         writer.writerows([f"{value:.6g}" for value in row] for row in rows)
+
+
+def limits(ranges: Ranges, views: Sequence[int], scores: Mapping[str, Mapping[str, float]]) -> str:
+    """Plain sentences about a network that learnt from scenes of `ranges`, shown in such numbers of `views`.
+
+    scores: the Dice coefficient and the number of scenes of another seed, by the number of views
+    """
+    return " ".join([_matter(ranges), _views(ranges, views), _noise(ranges), _never(ranges), _worst(scores)])
+
+
+def _matter(ranges: Ranges) -> str:
+    kinds = " and ".join(kind.replace("-", " ") for kind in ranges.kinds)
+    full = [ranges.crowded if kind == "crowd" else ranges.filled for kind in ranges.kinds]
+    low, high = min(low for low, _ in full), max(high for _, high in full)
+    return (
+        f"It knows {kinds} alone, {_span(ranges.across)} pixels across, in {100 * low:g} to {100 * high:g} % of the "
+        f"room, with δ/β of {_span(ranges.ratio)} and phases of {_span(ranges.phase)} rad, at Fresnel numbers of a "
+        f"pixel of {_span(ranges.fresnel)}; of other matter its guesses may be wrong."
+    )
+
+
+def _views(ranges: Ranges, views: Sequence[int]) -> str:
+    *counts, most = sorted({min(count, ranges.views) for count in views})
+    said = f"{', '.join(map(str, counts))} and {most}" if counts else str(most)
+    tilted = f"in a share of {ranges.tilted:g} of them beams were tilted by up to {ranges.tilt:g}°"
+    return f"It saw scenes in {said} views; {tilted if ranges.tilted else 'all beams had one axis'}."
+
+
+def _noise(ranges: Ranges) -> str:
+    if ranges.noiseless == 1:
+        return "It never saw noise."
+    return f"It never saw noise of more than {ranges.noise[1]:g} of the phase of a body."
+
+
+def _never(ranges: Ranges) -> str:
+    """What no scene of the ranges has."""
+    missing = {
+        "two materials of one δ/β in a body": "filled-capsules" not in ranges.kinds,
+        "continuous matter": "soft-cells" not in ranges.kinds,
+        "a medium that absorbs more than the bodies": ranges.medium == 0,
+        "uneven light": ranges.uneven[1] == 0,
+        "misaligned views": ranges.misaligned_px[1] == 0,
+        "materials of different δ/β": True,
+        "beams that are not parallel": True,
+    }
+    *first, last = [name for name, is_missing in missing.items() if is_missing]
+    return f"Nor did it see {', '.join(first)} or {last}."
+
+
+def _worst(scores: Mapping[str, Mapping[str, float]]) -> str:
+    views = min(scores, key=lambda count: scores[count]["dice"])
+    worst = scores[views]
+    return (
+        f"It is worst in {views} views: on {worst['scenes']:.0f} scenes of another seed the mean Dice coefficient is "
+        f"{worst['dice']:.2f}."
+    )
+
+
+def _span(pair: tuple[float, float]) -> str:
+    return f"{pair[0]:g} to {pair[1]:g}"
+
+
+def made_by(device: str) -> dict[str, str]:
+    """Versions, machine and commit, in one table; device: what computed it."""
+    found = environment("cuda" if device == "cuda" else "cpu")
+    return {**found["versions"], **found["machine"], "commit": source_commit() or "none: not a git checkout"}

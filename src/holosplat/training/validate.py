@@ -16,10 +16,9 @@ from ..io.atomic import atomic_path
 from ..learning.network import Guess
 from ..learning.start import unexplained
 from ..learning.weights import Card
-from .objective import dice
 from .ranges import Ranges
 from .sample import Sample, sample_of
-from .shown import whole
+from .shown import dice, example_of_views
 
 COUNTS = (2, 3, 4, 6)
 """Numbers of views."""
@@ -85,7 +84,7 @@ class Validation:
     def _scores(self, network: nn.Module, sample: Sample, count: int) -> tuple[float, float, float]:
         """Dice of the guess and of the corrected one from the first `count` views, and what that leaves unexplained."""
         assert isinstance(network, Guess)
-        shown = whole(sample, count).on(str(next(network.parameters()).device))
+        shown = example_of_views(sample, count).on(str(next(network.parameters()).device))
         with torch.inference_mode():
             first, second = network(shown.images, shown.taps)
             left = unexplained(torch.sigmoid(second), shown.images, shown.taps)

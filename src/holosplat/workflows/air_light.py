@@ -13,7 +13,7 @@ from ..checks import InputError
 from ..divided_light import DividedLight
 from ..optics.air import Box, find_air, has_air
 from ..optics.background import ORDER, Light, LightOptions
-from ..optics.modes import cosines
+from ..optics.patterns import cosines
 
 LONGEST = 128
 """Pixels along the longer side of the binned frames, at most."""

@@ -22,7 +22,7 @@ from ..representations import Stored
 from ..scan import Exposures, Scan
 from ..volume import Object, Volume
 from .reconstruct import Reconstruction
-from .run_light import light_of
+from .run_illumination import light_of
 from .verdict import Verdict, judge
 
 OTHER_FIELD = 8.0

@@ -29,17 +29,16 @@ from ..scan import Scan
 from ..tables import read_rows, to_table
 from .evaluate import render_object
 from .provenance import environment, scan_hash
-from .reconstruction import Reconstruction
+from .reconstruction import Reconstruction, summary_of
 from .run_folder import RunFolder
-from .run_light import light_of
-from .run_record import summary_of
+from .run_illumination import light_of
 from .track import write_tracks
 
 FRAMES, TABLE, NUMBERS = "forecast.nxs", "forecast.csv", "forecast.json"
 MOST_TIMES = 1000
 """Of a forecast."""
 UNTOLD = 0.5
-"""Standard error after the fit over that before from which on a number is not told."""
+"""Standard error after the fit over that before from which on a number counts as undetermined."""
 SAME_TIME = 1e-3
 """Share of a step within which two times are one."""
 
@@ -47,7 +46,7 @@ SAME_TIME = 1e-3
 @dataclass(frozen=True)
 @ranged
 class ForecastOptions:
-    """How a run is carried on."""
+    """Options of a forecast."""
 
     kind: ClassVar[str] = "forecast"
 
@@ -150,7 +149,7 @@ def forecast(
 
 
 def flow_in_words(flow: dict[str, float]) -> str:
-    """What was found of the flow, and what the window does not tell."""
+    """The estimated flow, and what the window does not determine, in words."""
     said = f"flow: peak {flow['peak_m_s']:.4g} m/s, shear modulus {1e6 * flow['shear_n_m']:.3g} µN/m"
     for name, word in (("peak", "the peak"), ("shear", "the shear modulus")):
         told = flow.get(f"{name}_told", np.nan)
@@ -203,7 +202,7 @@ def read_band(folder: RunFolder) -> tuple[np.ndarray, np.ndarray]:
 
 
 def config_of(options: ForecastOptions, scan: Scan, run: dict[str, Any], seed: int) -> dict[str, Any]:
-    """Entries of config.json. run: that of the run which is carried on."""
+    """Entries of config.json. run: that of the run whose future is predicted."""
     return {
         "schema_version": SCHEMA,
         "method": {"kind": options.kind, "forecast": (options.dynamics or options.model).kind, **to_table(options)},

@@ -17,8 +17,7 @@ from ..fit.running import Record, Running
 from ..inference import Decision
 from ..io.guess import write_guess
 from ..io.json import write_json
-from ..io.light import read_still_light, write_light
-from ..io.objects import write_object
+from ..io.light import read_still_light
 from ..learning.start import GuessedMatter
 from ..matter import MaterialPrior, MatterKind
 from ..methods import Auto, Gaussians, Method, Settled, Stage, Task, begun, finished, learned, settled
@@ -32,9 +31,17 @@ from ..ranges import require_plausible
 from ..representations import KINDS, Stored
 from ..scan import Scan
 from ..tables import to_table
-from .choice import Choice
+from .preconditions import (
+    check_frames,
+    decided_before,
+    decisions_of,
+    goes_on,
+    is_complete,
+    require_alike,
+    require_one_time,
+)
 from .provenance import environment, scan_hash
-from .reconstruction import Reconstruction
+from .reconstruction import Assumptions, Choice, Reconstruction, config_of, read_rest, write_run
 from .refine import (
     freedom_of,
     keep_geometry,
@@ -45,12 +52,8 @@ from .refine import (
     with_fitted,
     with_held_out,
 )
-from .rest_file import read_rest
-from .resume import decided_before, decisions_of, goes_on, is_complete, require_alike
 from .run_folder import RunFolder, claimed
-from .run_light import found_in, read_light_options, still_in
-from .run_record import config_of, summary_of
-from .suitable import check_frames, require_one_time
+from .run_illumination import fixed_pattern_of, light_options_of, read_light_options
 from .totals import TotalMatter, total_of_run
 from .verdict import Verdict, judge_run, said_of_run
 
@@ -106,8 +109,8 @@ def reconstruct(
     if not resume:  # a run that goes on may be past them
         method.require_files()
     assumed, ranges, planned = light or LightOptions(), uncertain or Uncertain(), scan
-    said = {"light": to_table(assumed), "uncertain": to_table(ranges), "refine": refine and to_table(refine)}
-    config = config_of(scan, prior, method, seed, matter) | said
+    asked = Assumptions(assumed, ranges, refine)
+    config = config_of(scan, prior, to_table(method), seed, matter or "auto", asked)
 
     def tell(stage: str, part: float) -> None:
         on_progress(stage, part, {})
@@ -242,7 +245,7 @@ class _Run:
         )
 
     def complete(self) -> Reconstruction:
-        """Run what is left of the stages."""
+        """Run the remaining stages."""
         found: Stored | None = None
         with self.as_written():
             stages, first = self.method.stages(), int(self._saved["stage"]) if self._saved else 0
@@ -260,7 +263,7 @@ class _Run:
                 found = start
                 continue
             last = fit
-            complete = _Journal(fit, number, start, self).run(saved["fit"] if saved else None)
+            complete = self._fitted(fit, number, start, saved["fit"] if saved else None)
             self.timing[stage.name] = fit.seconds
             found = cast(Stored, finished(fit))
             self.task = replace(self.task.moved(fit.result()), near=False)
@@ -292,16 +295,64 @@ class _Run:
             )
             self._keeper.moved(scan)
 
-    def placed(self) -> dict[str, Any]:
-        """Where the frames are at the beginning of a stage, as a checkpoint holds it."""
-        freedom = self.task.freedom
-        if freedom is None:
-            return {}
-        return {"placed": where(self.task.scan.exposures), "so_far": torch.from_numpy(freedom.so_far)}
+    def _fitted(self, fit: Running, number: int, start: Stored, saved: dict[str, Any] | None) -> bool:
+        """Run the fit of stage `number`, from a `saved` state if there is one, and keep metrics and checkpoints up to
+        date; whether it came to its end."""
+        if saved is not None:
+            with self.as_written():
+                require_alike(saved, fit.state_dict())
+                fit.load(saved)
+        name, pending, last = self.method.stages()[number].name, list[Record](), time.perf_counter()
+        self._make_folder(fit.backend)
+        self._note_resolved(name, fit)
 
-    def kept(self) -> dict[str, Any] | None:
-        """The best of the states so far, as a checkpoint holds it."""
-        return self._keeper.state_dict()
+        def save() -> None:
+            nonlocal last
+            if self.folder is None:
+                return
+            self.folder.append_metrics(pending)
+            pending.clear()
+            self.folder.save_checkpoint(self._state(fit, number, start))
+            last = time.perf_counter()
+
+        def on_record(record: Record) -> None:
+            pending.append(record)
+            self.on_progress(name, fit.share, record)
+            self.on_state(name, fit.share, record, lambda: finished(fit).on(in_main_memory(fit.backend)))
+            up_to_date = record["step"] == fit.step  # on a GPU, records come late and in batches
+            if up_to_date and time.perf_counter() - last > CHECKPOINT_SECONDS:
+                save()
+
+        if self.folder is not None:
+            if saved is None and number:
+                self.folder.set_aside_metrics(number - 1)
+            self.folder.start_metrics(fit.columns(), keep_until=fit.step)
+            save()
+        complete = True
+        try:
+            fit.run(on_record)
+        except KeyboardInterrupt:
+            complete = False
+            self.on_progress("interrupted", 1.0, {})
+        save()
+        return complete and fit.finished
+
+    def _state(self, fit: Running, number: int, start: Stored) -> dict[str, Any]:
+        """The checkpoint of stage `number`: the poses at its beginning, its fit, and the best state before it."""
+        freedom = self.task.freedom
+        placed = {} if freedom is None else {"placed": where(self.task.scan.exposures)}
+        so_far = {} if freedom is None else {"so_far": torch.from_numpy(freedom.so_far)}
+        return {
+            "stage": number,
+            "start": {"kind": start.kind, "state": start.state()},
+            "fit": fit.state_dict(),
+            "timing": self.timing,
+            "kept": self._keeper.state_dict(),
+            "near": self.task.near,
+            "decided": [each.as_dict() for each in self.start],
+            **placed,
+            **so_far,
+        }
 
     def _started(self, stage: Stage, before: Stored | None) -> Stored:
         began = time.perf_counter()
@@ -312,14 +363,14 @@ class _Run:
     def _note_start(self, decision: Decision, guess: GuessedMatter | None) -> None:
         self.start, self._guess = (decision,), guess
 
-    def make_folder(self, backend: str) -> None:
+    def _make_folder(self, backend: str) -> None:
         """Make the folder, once there is something to put in it."""
         if self.folder is not None and not self.folder.config.is_file():
             self.folder.begin(self._config | environment(backend))
             if self._guess is not None:
                 write_guess(self.folder.guess, self._guess.volume, self._guess.spread, self._guess.of_copies)
 
-    def note_resolved(self, stage: str, fit: Running) -> None:
+    def _note_resolved(self, stage: str, fit: Running) -> None:
         """Add to config.json what the options have become in a stage: wave samples a pixel, weights and widths."""
         if self.folder is not None:
             config = self.folder.read_config()
@@ -343,20 +394,15 @@ class _Run:
             judge_run(found, fit, self.task, oversample),
             self._total(found, fit, oversample),
             self.constants,
-            found_in(self.task),
-            still=still_in(self.task, self.method, found, oversample),
+            light_options_of(self.task),
+            still=fixed_pattern_of(self.task, self.method, found, oversample),
         )
         if self.folder is not None:
-            self.make_folder(found.backend)
+            self._make_folder(found.backend)
             if fit is None:
                 self.folder.start_metrics([])
-            write_object(self.folder.object, done.object, self.folder.marks())
-            background = self.task.uneven and self.task.uneven.background
-            if background is not None or done.still is not None:
-                write_light(self.folder.light, background, done.still, self.folder.marks())
-            said = {"times_s": self.task.scan.instants.tolist()} if self.method.of_series else {}
-            said |= {"light": self.task.light_in_words}
-            self.folder.write_summary(summary_of(done, fit, self.task.scan) | said)
+            times = {"times_s": self.task.scan.instants.tolist()} if self.method.of_series else {}
+            write_run(self.folder, done, self.task, fit, times)
         return done
 
     def _total(self, found: Stored, fit: Running | None, oversample: int) -> TotalMatter | None:
@@ -364,65 +410,3 @@ class _Run:
         if self.method.of_series:
             return None
         return total_of_run(*said_of_run(found, fit, self.task, oversample), self.task, self.constants)
-
-
-class _Journal:
-    """Runs one fit, and keeps metrics and checkpoints up to date while it runs."""
-
-    def __init__(self, fit: Running, number: int, start: Stored, run: _Run) -> None:
-        self._fit, self._number, self._start, self._run = fit, number, start, run
-        self._pending: list[Record] = []
-        self._last = time.perf_counter()
-
-    def run(self, saved: dict[str, Any] | None) -> bool:
-        """Run the fit, from a saved state if there is one; whether it came to its end."""
-        if saved is not None:
-            with self._run.as_written():
-                require_alike(saved, self._fit.state_dict())
-                self._fit.load(saved)
-        self._run.make_folder(self._fit.backend)
-        self._run.note_resolved(self._run.method.stages()[self._number].name, self._fit)
-        if self._run.folder is not None:
-            if saved is None and self._number:
-                self._run.folder.set_aside_metrics(self._number - 1)
-            self._run.folder.start_metrics(self._fit.columns(), keep_until=self._fit.step)
-            self._save()
-        complete = True
-        try:
-            self._fit.run(self._record)
-        except KeyboardInterrupt:
-            complete = False
-            self._run.on_progress("interrupted", 1.0, {})
-        self._save()
-        return complete and self._fit.finished
-
-    def _record(self, record: Record) -> None:
-        """Take in one step's record."""
-        self._pending.append(record)
-        fit = self._fit
-        name = self._run.method.stages()[self._number].name
-        self._run.on_progress(name, fit.share, record)
-        self._run.on_state(name, fit.share, record, lambda: finished(fit).on(in_main_memory(fit.backend)))
-        up_to_date = record["step"] == fit.step  # on a GPU, records come late and in batches
-        if up_to_date and time.perf_counter() - self._last > CHECKPOINT_SECONDS:
-            self._save()
-
-    def _save(self) -> None:
-        folder = self._run.folder
-        if folder is None:
-            return
-        folder.append_metrics(self._pending)
-        self._pending = []
-        start = {"kind": self._start.kind, "state": self._start.state()}
-        state = {
-            "stage": self._number,
-            "start": start,
-            "fit": self._fit.state_dict(),
-            "timing": self._run.timing,
-            "kept": self._run.kept(),
-            "near": self._run.task.near,
-            "decided": [each.as_dict() for each in self._run.start],
-            **self._run.placed(),
-        }
-        folder.save_checkpoint(state)
-        self._last = time.perf_counter()

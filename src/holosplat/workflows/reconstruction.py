@@ -1,23 +1,176 @@
-"""What `reconstruct` gives back: the matter, and what was decided and found on the way."""
+"""The result of `reconstruct`: the object, decisions and estimates, and their entries in the files of a run."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
 
 import numpy as np
 
 from ..align.geometry import Geometry
+from ..align.poses import PoseOptions
+from ..backends import device_name
+from ..bodies.rest_shape import KnownBody
+from ..checks import as_written, require
 from ..display import card, of_object
+from ..fit.running import Running
+from ..geometry import Grid
+from ..inference import Decision
+from ..io.json import read_json
+from ..io.light import write_light
+from ..io.objects import write_object
 from ..io.volumes import Contents
-from ..methods.uncertain import Determined, placed
+from ..io.vtk import read_meshes, write_mesh
+from ..matter import MaterialPrior, MatterKind
+from ..mesh import TriangleMesh
+from ..methods import Task
+from ..methods.presets import SCHEMA
+from ..methods.uncertain import Determined, Uncertain, placed
 from ..motion.elastic import Rest
 from ..optics.background import LightOptions
-from ..representations import Stored
+from ..representations import InMotion, MovingSurfaces, Stored
 from ..scan import Scan
-from .choice import Choice
-from .run_light import EVEN
+from ..tables import to_table
+from .provenance import scan_hash
+from .run_folder import RunFolder
+from .run_illumination import EVEN
 from .totals import TotalMatter
 from .verdict import Verdict
+
+GAUGE = (
+    "against {}: δ and β are differences, zero where it is alone; a constant phase is in no frame, and even absorption "
+    "of what fills the field counts as light"
+)
+"""The note on matter in a medium."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What was decided in a run.
+
+    matter: of which kind it was taken to be; judged: share of all matter that each state leaves unexplained in the
+    training frames, by its name; kept: the name of the state that is the result, empty where the run was interrupted;
+    begun: what it began with and why, in a sentence, where a network was asked; decisions: between hypotheses; against:
+    the medium that δ and β are differences to, empty for vacuum
+    """
+
+    matter: MatterKind = "levels"
+    judged: Mapping[str, float] = field(default_factory=dict)
+    kept: str = ""
+    begun: str = ""
+    decisions: tuple[Decision, ...] = ()
+    against: str = ""
+
+    @classmethod
+    def of(cls, task: Task, judged: Mapping[str, float], kept: str, decisions: tuple[Decision, ...]) -> Choice:
+        """What was decided of a `task`."""
+        return cls(task.matter, judged, kept, decisions=decisions, against=task.prior.against)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Entries of summary.json; `read` reads them."""
+        told = {"begun": self.begun, "against": self.against}
+        decided = {"matter": self.matter} | {name: said for name, said in told.items() if said}
+        decisions = [each.as_dict() for each in self.decisions]
+        return {"decided": decided, "decisions": decisions, "kept": self.kept, "unexplained": dict(self.judged)}
+
+    @classmethod
+    def read(cls, summary: Mapping[str, Any]) -> Choice:
+        """What a summary.json says of it; that of older versions says nothing."""
+        decided = summary.get("decided", {})
+        matter: MatterKind = "continuous" if decided.get("matter") == "continuous" else "levels"
+        decisions = tuple(Decision.from_dict(each) for each in summary.get("decisions", ()))
+        kept, begun = str(summary.get("kept", "")), str(decided.get("begun", ""))
+        against = str(decided.get("against", ""))
+        return cls(matter, summary.get("unexplained", {}), kept, begun, decisions, against)
+
+    def lines(self) -> list[str]:
+        """The same as a few lines of text."""
+        lines = [each.line for each in self.decisions]
+        lines += [GAUGE.format(self.against)] if self.against else []
+        lines += [f"start: {self.begun}"] if self.begun else []
+        if len(self.judged) > 1 and self.kept and self.kept != next((d.choice for d in self.decisions[-1:]), ""):
+            lines.append(f"result: {self.kept}")
+        return lines
+
+
+def summary_of(done: Reconstruction, fit: Running | None, train: Scan) -> dict[str, Any]:
+    """Entries of summary.json; fit: the last one, if there was any."""
+    (h, w), matter = train.views.shape, done.object.matter
+    backend = fit.backend if fit else done.object.backend
+    second = matter.second and {"delta": matter.second.delta, "beta": matter.second.beta}
+    return {
+        "finished": done.finished,
+        "method": done.method,
+        **done.choice.as_dict(),
+        "kind": done.object.kind,
+        "size": done.object.described,
+        "backend": backend,
+        "device": device_name(backend),
+        "steps": fit.step if fit else 0,
+        "stopped_early": bool(fit and fit.stopped_early),
+        "best_step": (fit.best_step or fit.step) if fit else 0,
+        "oversample": done.oversample,
+        "detector": {
+            **{"rows": h, "columns": w, "pixel_size_m": train.views.finest},
+            "centre_m": Grid.of_views(train.views).centre.tolist(),
+        },
+        "energy_kev": done.energy_kev,
+        "material": {
+            "delta": matter.delta,
+            "beta": matter.beta,
+            "single": matter.single,
+            "delta_told": done.delta_told,
+        },
+        "second_material": second,
+        "timing_s": done.timing,
+        "constants": [to_table(each) for each in done.constants],
+        **({"verdict": done.verdict.as_dict()} if done.verdict else {}),
+        **({"total": done.total.as_dict()} if done.total else {}),
+    }
+
+
+@dataclass(frozen=True)
+class Assumptions:
+    """Assumptions of a run beside its method: light, ranges of the scan's constants, and which poses are refined."""
+
+    light: LightOptions
+    uncertain: Uncertain = field(default_factory=Uncertain)
+    refine: PoseOptions | None = None
+
+
+def config_of(
+    scan: Scan,
+    prior: MaterialPrior,
+    method: dict[str, Any],
+    seed: int,
+    matter: MatterKind | Literal["auto"],
+    asked: Assumptions,
+) -> dict[str, Any]:
+    """Entries of config.json that determine a run; method: its table of options, with its `kind`."""
+    return {
+        "schema_version": SCHEMA,
+        "method": method,
+        "prior": prior.as_dict(),
+        "matter": matter,
+        "seed": seed,
+        "scan_hash": scan_hash(scan),
+        **to_table(asked),
+    }
+
+
+def write_run(
+    folder: RunFolder, done: Reconstruction, task: Task, fit: Running | None, entries: Mapping[str, Any]
+) -> None:
+    """Write object.h5, light.h5 where light is uneven, and summary.json with further `entries`.
+
+    fit: the last one, if there was any.
+    """
+    write_object(folder.object, done.object, folder.marks())
+    background = task.uneven and task.uneven.background
+    if background is not None or done.still is not None:
+        write_light(folder.light, background, done.still, folder.marks())
+    folder.write_summary(summary_of(done, fit, task.scan) | dict(entries) | {"light": task.light_in_words})
 
 
 @dataclass(frozen=True)
@@ -31,14 +184,14 @@ class Reconstruction:
     timing: seconds that each stage took
     finished: whether all stages came to their end
     choice: what was decided on the way, and which state `object` is
-    delta_told: whether prior or frames say what δ is; else β alone is known, and δ = β stands for it
+    delta_told: whether prior or frames determine δ; else β alone is known, and δ = β stands for it
     verdict: whether the training frames are explained; None for runs of versions that did not say
     total: the total δ by these frames, with its standard error; None likewise
     constants: what was known to a range only, or of continuous matter not at all, by the frames
     light: what is assumed of the light of other frames of the scan: smooth if that of the training frames is uneven
     geometry: where the frames were found to be; None: they are taken to be where the scan says
     still: [H, W] the light that all frames of the scan have in common, by those for training; None: there is none
-    rest: what is known of the shape of moving bodies at rest; None: nothing
+    rest: the shape of moving bodies at rest; None: unknown
     """
 
     object: Stored
@@ -59,7 +212,7 @@ class Reconstruction:
 
     @property
     def contents(self) -> Contents:
-        """What files of its volume hold: δ only where it is told."""
+        """The quantities in files of its volume: δ only where it is determined."""
         return Contents.of(self.delta_told, self.energy_kev)
 
     def _repr_html_(self) -> str:
@@ -74,3 +227,60 @@ class Reconstruction:
         """`scan`, as it was given to the reconstruction, at the distance and energy, or in the poses, that were
         found."""
         return placed(self.geometry.applied(scan) if self.geometry else scan, self.constants)
+
+
+LENGTH_UNIT = "um"
+
+
+def write_rest(folder: RunFolder, shape: TriangleMesh) -> None:
+    """Write the mesh `shape` [m]."""
+    write_mesh(folder.rest, shape, LENGTH_UNIT)
+
+
+def read_rest(folder: RunFolder, found: Stored, config: dict[str, Any]) -> Rest | None:
+    """What the run knows of the shape of its bodies `found` at rest; None where it knows nothing.
+
+    config: what config.json holds. Errors: `InputError` for a mesh that is not of these bodies, and other damage.
+    """
+    if not (isinstance(found, MovingSurfaces) and folder.rest.is_file()):
+        return None
+    with as_written(folder.config, "what track wrote"):
+        told = config["method"]["body"]  # None where red cells were found
+        stiffness = KnownBody.stiffness if told is None else float(told["stiffness"])
+    shape = read_meshes(folder.rest, LENGTH_UNIT)[0]
+    own = [found.body(k)[1].numpy() for k in range(found.count)]
+    fits = all(one.shape == shape.faces.shape and (one == shape.faces).all() for one in own)
+    require(fits, f"{folder.rest} must have the triangles of the run's bodies, but it has others; bring back its own.")
+    return Rest.of(shape, stiffness, found.unit_length)
+
+
+def instants_of(folder: RunFolder) -> list[float]:
+    """The times [s] of the frames that a run in motion was fitted to; empty for one that stands still."""
+    with as_written(folder.summary, "what track wrote"):
+        return [float(time) for time in read_json(folder.summary).get("times_s", ())]
+
+
+def chosen_frames(time_frame: int | Literal["all"] | None, times: list[float]) -> list[int]:
+    """Numbers of the instants that `time_frame` names; without one, the first. Errors: `InputError` for others."""
+    if time_frame == "all":
+        return list(range(len(times)))
+    frame = 0 if time_frame is None else time_frame
+    last = len(times) - 1
+    require(0 <= frame <= last, f"the run's instants are counted from 0 to {last}, but {frame} is asked for.")
+    return [frame]
+
+
+def reconstruction_at(done: Reconstruction, times: list[float], frame: int) -> Reconstruction:
+    """`done` as it is at the instant `frame` (0 is the first) of `times` [s]: matter that stands still.
+
+    Errors: `InputError` for an instant that the run does not have.
+    """
+    chosen_frames(frame, times)
+    assert isinstance(done.object, InMotion)
+    return replace(done, object=done.object.at(times[frame]))
+
+
+def with_time(scan: Scan, times: list[float], frame: int) -> Scan:
+    """A scan of one time, which says 0 of it, as of the instant `frame` of `times` [s]."""
+    exposures = replace(scan.exposures, time=[times[frame]] * len(scan))
+    return Scan.of(scan.source, exposures, scan.is_test, scan.provenance)

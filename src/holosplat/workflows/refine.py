@@ -16,7 +16,7 @@ from ..align.poses import PoseOptions
 from ..align.poses import Uncertain as Where
 from ..align.views import KINDS
 from ..checks import as_written, require
-from ..fit.freedom import Freedom
+from ..fit.pose_refinement import PoseRefinement
 from ..io.json import read_json, write_json
 from ..matter import MaterialPrior
 from ..methods.keeper import where
@@ -27,7 +27,7 @@ from ..scan import Scan
 from .provenance import scan_hash
 from .reconstruction import Reconstruction
 from .run_folder import RunFolder
-from .run_light import light_of
+from .run_illumination import light_of
 
 STILL = 1e-6
 """Changes [pixels, degrees, share] of the training frames below which their kind stays as planned for all frames."""
@@ -46,7 +46,7 @@ def require_compatible(ranges: Uncertain) -> None:
 def trained_geometry(
     scan: Scan, prior: MaterialPrior, options: PoseOptions, light: LightOptions, on_progress: Progress
 ) -> Geometry:
-    """Where the training frames of `scan` are, by themselves alone; held-out ones are as planned."""
+    """The poses of the training frames of `scan`, estimated from these alone; held-out ones are as planned."""
     found = align_views(scan.train(), prior, options, light=light, on_progress=on_progress)
     return Geometry.of_training(scan, found, options.uncertain)
 
@@ -66,7 +66,7 @@ def still_uncertain(geometry: Geometry, uncertain: Where) -> Where:
     return replace(uncertain, **{name: 0.0 for name in KINDS if not _moved(changes, KINDS[name])})
 
 
-def freedom_of(geometry: Geometry | None, options: PoseOptions | None) -> Freedom | None:
+def freedom_of(geometry: Geometry | None, options: PoseOptions | None) -> PoseRefinement | None:
     """What fits may still change of where the training frames are; None where nothing is refined."""
     if geometry is None or options is None:
         return None

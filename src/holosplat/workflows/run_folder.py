@@ -235,7 +235,7 @@ class RunFolder:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Keeps what a run has come to as checkpoint.pt of its folder: a `motion.journal.Journal`."""
+    """Keeps the state of a run as checkpoint.pt of its folder: a `motion.journal.Journal`."""
 
     folder: RunFolder
 

@@ -23,7 +23,7 @@ from ..scan import Scan
 from ..units import in_percent
 
 MOST_VIEWS = 16
-"""Views by which the total is told, at most, evenly chosen: beyond these it is shapes and voxels that are in doubt."""
+"""Most views for the total, evenly chosen: beyond these, errors of shapes and voxels dominate."""
 MOST_VOXELS = 1_000_000
 """Frames are binned rather than having more voxels than this: about 100 × 100 pixels, which takes seconds."""
 TOLD = 0.1

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import shutil
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -13,16 +12,12 @@ from ..checks import as_written, require
 from ..fit.residuals import Prediction
 from ..io.atomic import atomic_path
 from ..io.folder import atomic_folder
-from ..io.light import write_light
-from ..io.objects import write_object
 from ..io.pvd import TimeStep, write_pvd
 from ..io.vtk import write_mesh
 from ..matter import KnownTwo, MaterialPrior
 from ..methods import Task
 from ..methods.assumed import assumed_material
 from ..methods.illumination import prepared
-from ..methods.presets import SCHEMA
-from ..methods.uncertain import Uncertain
 from ..motion.elastic import Rest
 from ..motion.halves import standard_errors
 from ..motion.measures import columns, measured, row
@@ -33,15 +28,11 @@ from ..progress import FitProgress
 from ..representations import MovingSurfaces
 from ..scan import Scan
 from ..tables import read_rows, to_table
-from .choice import Choice
-from .provenance import environment, scan_hash
-from .reconstruction import Reconstruction
-from .rest_file import write_rest
-from .resume import goes_on
+from .preconditions import check_frames, goes_on
+from .provenance import environment
+from .reconstruction import Assumptions, Choice, Reconstruction, config_of, write_rest, write_run
 from .run_folder import Checkpoint, RunFolder, claimed
-from .run_light import found_in
-from .run_record import summary_of
-from .suitable import check_frames
+from .run_illumination import light_options_of
 from .verdict import judge
 
 LENGTH_UNIT = "um"
@@ -100,7 +91,8 @@ def track(
     require_times(scan.train())
     check_frames(scan.train())
     assumed = light or LightOptions()
-    config = _config(scan, prior, options, seed, assumed)
+    method = {"kind": options.kind, **to_table(options)}
+    config = config_of(scan, prior, method, seed, "levels", Assumptions(assumed))
     with claimed(folder):
         if folder is not None and not goes_on(folder, config, resume):
             folder.begin(config | environment("cpu"))
@@ -120,7 +112,7 @@ def track(
             Choice("levels", {}, "soft fit", found.begun, task.decisions),
             task.delta_told,
             judge(said, train, task.noise if task.uneven else None),
-            light=found_in(task),
+            light=light_options_of(task),
             rest=_rest(found),
         )
         if folder is not None:
@@ -143,33 +135,15 @@ def _more(found: Followed, scan: Scan) -> dict[str, np.ndarray]:
     return more | {f"{ERROR}{name}": values for name, values in errors.items()}
 
 
-def _config(scan: Scan, prior: MaterialPrior, options: TrackOptions, seed: int, light: LightOptions) -> dict[str, Any]:
-    """What config.json says the run is of."""
-    return {
-        "schema_version": SCHEMA,
-        "method": {"kind": options.kind, **to_table(options)},
-        "prior": prior.as_dict(),
-        "matter": "levels",
-        "seed": seed,
-        "scan_hash": scan_hash(scan),
-        "light": to_table(light),
-        "uncertain": to_table(Uncertain()),
-        "refine": None,
-    }
-
-
 def _write(folder: RunFolder, done: Reconstruction, found: Followed, task: Task) -> None:
-    """The object, the light, and what is said of the fits."""
+    """Write the object, the light, and the records and summary of the fits."""
     folder.start_metrics(dict.fromkeys(name for record in found.records for name in record))
     folder.append_metrics(found.records)
-    write_object(folder.object, found.bodies, folder.marks())
     if found.rest is not None:
         write_rest(folder, found.rest)
-    if task.uneven is not None and task.uneven.background is not None:
-        write_light(folder.light, task.uneven.background, marks=folder.marks())
     told = {"steps": len(found.records), "times_s": task.scan.instants.tolist(), "bodies": found.bodies.count}
-    told |= {"bodies_at_each_time": list(found.found), "light": task.light_in_words}
-    folder.write_summary(summary_of(done, None, task.scan) | told)
+    told |= {"bodies_at_each_time": list(found.found)}
+    write_run(folder, done, task, None, told)
 
 
 def read_errors(folder: RunFolder) -> dict[str, np.ndarray]:

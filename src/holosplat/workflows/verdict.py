@@ -11,10 +11,9 @@ import numpy as np
 import torch
 
 from ..checks import InputError
-from ..fit.causes import Cause, causes, scores
-from ..fit.residuals import Prediction, Residuals, residuals
+from ..fit.misfit_diagnosis import Cause, cause_scores, likely_causes
+from ..fit.residuals import Prediction, Residuals, residuals, split_validation
 from ..fit.running import Running
-from ..fit.validation import split_validation
 from ..methods import Task
 from ..model import LightField, Model, SolvedLight
 from ..optics.noise import noise_levels
@@ -113,7 +112,7 @@ LEAVES = (
     "frames of more rows, to where the matter ends."
 )
 NOTHING = "No matter was found: the frames are noise to within what is known of it, or matter is fainter than that."
-"""What is said of an empty object that explains its frames: right where nothing was in the beam, and else wrong."""
+"""The verdict on an empty object that explains its frames: right where nothing was in the beam, wrong otherwise."""
 OF_NOISE = "What the volume holds was fitted to noise."
 HELP = (
     "If something was in the beam, take more photons, join pixels (--bin), or give more of what is known (--material)."
@@ -124,7 +123,7 @@ that are looked at."""
 
 
 def judge(said: Prediction, frames: Scan, noise: NoiseModel | None = None) -> Verdict:
-    """The verdict on what is said of `frames`, whose exposures the prediction has; noise: None to estimate it."""
+    """The verdict on a prediction of `frames`, whose exposures the prediction has; noise: None to estimate it."""
     measured = torch.from_numpy(frames.frames)
     left = residuals(said, measured, (noise or _noise(measured)).power())
     found = verdict(left)
@@ -171,7 +170,7 @@ def _noise(frames: torch.Tensor) -> NoiseModel:
 def judge_run(found: Stored, fit: Running | None, task: Task, oversample: int) -> Verdict:
     """The verdict on the frames that were fitted, or on all training frames where nothing was.
 
-    Frames in uneven light are those that were evened; what air does not tell of the light counts as noise.
+    Frames in uneven light are flat-field corrected; the uncertainty of the light counts as noise.
     """
     said, fitted = said_of_run(found, fit, task, oversample)
     return judge(said, fitted, task.noise if task.uneven and said.light is None else None)
@@ -201,11 +200,11 @@ def verdict(found: Residuals) -> Verdict:
     counts, views = found.rings.counts, len(found.residual)
     over = found.residual.mean(axis=0) / found.allowed.mean(axis=0)
     limit = TOO_MUCH**2 * (1 + SCATTER * np.sqrt(2 / (counts * views)))
-    bad, single = np.flatnonzero(over > limit), scores(found)
+    bad, single = np.flatnonzero(over > limit), cause_scores(found)
     faults = [name for name, size in LARGE.items() if _is_fault(single[name], size)]
     good, cause = not len(bad) and not faults, next(iter(faults), "")
     if len(bad):
-        named = causes(found)
+        named = likely_causes(found)
         cause = named[0].name if named else STIFF
         reasons = _reasons(found, named, single)
         words = _unexplained(found, bad, over)

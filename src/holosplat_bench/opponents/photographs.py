@@ -14,15 +14,15 @@ from dataclasses import dataclass, field, replace
 from typing import ClassVar
 
 import torch
+from torch import Tensor
 
 from holosplat.checks import at_least, require
 from holosplat.fit.density import DensityControl, DensityEvent
 from holosplat.fit.loop import Fit, Plan, Stateless
-from holosplat.fit.optimiser import Adam
-from holosplat.fit.problem import Problem
+from holosplat.fit.optimiser import Adam, Trainable
+from holosplat.fit.problem import FIXED, Batch, LossPart, Problem
 from holosplat.fit.schedule import Schedule
 from holosplat.fit.terms import Objective
-from holosplat.fit.trainable import Trainable
 from holosplat.geometry import Grid
 from holosplat.matter import Matter
 from holosplat.methods.assumed import assumed_material
@@ -33,9 +33,10 @@ from holosplat.model import Instrument, Model
 from holosplat.optics.retrieval import paganin
 from holosplat.ranges import Rate, Share, ranged
 from holosplat.representations import Encoding, Network, Stored
+from holosplat.representations.neural_field import uniform
+from holosplat.scan import Scan
 
 from .photographed import AlphaCloud, RadianceField
-from .rays import RandomRays
 
 
 @dataclass(frozen=True)
@@ -246,3 +247,32 @@ class ReadDelta:
 
     def fit(self, task: Task, start: Stored) -> None:
         """There is none."""
+
+
+class RandomRays:
+    """Mean squared difference of intensities on rays drawn anew in every step (Mildenhall et al. 2020, eq. 6).
+
+    count: of all rays in a step, as many of each frame.
+    """
+
+    names = ("rays",)
+    resolved = FIXED
+
+    def __init__(self, train: Scan, count: int, generator: torch.Generator) -> None:
+        self._views, self._generator = train.views, generator
+        self._frames = torch.from_numpy(train.frames).flatten(1)
+        self._of_each = max(1, round(count / len(train)))
+
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
+        """The one part."""
+        field, generator = model.object, self._generator
+        assert isinstance(field, RadianceField)
+        positions, rays, measured = list[Tensor](), list[Tensor](), self._frames.new_zeros(0)
+        for v, frame in enumerate(self._frames):
+            chosen = (uniform(generator, self._of_each) * len(frame)).long().unique()
+            at, ray = field.along(self._views, v, chosen, generator)
+            positions.append(at)
+            rays.append(ray + len(measured))
+            measured = torch.cat((measured, frame[chosen]))
+        found = field.intensities(torch.cat(positions), torch.cat(rays), len(measured))
+        return [LossPart("rays", 1.0, (found - measured).square().mean())]

@@ -3,30 +3,100 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
+from torch.nn.functional import softplus
 
 from holosplat.backends import resolve
+from holosplat.checks import require
 from holosplat.fit.loop import DivergedError, Fit
 from holosplat.geometry import Grid, Views
 from holosplat.materials import WATER
 from holosplat.matter import Matter
+from holosplat.methods import finished
 from holosplat.methods.gaussians import gaussian_plan
 from holosplat.progress import FitProgress
-from holosplat.representations.gaussians import raw_of
+from holosplat.representations import GaussianCloud
+from holosplat.representations.gaussians import PARAMETERS, raw_of
 from holosplat.scan import Scan
+from holosplat.units import wavenumber
 from holosplat.version import source_commit
+from holosplat.volume import Object
+from holosplat.workflows.evaluate import score_object
 from holosplat.workflows.provenance import environment, scan_hash
 
-from . import looks
-from .cloud import DenseCloud
 from .configurations import THESIS_TABLE, Configuration, Pace, Recipe
 from .folder import CURVES, StudyFolder
 from .measured import Measured, mean_inside
+
+
+class DenseCloud(GaussianCloud):
+    """Gaussians of peak values d δ and d β: density d, δ and β are parameters each, all through softplus.
+
+    raw_densities [N, 1]: d before softplus, beside the parameters of `GaussianCloud`, whose raw_amplitudes are those of
+    δ and β, in the units of `matter`. d goes down alone when Gaussians are cloned or split, and says which are faint.
+    Errors: `InputError` if the arrays do not fit together.
+    """
+
+    names = (*PARAMETERS, "raw_densities")
+
+    def __init__(self, parameters: Iterable[Tensor], unit_length: float, matter: Matter) -> None:
+        *shared, self.raw_densities = parameters
+        super().__init__(shared, unit_length, matter)
+        shape = tuple(self.raw_densities.shape)
+        require(shape == (len(self), 1), f"raw_densities must have the shape ({len(self)}, 1), but they have {shape}.")
+
+    @property
+    def densities(self) -> Tensor:
+        """d [N, 1]."""
+        return softplus(self.raw_densities)
+
+    @property
+    def values(self) -> Tensor:
+        """δ and β [N, 2] of each Gaussian, in the units of the matter."""
+        return softplus(self.raw_amplitudes)
+
+    @property
+    def amplitudes(self) -> Tensor:
+        """Peak values d δ and d β [N, 2]."""
+        return self.densities * self.values
+
+    @property
+    def strength(self) -> Tensor:
+        """What says whether a Gaussian is faint, [N]: its density."""
+        return self.densities[:, 0]
+
+    def values_times(self, factor: float, index: Tensor) -> dict[str, Tensor]:
+        """The parameters of the Gaussians `index` whose density is `factor` times theirs, with δ and β as they are."""
+        weaker = raw_of(self.densities.detach()[index] * factor)
+        return {"raw_amplitudes": self.raw_amplitudes.detach()[index], "raw_densities": weaker}
+
+    def ratios(self) -> Tensor:
+        """δ/β [N] of each Gaussian, as its parameters have them."""
+        with torch.no_grad():
+            delta, beta = self.values.double().unbind(1)
+            smallest = torch.finfo(torch.float64).tiny
+            return self.matter.delta * delta / (self.matter.beta * beta).clamp_min(smallest)
+
+    def state(self) -> dict[str, Any]:
+        """Plain Gaussians with the same peak values, which files can hold."""
+        return self.plain().state()
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, Any]) -> GaussianCloud:  # type: ignore[override]
+        """The plain Gaussians that `state` described."""
+        return GaussianCloud.from_state(state)
+
+    def plain(self) -> GaussianCloud:
+        """Gaussians with the same peak values and no densities of their own."""
+        kept = [getattr(self, name).detach() for name in PARAMETERS[:3]]
+        return GaussianCloud([*kept, raw_of(self.amplitudes.detach())], self.unit_length, self.matter)
+
 
 START_DENSITY = 0.01
 """Mean density of the random start, in units of water: about what 16 cells fill of their channel."""
@@ -100,7 +170,7 @@ def run_configuration(
     except DivergedError as error:
         diverged = error.step
     folder.write_curves(name, watched.seen)
-    folder.write_maps(name, looks.maps(watched.lines, looks.geometry(watched.fit, measured), measured))
+    folder.write_maps(name, maps(watched.lines, geometry(watched.fit, measured), measured))
     folder.write_row(name, _row(configuration, watched, diverged))
 
 
@@ -137,9 +207,9 @@ class _Watched:
         self._look(before)
 
     def _look(self, before: int) -> None:
-        self.seen.append(looks.scores(self.fit, self._measured, self._loss))
-        if looks.due(self.fit.step, before, self.fit.schedule.steps):
-            self.lines.append((self.fit.step, looks.line_integrals(looks.cloud_of(self.fit), self._measured)))
+        self.seen.append(scores(self.fit, self._measured, self._loss))
+        if due(self.fit.step, before, self.fit.schedule.steps):
+            self.lines.append((self.fit.step, line_integrals(cloud_of(self.fit), self._measured)))
 
 
 def thesis_fit(train: Scan, start: DenseCloud, recipe: Recipe, seed: int) -> Fit:
@@ -193,3 +263,76 @@ def _plain(look: Mapping[str, float]) -> dict[str, float | None]:
     """A look as JSON holds it."""
     rounded = {key: float(f"{look[key]:.6g}") for key in CURVES}
     return {key: value if np.isfinite(value) else None for key, value in rounded.items()}
+
+
+SHOWN = (0.0, 0.04, 0.1, 0.25, 0.5, 1.0)
+"""Shares of the steps after which the line integrals are kept: the start, the warm-up behind it, the first
+densification, two on the way, and the end."""
+
+
+def scores(fit: Fit, measured: Measured, loss: float) -> dict[str, float]:
+    """All scores of the cloud as it is now; loss: that of the last step."""
+    cloud = cloud_of(fit)
+    found = score_object(cloud, measured.scan, measured.truth, fit.oversample)
+    assert found.test is not None
+    assert found.train is not None
+    assert found.volume is not None
+    delta, beta = mean_inside(cloud.voxelise(measured.truth.grid), measured.truth)
+    ratios = cloud.ratios()
+    return {
+        "step": fit.step,
+        "seconds": fit.seconds,
+        "count": len(cloud),
+        **{f"test_{score}": value for score, value in found.test.mean.items()},
+        **{f"train_{score}": value for score, value in found.train.mean.items()},
+        "loss": loss,
+        "dice": found.volume.dice,
+        "relative_error_delta": found.volume.relative_error_delta,
+        "mean_delta": delta,
+        "mean_beta": beta,
+        "ratio": delta / beta if beta > 0 else float("inf"),
+        "own_ratio": float(ratios.mean()) if len(cloud) else float("nan"),
+        "median_own_ratio": float(ratios.median()) if len(cloud) else float("nan"),
+    }
+
+
+def line_integrals(obj: Object, measured: Measured) -> torch.Tensor:
+    """k ∫δ and k ∫β [2, H, W] of `obj` in the first held-out view, float32: phase shift, and half the absorbance."""
+    exposures = measured.scan.test().exposures[np.array([0])]
+    with torch.no_grad():
+        beta, delta = obj.project(exposures.views)
+    return (float(wavenumber(exposures.energy_kev)[0]) * torch.cat((delta, beta))).float()
+
+
+def geometry(fit: Fit, measured: Measured) -> dict[str, np.ndarray]:
+    """A slice of δ through the middle of the field, and that of the truth [Y, X]."""
+    cloud, grid = cloud_of(fit), measured.truth.grid
+    middle = grid.shape[0] // 2
+    return {
+        "slice": cloud.voxelise(grid).delta[middle].astype(np.float32),
+        "true_slice": measured.truth.delta[middle].astype(np.float32),
+    }
+
+
+def maps(
+    taken: Sequence[tuple[int, torch.Tensor]], shapes: dict[str, np.ndarray], measured: Measured
+) -> dict[str, np.ndarray]:
+    """What NAME.maps.npz holds: `steps` [K] and `lines` [K, 2, H, W] of `taken`, `true_lines`, and the geometry."""
+    return {
+        "steps": np.array([step for step, _ in taken]),
+        "lines": torch.stack([lines for _, lines in taken]).numpy(),
+        "true_lines": line_integrals(measured.scene, measured).numpy(),
+        **shapes,
+    }
+
+
+def due(step: int, before: int, steps: int) -> bool:
+    """Whether one of the `SHOWN` shares of `steps` lies behind `before` and not behind `step`."""
+    return any(before < share * steps <= step for share in SHOWN)
+
+
+def cloud_of(fit: Fit) -> DenseCloud:
+    """The cloud as it is now, in main memory."""
+    cloud = finished(fit)
+    assert isinstance(cloud, DenseCloud)
+    return cloud

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from holosplat.geometry import Views
-from holosplat_bench.opponents.compositing import DILATION, composite, photograph
+from holosplat_bench.opponents.photographed import DILATION, composite, photograph
 
 SHAPE = (9, 13)
 

@@ -10,7 +10,7 @@ import torch
 
 import holosplat as hs
 from helpers.contract import MATERIAL, two_balls
-from holosplat.fit.causes import scores
+from holosplat.fit.misfit_diagnosis import cause_scores
 from holosplat.fit.residuals import Prediction, residuals
 from holosplat.matter import Matter
 from holosplat.methods import Task
@@ -70,7 +70,7 @@ def test_wave_optics_explains_nothing_of_photographs(scan):
     moved = replace(views, shifts=views.shifts + np.array([0.3 * views.pitch, 0.0]))
     noise = torch.tensor(1e-9).expand(len(scan), views.shape[0], views.shape[1] // 2 + 1)
     found = residuals(Prediction(seen, scan.exposures, 1), seen.photographs(moved).detach(), noise)
-    cause = scores(found)
+    cause = cause_scores(found)
     assert [cause[name].gain for name in ("mass", "absorption", "distance", "blur")] == [0.0] * 4
     assert cause["shift_x"].value[0] == pytest.approx(0.3, rel=0.1)
 

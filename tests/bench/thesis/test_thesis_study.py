@@ -20,8 +20,7 @@ from holosplat_bench.thesis.findings import findings
 from holosplat_bench.thesis.folder import CURVES, StudyFolder, load_study
 from holosplat_bench.thesis.measured import Measured
 from holosplat_bench.thesis.pages import page as report
-from holosplat_bench.thesis.pages.figures import LINES, PICTURES, pictures
-from holosplat_bench.thesis.pages.page import study_markdown, write_study
+from holosplat_bench.thesis.pages.page import LINES, PICTURES, pictures, study_markdown, write_study
 from holosplat_bench.thesis.study import run_study
 
 SMALL = replace(THESIS_TABLE[1], count=60, threshold=1.0, amplitude_rate=0.1)

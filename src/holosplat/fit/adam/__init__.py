@@ -40,7 +40,7 @@ def step(
     """One step on K arrays, in place: `parameter -= factors[k] · first / (√second + factors[-1])`.
 
     Before that, `first` and `second`, the running means, move towards the gradient (by 0.1 of the way) and its square
-    (by 0.001). The arrays of one k have one shape, and are contiguous but for the gradients; factors: [K + 1], of
+    (by 0.001). The arrays of one k have one shape, and are contiguous, except the gradients; factors: [K + 1], of
     the function of that name. Errors: `InputError` if the arrays do not fit together, or the backend.
     """
     groups = (parameters, gradients, first, second)

@@ -34,7 +34,7 @@ def statistics(frames: Tensor, low: float, span: float) -> Tensor:
 def l1_and_ssim(
     predicted: Tensor, frames: Tensor, statistics: Tensor, low: float, span: float
 ) -> tuple[Tensor, Tensor]:
-    """Mean absolute difference [V] and 1 - SSIM [V] of predicted and measured frames [V, H, W], mapped likewise.
+    """Mean absolute difference [V] and 1 - SSIM [V] of predicted and measured frames [V, H, W], in the same mapping.
 
     `statistics` are those of `frames`; gradients are of `predicted` alone.
     """

@@ -7,8 +7,7 @@ from collections.abc import Callable
 from ...model import Model
 from ...scan import Scan
 from ..problem import Term
-from .frames import FrameTerm
-from .geometry import alignment_prior, light_prior
+from .frames import FrameTerm, alignment_prior, light_prior
 from .object import Anisotropy, VolumeTerm
 from .objective import Objective
 

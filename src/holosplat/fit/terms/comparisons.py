@@ -20,8 +20,8 @@ def l1(predicted: Tensor, measured: Tensor) -> Tensor:
 def huber(predicted: Tensor, measured: Tensor, width: Tensor) -> Tensor:
     """Mean of Huber's function of the difference in each view: [V, H, W] → [V], width [V, H, W] > 0.
 
-    `|z| - w/2`, and `z²/2w` where `|z| < w` (Huber 1964, eq. 1.3, over w): the absolute difference, but for what may be
-    noise.
+    `|z| - w/2`, and `z²/2w` where `|z| < w` (Huber 1964, eq. 1.3, over w): the absolute difference, squared where
+    it may be noise.
     """
     size = (predicted - measured).abs()
     short = torch.minimum(size, width)

@@ -24,8 +24,7 @@ from ...representations import SpaceTimeField
 from ...representations.neural_field import uniform
 from ...representations.perceptron import Jet
 from ...representations.space_time import Frame
-from ..batch import Batch
-from ..problem import Part
+from ..problem import Batch, LossPart
 from ..total_variation import total_variation
 
 
@@ -93,7 +92,7 @@ class EquationTerm:
         self.names = tuple(self._weights)
         self.resolved = dict(self._weights)
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The parts in use; a velocity without divergence by construction has none of that name."""
         field = model.object
         assert isinstance(field, SpaceTimeField)
@@ -105,7 +104,7 @@ class EquationTerm:
             left = momentum(flow, pressure, self._equations.reynolds(field.frame))
             values["momentum"] = (step * field.edges * left).square().sum(-1).mean()
         size = float(field.coefficients.new_tensor(field.grid.shape).prod())
-        return [Part(name, self._weights[name], size * values[name]) for name in self.names if name in values]
+        return [LossPart(name, self._weights[name], size * values[name]) for name in self.names if name in values]
 
     def _moving(self, field: SpaceTimeField, step: float) -> dict[str, Tensor]:
         """Mean squares of what continuity leaves, and of the divergence where there can be one."""
@@ -144,11 +143,11 @@ class SpaceTimeVariation:
         self._weight, self._smoothing, self._times, self._generator = weight, smoothing, times, generator
         self.resolved = {"variation": weight}
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The one part."""
         field = model.object
         assert isinstance(field, SpaceTimeField)
         drawn = min(int(float(uniform(self._generator, 1)) * len(self._times)), len(self._times) - 1)
         values = field.values(self._times[drawn])
         total = total_variation(values[None], self._smoothing, "cpu") * values.numel()
-        return [Part("variation", self._weight, total)]
+        return [LossPart("variation", self._weight, total)]

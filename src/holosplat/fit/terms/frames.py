@@ -1,24 +1,85 @@
-"""The data term: how far predicted frames are from measured ones, by the weights of an `Objective`."""
+"""The data term: differences of predicted and measured frames, weighted by an `Objective`; priors of poses, light."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from ...checks import InputError, require
 from ...matter import Matter
 from ...model import Instrument, Model
 from ...optics.detector import blur
-from ...optics.noise import noise_levels, noise_share, sure_noise
-from ...scan import Scan
-from ..batch import Batch
+from ...optics.noise import noise_level, noise_levels, noise_share, sure_noise
+from ...optics.retrieval.spectra import sensitivity
+from ...scan import Exposures, Scan
+from ...units import wavelength, wavenumber
 from ..fidelity import Target, l1_and_ssim
-from ..problem import Part
+from ..problem import FIXED, Batch, LossPart, Term
 from . import comparisons
 from .objective import IMAGE_TERMS, Objective
-from .spectral import SpectralMisfit
+
+DARKEST = 1e-12
+"""Smallest intensity whose root is taken: the slope of √I has a pole at zero."""
+NOISE_FLOOR = 5.0
+"""What the floor rises by for every pixel of thickness that the noise amounts to."""
+
+
+class SpectralMisfit:
+    """½ Σ (r, W r) over the pixels of each view, with `r = (√I - √I₀) / (k p |δ| s)` and I from the full wave model.
+
+    Amplitudes √I have the same noise everywhere (Godard et al. 2012, eq. 9). A pixel of thickness p of the material
+    changes them by up to k p |δ| s, so r is a thickness in pixels; δ, β: of the first material of `matter`; s: 1 where
+    fringes are seen, else less (`optics.retrieval.spectra.sensitivity`). W divides the spectrum by `H² + f²`: H s =
+    sin χ + (β/δ) cos χ is the linear response of single views (Cloetens et al. 1999, eq. 3; χ = πλz f²) up to its first
+    maximum, and H = 1/s beyond. Without W, shapes larger than some fringes hardly count. The smaller f, the larger the
+    shapes that are fitted, and the more of the noise: f is `floor` and more where frames are noisy. Errors:
+    `InputError` for matter whose δ is zero.
+    """
+
+    def __init__(self, train: Scan, instrument: Instrument, matter: Matter, floor: float) -> None:
+        require(matter.delta != 0, "a spectral misfit needs a material with a δ, but it is 0.")
+        on, exposures = instrument.device, train.exposures
+        ratio = matter.beta / matter.delta
+        strongest = sensitivity(exposures, ratio)
+        delta = exposures.refraction(abs(matter.delta), 0.0)[0]
+        phase = wavenumber(exposures.energy_kev) * delta * train.views.finest
+        unit = phase * strongest
+        self._unit = torch.from_numpy(unit).float()[:, None, None].to(on)
+        self._amplitudes = torch.from_numpy(train.frames).clamp_min(0).sqrt().to(on)
+        response = linear_response(exposures, ratio) / torch.from_numpy(strongest)[:, None, None]
+        self.noise = noise_level(self._amplitudes) / float(unit.mean())
+        """Standard deviation of r that the noise of the measured frames gives [pixels of thickness]."""
+        self.floor = floor + NOISE_FLOOR * self.noise
+        """f, which noise has raised."""
+        self._weights = (1 / (response**2 + self.floor**2)).float().to(on)
+
+    def __call__(self, frames: Tensor, index: Tensor | None = None) -> Tensor:
+        """Misfits [V] of predicted frames [V, H, W] of all views, or of the views `index` [V]."""
+        measured, weights, unit = self._amplitudes, self._weights, self._unit
+        if index is not None:
+            measured, weights, unit = measured[index], weights[index], unit[index]
+        residual = (frames.clamp_min(DARKEST).sqrt() - measured) / unit
+        shape = (residual.shape[-2], residual.shape[-1])
+        weighted = torch.fft.irfft2(torch.fft.rfft2(residual) * weights, s=shape)
+        return 0.5 * (residual * weighted).sum(dim=(1, 2))
+
+
+def linear_response(exposures: Exposures, absorption: float) -> Tensor:
+    """|H| [V, H, W//2 + 1] for `rfft2`, float64, of a thin object with β/δ = `absorption` at the reference energy;
+    1 beyond its maximum."""
+    exposures = exposures.optical
+    views = exposures.views
+    fy, fx = np.fft.fftfreq(views.shape[0], views.pixel_size), np.fft.rfftfreq(views.shape[1], views.pixel_size)
+    reach = (wavelength(exposures.energy_kev) * exposures.distance)[:, None, None]
+    chi = np.pi * reach * (fy[:, None] ** 2 + fx**2)
+    delta, beta = (values[:, None, None] for values in exposures.refraction(1.0, absorption))
+    response = np.abs(np.sin(chi) + beta / delta * np.cos(chi))
+    return torch.from_numpy(np.where(chi < 0.5 * np.pi, response, 1.0))
+
 
 DARK = 0.05
 """Relative intensity below which noise falls no further."""
@@ -62,8 +123,8 @@ class FrameTerm:
         self._rounding = max(SMALLEST_ROUNDING, objective.rounding * noise)
         self.spectral = SpectralMisfit(train, instrument, matter, objective.floor) if objective.spectral > 0 else None
         self.resolved = self._resolved(coarse if self._blur else 0.0)
-        """What the frames make of the objective's options: `coarse` [pixels], `noise_width` (its mean over the pixels)
-        and `rounding` in units of the frames' range, `floor`."""
+        """The objective's options as the frames determine them: `coarse` [pixels], `noise_width` (its mean over the
+        pixels) and `rounding` in units of the frames' range, `floor`."""
 
     def _resolved(self, coarse: float) -> dict[str, float]:
         w, found = self.objective, dict[str, float]()
@@ -75,15 +136,15 @@ class FrameTerm:
             found["rounding"] = self._rounding
         return found if self.spectral is None else found | {"floor": self.spectral.floor}
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The loss of the frames, and the comparisons that it is made of."""
         parts = self.compared(model.frames(batch.index), batch)
         per_view = sum(weight * value for weight, value in parts.values())
         assert isinstance(per_view, Tensor)
         if self._detach_worst and len(per_view) > 1:
             per_view = torch.where(per_view > per_view.detach().median(), per_view.detach(), per_view)
-        shown = [Part(name, None, value.detach().mean()) for name, (_, value) in parts.items()]
-        return [Part("frames", 1.0, per_view.mean()), *shown]
+        shown = [LossPart(name, None, value.detach().mean()) for name, (_, value) in parts.items()]
+        return [LossPart("frames", 1.0, per_view.mean()), *shown]
 
     def compared(self, predicted: Tensor, batch: Batch) -> dict[str, Weighted]:
         """Weight and value [V] of every comparison in use."""
@@ -142,3 +203,45 @@ def photon_noise(frames: Tensor) -> Tensor:
     The frames' own noise is that of their quiet parts, where the intensity is about 1, and goes with its root.
     """
     return sure_noise(frames).to(frames)[:, None, None] * frames.clamp_min(DARK).sqrt()
+
+
+class Quadratic:
+    """Half the sum of squares of a model's parameters, each in units of how far off it is expected to be."""
+
+    def __init__(self, name: str, weight: float, expected: dict[str, float]) -> None:
+        """expected: standard deviation of each parameter by the name `part.parameter`."""
+        self.names, self.resolved = (name,), FIXED
+        self._weight, self._expected = weight, expected
+
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
+        """The one part."""
+        parameters = model.parameters()
+        squares = [(parameters[name] / deviation).square().sum() for name, deviation in self._expected.items()]
+        return [LossPart(self.names[0], self._weight, 0.5 * torch.stack([s.to(torch.float32) for s in squares]).sum())]
+
+
+EXPECTED = {
+    "alignment.turns": 0.01,
+    "alignment.shifts": 1.0,
+    "alignment.stretches": 0.02,
+    "alignment.blurs": 0.5,
+    "light.coefficients": 0.02,
+}
+"""Standard deviations where nobody says otherwise: [rad], [pixels], share of the distance, [pixels], share of light."""
+
+
+def alignment_prior(weight: float, model: Model, train: Scan) -> Term:
+    """Poses, distances and blurs near to the plan; `InputError` for a model without alignment."""
+    return _quadratic("alignment_prior", "alignment.", weight, model.parameters())
+
+
+def light_prior(weight: float, model: Model, train: Scan) -> Term:
+    """Light that is nearly even; `InputError` for a model without a light field."""
+    return _quadratic("light_prior", "light.", weight, model.parameters())
+
+
+def _quadratic(name: str, prefix: str, weight: float, parameters: dict[str, Tensor]) -> Quadratic:
+    own = {key: EXPECTED[key] for key in parameters if key.startswith(prefix)}
+    if not own:
+        raise InputError(f"the term {name} needs a model with {prefix}*, but it has {', '.join(parameters)}.")
+    return Quadratic(name, weight, own)

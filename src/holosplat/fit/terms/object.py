@@ -8,23 +8,21 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, diags_array
 from torch import Tensor
 
 from ...backends import device
 from ...geometry import Grid
 from ...model import Model
 from ...representations import GaussianCloud
-from ..batch import Batch
-from ..neighbours import Neighbours
-from ..problem import Part
+from ..problem import FIXED, Batch, LossPart
 from ..total_variation import total_variation
 from . import comparisons
 from .objective import Objective
 
 DEPTH, VIEWS = 100.0, 8.0
-"""Voxels along the beam, and views, for which the weights of the terms on the volume are meant. Few views leave more
-to what is known of the volume; the weights go with one over the root of their number."""
+"""Voxels along the beam, and views, for which the weights of the terms on the volume are meant. Few views give
+the prior of the volume more weight; the weights go with one over the root of their number."""
 
 
 class VolumeTerm:
@@ -47,7 +45,7 @@ class VolumeTerm:
         self.resolved = {name: self._scale * weight for name, weight in self._weights.items()}
         """The weights, after noise and the number of views, of sums along the beam in voxels."""
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The parts in use, where the batch looks at the volume."""
         if not (batch.volume and self._weights):
             return []
@@ -61,7 +59,7 @@ class VolumeTerm:
         }
         ramps = {"two_levels": batch.progress}
         return [
-            Part(name, batch.volume * weight * ramps.get(name, 1.0), self._scale * values[name]())
+            LossPart(name, batch.volume * weight * ramps.get(name, 1.0), self._scale * values[name]())
             for name, weight in self._weights.items()
         ]
 
@@ -70,15 +68,16 @@ class Anisotropy:
     """Gaussians longer than `limit` times their shortest axis."""
 
     names = ("anisotropy",)
+    resolved = FIXED
 
     def __init__(self, weight: float, limit: float) -> None:
         self._weight, self._limit = weight, limit
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The one part."""
         cloud = model.object
         assert isinstance(cloud, GaussianCloud)
-        return [Part("anisotropy", self._weight, comparisons.anisotropy(cloud.log_scales, self._limit))]
+        return [LossPart("anisotropy", self._weight, comparisons.anisotropy(cloud.log_scales, self._limit))]
 
 
 class Bending:
@@ -93,10 +92,10 @@ class Bending:
         self._weight = weight
         self.resolved = {"bending": weight}
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The one part."""
         vertices = model.parameters()["object.vertices"]
-        return [Part("bending", self._weight, squared_product(vertices, *self._operators))]
+        return [LossPart("bending", self._weight, squared_product(vertices, *self._operators))]
 
 
 def squared_product(x: Tensor, matrix: csr_array | Neighbours, transposed: csr_array | Neighbours) -> Tensor:
@@ -135,7 +134,65 @@ class VoxelVariation:
         self._weight, self._smoothing = weight, smoothing
         self.resolved = {"variation": weight}
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The one part."""
         values = model.parameters()["object.values"]
-        return [Part("variation", self._weight, total_variation(values, self._smoothing, "cpu") * values.numel())]
+        return [LossPart("variation", self._weight, total_variation(values, self._smoothing, "cpu") * values.numel())]
+
+
+class Neighbours:
+    """A sparse matrix [P, Q] float64 as lists of equal length: every row's columns and weights, padded with zeros.
+
+    On a device where rows are short and alike in length, as of neighbours on a mesh.
+    """
+
+    def __init__(self, matrix: csr_array, on: torch.device) -> None:
+        """on: where it multiplies."""
+        counts = np.diff(matrix.indptr)
+        there = np.arange(counts.max(initial=0)) < counts[:, None]
+        columns, weights = np.zeros(there.shape, dtype=np.int64), np.zeros(there.shape)
+        columns[there], weights[there] = matrix.indices, matrix.data
+        self._columns, self._weights = torch.from_numpy(columns).to(on), torch.from_numpy(weights).to(on)
+
+    def __matmul__(self, x: Tensor) -> Tensor:
+        """The product [P, C] with x [Q, C] float64 on the same device; nothing waits for it."""
+        found = x.index_select(0, self._columns.flatten()).reshape(*self._columns.shape, x.shape[1])
+        return (self._weights[..., None] * found).sum(1)
+
+
+def membrane_inverse(
+    edges: csr_array, stiffness: float, on: torch.device, error: float = 1e-9
+) -> Callable[[Tensor], Tensor]:
+    """The inverse of 1 + λΔ, Δ = D - W, for x [P, C] float64 on a device, by a fixed number of products.
+
+    edges: W [P, P], symmetric, not negative; D: its rows' sums; stiffness: λ; error: of what is found, relative, in the
+    norm of the diagonal M = 1 + λD.
+
+    Chebyshev's iteration (Saad 2003, "Iterative Methods for Sparse Linear Systems", section 12.3) with the
+    preconditioner M: the eigenvalues of λ M⁻¹W lie between -ρ and ρ = 1 - 1/(1 + λ d), d the largest in D, so that
+    those of M⁻¹(1 + λΔ) lie around 1, and n steps leave less than 1/T_n(1/ρ) of the error, T_n Chebyshev's polynomial.
+    """
+    sums = edges.sum(1)
+    diagonal = 1 + stiffness * sums
+    reach = 1 - 1 / float(diagonal.max())
+    step = Neighbours(csr_array(diags_array(stiffness / diagonal) @ edges), on)
+    inverse = torch.from_numpy(1 / diagonal).to(on)[:, None]
+    weights = _weights(reach, math.ceil(math.acosh(1 / error) / math.acosh(1 / reach)) if reach > 0 else 1)
+
+    def solve(x: Tensor) -> Tensor:
+        start = inverse * x
+        before, found = torch.zeros_like(start), start
+        for weight in weights:
+            before, found = found, torch.lerp(before, torch.add(start, step @ found), weight)
+        return found
+
+    return solve
+
+
+def _weights(reach: float, steps: int) -> list[float]:
+    """What each step but the first, which is Jacobi's, takes of Jacobi's next one; the rest is that before the last."""
+    found, last = list[float](), 2.0
+    for _ in range(steps - 1):
+        last = 1 / (1 - 0.25 * reach**2 * last)
+        found.append(last)
+    return found

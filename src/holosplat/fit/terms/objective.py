@@ -36,7 +36,7 @@ class Objective:
     rounded: float = 0.0
     """`√(r² + c²) - c` of the differences r, smooth where they may be noise."""
     spectral: float = 0.0
-    """Differences of amplitudes in pixels of thickness, low frequencies raised (`fit.terms.spectral`)."""
+    """Differences of amplitudes in pixels of thickness, low frequencies raised (`fit.terms.frames`)."""
     frc_ramp: Share = 1.0
     """Share of the steps over which the weight of `frc` is ramped."""
     noise_width: float = 0.0

@@ -70,7 +70,7 @@ class OpticalPath:
 
         Float64 tensors on the path's device, whose gradients the frames give; None: as they are. A width's gradient is
         zero at 0 exactly, since frames depend on its square: start a fit of widths above 0. Nothing waits for the
-        device. Errors: `InputError` if there is not one number a view.
+        device. Errors: `InputError` if there are fewer or more numbers than views.
         """
         path, wanted = self, (len(self),)
         for name, given in (("distance", distance), ("psf_sigma", psf_sigma)):
@@ -113,9 +113,8 @@ def optical_path(
     """The path of V exposures: distance [V] in metres, psf_sigma [V] in samples of `pitch` [m], on `raster` [H, W].
 
     energy_kev: photon energy [keV], one or [V]; frame: (rows, columns) of the frame, its margin (y, x) in samples, and
-    the samples along a pixel's edge. Distances and widths that are tensors (float64, on the device where the path is
-    wanted) pass gradients on, as `OpticalPath.corrected` says. Widths in an array that are all zero make a path
-    without blur.
+    the samples along a pixel's edge. Distances and widths that are tensors (float64, on the device of the path) pass
+    gradients on, as `OpticalPath.corrected` says. Widths in an array that are all zero make a path without blur.
     """
     tensors = [x for x in (distance, psf_sigma) if isinstance(x, Tensor)]
     on = tensors[0].device if tensors else torch.device("cpu")

@@ -3,18 +3,30 @@
 from __future__ import annotations
 
 import math
+import warnings
 from dataclasses import dataclass, field
 from functools import lru_cache
 
 import numpy as np
 import scipy.sparse
 import torch
+from scipy.sparse import csr_array, csr_matrix
 from torch import Tensor
 
 from ...backends import device, implementation
 from ...checks import require
 from ...geometry import Grid, Views
-from ..sparse import torch_csr
+
+
+def torch_csr(matrix: csr_matrix | csr_array, dtype: torch.dtype) -> Tensor:
+    """The same matrix as a CSR tensor of `dtype`, its columns sorted within each row."""
+    matrix.sort_indices()
+    starts, columns = (torch.from_numpy(a.astype(np.int64)) for a in (matrix.indptr, matrix.indices))
+    with warnings.catch_warnings():  # torch calls its CSR support beta
+        warnings.simplefilter("ignore")
+        values = torch.from_numpy(matrix.data).to(dtype)
+        return torch.sparse_csr_tensor(starts, columns, values, size=matrix.shape, check_invariants=True)
+
 
 SMALL = 1 << 16
 """Voxels of a slice times views, at most, of matrices that are kept: about 2 MB each."""

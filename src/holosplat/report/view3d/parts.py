@@ -36,7 +36,7 @@ until it does."""
 
 
 @dataclass(frozen=True)
-class Part:
+class ViewPart:
     """The representation of one object in the view.
 
     kind: `gaussians`, `surfaces`, `paths` or `volume`; arrays: by name; facts: what brings them back, as JSON holds it;
@@ -49,7 +49,7 @@ class Part:
     channels: tuple[tuple[float, float], ...] = field(default=())
 
 
-def part_of(obj: Stored, volume: Volume, pixel: float, times: np.ndarray | None = None) -> Part:
+def part_of(obj: Stored, volume: Volume, pixel: float, times: np.ndarray | None = None) -> ViewPart:
     """What stands for `obj`, exactly where the page can hold it, else by its `volume`.
 
     pixel: of the raster [m]; times: [T] at which something that moves is shown [s].
@@ -63,7 +63,7 @@ def part_of(obj: Stored, volume: Volume, pixel: float, times: np.ndarray | None 
     return volume_part(volume, pixel, VOLUME_BYTES)
 
 
-def volume_part(volume: Volume, pixel: float, most_bytes: int) -> Part:
+def volume_part(volume: Volume, pixel: float, most_bytes: int) -> ViewPart:
     """δ and β of a volume, binned until it takes at most `most_bytes` compressed."""
     found = _voxels(volume, pixel)
     for factor in range(2, max(volume.grid.shape)):
@@ -73,14 +73,14 @@ def volume_part(volume: Volume, pixel: float, most_bytes: int) -> Part:
     return found
 
 
-def _voxels(volume: Volume, pixel: float) -> Part:
+def _voxels(volume: Volume, pixel: float) -> ViewPart:
     """δ and β of a volume; β as its least-squares share of δ where it is one, so that one channel does."""
     share = _share(volume)
     values = [volume.delta] if share is not None else [volume.delta, volume.beta]
     stored = [_in_bits(np.asarray(v, dtype=np.float64), 8) for v in values]
     channels = ((1.0, share),) if share is not None else ((1.0, 0.0), (0.0, 1.0))
     grid = volume.grid
-    return Part(
+    return ViewPart(
         "volume",
         {"values": np.stack([bits for bits, _, _ in stored])},
         {
@@ -113,7 +113,7 @@ def _share(volume: Volume) -> float | None:
     return share if np.abs(beta - share * delta).max(initial=0.0) <= 1e-3 * np.abs(beta).max(initial=0.0) else None
 
 
-def _gaussians(cloud: GaussianCloud, pixel: float) -> Part | None:
+def _gaussians(cloud: GaussianCloud, pixel: float) -> ViewPart | None:
     """Gaussians without those that are too faint together to matter; None if they are still too many."""
     with torch.no_grad():
         mass = cloud.masses().abs().sum(dim=1).double().numpy()
@@ -131,17 +131,17 @@ def _gaussians(cloud: GaussianCloud, pixel: float) -> Part | None:
             "quaternions": np.rint(32767 * turned.numpy()[kept]).astype(np.int16),
             "amplitudes": cloud.amplitudes.numpy()[kept].astype(np.float16),
         }
-    return Part("gaussians", arrays, {"low": low, "step": step, "count": len(kept)}, _channels(cloud.matter))
+    return ViewPart("gaussians", arrays, {"low": low, "step": step, "count": len(kept)}, _channels(cloud.matter))
 
 
-def _surfaces(obj: SurfaceMesh, pixel: float) -> Part:
+def _surfaces(obj: SurfaceMesh, pixel: float) -> ViewPart:
     vertices = obj.vertices.detach().double().numpy() * (obj.unit_length / pixel)
     bits, low, step = _in_bits(vertices, 16)
     arrays = {"vertices": bits, "faces": _small(obj.faces.numpy())}
-    return Part("surfaces", arrays, {"low": low, "step": step}, _channels(obj.matter))
+    return ViewPart("surfaces", arrays, {"low": low, "step": step}, _channels(obj.matter))
 
 
-def _paths(obj: MovingSurfaces, pixel: float, times: np.ndarray) -> Part:
+def _paths(obj: MovingSurfaces, pixel: float, times: np.ndarray) -> ViewPart:
     coefficients = obj.coefficients.detach().double().numpy() * (obj.unit_length / pixel)
     bits, low, step = _in_bits(coefficients, 16)
     shown = np.linspace(times[0], times[-1], min(MOST_TIMES, 4 * len(times) - 3))
@@ -151,7 +151,7 @@ def _paths(obj: MovingSurfaces, pixel: float, times: np.ndarray) -> Part:
         "weights": obj.basis.weights(shown).astype(np.float32),
     }
     facts = {"low": low, "step": step, "paths": len(bits), "times_us": [round(1e6 * t, 4) for t in shown]}
-    return Part("paths", arrays, facts, _channels(obj.matter))
+    return ViewPart("paths", arrays, facts, _channels(obj.matter))
 
 
 def _channels(matter: Matter) -> tuple[tuple[float, float], ...]:

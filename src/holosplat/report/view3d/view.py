@@ -18,7 +18,7 @@ from markupsafe import Markup
 from ...geometry import Views
 from ...scan import Exposures
 from ...units import wavenumber
-from .parts import Part
+from .parts import ViewPart
 
 MOST_COLUMNS = 320
 """Raster pixels along the longer edge of the view's frame."""
@@ -38,8 +38,8 @@ class View3D:
     absorption, at which colours end; picture: the first view as a `data:` URI, where WebGL is missing.
     """
 
-    parts: Mapping[str, Part]
-    slices: Mapping[str, Part]
+    parts: Mapping[str, ViewPart]
+    slices: Mapping[str, ViewPart]
     exposures: Exposures
     views: Views
     labels: tuple[str, ...]
@@ -74,7 +74,7 @@ def packed(view: View3D) -> tuple[dict[str, Any], bytes]:
     """What describes the arrays, and their bytes, each aligned to four."""
     blob = bytearray()
 
-    def described(part: Part) -> dict[str, Any]:
+    def described(part: ViewPart) -> dict[str, Any]:
         arrays = {}
         for name, array in part.arrays.items():
             blob.extend(b"\0" * (-len(blob) % 4))

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from .deformed import Deformed
+from .deformed_voxels import Deformed
 from .each_time import EachTime, Snapshots, each_time
-from .hexplane import HexPlane
-from .low_rank import LowRank
+from .hexplane_field import HexPlane, LowRank
 from .space_time_tv import SpaceTimeFit, SpaceTimeTV
 from .through_waves import TimesFit
 

@@ -11,8 +11,7 @@ import torch
 from torch import Tensor
 
 from holosplat.checks import at_least, require
-from holosplat.fit.batch import Batch
-from holosplat.fit.problem import Part
+from holosplat.fit.problem import Batch, LossPart
 from holosplat.fit.terms.frames import FrameTerm
 from holosplat.fit.total_variation import total_variation
 from holosplat.model import Model
@@ -95,7 +94,7 @@ class SomeTimes:
         self.names = (*frames.names, *(cost.name for cost in costs))
         self.resolved = {**frames.resolved, **{cost.name: cost.weight for cost in costs}}
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The parts of the loss."""
         first, end = self._drawn.among(len(self._times), float(batch.progress))
         order = torch.randperm(end - first, generator=self._generator)[: self._drawn.count]
@@ -105,7 +104,7 @@ class SomeTimes:
         part = replace(batch, index=index)
         found = list(self._frames(replace(model, object=_Seen(model.object, seen)), part))
         values = [cost(model.object, list(seen.items())) for cost in self._costs]
-        return [*found, *(Part(cost.name, cost.weight, value) for cost, value in zip(self._costs, values))]
+        return [*found, *(LossPart(cost.name, cost.weight, value) for cost, value in zip(self._costs, values))]
 
 
 @dataclass(frozen=True)
@@ -139,7 +138,7 @@ class AllTimes:
         self._places = [torch.from_numpy(np.flatnonzero(train.exposures.time == time)) for time in train.instants]
         self.names, self.resolved = ("frames",), dict(frames.resolved)
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The one part: the mean over all frames."""
         series = model.object
         assert isinstance(series, VoxelSeries)
@@ -150,7 +149,7 @@ class AllTimes:
             misfit = self._frames(now, replace(batch, index=index))[0].value
             return misfit * (len(index) / len(self._train))
 
-        return [Part("frames", 1.0, one_after_another(model.parameters()[VOLUMES], of_one))]
+        return [LossPart("frames", 1.0, one_after_another(model.parameters()[VOLUMES], of_one))]
 
 
 class SpaceTimeVariation4D:
@@ -163,11 +162,11 @@ class SpaceTimeVariation4D:
         self._weight, self._pace, self._smoothing = weight, pace, smoothing
         self.resolved = {"variation": weight}
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The one part."""
         volumes = model.parameters()[VOLUMES]
         total = space_time_variation(volumes, self._pace, self._smoothing)
-        return [Part("variation", self._weight, total / len(volumes))]
+        return [LossPart("variation", self._weight, total / len(volumes))]
 
 
 def one_after_another(volumes: Tensor, function: Callable[[int, Tensor], Tensor]) -> Tensor:

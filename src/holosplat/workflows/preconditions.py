@@ -1,4 +1,4 @@
-"""Whether an interrupted run can go on: with what it was started with, and nothing else."""
+"""Preconditions of a run: scans that can be reconstructed, and folders that can be continued."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from numbers import Real
 from typing import Any
 
+import numpy as np
 import torch
 
 from ..checks import as_written, require
@@ -18,6 +19,7 @@ from ..methods.illumination import STAGE, Prepared
 from ..methods.presets import SCHEMA
 from ..methods.uncertain import Uncertain
 from ..optics.background import LightOptions
+from ..scan import Scan
 from ..tables import shown, to_table
 from .binding import RESUMED_WITH
 from .run_folder import OBJECT_SUM, RunFolder
@@ -104,3 +106,42 @@ def decided_before(folder: RunFolder) -> Prepared:
         table = folder.read_config()["decided"]
         made = tuple(Decision.from_dict(each) for each in table["decisions"])
         return tuple(str(each) for each in table["light"]), made
+
+
+FEWEST_COLUMNS = 11
+"""Pixels across the axis that are a field of view; rows may be as few as one."""
+FLAT_LEVELS = (0.2, 5.0)
+"""Between these lies the median of frames that are relative to the flat field."""
+MOST_NEGATIVE = 0.25
+"""Share of the pixels that may be below zero: noise makes half of those so that an absorber darkens wholly."""
+
+
+def require_one_time(scan: Scan) -> None:
+    """`InputError` for a time-resolved scan: one still volume cannot be all of its times."""
+    times = scan.instants
+    require(
+        not scan.is_series,
+        f"the scan must show one time, but its frames are of {len(times)}, from {times[0]:g} to {times[-1]:g} s, and "
+        f"the reconstruction stands still; choose a time with --time-frame 0 … {len(times) - 1} (Scan.at_instant), or "
+        "--motion flow, which finds out whether anything moves (Scan.as_static: nothing does).",
+    )
+
+
+def check_frames(train: Scan) -> None:
+    """`InputError` for too few columns, and for frames that are not relative to the flat field."""
+    h, w = train.views.shape
+    require(
+        w >= FEWEST_COLUMNS,
+        f"frames must have at least {FEWEST_COLUMNS} columns, but they are {h} × {w} pixels; take a wider part.",
+    )
+    level = float(np.median(train.frames))
+    require(
+        FLAT_LEVELS[0] < level < FLAT_LEVELS[1],
+        f"frames must be relative to the flat field (about 1 beside the sample), but their median is {level:.4g}; "
+        "divide counts by their flats, with --flats and --darks or image_key 1 and 2 in the file.",
+    )
+    negative = float((train.frames < 0).mean())
+    require(
+        negative <= MOST_NEGATIVE,
+        f"frames must be intensities, but {negative:.0%} of their pixels are below zero; take off less of the dark.",
+    )

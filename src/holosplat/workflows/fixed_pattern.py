@@ -1,4 +1,4 @@
-"""Still light: what all frames have in common beside the matter that they show, as where a flat field is missing."""
+"""Fixed pattern: the common factor of all frames beside their matter, where a flat field is missing."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from ..checks import require
 from ..frames import divided
 from ..matter import MaterialPrior
 from ..methods.illumination import predicted_first
-from ..optics.still_light import mean_light
+from ..optics.patterns import mean_light
 from ..progress import Progress
 from ..scan import Scan
 
 FEWEST = 2
-"""Frames for training that still light takes: one frame's light cannot be told from its matter."""
+"""Least number of training frames: in one frame, light and matter cannot be separated."""
 
 
 @dataclass(frozen=True)
-class StillLight:
-    """How still light is found."""
+class FixedPatternOptions:
+    """Options of the estimate of a fixed pattern."""
 
     order: int
     """Half waves across a frame up to which light changes, such as 4; its mean is taken to be right. 0: any pattern,
@@ -39,7 +39,9 @@ class StillLight:
         require(self.inside >= 0, f"matter must lie within 0 m or more, but it is {self.inside:g} m.")
 
 
-def still_light(scan: Scan, prior: MaterialPrior, options: StillLight, on_progress: Progress) -> np.ndarray:
+def estimate_fixed_pattern(
+    scan: Scan, prior: MaterialPrior, options: FixedPatternOptions, on_progress: Progress
+) -> np.ndarray:
     """The light [H, W], relative to the flat field, that the training frames of `scan` have in common.
 
     Their matter is made by phase retrieval and total variation, with an occupancy of at most one where `prior` knows
@@ -62,14 +64,14 @@ def still_light(scan: Scan, prior: MaterialPrior, options: StillLight, on_progre
     return mean_light(torch.from_numpy(train.frames), predicted, options.order).float().numpy()
 
 
-def evened(
+def flatfield_corrected(
     scan: Scan,
     prior: MaterialPrior,
-    options: StillLight,
+    options: FixedPatternOptions,
     on_progress: Progress = lambda stage, fraction: None,
 ) -> Scan:
-    """The scan with all its frames, held-out ones too, divided by the `still_light` of those for training."""
-    light = still_light(scan, prior, options, on_progress)
+    """The scan with all frames, held-out ones too, divided by the fixed pattern of the training frames."""
+    light = estimate_fixed_pattern(scan, prior, options, on_progress)
     said = {"still_light": f"{np.log(light).std():.2%} (rms), order {options.order}, divided out"}
     frames, provenance = divided(scan.source, light[None]), scan.provenance | said
     return Scan.of(frames, scan.exposures, scan.is_test, provenance, scan.light)

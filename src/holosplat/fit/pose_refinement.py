@@ -1,4 +1,4 @@
-"""Where beams are, as numbers of a fit beside its object: which are free, what is expected of them, and the gauge."""
+"""Poses as parameters of a fit: which are free, their prior, and the gauge that the object shares with them."""
 
 from __future__ import annotations
 
@@ -15,12 +15,10 @@ from ..model import Alignment, Model
 from ..optics.noise import noise_levels
 from ..optics.sampling import fringes
 from ..scan import Exposures, Scan
-from .batch import Batch
 from .loop import Plan, Stateless
-from .optimiser import Adam, Apart, Leaves, Optimiser
-from .problem import Part
-from .trainable import Trainable
-from .validation import set_aside
+from .optimiser import Adam, Apart, Leaves, Optimiser, Trainable
+from .problem import FIXED, Batch, LossPart
+from .residuals import set_aside
 
 RATE_PX = 0.05
 """First steps of shifts, and of turns at the edge of the field [pixels]: what voxels leave is found in some twenty."""
@@ -40,7 +38,7 @@ PLACES = {"shifts": [0, 1], "turns": [2, 3, 4], "stretches": [5], "magnified": [
 
 
 @dataclass(frozen=True)
-class Freedom:
+class PoseRefinement:
     """What is not known of V views, as standard deviations; 0: it stays as it is.
 
     shift [pixels], angle (turns about the axes across the beam) [rad], roll [rad], distance [share]
@@ -67,7 +65,7 @@ class Freedom:
     def __bool__(self) -> bool:
         return bool(self.deviations().any())
 
-    def __getitem__(self, index: np.ndarray) -> Freedom:
+    def __getitem__(self, index: np.ndarray) -> PoseRefinement:
         return replace(self, so_far=self.so_far[index])
 
     def deviations(self) -> np.ndarray:
@@ -82,7 +80,7 @@ class Freedom:
         names["magnified"] = self.magnification > 0
         return Alignment.planned(len(self), *(name for name, free in names.items() if free), device=device)
 
-    def after(self, alignment: Alignment) -> Freedom:
+    def after(self, alignment: Alignment) -> PoseRefinement:
         """The same of views that a fit has moved on; those that it had set aside are where they were."""
         so_far = self.so_far.copy()
         fitted = np.flatnonzero(_fitted(len(self), len(alignment)))
@@ -93,7 +91,7 @@ class Freedom:
         return replace(self, so_far=so_far)
 
     def tells_mean(self, exposures: Exposures) -> bool:
-        """Whether frames tell the mean distance better than the plan does (see `SAMPLED`)."""
+        """Whether the mean distance is known better from the frames than from the plan (see `SAMPLED`)."""
         return self.edges and mean_distance_error(exposures) < self.distance / np.sqrt(len(self))
 
 
@@ -109,7 +107,7 @@ def _fitted(count: int, used: int) -> np.ndarray:
     return ~set_aside(count, count - used)
 
 
-def moved(exposures: Exposures, alignment: Alignment) -> Exposures:
+def with_alignment(exposures: Exposures, alignment: Alignment) -> Exposures:
     """`exposures` [V] where a fit has found them; those that it had set aside are where they were."""
     fitted = np.flatnonzero(_fitted(len(exposures), len(alignment)))
     found = alignment.exposures(exposures[fitted])
@@ -122,11 +120,11 @@ def moved(exposures: Exposures, alignment: Alignment) -> Exposures:
     )
 
 
-def freed(plan: Plan, freedom: Freedom | None, train: Scan) -> Plan:
+def with_pose_refinement(plan: Plan, freedom: PoseRefinement | None, train: Scan) -> Plan:
     """`plan` with the geometry of its frames `train` as free as `freedom` says; as it is where nothing is free.
 
     freedom: of these frames and those that are set aside for validation, which stay where they are.
-    Steps are Adam's, with the rates' decay; the prior is that of `Freedom`, and what no frame can tell is kept
+    Steps are Adam's, with the rates' decay; the prior is that of `PoseRefinement`, and what no frame can tell is kept
     (`Gauge`).
     """
     if not freedom:
@@ -144,7 +142,7 @@ def freed(plan: Plan, freedom: Freedom | None, train: Scan) -> Plan:
         "alignment.stretches": RATE_SHARE * freedom.distance,
         "alignment.magnified": RATE_PX / (0.5 * max(h, w)),
     }
-    expected = Expected(freedom, level / (h * w * len(train)), on)
+    expected = GeometryPrior(freedom, level / (h * w * len(train)), on)
 
     def rates(factor: float, step: int) -> Mapping[str, float]:
         return {**plan.rates(factor, step), **{name: rate * factor for name, rate in own.items()}}
@@ -159,12 +157,13 @@ def freed(plan: Plan, freedom: Freedom | None, train: Scan) -> Plan:
     )
 
 
-class Expected:
+class GeometryPrior:
     """The term of what is expected of the geometry: half the sum of squares of its numbers in their deviations."""
 
     names = ("geometry",)
+    resolved = FIXED
 
-    def __init__(self, freedom: Freedom, weight: float, device: torch.device) -> None:
+    def __init__(self, freedom: PoseRefinement, weight: float, device: torch.device) -> None:
         """weight: of one number; that of a fit whose data term is a mean over pixels."""
         self._weight = weight
         deviations = freedom.deviations()
@@ -176,24 +175,24 @@ class Expected:
             for name, at in PLACES.items()
         }
 
-    def __call__(self, model: Model, batch: Batch) -> Sequence[Part]:
+    def __call__(self, model: Model, batch: Batch) -> Sequence[LossPart]:
         """The one part."""
         parameters, total = model.parameters(), list[Tensor]()
         for name, (so_far, deviations) in self._parts.items():
             if name in parameters:
                 away = parameters[name].reshape(so_far.shape) + so_far
                 total.append((away / deviations).square().sum())
-        return [Part("geometry", self._weight, (0.5 * torch.stack(total).sum()).float())]
+        return [LossPart("geometry", self._weight, (0.5 * torch.stack(total).sum()).float())]
 
 
 class Gauge(Stateless):
-    """What no frame tells stays: a motion and a turn of the whole object, its size (the mean magnification), and a mean
-    distance that sampling would move.
+    """Projects out what frames do not determine: a motion and a turn of the whole object, its size (the mean
+    magnification), and a mean distance that sampling would move.
 
     An event of a fit: gradients and numbers are projected onto what changes frames. What is not free has no gradient.
     """
 
-    def __init__(self, freedom: Freedom, exposures: Exposures, device: torch.device | str = "cpu") -> None:
+    def __init__(self, freedom: PoseRefinement, exposures: Exposures, device: torch.device | str = "cpu") -> None:
         free = freedom.deviations() > 0
         views, count = exposures.views, len(exposures)
         ones = np.full((count, 1), 0 if freedom.tells_mean(exposures) else 1.0)
@@ -212,7 +211,7 @@ class Gauge(Stateless):
                 values.copy_((kept.to(values) @ values.flatten()).reshape(values.shape))
 
     def on_gradients(self, leaves: Leaves) -> None:
-        """Gradients along what no frame tells are chance."""
+        """Project out gradients along directions that frames do not determine."""
         self._each(leaves, lambda leaf: leaf.grad)
 
     def after_step(self, trainable: Trainable, step: int, steps: int, generator: torch.Generator) -> bool:

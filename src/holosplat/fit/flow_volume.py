@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
 
-from ..representations.fading import Fading, faded
-from ..representations.flow import Flow
+from ..representations.flow import Fading, Flow, fading_factor
 from .smooth_volume import ContinuousPrior, VolumeProblem
 from .whitened import WhitenedFrames
 
@@ -24,7 +23,7 @@ SPARSE = 6.0
 """Distance [pixels] at most of the points that a flow carries back exactly; what lies between is linear."""
 
 
-class CarriedProblem:
+class FlowProblem:
     """½ χ² of the frames of several times and the prior of the volume u [Z, Y, X] ≥ 0 of the reference time.
 
     frames: of each time, of the same field; times: [s]; flow: what carries the volume, in `unit` pixels of the frames
@@ -63,9 +62,9 @@ class CarriedProblem:
             self._fading = [None if fading is None else self._factor(fading, flow, time) for time in self.times]
 
     def _factor(self, fading: Fading, flow: Flow, time: float) -> Tensor:
-        """What matter has become at `time` [Z, Y, X], as a share of what it was at the reference of `flow`."""
+        """The matter at `time` [Z, Y, X], as a share of what it was at the reference of `flow`."""
         values = fading.on([self._unit * torch.from_numpy(places) for places in self.grid.axes()])
-        return faded(values, (time - flow.reference) / (flow.basis.last - flow.basis.first))
+        return fading_factor(values, (time - flow.reference) / (flow.basis.last - flow.basis.first))
 
     def at(self, u: Tensor, k: int) -> Tensor:
         """The volume [Z, Y, X] of the time numbered k."""
@@ -108,7 +107,7 @@ class CarriedProblem:
         return value
 
     def _came_from(self, flow: Flow, time: float) -> Tensor | None:
-        """Where each voxel's matter at `time` was at the reference, as `grid_sample` wants it; None: where it is."""
+        """Reference positions of each voxel's matter at `time`, as `grid_sample` takes them; None: unchanged."""
         if time == flow.reference:
             return None
         moved = flow.carried(self._points.to(flow.potential), time, flow.reference) / self._unit
@@ -173,7 +172,7 @@ def _minimised(tensors: list[Tensor], iterations: int) -> torch.optim.LBFGS:
 
 
 def likelier_fading(
-    problem: CarriedProblem, u: Tensor, fading: Fading, flow: Flow, iterations: int, spread: float
+    problem: FlowProblem, u: Tensor, fading: Fading, flow: Flow, iterations: int, spread: float
 ) -> tuple[Fading, list[float]]:
     """`fading` after some iterations of L-BFGS towards the likeliest one of `u`, which the problem's flow carries; and
     the objective's values.
@@ -196,7 +195,7 @@ def likelier_fading(
 
 
 def likelier_flow(
-    problem: CarriedProblem,
+    problem: FlowProblem,
     u: Tensor,
     flow: Flow,
     iterations: int,

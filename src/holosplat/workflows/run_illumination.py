@@ -1,4 +1,4 @@
-"""The light of frames that a reconstruction is compared with, each by its own air: no matter is predicted for it."""
+"""The illumination of frames that a reconstruction is compared with, estimated from the air of each frame."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..methods import Method, Task
 from ..methods.cross_validation import predicted_frames
 from ..methods.illumination import still_order
 from ..optics.background import FLUX, Light, LightOptions
-from ..optics.still_light import mean_light
+from ..optics.patterns import mean_light
 from ..representations import Stored
 from ..scan import Scan
 from ..tables import from_table
@@ -22,7 +22,7 @@ EVEN = LightOptions("even")
 """Frames are compared as they are."""
 
 
-def found_in(task: Task) -> LightOptions:
+def light_options_of(task: Task) -> LightOptions:
     """What a run assumes of other frames of its scan: smooth light if that of the training frames is uneven; other
     frames are taken to have the mean flux."""
     known = task.uneven and task.uneven.background
@@ -37,10 +37,10 @@ def read_light_options(config: Mapping[str, Any], summary: Mapping[str, Any]) ->
     return replace(from_table(LightOptions, config.get("light", {}), "light"), kind="smooth")
 
 
-def still_in(task: Task, method: Method, found: Stored, oversample: int) -> np.ndarray | None:
+def fixed_pattern_of(task: Task, method: Method, found: Stored, oversample: int) -> np.ndarray | None:
     """The light [H, W] that the frames of a run have in common, float32; None where they have none.
 
-    It was divided out before (`prepared`), or is an unknown of `method`: then it is what is left beside what was found.
+    It was divided out before (`prepared`), or is an unknown of `method`: then it is the residual of the frames.
     """
     if task.lit is not None and task.lit.still is not None:
         return task.lit.still.numpy().astype(np.float32)
@@ -54,8 +54,8 @@ def still_in(task: Task, method: Method, found: Stored, oversample: int) -> np.n
 def light_of(scan: Scan, assumed: LightOptions, still: np.ndarray | None = None) -> Light | None:
     """The light of all frames of `scan`, held-out ones too, by their air; None where it is even.
 
-    How strong light of each number of half waves is, all frames say together; the light itself is each frame's own. A
-    frame without air has the light that is expected before it is seen: even; so have all where no frame has air.
+    The power of light at each number of half waves is estimated from all frames together; the light itself is each
+    frame's own. A frame without air has its prior mean, even light; so have all frames where none has air.
     still: [H, W], beside that: what the training frames of the run have in common, and frames of this raster with them.
     """
     frames = torch.from_numpy(scan.frames)

@@ -1,17 +1,20 @@
-"""A Slurm array script for the tasks of a series that are left: written, and submitted only when asked for."""
+"""Clusters for the tasks of a series: a Slurm array script, and dask."""
 
 from __future__ import annotations
 
 import shlex
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
 
-from ..checks import InputError, require
+from ..checks import InputError, MissingError, require
 from ..io.atomic import atomic_path
-from .asked import Slurm
-from .folder import SeriesFolder
-from .run import PROGRAM, states
+from ..io.lock import TakenError
+from .folder import SeriesFolder, TaskState
+from .run import PROGRAM, Counts, counted, states
+from .settings import Slurm
+from .task import run_task
 
 MOST_SECONDS = 60
 """How long sbatch may take [s]."""
@@ -102,3 +105,49 @@ def submit(folder: SeriesFolder) -> str:
     said = " ".join((done.stderr or done.stdout).split())
     require(done.returncode == 0, f"sbatch must take {folder.script}, but it says: {said}; change the options.")
     return done.stdout.strip().split(";")[0]
+
+
+CONNECT_SECONDS = 30
+"""How long a scheduler may take to answer [s]."""
+
+
+def run_on_dask(
+    folder: SeriesFolder, address: str, retry: bool = False, on_task: Callable[[TaskState], None] = lambda state: None
+) -> Counts:
+    """Do all tasks that are left on the workers of the cluster at `address`, which see the same folder under the same
+    path and have holosplat; how far all tasks are then. Ctrl-C takes back what has not begun, and is passed on.
+
+    Errors: `MissingError` without the extra, `InputError` where no scheduler answers.
+    """
+    try:
+        from distributed import Client, as_completed
+    except ImportError:
+        raise MissingError(
+            "--dask needs the package dask[distributed], which is not here; install it: pip install 'holosplat[dask]'."
+        ) from None
+    wanted = ("left", "failed") if retry else ("left",)
+    numbers = [state.number for state in states(folder) if state.state in wanted]
+    try:
+        client = Client(address, timeout=CONNECT_SECONDS)
+    except (OSError, ValueError) as error:
+        said = str(error).split("\n", 1)[0]
+        raise InputError(f"--dask must be the address of a Dask scheduler, but {address!r} gives: {said}.") from None
+    with client:
+        futures = client.map(_on_worker, [str(folder.path.resolve())] * len(numbers), numbers, pure=False)
+        try:
+            for future in as_completed(futures):
+                state = future.result()
+                if state is not None:
+                    on_task(state)
+        except KeyboardInterrupt:
+            client.cancel(futures)
+            raise
+    return counted(states(folder))
+
+
+def _on_worker(path: str, number: int) -> TaskState | None:
+    """One task; None where another process does it."""
+    try:
+        return run_task(SeriesFolder(Path(path)), number)
+    except TakenError:
+        return None

@@ -1,4 +1,4 @@
-"""What would explain a residual: score tests of the changes that `residuals` probed."""
+"""Diagnosis of a misfit: score tests of the changes that `residuals` probed."""
 
 from __future__ import annotations
 
@@ -53,17 +53,17 @@ def excess(found: Residuals) -> float:
     return float(np.maximum((ratio - 1).sum(axis=0) * found.rings.counts, 0.0).sum())
 
 
-def scores(found: Residuals) -> dict[str, Cause]:
+def cause_scores(found: Residuals) -> dict[str, Cause]:
     """Each change tested by itself: the step to the minimum of χ², whose derivatives the probes hold.
 
-    This is Rao's score test (Rao 1948), with the derivatives by finite differences. The object has already taken up
+    This is Rao's score test (Rao 1948), with the derivatives by finite differences. The object has already absorbed
     what it could, so that the change of a constant that it imitates is underestimated.
     """
     left = [probe.product for probe in found.probes]
     return {cause.name: cause for cause in _tested(found, left)}
 
 
-def causes(found: Residuals, least: float = 0.1, most: int = 3) -> list[Cause]:
+def likely_causes(found: Residuals, least: float = 0.1, most: int = 3) -> list[Cause]:
     """At most `most` causes, one after another: that which takes away most of what those before it left.
 
     Those that take away less than the share `least` of the excess are left out.

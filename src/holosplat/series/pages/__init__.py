@@ -1,1 +1,0 @@
-"""The page of a series, and its charts."""
