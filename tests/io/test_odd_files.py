@@ -42,6 +42,10 @@ from holosplat.io.stacks import stack_of
         ["p_\u221210.tif", "p_\u22125.tif", "p_0.tif", "p_5.tif"],
         ["a_1e-3.tif", "a_2e-3.tif", "a_1e-2.tif"],
         [f"p_{10**17 + n}.tif" for n in range(3)],
+        ["s_20240130_235957.tif", "s_20240131_000004.tif", "s_20240131_000011.tif"],
+        ["s_2024-01-30_23-59-57.tif", "s_2024-01-31_00-00-04.tif", "s_2024-02-01_00-00-01.tif"],
+        ["s_5_20240130T235957.tif", "s_6_20240131T000004.tif", "s_7_20240131T000011.tif"],
+        ["s_1_a1.tif", "s_1_a10.tif", "s_1_b1.tif"],
     ],
 )
 def test_frames_follow_the_running_number(names):
@@ -52,6 +56,20 @@ def test_frames_follow_the_running_number(names):
 def test_two_numbers_that_count_differently_are_refused():
     with pytest.raises(InputError, match=r"several numbers in s_0_0\.tif and the others run differently"):
         in_order([Path("folder") / name for name in ("s_0_0.tif", "s_2_1.tif", "s_1_2.tif")])
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (("s_31012024_000004.tif", "s_30012024_235950.tif", "s_30012024_235957.tif"), "several numbers"),
+        (("s_1_40.tif", "s_2_20.tif", "s_1_30.tif"), "several numbers"),
+        (("f_9.tif", "f_a.tif", "f_10.tif"), "may be hexadecimal"),
+        (("f_0009.tif", "f_000a.tif", "f_0010.tif"), "may be hexadecimal"),
+    ],
+)
+def test_an_order_that_may_be_another_is_refused(names, words):
+    with pytest.raises(InputError, match=words):
+        in_order([Path("folder") / name for name in names])
 
 
 def test_two_files_of_one_number_are_refused():
