@@ -6,7 +6,6 @@ import re
 from collections.abc import Sequence
 from decimal import Decimal
 from itertools import pairwise
-from os.path import commonprefix
 from pathlib import Path
 
 from ..checks import InputError, require
@@ -69,8 +68,8 @@ def _dated(name: str) -> str:
 
 def _require_decimal(files: Sequence[Path], names: Sequence[str], order: Sequence[int]) -> None:
     """`InputError` for names whose numbers may be hexadecimal, and would then have another order."""
-    start = len(commonprefix(names))
-    ends = [name[start : len(name) - len(commonprefix([each[start:][::-1] for each in names]))] for name in names]
+    start, end = _shared(names), _shared([name[::-1] for name in names])
+    ends = [name[start : len(name) - end] for name in names]
     if not all(map(HEXADECIMAL.fullmatch, ends)) or not any(end[0].isdigit() for end in ends):
         return
     values = [int(end, 16) for end in ends]
@@ -79,6 +78,11 @@ def _require_decimal(files: Sequence[Path], names: Sequence[str], order: Sequenc
         f"{files[0].parent} must say by its files' names in which order the frames were taken, but numbers such as "
         f"that in {files[order[-1]].name} may be hexadecimal; write them with decimal digits.",
     )
+
+
+def _shared(names: Sequence[str]) -> int:
+    """The number of characters with which all names begin."""
+    return next((n for n, letters in enumerate(zip(*names)) if len(set(letters)) > 1), min(map(len, names)))
 
 
 def _by_words(words: Words, numbers: Numbers) -> list[str | Decimal]:
