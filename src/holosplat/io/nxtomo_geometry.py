@@ -78,7 +78,9 @@ def _chain(fields: Fields) -> Iterator[h5py.Dataset]:
 def about_axis(fields: Fields, views: Views) -> Views:
     """The views about the axis that the file says, if it does. Errors: `InputError` for one beyond the frames."""
     name = fields.find(*AXIS)
-    if name is None and fields.find(VIEW) and str(attribute_text(fields.group[VIEW][()])).lower() == "half":
+    view = fields.group.get(VIEW)
+    said = attribute_text(view[()]) if isinstance(view, h5py.Dataset) and view.shape == () else None
+    if name is None and (said or "").lower() == "half":
         warn(f"{fields.label(VIEW)} says Half, but no axis is said; find it by holosplat align --axis-only")
     if name is None or not np.isfinite(values := fields.numbers(name)).all() or not values.any():
         return views
