@@ -32,7 +32,7 @@ NAMES = "a name that `holosplat materials` lists, such as water, plasma, soft ti
 WITH = "H2O|D2O|T2O|NH3|HCl|H2O2|CH3OH|CH4O|C2H5OH|C2H6O"
 """What crystals hold beside a salt: a point before a number of these joins them."""
 JOINT = re.compile(
-    rf"\s*[·•∙⋅*]\s*|\s*\.\s*(?=[A-Z(\[])|(?:\s*(?<!\.\d)\.\s*|\s+)(?=\d*\.?\d*\s*(?:{WITH})(?:$|[\s.·•∙⋅*]))(?<![.·•∙⋅*\s]\d\s)"
+    rf"\s*[·•∙⋅*]\s*|\s*\.\s*(?=[A-Z(\[])|(?:\s*(?<!\.\d)\.\s*|\s+)(?=\d*\.?\d*\s*(?:{WITH}|\((?:{WITH})\))(?:$|[\s.·•∙⋅*]))(?<![.·•∙⋅*\s]\d\s)"
 )
 """What joins the parts of a formula."""
 NUMBERED, ALONE = re.compile(r"(\d*\.?\d*)\s*(\S+)$"), re.compile(r"()([^\s\d]\S*)$")
@@ -44,8 +44,8 @@ MASSES = {
     **{"B10": 10.01294, "B11": 11.00931},
 }
 """Masses [u] of the isotopes that are farthest from their number of nucleons in proportion (Wang et al. 2021)."""
-ZERO = re.compile(r"[.·•∙⋅*\s]\d*\.?\d*\s*H20$")
-"""Water with the digit 0."""
+WRONG = re.compile(r"[.·•∙⋅*\s]\d*\.?\d*\s*H20$|\.(?!\s*[\dA-Z(\[])")
+"""Water with the digit 0, and points that nothing follows."""
 STAND_IN = "Lr"
 """An element beyond uranium, which stands for an isotope while its atoms are counted."""
 MAX_DENSITY_G_CM3 = 30.0
@@ -81,7 +81,7 @@ def _atoms(formula: str) -> tuple[str, float]:
                 added = MASSES.get(symbol + nucleons, float(nucleons)) - xraydb.atomic_mass(symbol)
                 isotopes += times * xraydb.chemparse(alone)[STAND_IN] * added
         heaviest = max(xraydb.atomic_number(symbol) for symbol in counts)
-        known = sum(counts.values()) > 0 and heaviest <= 92 and not ZERO.search(formula) and STAND_IN not in formula
+        known = sum(counts.values()) > 0 and heaviest <= 92 and not WRONG.search(formula) and STAND_IN not in formula
     except (AttributeError, KeyError, TypeError, ValueError):  # xraydb raises many kinds
         known = False
     if not known:

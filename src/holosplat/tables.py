@@ -27,6 +27,8 @@ LARGEST = 1 << 64
 """What no whole number of a table exceeds: larger ones are no numbers of an experiment, and no floats."""
 DOTTED = re.compile(r"""(?:[\w"'-]+[ \t]*\.[ \t]*){64}""")
 """A key of TOML with more parts than any table is deep; of tens of thousands, the decoder takes gigabytes."""
+MOST_ENTRIES = 2_000_000
+"""Tables, keys and values of a TOML file, at most: the decoder takes some microseconds for each."""
 SHOWN = 60
 """Characters of a value in messages, at most."""
 
@@ -71,6 +73,8 @@ def _json(text: str) -> Any:
 def _toml(text: str) -> dict[str, Any]:
     if DOTTED.search(text):
         raise RecursionError
+    if (entries := sum(map(text.count, "[{=,"))) > MOST_ENTRIES:
+        raise ValueError(f"it has some {entries} entries, and at most {MOST_ENTRIES} are read")
     found = tomllib.loads(text)
     _require_numbers(found)
     return found

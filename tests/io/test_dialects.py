@@ -220,12 +220,12 @@ def test_exchange_says_what_stands_in_measurement(tmp_path):
         (
             "exchange/theta",
             np.zeros(N - 1),
-            "each of the 5 projections, or of all 10 frames, but there are 4",
+            "each of the 5 projections .flats and darks have none., but there are 4",
         ),
         ("exchange/data_white", np.ones((2, H, W + 1)), r"flats and darks must have the frames' \(7, 10\) pixels"),
         ("exchange/data_white", np.ones((2, 3, H, W)), r"frames must have the shape \[N, H, W\]"),
         ("exchange/data_white", None, r"must mark flats \(1\) beside the dark ones"),
-        ("exchange/data_dark", FLATS, "must have flat frames brighter than dark ones everywhere"),
+        ("exchange/data_dark", FLATS, "must have darks that are alike and no flats"),
     ],
 )
 def test_a_broken_exchange_file_is_named(tmp_path, name, change, said):

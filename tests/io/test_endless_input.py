@@ -87,6 +87,14 @@ def test_a_geometry_has_as_many_views_as_can_be_read(tmp_path):
         read_beams(tmp_path / "a.toml")
 
 
+@pytest.mark.parametrize("text", ["[[a]]\n" * 1_000_001, f"a = [{'{},' * 1_000_001}]"])
+def test_tables_without_end_are_refused_before_they_are_parsed(tmp_path, monkeypatch, text):
+    monkeypatch.setattr("tomllib.loads", lambda _: pytest.fail("it was parsed"))
+    (tmp_path / "a.toml").write_text(text)
+    with pytest.raises(InputError, match="entries, and at most 2000000 are read"):
+        read_table(tmp_path / "a.toml")
+
+
 @pytest.mark.parametrize(
     "text", [".".join(["a"] * 50_000) + " = 1", f"[{' . '.join(['a'] * 50_000)}]", "a = " + "[" * 50_000]
 )

@@ -238,8 +238,8 @@ def test_room_on_the_disk_is_that_of_the_folder_above(folder, monkeypatch):
     assert room.free_disk(folder / "not" / "yet") == 17
 
 
-def test_a_file_system_without_locks_is_read(folder, monkeypatch):
-    """What HDF5 says there; any other failure is one."""
+def test_a_file_system_without_locks_is_read(folder, monkeypatch, caplog):
+    """What HDF5 says there, and of a file that another program writes, which is said; any other failure is one."""
     path, whole = virtual(folder / "a.h5", str(holding(folder / "b.h5"))), h5py.File
     said = f"unable to lock file, errno = {errno.ENOLCK}, error message = 'No locks available'"
 
@@ -250,6 +250,10 @@ def test_a_file_system_without_locks_is_read(folder, monkeypatch):
 
     monkeypatch.setattr(h5py, "File", unlocked)
     assert np.array_equal(read(path), VALUES)
+    assert not caplog.records
     said = "unable to lock file, errno = 11, error message = 'Resource temporarily unavailable'"
-    with pytest.raises(InputError, match="Resource temporarily unavailable"):
+    assert np.array_equal(read(path), VALUES)
+    assert "a.h5 is open for writing elsewhere" in caplog.text
+    said = "unable to lock file, errno = 5, error message = 'Input/output error'"
+    with pytest.raises(InputError, match="Input/output error"):
         read(path)

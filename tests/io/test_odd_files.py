@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import re
-import sys
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 import tifffile
@@ -17,7 +15,6 @@ from holosplat.geometry import rotation_y
 from holosplat.io.angles import read_angles
 from holosplat.io.file_order import in_order
 from holosplat.io.formats import read_as
-from holosplat.io.hdf5_filters import filters_missing_in
 from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.reading import Reading, Told
 from holosplat.io.stacks import stack_of
@@ -42,6 +39,10 @@ from holosplat.io.stacks import stack_of
         ["p_\u221210.tif", "p_\u22125.tif", "p_0.tif", "p_5.tif"],
         ["a_1e-3.tif", "a_2e-3.tif", "a_1e-2.tif"],
         [f"p_{10**17 + n}.tif" for n in range(3)],
+        ["s_20240130_235957.tif", "s_20240131_000004.tif", "s_20240131_000011.tif"],
+        ["s_2024-01-30_23-59-57.tif", "s_2024-01-31_00-00-04.tif", "s_2024-02-01_00-00-01.tif"],
+        ["s_5_20240130T235957.tif", "s_6_20240131T000004.tif", "s_7_20240131T000011.tif"],
+        ["s_1_a1.tif", "s_1_a10.tif", "s_1_b1.tif"],
     ],
 )
 def test_frames_follow_the_running_number(names):
@@ -52,6 +53,20 @@ def test_frames_follow_the_running_number(names):
 def test_two_numbers_that_count_differently_are_refused():
     with pytest.raises(InputError, match=r"several numbers in s_0_0\.tif and the others run differently"):
         in_order([Path("folder") / name for name in ("s_0_0.tif", "s_2_1.tif", "s_1_2.tif")])
+
+
+@pytest.mark.parametrize(
+    ("names", "words"),
+    [
+        (("s_31012024_000004.tif", "s_30012024_235950.tif", "s_30012024_235957.tif"), "several numbers"),
+        (("s_1_40.tif", "s_2_20.tif", "s_1_30.tif"), "several numbers"),
+        (("f_9.tif", "f_a.tif", "f_10.tif"), "may be hexadecimal"),
+        (("f_0009.tif", "f_000a.tif", "f_0010.tif"), "may be hexadecimal"),
+    ],
+)
+def test_an_order_that_may_be_another_is_refused(names, words):
+    with pytest.raises(InputError, match=words):
+        in_order([Path("folder") / name for name in names])
 
 
 def test_two_files_of_one_number_are_refused():
@@ -78,6 +93,7 @@ def test_a_golden_scan_gets_each_frame_its_own_angle(tmp_path, caplog):
         ("Tomo", "White", "DARKS"),
         ("radios", "refs", "dc"),
         ("raw", "OB", "df"),
+        ("proj", "open beam", "black"),
     ],
 )
 def test_a_tree_of_folders_with_angles_is_a_scan(tmp_path, names):
@@ -101,6 +117,42 @@ def test_arrays_in_the_folder_of_a_scan_are_its_flats_and_darks(tmp_path, caplog
     np.testing.assert_allclose(read_as(tmp_path / "scan", said()).frames, (FRAMES - 10.0) / 5000, rtol=1e-6)
     assert "the images in slices are not read" in caplog.text
     assert "2 flats, 2 darks" in caplog.text
+
+
+def test_arrays_in_folders_are_flats_and_darks(tmp_path):
+    images(tmp_path / "scan" / "projections", [f"darkmatter_{n}.tif" for n in range(N)], FRAMES)
+    for name, level in (("flats", 5010), ("darks", 10)):
+        (tmp_path / "scan" / name).mkdir()
+        np.save(tmp_path / "scan" / name / "all.npy", np.full((2, *SHAPE), level, np.uint16))
+    np.save(tmp_path / "scan" / "angles.npy", ANGLES)
+    np.testing.assert_allclose(read_as(tmp_path / "scan", said()).frames, (FRAMES - 10.0) / 5000, rtol=1e-6)
+    (tmp_path / "scan" / "flats" / "all.npy").unlink()
+    with pytest.raises(InputError, match=r"flats must hold flats .* but it holds none"):
+        read_as(tmp_path / "scan", said())
+
+
+def test_arrays_alone_are_a_scan(tmp_path):
+    for name, array in (("projections", FRAMES), ("flats", np.full((2, *SHAPE), 5000)), ("angles", ANGLES)):
+        np.save(tmp_path / f"{name}.npy", array)
+    np.testing.assert_allclose(read_as(tmp_path, said()).frames, FRAMES / 5000, rtol=1e-6)
+
+
+def test_what_a_folder_holds_is_said(tmp_path):
+    for n in range(3):
+        (tmp_path / f"{n}.edf").write_bytes(b"{}")
+    with pytest.raises(InputError, match=r"it holds 3 of \.edf, which is none of what is known"):
+        read_as(tmp_path, said())
+
+
+def test_the_folder_of_images_may_change_beside_them(tmp_path):
+    images(tmp_path, numbered(N), FRAMES)
+    (tmp_path / "angles.txt").write_text("\n".join(map(str, ANGLES)))
+    scan = read_as(tmp_path, said())
+    write_scan(tmp_path / "out.nxs", scan)
+    np.testing.assert_array_equal(read_scan(tmp_path / "out.nxs").frames, FRAMES)
+    tifffile.imwrite(tmp_path / numbered(N)[3], FRAMES[0])
+    with pytest.raises(InputError, match=r"003\.tif must be the file that was opened, but it has changed"):
+        _ = scan.source[3:4]
 
 
 def test_an_array_of_frames_is_a_scan(tmp_path):
@@ -132,6 +184,19 @@ READ = {
     "a list": "[" + ", ".join(PLAIN) + "]",
     "semicolons": ";\n".join(PLAIN),
     "millidegrees in a column": "n,angle (mdeg)\n" + "\n".join(f"{n},{1000 * a}" for n, a in enumerate(ANGLES)),
+    "a log of many numbers": "\n".join(
+        f"10:00:{n:02d} Projection: {n} angle: {a} counts: 45" for n, a in enumerate(PLAIN)
+    ),
+    "a log in radians": "\n".join(f"{n}: angle={a:.8f} rad, 0.5 s" for n, a in enumerate(np.deg2rad(ANGLES))),
+    "frames in another order": "frame,angle\n" + "\n".join(f"{n},{ANGLES[n]}" for n in (3, 1, 0, 2, 7, 6, 5, 4)),
+    "files in another order": "file,angle\n"
+    + "\n".join(f"a_{n + 7}.tif,{ANGLES[n]}" for n in (3, 1, 0, 2, 7, 6, 5, 4)),
+    "degree signs": "\n".join(f"{angle}°" for angle in PLAIN),
+    "units in words": "\n".join(f"{angle:.8f} rad" for angle in np.deg2rad(ANGLES)),
+    "semicolons and decimal commas": "Nr;Winkel\n"
+    + "\n".join(f"{n};{a}".replace(".", ",") for n, a in enumerate(PLAIN)),
+    "a list with a name": "theta = [" + " ".join(PLAIN) + "];",
+    "a list over two lines": "[" + " ".join(PLAIN[:4]) + "\n " + " ".join(PLAIN[4:]) + "]",
     "radians that say so": "# rad\n" + "\n".join(f"{angle:.8f}" for angle in np.deg2rad(ANGLES)),
 }
 
@@ -142,9 +207,15 @@ def test_angles_are_read(tmp_path, kind):
     np.testing.assert_allclose(read_angles(tmp_path / "angles.txt"), ANGLES, atol=1e-5)
 
 
-def test_angles_in_utf16_are_read(tmp_path):
-    (tmp_path / "angles.txt").write_text("\n".join(PLAIN), encoding="utf-16")
+@pytest.mark.parametrize("encoding", ["utf-16", "latin-1"])
+def test_angles_in_other_encodings_are_read(tmp_path, encoding):
+    (tmp_path / "angles.txt").write_text("Winkel [°]\n" + "\n".join(PLAIN), encoding=encoding)
     np.testing.assert_allclose(read_angles(tmp_path / "angles.txt"), ANGLES)
+
+
+def test_angles_in_an_array_are_read(tmp_path):
+    np.save(tmp_path / "angles.npy", ANGLES)
+    np.testing.assert_allclose(read_angles(tmp_path / "angles.npy"), ANGLES)
 
 
 @pytest.mark.parametrize(
@@ -153,12 +224,29 @@ def test_angles_in_utf16_are_read(tmp_path):
         ("\n".join(f"{angle:.6f}" for angle in np.deg2rad(ANGLES)), "look like radians"),
         ("\n".join(angle.replace(".", ",") for angle in ("0.0", "22.5")), "with a point before the decimals"),
         ("\n".join(f"{n} {angle}" for n, angle in enumerate(PLAIN)), "a line holds 2 numbers"),
+        ("\n".join(f"{angle:.0f}°30'" for angle in ANGLES), "must hold angles in degrees, but it holds"),
+        ("\n".join(f"{angle} {'rad' if angle == '0' else 'deg'}" for angle in PLAIN), "angles of one unit"),
     ],
 )
 def test_angles_that_may_mean_something_else_are_refused(tmp_path, text, words):
     (tmp_path / "angles.txt").write_text(text)
     with pytest.raises(InputError, match=words):
         read_angles(tmp_path / "angles.txt")
+
+
+def test_angles_of_all_frames_are_refused_where_their_order_is_not_known(tmp_path):
+    images(tmp_path / "scan" / "projections", numbered(N), FRAMES)
+    images(tmp_path / "scan" / "flats", numbered(2), np.full((2, *SHAPE), 5010, np.uint16))
+    (tmp_path / "scan" / "angles.txt").write_text("\n".join(["0", "0", *PLAIN]))
+    with pytest.raises(InputError, match=r"each of the 8 projections \(flats and darks have none\), but there are 10"):
+        read_as(tmp_path / "scan", said())
+
+
+def test_steps_of_more_than_a_turn_are_warned_of(tmp_path, caplog):
+    images(tmp_path / "scan", numbered(N), FRAMES)
+    (tmp_path / "scan" / "angles.txt").write_text("\n".join(f"{1000 * angle:g}" for angle in ANGLES))
+    read_as(tmp_path / "scan", said())
+    assert "angles go on by 22500 degrees, more than a turn each" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -214,6 +302,23 @@ def test_pages_that_are_cut_short_are_refused(tmp_path, imagej):
     (tmp_path / "all.tif").write_bytes(content[: len(content) // 2])
     with pytest.raises(InputError, match="must hold its pages whole, but the one after"):
         stack_of(tmp_path / "all.tif")
+
+
+@pytest.mark.parametrize("axes", ["TYX", "ZYX", "TZYX"])
+def test_pages_of_ome_are_frames(tmp_path, axes):
+    shape = (N, *SHAPE) if len(axes) == 3 else (4, 2, *SHAPE)
+    tifffile.imwrite(tmp_path / "a.tif", FRAMES.reshape(shape), metadata={"axes": axes}, ome=True)
+    stack = stack_of(tmp_path / "a.tif")
+    np.testing.assert_array_equal([stack[n, slice(0, 99)] for n in range(N)], FRAMES)
+
+
+def test_small_copies_between_the_pages_are_no_frames(tmp_path):
+    with tifffile.TiffWriter(tmp_path / "a.tif") as file:
+        for frame in FRAMES:
+            file.write(frame, metadata=None)
+            file.write(frame[::4, ::4], metadata=None, subfiletype=1)
+    stack = stack_of(tmp_path / "a.tif")
+    np.testing.assert_array_equal([stack[n, slice(0, 99)] for n in range(stack.shape[0])], FRAMES)
 
 
 @pytest.mark.parametrize("kind", ["imagej", "ome"])
@@ -272,52 +377,3 @@ def test_the_package_for_compressed_images_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr(tifffile.TiffPage, "asarray", missing)
     with pytest.raises(MissingError, match=r"holosplat\[codecs\]"):
         stack_of(tmp_path / "a.tif")
-
-
-# --- HDF5 ---------------------------------------------------------------------------------------------------------
-
-
-def virtual(path: Path, layout: h5py.VirtualLayout) -> Path:
-    write_scan(path, a_scan())
-    with h5py.File(path, "a") as file:
-        del file["entry/instrument/detector/data"], file["entry/data/data"]
-        file.create_virtual_dataset("entry/instrument/detector/data", layout)
-    return path
-
-
-@pytest.mark.parametrize(("held", "mapped", "empty"), [(N, N, 0), (N, 5, 3), (5, N, 3), (0, N, N)])
-def test_virtual_frames_without_data_are_refused(tmp_path, held, mapped, empty):
-    with h5py.File(tmp_path / "raw.h5", "w") as file:
-        file["data" if held else "other"] = a_scan().frames[: held or N]
-    layout = h5py.VirtualLayout((N, *SHAPE), np.float32)
-    layout[:mapped] = h5py.VirtualSource("raw.h5", "data", (N, *SHAPE))[:mapped]
-    path = virtual(tmp_path / "scan.nxs", layout)
-    told = Told(allow_external=True)
-    if not empty:
-        np.testing.assert_array_equal(read_as(path, Reading(told)).frames, a_scan().frames)
-        return
-    with pytest.raises(InputError, match=f"for {empty} of {N} it has none"):
-        read_as(path, Reading(told))
-    if empty < N:
-        left = read_as(path, Reading(Told(allow_external=True, leave_out="5:8")))
-        np.testing.assert_array_equal(left.frames, a_scan().frames[:5])
-
-
-def test_virtual_frames_of_the_file_itself_are_its_own(tmp_path):
-    layout = h5py.VirtualLayout((N, *SHAPE), np.float32)
-    layout[:] = h5py.VirtualSource(".", "raw", (N, *SHAPE))
-    path = virtual(tmp_path / "scan.nxs", layout)
-    with h5py.File(path, "a") as file:
-        file["raw"] = a_scan().frames
-    np.testing.assert_array_equal(read_as(path, Reading()).frames, a_scan().frames)
-
-
-def test_filters_that_are_plugins_are_named(tmp_path, monkeypatch):
-    path = tmp_path / "scan.nxs"
-    write_scan(path, a_scan())
-    monkeypatch.setitem(sys.modules, "hdf5plugin", None)
-    monkeypatch.setattr("holosplat.io.hdf5_filters.h5z.filter_avail", lambda code: False)
-    assert "fletcher32 (number 3)" in filters_missing_in(path)
-    monkeypatch.setattr(h5py.Dataset, "__getitem__", lambda *_: (_ for _ in ()).throw(OSError("no filter")))
-    with pytest.raises(MissingError, match=r"filters that HDF5 does not have here: fletcher32 .*holosplat\[codecs\]"):
-        _ = read_scan(path).frames

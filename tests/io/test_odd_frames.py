@@ -39,6 +39,7 @@ SAMPLE_IN = np.where(np.arange(SHAPE[1]) < 9, 3000, 5010)
         (FLATS, np.where(np.arange(4)[:, None, None] == 2, 5010, DARKS), "darks, frame 6 is left out"),
         (np.where(np.arange(4)[:, None, None] == 1, 10, FLATS), DARKS, "flats, frame 1 is left out"),
         (np.where(np.arange(4)[:, None, None] == 3, SAMPLE_IN, FLATS), DARKS, "flats, frame 3 is left out"),
+        (np.where(np.arange(4)[:, None, None] == 3, 65535, FLATS), DARKS, "flats, frame 3 is left out"),
     ],
 )
 def test_flats_and_darks_unlike_the_others_are_left_out_and_named(tmp_path, caplog, flats, darks, odd):
@@ -63,7 +64,39 @@ def test_frames_are_left_out_by_number(tmp_path, caplog):
 
 def test_two_darks_that_differ_are_refused(tmp_path):
     path = raw_file(tmp_path / "raw.nxs", FLATS, np.stack([DARKS[0], FLATS[0]]))
-    with pytest.raises(InputError, match=r"darks that are alike, but frame 4, frame 5 differ; .*--leave-out"):
+    with pytest.raises(
+        InputError, match=r"darks that are alike and no flats, but frame 4, frame 5 differ; .*--leave-out"
+    ):
+        read_scan(path)
+
+
+@pytest.mark.parametrize(
+    ("flats", "darks", "words"),
+    [
+        (
+            FLATS,
+            np.where(np.arange(4)[:, None, None] > 0, 5010, DARKS),
+            "no flats, but frame 5, frame 6, frame 7 differ",
+        ),
+        (FLATS, FLATS[:1], "no flats, but frame 4 differ"),
+        (np.where(np.arange(4)[:, None, None] > 0, 11, FLATS), DARKS, "no darks, but frame 1, frame 2, frame 3 differ"),
+    ],
+)
+def test_flats_and_darks_that_are_mostly_the_other_are_refused(tmp_path, flats, darks, words):
+    with pytest.raises(InputError, match=words):
+        read_scan(raw_file(tmp_path / "raw.nxs", flats, darks))
+
+
+def test_dead_pixels_that_the_file_marks_need_no_flat(tmp_path):
+    path = raw_file(tmp_path / "raw.nxs", np.where(np.arange(SHAPE[1]) == 5, 0, FLATS), DARKS)
+    with pytest.raises(InputError, match="flat frames brighter than dark ones"):
+        read_scan(path)
+    with h5py.File(path, "a") as file:
+        file["entry/instrument/detector/pixel_mask"][:, 5] = 1
+    np.testing.assert_allclose(read_scan(path).frames, (FRAMES - 10.0) / 5000, atol=3e-3)
+    with h5py.File(path, "a") as file:
+        file["entry/instrument/detector/pixel_mask"][:] = 1
+    with pytest.raises(InputError, match="pixel_mask marks 100% of the pixels"):
         read_scan(path)
 
 
@@ -127,6 +160,26 @@ def test_the_axis_of_the_file_is_taken_unless_another_is_said(tmp_path):
     far = {"instrument/detector/x_rotation_axis_pixel_position": (40.0, "pixel")}
     with pytest.raises(InputError, match="must count columns from the middle of 24"):
         read_scan(of_library(tmp_path / "c.nxs", far))
+
+
+def test_the_axis_may_be_said_in_metres_and_half_a_view_is_warned_of(tmp_path, caplog):
+    axis = {"instrument/detector/x_rotation_axis_pixel_position": (-12.8, "um")}
+    assert read_scan(of_library(tmp_path / "a.nxs", axis)).views.shifts[0, 0] == pytest.approx(4 * PIXEL)
+    read_scan(of_library(tmp_path / "b.nxs", {"instrument/detector/field_of_view": ("Half", "")}))
+    assert "says Half, but no axis is said" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("depends", "mirrored"), [(".", False), ("transformations/turn", True), ("/entry/other/turn", False), (None, True)]
+)
+def test_the_detector_is_turned_by_what_it_depends_on(tmp_path, depends, mirrored):
+    path = of_library(tmp_path / "a.nxs", {} if depends is None else {"instrument/detector/depends_on": (depends, "")})
+    with h5py.File(path, "a") as file:
+        for place, kind in (("instrument/detector/transformations", "rotation"), ("other", "translation")):
+            file[f"entry/{place}/turn"] = 180.0
+            file[f"entry/{place}/turn"].attrs.update(transformation_type=kind, units="deg", vector=(0, 0, 1))
+    expected = FRAMES[:, :, ::-1] if mirrored else FRAMES
+    np.testing.assert_allclose(read_scan(path).frames, expected / 5000, rtol=1e-6)
 
 
 def test_a_source_near_by_makes_pixels_and_distance_smaller(tmp_path, caplog):
@@ -208,5 +261,5 @@ def test_pixels_that_no_light_can_be_are_filled_for_those_who_use_them(tmp_path,
     assert "2 pixels in 1 of 8 frames are not above 0" in caplog.text
     broken[3, :9] = 0
     write_scan(tmp_path / "a.nxs", a_scan(frames=broken))
-    with pytest.raises(InputError, match="45% of a frame are not"):
+    with pytest.raises(InputError, match="45% of frame 3 are not"):
         _ = read_frames(tmp_path / "a.nxs", Reading()).frames

@@ -13,14 +13,21 @@ import numpy as np
 from ..checks import InputError, finite, note, require, require_regular, warn
 from ..tables import number_in, shown
 from ..units import ANGLE_UNITS, unit_factor
+from .file_order import in_order
+from .guard import mapped_array
 
 if TYPE_CHECKING:
     from ..geometry import Views
     from ..scan import Scan
 
 UNIT = re.compile(rf"(?<![a-z])({'|'.join(sorted(ANGLE_UNITS, key=len, reverse=True))})s?(?![a-z])", re.IGNORECASE)
-NAME = re.compile(r"angle|theta|rotation|^rot\b|^deg", re.IGNORECASE)
-"""Names of the column of angles, and of their part of a line of a log."""
+WITH_UNIT = re.compile(rf"([-+.\deE]*\d\.?)\s*({UNIT.pattern})", re.IGNORECASE)
+NAME = re.compile(r"angle|theta|rotation|^rot(?![a-z])|^deg|omega|winkel", re.IGNORECASE)
+"""Names of the column of angles."""
+LABELLED = re.compile(r"(?:angle|theta|rotation)\s*[:=]?\s*([-+]?\d[\d.]*(?:e[-+]?\d+)?)(.*)", re.IGNORECASE)
+"""The angle in a line of a log, and what follows it."""
+ORDER = re.compile(r"(image|frame|projection|file)?[ _]*(name|file|index|number|no|nr|id|n|i|#)?\.?", re.IGNORECASE)
+"""Names of the column that says which frame a row is of."""
 FIELD = re.compile(r"\b(flat|dark)", re.IGNORECASE)
 """Words of a line of a log that is of no projection."""
 WHOLE_TURNS = np.array([np.pi, 2 * np.pi])
@@ -28,28 +35,35 @@ CLOSE = 0.01
 """Angles that cover a half or a whole turn in radians to this part are radians in all likelihood."""
 SAME_DEG = 1e-4
 """Views within so many degrees look from one side."""
+WHOLE_TURN = 360.0
 FEW, NARROW = 8, 10.0
 """So many views within so many degrees are unusual."""
 OFF_CENTRE = 0.1
 """Part of a frame's width by which the axis may be off its middle before matter is cut off that matters."""
+LIST = re.compile(r"[^\[\]#\d]*\[([-+\d\s,;.eE]+)\][^\[\]#\d]*")
 ADVICE = "write one angle [degrees] a line, as 22.5"
 
 
 def read_angles(path: Path) -> np.ndarray:
-    """The angles [N] in degrees of a text file.
+    """The angles [N] in degrees of a text file, or of an array (.npy).
 
-    It holds one a line, or all in one line, or a table with a header that names one column of angles, or lines of a log
-    with `angle: NUMBER` in each; # begins a comment. A header or comment may say their unit. Errors: `InputError` for
-    anything else, and for what looks like radians without saying so.
+    The text holds one a line, or all in one line or in brackets, or a table with a header that names one column of
+    angles, or lines of a log with `angle: NUMBER` in each; # begins a comment. A header, a comment or what follows each
+    number may say their unit. Rows with the number or the name of their frame are brought into its order. Errors:
+    `InputError` for anything else, and for what looks like radians without saying so.
     """
     require_regular(path, "a text file of angles (--angles)")
     lines = [line.partition("#") for line in _text(path).splitlines()]
-    rows = [row for row in (_cells(line) for line, *_ in lines) if row]
+    decimal = {";": ",", "\t": ","}.get(separator := _separator(lines), "")
+    rows = [row for row in (_cells(line, separator, decimal) for line, *_ in lines) if row]
     said = " ".join(comment for *_, comment in lines)
     words, header = _angle_words(path, rows)
     require(len(words) > 0, f"{path} must hold the frames' angles in degrees, but it holds none.")
-    values = finite(f"{path}: angles", np.array([_number(path, word) for word in words]))
-    if unit := UNIT.search(f"{header} {said}".replace("_", " ")):
+    parts = [(found[1], found[2]) if (found := WITH_UNIT.fullmatch(word)) else (word, "") for word in words]
+    units = {unit for _, unit in parts}
+    require(len(units) == 1, f"{path} must hold angles of one unit, but it holds several; {ADVICE}.")
+    values = finite(f"{path}: angles", np.array([_number(path, word) for word, _ in parts]))
+    if unit := UNIT.search(f"{units.pop()} {header} {said}".replace("_", " ")):
         return values * (unit_factor(f"{path}: angles", unit[1], ANGLE_UNITS) / ANGLE_UNITS["deg"])
     if len(values) >= FEW // 2:
         reach = np.ptp(values) * np.array([[1.0], [len(values) / (len(values) - 1)]])
@@ -62,21 +76,38 @@ def read_angles(path: Path) -> np.ndarray:
 
 
 def _text(path: Path) -> str:
-    """The text of a file in UTF-8, or in UTF-16 with a mark."""
+    """The text of a file in UTF-8, in UTF-16 with a mark, or else in Latin-1; of one list in brackets, the list."""
+    if path.suffix.lower() == ".npy":
+        found = mapped_array(path, "an array of angles").reshape(-1)
+        require(found.dtype.kind in "iuf", f"{path} must hold numbers, but its type is {found.dtype}.")
+        return "\n".join(map(str, found.tolist()))
     try:
         content = path.read_bytes()
         wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
-        return content.decode("utf-16" if wide else "utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
+        text = content.decode("utf-16" if wide else "utf-8-sig")
+    except UnicodeDecodeError:
+        text = content.decode("latin-1")
+    except OSError as error:
         raise InputError(f"--angles must be a text file of angles, but reading {path} failed: {error}.") from None
+    alone = LIST.fullmatch(text)
+    return (alone[1].replace("\n", " ") if alone else text).replace("\N{MINUS SIGN}", "-")
 
 
-def _cells(line: str) -> list[str]:
-    """The entries of a line: between commas, semicolons or tabs if there are any, else between spaces."""
+def _separator(lines: list[tuple[str, str, str]]) -> str:
+    """What stands between the entries of a line: a semicolon or tab where most have one, else commas."""
+    for separator in ";\t":
+        if 2 * sum(separator in line.strip().rstrip(";,") for line, *_ in lines) > len(lines):
+            return separator
+    return ","
+
+
+def _cells(line: str, separator: str, decimal: str) -> list[str]:
+    """The entries of a line: between separators if there are any, else between spaces."""
     line = re.sub("[\"']", "", line).strip().strip("[]()").rstrip(",;").strip()
-    if re.search(r"[,;\t]", line):
-        return [cell.strip() for cell in re.split(r"[,;\t]", line)]
-    return line.split() if _is_number(line.partition(" ")[0]) else [line] * bool(line)
+    if separator in line:
+        cells = [cell.strip() for cell in line.split(separator)]
+        return [re.sub(r"(?<=\d),(?=\d+$)", ".", cell) if decimal else cell for cell in cells]
+    return line.split() if _is_number(line.partition(" ")[0]) and not _is_angle(line) else [line] * bool(line)
 
 
 def _is_number(word: str) -> bool:
@@ -87,27 +118,42 @@ def _is_number(word: str) -> bool:
     return True
 
 
+def _is_angle(cell: str) -> bool:
+    """Whether a cell is an angle: a number, with its unit or without, or with the word `angle` before it."""
+    return _is_number(cell) or bool(WITH_UNIT.fullmatch(cell) or LABELLED.search(cell))
+
+
 def _angle_words(path: Path, rows: list[list[str]]) -> tuple[list[str], str]:
     """The entries that are angles, as written, and what their header says of them."""
     if len(rows) == 1:
         return rows[0], ""
-    header = [] if not rows or any(map(_is_number, rows[0])) else rows[0]
+    header = [] if not rows or any(map(_is_angle, rows[0])) else rows[0]
     body = rows[1:] if header else rows
     if len(header) == 1 and body and len(body[0]) > 1:
         header = header[0].split()
     projections = [row for row in body if not FIELD.search(" ".join(row))]
-    labelled = [[re.split(r"[:=]", cell)[-1].strip() for cell in row if NAME.search(cell)] for row in projections]
-    if labelled and all(len(found) == 1 for found in labelled):
-        return [found[0] for found in labelled], " ".join(projections[0])
+    labelled = [LABELLED.search(" ".join(row)) for row in projections]
+    if (found := [each for each in labelled if each]) and len(found) == len(projections):
+        return [each[1] for each in found], " ".join((*header, *found[0][2].split()[:1]))
     if all(len(row) == 1 for row in body):
         return [row[0] for row in body], " ".join(header)
     named = [n for n, name in enumerate(header) if NAME.search(name)]
     if len(named) == 1 and all(len(row) == len(header) for row in body):
+        frames = [n for n, name in enumerate(header) if name and ORDER.fullmatch(name)]
+        body = _by_frames(body, frames[0]) if len(frames) == 1 else body
         return [row[named[0]] for row in body], header[named[0]]
     raise InputError(
         f"{path} must hold one angle a line, or a table with a header that names one column 'angle', but a line holds "
         f"{max(map(len, rows))} numbers; {ADVICE}, with a point before the decimals."
     )
+
+
+def _by_frames(rows: list[list[str]], column: int) -> list[list[str]]:
+    """Rows of a table in the order of the frames that their entries in `column` number or name."""
+    names = [Path(row[column]) for row in rows]
+    if len(set(names)) < len(rows):
+        return rows
+    return [rows[names.index(name)] for name in in_order(names)]
 
 
 def _number(path: Path, word: str) -> float:
@@ -125,7 +171,10 @@ def angles_of(views: Views) -> np.ndarray | None:
 
 
 def tell_angles(angles_deg: np.ndarray, source: str) -> None:
-    """Say which range the angles [N] span, and where they are from."""
+    """Say which range the angles [N] span, and where they are from; warn of steps that can hardly be meant."""
+    steps = np.abs(np.diff(angles_deg))
+    if len(steps) and np.median(steps) > WHOLE_TURN:
+        warn(f"{source}: angles go on by {np.median(steps):.6g} degrees, more than a turn each; check their unit")
     note(f"{source}: {len(angles_deg)} angles from {angles_deg.min():.6g} to {angles_deg.max():.6g} degrees")
 
 

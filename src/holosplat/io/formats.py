@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -104,4 +105,14 @@ def loader_of(path: str | Path) -> Loader:
         kinds = " and ".join(loader.name for loader in loaders)
         raise InputError(f"{path} must be a scan of one format, but it is ambiguous: {kinds}; keep the files of one.")
     known = "; ".join(f"{loader.mark} ({loader.name})" for loader in LOADERS)
-    raise InputError(f"{path} must be a scan, but it is none of what is known: {known}.")
+    raise InputError(f"{path} must be a scan, but it {_content(found)}, which is none of what is known: {known}.")
+
+
+def _content(path: Path) -> str:
+    """What a file, or a folder, holds by the endings of names."""
+    if not path.is_dir():
+        return f"is a {path.suffix} file" if path.suffix else "is a file without an ending"
+    endings = Counter((one.suffix or one.name) + "/" * one.is_dir() for one in path.iterdir())
+    if not endings:
+        return "is an empty folder"
+    return f"holds {', '.join(f'{count} of {name}' for name, count in endings.most_common(3))}"

@@ -16,7 +16,7 @@ from ..checks import InputError, MissingError, UnsaidError, require_regular, sha
 from ..units import unit_factor
 from .guard import require_memory
 from .hdf5_filters import filters_missing_in
-from .hdf5_guard import opened_for_reading, require_own
+from .hdf5_guard import WRITING, opened_for_reading, require_own
 from .seal import require_sealed
 
 
@@ -37,6 +37,11 @@ def open_hdf5(path: str | Path) -> Iterator[h5py.File]:
             raise MissingError(
                 f"{path} is compressed by filters that HDF5 does not have here: {missing}; install them by pip install "
                 '"holosplat[codecs]" (hdf5plugin), or write the file anew without them (h5repack -f GZIP=4).'
+            ) from error
+        if WRITING[-1] in str(error):
+            raise InputError(
+                f"{path} must be closed, but another program has it open for writing, or ended before it closed it; "
+                "close it there, or run h5clear -s on a copy of it."
             ) from error
         raise InputError(
             f"{path} must be a complete HDF5 file, but it is truncated, damaged or not readable: {error}."

@@ -37,14 +37,14 @@ def require_chunks(dataset: h5d.DatasetID, label: str, size: int) -> None:
     if DEFLATION * size <= most:
         return
     place = filters.index(h5z.FILTER_DEFLATE)
-    for offset, skipped, stored in _chunks(dataset):
+    for offset, skipped, stored in chunks_of(dataset):
         if DEFLATION * stored > most and not skipped & (1 << place):
             known = all(one == h5z.FILTER_FLETCHER32 for one in filters[place + 1 :])
             require(known, f"{label} must be deflated last of all filters, but it is not; unpack it.")
             _require_unpacked(dataset, offset, declared, label)
 
 
-def _chunks(dataset: h5d.DatasetID) -> Iterator[tuple[tuple[int, ...], int, int]]:
+def chunks_of(dataset: h5d.DatasetID) -> Iterator[tuple[tuple[int, ...], int, int]]:
     """Offset, filters that were left out (a bit each) and stored bytes of each chunk."""
     if not hasattr(dataset, "chunk_iter"):  # HDF5 before 1.14
         infos = (dataset.get_chunk_info(number) for number in range(dataset.get_num_chunks()))

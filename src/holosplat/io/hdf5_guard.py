@@ -14,7 +14,7 @@ from pathlib import Path
 import h5py
 from h5py import h5d, h5l, h5o  # pyright: ignore[reportAttributeAccessIssue]  # compiled, without stubs
 
-from ..checks import InputError, require
+from ..checks import InputError, require, warn
 from .guard import DEEPEST, require_declared
 from .hdf5_chunks import require_chunks
 from .hdf5_filters import unknown_filters
@@ -31,19 +31,30 @@ MOST_KNOWN = 1000
 """Files that are remembered, at most."""
 WITHOUT_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP)
 """What locking a file fails with where the file system has no locks."""
+WRITING = (f"errno = {errno.EAGAIN},", f"errno = {errno.EACCES},", "already open for write")
+"""What HDF5 says of a file that another program has open for writing, or left open as it ended."""
 _vouched: set[Path] = set()
 _known: dict[tuple[int, ...], None] = {}
 """Files that hold all that they are read for, by device, number, size and times: a command opens one several times."""
 
 
 def opened_for_reading(path: Path) -> h5py.File:
-    """The file at `path`, which nobody else may write meanwhile; on a file system without locks, without that."""
+    """The file at `path`, which nobody else may write meanwhile; on a file system without locks, without that.
+
+    One that another program writes, or left open, is read as it is now, with a warning, where HDF5 can tell its parts.
+    """
     try:
         return h5py.File(path, "r")
     except OSError as error:
-        if not any(f"errno = {number}," in str(error) for number in WITHOUT_LOCKS):
+        said = str(error)
+        if any(f"errno = {number}," in said for number in WITHOUT_LOCKS):
+            return h5py.File(path, "r", locking=False)
+        if not any(words in said for words in WRITING):
             raise
-        return h5py.File(path, "r", locking=False)
+    # SWMR: what a writer has flushed is whole, and its marks that the file is open do not count.
+    opened = h5py.File(path, "r", locking=False, swmr=WRITING[-1] in said)
+    warn(f"{path} is open for writing elsewhere, or was not closed; it is read as it is now")
+    return opened
 
 
 def allow_external(path: Path) -> None:

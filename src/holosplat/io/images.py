@@ -28,16 +28,20 @@ from .stacks import IMAGES, ImageStack, images_in, stack_of
 from .stored_frames import reader
 from .tiff import LOADER as TIFF
 
-FIELDS = {FLAT: "flat|white|open_?beam|bright|refs?(?![a-z])", DARK: "dark"}
+FIELDS = {FLAT: "flat|white|open_?beam|bright|refs?(?![a-z])|refhst", DARK: "dark"}
 """How the names of flats and of darks, and of their folders, begin, or a word in them."""
-FOLDERS = {FLAT: "references?|ff|ob|i0|empty|gain|background", DARK: "dc|df|offsets?|bias"}
+FOLDERS = {
+    FLAT: "references?|ff|hf|ob|i0|air|blanks?|empty|gain|background|open[ _-]?beam",
+    DARK: "dc|df|d0|offsets?|bias|black",
+}
 """Names of folders of flats and of darks beside these."""
 KINDS = {FLAT: "flats", DARK: "darks"}
 ARRAYS = (".npy", ".npz", ".h5", ".hdf5", ".hdf", ".nxs", ".nx")
 """Endings of files of flats and darks that are no images."""
+NUMPY = (".npy", ".npz")
 PROJECTIONS = re.compile("proj|tomo|sample|radio", re.IGNORECASE)
 """How the names of folders of projections begin."""
-ANGLES = (".txt", ".csv", ".dat", ".log")
+ANGLES = (".txt", ".csv", ".dat", ".log", ".tlt", ".npy")
 """Endings of files of angles."""
 
 
@@ -82,15 +86,20 @@ def _greys(path: Path, parts: list[tuple[int, Any]], given: Mapping[str, Any]) -
 
 def _in_folder(folder: Path, pattern: str | None) -> list[tuple[int, Any]]:
     """The projections in a folder, or in a folder within it, and the flats and darks beside them."""
-    light = {kind: _fields_of_light(folder, kind) for kind in FIELDS}
     places = _places(folder)
-    files = [file for place in places for file in images_in(place, pattern) if _kind(file) is None]
+    light = {kind: _fields_of_light(folder, places, kind) for kind in FIELDS}
+    apart = {kind for kind in FIELDS if _folders_of(folder, kind)}
+    files = [file for place in places for file in images_in(place, pattern) if _kind(file) in {None, *apart}]
+    arrays = [] if places or pattern else _arrays_of(folder, PROJECTION)
     named = f" named {pattern}" if pattern else ""
-    require(len(files) > 0, f"{folder} must hold projections ({', '.join(IMAGES)}), but it holds none{named}.")
+    require(
+        len(files) + len(arrays) > 0, f"{folder} must hold projections ({', '.join(IMAGES)}), but it holds none{named}."
+    )
     unread = [path.name for path in _folders(folder) if _kind(path) is None and path not in places]
     if unread:
         note(f"{folder}: the images in {', '.join(unread)} are not read")
-    return [(PROJECTION, ImageStack.of(in_order(files)))] + [item for item in light.items() if item[1] is not None]
+    stack = light_frames(arrays[0], "proj|data", PROJECTION) if arrays else ImageStack.of(in_order(files))
+    return [(PROJECTION, stack)] + [item for item in light.items() if item[1] is not None]
 
 
 def _places(folder: Path) -> list[Path]:
@@ -112,19 +121,47 @@ def _folders(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.is_dir() and not is_hidden(path) and images_in(path))
 
 
-def _fields_of_light(folder: Path, kind: int) -> Any:
-    """Images whose names say that they are of `kind`, or all in folders of such a name, or frames of an array or HDF5
-    file of such a name; None where there are none."""
-    inner = [file for path in _folders(folder) if _kind(path) == kind for file in images_in(path)]
-    if images := inner + [file for file in images_in(folder) if _kind(file) == kind]:
+def _fields_of_light(folder: Path, places: list[Path], kind: int) -> Any:
+    """All images in folders whose names say that they are of `kind`, and images of such names beside the folders; or
+    else images of such names among the projections, in `places`, or an array or HDF5 file; None where there are none.
+
+    Errors: `InputError` for a folder of such a name without frames, and for several arrays.
+    """
+    inner = _folders_of(folder, kind)
+    images = [file for path in inner for file in images_in(path)]
+    images += [file for file in images_in(folder) if _kind(file) == kind]
+    if not inner:
+        images = images or [file for place in places for file in images_in(place) if _kind(file) == kind]
+    if images:
         return ImageStack.of(images)
-    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in ARRAYS and _kind(file) == kind)
+    files = [file for path in inner for file in _arrays_in(path)] or _arrays_of(folder, kind)
+    require(
+        len(files) > 0 or not inner,
+        f"{', '.join(map(str, inner))} must hold {KINDS[kind]} ({', '.join((*IMAGES, *ARRAYS))}), but it holds none; "
+        f"bring them, say them by --{KINDS[kind]}, or take the folder away.",
+    )
     require(
         len(files) < 2,
         f"{folder} has several files of {KINDS[kind]}, {', '.join(file.name for file in files)}; say one by "
         f"--{KINDS[kind]}.",
     )
     return light_frames(files[0], FIELDS[kind], kind) if files else None
+
+
+def _folders_of(folder: Path, kind: int) -> list[Path]:
+    """The folders within `folder` whose names say that they are of `kind`, whatever they hold."""
+    return sorted(path for path in folder.iterdir() if path.is_dir() and not is_hidden(path) and _kind(path) == kind)
+
+
+def _arrays_in(folder: Path) -> list[Path]:
+    return sorted(file for file in folder.iterdir() if file.suffix.lower() in ARRAYS and not is_hidden(file))
+
+
+def _arrays_of(folder: Path, kind: int) -> list[Path]:
+    """The arrays in `folder` whose names say that they are of `kind`; of projections, NumPy's alone."""
+    if kind != PROJECTION:
+        return [file for file in _arrays_in(folder) if _kind(file) == kind]
+    return [file for file in _arrays_in(folder) if file.suffix.lower() in NUMPY and PROJECTIONS.match(file.name)]
 
 
 def _kind(path: Path) -> int | None:
@@ -171,7 +208,8 @@ def _recognises(path: Path) -> bool:
         return False
     if path.is_file():
         return path.suffix.lower() in (*IMAGES, ".npy")
-    return bool(images_in(path)) or any(PROJECTIONS.match(one.name) or _kind(one) for one in _folders(path))
+    folders = any(PROJECTIONS.match(one.name) or _kind(one) for one in _folders(path))
+    return bool(images_in(path)) or folders or bool(_arrays_of(path, PROJECTION))
 
 
 LOADER = Loader(

@@ -27,7 +27,9 @@ def with_fields(file: ScanFile, given: Mapping[str, Any]) -> ScanFile:
     begin = 0
     for stack in file.stacks:
         if isinstance(stack, h5py.Dataset):
-            require_filled(stack, file.label, file.kinds[begin : begin + len(stack)] != INVALID)
+            gaps = require_filled(stack, file.label, file.kinds[begin : begin + len(stack)] != INVALID)
+            if gaps is not None:
+                file = replace(file, marked=gaps if file.marked is None else gaps | (file.marked != 0))
         begin += stack.shape[0]
     return _without_odd(file, is_told=given.get("leave_out") is not None)
 
@@ -57,22 +59,24 @@ def _without(file: ScanFile, numbers: str | None) -> ScanFile:
 
 def _without_odd(file: ScanFile, is_told: bool) -> ScanFile:
     """The file without flats and darks that are unlike the others, which it names; is_told: with them, as --leave-out
-    says which frames to leave. Errors: `InputError` for two that differ."""
+    says which frames to leave. Errors: `InputError` where half of them differ or more."""
     small = {kind: [thumbnail(file.frame(n)) for n in file.numbers(kind)] for kind in (FLAT, DARK)}
     if not small[FLAT]:
         return file
-    dark = np.median(small[DARK], axis=0) if small[DARK] else 0.0
-    lit = np.array(small[FLAT]) - dark
-    found = {FLAT: odd_flats(lit)}
-    if small[DARK]:
-        found[DARK] = odd_darks(np.array(small[DARK]), float(np.median(lit)))
+    darks, flats, found = np.array(small[DARK]), np.array(small[FLAT]), dict[int, np.ndarray]()
+    if len(darks):
+        found[DARK] = odd_darks(darks, float(np.nanmedian(flats)))
+        good = darks[~found[DARK]]
+        flats = flats - np.median(good if len(good) else darks, axis=0)
+    found[FLAT] = odd_flats(flats)
     kinds = file.kinds.copy()
     for kind, odd in found.items():
-        numbers, word = file.numbers(kind)[odd], "flat" if kind == FLAT else "dark"
+        numbers, (word, other) = file.numbers(kind)[odd], ("flat", "dark") if kind == FLAT else ("dark", "flat")
         named = ", ".join(file.name(n) for n in numbers)
         require(
-            len(odd) != 2 or not len(numbers) or is_told,
-            f"{file.path} must have {word}s that are alike, but {named} differ; leave one of them by --leave-out.",
+            2 * len(numbers) < len(odd) or not len(numbers) or is_told,
+            f"{file.path} must have {word}s that are alike and no {other}s, but {named} differ; leave those that are "
+            "wrong by --leave-out.",
         )
         if len(numbers):
             kept = "stays, as --leave-out does not name it" if is_told else "is left out; --leave-out chooses otherwise"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import h5py
 import numpy as np
@@ -16,6 +16,8 @@ FLIPS = ("instrument/detector/y_flipped", "instrument/detector/x_flipped")
 SHIFT = "instrument/detector/shift"
 AXIS = ("instrument/detector/x_rotation_axis_pixel_position", "instrument/detector/estimated_cor_from_motor")
 """Columns from the middle of a frame, as it is stored, to the axis."""
+VIEW = "instrument/detector/field_of_view"
+PIXELS = ("px", "pixel", "pixels", "")
 SOURCES = ("instrument/source/distance", "sample/source_distance", "source/distance")
 MOVES = tuple(f"sample/{axis}_translation" for axis in "xyz")
 TRANSFORMATIONS = "instrument/detector/transformations"
@@ -34,12 +36,11 @@ def flips_of(fields: Fields) -> tuple[bool, bool]:
     the vertical is z, and the beam x, unless the file has McStas' axes. Errors: `InputError` for other turns.
     """
     flags = [bool(fields.numbers(name).any()) if fields.find(name) else False for name in FLIPS]
-    group = fields.group.get(TRANSFORMATIONS)
     turns = np.zeros(3, dtype=bool)
-    for name, item in group.items() if isinstance(group, h5py.Group) else ():
-        if not isinstance(item, h5py.Dataset) or attribute_text(item.attrs.get("transformation_type")) != "rotation":
+    for item in _chain(fields):
+        if attribute_text(item.attrs.get("transformation_type")) != "rotation":
             continue
-        label, unit = fields.label(f"{TRANSFORMATIONS}/{name}"), attribute_text(item.attrs.get("units")) or "deg"
+        label, unit = f"{fields.path}: {item.name}", attribute_text(item.attrs.get("units")) or "deg"
         angle = np.rad2deg(np.asarray(item, dtype=np.float64).reshape(-1) * unit_factor(label, unit, ANGLE_UNITS))
         axis = np.abs(np.asarray(item.attrs.get("vector", np.zeros(3)), dtype=np.float64).reshape(-1)) > 0.5
         half = np.isclose(angle % 360, 180)
@@ -55,9 +56,32 @@ def flips_of(fields: Fields) -> tuple[bool, bool]:
     return bool(flags[0] ^ across ^ along), bool(flags[1] ^ up ^ along)
 
 
+def _chain(fields: Fields) -> Iterator[h5py.Dataset]:
+    """The transformations of the detector: from its `depends_on` from one to the next until ".", each once; where it
+    has none, all of its group `transformations`."""
+    detector, group = fields.group.get("instrument/detector"), fields.group.get(TRANSFORMATIONS)
+    start = detector.get("depends_on") if isinstance(detector, h5py.Group) else None
+    if not isinstance(start, h5py.Dataset) or start.shape != ():
+        items = group.values() if isinstance(group, h5py.Group) else ()
+        yield from (item for item in items if isinstance(item, h5py.Dataset))
+        return
+    parent, text, seen = detector, attribute_text(start[()]), set[str]()
+    while isinstance(parent, h5py.Group) and text and text != ".":
+        item = parent.get(text)
+        if not isinstance(item, h5py.Dataset) or item.name in seen:
+            raise InputError(f"{fields.path}: {parent.name} depends on {text}, which is no transformation; correct it.")
+        seen.add(str(item.name))
+        yield item
+        parent, text = item.parent, attribute_text(item.attrs.get("depends_on"))
+
+
 def about_axis(fields: Fields, views: Views) -> Views:
     """The views about the axis that the file says, if it does. Errors: `InputError` for one beyond the frames."""
     name = fields.find(*AXIS)
+    view = fields.group.get(VIEW)
+    said = attribute_text(view[()]) if isinstance(view, h5py.Dataset) and view.shape == () else None
+    if name is None and (said or "").lower() == "half":
+        warn(f"{fields.label(VIEW)} says Half, but no axis is said; find it by holosplat align --axis-only")
     if name is None or not np.isfinite(values := fields.numbers(name)).all() or not values.any():
         return views
     require(
@@ -65,6 +89,9 @@ def about_axis(fields: Fields, views: Views) -> Views:
         f"{fields.label(name)} must be one number, but it differs from frame to frame; write one, or {SHIFT} of each.",
     )
     width, mirrored = views.shape[1], flips_of(fields)[1]
+    values = (
+        values * fields.unit(name, {**LENGTH_UNITS, **dict.fromkeys(PIXELS, views.pixel_size)}, "px") / views.pixel_size
+    )
     off = float(values.reshape(-1)[0]) * (-1 if mirrored else 1)
     column = 0.5 * (width - 1) + off
     require(

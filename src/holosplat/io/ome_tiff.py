@@ -13,7 +13,7 @@ from ..geometry import Grid
 from ..volume import Volume
 from .atomic import atomic_path
 from .hdf5_writing import require_room
-from .tiff_guard import all_images, image_count, open_tiff
+from .tiff_guard import all_images, image_numbers, open_tiff
 from .volumes import ABSORPTION, REFRACTION, Contents, Stored, contents_of
 
 TIFF_SUFFIXES = (".tif", ".tiff")
@@ -34,7 +34,7 @@ def read_ome_tiff(path: Path) -> Stored:
     Errors: `InputError` for other TIFF files, which do not say what their numbers are.
     """
     with open_tiff(path) as opened:
-        text, count = opened.ome_metadata, image_count(opened, path)
+        text, count = opened.ome_metadata, len(image_numbers(opened, path))
     grid = _grid_of_ome(text or "")
     if grid is None or count != 2 * grid.shape[0]:
         raise InputError(

@@ -190,7 +190,13 @@ def exposures_of(
             f"{label} does not say the frames' angles; name a text file of them by --angles FILE.",
             {"angles_deg": np.zeros(int(projections.sum()))},
         )
-    turned = rotation_y(angles_of_projections(np.asarray(angles, dtype=np.float64).reshape(-1), projections))
+    count, angles = int(projections.sum()), np.asarray(angles, dtype=np.float64).reshape(-1)
+    frames = "frames" if len(projections) == count else "projections (flats and darks have none)"
+    require(
+        len(angles) == count,
+        f"there must be one angle for each of the {count} {frames}, but there are {len(angles)}; correct --angles.",
+    )
+    turned = rotation_y(angles)
     views = Views.from_rotations(turned, shape, values["pixel_size"])
     return Exposures.of(views, values["energy_kev"], values["distance"])
 

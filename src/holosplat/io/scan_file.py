@@ -40,6 +40,7 @@ DATA_NAMES = (DATA, "data/data")
 IMAGE_KEY = "instrument/detector/image_key"
 IMAGE_KEYS = ("instrument/detector/image_key_control", IMAGE_KEY, "data/image_key")
 MASK = "instrument/detector/pixel_mask"
+MASKS = (MASK, "instrument/detector/detectorSpecific/pixel_mask", "instrument/detector/detector_specific/pixel_mask")
 DETECTOR = "instrument/detector/"
 PIXEL_SIZES = ("sample/{}_pixel_size", DETECTOR + "{}_magnified_pixel_size", DETECTOR + "{}_pixel_size")
 """Names of a pixel's size along x and y; those in the sample's plane come first."""
@@ -159,7 +160,8 @@ def _require_no_two_missing(fields: Fields, given: Mapping[str, Any]) -> None:
 
 def _marked(fields: Fields, shape: tuple[int, int]) -> np.ndarray | None:
     """`pixel_mask` [H, W] of NXdetector as stored, if there is one."""
-    return shaped(fields.label(MASK), fields.numbers(MASK), shape) if fields.find(MASK) else None
+    name = fields.find(*MASKS)
+    return shaped(fields.label(name), fields.numbers(name), shape) if name else None
 
 
 def _per_frame(fields: Fields, kinds: np.ndarray, name: str, tail: tuple[int, ...] = ()) -> np.ndarray:

@@ -11,7 +11,7 @@ import numpy as np
 from ..checks import InputError, require
 from .guard import mapped_array
 from .leftovers import is_hidden
-from .tiff_guard import image_count, image_values, open_tiff, require_one_channel
+from .tiff_guard import image_numbers, image_values, open_tiff, require_one_channel
 
 IMAGES = (".tif", ".tiff", ".png")
 
@@ -29,7 +29,7 @@ class ImageStack:
     @classmethod
     def of(cls, files: Sequence[Path]) -> ImageStack:
         """All pages of `files`, in this order. Errors: `InputError` for files that hold no grey images."""
-        pages = tuple((file, page) for file in files for page in range(_page_count(file)))
+        pages = tuple((file, page) for file in files for page in _pages(file))
         require(len(pages) > 0, f"{files[0]} must hold an image, but it holds none; it may be damaged.")
         first = _image(*pages[0])
         return cls(pages, (len(pages), *first.shape))
@@ -83,16 +83,20 @@ def _like(pattern: str | None) -> str:
 
 def _array(path: Path) -> np.ndarray:
     found = mapped_array(path, "a NumPy array")
-    require(found.ndim in (2, 3) and found.dtype.kind in "iuf", f"{path} must hold frames [N, H, W] of numbers.")
+    require(
+        found.ndim in (2, 3) and found.dtype.kind in "iuf",
+        f"{path} must hold frames [N, H, W] of numbers, but it holds {found.dtype} of the shape {found.shape}.",
+    )
     return found.reshape(-1, *found.shape[-2:])
 
 
-def _page_count(file: Path) -> int:
+def _pages(file: Path) -> list[int]:
     if file.suffix.lower() == ".png":
-        return 1
+        return [0]
     with open_tiff(file) as opened:
+        found = image_numbers(opened, file)  # first: the axes of OME leave pages that say less of themselves
         require_one_channel(opened, file)
-        return image_count(opened, file)
+        return found
 
 
 def _image(file: Path, page: int) -> np.ndarray:

@@ -19,6 +19,7 @@ from ..scan import Scan
 from .hdf5 import open_hdf5
 from .kept_frames import with_fields
 from .raw_file import DARK, FLAT, PROJECTION, Opens, ScanFile, Stack, rows_of
+from .stacks import ImageStack
 
 FILLED = "are filled from their neighbours, and count as measured"
 """What is said of pixels that have no value of their own."""
@@ -46,7 +47,7 @@ class StoredFrames(Frames):
     dark, light: [H, W] mean dark field and mean flat field less that, light None where the file is corrected already.
     mask: [H, W] bool of the pixels that are marked as defective. These, and values that are not finite, are filled from
     their neighbours, and their number is said.
-    stamp: of the file when it was opened.
+    held: the file that holds each projection, and its stamp when it was opened.
 
     The file is opened anew for each reading. Errors: `InputError` for a file that is gone or changed, or of which more
     than a part `MOST_DEFECTS` of a frame is to be filled.
@@ -61,25 +62,34 @@ class StoredFrames(Frames):
     light: np.ndarray | None
     mask: np.ndarray
     shape: tuple[int, int, int]
-    stamp: tuple[int, ...]
+    held: tuple[tuple[Path, tuple[int, ...]], ...]
 
     @classmethod
     def of(cls, file: ScanFile) -> StoredFrames:
         """Those of an open file, whose dark and flat frames are read for their means."""
         numbers, path = file.numbers(PROJECTION), file.path.resolve()
-        dark, light = _fields_of_light(file)
+        mask = file.mask()
+        require(
+            mask.mean() <= MOST_DEFECTS,
+            f"{file.label}: its pixel_mask marks {mask.mean():.0%} of the pixels as defective; 0 must stand for good "
+            "ones.",
+        )
+        dark, light = _fields_of_light(file, mask)
         stacks = tuple(_Place.of(stack) if isinstance(stack, h5py.Dataset) else stack for stack in file.stacks)
-        whole, mask = (len(numbers), *file.exposures.views.shape), file.mask()
+        whole = (len(numbers), *file.exposures.views.shape)
         if mask.any():
             note(f"{file.label}: the {int(mask.sum())} pixels that the file marks as defective {FILLED}")
-        return cls(path, file.label, stacks, file.flips, numbers, dark, light, mask, whole, _stamp(path))
+        places = [place for stack in file.stacks for place in _places_of(stack, path)]
+        held = tuple((places[n], _stamp(places[n])) for n in numbers)
+        return cls(path, file.label, stacks, file.flips, numbers, dark, light, mask, whole, held)
 
     def read(self, numbers: np.ndarray) -> np.ndarray:
         """See `Frames.read`."""
-        gone = f"{self.path} must be the file that was opened, but it is gone; put it back, or open another."
-        require(self.path.exists(), gone)
-        changed = f"{self.path} must be the file that was opened, but it has changed since; open it again."
-        require(_stamp(self.path) == self.stamp, changed)
+        for place, stamp in {self.held[n] for n in numbers}:
+            gone = f"{place} must be the file that was opened, but it is gone; put it back, or open another."
+            require(place.exists(), gone)
+            changed = f"{place} must be the file that was opened, but it has changed since; open it again."
+            require(_stamp(place) == stamp, changed)
         frames = np.empty((len(numbers), *self.shape[1:]), dtype=np.float32)
         files = {stack.file for stack in self.stacks if isinstance(stack, _Place)}
         with ExitStack() as opened:
@@ -90,21 +100,30 @@ class StoredFrames(Frames):
             for i, n in enumerate(self.numbers[numbers]):  # one by one: raw frames are wider, and there may be many
                 raw = rows_of(stacks, int(n), slice(0, self.shape[1]), self.flips)
                 frames[i] = raw if self.light is None else relative_intensity(raw, self.dark, self.light)
-        return filled(self.label, frames, ~np.isfinite(frames), self.mask)
+        return filled(self.label, frames, ~np.isfinite(frames), self.mask, self.numbers[numbers])
 
 
-def filled(label: str, frames: np.ndarray, bad: np.ndarray, mask: np.ndarray) -> np.ndarray:
+def _places_of(stack: Stack, path: Path) -> list[Path]:
+    """The file that holds each frame of a stack of the file or folder `path`."""
+    if isinstance(stack, ImageStack):
+        return [place for place, _ in stack.pages]
+    return [path] * stack.shape[0]
+
+
+def filled(label: str, frames: np.ndarray, bad: np.ndarray, mask: np.ndarray, numbers: np.ndarray) -> np.ndarray:
     """Frames [K, H, W] whose `bad` pixels [K, H, W], and those of the `mask` [H, W], are filled from their neighbours.
 
-    The number of bad ones is said. Errors: `InputError` for a frame with more than a part `MOST_DEFECTS` of them.
+    The number of bad ones is said; numbers: [K] of the frames. Errors: `InputError` for a frame with more than a part
+    `MOST_DEFECTS` of them.
     """
     found = bad & ~mask
     if found.any():
-        worst, count = float(found.mean(axis=(1, 2)).max()), int(found.any(axis=(1, 2)).sum())
+        shares, count = found.mean(axis=(1, 2)), int(found.any(axis=(1, 2)).sum())
+        worst = int(np.argmax(shares))
         require(
-            worst <= MOST_DEFECTS,
-            f"{label} must hold relative intensities, finite and above 0, but {worst:.0%} of a frame are not; correct "
-            "the frames by their flats and darks, or crop them.",
+            shares[worst] <= MOST_DEFECTS,
+            f"{label} must hold relative intensities, finite and above 0, but {shares[worst]:.0%} of frame "
+            f"{numbers[worst]} are not; correct the frames by their flats and darks, crop them, or leave this one out.",
         )
         which = f"{int(found.sum())} pixels in {count} of {len(frames)} frames"
         warn(f"{label}: {which} are not above 0, or no numbers; they {FILLED}")
@@ -125,7 +144,9 @@ class Mended(Frames):
     def read(self, numbers: np.ndarray) -> np.ndarray:
         """See `Frames.read`."""
         frames = np.array(self._frames[numbers])
-        return filled("the scan", frames, frames <= 0, np.zeros(self.shape[1:], dtype=bool))
+        return filled(
+            "the scan", frames, frames <= 0, np.zeros(self.shape[1:], dtype=bool), np.arange(self.shape[0])[numbers]
+        )
 
 
 def reader(opens: Opens) -> Callable[[Path, Mapping[str, Any]], Scan]:
@@ -149,15 +170,16 @@ def _stamp(path: Path) -> tuple[int, ...]:
     return found.st_mtime_ns, found.st_size, found.st_ino
 
 
-def _fields_of_light(file: ScanFile) -> tuple[np.ndarray, np.ndarray | None]:
-    """The mean dark field [H, W], and the mean flat field less that, None where the file has no flats."""
+def _fields_of_light(file: ScanFile, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """The mean dark field [H, W], and the mean flat field less that, None where the file has no flats; 1 in pixels of
+    the `mask` [H, W]."""
     flats, darks = file.numbers(FLAT), file.numbers(DARK)
     if len(darks) and not len(flats):
         raise InputError(f"{file.kinds_label} must mark flats (1) beside the dark ones (2), but it marks none.")
     dark = file.mean(DARK)
     if not len(flats):
         return dark, None
-    light = file.mean(FLAT) - dark
+    light = np.where(mask, 1.0, file.mean(FLAT) - dark)
     bad = int(unlit(light).sum())
     require(
         bad == 0,

@@ -42,11 +42,11 @@ def open_tiff(file: Path) -> Iterator[Any]:
         raise InputError(f"{file} must be a complete TIFF file, but it is damaged or none: {error}.") from None
 
 
-def image_count(opened: Any, file: Path) -> int:
-    """The images of an open TIFF file: its pages, without smaller copies at their end, or, where there is one page, the
-    planes behind it (ImageJ writes large stacks so). Errors: `InputError` for pages that run in a circle or beyond its
-    end, and for fewer planes than ImageJ declares."""
-    places, count, following = set[int](), 0, 0
+def image_numbers(opened: Any, file: Path) -> list[int]:
+    """The numbers of the images of an open TIFF file: its pages, without smaller copies of others, or, where there is
+    one page, the planes behind it (ImageJ writes large stacks so). Errors: `InputError` for pages that run in a circle
+    or beyond its end, and for fewer planes than ImageJ declares."""
+    places, whole, following = set[int](), list[int](), 0
     while True:
         try:
             page = opened.pages[len(places)]
@@ -54,10 +54,13 @@ def image_count(opened: Any, file: Path) -> int:
             break
         require(page.offset not in places, f"{file} must hold its pages one after another, but they run in a circle.")
         places.add(page.offset)
-        count = count if page.is_reduced and count else len(places)
+        whole += [] if page.is_reduced and whole else [len(places) - 1]
         following = _next_page(opened, page)
     require(following == 0, f"{file} must hold its pages whole, but the one after {len(places)} is not; save it anew.")
-    return count * _samples(opened.pages[0]) if count != 1 else _planes(opened, file)
+    if len(whole) == 1:
+        return list(range(_planes(opened, file)))
+    samples = _samples(opened.pages[0])
+    return [page * samples + sample for page in whole for sample in range(samples)]
 
 
 def require_one_channel(opened: Any, file: Path) -> None:
@@ -138,7 +141,7 @@ def _plane(opened: Any, number: int, file: Path) -> np.ndarray:
 def all_images(file: Path) -> list[np.ndarray]:
     """The values of all images of a TIFF file. Errors: `InputError` for one that is damaged or none."""
     with open_tiff(file) as opened:
-        return [image_values(opened, file, number) for number in range(image_count(opened, file))]
+        return [image_values(opened, file, number) for number in image_numbers(opened, file)]
 
 
 def _grey(page: Any, values: np.ndarray, file: Path) -> np.ndarray:
@@ -152,7 +155,7 @@ def _grey(page: Any, values: np.ndarray, file: Path) -> np.ndarray:
             values.dtype.kind == "u",
             f"{file} says that 0 is white, which has no meaning for {values.dtype}; save it with 0 as black.",
         )
-        note(f"{file.parent}: images such as {file.name} have 0 as white; they are turned to 0 as black")
+        note(f"{file.parent}: images there have 0 as white; they are turned to 0 as black")
         return np.asarray((1 << int(page.bitspersample)) - 1 - values, dtype=values.dtype)
     if kind == PALETTE:
         table = np.asarray(page.colormap)
@@ -169,7 +172,7 @@ def _upright(page: Any, values: np.ndarray, file: Path) -> np.ndarray:
     if kind == UPRIGHT:
         return values
     require(1 <= kind <= 8, f"{file} must have an orientation from 1 to 8, but it is {kind}; save it anew.")
-    note(f"{file.parent}: images such as {file.name} are turned upright, as their orientation {kind} says")
+    note(f"{file.parent}: images there are turned upright, as their orientation {kind} says")
     if kind > 4:  # rows are columns
         values, kind = values.swapaxes(0, 1), {5: 1, 6: 2, 7: 3, 8: 4}[kind]
     return values[:: -1 if kind in (3, 4) else 1, :: -1 if kind in (2, 3) else 1]

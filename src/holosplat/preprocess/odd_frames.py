@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from .pixels import MOST_DEFECTS
+
 SIDE = 64
 """Frames are compared on about so many rows and columns."""
 UNLIKE = 0.05
@@ -15,19 +17,30 @@ DIM = 10.0
 
 
 def thumbnail(frame: np.ndarray) -> np.ndarray:
-    """A frame [H, W] averaged over blocks of pixels to about `SIDE` rows and columns."""
+    """A frame [H, W] averaged over blocks of pixels to about `SIDE` rows and columns; few pixels that are no numbers do
+    not count."""
+    bad = ~np.isfinite(frame)
+    if 0 < bad.mean() <= MOST_DEFECTS:
+        frame = np.where(bad, np.median(frame[~bad]), frame)
     (h, w), step = frame.shape, [max(1, n // SIDE) for n in frame.shape]
     rows, columns = (n // s for n, s in zip((h, w), step))
     whole = frame[: rows * step[0], : columns * step[1]]
     return whole.reshape(rows, step[0], columns, step[1]).mean(axis=(1, 3))
 
 
-def odd_darks(darks: np.ndarray, light: float) -> np.ndarray:
-    """[n] bool: which of the darks [n, h, w] are unlike the others; light: counts of the flats above the darks.
+def odd_darks(darks: np.ndarray, lit: float) -> np.ndarray:
+    """[n] bool: which of the darks [n, h, w] are nearer to the counts of the flats (`lit`) than to those of the darkest
+    one, or else unlike the others.
 
     Of two that differ, both.
     """
-    return _unlike(darks, UNLIKE * light) if light > 0 else np.zeros(len(darks), dtype=bool)
+    levels = darks.mean(axis=(1, 2))
+    bright = levels >= 0.5 * (levels.min() + lit)
+    light = lit - float(np.median(levels[~bright])) if not bright.all() else 0.0
+    odd = bright | ~np.isfinite(levels)
+    if light > 0:
+        odd[~odd] = _unlike(darks[~odd], UNLIKE * light)
+    return np.full(2, True) if len(odd) == 2 and odd.any() else odd
 
 
 def odd_flats(flats: np.ndarray) -> np.ndarray:
@@ -36,11 +49,14 @@ def odd_flats(flats: np.ndarray) -> np.ndarray:
     Of two of which one has no light, both.
     """
     levels = flats.mean(axis=(1, 2))
-    usual = float(np.median(levels)) if len(flats) else 0.0
+    finite = levels[np.isfinite(levels)]
+    usual = float(np.median(finite)) if len(finite) else 0.0
+    if usual < finite.max(initial=0.0) / DIM**2:  # most have no light
+        usual = float(finite.max(initial=0.0))
     if usual <= 0:
         return np.zeros(len(flats), dtype=bool)
-    odd = (levels < usual / DIM) | (levels > DIM * usual)
-    if len(flats) == 2:
+    odd = (levels < usual / DIM) | (levels > DIM * usual) | ~np.isfinite(levels)
+    if len(flats) == 2 and np.isfinite(levels).all():
         return np.full(2, bool(levels.min() < levels.max() / DIM))
     odd[~odd] = _unlike(flats[~odd] / levels[~odd, None, None], UNLIKE)
     return odd

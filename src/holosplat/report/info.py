@@ -11,7 +11,6 @@ from ..io.reading import Reading
 from ..planning.scan_facts import facts_of_scan
 from ..workflows.run_folder import RunFolder
 from ..workflows.run_status import facts_of_run
-from .look import look_figure
 
 
 def info(path: str | Path, reading: Reading = Reading(), picture: Path | None = None) -> Facts:
@@ -53,6 +52,8 @@ def info(path: str | Path, reading: Reading = Reading(), picture: Path | None = 
         scan is not None or picture is None, f"--picture is of the frames of a scan, but {path} shows none; leave it."
     )
     if scan is not None and picture is not None:
+        from .look import look_figure  # needs matplotlib, which takes half a second
+
         with atomic_path(picture) as temporary:
             look_figure(scan).savefig(temporary, format="png")
     facts = found or (scan and scan.facts)
