@@ -36,14 +36,14 @@ if TYPE_CHECKING:
     from ..beamline.series import Timing
     from ..geometry import Views
     from ..scan import Exposures
-    from ..specimens.bubbles import Bubbles
+    from ..specimens.rods import RodScene
     from ..specimens.carried import CarriedScene
     from ..specimens.continuous import ContinuousScene
     from ..specimens.mesh_series import MeshSeries
     from ..specimens.scene import MeshScene
     from ..specimens.voxel_scene import VoxelScene
 
-    Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene | Bubbles
+    Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene | RodScene
 
 
 MOST_FRAMES = 10**6

@@ -18,14 +18,14 @@ if TYPE_CHECKING:
     from ..beamline.simulate import Simulation
     from ..optics.coherence import Spectrum
     from ..scan import Exposures
-    from ..specimens.bubbles import Bubbles
+    from ..specimens.rods import RodScene
     from ..specimens.carried import CarriedScene
     from ..specimens.continuous import ContinuousScene
     from ..specimens.mesh_series import MeshSeries
     from ..specimens.scene import MeshScene
     from ..specimens.voxel_scene import VoxelScene
 
-    Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene | Bubbles
+    Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene | RodScene
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class SourceOptions:
         """Frames [H, W] of `matter`, one after another."""
         from ..beamline.polychromatic import polychromatic_frames, refilled
         from ..beamline.simulate import simulated_frames
-        from ..specimens.bubbles import Bubbles
+        from ..specimens.rods import RodScene
         from ..specimens.carried import CarriedScene
         from ..specimens.continuous import ContinuousScene
         from ..specimens.voxel_scene import VoxelScene
@@ -92,7 +92,7 @@ class SourceOptions:
         light = self.light(exposures.one_energy("a simulation"))
         if light is None:
             return simulated_frames(matter, exposures, how)
-        if isinstance(matter, ContinuousScene | CarriedScene | VoxelScene | Bubbles):
+        if isinstance(matter, ContinuousScene | CarriedScene | VoxelScene | RodScene):
             raise InputError(
                 "a spectrum needs meshes, whose materials are known at every energy; leave --bandwidth and --spectrum "
                 "out."

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from ..beamline.scenes import Filling
-    from ..specimens.bubbles import Bubbles
+    from ..specimens.rods import RodScene
     from ..specimens.carried import CarriedScene
     from ..specimens.continuous import ContinuousScene
     from ..specimens.voxel_scene import VoxelScene
@@ -117,10 +117,10 @@ class GeneratedOptions:
 
     def scene(
         self, beamline: BeamlineOptions, filling: Filling, duration: float = 0.0
-    ) -> ContinuousScene | CarriedScene | Bubbles:
+    ) -> ContinuousScene | CarriedScene | RodScene:
         """The specimen in the beamline's field of view; duration: from the first frame to the last [s]."""
         from ..specimens import soft_matter, soft_motion
-        from ..specimens.bubbles import random_bubbles
+        from ..specimens.rods import random_bubbles
 
         assert self.specimen is not None
         pixel = beamline.pixel_size
@@ -187,7 +187,7 @@ class SpecimenOptions:
 
     def continuous(
         self, paths: tuple[Path, ...], beamline: BeamlineOptions, filling: Filling, duration: float = 0.0
-    ) -> ContinuousScene | CarriedScene | VoxelScene | Bubbles | None:
+    ) -> ContinuousScene | CarriedScene | VoxelScene | RodScene | None:
         """The specimen, unless `paths` are meshes; `InputError` for a mixture. duration: of its motion [s]."""
         from ..io.volume_formats import FORMATS
 
