@@ -101,7 +101,7 @@ def test_light_is_in_the_frames_and_in_the_file(tmp_path):
         (["--specimen", "stirred-blob", "--frame-rate", 100], "--frames of two or more"),
         (["--specimen", "stirred-blob", "--frame-rate", 1, "--frames", 2, "--start", 1], "leave --start"),
         (["--specimen", "tissue", "--specimen-motion", 3], "--specimen-motion is of stirred-blob"),
-        (["--specimen", "tissue", "--bandwidth", 0.01], "a spectrum needs meshes"),
+        (["--specimen", "tissue", "--bandwidth", 0.01], "a spectrum needs meshes of files"),
         (["--specimen", "tissue", "--specimen-seed", -1], "specimen-seed must not be negative"),
         (["--specimen", "tissue", "--light-drift-px", 3], "light_drift_px moves the pattern"),
         (["a.vtk", "--voxel-size", "1e-6"], "of TIFF images, not of meshes"),

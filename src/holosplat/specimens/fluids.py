@@ -52,7 +52,7 @@ class Bubbles:
     def drawn(self, substances: Substances, seed: int) -> Drawn:
         """The bubbles that `seed` gives."""
         low, high = self.radii
-        radii, box = (low * self.size, high * self.size), (self.size,) * 3
+        radii, box = (low * self.size, high * self.size), (self.size, self.size, self.size)
         scene = random_bubbles(self.count, radii, box, substances.contrast, seed, overlapping=self.overlap)
         return Drawn(scene, f"{self.count} bubbles, seed {seed}", {"bubbles": RodScene(scene.rods, SHARE)})
 

@@ -242,7 +242,7 @@ class Star:
         wedges = []
         for n in range(self.spokes):
             edges = turn + 2 * np.pi * (n + np.array([0, 0.5])) / self.spokes
-            rim = np.linspace(*edges, 9)
+            rim = np.linspace(edges[0], edges[1], 9)
             angles = np.concatenate([[edges[0]], rim, [edges[1]]])
             at = np.concatenate([radii[:1], np.full(len(rim), radii[1]), radii[:1]])
             outline = np.column_stack([at * np.cos(angles), at * np.sin(angles)])
