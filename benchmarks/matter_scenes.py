@@ -96,17 +96,22 @@ class Scene:
         return hs.MaterialPrior.known(self.substances.contrast, second)
 
 
-def scene(name: str, size: str, seed: int) -> Scene:
-    """The scene of a kind that `seed` gives."""
-    pixels, count, photons = SIZES[size]
+def planned(name: str, size: str, seed: int) -> tuple[Substances, Drawn, Exposures]:
+    """What is in the scene of a kind that `seed` gives, the scene, and how its frames are taken."""
+    pixels, count, _ = SIZES[size]
     kind = MATTER[name](MATTER[name].extent * pixels * PIXEL)
     material, core, medium = (_delta_beta(one) for one in kind.named)
     substances = Substances(material, None if kind.named[1] is None else core, medium)
-    drawn = kind.drawn(substances, seed)
     views = Views.evenly_spaced(count, shape=(pixels, pixels), pixel_size=PIXEL)
     exposures = Exposures.of(views, energy_kev=ENERGY, distance=DISTANCE)
-    is_test = np.zeros(count, dtype=bool)
-    scan = hs.simulate(drawn.scene, exposures, photons_per_pixel=photons, seed=seed, is_test=is_test)
+    return substances, kind.drawn(substances, seed), exposures
+
+
+def scene(name: str, size: str, seed: int) -> Scene:
+    """The scene of a kind that `seed` gives, with its frames."""
+    substances, drawn, exposures = planned(name, size, seed)
+    is_test = np.zeros(len(exposures), dtype=bool)
+    scan = hs.simulate(drawn.scene, exposures, photons_per_pixel=SIZES[size][2], seed=seed, is_test=is_test)
     return Scene(scan, substances, drawn, name == "shock")
 
 
