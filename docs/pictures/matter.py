@@ -16,6 +16,8 @@ from holosplat.specimens.matter import MATTER
 
 IMAGES = Path(__file__).parents[1] / "images" / "matter"
 SEED, DPI, PHOTONS = 1, 72, 3000.0
+SHOWN = ("bubbles", "cells", "keyhole")
+"""Parts through which the slice goes, where a kind has them."""
 
 
 def picture(name: str) -> None:
@@ -23,14 +25,15 @@ def picture(name: str) -> None:
     drawn, exposures = script("matter_scenes").planned(name, "small", SEED)[1:]
     truth = drawn.scene.voxelise(hs.Grid.of_views(exposures.views))
     scan = hs.simulate(drawn.scene, exposures[[0]], photons_per_pixel=PHOTONS, is_test=np.zeros(1, dtype=bool))
-    middle = int(np.argmax(np.abs(truth.delta - np.median(truth.delta)).sum(axis=(1, 2))))
+    named = next((part for part in SHOWN if part in drawn.regions), next(iter(drawn.regions)))
+    middle = int(drawn.regions[named].voxelise(truth.grid).delta.sum(axis=(1, 2)).argmax())
     figure, (left, right) = plt.subplots(1, 2, figsize=(4.2, 2.1))
     left.imshow(scan.frames[0], cmap="gray", vmin=0.6, vmax=1.5)
     right.imshow(1e6 * truth.delta[middle], cmap="gray")
     for axes, title in ((left, "frame"), (right, "slice of the true δ")):
         axes.set_title(title, fontsize=8)
         axes.set_axis_off()
-    figure.tight_layout(pad=0.3)
+    figure.tight_layout(pad=0.8)
     figure.savefig(IMAGES / f"{name}.png", dpi=DPI, metadata={"Software": None})
     plt.close(figure)
 

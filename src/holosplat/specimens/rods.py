@@ -30,7 +30,7 @@ class Rod:
     """A cylinder with a half ball at each end: all points within `radius` [m] of a straight line.
 
     start, end: [3] ends of the line `(x, y, z)` [m]; equal ends make a ball. Errors: `InputError` for ends of another
-    shape, and for a radius that is no length.
+    shape, and for a radius out of range.
     """
 
     start: np.ndarray
