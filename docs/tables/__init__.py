@@ -266,13 +266,9 @@ TABLES |= {
 TABLES["faults"] = Table(
     runs.faults, ("faults.csv",), "python benchmarks/faults.py --trials 200 --csv docs/data/faults.csv", "an hour"
 )
-TABLES |= {
-    name: Table(make, ("matter_scenes.csv",), "python benchmarks/matter_scenes.py --seeds 101", "hours")
-    for name, make in (
-        ("matter-small", lambda: matter.scenes("small")),
-        ("matter-large", lambda: matter.scenes("large")),
-    )
-}
+TABLES["matter"] = Table(
+    lambda: matter.scenes("small"), ("matter_scenes.csv",), "python benchmarks/matter_scenes.py --seeds 101", "hours"
+)
 THESIS = "python benchmarks/thesis_runs.py run RUNS --snapshots DIR, then collect RUNS"
 TABLES |= {
     f"thesis-{name}": Table(make, ("thesis_study/runs.csv",), THESIS, "a day")

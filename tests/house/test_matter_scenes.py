@@ -67,5 +67,5 @@ def test_tables_hold_each_kind_by_each_run(tables, monkeypatch):
     rows = [row | {"kind": "jet"}, row | {"kind": "jet", "run": "Paganin, TV", "error": "inf"}]
     rows += [row | {"kind": "star", "use": "development"}, row | {"kind": "star", "size": "large"}]
     monkeypatch.setattr(tables, "read", lambda name: rows)
-    assert tables.scenes("small").splitlines()[2:] == ["| `jet` | 0.027 / 0.990 / 1.01 | – | refused |"]
+    assert tables.scenes("small").splitlines()[2:] == ["| `jet` | 0.027 / 0.990 / 1.01 | refused |"]
     assert list(MATTER) == tables.KINDS
