@@ -29,15 +29,17 @@ def tables(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def test_the_truth_is_judged_right_and_an_empty_volume_wrong(script):
-    _, drawn, exposures = script.planned("jet", "small", 1)
+    substances, drawn, exposures = script.planned("jet", "small", 1)
     grid = hs.Grid.of_views(exposures.views)
-    truth = drawn.scene.voxelise(grid)
-    assert script.judged(truth, drawn, grid) == pytest.approx((0, 1, 1, 1), abs=0.01)
-    full = replace(truth, delta=np.where(truth.delta > 0, truth.delta.max(), 0.0))
-    error, _, total, holes = script.judged(full, drawn, grid)
+    truth, bubbles = (one.voxelise(grid) for one in (drawn.scene, drawn.regions["bubbles"]))
+    *scores, right = script.judged(truth, drawn, grid)
+    assert scores == pytest.approx([0, 1, 1])
+    full = replace(truth, delta=truth.delta + substances.contrast.delta * bubbles.delta)
+    error, _, total, wrong = script.judged(full, drawn, grid)
     assert error > 0.05
     assert total > 1
-    assert holes < 0.6
+    assert right > 0.8
+    assert wrong < 0.3  # air beside the jet, where a bubble is near its edge
     error, overlap, total, _ = script.judged(replace(truth, delta=0 * truth.delta), drawn, grid)
     assert (error, overlap, total) == (1, 0, 0)
     assert script.judged(None, drawn, grid)[:2] == (np.inf, 0)
