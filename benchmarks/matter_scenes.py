@@ -57,7 +57,8 @@ AROUND = 2
 class Row:
     """use: development or reporting; error: relative, of δ; dice: of the voxels beyond half the material's δ; total: of
     δ, over the true one; holes: Dice of voxels below half of it, in true holes and two voxels around (also
-    outside of the matter); result: the kind of Object, or why there is none; verdict: whether it is good; seconds: of the processor."""
+    outside of the matter); result: the kind of Object, or why there is none; verdict: whether it is good; seconds: of
+    the processor."""
 
     kind: str
     size: str
