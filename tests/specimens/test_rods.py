@@ -28,9 +28,9 @@ def test_line_integrals_and_voxels_sum_up_to_the_volume(way):
     tilted = np.array([[1, 0, 0], [0, 0.8, -0.6], [0, 0.6, 0.8]]) @ rotations[1]
     views = Views(np.stack([*rotations, tilted]), np.full((3, 2), 1.7e-6), (45, 53), PIXEL)
     _, delta = RodScene((one,), MATTER).project(views)
-    assert (delta.sum(dim=(1, 2)) * PIXEL**2).numpy() == pytest.approx(MATTER.delta * one.volume, rel=2e-3)
+    assert (delta.sum(dim=(1, 2)) * PIXEL**2).numpy() == pytest.approx(MATTER.delta * one.volume, rel=1e-2, abs=0)
     volume = RodScene((one,), MATTER).voxelise(Grid.of_views(views))
-    assert float(volume.delta.sum()) * PIXEL**3 == pytest.approx(MATTER.delta * one.volume, rel=2e-3)
+    assert float(volume.delta.sum()) * PIXEL**3 == pytest.approx(MATTER.delta * one.volume, rel=1e-2, abs=0)
     assert volume.delta.max() == pytest.approx(MATTER.delta)
 
 
@@ -58,7 +58,7 @@ def test_rods_that_cross_count_once():
     views = Views.from_angles([0.0, 30.0], (47, 51), PIXEL)
     expected = sum(one.volume for one in cross.rods) - 16 / 3 * r**3
     _, delta = cross.project(views)
-    assert (delta.sum(dim=(1, 2)) * PIXEL**2).numpy() == pytest.approx(MATTER.delta * expected, rel=2e-3)
+    assert (delta.sum(dim=(1, 2)) * PIXEL**2).numpy() == pytest.approx(MATTER.delta * expected, rel=1e-2, abs=0)
 
 
 def rod_through(way: str, radius: float) -> Rod:
