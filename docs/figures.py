@@ -16,7 +16,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from tables import TABLES
+from tables import TABLES, matter
 
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
@@ -73,6 +73,11 @@ FIGURES = {
         "thesis",
     ),
     "compact": Figure(("compact.png",), "compact"),
+    "matter": Figure(
+        tuple(f"matter/{kind}.png" for kind in matter.KINDS),
+        "matter",
+        takes="a minute",
+    ),
     "benchmark-rows": Figure((), "benchmark_rows", ("BENCH", "FILE.csv"), "holosplat bench run --out BENCH", "hours"),
     "benchmark": Figure(
         tuple(

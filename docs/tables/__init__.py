@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from . import alignment, benchmark, learning, measured, motion, moving, printed, runs, thesis
+from . import alignment, benchmark, learning, matter, measured, motion, moving, printed, runs, thesis
 
 
 @dataclass(frozen=True)
@@ -268,6 +268,9 @@ TABLES |= {
 
 TABLES["faults"] = Table(
     runs.faults, ("faults.csv",), "python benchmarks/faults.py --trials 200 --csv docs/data/faults.csv", "an hour"
+)
+TABLES["matter"] = Table(
+    lambda: matter.scenes("small"), ("matter_scenes.csv",), "python benchmarks/matter_scenes.py --seeds 101", "hours"
 )
 THESIS = "python benchmarks/thesis_runs.py run RUNS --snapshots DIR, then collect RUNS"
 TABLES |= {

@@ -12,6 +12,9 @@ from helpers.cli import Outcome, holosplat, worked
 from holosplat.geometry import Grid
 from holosplat.io.nxtomo import read_scan
 from holosplat.io.volumes import read_volume
+from holosplat.io.vtk import read_meshes
+from holosplat.materials import parse_material
+from holosplat.specimens.matter import MATTER
 
 FIELD: list[object] = ["--detector", 21, 30, "--pixel-size", "2e-6", "--views", 4]
 
@@ -101,7 +104,7 @@ def test_light_is_in_the_frames_and_in_the_file(tmp_path):
         (["--specimen", "stirred-blob", "--frame-rate", 100], "--frames of two or more"),
         (["--specimen", "stirred-blob", "--frame-rate", 1, "--frames", 2, "--start", 1], "leave --start"),
         (["--specimen", "tissue", "--specimen-motion", 3], "--specimen-motion is of stirred-blob"),
-        (["--specimen", "tissue", "--bandwidth", 0.01], "a spectrum needs meshes"),
+        (["--specimen", "tissue", "--bandwidth", 0.01], "a spectrum needs meshes of files"),
         (["--specimen", "tissue", "--specimen-seed", -1], "specimen-seed must not be negative"),
         (["--specimen", "tissue", "--light-drift-px", 3], "light_drift_px moves the pattern"),
         (["a.vtk", "--voxel-size", "1e-6"], "of TIFF images, not of meshes"),
@@ -164,13 +167,15 @@ def test_bubbles_are_generated_against_their_medium(tmp_path):
     ran("simulate", "--specimen", "bubbles", "--medium", "water", *drawn, *FIELD, "--out", scan, "--truth", truth)
     found, volume = read_scan(scan), read_volume(truth)
     assert found.provenance["specimen"] == "bubbles"
-    assert found.provenance["specimen_radii"] == "3e-06 8e-06"
-    assert found.provenance["medium"] != "vacuum"
+    assert found.provenance["specimen_count"] == "5"
+    assert found.provenance["medium"] == "water"
+    assert found.provenance["material"] == "air"
+    size = float(found.provenance["specimen_size"])
+    radii = [float(share) * size for share in found.provenance["specimen_radii"].split()]
+    assert radii == pytest.approx([3e-6, 8e-6], rel=1e-4)
     assert volume.delta.min() == pytest.approx(-5.75e-7, rel=0.01)
     assert volume.delta.max() == 0
     assert volume.beta.min() < 0
-    refused = holosplat("simulate", "--specimen", "bubbles", *FIELD, "--out", tmp_path / "x.nxs")
-    assert "--specimen bubbles needs --medium" in refused.err
     stray = ["--specimen-overlap", *FIELD, "--out", tmp_path / "x.nxs"]
     refused = holosplat("simulate", "--specimen", "tissue", *stray)
     assert "--specimen-radii and --specimen-overlap are of bubbles, not of tissue" in refused.err
@@ -180,3 +185,64 @@ def test_bubbles_are_generated_against_their_medium(tmp_path):
     assert refused.code != 0
     assert "the material must differ from its medium in δ, but the difference is 0" in refused.err
     assert not (tmp_path / "run").exists()
+
+
+def test_matter_that_fills_the_field_is_written_with_its_parts(tmp_path):
+    """A cuvette: materials and parameters, the usual ones or those that are named, the true parts and surfaces."""
+    scan, truth, surfaces = (tmp_path / name for name in ("s.nxs", "t.h5", "t.stl"))
+    says = ["--specimen", "cuvette", "--core", "ethanol", "--specimen-set", "wall=0.2", "--specimen-count", 2]
+    outcome = ran(
+        "simulate", *says, *FIELD, "--out", scan, "--truth", truth, "--truth-regions", "--truth-mesh", surfaces
+    )
+    assert "goes on beyond the field of view" in outcome.err
+    assert "enlarge --detector" not in outcome.err
+    facts = read_scan(scan).provenance
+    assert facts["specimen_wall"] == "0.2"
+    assert (facts["material"], facts["core"], facts["medium"]) == ("glass", "ethanol", "vacuum")
+    assert facts["specimen_drawn"] == "a cuvette with 2 bubbles, seed 0"
+    volume, wall, bubbles = (read_volume(p) for p in (truth, tmp_path / "t_wall.h5", tmp_path / "t_bubbles.h5"))
+    glass, ethanol = (parse_material(name).delta_beta(20.0).delta for name in ("glass", "ethanol"))
+    assert volume.delta[wall.delta > 0.99999] == pytest.approx(glass, rel=1e-4)
+    assert wall.delta.max() == bubbles.delta.max() == pytest.approx(1)
+    liquid = (volume.delta > 0.1 * ethanol) & (wall.delta == 0) & (bubbles.delta == 0)
+    assert volume.delta[liquid] == pytest.approx(ethanol, rel=1e-4)
+    (found,) = read_meshes(surfaces, "um")
+    assert len(found.faces) == 2 * 12 + 2 * 5120  # wall, liquid and two bubbles
+
+
+@pytest.mark.parametrize("kind", [name for name in MATTER if name not in ("bubbles", "cuvette")])
+def test_every_kind_that_may_fill_the_field_is_generated(kind, tmp_path):
+    scan, truth = tmp_path / "s.nxs", tmp_path / "t.h5"
+    ran("simulate", "--specimen", kind, "--specimen-seed", 1, *FIELD, "--out", scan, "--truth", truth)
+    found, volume = read_scan(scan), read_volume(truth)
+    assert found.frames.std() > 0.004
+    assert found.provenance["specimen"] == kind
+    assert found.provenance["medium"] == (MATTER[kind].named[2] or "vacuum")
+    assert float(found.provenance["specimen_size"]) == pytest.approx(MATTER[kind].extent * 42e-6, rel=1e-4)
+    assert np.abs(volume.delta).max() > 4e-8
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--specimen", "jet", "--specimen-set", "wall=0.1"], "the setting wall is not known; use one of size, count"),
+        (["--specimen", "jet", "--specimen-set", "amplitude=0.9"], "amplitude must be below 0.7"),
+        (["--specimen", "jet", "--core", "iron"], "--core is not of the jet"),
+        (["--specimen", "jet", "--specimen-motion", 3], "--specimen-motion is of stirred-blob"),
+        (["--specimen", "jet", "--specimen-edge", "1e-6"], "--specimen-edge is not of the jet"),
+        (["--specimen", "jet", "--bandwidth", 0.01], "a spectrum needs meshes of files"),
+        (["--specimen", "crack", "--specimen-count", 3], "--specimen-count is not of the crack"),
+        (["--specimen", "tissue", "--specimen-set", "wall=0.1"], "--specimen-set is of matter that may fill the field"),
+        (["--specimen", "tissue", "--truth", "t.h5", "--truth-regions"], "--truth-regions is of matter that may fill"),
+        (["--specimen", "bubbles", "--truth-regions"], "--truth-regions needs --truth"),
+        (["--specimen", "bubbles", "--truth-mesh", "b.stl"], "--truth-mesh needs a still truth of surfaces"),
+        (["--specimen", "jet", "--truth-mesh", "b.obj"], "--truth-mesh must be a file whose name ends with .stl"),
+        (["--specimen", "keyhole", "--specimen-radii", "1e-6", "2e-6"], "are of bubbles, not of keyhole"),
+    ],
+)
+def test_requests_of_matter_in_the_field_that_cannot_be_are_refused(arguments, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    outcome = holosplat("simulate", *arguments, *FIELD, "--out", tmp_path / "s.nxs")
+    assert outcome.code == 2
+    assert re.search(r"\W+".join(re.findall(r"\w+", said)), outcome.said)
+    assert list(tmp_path.iterdir()) == []

@@ -15,7 +15,7 @@ from holosplat.methods.illumination import prepared
 from holosplat.methods.trials import first_of_task
 from holosplat.metrics import volume_scores
 from holosplat.scan import Exposures, Scan
-from holosplat.specimens import Bubbles, MeshScene, random_bubbles
+from holosplat.specimens import MeshScene, RodScene, random_bubbles
 from holosplat.specimens.red_cells import random_cells
 from holosplat.workflows.preconditions import decisions_of
 from holosplat.workflows.totals import TotalMatter
@@ -31,7 +31,7 @@ def of(scene, photons: float | None = None) -> Scan:
 
 
 @pytest.fixture(scope="module")
-def bubbles() -> Bubbles:
+def bubbles() -> RodScene:
     return random_bubbles(4, (3e-6, 6e-6), (34e-6, 30e-6, 34e-6), AIR_IN_WATER, 5)
 
 

@@ -13,7 +13,7 @@ from holosplat.geometry import Grid, Views
 from holosplat.materials import WATER, DeltaBeta, parse_material
 from holosplat.model import measure
 from holosplat.scan import Exposures
-from holosplat.specimens import Ball, Bubbles, random_bubbles
+from holosplat.specimens import Ball, RodScene, random_bubbles
 
 PIXEL = 1e-6
 AIR_IN_WATER = parse_material("air").delta_beta(20.0).against(WATER.delta_beta(20.0))
@@ -28,10 +28,10 @@ def union(first: float, second: float, apart: float) -> float:
     return whole - math.pi * (first + second - apart) ** 2 * square / (12 * apart)
 
 
-def two(apart: float) -> Bubbles:
+def two(apart: float) -> RodScene:
     """Balls of the radii 9 and 6 µm, whose centres are `apart` [m] along a slanted line."""
     way = np.array([0.48, 0.6, 0.64]) * apart
-    return Bubbles((Ball(-0.4 * way, 18e-6), Ball(0.6 * way, 12e-6)), AIR_IN_WATER)
+    return RodScene.of_balls((Ball(-0.4 * way, 18e-6), Ball(0.6 * way, 12e-6)), AIR_IN_WATER)
 
 
 @pytest.mark.parametrize("apart", [4e-6, 11e-6, 20e-6])
@@ -53,7 +53,7 @@ def test_a_bubbles_frames_are_a_balls_of_the_opposite_contrast():
     ball = (Ball(np.array([3e-6, -2e-6, 1e-6]), 14e-6),)
     views = Views.from_angles([0.0, 50.0], (33, 41), PIXEL)
     weak = DeltaBeta(1e-3 * AIR_IN_WATER.delta, 1e-3 * AIR_IN_WATER.beta)
-    hole, body = (Bubbles(ball, DeltaBeta(s * weak.delta, s * weak.beta)) for s in (1, -1))
+    hole, body = (RodScene.of_balls(ball, DeltaBeta(s * weak.delta, s * weak.beta)) for s in (1, -1))
     for of_hole, of_body in zip(hole.project(views), body.project(views)):
         assert torch.equal(of_hole, -of_body)
     where = Exposures.of(views, 20.0, 0.1)
@@ -66,11 +66,11 @@ def test_bubbles_are_drawn_within_their_box():
     box, radii = (40e-6, 30e-6, 40e-6), (2e-6, 5e-6)
     scene = random_bubbles(8, radii, box, AIR_IN_WATER, 3)
     again, other = (random_bubbles(8, radii, box, AIR_IN_WATER, seed) for seed in (3, 4))
-    assert np.array_equal(scene.centres, again.centres)
-    assert not np.array_equal(scene.centres, other.centres)
+    assert np.array_equal(scene.ends[:, 0], again.ends[:, 0])
+    assert not np.array_equal(scene.ends[:, 0], other.ends[:, 0])
     assert scene.radii.min() == pytest.approx(2e-6)
     assert scene.radii.max() == pytest.approx(5e-6)
-    away = np.linalg.norm(scene.centres[:, None] - scene.centres, axis=-1) + 1e-3 * np.eye(8)
+    away = np.linalg.norm(scene.ends[:, 0][:, None] - scene.ends[:, 0], axis=-1) + 1e-3 * np.eye(8)
     assert (away > scene.radii[:, None] + scene.radii).all()
     low, high = scene.bounds
     assert (np.abs([low, high]) <= 0.5 * np.array(box)).all()
@@ -82,7 +82,7 @@ def test_bubbles_are_drawn_within_their_box():
 
 def test_bubbles_overlap_where_they_may():
     crowd = random_bubbles(40, (4e-6, 5e-6), (30e-6, 30e-6, 30e-6), AIR_IN_WATER, 0, overlapping=True)
-    away = np.linalg.norm(crowd.centres[:, None] - crowd.centres, axis=-1) + np.eye(40)
+    away = np.linalg.norm(crowd.ends[:, 0][:, None] - crowd.ends[:, 0], axis=-1) + np.eye(40)
     assert (away < crowd.radii[:, None] + crowd.radii).any()
     with pytest.raises(InputError, match="only"):
         random_bubbles(40, (4e-6, 5e-6), (30e-6, 30e-6, 30e-6), AIR_IN_WATER, 0)
@@ -91,7 +91,7 @@ def test_bubbles_overlap_where_they_may():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: Bubbles((), AIR_IN_WATER), "needs at least one, but there is none"),
+        (lambda: RodScene((), AIR_IN_WATER), "needs at least one, but there is none"),
         (lambda: random_bubbles(0, (1e-6, 2e-6), (1e-5,) * 3, AIR_IN_WATER), "count must be at least 1"),
         (lambda: random_bubbles(1, (3e-6, 2e-6), (1e-5,) * 3, AIR_IN_WATER), r"radii must be \(smallest, largest\)"),
         (lambda: random_bubbles(1, (0.0, 2e-6), (1e-5,) * 3, AIR_IN_WATER), "radius of bubbles"),

@@ -17,10 +17,11 @@ from .align import RefineOptions
 from .carried import CarriedFlags
 from .light import RunLightFlags
 from .live import LiveFlags, watched
-from .options import BeamlineOptions, MethodOptions, PriorOptions, TruthOptions
+from .options import BeamlineOptions, MethodOptions, PriorOptions
 from .places import Output
 from .progress import INTERRUPTED, ProgressBar
 from .room import tell_frames, tell_reconstruction
+from .truth import TruthOptions
 
 if TYPE_CHECKING:
     from ..methods import Method

@@ -30,7 +30,6 @@ from ..ranges import (
     Within,
     ranged,
 )
-from .places import Output
 
 if TYPE_CHECKING:
     import numpy as np
@@ -255,41 +254,6 @@ class MisalignmentOptions:
     def facts(self) -> dict[str, str]:
         """What the file of the true exposures says of them."""
         return {name: f"{value:g}" for name, value in vars(self).items()}
-
-
-@dataclass(frozen=True)
-@ranged
-class TruthOptions:
-    """What is also written, for judging."""
-
-    truth: Output | None = None
-    """Volume file (as `export --volume`): the true δ and β, of a series at its first time."""
-    truth_frames: tuple[int, ...] = ()
-    """Series: write the true volume at these times instead, counted from 0, to TRUTH_t0000.h5 and so on."""
-    true_exposures: Output | None = None
-    """Scan file: the same frames, with poses and distances as they were, not as --out tells them."""
-
-    def require_usable(self, out: Path) -> None:
-        """`InputError` unless all files, `out` among them, can be written."""
-        from ..io.atomic import require_writable
-        from ..io.volume_formats import volume_format
-
-        require(self.truth is not None or not self.truth_frames, "--truth-frames needs --truth.")
-        if self.truth is not None:
-            volume_format(self.truth, "--truth")
-        for path in filter(None, (out, self.truth, self.true_exposures)):
-            require_writable(path)
-
-    def volumes(self, times: int) -> list[tuple[Path, int]]:
-        """Each volume file to write, and the number of its time, one of `times`."""
-        from ..io.volume_formats import of_time
-
-        if self.truth is None:
-            return []
-        for n in self.truth_frames:
-            require(0 <= n < times, f"--truth-frames must be times of the scan, 0 to {times - 1}, but {n} is none.")
-        named = [(of_time(self.truth, frame), frame) for frame in self.truth_frames]
-        return named or [(self.truth, 0)]
 
 
 @dataclass(frozen=True)

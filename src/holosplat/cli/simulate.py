@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -21,13 +21,13 @@ from .options import (
     MisalignmentOptions,
     MotionOptions,
     NoiseOptions,
-    TruthOptions,
 )
 from .places import Output
 from .progress import ProgressBar
 from .room import tell_simulation
-from .source import SourceOptions
+from .source import NO_SPECTRUM, SourceOptions
 from .specimen import SpecimenOptions
+from .truth import TruthOptions
 
 if TYPE_CHECKING:
     import numpy as np
@@ -36,29 +36,37 @@ if TYPE_CHECKING:
     from ..beamline.series import Timing
     from ..geometry import Views
     from ..scan import Exposures
-    from ..specimens.bubbles import Bubbles
     from ..specimens.carried import CarriedScene
     from ..specimens.continuous import ContinuousScene
+    from ..specimens.drawn import Drawn
     from ..specimens.mesh_series import MeshSeries
+    from ..specimens.rods import RodScene
     from ..specimens.scene import MeshScene
     from ..specimens.voxel_scene import VoxelScene
+    from ..volume import Object
 
-    Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene | Bubbles
+    Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene | RodScene
 
 
 MOST_FRAMES = 10**6
 """Frames of a scan, at most: more take hours on the smallest of detectors."""
+NO_TRUTH = TruthOptions()
 MESHES = SpecimenOptions()
 """What is imaged unless options say otherwise."""
 
 
 @dataclass(frozen=True)
 class _Specimen:
-    """What is imaged, and at which times [T] of the frames [s]; facts: what the scan file says of it."""
+    """What is imaged, and at which times [T] of the frames [s].
+
+    facts: what the scan file says of it; regions: its named parts; goes_on: whether it goes on beyond the field.
+    """
 
     matter: Still | MeshSeries
     times: np.ndarray
     facts: dict[str, str]
+    regions: Mapping[str, Still] = field(default_factory=dict)
+    goes_on: bool = False
 
 
 @dataclass(frozen=True)
@@ -82,7 +90,7 @@ def simulate(
     imaged: SpecimenOptions = MESHES,
     filling: MaterialOptions = MaterialOptions(),
     experiment: ExperimentOptions = ExperimentOptions(),
-    truth: TruthOptions = TruthOptions(),
+    truth: TruthOptions = NO_TRUTH,
 ) -> None:
     """Simulate the holograms of closed meshes, still or moving (--frame-rate), of a volume, or of generated matter.
 
@@ -102,7 +110,8 @@ def simulate(
     motion, source, beamline = experiment.motion, experiment.source, beamline.told()
     require(beamline.exposures is None or not source.cone, "--cone goes with --distance; leave it, or --exposures.")
     of_source, beamline = source.facts(beamline), source.applied(beamline)
-    views, filled = beamline.planned(), imaged.generated.in_medium(filling).filling()
+    named = imaged.generated.in_medium(filling)
+    views, filled = beamline.planned(), named.filling()
     true_views = experiment.misalignment.errors().true_exposures(views)
     with ProgressBar() as bar:
         times = imaged.generated.timing(motion) if imaged.generated.specimen else np.zeros(1)
@@ -113,19 +122,24 @@ def simulate(
             imaged.meshes.require_static()
             moves = len(times) > 1
             require(moves or motion.frame_rate is None, "--frame-rate is of moving meshes; leave it out.")
-            specimen = _Specimen(generated, times, _facts_of_still(imaged, files))
+            require(source.light(beamline.energy_kev) is None, NO_SPECTRUM)
+            specimen = _still(generated, times, imaged, files, beamline)
     times = specimen.times
     _require_few(len(views) * len(times))
     how = replace(experiment.noise.simulation(motion.shutter(), experiment.light), backend=experiment.backend)
-    _warn_of_missing_field(specimen.matter, true_views.views, beamline.pixel_size)
+    _say_of_missing_field(specimen, true_views.views, beamline.pixel_size)
     split = beamline.split(len(views) if motion.hold_out == "views" else len(times))
     is_test = held_out(split, len(views), len(times), motion.hold_out)
     nominal, true, volumes = views.repeated(times), true_views.repeated(times), truth.volumes(len(times))
-    facts = {**how.provenance(true), **specimen.facts, **of_source, "medium": filling.medium or "vacuum"}
-    targets = [(out, nominal, facts)]
+    facts = {**how.provenance(true), **specimen.facts, **of_source, "medium": named.medium or "vacuum"}
+    if imaged.generated.specimen is not None and named.material is not None:
+        facts["material"] = named.material
+    regions, targets = truth.of_regions(specimen.regions), [(out, nominal, facts)]
     if truth.true_exposures:
         targets.append((truth.true_exposures, true, facts | experiment.misalignment.facts()))
     tell_simulation(true_views, out, how.samples(true_views), len(true))
+    if truth.write_mesh(specimen.matter):
+        _say(f"wrote {truth.truth_mesh}: the true surfaces")
     with ProgressBar() as bar:
         _write_frames(targets, is_test, source.frames(specimen.matter, filled, true, how), bar)
     text = "{} frames of {} × {} pixels, {} of them held out".format(len(true), *beamline.detector, is_test.sum())
@@ -135,6 +149,9 @@ def simulate(
     for path, frame in volumes:
         _write_truth(path, specimen.matter.at(times[frame]), views.views)
         _say(f"wrote {path}: the true volume{f' at {times[frame]:.6g} s' if motion.frame_rate else ''}")
+    for path, region in regions.items():
+        _write_truth(path, region, views.views)
+        _say(f"wrote {path}: the share of each voxel that this part fills")
 
 
 def _specimen(
@@ -176,14 +193,25 @@ def _facts(scene: MeshScene) -> dict[str, str]:
     return {"meshes": str(len(scene.meshes)), "materials": "; ".join(found)}
 
 
-def _facts_of_still(imaged: SpecimenOptions, files: tuple[Path, ...]) -> dict[str, str]:
-    generated = imaged.generated
-    if generated.specimen is None:
-        return {"volume": ", ".join(path.name for path in files[:3]) + (" …" if len(files) > 3 else "")}
-    radii, overlap = generated.specimen_radii, generated.specimen_overlap
-    drawn = {"specimen_radii": "{:g} {:g}".format(*radii)} if radii else {}
-    drawn |= {"specimen_overlap": "yes"} if overlap else {}
-    return {"specimen": generated.specimen, "specimen_seed": str(generated.specimen_seed), **drawn}
+def _still(
+    generated: Still | Drawn,
+    times: np.ndarray,
+    imaged: SpecimenOptions,
+    files: tuple[Path, ...],
+    beamline: BeamlineOptions,
+) -> _Specimen:
+    """A volume, or matter that is generated."""
+    from ..specimens.drawn import Drawn
+
+    if imaged.generated.specimen is None:
+        said = {"volume": ", ".join(path.name for path in files[:3]) + (" …" if len(files) > 3 else "")}
+    else:
+        said = imaged.generated.facts(beamline)
+    if not isinstance(generated, Drawn):
+        return _Specimen(generated, times, said)
+    found = imaged.generated.in_field(beamline)
+    goes_on = found is not None and found.goes_on
+    return _Specimen(generated.scene, times, said | {"specimen_drawn": generated.text}, generated.regions, goes_on)
 
 
 def _require_few(frames: int) -> None:
@@ -194,9 +222,11 @@ def _require_few(frames: int) -> None:
     )
 
 
-def _warn_of_missing_field(matter: Still | MeshSeries, views: Views, pixel_size: float) -> None:
-    missing = matter.missing_field(views)
-    if missing > 0:
+def _say_of_missing_field(specimen: _Specimen, views: Views, pixel_size: float) -> None:
+    missing = specimen.matter.missing_field(views)
+    if specimen.goes_on:
+        _say("the matter, or its medium, goes on beyond the field of view; the frames are made with it")
+    elif missing > 0:
         _say(
             f"warning: the scene reaches {1e6 * missing:.3g} µm ({missing / pixel_size:.3g} pixels) beyond "
             "the detector in at least one view; enlarge --detector, or move --origin."
@@ -220,7 +250,7 @@ def _write_frames(
             bar.show("simulating views", (n + 1) / len(is_test), {})
 
 
-def _write_truth(path: Path, matter: Still, views: Views) -> None:
+def _write_truth(path: Path, matter: Object, views: Views) -> None:
     from ..geometry import Grid
     from ..io.volume_formats import write_volume_file
 

@@ -18,14 +18,19 @@ if TYPE_CHECKING:
     from ..beamline.simulate import Simulation
     from ..optics.coherence import Spectrum
     from ..scan import Exposures
-    from ..specimens.bubbles import Bubbles
     from ..specimens.carried import CarriedScene
     from ..specimens.continuous import ContinuousScene
     from ..specimens.mesh_series import MeshSeries
+    from ..specimens.rods import RodScene
     from ..specimens.scene import MeshScene
     from ..specimens.voxel_scene import VoxelScene
 
-    Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene | Bubbles
+    Still = MeshScene | ContinuousScene | VoxelScene | CarriedScene | RodScene
+
+
+NO_SPECTRUM = (
+    "a spectrum needs meshes of files, whose materials are known at every energy; leave --bandwidth and --spectrum out."
+)
 
 
 @dataclass(frozen=True)
@@ -84,19 +89,14 @@ class SourceOptions:
         """Frames [H, W] of `matter`, one after another."""
         from ..beamline.polychromatic import polychromatic_frames, refilled
         from ..beamline.simulate import simulated_frames
-        from ..specimens.bubbles import Bubbles
-        from ..specimens.carried import CarriedScene
-        from ..specimens.continuous import ContinuousScene
-        from ..specimens.voxel_scene import VoxelScene
+        from ..specimens.mesh_series import MeshSeries
+        from ..specimens.scene import MeshScene
 
         light = self.light(exposures.one_energy("a simulation"))
         if light is None:
             return simulated_frames(matter, exposures, how)
-        if isinstance(matter, ContinuousScene | CarriedScene | VoxelScene | Bubbles):
-            raise InputError(
-                "a spectrum needs meshes, whose materials are known at every energy; leave --bandwidth and --spectrum "
-                "out."
-            )
+        if not isinstance(matter, MeshScene | MeshSeries):
+            raise InputError(NO_SPECTRUM)
         return polychromatic_frames(lambda energy: refilled(matter, filling, energy), light, exposures, how)
 
     def facts(self, beamline: BeamlineOptions) -> dict[str, str]:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from tyro.conf import UseAppendAction, arg
 
 from ..checks import InputError, require
 from ..ranges import Grams, Many, Seed, Signed, Small, ranged
@@ -15,18 +17,32 @@ if TYPE_CHECKING:
     import numpy as np
 
     from ..beamline.scenes import Filling
-    from ..specimens.bubbles import Bubbles
     from ..specimens.carried import CarriedScene
     from ..specimens.continuous import ContinuousScene
+    from ..specimens.drawn import Drawn
+    from ..specimens.matter import FieldMatter
     from ..specimens.voxel_scene import VoxelScene
 
 Moving = Literal["stirred-blob", "collapsing-foam"]
-Kind = (
-    Literal["soft-cells", "round-cell", "tissue", "head-phantom", "coated-droplets", "body-with-absorber", "bubbles"]
-    | Moving
-)
+Soft = Literal["soft-cells", "round-cell", "tissue", "head-phantom", "coated-droplets", "body-with-absorber"]
+InField = Literal[
+    "bubbles",
+    "cuvette",
+    "jet",
+    "break-up",
+    "crack",
+    "shock",
+    "keyhole",
+    "lattice",
+    "fibres",
+    "channel",
+    "star",
+]
+"""The kinds of `specimens.MATTER`."""
 MOVING: tuple[Moving, ...] = ("stirred-blob", "collapsing-foam")
 CORED = ("coated-droplets", "body-with-absorber")
+USUAL_COUNT = 9
+"""Cells or droplets unless --specimen-count says otherwise."""
 
 
 @dataclass(frozen=True)
@@ -68,12 +84,12 @@ class VolumeOptions:
 class GeneratedOptions:
     """Matter that is generated, in place of files."""
 
-    specimen: Kind | None = None
-    """Kind of specimen."""
+    specimen: Soft | Moving | InField | None = None
+    """Kind of specimen (docs/simulation.md)."""
     specimen_size: Small | None = None
-    """Its extent [m] (default: 0.85 of the shorter side of the field of view)."""
-    specimen_count: Many = 9
-    """Number of cells, droplets or bubbles."""
+    """Its extent [m] (default: 0.85 of the shorter side of the field of view, or as its kind has it)."""
+    specimen_count: Many | None = None
+    """Number of cells, droplets, bubbles, threads, fibres … (default: 9, or as its kind has it)."""
     specimen_edge: Small | None = None
     """Width of the edges of soft cells, of the head phantom and of a foam [m] (default: 3 pixels, or 4 % of the
     extent where that is less)."""
@@ -82,13 +98,16 @@ class GeneratedOptions:
     between them."""
     specimen_overlap: bool = False
     """Whether bubbles may overlap, as those that merge."""
+    specimen_set: Annotated[UseAppendAction[tuple[str, ...]], arg(metavar="NAME=VALUE")] = ()
+    """Another parameter of matter that may fill the field, as wall=0.1 of a cuvette (docs/simulation.md)."""
     specimen_seed: Seed = 0
     """Seed of the specimen."""
     specimen_motion: float | None = None
     """How far it goes from the first frame to the last: by how much the middle of the stirred blob turns [degrees]
     (default: 60), or which share of its gas the collapsing foam loses (default: 0.5)."""
     core: str | None = None
-    """Formula or name of what is in coated droplets, or of the absorber; --material is around it."""
+    """Formula or name of what is in coated droplets, in a cuvette or a channel, or of the absorber; --material is
+    around it."""
     core_density: Grams | None = None
     """Its density [g/cm³]; a named one has its own."""
 
@@ -107,30 +126,20 @@ class GeneratedOptions:
         return np.arange(timing.frames) / timing.frame_rate
 
     def in_medium(self, filling: MaterialOptions) -> MaterialOptions:
-        """The materials: bubbles hold air unless said otherwise, and are in a medium; `InputError` without one."""
-        if self.specimen != "bubbles":
+        """The materials: where they are not named, those that are usual for matter that may fill the field."""
+        kind = self._kind()
+        if kind is None:
             return filling
-        require(
-            filling.medium is not None, "--specimen bubbles needs --medium, what the bubbles are in, such as water."
-        )
-        return replace(filling, material=filling.material or "air")
+        material, _, medium = kind.named
+        return replace(filling, material=filling.material or material, medium=filling.medium or medium)
 
-    def scene(
-        self, beamline: BeamlineOptions, filling: Filling, duration: float = 0.0
-    ) -> ContinuousScene | CarriedScene | Bubbles:
-        """The specimen in the beamline's field of view; duration: from the first frame to the last [s]."""
-        from ..specimens import soft_matter, soft_motion
-        from ..specimens.bubbles import random_bubbles
+    def in_field(self, beamline: BeamlineOptions) -> FieldMatter | None:
+        """The matter that may fill the field, with its parameters; None for other specimens."""
+        from ..tables import overridden
 
-        assert self.specimen is not None
-        pixel = beamline.pixel_size
-        size = self.specimen_size or 0.85 * min(beamline.detector) * pixel
-        edge, seed, box = self.specimen_edge, self.specimen_seed, (size, size, size)
-        edge = min(3 * pixel, 0.04 * size) if edge is None else edge
-        matter = filling.of(self.specimen, beamline.energy_kev)
-        cores, goes = self._cores(filling, beamline.energy_kev), self.specimen_motion
+        kind = self._kind()
         require(
-            goes is None or self.specimen in MOVING,
+            self.specimen_motion is None or self.specimen in MOVING,
             f"--specimen-motion is of {' and '.join(MOVING)}, not of {self.specimen}; leave it.",
         )
         of_bubbles = self.specimen_radii is not None or self.specimen_overlap
@@ -138,17 +147,79 @@ class GeneratedOptions:
             self.specimen == "bubbles" or not of_bubbles,
             f"--specimen-radii and --specimen-overlap are of bubbles, not of {self.specimen}; leave them.",
         )
-        if self.specimen == "bubbles":
-            radii = self.specimen_radii or (0.05 * size, 0.14 * size)
-            return random_bubbles(self.specimen_count, radii, box, matter, seed, overlapping=self.specimen_overlap)
+        require(
+            kind is not None or not self.specimen_set,
+            f"--specimen-set is of matter that may fill the field, not of {self.specimen}; leave it.",
+        )
+        if kind is None:
+            return None
+        given: dict[str, Any] = {} if self.specimen_count is None else {"count": self.specimen_count}
+        require(not given or hasattr(kind, "count"), f"--specimen-count is not of the {self.specimen}; leave it.")
+        require(self.specimen_edge is None, f"--specimen-edge is not of the {self.specimen}; leave it.")
+        size = self.specimen_size or kind.extent * min(beamline.detector) * beamline.pixel_size
+        if self.specimen_radii is not None:
+            given["radii"] = tuple(radius / size for radius in self.specimen_radii)
+        if self.specimen_overlap:
+            given["overlap"] = True
+        return overridden(kind(size, **given), self.specimen_set)
+
+    def facts(self, beamline: BeamlineOptions) -> dict[str, str]:
+        """What the scan file says of the specimen: its kind, seed, parameters, and what is inside."""
+        from ..tables import to_table
+
+        said = {"specimen": str(self.specimen), "specimen_seed": str(self.specimen_seed)}
+        if (found := self.in_field(beamline)) is None:
+            return said
+        parameters = {name: value for name, value in to_table(found).items() if name != "kind"}
+        shown = {name: " ".join(map(_number, v if isinstance(v, list) else [v])) for name, v in parameters.items()}
+        core = {"core": str(self.core or found.named[1])} if found.has_core else {}
+        return said | {f"specimen_{name}": text for name, text in shown.items()} | core
+
+    def drawn(self, beamline: BeamlineOptions, filling: Filling) -> Drawn:
+        """What `in_field` gives of the named materials."""
+        from ..materials import parse_material
+        from ..specimens.drawn import VACUUM, Substances
+
+        found = self.in_field(beamline)
+        assert found is not None
+        assert self.specimen is not None
+        energy = beamline.energy_kev
+        cored = self.core if found.has_core else None
+        require(cored == self.core, f"--core is not of the {self.specimen}; leave it.")
+        require(found.has_core or self.core_density is None, f"--core-density is not of the {self.specimen}; leave it.")
+        core = cored or found.named[1]
+        medium = VACUUM if filling.medium is None else filling.medium.delta_beta(energy)
+        material = replace(filling, medium=None).of(self.specimen, energy)
+        inside = None if core is None else parse_material(core, self.core_density).delta_beta(energy)
+        return found.drawn(Substances(material, inside, medium), self.specimen_seed)
+
+    def _kind(self) -> type[FieldMatter] | None:
+        from ..specimens.matter import MATTER
+
+        return None if self.specimen is None else MATTER.get(self.specimen)
+
+    def scene(
+        self, beamline: BeamlineOptions, filling: Filling, duration: float = 0.0
+    ) -> ContinuousScene | CarriedScene:
+        """A specimen that ends in the beamline's field of view; duration: from the first frame to the last [s]."""
+        from ..specimens import soft_matter, soft_motion
+
+        assert self.specimen is not None
+        pixel = beamline.pixel_size
+        size = self.specimen_size or 0.85 * min(beamline.detector) * pixel
+        edge, seed, box = self.specimen_edge, self.specimen_seed, (size, size, size)
+        count = USUAL_COUNT if self.specimen_count is None else self.specimen_count
+        edge = min(3 * pixel, 0.04 * size) if edge is None else edge
+        matter = filling.of(self.specimen, beamline.energy_kev)
+        cores, goes = self._cores(filling, beamline.energy_kev), self.specimen_motion
         if self.specimen == "stirred-blob":
             turn = math.radians(60.0 if goes is None else goes)
             return soft_motion.stirred_blob(size, matter, seed, turn, duration)
         if self.specimen == "collapsing-foam":
             lost = 0.5 if goes is None else goes
-            return soft_motion.collapsing_foam(size, matter, seed, lost, duration, self.specimen_count, edge)
+            return soft_motion.collapsing_foam(size, matter, seed, lost, duration, count, edge)
         if self.specimen == "soft-cells":
-            return soft_matter.soft_cells(self.specimen_count, (0.2 * size, 0.35 * size), box, matter, seed, edge)
+            return soft_matter.soft_cells(count, (0.2 * size, 0.35 * size), box, matter, seed, edge)
         if self.specimen == "round-cell":
             return soft_matter.round_cell(size, matter, seed)
         if self.specimen == "tissue":
@@ -157,9 +228,7 @@ class GeneratedOptions:
             return soft_matter.shepp_logan(size, matter, edge)
         if self.specimen == "coated-droplets":
             sizes = (0.18 * size, 0.36 * size)
-            return soft_matter.coated_droplets(
-                self.specimen_count, sizes, 0.04 * size, box, (cores[0], matter), self.specimen_seed
-            )
+            return soft_matter.coated_droplets(count, sizes, 0.04 * size, box, (cores[0], matter), self.specimen_seed)
         return soft_matter.body_with_absorber((size, 0.75 * size, 0.9 * size), matter, cores[0], 0.16 * size, seed)
 
     def _cores(self, filling: Filling, energy_kev: float) -> list:
@@ -187,13 +256,15 @@ class SpecimenOptions:
 
     def continuous(
         self, paths: tuple[Path, ...], beamline: BeamlineOptions, filling: Filling, duration: float = 0.0
-    ) -> ContinuousScene | CarriedScene | VoxelScene | Bubbles | None:
+    ) -> ContinuousScene | CarriedScene | VoxelScene | Drawn | None:
         """The specimen, unless `paths` are meshes; `InputError` for a mixture. duration: of its motion [s]."""
         from ..io.volume_formats import FORMATS
 
         of_volume = [path for path in paths if path.suffix.lower() in FORMATS]
         if self.generated.specimen is not None:
             require(not paths, "--specimen generates what is imaged; give it or files, not both.")
+            if self.generated.in_field(beamline) is not None:
+                return self.generated.drawn(beamline, filling)
             return self.generated.scene(beamline, filling, duration)
         require(len(paths) > 0, "simulate needs mesh files, a volume, or --specimen.")
         if not of_volume:
@@ -201,3 +272,7 @@ class SpecimenOptions:
             return None
         require(len(of_volume) == len(paths), "simulate takes meshes or a volume, but there are both; give one kind.")
         return self.volume.volume(paths, filling, beamline.energy_kev)
+
+
+def _number(value: Any) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)

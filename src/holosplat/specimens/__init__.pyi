@@ -1,5 +1,4 @@
-from .bubbles import Bubbles as Bubbles
-from .bubbles import random_bubbles as random_bubbles
+from .blast import Blast as Blast
 from .capsules import Capsule as Capsule
 from .capsules import place_capsules as place_capsules
 from .carried import CarriedScene as CarriedScene
@@ -9,8 +8,15 @@ from .continuous import ContinuousScene as ContinuousScene
 from .continuous import Element as Element
 from .continuous import Soft as Soft
 from .continuous import ellipsoid as ellipsoid
+from .drawn import Drawn as Drawn
+from .drawn import Substances as Substances
 from .flow.suspension import Medium as Medium
 from .flow.suspension import Suspension as Suspension
+from .fluids import BreakUp as BreakUp
+from .fluids import Bubbles as Bubbles
+from .fluids import Cuvette as Cuvette
+from .fluids import Jet as Jet
+from .fluids import Shock as Shock
 from .foam import Foam as Foam
 from .foam import random_foam as random_foam
 from .membrane.model import Elasticity as Elasticity
@@ -26,6 +32,9 @@ from .red_cells import evans_fung_cell as evans_fung_cell
 from .red_cells import place_cells as place_cells
 from .red_cells import random_cells as random_cells
 from .repair import closed as closed
+from .rods import Rod as Rod
+from .rods import RodScene as RodScene
+from .rods import random_bubbles as random_bubbles
 from .scene import MeshScene as MeshScene
 from .soft_matter import body_with_absorber as body_with_absorber
 from .soft_matter import coated_droplets as coated_droplets
@@ -35,3 +44,9 @@ from .soft_matter import soft_cells as soft_cells
 from .soft_matter import tissue as tissue
 from .soft_motion import collapsing_foam as collapsing_foam
 from .soft_motion import stirred_blob as stirred_blob
+from .solids import Channel as Channel
+from .solids import Crack as Crack
+from .solids import Fibres as Fibres
+from .solids import Keyhole as Keyhole
+from .solids import Lattice as Lattice
+from .solids import Star as Star

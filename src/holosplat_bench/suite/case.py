@@ -17,7 +17,7 @@ FOLDER = Path(__file__).with_name("cases")
 """The suite: a TOML file for each case, or for several that differ little."""
 ORDER = ("main", "thesis", "cells", "xmpi", "plasma8", "noise12", "crowded12", "sharp_light")
 ORDER += ("misaligned", "two_materials8", "shells8", "foam12")
-ORDER += ("soft12", "tissue16", "coated", "absorber12", "contact91")
+ORDER += ("soft12", "tissue16", "coated", "absorber12", "contact91", "matter")
 """How tables list the files of the suite; others follow by name."""
 
 

@@ -17,7 +17,8 @@ from holosplat.io.nxtomo import read_scan, write_scan
 from holosplat.io.volumes import read_volume, write_volume
 from holosplat.scan import Scan
 from holosplat.specimens.continuous import ContinuousScene
-from holosplat.specimens.scene import MeshScene
+from holosplat.specimens.drawn import Scene
+from holosplat.specimens.rods import RodScene
 from holosplat.volume import Volume
 from holosplat.workflows.provenance import scan_hash
 
@@ -67,10 +68,12 @@ def fingerprint(case: Case) -> str:
     return digest.hexdigest()[:16]
 
 
-def _matter(scene: MeshScene | ContinuousScene) -> list[object]:
+def _matter(scene: Scene) -> list[object]:
     """δ and β of each body, and the profiles of continuous ones."""
     if isinstance(scene, ContinuousScene):
         return [(element.profile, tuple(element.matter)) for element in scene.elements]
+    if isinstance(scene, RodScene):
+        return [tuple(scene.matter)]
     return [tuple(material) for material in scene.materials]
 
 
@@ -78,6 +81,8 @@ def _arrays(case: Case) -> Iterable[np.ndarray]:
     if isinstance(case.scene, ContinuousScene):
         for element in case.scene.elements:
             yield from (element.centre, element.axes, element.gradient)
+    elif isinstance(case.scene, RodScene):
+        yield from (case.scene.ends, case.scene.radii)
     else:
         for mesh in case.scene.meshes:
             yield from (mesh.vertices, mesh.faces)

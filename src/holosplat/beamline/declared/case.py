@@ -12,9 +12,8 @@ from ...geometry import Grid
 from ...matter import MaterialPrior
 from ...optics.detector import poisson
 from ...scan import Exposures, Scan
-from ...specimens.continuous import ContinuousScene
+from ...specimens.drawn import Scene
 from ...specimens.phantoms import Ball
-from ...specimens.scene import MeshScene
 from ...volume import Volume
 from ..light import EVEN_LIGHT, UnevenLight
 from ..misalignment import AS_PLANNED, Misalignment
@@ -28,11 +27,13 @@ class Case:
     those held out; prior: of the matter, for every method; photons: a pixel, None without noise; summary: one
     line about the case; specimen: what the scene is, in words; balls: those of a resolution phantom, mesh by mesh;
     light: how it differs from the flat field on the frames for training; misalignment: errors of the exposures, drawn
-    with `seed` added to their own. Methods get the planned `exposures`; frames are taken in the true ones."""
+    with `seed` added to their own.
+    Methods get the planned `exposures`; frames are taken in the true ones. goes_on: whether the scene may reach beyond
+    the detector."""
 
     name: str
     seed: int
-    scene: MeshScene | ContinuousScene
+    scene: Scene
     exposures: Exposures
     is_test: np.ndarray
     prior: MaterialPrior
@@ -42,6 +43,7 @@ class Case:
     balls: tuple[Ball, ...] = ()
     light: UnevenLight = EVEN_LIGHT
     misalignment: Misalignment = AS_PLANNED
+    goes_on: bool = False
 
     def __post_init__(self) -> None:
         whole_seed("seed", self.seed)
@@ -51,7 +53,7 @@ class Case:
         require(both, f"case {self.name} must have frames for training and held-out ones; it has one kind only.")
         missing = self.scene.missing_field(self.exposures.views)
         require(
-            missing <= 0,
+            missing <= 0 or self.goes_on,
             f"the scene of case {self.name} (seed {self.seed}) must lie within the detector in every view, but it "
             f"reaches {1e6 * missing:.4g} µm beyond; use more pixels, larger ones or a smaller scene.",
         )
@@ -108,4 +110,5 @@ def case_of(declared: Declaration, name: str, seed: int, snapshots: Path | None 
         balls=balls,
         light=declared.light,
         misalignment=declared.misalignment,
+        goes_on=declared.goes_on,
     )

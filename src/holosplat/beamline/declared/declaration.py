@@ -19,14 +19,14 @@ from ...matter import MaterialPrior
 from ...optics.noise import PHOTON_RANGE
 from ...ranges import Grams, Many, ManyOrNone, Metres, Photons, Pixels, Positive, Signed, Small, ranged
 from ...scan import Exposures, interleaved_split
-from ...specimens.continuous import ContinuousScene
+from ...specimens.drawn import Scene, Substances
 from ...specimens.phantoms import Ball
 from ...specimens.scene import MeshScene
 from ...tables import from_table, merged, read_table
 from ..light import EVEN_LIGHT, UnevenLight
 from ..misalignment import AS_PLANNED, Misalignment
 from .soft_specimens import Continuous
-from .specimens import Specimen
+from .specimens import Meshed, Specimen
 
 MOST_PIXELS = 4096
 
@@ -204,7 +204,7 @@ class Declaration:
             return MaterialPrior.known(contrast)
         return MaterialPrior.of_ratio(contrast.ratio) if self.prior == "ratio" else MaterialPrior.unknown()
 
-    def scene(self, seed: int, snapshots: Path | None) -> tuple[MeshScene | ContinuousScene, str, tuple[Ball, ...]]:
+    def scene(self, seed: int, snapshots: Path | None) -> tuple[Scene, str, tuple[Ball, ...]]:
         """The matter that `seed` gives, what it is in words, and the balls of a phantom of balls.
 
         The core of a mesh adds what it is filled with, less the material around it.
@@ -213,11 +213,20 @@ class Declaration:
         if isinstance(self.specimen, Continuous):
             cores = [self._delta_beta(self.matter.core).against(medium)] if self.matter.core else []
             return *self.specimen.continuous(seed, [material.against(medium), *cores]), ()
+        if not isinstance(self.specimen, Meshed):
+            core = None if self.matter.core is None else self._delta_beta(self.matter.core)
+            found = self.specimen.drawn(Substances(material, core, medium), seed)
+            return found.scene, found.text, ()
         bodies = self.specimen.bodies(seed, snapshots)
         filling = [material.against(medium)] * len(bodies.outer)
         if self.matter.core is not None:
             filling += [self._delta_beta(self.matter.core).against(material)] * len(bodies.cores)
         return MeshScene((*bodies.outer, *bodies.cores), tuple(filling)), bodies.text, bodies.balls
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether the matter, or its medium, goes on beyond the field of view, and is meant to."""
+        return not isinstance(self.specimen, Meshed | Continuous) and self.specimen.goes_on
 
     def _delta_beta(self, substance: Substance) -> DeltaBeta:
         return substance.delta_beta(self.beam.energy_kev)

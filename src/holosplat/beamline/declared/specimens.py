@@ -16,6 +16,7 @@ from ...mesh import TriangleMesh
 from ...ranges import Many, Seed, Share, Small, SomeShare, ranged
 from ...specimens.capsules import place_capsules
 from ...specimens.foam import random_foam
+from ...specimens.matter import FieldMatter
 from ...specimens.phantoms import Ball, star_of_balls
 from ...specimens.red_cells import crowded_cells, random_cells
 from ...specimens.repair import closed
@@ -175,5 +176,5 @@ class BallStar:
 
 Meshed = RedCells | CrowdedCells | Snapshots | Capsules | FoamDrop | BallStar
 """Every kind of closed meshes."""
-Specimen = Meshed | Continuous
+Specimen = Meshed | Continuous | FieldMatter
 """Every kind that a case's file may declare."""

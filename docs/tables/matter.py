@@ -1,0 +1,32 @@
+"""Tables of matter that may fill the field, from docs/data/matter_scenes.csv."""
+
+from __future__ import annotations
+
+from .benchmark import Row, markdown, read
+
+KINDS = ["bubbles", "cuvette", "jet", "break-up", "crack", "shock", "keyhole", "lattice", "fibres", "channel", "star"]
+HEAD = {
+    "told": "by default, told the materials",
+    "nothing told": "by default, nothing told",
+    "Paganin, TV": "Paganin and total variation",
+}
+
+
+def scenes(size: str) -> str:
+    """Error of δ / Dice / total over the true one, of each kind by each run that there is, of seeds for reporting."""
+    rows = [row for row in read("matter_scenes.csv") if row["size"] == size and row["use"] == "reporting"]
+    runs, lines = [run for run in HEAD if any(row["run"] == run for row in rows)], []
+    for kind in KINDS:
+        own = {row["run"]: row for row in rows if row["kind"] == kind}
+        if own:
+            lines.append([f"`{kind}`", *(_three(own.get(run)) for run in runs)])
+    return markdown(("kind", *(HEAD[run] for run in runs)), lines)
+
+
+def _three(row: Row | None) -> str:
+    if row is None:
+        return "–"
+    if row["error"] == "inf":
+        return "refused"
+    error, dice, total = (float(row[name]) for name in ("error", "dice", "total"))
+    return f"{error:.3f} / {dice:.3f} / {total:.2f}"
