@@ -10,8 +10,7 @@ import pytest
 
 from helpers.discs import PITCH, ball_lines
 from holosplat.align import Axis, AxisOptions, find_axis
-from holosplat.align.combine import Estimate, combined
-from holosplat.align.consistency import polynomials
+from holosplat.align.consistency import Estimate, combined, polynomials
 from holosplat.checks import InputError
 from holosplat.geometry import Views, rotation_y
 from holosplat.scan import Exposures, Scan

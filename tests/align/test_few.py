@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from helpers.misaligned_balls import MATERIAL, scan_of
 from holosplat.align import PoseOptions, Uncertain, align_views
 from holosplat.align.derivatives import projections
-from holosplat.align.evidence import weighed
 from holosplat.align.following import SHARP, SOFT, Following, of_poses
-from holosplat.align.untold import beside, motions
+from holosplat.align.marginal_likelihood import weighed
+from holosplat.align.null_space import beside, motions
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.geometry import Grid, Views
 from holosplat.matter import MaterialPrior

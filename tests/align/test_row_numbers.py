@@ -8,11 +8,11 @@ import pytest
 from helpers.misaligned_balls import SHAPE
 from helpers.moving_balls import beams, thickness
 from helpers.row_images import gaussians, placed
-from holosplat.align.begin import ANGLE, Images, begun
 from holosplat.align.derivatives import in_pixels
+from holosplat.align.initial_geometry import ANGLE, Images, begun
+from holosplat.align.null_space import FACTOR as NUMBERS
+from holosplat.align.null_space import Told
 from holosplat.align.row_sums import COUNT, FACTOR, RETRIEVED, RowPrior, by_rows, plane_angles
-from holosplat.align.untold import FACTOR as NUMBERS
-from holosplat.align.untold import Told
 from holosplat.geometry import Views
 
 EXPECTED = np.array([2.0, 2.0, *np.deg2rad([1.0, 1.0, 1.0])])

@@ -11,11 +11,11 @@ from scipy.spatial.transform import Rotation
 from helpers.misaligned_balls import SHAPE
 from helpers.moving_balls import beams, thickness
 from helpers.row_images import gaussians, placed
-from holosplat.align.begin import Images, begun
 from holosplat.align.derivatives import in_pixels
 from holosplat.align.gauge import moved_onto
+from holosplat.align.initial_geometry import Images, begun
+from holosplat.align.null_space import Told, motions
 from holosplat.align.row_sums import COUNT, RowPrior, Rows, by_rows, conditions, plane_angles
-from holosplat.align.untold import Told, motions
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.geometry import Views, rotation_tilted
 

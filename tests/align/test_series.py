@@ -14,9 +14,8 @@ from helpers.moving_balls import beams, series
 from holosplat.align import AlignedBeams, Drift, PoseOptions, Uncertain, align_views
 from holosplat.align.derivatives import NUMBERS
 from holosplat.align.gauge import moved_onto
-from holosplat.align.moments import Beams, Moment, chosen_moments
 from holosplat.align.newton import Normal
-from holosplat.align.series_search import SeriesSearch
+from holosplat.align.series_search import Beams, Moment, SeriesSearch, chosen_moments
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.checks import InputError
 from holosplat.matter import MaterialPrior

@@ -13,9 +13,9 @@ from torch.nn.functional import interpolate
 from helpers.discs import ball_lines
 from helpers.misaligned_balls import BALLS, MATERIAL, PIXEL, scan_of
 from holosplat.align import AlignedViews, PoseOptions, Uncertain, align_views
-from holosplat.align.coarse import mirrored, shifts_by_mass
 from holosplat.align.derivatives import NUMBERS, Predicted, projections
 from holosplat.align.gauge import moved_onto
+from holosplat.align.initial_geometry import mirrored, shifts_by_mass
 from holosplat.align.newton import Normal, blurred, step
 from holosplat.align.views import Judged
 from holosplat.beamline.misalignment import Misalignment

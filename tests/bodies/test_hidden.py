@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from helpers.motion_shadows import OTHER, TURN, cell, pose, shadows
-from holosplat.bodies.pool import Pool
+from holosplat.bodies.neighbourhood_search import Pool, pursued
 from holosplat.bodies.poses import FREER, HIDDEN, Explained, Pose
-from holosplat.bodies.replaced import pursued
 from holosplat.bodies.shadows import Shadows
 
 TRUTH = (9.0, 2.0, -8.0)

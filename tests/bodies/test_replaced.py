@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from helpers.motion_shadows import FLOW, OTHER, TURN, cell, pose, shadows
-from holosplat.bodies import replaced
-from holosplat.bodies.pool import Pool, annealed
+from holosplat.bodies import neighbourhood_search
+from holosplat.bodies.neighbourhood_search import Pool, Replaced, annealed
 from holosplat.bodies.poses import FREER, Explained
-from holosplat.bodies.replaced import Replaced
 from holosplat.bodies.templates import Search, Templates
 
 
@@ -39,7 +38,7 @@ def test_the_best_of_several_tries_are_put_together():
 
 def test_a_body_that_stands_for_two_is_replaced_by_them(monkeypatch):
     """It lies between two cells that cross in the first beam; from there no small step is better."""
-    monkeypatch.setattr(replaced, "PATIENCE", 1)
+    monkeypatch.setattr(neighbourhood_search, "PATIENCE", 1)
     truth = [pose(TURN, (1.0, 0.0, -7.0)), pose(OTHER, (-1.0, 1.0, 7.0), 1.1)]
     seen = shadows(truth)
     every = Explained(cell(), seen)

@@ -13,8 +13,8 @@ from helpers.kept import Kept
 from helpers.moving_ellipsoids import MATERIAL, scan, true_paths
 from holosplat.checks import InputError
 from holosplat.learning.weights import Card, Trained
-from holosplat.motion import contest, following
-from holosplat.motion.contest import Parts, cells_or_any, residual
+from holosplat.motion import body_tracker, model_comparison
+from holosplat.motion.model_comparison import Parts, cells_or_any, residual
 from holosplat.motion.track import TrackOptions, follow
 
 
@@ -44,7 +44,7 @@ class Run:
     ids=["any shape leaves clearly less", "no shape leaves clearly less", "no cells"],
 )
 def test_what_leaves_less_is_kept(monkeypatch, cells, other, kept, looked):
-    monkeypatch.setattr(contest, "residual", lambda run: run.left)
+    monkeypatch.setattr(model_comparison, "residual", lambda run: run.left)
     runs = Run("cells", cells or 0.0, cells is None), Run("other", other)
     said = cells_or_any(*runs)  # type: ignore[arg-type]
     assert said.startswith(kept)
@@ -77,15 +77,15 @@ def short() -> TrackOptions:
 @pytest.fixture
 def guessed(monkeypatch):
     """Each time sees the true bodies, and a network that knows red cells alone is said to have guessed them."""
-    monkeypatch.setattr(following, "CHECKPOINT_SECONDS", -1.0)
+    monkeypatch.setattr(body_tracker, "CHECKPOINT_SECONDS", -1.0)
     at = lambda frames, material, options, network: [  # noqa: E731
-        following.Sighting(mesh, False) for mesh in true_paths().bodies(float(frames.instants[0]))
+        body_tracker.Sighting(mesh, False) for mesh in true_paths().bodies(float(frames.instants[0]))
     ]
-    monkeypatch.setattr(following, "sightings", at)
+    monkeypatch.setattr(body_tracker, "sightings", at)
     trained = Trained(object(), Card(trained_on={"kinds": ["red-cells"]}))  # type: ignore[arg-type]
     monkeypatch.setattr("holosplat.learning.start.LearnedStart.network", property(lambda self: trained))
-    monkeypatch.setattr(following.Following, "network", lambda self: trained.network)
-    monkeypatch.setattr("holosplat.bodies.replaced.PATIENCE", 1)
+    monkeypatch.setattr(body_tracker.Following, "network", lambda self: trained.network)
+    monkeypatch.setattr("holosplat.bodies.neighbourhood_search.PATIENCE", 1)
     return trained
 
 

@@ -17,7 +17,7 @@ from holosplat.geometry import Grid
 from holosplat.io.objects import read_object, write_object
 from holosplat.matter import MaterialPrior
 from holosplat.methods import SmoothVolume, Task
-from holosplat.motion.carried import CarriedOptions, Search, merged
+from holosplat.motion.flow_reconstruction import CarriedOptions, Search, merged
 from holosplat.representations import Fading, Flow, Lattice, TimeBasis
 from holosplat.representations.fading import faded
 

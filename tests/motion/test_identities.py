@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from holosplat.checks import InputError
-from holosplat.motion.identities import LinkOptions, Seen, drift, identified, place_at
+from holosplat.motion.track_linking import LinkOptions, Seen, drift, identified, place_at
 
 TIMES = 1e-5 * np.arange(10)
 RADIUS = 4.0

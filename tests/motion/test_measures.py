@@ -11,8 +11,8 @@ from holosplat.bodies.moments import centroid, moments
 from holosplat.geometry import Views
 from holosplat.matter import Matter
 from holosplat.mesh import TriangleMesh
+from holosplat.motion.detections import Sighting
 from holosplat.motion.measures import angular_velocity, columns, measure, measured, row, volume_velocity
-from holosplat.motion.sightings import Sighting
 from holosplat.representations import MovingSurfaces, TimeBasis
 from holosplat.scan import Exposures
 from holosplat.specimens.red_cells import icosphere

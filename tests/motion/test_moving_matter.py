@@ -14,7 +14,7 @@ from holosplat.fit.whitened import WhitenedFrames
 from holosplat.geometry import Grid, Views
 from holosplat.matter import DeltaBeta, MaterialPrior, Matter
 from holosplat.methods import SmoothVolume, Task
-from holosplat.motion.carried import CarriedOptions, Search
+from holosplat.motion.flow_reconstruction import CarriedOptions, Search
 from holosplat.motion.freer_flow import of_degree, on_lattice
 from holosplat.motion.timed_frames import merged, trendless
 from holosplat.representations import Flow, Lattice, TimeBasis, VoxelGrid

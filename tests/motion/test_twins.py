@@ -18,10 +18,10 @@ from holosplat.fit.steps import Steps
 from holosplat.geometry import rotation_y
 from holosplat.materials import HAEMOGLOBIN
 from holosplat.matter import Matter
-from holosplat.motion import twins
+from holosplat.motion import two_view_ambiguity
 from holosplat.motion.elastic import Elastic, Rest
 from holosplat.motion.fit import MotionFit
-from holosplat.motion.twins import Trials, chosen_twins, in_question, twinned, without_details
+from holosplat.motion.two_view_ambiguity import Trials, chosen_twins, in_question, twinned, without_details
 from holosplat.representations import MovingSurfaces, TimeBasis
 
 PIXEL, SHAPE = 1e-6, (29, 35)
@@ -113,7 +113,7 @@ def test_frames_tell_a_body_from_its_twin(monkeypatch):
     told = [*trials.steps.done]
     assert len(told) >= 4  # a stiff and a soft fit of a body and of its twin
     with monkeypatch.context() as none:
-        none.setattr(twins, "motion_fit", lambda *given: pytest.fail("this fit was made before"))
+        none.setattr(two_view_ambiguity, "motion_fit", lambda *given: pytest.fail("this fit was made before"))
         again = chosen_twins(twinned(truth, 0, ACROSS), replace(trials, steps=Steps(told)))
     assert torch.equal(again.coefficients, found.coefficients)
     assert chosen_twins(truth, replace(trials, steps=Steps())) is truth

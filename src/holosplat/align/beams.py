@@ -15,15 +15,13 @@ from ..model import Alignment
 from ..optics.background import Light, LightOptions
 from ..progress import Advance, Progress
 from ..scan import Exposures, Scan
-from .begin import Begun, Images, begun
 from .changes import changes, header, in_words, line
-from .coarse import SIDES
 from .derivatives import NUMBERS
-from .few import KINDS
 from .gauge import moved_onto
-from .moments import Beams, Moment, chosen_moments, whens
+from .initial_geometry import SIDES, Begun, Images, begun
+from .marginal_likelihood import KINDS
 from .poses import DISTANCE, FLUX, SHIFT, TURN, Drift, Level, PoseOptions, PoseSearch
-from .series_search import SeriesSearch
+from .series_search import Beams, Moment, SeriesSearch, chosen_moments, whens
 from .shadows import EVEN_OR_NOT
 from .views import ACCURACY, DEFAULT, FEW, FEWEST, AlignedViews, Judged
 

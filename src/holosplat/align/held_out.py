@@ -15,10 +15,10 @@ from ..optics.sampling import fringe_sampling
 from ..progress import Progress
 from ..representations import Stored
 from ..scan import Scan
-from .beside import Beside
 from .changes import changes, numbers_of
-from .coarse import centres_of_mass
 from .derivatives import NUMBERS, in_pixels
+from .fixed_matter import Beside
+from .initial_geometry import centres_of_mass
 from .newton import unexplained
 from .poses import DISTANCE, FLUX, SHIFT, PoseOptions, PoseSearch
 from .views import AlignedViews, errors_of

@@ -15,9 +15,9 @@ from ..methods.surface_fit import oversampling
 from ..optics.sampling import fringe_sampling
 from ..representations import SurfaceMesh
 from ..scan import Scan
-from .beside import Beside
 from .changes import numbers_of
 from .derivatives import in_pixels, predicted
+from .fixed_matter import Beside
 from .gauge import moved_onto
 from .poses import FLUX, SHIFT, PoseOptions, PoseSearch
 

@@ -23,8 +23,8 @@ from ..optics.noise import noise_levels
 from ..progress import Advance
 from ..representations import SurfaceMesh, isosurface
 from ..scan import Exposures, Scan
-from .beside import Beside, aligned
 from .changes import numbers_of
+from .fixed_matter import Beside, aligned
 from .newton import Step, unexplained
 from .poses import DISTANCE, FLUX, PoseOptions
 

@@ -21,11 +21,11 @@ from ..projectors.voxels import LatticeProjector
 from ..representations import SurfaceMesh
 from ..scan import Exposures, Scan
 from .changes import changes, header, in_words, line
-from .coarse import mirrored
 from .derivatives import in_pixels, predicted
-from .directions import hardly_told
-from .few import KINDS, beside_unknown
 from .gauge import moved_onto
+from .initial_geometry import mirrored
+from .marginal_likelihood import KINDS, beside_unknown
+from .null_space import hardly_told
 from .poses import DISTANCE, FLUX, SHIFT, PoseOptions, PoseSearch
 from .rehearsal import Searched, rehearsed
 from .shadows import EVEN_OR_NOT

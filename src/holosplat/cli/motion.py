@@ -13,7 +13,7 @@ from ..io.reading import Reading
 from ..io.run_scan import run_source
 from ..matter import KnownTwo, MaterialPrior, MatterKind
 from ..methods import Auto, Method
-from ..motion.carried import CarriedOptions
+from ..motion.flow_reconstruction import CarriedOptions
 from ..optics.background import LightOptions
 from ..planning.acts import of_motion
 from ..report.run import report_run

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 import torch
 
 from ..mesh import TriangleMesh
-from .sightings import Sighting
+from .detections import Sighting
 
 
 class Journal(Protocol):

@@ -10,9 +10,9 @@ from ..matter import DeltaBeta
 from ..optics.background import Light
 from ..progress import FitProgress
 from ..scan import Scan
-from .contest import Parts, cells_or_any
-from .following import Followed, Following, require_times
+from .body_tracker import Followed, Following, require_times
 from .journal import Journal, Nowhere
+from .model_comparison import Parts, cells_or_any
 from .track_options import TrackOptions
 
 __all__ = ["NOWHERE", "USUAL", "Followed", "TrackOptions", "follow", "require_times"]

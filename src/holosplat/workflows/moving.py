@@ -15,7 +15,7 @@ from ..methods.assumed import assumed_material
 from ..methods.illumination import prepared
 from ..methods.presets import SCHEMA
 from ..methods.uncertain import Uncertain
-from ..motion.carried import NOWHERE, CarriedOptions, Search, merged
+from ..motion.flow_reconstruction import NOWHERE, CarriedOptions, Search, merged
 from ..optics.background import LightOptions
 from ..optics.sampling import fringe_sampling
 from ..progress import FitProgress

@@ -23,10 +23,9 @@ from ..methods.assumed import assumed_material
 from ..methods.illumination import prepared
 from ..methods.presets import SCHEMA
 from ..methods.uncertain import Uncertain
-from ..motion.elastic import Rest
-from ..motion.halves import standard_errors
+from ..motion.elastic import Rest, strain_energy
 from ..motion.measures import columns, measured, row
-from ..motion.strain import strain_energy
+from ..motion.split_half_errors import standard_errors
 from ..motion.track import NOWHERE, USUAL, Followed, TrackOptions, follow, require_times
 from ..optics.background import LightOptions
 from ..progress import FitProgress

@@ -19,7 +19,7 @@ from ..representations import MovingSurfaces
 from ..scan import Scan
 from .elastic import Rest
 from .fit import MotionFit, motion_fit
-from .remainder import beside, only
+from .residual_detection import beside, only
 
 APART = 0.05
 """Least distance of a body and its twin, over its extent, at which they can be distinguished."""

@@ -14,9 +14,9 @@ import numpy as np
 
 from ..checks import InputError, as_written
 from ..units import in_percent
-from .following import Followed, Following
+from .body_tracker import Followed, Following
 from .journal import Journal
-from .remainder import predicted
+from .residual_detection import predicted
 
 CLEARLY = 0.95
 """What bodies of any shape must leave of what cells leave: so much freer in two beams, they follow noise and explain by

@@ -21,19 +21,17 @@ from ..optics.background import Light
 from ..progress import FitProgress
 from ..representations import MovingSurfaces, TimeBasis
 from ..scan import Scan
+from .detections import Sighting, SightingOptions, network_for, sightings
 from .elastic import Rest
 from .fit import MotionFit, motion_fit
-from .guesses import network_for
-from .halves import astray, halves_of, tell_shapes
 from .journal import Journal, from_sightings, to_sightings
 from .known import KnownBodies, at_rest
-from .mergers import without_merger
 from .pieces import chosen_paths
-from .remainder import apart, beside, joined, only, sure_ones, whole_ones
-from .sightings import Sighting, SightingOptions, sightings
-from .start import first_paths
+from .residual_detection import apart, beside, joined, only, sure_ones, whole_ones, without_merger
+from .split_half_errors import astray, halves_of, tell_shapes
+from .track_linking import first_paths
 from .track_options import TrackOptions
-from .twins import Trials, chosen_twins
+from .two_view_ambiguity import Trials, chosen_twins
 
 CHECKPOINT_SECONDS = 20.0
 """What a stage has come to is kept so often [s]."""

@@ -41,9 +41,8 @@ from ..representations import (
 from ..representations.initialise import FILLED
 from ..scan import Scan
 from .freer_flow import Change, freer_flows
-from .held_out import iterations_that_predict, kept_frames
 from .journal import Journal, Nowhere
-from .timed_frames import Frames, merged, trendless
+from .timed_frames import Frames, iterations_that_predict, kept_frames, merged, trendless
 
 SURE, AGAIN = 4.0, 2.0
 """Standard deviations, and times what it explains of times in another order, by which a flow must explain frames before
