@@ -104,4 +104,6 @@ def test_few_noisy_frames_leave_a_good_plan():
     options = PoseOptions(Uncertain(shift=1.0, angle=0.5, roll=0.5), rounds=2, retrieval=15, first=10, steps=4, edges=0)
     found = align_views(noisy, MaterialPrior.known(MATERIAL), options)
     assert not found.changes.any()
-    assert [word.split(" is as")[0] for word in found.words if "may be noise" in word] == ["shift", "angle", "roll"]
+    (decision,) = (one for one in found.decisions if one.name == "errors of the plan")
+    assert decision.choice == "none"
+    assert {one.name for one in decision.compared} == {"shift", "angle", "roll"}

@@ -17,7 +17,7 @@ from holosplat.align.derivatives import NUMBERS, Predicted, projections
 from holosplat.align.gauge import moved_onto
 from holosplat.align.initial_geometry import mirrored, shifts_by_mass
 from holosplat.align.newton import Normal, blurred, step
-from holosplat.align.views import Judged
+from holosplat.align.views import PLANNED, POSES, Judged
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
@@ -109,7 +109,7 @@ def test_a_good_plan_is_kept():
     """It loses nothing, for what differs by less than can be known is put back."""
     scan, _ = scan_of(Misalignment(), 8)
     found = align_views(scan, MaterialPrior.known(MATERIAL), replace(QUICK, rounds=3))
-    assert {word.split(" is as planned")[0] for word in found.words} & {"shift", "all"}
+    assert [one.choice for one in found.decisions if one.name == POSES] == [PLANNED]
     np.testing.assert_allclose(found.exposures.views.shifts, scan.views.shifts, atol=1e-9 * PIXEL)
 
 
@@ -151,7 +151,12 @@ def test_a_mirrored_beam_is_reported(misaligned):
 def test_few_training_frames_do_not_judge_what_was_found(monkeypatch, enough, kept):
     """They agree with any poses, so that what is left of them says nothing; of enough frames it does."""
     left = iter([1.0, 1.1])
-    worse = classmethod(lambda _, scan, *__: Judged(np.full(len(scan), next(left)), [""] * len(scan)))
+
+    def judged(_, scan, *__):
+        size = next(left)
+        return Judged(np.full(len(scan), size), [""] * len(scan), torch.full(scan.frames.shape, size))
+
+    worse = classmethod(judged)
     monkeypatch.setattr(Judged, "of", worse)
     scan, _ = scan_of(Misalignment(1.0, 0.0, 0.0, seed=2), 5, 6)
     options = replace(QUICK, uncertain=Uncertain(angle=0.0, roll=0.0), rounds=1, few_views=enough)

@@ -29,7 +29,7 @@ def frequent(monkeypatch):
     """Fits are kept after every step, and each time sees the true bodies at once."""
     monkeypatch.setattr(body_tracker, "CHECKPOINT_SECONDS", -1.0)
     monkeypatch.setattr(
-        following, "sightings", lambda frames, material, options, network: seen(float(frames.instants[0]))
+        body_tracker, "sightings", lambda frames, material, options, network: seen(float(frames.instants[0]))
     )
 
 
@@ -116,7 +116,7 @@ def test_times_that_were_looked_at_are_not_looked_at_again(monkeypatch):
     monkeypatch.setattr(body_tracker, "sightings", look)
     with pytest.raises(KeyboardInterrupt):
         follow(scan(), MATERIAL, QUICK, journal=(kept := Kept()))
-    assert [(one["next"], len(one["steps"])) for one in kept.plain] == [("sightings", 2)]
+    assert [(one["next"], len(one["stage_steps"])) for one in kept.plain] == [("sightings", 2)]
     again = follow(scan(), MATERIAL, QUICK, journal=kept)
     assert len(looked) == TIMES + 1 + TIMES  # the third twice; and all beside the bodies
     assert torch.equal(again.bodies.coefficients, whole()[1].bodies.coefficients)

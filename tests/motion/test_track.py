@@ -182,7 +182,11 @@ def test_pieces_are_chosen_by_frames_that_are_held_out():
         chosen = 4 * np.repeat(order, 4) + np.tile(np.arange(4), 5)
         noise = 0.02 * np.random.default_rng(0).normal(size=scan().frames.shape)
         frames = replace(scan(), frames=scan().frames[chosen] + noise)
-        assert (chosen_paths(frames, start, how, short).basis.pieces > 1) == bent
+        found, decision = chosen_paths(frames, start, how, short)
+        assert (found.basis.pieces > 1) == bent
+        assert decision is not None
+        assert decision.choice == str(found.basis.pieces)
+        assert decision.by == "frames set aside"
 
 
 def test_one_time_is_no_motion():

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..checks import at_least, in_range, require
 from ..geometry import Views, rotation_y
+from ..inference import Decision
 from ..optics.background import LightOptions
 from ..progress import Advance
 from ..ranges import ranged
@@ -20,10 +21,7 @@ from .shadows import EVEN_OR_NOT, shadows
 
 STEP = 0.25
 """Distance of the places that are tried [columns]; a parabola finds the place between them."""
-SURE = 3.0
-"""Standard errors from which on a lean is believed, and put into the exposures."""
-LEAST_LEAN_PX = 0.1
-"""Sideways reach of a lean over the frame's height that matters [pixels]."""
+LEAN, UPRIGHT, LEANING = "lean of the axis", "as the scan says", "leaning"
 FINE_REACH = 4
 """How far beside the place that a coarse search finds a fine one looks [columns]."""
 FEWEST_VIEWS = 6
@@ -67,11 +65,18 @@ class Axis:
     rows: int
     turn: HalfTurn | None = None
 
-    @cached_property
+    @property
     def leans(self) -> bool:
-        """Whether the axis leans, beyond doubt and by as much as matters."""
-        lean = self.lean
-        return lean is not None and abs(lean.value) > max(SURE * lean.error, LEAST_LEAN_PX / self.rows)
+        """Whether the axis leans for sure."""
+        return any(each.choice == LEANING for each in self.decisions)
+
+    @cached_property
+    def decisions(self) -> tuple[Decision, ...]:
+        """On the lean, where the frames have enough rows."""
+        if self.lean is None:
+            return ()
+        found = self.lean.compared(LEANING)
+        return (Decision(LEAN, LEANING if found.wins else UPRIGHT, "likelihood ratio", (found,)),)
 
     def applied(self, exposures: Exposures) -> Exposures:
         """The exposures with the axis where it is: detector shifts, a roll `ω_z = -atan(lean)` where it leans, and the
@@ -97,7 +102,7 @@ class Axis:
             said.append("lean of the axis: the frames have too few rows to tell")
         else:
             degrees = np.rad2deg(np.arctan([self.lean.value, self.lean.error]))
-            used = "" if self.leans else "; not beyond doubt, left as the scan says"
+            used = "" if self.leans else "; not sure, left as the scan says"
             said.append(f"lean of the axis {degrees[0]:+.3f}° ± {degrees[1]:.3f}°{used}")
         said.append(
             "sense of rotation: parallel beams cannot tell it, for the mirrored object that turns the other way gives "

@@ -11,6 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..inference import Compared
+
 FEWEST_SAMPLES = 5.0
 """Columns for a half wave of the highest order, at least: higher orders are hardly sampled, and see noise."""
 LOWEST = 4
@@ -99,6 +101,12 @@ class Estimate:
 
     value: float
     error: float
+
+    def compared(self, name: str) -> Compared:
+        """The hypothesis `name`, that the number is not zero: the logarithm of its likelihood ratio `z²/2`, whose
+        standard deviation is |z|, the number over its error (Cox 1961, Proc. 4th Berkeley Symp. 1, 105)."""
+        z = abs(self.value) / max(self.error, 1e-300)
+        return Compared(name, 0.5 * z**2, z)
 
 
 def combined(values: np.ndarray, errors: np.ndarray) -> Estimate:

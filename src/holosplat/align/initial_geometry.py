@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ..geometry import Views
+from ..inference import Compared, Decision, Score, select
 from ..matter import DeltaBeta
 from ..optics.retrieval import Tikhonov, tikhonov
 from ..scan import Scan
@@ -17,8 +18,7 @@ from .derivatives import in_pixels
 from .null_space import Told
 from .row_sums import FACTOR, RowEstimate, RowPrior, by_rows, plane_angles
 
-MIRRORED = 0.85
-"""A view counts as mirrored if its mirror image has less than this part of its own residual."""
+BY = "the same rows"
 SIDES = {"x": (-1,), "y": (-2,), "xy": (-1, -2)}
 """Names of mirror images, and the axes that are reversed."""
 
@@ -49,18 +49,15 @@ def mirrored(frames: Tensor, predicted: Tensor) -> list[str]:
 
     One of "x" (columns are reversed), "y" (rows are), "xy".
     """
-    names = ["", *SIDES]
-    images = [frames, *(frames.flip(axes) for axes in SIDES.values())]
-    left = torch.stack([(image - predicted).square().mean((1, 2)).sqrt() for image in images])
-    best = left.argmin(0)
-    sure = left.amin(0) < MIRRORED * left[0]
-    return [names[k] if known else "" for k, known in zip(best.tolist(), sure.tolist())]
+    images = {"": frames, **{side: frames.flip(axes) for side, axes in SIDES.items()}}
+    found = list[str]()
+    for v in range(len(frames)):
+        scores = {side: Score.of(image[[v]] - predicted[[v]]) for side, image in images.items()}
+        found.append(select("mirrored", tuple(scores), lambda side, fold, of=scores: of[side], by="a frame").choice)
+    return found
 
 
-REVERSED = 0.5
-"""A beam counts as reversed if the disagreement of its rows then falls below this part."""
-SMALL = 0.03
-"""Disagreement of rows, as a share of their moments, below which nothing is looked for that is reversed."""
+REVERSED, NONE = "reversed beams", "none"
 EDGE, PASSING = 1 / 16, 0.25
 """Share of the columns on either side of a frame that are its edge; matter passes it where thickness there is more than
 this part of the mean (0.03 to 0.1 with the retrieval's errors alone, 0.4 and more with cells that pass)."""
@@ -80,7 +77,7 @@ class Begun:
     before, after: [V] rms of what rows have against being of one object, as a share of their moments
     sides: [V] which mirror image each frame is, or ""
     believed: whether matter lies in the field of every view, else rows need not agree
-    words: what they cannot tell
+    words: what they cannot tell; left: of all rows, before and after; decision: on reversed beams
     """
 
     numbers: np.ndarray
@@ -92,6 +89,8 @@ class Begun:
     sides: tuple[str, ...]
     believed: bool
     words: tuple[str, ...]
+    left: tuple[Score, Score]
+    decision: Decision
 
 
 @dataclass(frozen=True)
@@ -140,7 +139,9 @@ def begun(images: Images, expected: np.ndarray, drifts: np.ndarray, few: bool) -
     train, everything = np.flatnonzero(~images.is_test), np.arange(len(images.views))
     planned = images.estimate(RowPrior.of(np.zeros_like(expected), len(everything)), everything)
     held = expected * (np.arange(len(expected)) != ANGLE) if few else expected
-    images, sides, first = _upright(images, train, RowPrior.of(held, len(train)))
+    images, sides, first, compared = _upright(images, train, RowPrior.of(held, len(train)))
+    turned = ", ".join(f"beam {v} along {side}" for v, side in enumerate(sides) if side)
+    decision = Decision(REVERSED, turned or NONE, BY, compared)
     told, free = Told.of(first.information, images.views[train], expected), held
     if few and len(told.ratios) and told.ratios[0] >= FIRMLY:
         free = expected
@@ -164,6 +165,8 @@ def begun(images: Images, expected: np.ndarray, drifts: np.ndarray, few: bool) -
         tuple(sides),
         not images.passing(),
         tuple(told.words(FIRMLY if few else 0.0)) if few else (),
+        (planned.left, whole.left),
+        decision,
     )
 
 
@@ -180,8 +183,10 @@ def _errors(found: RowEstimate) -> np.ndarray:
     return np.sqrt(np.maximum(variances, 0))
 
 
-def _upright(images: Images, train: np.ndarray, prior: RowPrior) -> tuple[Images, list[str], RowEstimate]:
-    """The images with reversed views turned back, which these are, and the estimate by training views.
+def _upright(
+    images: Images, train: np.ndarray, prior: RowPrior
+) -> tuple[Images, list[str], RowEstimate, tuple[Compared, ...]]:
+    """The images with reversed views turned back, which these are, the estimate by training views, and comparisons.
 
     One view after another is reversed, that which makes rows agree best; the later one of two that are as good. Masses
     of rows tell which are upside down. Columns that are reversed turn the signs of first moments; with two views, any
@@ -189,15 +194,14 @@ def _upright(images: Images, train: np.ndarray, prior: RowPrior) -> tuple[Images
     """
     sides, found = [""] * len(images.views), images.estimate(prior, train)
     kinds = tuple(SIDES) if len(train) > 2 else ("y",)
+    compared = list[Compared]()
     for _ in range(0 if images.passing() else len(train) // 2):
-        left = float(np.sqrt(np.mean(found.after**2)))
-        if left < SMALL:
-            break
         tried = {(v, side): images.reversed(v, side) for v in train[::-1] if not sides[v] for side in kinds}
         estimates = {key: each.estimate(prior, train) for key, each in tried.items()}
-        worst = {key: float(np.sqrt(np.mean(each.after**2))) for key, each in estimates.items()}
-        best = min(worst, key=lambda key: round(worst[key] / left, 3))
-        if worst[best] > REVERSED * left:
+        gains = {key: each.left.gain_over(found.left) for key, each in estimates.items()}
+        best = max(gains, key=lambda key: round(gains[key][0], 3))
+        compared.append(Compared(f"beam {best[0]} along {best[1]}", *gains[best]))
+        if not compared[-1].wins:
             break
         sides[best[0]], images, found = best[1], tried[best], estimates[best]
-    return images, sides, found
+    return images, sides, found, tuple(compared)

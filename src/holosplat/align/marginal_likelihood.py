@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.optimize import minimize
 from torch import Tensor
 from torch.nn.functional import interpolate
 
 from ..geometry import Grid, Views
+from ..inference import Compared, Decision
 from ..optics.sampling import fringe_sampling
 from ..representations import SurfaceMesh
 from .derivatives import in_pixels, predicted
@@ -19,12 +22,7 @@ from .newton import blurred
 from .null_space import beside, motions, null
 from .poses import DISTANCE, FLUX, MAGNIFICATION, PoseSearch
 
-STRONG = 3.0
-"""Logarithm of the ratio of evidences from which a plan counts as wrong: 20 to 1, strong (Kass & Raftery 1995)."""
-SCALES = (0.0, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
-"""Sizes of the plan's errors, as shares of what is uncertain, that are tried."""
-SWEEPS = 3
-"""Times that the size of each kind's errors is chosen beside those of the others."""
+NAME, NONE = "errors of the plan", "none"
 
 
 @dataclass(frozen=True)
@@ -35,13 +33,15 @@ class Weighed:
     covariance: [V · K, V · K] of what was found, with what is uncertain as the prior
     off: [V · K, V · K] mean squares and products of what `numbers` are off by: the covariance, and how far they are
         from the likeliest with this prior, for what stays as planned may be as wrong as the estimates indicate
-    scales: of each kind of numbers, the likeliest size of the plan's errors as a share of what is uncertain
+    scales: of each kind of numbers, the likeliest size of the plan's errors as a share of what is uncertain, 0 for none
+    compared: each of these hypotheses beside that of no such errors, the weakest first, as far as they were asked
     """
 
     numbers: np.ndarray
     covariance: np.ndarray
     off: np.ndarray
     scales: tuple[float, ...]
+    compared: tuple[tuple[int, Compared], ...]
 
 
 def weighed(
@@ -58,8 +58,9 @@ def weighed(
     motions do to all, which no frame determines and which are left out.
 
     With found numbers normal about the true ones, and these about the plan, the evidence of a size of the plan's errors
-    has a closed form (MacKay 1992). The largest is taken; for each kind with errors it must be larger by `STRONG`. Each
-    combination of parameters then shrinks to the plan as far as the frames do not determine it.
+    has a closed form (MacKay 1992). The largest is taken; a kind has errors if it is so much larger than without them
+    that `Compared` wins: ℓ, the logarithm of the ratio, has the standard deviation √(2ℓ) (Cox 1961). Each combination
+    of parameters then shrinks to the plan as far as the frames do not determine it.
     """
     units = np.tile(expected, len(found))
     kept = beside(motions / units[:, None])
@@ -69,23 +70,41 @@ def weighed(
     for row, places in zip(shares.reshape(len(kinds), *found.shape), kinds):
         row[:, places] = 1
 
-    def spread_of(scales: tuple[float, ...]) -> np.ndarray:
-        return (kept.T * (np.square(scales) @ shares)) @ kept
+    def spread_of(variances: np.ndarray) -> np.ndarray:
+        return (kept.T * (variances @ shares)) @ kept
 
-    def gain(scales: tuple[float, ...]) -> float:
-        return _evidence(told, values, spread_of(scales)) - STRONG * np.count_nonzero(scales)
+    def likeliest(free: Sequence[int]) -> tuple[float, np.ndarray]:
+        """The largest evidence where the kinds `free` have errors, and the variances [kinds] of these."""
+        whole = np.zeros(len(kinds))
 
-    scales = (1.0,) * len(kinds)
-    for k in list(range(len(kinds))) * SWEEPS:
-        scales = max((scales[:k] + (tried,) + scales[k + 1 :] for tried in SCALES), key=gain)
-    spread = spread_of(scales)
+        def lacking(variances: np.ndarray) -> float:
+            whole[list(free)] = variances
+            return -_evidence(told, values, spread_of(whole))
+
+        if not len(free):
+            return -lacking(np.zeros(0)), whole
+        best = minimize(lacking, np.ones(len(free)), method="L-BFGS-B", bounds=[(0.0, 1.0)] * len(free))
+        return -lacking(best.x), whole
+
+    free, compared = list(range(len(kinds))), list[tuple[int, Compared]]()
+    evidence, variances = likeliest(free)
+    while free:
+        gains = {k: evidence - likeliest([other for other in free if other != k])[0] for k in free}
+        weakest = min(gains, key=lambda k: gains[k])
+        gain = max(gains[weakest], 0.0)
+        compared.append((weakest, Compared(str(weakest), gain, float(np.sqrt(2 * gain)))))
+        if compared[-1][1].wins:
+            break
+        free.remove(weakest)
+        evidence, variances = likeliest(free)
+    spread, scales = spread_of(variances), tuple(np.sqrt(variances).tolist())
     shrunk = spread @ np.linalg.solve(told @ spread + np.eye(len(told)), told @ values)
     whole = np.linalg.inv(told + np.eye(len(told)))
     away = whole @ told @ values - shrunk
     covariance, off = (
         units[:, None] * (kept @ part @ kept.T) * units for part in (whole, whole + np.outer(away, away))
     )
-    return Weighed((units * (kept @ shrunk)).reshape(found.shape), covariance, off, scales)
+    return Weighed((units * (kept @ shrunk)).reshape(found.shape), covariance, off, scales, tuple(compared))
 
 
 def _evidence(told: np.ndarray, values: np.ndarray, spread: np.ndarray) -> float:
@@ -110,11 +129,11 @@ SIDE = 64
 
 def beside_unknown(
     search: PoseSearch, pixels: int, surfaces: SurfaceMesh | None, rehearsed: np.ndarray
-) -> tuple[str, ...]:
+) -> Decision | None:
     """Makes the covariances of the training views those beside matter that is not known, and as large as errors are.
 
     Where no frames are held out, that could judge, numbers also go back to the plan as far as frames do not tell them
-    (`evidence.weighed`); returned are the kinds that do so altogether. Distances are left as they are.
+    (`weighed`), and the decision which kinds of them are wrong at all is returned. Distances are left as they are.
 
     pixels: of the last images; surfaces: in the poses that were found, or None for voxels; rehearsed: [V, 7] errors of
     the numbers in a rehearsal (`rehearsal.rehearsed`), of which each kind is made as uncertain as they are.
@@ -123,7 +142,7 @@ def beside_unknown(
     free = {kind: places for kind, places in KINDS.items() if kind != "distance" and getattr(uncertain, kind) > 0}
     places = sorted(place for kind in free.values() for place in kind)
     if not places:
-        return ()
+        return None
     while min(search.scan.views.shape) // pixels > SIDE:
         pixels *= 2
     units = torch.tensor([pixels if place in range(2) else 1.0 for place in places]).double().repeat(len(train))
@@ -147,11 +166,14 @@ def beside_unknown(
     covariances[:, at[:, None], at] = torch.stack([blocks[v, :, v] for v in range(len(train))])
     search.covariances[train] = covariances
     if not moves:
-        return ()
+        return None
     numbers = search.numbers[train]
     numbers[:, at] = torch.from_numpy(judged.numbers)
     search.numbers[train] = numbers
-    return tuple(kind for kind, scale in zip(free, judged.scales) if scale == 0)
+    names = list(free)
+    wrong = ", ".join(kind for kind, scale in zip(names, judged.scales) if scale > 0)
+    compared = tuple(replace(each, name=names[k]) for k, each in judged.compared)
+    return Decision(NAME, wrong or NONE, "marginal likelihood", compared)
 
 
 def _larger(away: np.ndarray, covariance: np.ndarray, kinds: list[list[int]]) -> np.ndarray:

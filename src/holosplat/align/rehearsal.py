@@ -11,6 +11,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from ..geometry import Grid
+from ..inference import Decision
 from ..methods.surface_fit import oversampling
 from ..optics.sampling import fringe_sampling
 from ..representations import SurfaceMesh
@@ -29,12 +30,14 @@ SEED = 0
 class Searched:
     """A search that is done.
 
-    pixels: edge of the last images [detector pixels]; surfaces: what explains frames better than voxels, or None
+    pixels: edge of the last images [detector pixels]; surfaces: what explains frames better than voxels, or None;
+    decisions: on these
     """
 
     search: PoseSearch
     pixels: int
     surfaces: SurfaceMesh | None
+    decisions: tuple[Decision, ...] = ()
 
 
 Search = Callable[[Scan, PoseOptions], Searched]

@@ -14,6 +14,7 @@ from ..bodies.rest_shape import KnownBody, extent_like
 from ..checks import InputError, as_written, require
 from ..fit.running import Record
 from ..fit.steps import Steps
+from ..inference import Decision
 from ..learning.network import Guess
 from ..matter import DeltaBeta
 from ..mesh import TriangleMesh
@@ -46,7 +47,8 @@ class Followed:
     """The tracked bodies. bodies: on their paths; records: of the steps of all fits; oversample: wave samples a pixel
     in these; timing: seconds of each stage; found: how many bodies each time shows by itself; halves: the bodies by
     halves of the frames, two and two, empty without intervals; rest: their shape at rest [m], if that is known; begun:
-    the detection method at single times, in words; body: their known shape, given or found."""
+    the detection method at single times, in words; body: their known shape, given or found; decisions: on detections,
+    pieces of paths, twins, and the kind of bodies."""
 
     bodies: MovingSurfaces
     records: list[Record]
@@ -57,6 +59,7 @@ class Followed:
     rest: TriangleMesh | None = None
     begun: str = ""
     body: KnownBody | None = None
+    decisions: tuple[Decision, ...] = ()
 
 
 @dataclass
@@ -79,6 +82,7 @@ class Following:
     records: list[Record] = field(default_factory=list)
     timing: dict[str, float] = field(default_factory=dict)
     halves: list[MovingSurfaces] = field(default_factory=list)
+    decisions: list[Decision] = field(default_factory=list)
     oversample: int = 1
     size: float = 1.0
     """Of all bodies of known rest shape, beside what was said."""
@@ -112,7 +116,8 @@ class Following:
         self.halves = [MovingSurfaces.from_state(one) for one in saved["halves"]]
         self._begun, self.size, self.guess = saved["fit"], float(saved["size"]), str(saved["guess"])
         self.cells = float(saved["cells"])
-        self._steps = Steps(saved.get("steps", ()), self._save_now_and_then)
+        self.decisions = [Decision.from_dict(one) for one in saved.get("decisions", ())]
+        self._steps = Steps(saved.get("stage_steps", ()), self._save_now_and_then)
 
     def _save(self, fit: Mapping[str, Any] | None = None) -> None:
         """Write the journal; fit: the state of the one that runs, which starts at `bodies`."""
@@ -120,7 +125,8 @@ class Following:
         state |= {"size": self.size, "guess": self.guess, "cells": self.cells}
         state |= {"bodies": None if self.bodies is None else self.bodies.state(), "fit": fit}
         state |= {"seen": from_sightings(self.seen), "records": self.records, "timing": self.timing}
-        self.journal.save(state | {"halves": [one.state() for one in self.halves], "steps": self._steps.done})
+        state |= {"decisions": [one.as_dict() for one in self.decisions], "stage_steps": self._steps.done}
+        self.journal.save(state | {"halves": [one.state() for one in self.halves]})
         self._kept = time.perf_counter()
 
     def _save_now_and_then(self) -> None:
@@ -137,7 +143,8 @@ class Following:
         """The tracked bodies; said: a sentence on their kind."""
         assert self.bodies is not None
         told = self.records, self.oversample, self.timing, tuple(self.counts), tuple(self.halves)
-        return Followed(self.bodies, *told, self.shape_at_rest(), self.guess + said, self.options.body)
+        guess, made = self.guess + said, tuple(self.decisions)
+        return Followed(self.bodies, *told, self.shape_at_rest(), guess, self.options.body, made)
 
     def advance(self) -> None:
         """Do the stage that is next."""
@@ -215,6 +222,7 @@ class Following:
         with self._record_time("sightings"):
             found, decision = network_for(at, self.material, *how, lambda stage, part: None)
         self.guess = decision.line
+        self.decisions.append(decision)
         return found
 
     def look(self, frames: Scan, level: float = 1.0, network: Guess | None = None) -> list[list[Sighting]]:
@@ -319,14 +327,21 @@ class Following:
         how = (self.options.stiff, self.options.soft, self.oversample, self.seed, self.light, self._steps)
         trials = Trials(self.train, self.rest, *how)
         with self._record_time("twins"):
-            return chosen_twins(bodies, trials, lambda share: self.on_progress("twins", share, {}))
+            found = chosen_twins(bodies, trials, lambda share: self.on_progress("twins", share, {}))
+        return self._decided(*found)
 
     def on_chosen_paths(self, bodies: MovingSurfaces) -> MovingSurfaces:
         """`bodies` on paths of as many pieces as the frames support."""
         how = (self.options.paths, self.options.stiff, self.seed, self.light, self.rest)
         self.on_progress("paths", 0.0, {})
         with self._record_time("paths"):
-            return chosen_paths(self.train, bodies, *how, steps=self._steps)
+            found = chosen_paths(self.train, bodies, *how, steps=self._steps)
+        return self._decided(*found)
+
+    def _decided(self, bodies: MovingSurfaces, decision: Decision | None) -> MovingSurfaces:
+        """`bodies`, whose decision is kept."""
+        self.decisions += [] if decision is None else [decision]
+        return bodies
 
     def fitted(
         self, name: str, frames: Scan, start: MovingSurfaces, how: MotionFit, light: Light | None

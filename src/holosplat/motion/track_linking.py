@@ -9,6 +9,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from ..checks import at_least, in_range, require
+from ..inference import Score, select
 from ..matter import DeltaBeta, Matter
 from ..ranges import ranged
 from ..representations import MovingSurfaces, TimeBasis
@@ -203,10 +204,6 @@ def _is_accepted(track: Track, seen: Sequence[Seen], options: LinkOptions) -> bo
 
 USUAL = LinkOptions()
 """The usual options of linking detections."""
-SURE = 3
-"""Whole sightings from which a track's own velocity is believed; with fewer it is that of the flow."""
-BENT = 6
-"""Whole sightings from which its acceleration is."""
 
 
 def first_paths(
@@ -253,19 +250,30 @@ def best_sighting(track: Track, seen: Sequence[Seen]) -> int:
 def _middle(
     track: Track, best: int, seen: Sequence[Seen], times: np.ndarray, flow: np.ndarray, basis: TimeBasis
 ) -> np.ndarray:
-    """Coefficients [K, 3] [m] of the path of the middle, a polynomial of as many powers as sightings can tell.
+    """Coefficients [K, 3] [m] of the path of the middle: with the velocity of the flow, the null, or a polynomial of
+    degree one or two, whichever predicts detections that it was not fitted to (`inference.select`).
 
-    It passes the middle of the best sighting, whose surface it carries, where only that one or the flow is known.
+    Beside the flow, it passes the middle of the best detection, whose surface it carries.
     """
     whole = [k for k in track if not seen[k].cut]
-    when = np.array([times[seen[k].time] for k in whole])
-    dense = np.linspace(basis.first, basis.last, 4 * basis.count)
-    degree = min(basis.degree, 2 if len(whole) >= BENT else 1 if len(whole) >= SURE else 0)
-    if degree == 0:
-        places = seen[best].centre + (dense - times[seen[best].time])[:, None] * flow * (basis.degree > 0)
-    else:
-        scale = basis.last - basis.first
-        centres = np.array([seen[k].centre for k in whole])
-        powers = np.polynomial.polynomial.polyfit((when - basis.first) / scale, centres, degree)
-        places = np.polynomial.polynomial.polyval((dense - basis.first) / scale, powers).T
-    return basis.fitted(dense, places)
+    when, centres = times[[seen[k].time for k in whole]], np.array([seen[k].centre for k in whole])
+    dense, velocity = np.linspace(basis.first, basis.last, 4 * basis.count), flow * (basis.degree > 0)
+
+    def path(degree: int, kept: np.ndarray, at: np.ndarray) -> np.ndarray:
+        away = centres[kept] - (when[kept] - basis.first)[:, None] * velocity
+        powers = np.polynomial.polynomial.polyfit((when[kept] - basis.first) / scale, away, degree)
+        return (
+            np.polynomial.polynomial.polyval((at - basis.first) / scale, powers).T
+            + (at - basis.first)[:, None] * velocity
+        )
+
+    def left_out(name: str, fold: int) -> Score:
+        every = np.arange(len(whole))
+        missed = [centres[k] - path(int(name), every != k, when[[k]])[0] for k in every]
+        return Score(np.square(missed).sum(axis=1)[:, None])
+
+    degrees, scale = [str(n) for n in range(min(2, basis.degree) + 1) if len(whole) > n + 1], basis.last - basis.first
+    chosen = int(select("degree of a path", degrees, left_out, by="detections left out").choice) if degrees else 0
+    if chosen > 0:
+        return basis.fitted(dense, path(chosen, np.arange(len(whole)), dense))
+    return basis.fitted(dense, seen[best].centre + (dense - times[seen[best].time])[:, None] * velocity)

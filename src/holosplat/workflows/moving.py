@@ -94,6 +94,7 @@ def reconstruct_moving(
     found = search.run()
     oversample = fringe_sampling(train.exposures)
     said = Prediction(found.object, task.scan.exposures, oversample)
+    decisions = (*task.decisions, *found.decisions)
     done = Reconstruction(
         found.object,
         KIND,
@@ -101,7 +102,7 @@ def reconstruct_moving(
         oversample,
         found.timing,
         True,
-        Choice("continuous", {}, "Gaussians", decisions=task.decisions, against=task.prior.against),
+        Choice("continuous", {}, "Gaussians", decisions=decisions, against=task.prior.against),
         task.delta_told,
         judge(said, task.scan, task.noise if task.uneven else None),
         light=found_in(task),

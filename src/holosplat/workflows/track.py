@@ -116,7 +116,7 @@ def track(
             found.oversample,
             found.timing,
             True,
-            Choice("levels", {}, "soft fit", found.begun, task.decisions),
+            Choice("levels", {}, "soft fit", found.begun, (*task.decisions, *found.decisions)),
             task.delta_told,
             judge(said, train, task.noise if task.uneven else None),
             light=found_in(task),
