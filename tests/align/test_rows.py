@@ -13,7 +13,7 @@ from helpers.moving_balls import beams, thickness
 from helpers.row_images import gaussians, placed
 from holosplat.align.derivatives import in_pixels
 from holosplat.align.gauge import moved_onto
-from holosplat.align.initial_geometry import Images, begun
+from holosplat.align.initial_geometry import NONE, REVERSED, Images, begun
 from holosplat.align.null_space import Told, motions
 from holosplat.align.row_sums import COUNT, RowPrior, Rows, by_rows, conditions, plane_angles
 from holosplat.beamline.misalignment import Misalignment
@@ -144,7 +144,22 @@ def test_a_reversed_beam_is_noticed(side, axis):
     found = begun(Images(values[1:3], planned, np.zeros(3, dtype=bool), WHEN[1:3]), EXPECTED, np.zeros(5), few=True)
     assert found is not None
     assert found.sides == ("", side, "")
+    assert found.decision.choice == f"beam 1 along {side}"
     assert apart(placed(found.numbers, planned), true)[0] < 0.05
+
+
+@pytest.mark.parametrize("angles", [THREE, TWO])
+def test_upright_beams_are_left_alone(angles):
+    """Of many balls in noise, and of soft matter that is nearly the same upside down."""
+    none = np.zeros(len(angles), dtype=bool)
+    values, planned, true = images(angles, Misalignment(1.0, 0.6, 0.0, seed=3))
+    noise = 0.3 * np.random.default_rng(3).normal(size=values[1:3].shape)
+    soft = np.repeat(gaussians(true)[None], 2, axis=0)
+    for one in (values[1:3] + noise, soft):
+        found = begun(Images(one, planned, none, WHEN[1:3]), EXPECTED, np.zeros(5), few=True)
+        assert found is not None
+        assert found.sides == ("",) * len(angles)
+        assert (found.decision.name, found.decision.choice, found.decision.by) == (REVERSED, NONE, "the same rows")
 
 
 @pytest.mark.parametrize(("share", "free"), [(0.6, False), (1.6, True)])

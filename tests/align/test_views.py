@@ -8,21 +8,24 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from torch.nn.functional import interpolate
+from torch.nn.functional import interpolate, pad
 
 from helpers.discs import ball_lines
 from helpers.misaligned_balls import BALLS, MATERIAL, PIXEL, scan_of
 from holosplat.align import AlignedViews, PoseOptions, Uncertain, align_views
-from holosplat.align.derivatives import NUMBERS, Predicted, projections
+from holosplat.align.derivatives import NUMBERS, Predicted, in_pixels, projections
 from holosplat.align.gauge import moved_onto
 from holosplat.align.initial_geometry import mirrored, shifts_by_mass
 from holosplat.align.newton import Normal, blurred, step
+from holosplat.align.sharp import EDGES, SURFACES, VOXELS
 from holosplat.align.views import PLANNED, POSES, Judged
 from holosplat.beamline.misalignment import Misalignment
 from holosplat.checks import InputError
 from holosplat.geometry import Grid, Views
 from holosplat.matter import MaterialPrior
+from holosplat.model import Instrument
 from holosplat.scan import Exposures, Scan
+from holosplat.volume import LineIntegrals
 
 QUICK = PoseOptions(rounds=2, retrieval=15, first=20, edges=0, few_views=2)
 """Options of tests that do not ask how near the poses come; test_rehearsal.py has what few views need beside."""
@@ -53,6 +56,19 @@ def test_shifts_turns_and_roll_of_every_view_are_found(misaligned):
     assert after[0] < 0.02
     assert after[1] < 0.12
     assert after[2] < 0.08
+
+
+def test_surfaces_are_taken_where_matter_has_edges(misaligned):
+    """And not for soft lumps of the same material, whose frames voxels explain."""
+    assert [one.choice for one in misaligned[2].decisions if one.name == EDGES] == [SURFACES]
+    scan, true, _ = misaligned
+    instrument = Instrument(true, 1)
+    my, mx = instrument.margin
+    wide = pad(torch.from_numpy(PIXEL * gaussians(in_pixels(true.views))).float(), (mx, mx, my, my))[:, None]
+    frames = instrument.frames(LineIntegrals(wide, ((MATERIAL.delta, MATERIAL.beta),)))
+    options = PoseOptions(Uncertain(shift=1.0, angle=0.0, roll=0.0), rounds=1, retrieval=20, edges=25)
+    found = align_views(Scan(frames.numpy(), true, scan.is_test), MaterialPrior.known(MATERIAL), options)
+    assert [one.choice for one in found.decisions if one.name == EDGES] == [VOXELS]
 
 
 def test_edges_tell_the_distances_beside_their_mean(misaligned):
