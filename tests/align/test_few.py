@@ -83,7 +83,7 @@ def test_numbers_go_back_to_the_plan_as_far_as_they_are_not_told():
     assert ours**2 == pytest.approx(np.mean(said), rel=0.5)
     noises = [(kept @ own @ rng.normal(size=14)).reshape(4, 5) * expected for _ in range(30)]
     kept_plans = [weighed(noise, told, expected, kinds, common).scales == (0.0, 0.0, 0.0) for noise in noises]
-    assert np.mean(kept_plans) > 0.9  # odds of 20 to 1 are asked for
+    assert np.mean(kept_plans) > 0.9
     noise = noises[kept_plans.index(True)]
     nothing = weighed(noise, told, expected, kinds, common)
     assert not nothing.numbers.any()

@@ -97,7 +97,7 @@ def test_what_is_left_falls_and_is_told(misaligned):
     assert "hardly told: distance" in [word.split(", in views")[0] for word in found.words]  # its mean is the plan's
     text = "\n".join(found.lines())
     assert "rms" in text
-    assert len(found.lines()) == 3 + len(found.words) + len(scan)
+    assert len(found.lines()) == 3 + len(found.words) + len(found.decisions) + len(scan)
     moved = moved_onto(found.exposures.views, scan.views)
     np.testing.assert_allclose(moved.shifts, found.exposures.views.shifts, atol=1e-3 * PIXEL)
     np.testing.assert_allclose(moved.rotations, found.exposures.views.rotations, atol=1e-6)

@@ -59,8 +59,8 @@ def weighed(
 
     With found numbers normal about the true ones, and these about the plan, the evidence of a size of the plan's errors
     has a closed form (MacKay 1992). The largest is taken; a kind has errors if it is so much larger than without them
-    that `Compared` wins: ℓ, the logarithm of the ratio, has the standard deviation √(2ℓ) (Cox 1961). Each combination
-    of parameters then shrinks to the plan as far as the frames do not determine it.
+    that `Compared` wins: with ℓ the logarithm of the ratio, √(2ℓ) is the deviation of a normal number in its standard
+    errors. Each combination of parameters then shrinks to the plan as far as the frames do not determine it.
     """
     units = np.tile(expected, len(found))
     kept = beside(motions / units[:, None])
@@ -91,8 +91,7 @@ def weighed(
     while free:
         gains = {k: evidence - likeliest([other for other in free if other != k])[0] for k in free}
         weakest = min(gains, key=lambda k: gains[k])
-        gain = max(gains[weakest], 0.0)
-        compared.append((weakest, Compared(str(weakest), gain, float(np.sqrt(2 * gain)))))
+        compared.append((weakest, Compared(str(weakest), float(np.sqrt(2 * max(gains[weakest], 0.0))), 1.0)))
         if compared[-1][1].wins:
             break
         free.remove(weakest)
