@@ -81,7 +81,7 @@ def reconstruct_in_motion(
     for line in (*evaluation.lines(), *(result.verdict.lines("training frames") if result.verdict else ())):
         print(line)
     seconds = sum(result.timing.values())
-    for line in found.history:
+    for line in (*found.history, *(each.line for each in result.choice.decisions)):
         print(line, file=sys.stderr)
     print(f"{seconds:.1f} s, {result.object.described}; report: {report}", file=sys.stderr)
     return True

@@ -39,7 +39,7 @@ def follow(
     light: of the training frames, which were divided by it, where it is uneven. journal: keeps every stage that is
     done, and fits from time to time; what it holds already is not done again, and the result is the same bit for bit.
     Where all frames are of two beams, of unknown shape, and a network of red cells guesses the bodies, they are
-    followed as red cells, too; these are kept unless bodies of any shape leave clearly less (`contest`). Errors:
+    followed as red cells, too; these are kept unless bodies of any shape leave less (`model_comparison`). Errors:
     `InputError` for a scan of one time, and where no body is seen.
     """
     train = scan.train()
