@@ -9,7 +9,7 @@ import pytest
 
 from helpers.motion_shadows import FLOW, OTHER, TURN, cell, pose, shadows
 from holosplat.bodies import neighbourhood_search
-from holosplat.bodies.neighbourhood_search import Pool, Replaced, best_choice
+from holosplat.bodies.neighbourhood_search import NeighbourhoodSearch, Pool, best_choice
 from holosplat.bodies.poses import FREER, Explained
 from holosplat.bodies.templates import Search, Templates
 
@@ -45,7 +45,7 @@ def test_a_body_that_stands_for_two_is_replaced_by_them(monkeypatch):
     search = Search(Templates.of(cell(), seen), seen, FLOW[None])
     begun = every.improved([pose(TURN, (0.0, 0.5, 0.0))], 15)
     heard: list[float] = []
-    found = Replaced(every, search, 1).better(begun, on_progress=heard.append)
+    found = NeighbourhoodSearch(every, search, 1).better(begun, on_progress=heard.append)
     assert len(found) == 2
     for one in truth:
         assert min(np.linalg.norm(other.centre - one.centre) for other in found) < 0.5
@@ -56,7 +56,7 @@ def test_a_body_that_stands_for_two_is_replaced_by_them(monkeypatch):
 def test_nothing_becomes_nothing():
     seen = shadows([])
     every = Explained(cell(), seen)
-    assert Replaced(every, Search(Templates.of(cell(), seen), seen, FLOW[None])).better([]) == []
+    assert NeighbourhoodSearch(every, Search(Templates.of(cell(), seen), seen, FLOW[None])).better([]) == []
 
 
 def test_doubts_are_where_something_is_missing():

@@ -15,7 +15,7 @@ from holosplat.checks import InputError
 from holosplat.inference import Decision, Score
 from holosplat.learning.weights import Card, Trained
 from holosplat.motion import body_tracker, model_comparison
-from holosplat.motion.model_comparison import NAME, Parts, cells_or_any, unexplained
+from holosplat.motion.model_comparison import NAME, Parts, compared_kinds, unexplained
 from holosplat.motion.track import TrackOptions, follow
 
 
@@ -49,7 +49,7 @@ def test_what_leaves_less_is_kept(monkeypatch, cells, other, kept, looked):
     spread = 1 + 0.05 * np.random.default_rng(0).normal(size=(40, 3))
     monkeypatch.setattr(model_comparison, "unexplained", lambda run: Score(run.left**2 * spread))
     runs = Run("cells", cells or 0.0, cells is None), Run("other", other)
-    said = cells_or_any(*runs)  # type: ignore[arg-type]
+    said = compared_kinds(*runs)  # type: ignore[arg-type]
     assert said.startswith(kept)
     assert runs[0].seen == [["other"]]
     assert runs[0].guess == "other"
@@ -84,12 +84,12 @@ def guessed(monkeypatch):
     """Each time sees the true bodies, and a network that knows red cells alone is said to have guessed them."""
     monkeypatch.setattr(body_tracker, "CHECKPOINT_SECONDS", -1.0)
     at = lambda frames, material, options, network: [  # noqa: E731
-        body_tracker.Sighting(mesh, False) for mesh in true_paths().bodies(float(frames.instants[0]))
+        body_tracker.Detection(mesh, False) for mesh in true_paths().bodies(float(frames.instants[0]))
     ]
     monkeypatch.setattr(body_tracker, "sightings", at)
     trained = Trained(object(), Card(trained_on={"kinds": ["red-cells"]}))  # type: ignore[arg-type]
     monkeypatch.setattr("holosplat.learning.start.LearnedStart.network", property(lambda self: trained))
-    monkeypatch.setattr(body_tracker.Following, "network", lambda self: trained.network)
+    monkeypatch.setattr(body_tracker.BodyTracker, "network", lambda self: trained.network)
     monkeypatch.setattr("holosplat.bodies.neighbourhood_search.PATIENCE", 1)
     return trained
 
@@ -107,7 +107,7 @@ def test_both_are_followed_and_a_run_goes_on_in_either_part(guessed):
 
 
 def test_nobody_asks_for_cells_elsewhere(guessed, monkeypatch):
-    monkeypatch.setattr("holosplat.motion.track.cells_or_any", lambda *runs: pytest.fail("cells were asked for"))
+    monkeypatch.setattr("holosplat.motion.track.compared_kinds", lambda *runs: pytest.fail("cells were asked for"))
     follow(scan(), MATERIAL, short())  # four beams
     follow(two_beams(), MATERIAL, replace(short(), cells=False))
     card = Card(trained_on={"kinds": ["capsules"]})

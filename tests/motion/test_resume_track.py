@@ -34,7 +34,7 @@ def frequent(monkeypatch):
 
 
 def seen(time: float):
-    return [body_tracker.Sighting(mesh, False) for mesh in true_paths().bodies(time)]
+    return [body_tracker.Detection(mesh, False) for mesh in true_paths().bodies(time)]
 
 
 def three_views():
@@ -75,7 +75,7 @@ def test_the_fit_after_twins_goes_on_too(monkeypatch):
     def moved(run, bodies):
         return bodies.with_parameters({"coefficients": bodies.coefficients + 0.3})
 
-    monkeypatch.setattr(body_tracker.Following, "told_from_twins", moved)
+    monkeypatch.setattr(body_tracker.BodyTracker, "told_from_twins", moved)
     result = follow(scan(), MATERIAL, QUICK, journal=(kept := Kept()))
     named = [state["next"] for state in kept.plain]
     assert named.index("twins") < named.index("soft again") < named.index("halves")
@@ -169,7 +169,7 @@ def test_halves_of_few_views_begin_apart(monkeypatch):
     assert 0.5 < float(one[0, own].square().sum(1).mean().sqrt()) / (ASTRAY * radius) < 3
     assert tell_shapes(scan())
     assert not tell_shapes(three_views())
-    monkeypatch.setattr(body_tracker.Following, "fitted", lambda run, name, frames, start, how, light: start)
+    monkeypatch.setattr(body_tracker.BodyTracker, "fitted", lambda run, name, frames, start, how, light: start)
     result = follow(three_views(), MATERIAL, QUICK)
     apart = result.halves[0].coefficients - result.halves[1].coefficients
     middle = 0.5 * (result.halves[0].coefficients + result.halves[1].coefficients)
@@ -183,8 +183,8 @@ def test_halves_that_begin_apart_are_fitted_to_the_end_where_no_shape_is_known(m
         steps.append((name, how.schedule.steps))
         return start
 
-    monkeypatch.setattr(body_tracker.Following, "fitted", fitted)
-    monkeypatch.setattr(body_tracker.Following, "on_chosen_paths", lambda run, bodies: bodies)
+    monkeypatch.setattr(body_tracker.BodyTracker, "fitted", fitted)
+    monkeypatch.setattr(body_tracker.BodyTracker, "on_chosen_paths", lambda run, bodies: bodies)
     long = replace(QUICK, soft=replace(QUICK.soft, schedule=Schedule(steps=7)))
     for frames, wanted in ((three_views(), [7, 7]), (scan(), [3, 3, 3, 3])):
         steps.clear()

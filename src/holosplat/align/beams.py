@@ -20,7 +20,7 @@ from .changes import changes, header, in_words, line
 from .consistency import Estimate
 from .derivatives import NUMBERS
 from .gauge import moved_onto
-from .initial_geometry import SIDES, Begun, Images, begun
+from .initial_geometry import SIDES, Images, RowGeometry, geometry_from_rows
 from .poses import DISTANCE, FLUX, SHIFT, TURN, Drift, Level, PoseOptions, PoseSearch
 from .series_search import Beams, Moment, SeriesSearch, chosen_moments, whens
 from .shadows import EVEN_OR_NOT
@@ -202,17 +202,17 @@ def _turned_back(moment: Moment, sides: tuple[str, ...]) -> Moment:
 
 def _rows(
     moments: Sequence[Moment], count: int, material: DeltaBeta, options: PoseOptions, few: bool, pixels: int
-) -> Begun | None:
+) -> RowGeometry | None:
     """Estimate the beams from rows, at times that have all of them, on pixels so many times larger."""
     whole = [moment for moment in moments if len(moment.beams) == count]
     if not whole:
         return None
     scans = [moment.scan[np.argsort(moment.beams)].binned(pixels) for moment in whole]
     images = Images.of(scans, [moment.when for moment in whole], material, options.retrieval)
-    return begun(images, options.uncertain.pose(pixels), options.drift.pose(pixels), few)
+    return geometry_from_rows(images, options.uncertain.pose(pixels), options.drift.pose(pixels), few)
 
 
-def _by_rows(start: Begun, pixels: int) -> Found:
+def _by_rows(start: RowGeometry, pixels: int) -> Found:
     """The numbers of rows, for detector pixels."""
     scales = np.array([pixels, pixels, 1, 1, 1])
     numbers, rates = (np.pad(scales * part, ((0, 0), (0, len(NUMBERS) - 5))) for part in (start.numbers, start.rates))
@@ -234,7 +234,7 @@ def _shifted_by_volumes(search: SeriesSearch, found: Found, on_progress: Advance
 
 
 def _by_volumes(
-    search: SeriesSearch, planned: Exposures, start: Begun | None, few: bool, pixels: int, on_progress: Progress
+    search: SeriesSearch, planned: Exposures, start: RowGeometry | None, few: bool, pixels: int, on_progress: Progress
 ) -> Found:
     """The numbers of volumes of all times, which begin with those of rows where these agree; turns of `few` beams stay
     as they begin."""

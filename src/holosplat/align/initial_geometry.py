@@ -69,7 +69,7 @@ ANGLE = 3
 
 
 @dataclass(frozen=True)
-class Begun:
+class RowGeometry:
     """Estimates of V views from rows, lengths in pixels of the images.
 
     numbers, rates: [V, 5] shifts and turns [rad] at the middle of the times, and how much more at their end
@@ -128,7 +128,7 @@ class Images:
         return by_rows(self.values[:, index], self.views[index], prior, self.when)
 
 
-def begun(images: Images, expected: np.ndarray, drifts: np.ndarray, few: bool) -> Begun | None:
+def geometry_from_rows(images: Images, expected: np.ndarray, drifts: np.ndarray, few: bool) -> RowGeometry | None:
     """Estimate poses from rows; None for beams that do not lie in one plane.
 
     expected: [5] standard deviations of shifts [pixels of the images] and turns [rad]; drifts: [5], as in `RowPrior`;
@@ -155,7 +155,7 @@ def begun(images: Images, expected: np.ndarray, drifts: np.ndarray, few: bool) -
     errors[train] = told.errors
     rate_errors[train] = Told.of(found.rate_information, images.views[train], prior.drifts).errors
     errors[:, free == 0] = expected[free == 0]
-    return Begun(
+    return RowGeometry(
         whole.numbers[:, : len(free)],
         whole.rates[:, : len(free)],
         errors,

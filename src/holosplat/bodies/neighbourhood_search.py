@@ -123,12 +123,12 @@ def pursued(
     found = [free.improved(searched(every, search, start), LAST_STEPS) for start in starts]
     best = int(np.argmin([free.value(poses) for poses in found]))
     tried = [pose for poses in found for pose in poses]
-    better = Replaced(free, search, seed).better(found[best], tried, on_progress)
+    better = NeighbourhoodSearch(free, search, seed).better(found[best], tried, on_progress)
     return free.improved(better, FREE_STEPS), best > 0
 
 
 @dataclass
-class Replaced:
+class NeighbourhoodSearch:
     """Takes some bodies away, looks for others in their place, and keeps what explains more.
 
     A pursuit takes one body at a time: the first ones may stand for the shadows of several, or for their crossing, and

@@ -22,7 +22,7 @@ from ..optics.background import Light
 from ..progress import FitProgress
 from ..representations import MovingSurfaces, TimeBasis
 from ..scan import Scan
-from .detections import Sighting, SightingOptions, network_for, sightings
+from .detections import Detection, SightingOptions, network_for, sightings
 from .elastic import Rest
 from .fit import MotionFit, motion_fit
 from .journal import Journal, from_sightings, to_sightings
@@ -63,7 +63,7 @@ class Followed:
 
 
 @dataclass
-class Following:
+class BodyTracker:
     """Tracking stage by stage: sightings, then stiff fits and looks beside their bodies in turn,
     then paths, the soft fit, and fits to halves of the frames."""
 
@@ -77,7 +77,7 @@ class Following:
     stage: str = "sightings"
     round: int = 0
     bodies: MovingSurfaces | None = None
-    seen: list[list[Sighting]] = field(default_factory=list)
+    seen: list[list[Detection]] = field(default_factory=list)
     counts: list[int] = field(default_factory=list)
     records: list[Record] = field(default_factory=list)
     timing: dict[str, float] = field(default_factory=dict)
@@ -225,13 +225,13 @@ class Following:
         self.decisions.append(decision)
         return found
 
-    def look(self, frames: Scan, level: float = 1.0, network: Guess | None = None) -> list[list[Sighting]]:
+    def look(self, frames: Scan, level: float = 1.0, network: Guess | None = None) -> list[list[Detection]]:
         """The bodies that each time of `frames` shows by itself.
 
         level: factor of the occupancy at the surface; network: what guesses the volumes.
         """
         how = replace(self.options.sightings, level=level * self.options.sightings.level)
-        times, found = frames.instants, list[list[Sighting]]()
+        times, found = frames.instants, list[list[Detection]]()
         with self._record_time("sightings"):
             for t in range(len(times)):
                 self.on_progress("bodies at each time", t / len(times), {})

@@ -25,7 +25,7 @@ from ..scan import Scan
 
 
 @dataclass(frozen=True)
-class Sighting:
+class Detection:
     """A body at one time. mesh: its surface [m]; cut: whether it goes on beyond the field, so that a part is seen."""
 
     mesh: TriangleMesh
@@ -73,7 +73,7 @@ def sightings(
     options: SightingOptions = SightingOptions(),
     on_progress: Progress = lambda stage, part: None,
     network: Guess | None = None,
-) -> list[Sighting]:
+) -> list[Detection]:
     """The bodies of `material` in the frames of `scan`, of one time, the largest first; none where nothing is seen.
 
     network: guesses the volume, which is made by total variation without one.
@@ -81,7 +81,7 @@ def sightings(
     values, grid = occupancy(scan, material, options, on_progress, network)
     how = options.level, options.least_volume, options.smoothing
     bodies = cut_bodies(values.numpy(), grid, scan.views.finest, *how)
-    return [Sighting(body, is_cut(body, scan.views, options.edge)) for body in bodies]
+    return [Detection(body, is_cut(body, scan.views, options.edge)) for body in bodies]
 
 
 def occupancy(

@@ -14,7 +14,7 @@ import torch
 
 from ..checks import InputError, as_written
 from ..inference import Score, select
-from .body_tracker import Followed, Following
+from .body_tracker import BodyTracker, Followed
 from .journal import Journal
 from .residual_detection import predicted
 
@@ -58,7 +58,7 @@ class Part:
         self._parts.save(self._name, state)
 
 
-def cells_or_any(cells: Following, other: Following) -> Followed:
+def compared_kinds(cells: BodyTracker, other: BodyTracker) -> Followed:
     """What `cells`, of red cells, found, or `other`, of bodies of any shape, which has its sightings.
 
     Errors: those of either; where there are no cells of that size, of `other` alone.
@@ -81,7 +81,7 @@ def cells_or_any(cells: Following, other: Following) -> Followed:
     return kept.followed()
 
 
-def unexplained(of: Following) -> Score:
+def unexplained(of: BodyTracker) -> Score:
     """What the bodies leave of the training frames."""
     assert of.bodies is not None
     return Score.of(torch.from_numpy(of.train.frames - predicted(of.train, of.bodies, of.oversample)))

@@ -10,9 +10,9 @@ from ..matter import DeltaBeta
 from ..optics.background import Light
 from ..progress import FitProgress
 from ..scan import Scan
-from .body_tracker import Followed, Following, require_times
+from .body_tracker import BodyTracker, Followed, require_times
 from .journal import Journal, Nowhere
-from .model_comparison import Parts, cells_or_any
+from .model_comparison import Parts, compared_kinds
 from .track_options import TrackOptions
 
 __all__ = ["NOWHERE", "USUAL", "Followed", "TrackOptions", "follow", "require_times"]
@@ -46,8 +46,8 @@ def follow(
     require_times(train)
     parts = Parts(journal)
 
-    def following(name: str, body: KnownBody | None) -> Following:
-        run = Following(train, material, replace(options, body=body), seed, light, parts.of(name), on_progress)
+    def following(name: str, body: KnownBody | None) -> BodyTracker:
+        run = BodyTracker(train, material, replace(options, body=body), seed, light, parts.of(name), on_progress)
         run.take_up()
         return run
 
@@ -55,6 +55,6 @@ def follow(
     if options.body is None and options.cells and two_beams(train.views) is not None:
         run.until("first paths")
         if run.cells > 0:
-            return cells_or_any(following("cells", guessed_cells(run.cells)), run)
+            return compared_kinds(following("cells", guessed_cells(run.cells)), run)
     run.until("done")
     return run.followed()

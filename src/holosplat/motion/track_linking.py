@@ -13,7 +13,7 @@ from ..inference import Score, select
 from ..matter import DeltaBeta, Matter
 from ..ranges import ranged
 from ..representations import MovingSurfaces, TimeBasis
-from .detections import Sighting
+from .detections import Detection
 
 FAR = 1e9
 """Cost of a pair that cannot be."""
@@ -207,7 +207,7 @@ USUAL = LinkOptions()
 
 
 def first_paths(
-    found: Sequence[Sequence[Sighting]],
+    found: Sequence[Sequence[Detection]],
     times: np.ndarray,
     basis: TimeBasis,
     pixel: float,
