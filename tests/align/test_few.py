@@ -83,7 +83,7 @@ def test_numbers_go_back_to_the_plan_as_far_as_they_are_not_told():
     assert ours**2 == pytest.approx(np.mean(said), rel=0.5)
     noises = [(kept @ own @ rng.normal(size=14)).reshape(4, 5) * expected for _ in range(30)]
     kept_plans = [weighed(noise, told, expected, kinds, common).scales == (0.0, 0.0, 0.0) for noise in noises]
-    assert np.mean(kept_plans) > 0.9
+    assert np.mean(kept_plans) > 0.9  # odds of 20 to 1 are asked for
     noise = noises[kept_plans.index(True)]
     nothing = weighed(noise, told, expected, kinds, common)
     assert not nothing.numbers.any()
@@ -106,4 +106,3 @@ def test_few_noisy_frames_leave_a_good_plan():
     assert not found.changes.any()
     (decision,) = (one for one in found.decisions if one.name == "errors of the plan")
     assert decision.choice == "none"
-    assert {one.name for one in decision.compared} == {"shift", "angle", "roll"}

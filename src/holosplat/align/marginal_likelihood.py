@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
-from scipy.optimize import minimize
 from torch import Tensor
 from torch.nn.functional import interpolate
 
 from ..geometry import Grid, Views
-from ..inference import Compared, Decision
+from ..inference import Decision
 from ..optics.sampling import fringe_sampling
 from ..representations import SurfaceMesh
 from .derivatives import in_pixels, predicted
@@ -23,6 +21,12 @@ from .null_space import beside, motions, null
 from .poses import DISTANCE, FLUX, MAGNIFICATION, PoseSearch
 
 NAME, NONE = "errors of the plan", "none"
+STRONG = 3.0
+"""Logarithm of the ratio of evidences from which a plan counts as wrong: 20 to 1, strong (Kass & Raftery 1995)."""
+SCALES = (0.0, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2, 1.0)
+"""Sizes of the plan's errors, as shares of what is uncertain, that are tried."""
+SWEEPS = 3
+"""Times that the size of each kind's errors is chosen beside those of the others."""
 
 
 @dataclass(frozen=True)
@@ -34,14 +38,12 @@ class Weighed:
     off: [V · K, V · K] mean squares and products of what `numbers` are off by: the covariance, and how far they are
         from the likeliest with this prior, for what stays as planned may be as wrong as the estimates indicate
     scales: of each kind of numbers, the likeliest size of the plan's errors as a share of what is uncertain, 0 for none
-    compared: each of these hypotheses beside that of no such errors, the weakest first, as far as they were asked
     """
 
     numbers: np.ndarray
     covariance: np.ndarray
     off: np.ndarray
     scales: tuple[float, ...]
-    compared: tuple[tuple[int, Compared], ...]
 
 
 def weighed(
@@ -58,9 +60,8 @@ def weighed(
     motions do to all, which no frame determines and which are left out.
 
     With found numbers normal about the true ones, and these about the plan, the evidence of a size of the plan's errors
-    has a closed form (MacKay 1992). The largest is taken; a kind has errors if it is so much larger than without them
-    that `Compared` wins: with ℓ the logarithm of the ratio, √(2ℓ) is the deviation of a normal number in its standard
-    errors. Each combination of parameters then shrinks to the plan as far as the frames do not determine it.
+    has a closed form (MacKay 1992). The largest is taken; for each kind with errors it must be larger by `STRONG`. Each
+    combination of parameters then shrinks to the plan as far as the frames do not determine it.
     """
     units = np.tile(expected, len(found))
     kept = beside(motions / units[:, None])
@@ -70,40 +71,23 @@ def weighed(
     for row, places in zip(shares.reshape(len(kinds), *found.shape), kinds):
         row[:, places] = 1
 
-    def spread_of(variances: np.ndarray) -> np.ndarray:
-        return (kept.T * (variances @ shares)) @ kept
+    def spread_of(scales: tuple[float, ...]) -> np.ndarray:
+        return (kept.T * (np.square(scales) @ shares)) @ kept
 
-    def likeliest(free: Sequence[int]) -> tuple[float, np.ndarray]:
-        """The largest evidence where the kinds `free` have errors, and the variances [kinds] of these."""
-        whole = np.zeros(len(kinds))
+    def gain(scales: tuple[float, ...]) -> float:
+        return _evidence(told, values, spread_of(scales)) - STRONG * np.count_nonzero(scales)
 
-        def lacking(variances: np.ndarray) -> float:
-            whole[list(free)] = variances
-            return -_evidence(told, values, spread_of(whole))
-
-        if not len(free):
-            return -lacking(np.zeros(0)), whole
-        best = minimize(lacking, np.ones(len(free)), method="L-BFGS-B", bounds=[(0.0, 1.0)] * len(free))
-        return -lacking(best.x), whole
-
-    free, compared = list(range(len(kinds))), list[tuple[int, Compared]]()
-    evidence, variances = likeliest(free)
-    while free:
-        gains = {k: evidence - likeliest([other for other in free if other != k])[0] for k in free}
-        weakest = min(gains, key=lambda k: gains[k])
-        compared.append((weakest, Compared(str(weakest), float(np.sqrt(2 * max(gains[weakest], 0.0))), 1.0)))
-        if compared[-1][1].wins:
-            break
-        free.remove(weakest)
-        evidence, variances = likeliest(free)
-    spread, scales = spread_of(variances), tuple(np.sqrt(variances).tolist())
+    scales = (1.0,) * len(kinds)
+    for k in list(range(len(kinds))) * SWEEPS:
+        scales = max((scales[:k] + (tried,) + scales[k + 1 :] for tried in SCALES), key=gain)
+    spread = spread_of(scales)
     shrunk = spread @ np.linalg.solve(told @ spread + np.eye(len(told)), told @ values)
     whole = np.linalg.inv(told + np.eye(len(told)))
     away = whole @ told @ values - shrunk
     covariance, off = (
         units[:, None] * (kept @ part @ kept.T) * units for part in (whole, whole + np.outer(away, away))
     )
-    return Weighed((units * (kept @ shrunk)).reshape(found.shape), covariance, off, scales, tuple(compared))
+    return Weighed((units * (kept @ shrunk)).reshape(found.shape), covariance, off, scales)
 
 
 def _evidence(told: np.ndarray, values: np.ndarray, spread: np.ndarray) -> float:
@@ -171,8 +155,7 @@ def beside_unknown(
     search.numbers[train] = numbers
     names = list(free)
     wrong = ", ".join(kind for kind, scale in zip(names, judged.scales) if scale > 0)
-    compared = tuple(replace(each, name=names[k]) for k, each in judged.compared)
-    return Decision(NAME, wrong or NONE, "marginal likelihood", compared)
+    return Decision(NAME, wrong or NONE, "marginal likelihood")
 
 
 def _larger(away: np.ndarray, covariance: np.ndarray, kinds: list[list[int]]) -> np.ndarray:
