@@ -224,7 +224,7 @@ class Judged:
     images: Tensor
 
     def score(self, which: np.ndarray) -> Score:
-        """What is left of the frames `which` [V] bool."""
+        """Score the residual of the frames that `which` [V] marks."""
         return Score.of(self.images[torch.from_numpy(which)])
 
     @classmethod
