@@ -66,7 +66,8 @@ def test_surfaces_are_taken_where_matter_has_edges(misaligned):
     my, mx = instrument.margin
     wide = pad(torch.from_numpy(PIXEL * gaussians(in_pixels(true.views))).float(), (mx, mx, my, my))[:, None]
     frames = instrument.frames(LineIntegrals(wide, ((MATERIAL.delta, MATERIAL.beta),)))
-    options = PoseOptions(Uncertain(shift=1.0, angle=0.0, roll=0.0), rounds=1, retrieval=20, edges=25)
+    few = Uncertain(shift=1.0, angle=0.0, roll=0.0)
+    options = PoseOptions(few, rounds=1, retrieval=8, first=10, steps=4, few_views=2, edges=12)
     found = align_views(Scan(frames.numpy(), true, scan.is_test), MaterialPrior.known(MATERIAL), options)
     assert [one.choice for one in found.decisions if one.name == EDGES] == [VOXELS]
 
